@@ -20,8 +20,7 @@ from scipy.stats import binomtest
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.frames import Array
 from stitch.measurement.session import Session
-from stitch.model.arm import keep_arm_effects
-from stitch.model.model_toml import ModelFile
+from stitch.model.model_toml import ModelFile, keep_arm_effects
 from stitch.pipeline import run
 from stitch.writing.result_document import model_of
 

@@ -10,10 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stitch import frames
-from stitch.cells.base_to_base.contradiction import compare_distances
-from stitch.cells.base_to_base.stand import Stand, TouchedPoints, cylinder_points
-from stitch.cells.base_to_base.stand_fit import fit_stand
-from stitch.cells.base_to_base.stand_projection import project
+from stitch.cells.stand import Stand, TouchedPoints, compare_distances, cylinder_points, fit_stand, project
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "base-to-base.md"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"

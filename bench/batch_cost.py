@@ -14,8 +14,8 @@ _SECONDS_A_DAY = 86_400
 _CODE = """
 import os, resource, sys
 from pathlib import Path
-from stitch.batch.job import Job
-from stitch.batch.one_session import run_session
+from stitch.batch.run_batch import Job
+from stitch.batch.run_batch import run_session
 from stitch.system.threads import share_cores
 
 def spent():

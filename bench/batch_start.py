@@ -14,11 +14,11 @@ _ALL = f"import {_ACTIONS}.run_sessions, {_ACTIONS}.changed_run, {_ACTIONS}.watc
 _COMMANDS = {
     "stitch --version": ("--version", ""),
     "stitch --help": ("--help", _ALL),
-    "stitch run --help": ("run --help", "import stitch.cli.actions.run_sessions\n"),
-    "stitch batch --help": ("batch --help", "import stitch.cli.actions.batch_sessions\n"),
+    "stitch run --help": ("run --help", "import stitch.cli.run\n"),
+    "stitch batch --help": ("batch --help", "import stitch.cli.batch\n"),
 }
 _STEPS = {
-    "before the first stage": "import stitch.cli.actions.run_sessions\n",
+    "before the first stage": "import stitch.cli.run\n",
     "and for the recording": "import viz.recording\n",
     "and for the page": "import viz.run_page\n",
 }

@@ -13,11 +13,10 @@ from data_synth.scene import Scene, load_scene
 from data_synth.simulate import Measured, simulate
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.form_trial import scales_of
-from stitch.diagnosis.score import form_weights
-from stitch.diagnosis.sensitivity.detectable import least_noncentrality
+from stitch.diagnosis.score import form_weights, scales_of
+from stitch.diagnosis.sensitivity import least_noncentrality
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import missing_need
+from stitch.effects.contract import missing_need
 from stitch.effects.user_file import load
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement

@@ -27,15 +27,12 @@ from data_synth.nature import LAWS
 from data_synth.simulate import Measured
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.validation.cross_validation import CrossValidation
+from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.errors import StitchError
 from stitch.observations.linear_model import LinearModel
-from stitch.pipeline import diagnose, run
-from stitch.revision import change
-from stitch.runs.run import Run
-from stitch.runs.state import RunState, state_of
-from stitch.stepwise import suggest
+from stitch.pipeline import change, diagnose, run, suggest
+from stitch.runs.run import Run, RunState, state_of
 from stitch.system.threads import library_threads_off
 
 Row = dict[str, Any]

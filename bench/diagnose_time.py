@@ -21,15 +21,14 @@ import numpy as np
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from data_synth.write import write_session
-from stitch.effects.contract import EFFECTS
-from stitch.effects.in_session import missing_need
+from stitch.effects.contract import EFFECTS, missing_need
 from stitch.model.forward import corrected_capture, moves_points
-from stitch.model.term import term_of
-from stitch.observations.surfaces.free_poses import UnconstrainedPoses
-from stitch.observations.surfaces.match import sample_points
-from stitch.observations.surfaces.overlaps import collect_overlaps
-from stitch.observations.surfaces.view_responses import view_responses
-from stitch.stored.load_state import load_state
+from stitch.model.model import term_of
+from stitch.observations.surfaces.effect_columns import view_responses
+from stitch.observations.surfaces.matching import sample_points
+from stitch.observations.surfaces.normal_equations import collect_overlaps
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
+from stitch.stored.stored_run import load_state
 from stitch.system.threads import library_threads_off
 
 # Points of a view of the blade scene with 280 × 280 rays.

@@ -11,9 +11,9 @@ from data_synth.scene import Scene
 from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.measurement.measurement import Measurement
-from stitch.observations.surfaces.free_poses import UnconstrainedPoses, visible_step
-from stitch.observations.surfaces.gram import gram, robust_scale
-from stitch.observations.surfaces.match import Match
+from stitch.observations.surfaces.matching import Match
+from stitch.observations.surfaces.normal_equations import gram, robust_scale
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, visible_step
 
 _PLACES = ("points", "surface")
 # Weights follow the distances; after these steps both stand still.

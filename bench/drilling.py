@@ -10,12 +10,16 @@ import numpy as np
 
 from data_synth.drilling_cell import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.drilling_image import render_plate
-from stitch.cells.drilling.camera_effects import select_effects
-from stitch.cells.drilling.camera_model import HoleObservations
-from stitch.cells.drilling.drill_procedure import calibrate_sensors, run_group
-from stitch.cells.drilling.hole_frame import drive_pose
-from stitch.cells.drilling.homography import fit_homography, leave_one_out, to_plane
-from stitch.cells.drilling.servo import measure_hole
+from stitch.cells.drilling import calibrate_sensors, run_group
+from stitch.cells.drilling_sensors import (
+    HoleObservations,
+    drive_pose,
+    fit_homography,
+    leave_one_out,
+    measure_hole,
+    select_effects,
+    to_plane,
+)
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "drilling.md"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
@@ -111,7 +115,7 @@ def _size(found: np.ndarray, seeds: int) -> str:
 
 def image_table(seeds: int) -> list[str]:
     """Needs OpenCV."""
-    from stitch.cells.drilling.hole_image import find_holes, order_grid
+    from stitch.cells.drilling_sensors import find_holes, order_grid
 
     errors, left_out = [], []
     for seed in range(seeds):

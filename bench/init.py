@@ -18,14 +18,18 @@ import numpy as np
 
 from data_synth.fixtures.raw_folders import Convention, session_poses, table_of
 from stitch import frames
-from stitch.intake.cloud_pairs import pairings
-from stitch.intake.doctor import choose_convention
-from stitch.intake.first_session import all_readings, candidate_units, capture_of
-from stitch.intake.mounting import choose_mounting
+from stitch.intake.first_session import (
+    StatedTable,
+    all_readings,
+    candidate_units,
+    capture_of,
+    choose_convention,
+    choose_mounting,
+)
+from stitch.intake.folder_files import pairings
 from stitch.intake.raw_poses import RawPoses
-from stitch.intake.stated import StatedTable
-from stitch.integrity.misread_rotations import ORDERS
-from stitch.integrity.relative_scans import register_scan_pairs
+from stitch.integrity.conventions import register_scan_pairs
+from stitch.integrity.hypotheses import ORDERS
 from stitch.measurement.capture import Capture
 from stitch.reading.clouds import read_cloud
 

@@ -13,15 +13,14 @@ from data_synth.fixtures.quiet_scenes import simulated, with_part
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured
 from stitch.errors import StitchError
-from stitch.integrity.arm_limits import apply_displacement_limits
-from stitch.integrity.deep_check import deep_check
+from stitch.integrity.deep_check import apply_displacement_limits, deep_check
 from stitch.integrity.snooping import Snooping, snoop_views
-from stitch.integrity.usual_effects import UsualEffects
+from stitch.integrity.view_model import UsualEffects
 from stitch.measurement.capture import Capture, prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Session
 from stitch.model.model import Model
-from stitch.observations.surfaces.free_poses import unconstrained_poses
+from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.pipeline import run
 from stitch.stages.correct import icp_hand_eye
 

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.measurement.cloud import Cloud
 from stitch.measurement.robot import forward
-from stitch.measurement.session import Session
+from stitch.measurement.session import Cloud, Session
 
 Array = NDArray[np.float64]
 _OTHER = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from kept_arm import SHARED, every
 
-from stitch.calibrate.link_table import link_table
+from stitch.calibrate.robot import link_table
 from stitch.reading.session_folder import load_session
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"

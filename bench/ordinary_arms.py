@@ -23,7 +23,7 @@ from ordinary_cells import SCANS_A_STOP, Cell, cell_of, erring, seen
 from stitch import frames
 from stitch.model.model import Model
 from stitch.observations.pose_errors import prior_pose_errors
-from stitch.observations.surfaces.hand_eye import fit_hand_eye
+from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
 
 SCENES = ("blade", "drill-plate", "blade-table")
 DEVELOPMENT, HELD_OUT = (0, 1), (746, 747, 748, 749)

@@ -16,10 +16,10 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import part_size, prepare_capture
 from stitch.measurement.measurement import Measurement, measurement_of, with_part_origin
-from stitch.observations.surfaces.free_poses import UnconstrainedPoses, unconstrained_poses, visible_directions
-from stitch.observations.surfaces.hand_eye import capture_repeatability
-from stitch.observations.surfaces.match import sample_points
-from stitch.observations.surfaces.overlaps import collect_overlaps, next_gate
+from stitch.observations.surfaces.hand_eye_fit import capture_repeatability
+from stitch.observations.surfaces.matching import sample_points
+from stitch.observations.surfaces.normal_equations import collect_overlaps, next_gate
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses, visible_directions
 from stitch.stages.correct import COARSE_SAMPLES
 
 SCATTER = np.repeat([20e-6, 0.02], 3)  # of the flange, rad and mm

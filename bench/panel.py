@@ -14,12 +14,16 @@ from panel_ready import MASTER, POSES, TOLERANCE, pose_error, read, ready, ready
 from data_synth import hexapod, panel_job
 from data_synth.panel_cell import NAMES, PanelCell
 from stitch import frames
-from stitch.cells.panel.errors_along import errors_along_motion
-from stitch.cells.panel.global_model import calibrate_robot
-from stitch.cells.panel.laser_tracker import LaserTracker
-from stitch.cells.panel.legs import Legs, find_leg_offset, true_flanges
-from stitch.cells.panel.panel_loops import run_pose
-from stitch.cells.panel.shape_control import SHAPE_AXES
+from stitch.cells.panel_model import (
+    SHAPE_AXES,
+    LaserTracker,
+    Legs,
+    calibrate_robot,
+    errors_along_motion,
+    find_leg_offset,
+    run_pose,
+    true_flanges,
+)
 from stitch.errors import NoResultError
 from viz.cells.panel_error_figures import errors_figure, shape_figure
 

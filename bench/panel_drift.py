@@ -7,8 +7,7 @@ import numpy as np
 from panel_ready import MASTER, ready_without_panel
 
 from stitch import frames
-from stitch.cells.panel.errors_along import errors_along_motion
-from stitch.cells.panel.panel_motion import follow
+from stitch.cells.panel_model import errors_along_motion, follow
 
 
 def drift_table() -> list[str]:

@@ -7,13 +7,20 @@ import numpy as np
 from data_synth import panel_job
 from data_synth.panel_cell import NAMES, PanelCell
 from stitch import frames
-from stitch.cells.panel.global_model import ReflectorReadings, calibrate_robot
-from stitch.cells.panel.laser_tracker import LaserTracker
-from stitch.cells.panel.layout import ClampLayout, clamp_contacts
-from stitch.cells.panel.panel_loops import PanelSetup, ShapeRun, run_pose, run_shape
-from stitch.cells.panel.panel_motion import preposition
-from stitch.cells.panel.rigid_fit import rigid_fit
-from stitch.cells.panel.shape_control import ControlPoints
+from stitch.cells.panel_model import (
+    ClampLayout,
+    ControlPoints,
+    LaserTracker,
+    PanelSetup,
+    ReflectorReadings,
+    ShapeRun,
+    calibrate_robot,
+    clamp_contacts,
+    preposition,
+    rigid_fit,
+    run_pose,
+    run_shape,
+)
 
 LAYOUT = ClampLayout(**panel_job.LAYOUT, columns=3)
 POSES, MASTER, TOLERANCE = 40, 1, 0.6

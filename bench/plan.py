@@ -24,22 +24,27 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.simulate import Measured
 from stitch import frames
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.diagnosis.conclusion import decide
-from stitch.diagnosis.plausible_scatter import scatter_limit
+from stitch.diagnosis.score import scatter_limit
+from stitch.diagnosis.verdict import decide
 from stitch.frames import Array
 from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.model.model import Model
 from stitch.observations.pose_errors import prior_pose_errors
-from stitch.observations.surfaces.free_poses import unconstrained_poses
-from stitch.observations.surfaces.hand_eye import fit_hand_eye
+from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
 from stitch.observations.surfaces.surface_model import surface_model
-from stitch.planning.chances import DRAWS, ExpectedDiagnosis
-from stitch.planning.expected_hand_eye import expected_hand_eye
-from stitch.planning.expected_model import CellModel, expected_model, simulate_views
-from stitch.planning.expected_scan import FieldOfView
-from stitch.planning.planned_part import surface_of_mesh
-from stitch.planning.scatter import stated_scatter
-from stitch.planning.told_sizes import expected_scatter, with_scatter
+from stitch.observations.surfaces.view_poses import unconstrained_poses
+from stitch.planning.detection_chances import DRAWS, ExpectedDiagnosis
+from stitch.planning.expected_model import (
+    CellModel,
+    FieldOfView,
+    expected_hand_eye,
+    expected_model,
+    expected_scatter,
+    simulate_views,
+    stated_scatter,
+    surface_of_mesh,
+    with_scatter,
+)
 from stitch.system.threads import library_threads_off
 
 Row = dict[str, Any]

@@ -25,9 +25,8 @@ from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.conclusion import decide
-from stitch.diagnosis.plausible_scatter import scatter_limit
-from stitch.diagnosis.selection.verdict import Selection
+from stitch.diagnosis.score import scatter_limit
+from stitch.diagnosis.verdict import Selection, decide
 from stitch.frames import Array
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of

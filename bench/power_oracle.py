@@ -22,13 +22,13 @@ from unknown_cells import Asked, World, asked, seen
 
 from data_synth import nature
 from stitch.diagnosis.candidates import Form
-from stitch.diagnosis.conclusion import decide
-from stitch.diagnosis.plausible_scatter import ScatterLimit
+from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import ALPHA_NAME, IMPLAUSIBLE, POWER
+from stitch.diagnosis.verdict import decide
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import missing_need
+from stitch.effects.contract import missing_need
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.variance_components import at_variances
+from stitch.statistics.reml import at_variances
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")

@@ -14,11 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from stitch.measurement.session import Session
-from stitch.pipeline import run
+from stitch.pipeline import run, suggest
 from stitch.reading.session_folder import load_session
-from stitch.runs.run import Run
-from stitch.runs.state import state_of
-from stitch.stepwise import suggest
+from stitch.runs.run import Run, state_of
 from stitch.writing.result_document import model_of
 
 ROOT = Path(__file__).resolve().parents[1]

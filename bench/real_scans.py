@@ -14,8 +14,8 @@ from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from stitch import frames
 from stitch.measurement.capture import part_size, prepare_capture
-from stitch.observations.surfaces.match import sample_points
-from stitch.observations.surfaces.overlaps import collect_overlaps
+from stitch.observations.surfaces.matching import sample_points
+from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.pipeline import run, run_rig
 from stitch.reading.session_folder import load_session
 from stitch.stages.correct import correct

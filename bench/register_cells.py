@@ -15,7 +15,7 @@ from data_synth.shapes.casting import with_stock
 from data_synth.simulate import Measured, simulate
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.observations.surfaces.pose_channel import Repeatability
+from stitch.observations.surfaces.hand_eye_fit import Repeatability
 from stitch.stages.correct import correct
 
 PIXELS, VIEWS = 150, 14

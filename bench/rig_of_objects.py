@@ -24,12 +24,12 @@ from stitch.measurement.capture import Capture, prepare_capture
 from stitch.measurement.measurement import Measurement, measurement_of, with_part_origin
 from stitch.model.model import Model
 from stitch.observations.pose_errors import prior_pose_errors
-from stitch.observations.surfaces.free_poses import UnconstrainedPoses
-from stitch.observations.surfaces.hand_eye import SCANNER_FIELD, HandEyeFit, fit_hand_eye
-from stitch.observations.surfaces.scanner_field import field_scatter
+from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD, HandEyeFit, fit_hand_eye
+from stitch.observations.surfaces.scanner_errors import field_scatter
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.reading.session_folder import load_session
-from stitch.stages.coarse import find_coarse_hand_eye
 from stitch.stages.correct import correct
+from stitch.stages.initial_guess import find_coarse_hand_eye
 
 IN_HAND = ("david", "cone", "sphere", "rubik")
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "method.md"

@@ -22,7 +22,7 @@ from data_synth.fixtures.quiet_scenes import Measured
 from stitch.diagnosis.diagnose import diagnose_state
 from stitch.errors import StitchError
 from stitch.pipeline import run
-from stitch.runs.state import state_of
+from stitch.runs.run import state_of
 from stitch.system.threads import library_threads_off
 
 # Of the points (N, 3) of one view, scanner frame, the view's number and the cell.

@@ -17,9 +17,9 @@ from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.frames import Array
 from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.free_poses import UnconstrainedPoses, visible_directions
 from stitch.observations.surfaces.surface_model import SurfaceObservation, surface_model
-from stitch.statistics.variance_components import fit_variances
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, visible_directions
+from stitch.statistics.reml import fit_variances
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,10 @@ from unknown_cells import Asked, World, asked, seen, with_overlaps_of
 from unknown_trials import HEAD, Trial, shares
 from unknown_worlds import MULTIPLES, PARTS
 
-from stitch.diagnosis.conclusion import decide
-from stitch.diagnosis.plausible_scatter import ScatterLimit
-from stitch.diagnosis.selection.verdict import Selection
+from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
-from stitch.diagnosis.unknown.unnamed_errors import find_repeating_errors
+from stitch.diagnosis.unnamed_time_laws import find_repeating_errors
+from stitch.diagnosis.verdict import Selection, decide
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 

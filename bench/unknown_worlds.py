@@ -15,7 +15,7 @@ from data_synth.further_laws import FURTHER, FURTHER_IN_TIME, FURTHER_OF_FLANGE
 from data_synth.later_laws import LATER, LATER_IN_TIME, LATER_OF_FLANGE
 from data_synth.ordinary_arm import draw_arm, with_memory
 from data_synth.unnamed_laws import IN_TIME, UNNAMED
-from stitch.diagnosis.sensitivity.detectable import least_noncentrality
+from stitch.diagnosis.sensitivity import least_noncentrality
 from stitch.effects import EFFECTS
 from stitch.frames import Array
 

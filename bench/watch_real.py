@@ -17,11 +17,9 @@ from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import Run
 from stitch.units import length_text
-from stitch.watch.append import append_runs
-from stitch.watch.cell_assessment import cell_report
-from stitch.watch.cell_report import CellReport
-from stitch.watch.history import open_history
-from stitch.watch.read_record import read_record
+from stitch.watch.history import open_history, read_record
+from stitch.watch.report import CellReport, cell_report
+from stitch.watch.update import append_runs
 from stitch.writing.result_document import model_of
 from stitch.writing.run_folder import write_run
 

@@ -4,11 +4,22 @@ import numpy as np
 from scipy.stats import chi2
 
 from data_synth.cell_history import CellPlan, cell_history
-from stitch.watch.append import RUN_LENGTH
-from stitch.watch.control_charts import chart_limits, empty_charts, limit_shares, odds_limit, updated_charts
-from stitch.watch.regressors import DAY_SECONDS, regressor_prior_sigmas, regressors
-from stitch.watch.slope_odds import STEADY, STILL, slope_odds
-from stitch.watch.state_bank import MEMBERS, empty_bank, predicted_bank, updated_bank, with_parameters
+from stitch.watch.tracking import (
+    MEMBERS,
+    STEADY,
+    STILL,
+    chart_limits,
+    empty_bank,
+    empty_charts,
+    limit_shares,
+    odds_limit,
+    predicted_bank,
+    slope_odds,
+    updated_bank,
+    updated_charts,
+    with_parameters,
+)
+from stitch.watch.update import DAY_SECONDS, RUN_LENGTH, regressor_prior_sigmas, regressors
 
 HALLS, CELLS = 100, 50
 _PARAMETERS = 12

@@ -15,13 +15,9 @@ from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from data_synth.window_scans import Weld, warp
 from stitch import frames
-from stitch.cells.window.cad import cad_surface
-from stitch.cells.window.cad_fit import fit_cad
-from stitch.cells.window.cad_start import find_cad_start
-from stitch.cells.window.deviation import measure_deviations
-from stitch.cells.window.joined_scans import join_scans
-from stitch.cells.window.regions import Box, Regions
-from stitch.cells.window.seam import Limits, Station, measure_seam
+from stitch.cells.cad import Box, Regions, cad_surface, join_scans
+from stitch.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations
+from stitch.cells.seam import Limits, Station, measure_seam
 from stitch.measurement.scan import prepare_scan
 from viz.cells.window_fit_figures import deviation_map
 

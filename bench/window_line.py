@@ -20,9 +20,8 @@ from data_synth.window_line import EXACT, Errors, WindowLine
 from data_synth.window_line_job import write_line, write_seam
 from data_synth.window_scans import true_seam
 from stitch import frames
-from stitch.cells.csv_table import read_columns
-from stitch.cells.pose_table import poses_from_columns
-from stitch.cells.window.seam import Station
+from stitch.cells.job_files import poses_from_columns, read_columns
+from stitch.cells.seam import Station
 from stitch.cli.main import main as stitch
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "window.md"

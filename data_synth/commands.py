@@ -62,7 +62,7 @@ def reveal(
     from rich.table import Table
 
     from data_synth.judgement import judge
-    from stitch.system.console import console
+    from stitch.system.process import console
 
     judged = judge(run, truth)
     if as_json:

@@ -31,11 +31,9 @@ def demo(
     from data_synth.commands import reveal
     from data_synth.made_session import make, truth_path
     from data_synth.write import write_session, write_truth
-    from stitch.cli.actions.changed_run import add_diagnosed
-    from stitch.cli.actions.diagnosed_run import run_diagnose
-    from stitch.cli.actions.run_sessions import run_sessions
-    from stitch.cli.change import AT_MOST
-    from stitch.cli.run_options import RunOptions
+    from stitch.cli.change import AT_MOST, add_diagnosed
+    from stitch.cli.diagnose import run_diagnose
+    from stitch.cli.run import RunOptions, run_sessions
 
     session = folder / "blade"
     if folder.exists() and not truth_path(session).is_file():

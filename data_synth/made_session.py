@@ -9,7 +9,7 @@ from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
 from data_synth.write import write_session, write_truth
 from stitch.errors import InputError
-from stitch.system.console import console
+from stitch.system.process import console
 
 
 def made_session(scene: str, out: Path, hide: list[str], seed: int, views: int | None, truth: Path | None) -> None:

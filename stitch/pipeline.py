@@ -6,27 +6,86 @@ from functools import partial
 
 from stitch.diagnosis.diagnose import diagnose_state
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.initial_values import start_with_effects
-from stitch.integrity.admitted_fit import ScreenedFit, fit_screened_views
-from stitch.integrity.arm_here import ArmTransfer, check_arm_transfer
-from stitch.integrity.model_here import check_model_transfer
-from stitch.integrity.refusals import refuse_explained_mistake
-from stitch.integrity.rig_apart import find_disagreeing_sessions
-from stitch.measurement.capture import prepare_capture
+from stitch.diagnosis.score import start_with_effects
+from stitch.diagnosis.stepwise_selection import find_effect_to_drop
+from stitch.diagnosis.thresholds import HELDOUT_RISE, MANY_VIEWS
+from stitch.diagnosis.validation import group_helps, group_share
+from stitch.integrity.deep_check import refuse_explained_mistake
+from stitch.integrity.model_transfer import (
+    ArmTransfer,
+    check_arm_transfer,
+    check_model_transfer,
+    find_disagreeing_sessions,
+)
+from stitch.integrity.view_screening import ScreenedFit, fit_screened_views, session_warnings
+from stitch.measurement.capture import part_size, prepare_capture
 from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.measurement.session import Session
-from stitch.model.arm import arm_model
-from stitch.model.bound import convert_unit
-from stitch.model.model_toml import ModelFile
+from stitch.model.model_toml import ModelFile, arm_model, convert_unit
 from stitch.runs.recorder import Recorder, SilentRecorder
-from stitch.runs.run import Run, StageResult
-from stitch.runs.state import RunState, state_of
-from stitch.stages.coarse import CoarseHandEye
-from stitch.stages.course import FitSummary, assemble_run, pipeline_for
-from stitch.stages.fitted import FittedRig, InitialModel, Pipeline
+from stitch.runs.run import Run, RunState, StageResult, state_of
+from stitch.stages.assemble import FitSummary, assemble_run, pipeline_for
+from stitch.stages.finish import FittedRig, InitialModel, Pipeline
+from stitch.stages.initial_guess import COARSE_GATE, CoarseHandEye
 from stitch.stages.register import DEFAULT, method_named
 from stitch.stages.rig import require_effects, require_measured_once, require_same_rig
 from stitch.system.threads import Clock, library_threads_off
+from stitch.writing.diagnosis_document import plain_finding
+
+# Change the model of a run: put effects in or take them out, and fit everything again.
+
+
+def add(run: Run | RunState, *effects: str, recorder: Recorder | None = None) -> Run:
+    """Fit a run again with further effects in its model: hand-eye and all effects together.
+
+    Raises:
+        InputError: an effect that is not known, or that the session cannot have.
+        NoResultError: no two views overlap.
+    """
+    state = state_of(run) if isinstance(run, Run) else run
+    return change(state, [*state.model.effects, *effects], recorder)
+
+
+def drop(run: Run | RunState, *effects: str, recorder: Recorder | None = None) -> Run:
+    """Fit a run again without some of its effects."""
+    state = state_of(run) if isinstance(run, Run) else run
+    return change(state, [name for name in state.model.effects if name not in effects], recorder)
+
+
+def change(state: RunState, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
+    """Fit a run again with these effects in its model: matches, hand-eye and all effects.
+
+    Raises:
+        InputError: an effect that is not known, or that the session cannot have.
+        NoResultError: no two views overlap.
+    """
+    recorder = recorder or SilentRecorder()
+    with library_threads_off():
+        clock, course = Clock(), pipeline_for(state.session)
+        session, measurement, effects = state.session, state.measurement, list(dict.fromkeys(effects))
+        recorder.start(session)
+        require_effects([measurement], effects)
+        new = [name for name in effects if name not in state.model.effects]
+        model = start_with_effects(session, new, None, measurement, state.model, state.gate)
+        model = model.with_terms([term for term in model.terms if term.name in effects])
+        gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
+        begun = CoarseHandEye(state.T_mount_coarse, gate, "of the first run", ())
+        before = course.initial_stage(measurement, begun, clock.lap(), recorder)
+        clock.lap()
+        fitted = course.refit([session], [measurement], model, [state.gate], recorder)
+        own = fitted.sessions[0].measurement
+        end = FitSummary(
+            starts=[begun],
+            fitted=fitted,
+            seconds=clock.lap(),
+            effects_file=state.effects_file,
+            register=state.register or DEFAULT,
+            ledger=state.ledger,
+            left_out=state.left_out,
+            links=state.links,
+            doubts=session_warnings(session, own, fitted.correction, 0),
+        )
+        return assemble_run(session, 0, end, before, recorder)
 
 
 def run(
@@ -153,3 +212,98 @@ def diagnose(run: Run | RunState) -> Diagnosis:
         NoResultError: no two views overlap.
     """
     return diagnose_state(state_of(run) if isinstance(run, Run) else run)
+
+
+# Diagnose, add, and again, until nothing is left to add; then drop what later effects have made idle.
+#
+# Or add a whole group of effects that the views cannot tell apart, where that helps.
+
+
+def suggest(state: RunState, at_most: int) -> tuple[Run | None, list[str], Diagnosis]:
+    """The run with everything that the diagnosis names, the way in lines, and the last diagnosis.
+
+    The run is None where nothing is named.
+
+    An effect stays unless the held-out residual rises: the diagnosis has asked already whether it predicts the poses
+    of views left out, and a small effect moves them by less than the sensor's noise shows in a residual. What is less
+    likely than nothing being missing is not added. At the end
+    effects that came early go, if those that came later explain the same; what was in the model before stays.
+    """
+    lines: list[str] = []
+    result: Run | None = None
+    found: Diagnosis | None = None
+    given = set(state.model.effects)
+    for _ in range(at_most):
+        found = diagnose(state)
+        lines += [*_finding_and_evidence(found), *(f"{note}." for note in found.notes if note not in found.sentence)]
+        if found.verdict != "missing_effect":
+            break
+        if not found.likelier_than_not:
+            name = found.effects[0]
+            lines.append(f"{name} was not added: that it is chance is likelier. All the same: stitch add RUN {name}.")
+            break
+        tried = change(state, [*state.model.effects, found.effects[0]])
+        if not _improves_heldout(state, tried):
+            lines.append(f"{found.effects[0]} was tried and did not earn its place: the held-out residual rose.")
+            break
+        result, state = tried, state_of(tried)
+        lines.append(f"Added {found.effects[0]}. With it:")
+        # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
+        found = None
+    else:
+        lines.append(f"Stopped after {at_most} effects; run it again to go on.")
+    if result is not None and not state.session.has_clouds and state.measurement.views.count >= MANY_VIEWS:
+        result, dropped = _drop_unneeded(result, given)
+        lines += dropped
+        state, found = (state_of(result), None) if dropped else (state, found)
+    return result, lines, diagnose(state) if found is None else found
+
+
+def suggest_group(state: RunState) -> tuple[Run | None, list[str], Diagnosis]:
+    """The run with all effects of a group that these views cannot tell apart, what to say of it, and the diagnosis.
+
+    The run is None where the diagnosis names no such group, or where the group does not help on views left out.
+    """
+    found = diagnose(state)
+    if found.verdict != "cannot_tell":
+        return (
+            None,
+            [*_finding_and_evidence(found), "There is no group of effects that these views cannot tell apart."],
+            found,
+        )
+    names = " + ".join(found.effects)
+    asked = [c.ranked.score for c in found.candidates if c.name in found.effects]
+    share, sigma = group_share(found.linear, asked)
+    judged = f"of the mean square error of poses left out they leave {share:.2f} ± {sigma:.2f}"
+    if not group_helps(share, sigma):
+        return (
+            None,
+            [*_finding_and_evidence(found), f"{names} together do not help on views left out: {judged}."],
+            found,
+        )
+    tried = change(state, [*state.model.effects, *found.effects])
+    told = (
+        f"{names} are fitted as one group: {judged}, and together they stand for what is missing; these views do not "
+        "tell its parts apart, so that none of their values means anything alone"
+    )
+    tried = replace(tried, notes=(f"{told}.", *tried.notes))
+    return tried, [*_finding_and_evidence(found), f"{told}."], diagnose(state_of(tried))
+
+
+def _finding_and_evidence(found: Diagnosis) -> list[str]:
+    """For everybody first, then the evidence, as `stitch diagnose` says it."""
+    return [plain_finding(found, found.linear.measurement.length_unit), found.sentence]
+
+
+def _drop_unneeded(result: Run, given: set[str]) -> tuple[Run, list[str]]:
+    """The run without added effects that do not hold their place beside the others, and why each went."""
+    lines: list[str] = []
+    while (idle := find_effect_to_drop(state_of(result), set(result.effects) - given)) is not None:
+        name, reason = idle
+        lines.append(f"{reason}; it was dropped.")
+        result = change(state_of(result), [other for other in result.effects if other != name])
+    return result, lines
+
+
+def _improves_heldout(state: RunState, tried: Run) -> bool:
+    return not state.ledger or tried.heldout_rms < HELDOUT_RISE * state.ledger[-1].heldout_rms

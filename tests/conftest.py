@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from data_synth.fixtures.blade_cells import captured_blade, measured_blade
 from data_synth.write import write_session
 from stitch.cli.main import main
-from stitch.cli.terminal.printing import printing_browser
+from stitch.cli.report import printing_browser
 from stitch.diagnosis import candidates
 from stitch.effects import EFFECTS
 from stitch.errors import InputError

@@ -9,11 +9,11 @@ from contextlib import chdir
 from importlib import import_module, util
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import stitch
 from data_synth.fixtures.blade_cells import measured_blade
-from data_synth.write import write_session
 
 # How the docstring of a function begins.
 VERBS = {"Compute", "Find", "Fit", "Read", "Return", "Stitch", "Write"}
@@ -67,11 +67,11 @@ def test_the_package_alone_is_imported_at_once():
 
 def test_the_example_of_the_package_runs(tmp_path, few_effects, capsys):
     code = stitch.__doc__.split("\n", 1)[1]
-    name = re.search(r'load_session\("([^"]+)"\)', code)[1]
-    write_session(tmp_path / name, measured_blade(0, views=6, pixels=50), name)
-    found = {}
+    cell = measured_blade(0, views=6, mount="eye_in_hand", pixels=50)
+    names = {"clouds": [cloud.points for cloud in cell.clouds], "poses": np.array(cell.T_base_flange)}
     with chdir(tmp_path):
-        exec(compile(code, "the docstring of stitch", "exec"), found)
+        exec(compile(code, "the docstring of stitch", "exec"), names)
     assert capsys.readouterr().out.strip()
-    assert found["run"].effects == ["joint_compliance"]
-    assert stitch.drop_views(found["run"], "joint_compliance").effects == []
+    assert names["run"].effects == ["joint_compliance"]
+    assert (tmp_path / "runs" / "blade-17" / "result.json").is_file()
+    assert stitch.drop(names["run"], "joint_compliance").effects == []

@@ -11,8 +11,8 @@ from stitch import frames
 from stitch.cli.main import main
 from stitch.measurement.capture import prepare_capture
 from stitch.model.model_toml import read_model
-from stitch.observations.surfaces.match import sample_points
-from stitch.observations.surfaces.overlaps import collect_overlaps
+from stitch.observations.surfaces.matching import sample_points
+from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.pipeline import diagnose, run, run_rig
 from stitch.reading.session_folder import load_session
 

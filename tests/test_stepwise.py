@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch import stepwise
+from stitch import pipeline as stepwise
 from stitch.pipeline import diagnose, run
-from stitch.runs.state import state_of
+from stitch.runs.run import state_of
 
 OFFSET = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
 

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from os.path import relpath
 from pathlib import Path
 
-from stitch.batch.session_row import SessionRow
-from stitch.batch.summary import batch_sentence
-from stitch.system.whole_file import whole_file
+from stitch.batch.run_batch import SessionRow, batch_sentence
+from stitch.system.files import whole_file
 from stitch.units import length_text
 from viz.filled_templates import render
 

@@ -6,7 +6,7 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 import numpy as np
 import rerun.blueprint as rrb
 
-from stitch.comparison.model_history import effect_changes
+from stitch.comparison.disagreement_field import effect_changes
 from stitch.frames import Array
 from stitch.runs.run import Run
 from viz.colour_bar import HIGH, WIDE

@@ -6,9 +6,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.variance_budget import NOT_REPEATING, BudgetLine
+from stitch.diagnosis.residual_structure import NOT_REPEATING, BudgetLine
 from stitch.units import MICROMETRES, length_text
-from stitch.writing.error_sources import OTHER_SOURCES, largest_error_sources, share_text
+from stitch.writing.diagnosis_document import OTHER_SOURCES, largest_error_sources, share_text
 from viz.colours import BLUE, DARK, GREEN, ORANGE
 from viz.drawing import above, plain
 

@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
-from stitch.comparison.disagreement_field import DisagreementField
-from stitch.comparison.patches import Patches, patches_of
+from stitch.comparison.disagreement_field import DisagreementField, Patches, patches_of
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.predicted_distances import predicted_distances
+from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.units import MICROMETRES
 from viz.packed_numbers import packed_floats, packed_values

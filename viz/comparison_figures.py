@@ -4,8 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch.comparison.table import ResidualTable
-from stitch.comparison.tables import ResidualTables
+from stitch.comparison.residual_tables import ResidualTable, ResidualTables
 from stitch.units import MICROMETRES
 from viz.colours import BLUE
 from viz.drawing import plain

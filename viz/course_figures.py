@@ -5,10 +5,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.unknown.joint_curves import JointCurve
-from stitch.diagnosis.unknown.time_curve import ROTATION_PART, TRANSLATION_PART, TimeCurve
+from stitch.diagnosis.unnamed_joint_laws import JointCurve
+from stitch.diagnosis.unnamed_time_laws import ROTATION_PART, TRANSLATION_PART, TimeCurve
 from stitch.frames import Array
-from stitch.observations.flange_errors import time_in_steps
+from stitch.observations.pose_errors import time_in_steps
 from stitch.units import MICROMETRES
 from viz.colours import BLUE, GREEN, ORANGE
 from viz.drawing import above, covariate, plain

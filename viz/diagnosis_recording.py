@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.diagnosis.course_sentences import curve_sentences
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.sentences import fitted_amounts
-from stitch.system.whole_file import whole_file
+from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
+from stitch.system.files import whole_file
 from stitch.units import MICROMETRES
-from stitch.writing.plain_effects import effect_description, effect_in_words
-from stitch.writing.plain_finding import plain_finding, suggested_command
+from stitch.writing.diagnosis_document import effect_description, effect_in_words, plain_finding, suggested_command
 from viz.candidate_fields import CandidateFields
 from viz.colours import COLOURS_OF_FEW
 from viz.recorded_words import words

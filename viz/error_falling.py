@@ -7,8 +7,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from stitch.comparison.disagreement_field import full_colour_distance
-from stitch.comparison.model_history import effect_changes, model_history
+from stitch.comparison.disagreement_field import effect_changes, full_colour_distance, model_history
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES, length_text
 from viz.colours import BLUE, FIELD, GREEN, unsigned_colours

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stitch.frames import Array
-from stitch.observations.surfaces.field_map import FieldMap
+from stitch.observations.surfaces.scanner_errors import FieldMap
 from stitch.units import MICROMETRES
 from viz.colours import FIELD, SIGNED
 

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from stitch.comparison.model_history import effect_changes
+from stitch.comparison.disagreement_field import effect_changes
 from stitch.runs.run import LedgerStep, Run
 from stitch.units import MICROMETRES
 from viz.colours import BLUE, GREEN

@@ -5,9 +5,9 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 
 from stitch.measurement.session import Session
-from stitch.reading.session_hash import session_hash
+from stitch.reading.session_folder import session_hash
 from stitch.runs.run import Run
-from stitch.writing.plain_effects import effect_in_words
+from stitch.writing.diagnosis_document import effect_in_words
 
 Row = tuple[str, str]
 

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch import frames
-from stitch.comparison.disagreement_field import full_colour_distance
-from stitch.comparison.model_history import ModelHistory, ModelStep
+from stitch.comparison.disagreement_field import ModelHistory, ModelStep, full_colour_distance
 from stitch.frames import Array
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES, length_text

@@ -4,8 +4,7 @@ import html
 
 from matplotlib.figure import Figure
 
-from stitch.comparison.disagreement_field import full_colour_distance
-from stitch.comparison.model_history import model_history
+from stitch.comparison.disagreement_field import full_colour_distance, model_history
 from stitch.comparison.run_verdict import run_headline
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES

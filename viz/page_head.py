@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from stitch.comparison.plain_verdict import ToleranceVerdict
-from stitch.system.whole_file import whole_file
+from stitch.comparison.run_verdict import ToleranceVerdict
+from stitch.system.files import whole_file
 from viz.filled_templates import render
 
 

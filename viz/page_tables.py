@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch.comparison.model_history import ModelHistory, effect_changes
-from stitch.model.hand_eye_uncertainty import expanded_uncertainty
+from stitch.comparison.disagreement_field import ModelHistory, effect_changes
+from stitch.model.model import expanded_uncertainty
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES, value_uncertainty_text
 from viz.run_figures import shown_points, view_shifts

@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib import colormaps
 
-from stitch.comparison.disagreement_field import full_colour_distance
-from stitch.comparison.model_history import ModelHistory
+from stitch.comparison.disagreement_field import ModelHistory, full_colour_distance
 from stitch.frames import Array
 from stitch.units import MICROMETRES
 from viz.colours import FIELD, SIGNED

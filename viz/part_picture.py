@@ -8,7 +8,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from stitch.comparison.model_history import ModelStep
+from stitch.comparison.disagreement_field import ModelStep
 from stitch.frames import Array, Indices
 from stitch.units import length_text
 from viz.colours import FIELD, unsigned_colours

@@ -7,11 +7,11 @@ from pykdtree.kdtree import KDTree
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from stitch.comparison.patches import Patches
+from stitch.comparison.disagreement_field import Patches
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.runs.run import FusedCloud
-from stitch.system.mapped_file import release_mapped
+from stitch.system.threads import release_mapped
 from stitch.writing.mesh import TriangleMesh, mesh_of
 
 # Points along the part's longest side: what a screen shows, and a page of a few megabytes holds.

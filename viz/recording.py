@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.comparison.model_history import model_history
+from stitch.comparison.disagreement_field import model_history
 from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.runs.run import Run, StageResult

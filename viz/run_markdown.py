@@ -1,10 +1,10 @@
 """What a run found, as Markdown for the recording."""
 
-from stitch.comparison.model_history import ModelHistory
+from stitch.comparison.disagreement_field import ModelHistory
 from stitch.comparison.run_verdict import run_headline
 from stitch.runs.run import Run
 from stitch.units import length_text
-from stitch.writing.plain_effects import effect_in_words
+from stitch.writing.diagnosis_document import effect_in_words
 
 
 def run_markdown(run: Run, history: ModelHistory | None) -> str:

@@ -3,10 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from stitch.comparison.disagreement_field import full_colour_distance
-from stitch.comparison.model_history import ModelHistory, model_history
+from stitch.comparison.disagreement_field import ModelHistory, full_colour_distance, model_history
 from stitch.comparison.run_verdict import run_headline, run_light
-from stitch.model.hand_eye_uncertainty import uncertainty_scope
+from stitch.model.model import uncertainty_scope
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES
 from viz import captions, run_figures, target_figures

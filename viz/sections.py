@@ -8,16 +8,19 @@ from typing import NamedTuple
 from markupsafe import escape
 from matplotlib.figure import Figure
 
-from stitch.comparison.tables import ResidualTables
+from stitch.comparison.residual_tables import ResidualTables
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import fitted_amounts
-from stitch.model.hand_eye_uncertainty import uncertainty_scope
-from stitch.stored.load_state import State
-from stitch.system.whole_file import whole_file
+from stitch.model.model import uncertainty_scope
+from stitch.stored.stored_run import State
+from stitch.system.files import whole_file
 from stitch.units import MICROMETRES, length_text
-from stitch.writing.error_sources import largest_error_sources
-from stitch.writing.plain_effects import effect_description
-from stitch.writing.plain_finding import plain_finding, suggested_command
+from stitch.writing.diagnosis_document import (
+    effect_description,
+    largest_error_sources,
+    plain_finding,
+    suggested_command,
+)
 from viz import captions
 from viz import diagnosis_figures as draw
 from viz.budget_figure import budget

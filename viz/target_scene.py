@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from stitch.comparison.target_history import TargetStep, target_history
+from stitch.comparison.disagreement_field import TargetStep, target_history
 from stitch.frames import Array
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES, length_text

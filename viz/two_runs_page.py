@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from stitch.comparison.disagreement_field import full_colour_distance
-from stitch.comparison.plain_verdict import ToleranceVerdict
-from stitch.comparison.run_verdict import run_light, run_verdict
+from stitch.comparison.run_verdict import ToleranceVerdict, run_light, run_verdict
 from stitch.comparison.two_runs import ComparedRun, TwoRuns, comparison_sentence
 from stitch.units import MICROMETRES, length_text
 from viz import captions

@@ -9,14 +9,12 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from bench.docs.report_pictures import call, shot
-from stitch.cells.base_to_base.stand_file import read_stand
-from stitch.cells.base_to_base.stand_solution import solve_stand
-from stitch.cells.drilling.drill_job import read_drill_job as read_drilling
-from stitch.cells.drilling.drill_solution import solve_drill_job as solve_drilling
-from stitch.cells.panel.panel_job import read_panel_job as read_panel
-from stitch.cells.panel.panel_solution import solve_panel_job as solve_panel
-from stitch.cells.window.window_jobs import read_seam_job
-from stitch.cells.window.window_solution import solve_seam
+from stitch.cells.base_to_base import read_stand, solve_stand
+from stitch.cells.drilling import read_drill_job as read_drilling
+from stitch.cells.drilling import solve_drill_job as solve_drilling
+from stitch.cells.panel import read_panel_job as read_panel
+from stitch.cells.panel import solve_panel_job as solve_panel
+from stitch.cells.window import read_seam_job, solve_seam
 from viz.cells import base_to_base_figures, drilling_figures, panel_figures, window_seam
 
 ROOT = Path(__file__).resolve().parents[2]

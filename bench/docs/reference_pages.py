@@ -8,7 +8,7 @@ from typer.cli import get_docs_for_click
 
 import stitch
 from stitch import MODULES
-from stitch.cli.actions.listed_effects import parameter_signature
+from stitch.cli.effects import parameter_signature
 from stitch.cli.main import build
 from stitch.effects import EFFECTS
 from stitch.effects.contract import PLACES
@@ -28,7 +28,8 @@ def commands_page() -> str:
 def effects_page() -> str:
     """The library of effects."""
     rows = [
-        f"| `{e.name}` | {e.place} | {_cell(e.formula)} | {_cell(parameter_signature(e))} | {_sizes(e)} | {', '.join(e.needs)} |"
+        f"| `{e.name}` | {e.place} | {_cell(e.formula)} | {_cell(parameter_signature(e))} | {_sizes(e)} | "
+        f"{', '.join(e.needs)} |"
         for e in EFFECTS.values()
     ]
     places = "\n".join(f"| `{name}` | {_cell(text)} |" for name, text in PLACES.items())

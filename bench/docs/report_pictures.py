@@ -20,7 +20,7 @@ import rerun.experimental as viewer
 from PIL import Image
 
 from stitch.cli.main import main as stitch
-from stitch.cli.terminal.printing import print_page, printing_browser
+from stitch.cli.report import print_page, printing_browser
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 _DRAWN = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars")

@@ -21,7 +21,7 @@ from bench.docs.page_folders import tracked_arm
 from bench.docs.report_pictures import call
 from bench.docs.review_clicks import LONG, Camera, after, story
 from bench.docs.review_server import choices, memory, served
-from stitch.cli.terminal.printing import printing_browser
+from stitch.cli.report import printing_browser
 
 DRAWN = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars")
 WIDE, PHONE = {"width": 1360, "height": 900}, {"width": 412, "height": 900}

@@ -13,15 +13,11 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.layouts import possible_layouts
+from stitch.intake.layouts import possible_layouts, readings
 from stitch.intake.raw_poses import RawPoses
-from stitch.intake.readings import readings
-from stitch.measurement.cloud import Cloud
-from stitch.measurement.labelled_points import Sighting
-from stitch.reading.clouds import cloud_of_columns
-from stitch.reading.depth_image import lifted
-from stitch.reading.intrinsics import Intrinsics
-from stitch.reading.organised import measured_pixels
+from stitch.measurement.session import Cloud, Sighting
+from stitch.reading.clouds import cloud_of_columns, measured_pixels
+from stitch.reading.depth_image import Intrinsics, lifted
 
 Columns = dict[str, Array]
 _KNOWN = (
@@ -86,7 +82,7 @@ def _of_cloud(cloud: Cloud) -> Columns:
 def _points(points: Array, where: str) -> Columns:
     """Return columns x, y, z of (N, 3), or of (H, W, 3) whose pixels without a measurement are NaN."""
     if points.ndim not in (2, 3) or points.shape[-1] != 3 or points.dtype.kind not in "fiu":
-        raise InputError(f"{where}: {_shown(points)} is no cloud that is known; to fix: pass {_KNOWN}")
+        raise InputError(f"{where}: {_array_kind(points)} is no cloud that is known; to fix: pass {_KNOWN}")
     columns = dict(zip("xyz", points.reshape(-1, 3).T, strict=True))
     return measured_pixels(columns) if points.ndim == 3 else columns
 
@@ -160,7 +156,9 @@ def _of_depth(image: Any, intrinsics: Any, where: str) -> Columns:
     depth = _pixels(getattr(image, "depth", image))
     colour = getattr(image, "color", None)
     if depth.ndim != 2:
-        raise InputError(f"{where}: {_shown(depth)} is no depth image; to fix: pass (H, W) numbers with intrinsics")
+        raise InputError(
+            f"{where}: {_array_kind(depth)} is no depth image; to fix: pass (H, W) numbers with intrinsics"
+        )
     points = lifted(where, depth.astype(float), _intrinsics(intrinsics, where)).reshape(-1, 3)
     seen = np.isfinite(points[:, 2])
     columns = dict(zip("xyz", points[seen].T, strict=True))
@@ -306,5 +304,5 @@ def per_view(values: Any, count: int, where: str, ndim: int = 1) -> Array:
     return found
 
 
-def _shown(array: Array) -> str:
+def _array_kind(array: Array) -> str:
     return f"an array of shape {array.shape} and type {array.dtype}"

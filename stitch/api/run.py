@@ -16,18 +16,17 @@ from stitch.errors import InputError
 from stitch.export.cloud_formats import Colours, coloured
 from stitch.frames import Array
 from stitch.measurement import session as measured
-from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR
-from stitch.planning.expected_hand_eye import displacement
-from stitch.reading.session_hash import content_hash, measured_files
+from stitch.model.model import COVERAGE_FACTOR
+from stitch.planning.expected_model import displacement
+from stitch.reading.session_folder import content_hash, measured_files
 from stitch.runs import run as runs
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import FusedCloud, StageResult
 from stitch.units import METRES
 from stitch.writing import run_folder
 from stitch.writing.fit_report import fit_report
-from stitch.writing.recordings import recordings
 from stitch.writing.result_document import points_of
-from stitch.writing.tables import residual_table
+from stitch.writing.run_folder import recordings, residual_table
 
 
 class AtPart(NamedTuple):
@@ -259,7 +258,7 @@ class Run(runs.Run):
         """
         folder = Path(folder)
         whole = self.measured or public_session(self.session)
-        path = _saved_beside(whole, folder) if whole.in_memory else whole.path
+        path = _save_session_of_run(whole, folder) if whole.in_memory else whole.path
         own = replace(self, session=replace(self.session, path=path))
         with run_folder.new_folder(folder, [path], force) as scratch:
             for recorder in recordings(scratch) if recording else []:
@@ -345,7 +344,7 @@ def rigid_transform(pose: Array) -> Any:
     return kind.from_matrix(pose)
 
 
-def _saved_beside(session: Session, folder: Path) -> Path:
+def _save_session_of_run(session: Session, folder: Path) -> Path:
     """Write the session as FOLDER-session and return the path; one that lies there already has to be the same.
 
     Raises:

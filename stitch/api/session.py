@@ -12,29 +12,24 @@ from typing import Any, cast, get_args
 import numpy as np
 
 from stitch.api.arrays import cloud_of, per_view, poses_of, sighting_of
-from stitch.calibrate.robot_table import repeatability_table, robot_toml
+from stitch.calibrate.robot import repeatability_table, robot_toml
 from stitch.errors import InputError, NoResultError, StitchError
 from stitch.frames import Array
-from stitch.intake.cloud_pairs import pairings
-from stitch.intake.doctor import choose_convention
-from stitch.intake.first_session import all_readings, capture_of
-from stitch.intake.one_frame import require_own_frames
+from stitch.intake.first_session import StatedFolder, all_readings, capture_of, choose_convention, require_own_frames
+from stitch.intake.folder_files import MM, pairings
 from stitch.intake.raw_poses import RawPoses
-from stitch.intake.stated import StatedFolder
-from stitch.intake.ways import MM
-from stitch.integrity.refusals import refuse_whole
-from stitch.integrity.relative_scans import register_scan_pairs
+from stitch.integrity.conventions import register_scan_pairs
+from stitch.integrity.deep_check import refuse_whole
 from stitch.measurement import session as measured
-from stitch.measurement.cloud import Cloud
+from stitch.measurement.capture import MAX_POINTS
 from stitch.measurement.robot import Robot, forward
-from stitch.measurement.session import Mount, Scanner, StatedRepeatability, View
-from stitch.measurement.thinning import MAX_POINTS
-from stitch.reading import scanner_toml, session_folder, session_toml
-from stitch.reading.names import require_folder_name, require_name
-from stitch.reading.plausible import check_scale
-from stitch.reading.reported_pose import require_agreement
-from stitch.reading.session_scans import checked_scan
-from stitch.reading.toml_file import table_choice
+from stitch.measurement.session import Cloud, Mount, Scanner, StatedRepeatability, View
+from stitch.reading import session_folder
+from stitch.reading import session_folder as scanner_toml
+from stitch.reading import session_folder as session_toml
+from stitch.reading.session_folder import check_scale, checked_scan
+from stitch.reading.session_tables import require_agreement
+from stitch.reading.text_files import require_folder_name, require_name, table_choice
 from stitch.system.threads import parallel
 from stitch.units import METRES
 from stitch.writing.session_files import SessionFiles, pose_columns, table_text, write_session
@@ -359,7 +354,7 @@ def _scans_confirm(session: Session) -> bool:
     require_own_frames(session.path, motions, decided)
     way = decided.best.interpretation
     in_order = way.pairing.rows == tuple(range(len(T)))
-    return decided.told and in_order and way.carries == (session.mount == "eye_in_hand")
+    return decided.determined and in_order and way.carries == (session.mount == "eye_in_hand")
 
 
 @contextmanager

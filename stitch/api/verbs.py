@@ -7,40 +7,35 @@ from typing import Any
 
 import numpy as np
 
-from stitch import pipeline, revision
+from stitch import pipeline
+from stitch import pipeline as revision
 from stitch.api.run import ReplayRecorder, Run, public_run
 from stitch.api.session import Session, public_session
-from stitch.comparison.compare_surfaces import compare_surfaces
-from stitch.comparison.compare_targets import compare_targets
-from stitch.comparison.tables import ResidualTables
+from stitch.comparison.residual_tables import ResidualTables, compare_surfaces, compare_targets
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.effects.in_session import find_effect, require_available
+from stitch.effects.contract import find_effect, require_available
 from stitch.errors import InputError
 from stitch.explanation import explain as explanation
 from stitch.explanation.explain import EFFECT_NAME, Explanation
-from stitch.export.arm_formats import ARM_FORMATS
-from stitch.export.arm_model import arm_from
+from stitch.export.arm_model import ARM_FORMATS, arm_from
 from stitch.export.cloud_formats import CLOUD_FORMATS, coloured
-from stitch.export.hand_eye import hand_eye_from
-from stitch.export.hand_eye_formats import HAND_EYE_FORMATS
+from stitch.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_from
 from stitch.frames import Array
 from stitch.measurement import session as measured
 from stitch.measurement.capture import part_size
-from stitch.model.arm import keep_arm_effects
 from stitch.model.forward import corrected_capture
-from stitch.model.model_toml import ModelFile
+from stitch.model.model_toml import ModelFile, keep_arm_effects
 from stitch.planning import plan as planning
-from stitch.planning.cells import PlannedCell, cell_of_session, cell_of_state
+from stitch.planning.expected_model import PlannedCell, cell_of_session, cell_of_state
 from stitch.planning.plan import Plan, PlanRequest
 from stitch.runs import run as runs
 from stitch.runs.recorder import Recorder
-from stitch.runs.state import RunState, state_of
-from stitch.stages.reuse import REUSE_GATE, converged_gate
-from stitch.stored.load_state import load_state
-from stitch.stored.stored_run import stored_run
+from stitch.runs.run import RunState, state_of
+from stitch.stages.correct import REUSE_GATE, converged_gate
+from stitch.stored.stored_run import load_state, stored_run
+from stitch.system.files import whole_file
 from stitch.system.threads import library_threads_off
-from stitch.system.whole_file import whole_file
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.result_document import model_of, result_document
 
@@ -246,7 +241,8 @@ def explain(run: runs.Run | RunState) -> Explanation:
     state = _state(run)
     if EFFECT_NAME in state.model.effects:
         raise InputError(
-            f"{state.session.name}: has an effect {EFFECT_NAME!r} in its model; to fix: give it another name in its file, "
+            f"{state.session.name}: has an effect {EFFECT_NAME!r} in its model; to fix: give it another name in "
+            "its file, "
             "and add that"
         )
     return explanation.explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")

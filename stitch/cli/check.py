@@ -1,11 +1,132 @@
 """`stitch check SESSION`: read everything, compute nothing, say what is there or what is wrong."""
 
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stitch.cli.options import Json
+from stitch.cli.terminal import emit
+from stitch.errors import InputError
+
+if TYPE_CHECKING:
+    from stitch.measurement.session import Session
+
+
+# What `stitch check` does: what sessions hold, and what is wrong with them.
+
+
+def check_sessions(sessions: list[Path], as_json: bool) -> None:
+    """Read sessions and say what they hold; what cannot be read is said for each.
+
+    Raises:
+        typer.Exit: with 2, where one cannot be read.
+    """
+    from stitch.reading.session_folder import load_session
+
+    facts, errors = [], []
+    for path in sessions:
+        try:
+            facts.append(session_summary(load_session(path)))
+        except InputError as error:
+            errors.append(str(error))
+    if as_json:
+        emit(json.dumps({"sessions": facts, "errors": errors}, indent=1))
+    else:
+        for fact in facts:
+            _print_summary(fact)
+    for line in errors:
+        print(f"stitch: {line}", file=sys.stderr)
+    if errors:
+        raise typer.Exit(2)
+
+
+def check_deeply(sessions: list[Path], as_json: bool) -> None:
+    """Every usual mistake tried on each session: what is wrong, in which views, how to fix it.
+
+    Raises:
+        typer.Exit: with 2, where something is wrong for certain.
+    """
+    from stitch.integrity.deep_check import deep_check
+    from stitch.reading.session_folder import load_session
+    from stitch.system.process import console
+    from stitch.writing.json_file import to_json
+
+    loaded = {str(path): load_session(path) for path in sessions}
+    found = {path: deep_check(session) for path, session in loaded.items()}
+    documents = [
+        {"session": path, "ok": not problems, "problems": [p.as_dict() for p in problems]}
+        for path, problems in found.items()
+    ]
+    if as_json:
+        emit(to_json(documents[0] if len(documents) == 1 else documents))
+    else:
+        for path, problems in found.items():
+            for line in [p.line(loaded[path].names) for p in problems] or ["nothing wrong was found"]:
+                console().print(f"{path}: {line}", soft_wrap=True)
+    if any(p.certain for problems in found.values() for p in problems):
+        raise typer.Exit(2)
+
+
+def session_summary(session: Session) -> dict[str, object]:
+    """What a session holds, in plain numbers."""
+    import numpy as np
+
+    from stitch.measurement.measurement import session_notes
+
+    clouds = [view.cloud.points for view in session.views if view.cloud is not None]
+    sighted = [view.sighting.points for view in session.views if view.sighting is not None]
+    ranges = [float(np.median(np.linalg.norm(points, axis=1))) for points in clouds or sighted]
+    return {
+        "session": session.name,
+        "mount": session.mount,
+        "length_unit": session.length_unit,
+        "views": len(session.views),
+        "points": sum(view.cloud.count for view in session.views if view.cloud is not None),
+        "targets": len({name for view in session.views if view.sighting for name in view.sighting.targets}),
+        "sightings": sum(len(view.sighting.targets) for view in session.views if view.sighting),
+        "median_range": round(float(np.median(ranges)), 3) if ranges else None,
+        "joints": session.views[0].joints is not None,
+        "robot": session.robot.name if session.robot else None,
+        "hand_eye_given": session.scanner.T_mount is not None,
+        "covariates": sorted({name for view in session.views for name in view.covariates}),
+        "notes": session_notes(session),
+    }
+
+
+def _print_summary(fact: dict[str, Any]) -> None:
+    from rich.table import Table
+
+    from stitch.system.process import console
+
+    table = Table(show_header=False, title=f"{fact['session']}: readable", title_justify="left")
+    for name, told in _summary_rows(fact):
+        table.add_row(name, told)
+    console().print(table)
+
+
+def _summary_rows(fact: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """The same for people: words for keys, lengths with their unit."""
+    carried = "the scanner" if fact["mount"] == "eye_in_hand" else "the part"
+    yield "mount", f"{fact['mount']}: {carried} sits at the flange"
+    yield "length unit", fact["length_unit"]
+    yield "views", str(fact["views"])
+    if fact["points"]:
+        yield "scanned points", f"{fact['points']:,}"
+    if fact["targets"]:
+        yield "labelled points", f"{fact['targets']} targets, seen {fact['sightings']} times"
+    if fact["median_range"] is not None:
+        yield "distance from the scanner", f"{fact['median_range']:g} {fact['length_unit']}, median"
+    yield "arm", fact["robot"] or "not stated: poses of the flange only"
+    yield "joint angles", "in views.csv" if fact["joints"] else "none: effects of joints cannot be tested"
+    yield "hand-eye", "a coarse one is stated" if fact["hand_eye_given"] else "not stated: it is found from the scans"
+    yield "beside the poses", ", ".join(fact["covariates"]) or "nothing"
+    yield from (("note", note) for note in fact["notes"])
 
 
 def check(
@@ -22,8 +143,6 @@ def check(
       stitch check blade-17
       stitch check --deep blade-17 --json
     """
-    # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.cli.actions.checked_sessions import check_deeply, check_sessions
 
     if deep:
         check_deeply(sessions, as_json)

@@ -12,12 +12,11 @@ from typing import Annotated
 import typer
 
 from stitch.cli.commands import CommandGroup
-from stitch.cli.terminal.live_line import TimeLeft, live_line
-from stitch.cli.terminal.streams import speak_any_terminal
+from stitch.cli.terminal import TimeLeft, live_line, speak_any_terminal
 from stitch.errors import StitchError
-from stitch.reading.text_file import shortened
-from stitch.system import time_limit
-from stitch.system.steps import watched
+from stitch.reading.text_files import shortened
+from stitch.system import process
+from stitch.system.process import watched
 
 _LONGEST = 2000
 _ROOM = "; to fix: make room there, then run it again; what stood there is as it was"
@@ -64,7 +63,7 @@ def _options(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; errors of the input or the computation end in one line and their exit code."""
     speak_any_terminal()
-    time_limit.may_end_process()
+    process.may_end_process()
     try:
         with watched(TimeLeft()):
             try:
@@ -91,7 +90,7 @@ def _exit_with_message(message: str, code: int) -> None:
     """One line on standard error, and the end of the process."""
     line = "".join(c if c.isprintable() else " " for c in " ".join(message.split()))
     print(f"stitch: {line if len(line) <= _LONGEST else line[:_LONGEST] + ' …'}", file=sys.stderr, flush=True)
-    if time_limit.running_over():
+    if process.running_over():
         # The thread of an effect that never ends would be waited for.
         os._exit(code)
     sys.exit(code)

@@ -6,9 +6,8 @@ from typing import Annotated
 import typer
 
 from stitch.cli.options import Json, RunFolder
-from stitch.cli.terminal.streams import emit
+from stitch.cli.terminal import emit
 from stitch.errors import InputError
-from stitch.system.console import console
 
 _LONGEST = 2000
 
@@ -26,13 +25,15 @@ def note(
     Examples:
       stitch note runs/blade-17 "fixture shimmed after this step" --step 0
     """
+    from stitch.system.process import console
+
     text, by = text.strip(), by.strip()
     if not text:
         raise InputError("TEXT: is empty; to fix: say what to remark")
     if len(text) > _LONGEST:
         raise InputError(f"TEXT: has {len(text)} characters; to fix: shorten it to {_LONGEST}")
     # Loaded by who runs something: whoever asks for help has it at once.
-    from stitch.stored.run_documents import read_ledger
+    from stitch.stored.stored_run import read_ledger
     from stitch.writing.json_file import to_json, write_json
     from stitch.writing.run_folder import lock_run_folder
 

@@ -7,13 +7,13 @@ from functools import cached_property
 import numpy as np
 
 from stitch import frames
-from stitch.comparison.model_history import ModelHistory, model_history
+from stitch.comparison.disagreement_field import ModelHistory, model_history
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.model.hand_eye_uncertainty import COVERAGE_FACTOR
-from stitch.reading.session_hash import UNKNOWN, session_hash
+from stitch.model.model import COVERAGE_FACTOR
+from stitch.reading.session_folder import UNKNOWN, session_hash
 from stitch.runs.run import Run
-from stitch.statistics.tails import chi2_tail
+from stitch.statistics.distributions import chi2_tail
 from stitch.units import length_text
 
 # Probability below which chance does not explain a difference (5 %, as k = 2 covers 95 %).

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import TaughtPoint, WrittenNumber, line_of, quaternion_w_first
+from stitch.controllers.taught_points import TaughtPoint, WrittenNumber, line_of, quaternion_w_first
 from stitch.errors import InputError
-from stitch.reading.csv_number import finite_number
+from stitch.reading.csv_files import finite_number
 
 CONVENTION = "quaternion q1, q2, q3, q4 with q1 = w; mm"
 pose = quaternion_w_first

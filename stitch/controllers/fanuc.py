@@ -7,9 +7,9 @@ DH joint 3 of most published tables is J2 + J3.
 import re
 from pathlib import Path
 
-from stitch.controllers.taught import TaughtPoint, WrittenNumber, fixed_xyz, line_of, taught_point
+from stitch.controllers.taught_points import TaughtPoint, WrittenNumber, fixed_xyz, line_of, taught_point
 from stitch.errors import InputError
-from stitch.reading.csv_number import finite_number
+from stitch.reading.csv_files import finite_number
 
 CONVENTION = "W, P, R in degrees about fixed x, y, z: Rz(R)·Ry(P)·Rx(W); mm"
 pose = fixed_xyz

@@ -7,7 +7,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from stitch.controllers.taught import (
+from stitch.controllers.taught_points import (
     TaughtPoint,
     WrittenNumber,
     line_of,
@@ -17,7 +17,7 @@ from stitch.controllers.taught import (
     zyx,
 )
 from stitch.errors import InputError
-from stitch.reading.csv_number import finite_number
+from stitch.reading.csv_files import finite_number
 
 CONVENTION = "A, B, C in degrees about z, new y, new x: Rz(A)·Ry(B)·Rx(C); mm"
 pose = zyx

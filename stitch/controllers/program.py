@@ -1,31 +1,85 @@
 """A robot program with the places of its numbers, and the frame and tool in which it was taught."""
 
+import csv
+import io
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from stitch.controllers import abb, fanuc, kuka, universal
-from stitch.controllers.taught import TaughtPoint, line_of, program_text, without_comments
+from stitch import frames
+from stitch.controllers import abb, fanuc, kuka, tracker_csv, universal_robots
+from stitch.controllers.taught_points import TaughtPoint, line_of, program_text, without_comments
+from stitch.controllers.tracker_csv import TrackerPoint
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
-from stitch.reading.csv_number import is_number
+from stitch.reading.csv_files import is_number
+
+# Rows of views.csv, frames.csv and points.csv.
+
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+def view_rows(
+    points: Sequence[TaughtPoint], T_base_frame: Array, T_tool_flange: Array, scale: float
+) -> list[list[str]]:
+    """Header and rows of views.csv; `scale` from mm to the session's unit. What a point lacks stays empty."""
+    joints = max((len(p.joints) for p in points if p.joints is not None), default=0)
+    posed = any(p.T_frame_tool is not None for p in points)
+    rows = [["view", *(f"j{i + 1}_deg" for i in range(joints)), *(POSE_COLUMNS if posed else ())]]
+    for name, point in zip(numbered_names(p.name for p in points), points, strict=True):
+        row = [name]
+        if joints:
+            row += [""] * joints if point.joints is None else [f"{q:.9g}" for q in np.degrees(point.joints)]
+        if posed:
+            T = None if point.T_frame_tool is None else T_base_frame @ point.T_frame_tool @ T_tool_flange
+            row += [""] * len(POSE_COLUMNS) if T is None else pose_cells(T, scale)
+        rows.append(row)
+    return rows
+
+
+def pose_cells(T: Array, scale: float) -> list[str]:
+    """Position and quaternion of a pose (4, 4) as cells of a table."""
+    return [*(f"{x * scale:.9g}" for x in T[:3, 3]), *(f"{q:.10f}" for q in frames.to_quaternion(T))]
+
+
+def numbered_names(names: Iterable[str]) -> list[str]:
+    """The names, numbered from the second on where one stands again."""
+    out: list[str] = []
+    taken: set[str] = set()
+    for name in names:
+        plain, k = name.strip() or "view", 1
+        label = plain
+        while label in taken:
+            k += 1
+            label = f"{plain}_{k}"
+        taken.add(label)
+        out.append(label)
+    return out
+
+
+def csv_text(rows: Sequence[Sequence[str]]) -> str:
+    """Rows as the text of a CSV file."""
+    stream = io.StringIO()
+    csv.writer(stream, lineterminator="\n").writerows(rows)
+    return stream.getvalue()
+
 
 PROGRAMS: dict[str, ModuleType] = {
     ".ls": fanuc,
     ".dat": kuka,
     ".src": kuka,
     ".mod": abb,
-    ".script": universal,
+    ".script": universal_robots,
 }
 # Frame and tool of nothing: points taught in them are flange poses in the base.
 NOTHING_IN_FORCE = ("UF 0, UT 0", "TOOL 0, BASE 0", "tool0, wobj0")
 # No length in mm and no angle of a controller is larger.
 _LARGEST = 1e9
-_NAMES = {fanuc: "fanuc", kuka: "kuka", abb: "abb", universal: "ur"}
+_NAMES = {fanuc: "fanuc", kuka: "kuka", abb: "abb", universal_robots: "ur"}
 
 
 @dataclass(frozen=True)
@@ -67,7 +121,7 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
     if not points:
         raise NoResultError(f"{file}: no taught points found; export the program with its positions")
     # A script of a UR has its poses in the base.
-    needed = {"tool": tool} if reader is universal else {"frame": frame, "tool": tool}
+    needed = {"tool": tool} if reader is universal_robots else {"frame": frame, "tool": tool}
     _require_stated(file, require_one_frame(file, points), [f"--{name}" for name in needed if needed[name] is None])
     _require_own_motion(file, points)
     files = dict.fromkeys(p.file for p in points if p.file is not None)
@@ -109,7 +163,7 @@ def _require_own_motion(file: Path, points: Sequence[TaughtPoint]) -> None:
 
 def _without_comments(reader: ModuleType, text: str) -> str:
     """The text without comments; lengths stay."""
-    mark = {kuka: ";", universal: "#", abb: "!"}.get(reader)
+    mark = {kuka: ";", universal_robots: "#", abb: "!"}.get(reader)
     return text if mark is None else without_comments(text, mark)
 
 
@@ -150,3 +204,94 @@ def require_one_frame(file: Path, points: Sequence[TaughtPoint]) -> str | None:
             "to fix: give points of one frame and tool at a time"
         )
     return told[0].frame if len(told) == len(posed) else ""
+
+
+# A controller's or tracker's file -> the text of views.csv, frames.csv or points.csv.
+
+_READERS = PROGRAMS | {".csv": universal_robots}
+# Programs are in mm; views.csv is in the session's length_unit.
+_MM_IN_UNIT = {"mm": 1.0, "m": 1e-3}
+
+
+@dataclass(frozen=True)
+class ImportedTable:
+    """A table of a session."""
+
+    table: str  # "views.csv", "frames.csv" or "points.csv"
+    text: str
+    rows: int
+    convention: str  # how the file writes orientations
+    warnings: tuple[str, ...]
+
+
+def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: str | None = None) -> ImportedTable:
+    """Read a program or an export of a tracker.
+
+    Args:
+        unit: "mm" or "m", the session's length_unit.
+        frame: T_base_frame in which the points were taught, numbers as the controller writes a pose.
+        tool: T_flange_tool in force when they were taught, likewise. T_base_flange = frame · point · tool⁻¹.
+
+    Raises:
+        InputError: unknown or broken file, points of different frames; names the line and how to fix it.
+        NoResultError: no points in the file.
+    """
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; to fix: name an export of the controller")
+    if unit not in _MM_IN_UNIT:
+        raise InputError(f"--unit {unit}: use mm or m")
+    reader = _READERS.get(file.suffix.lower())
+    if reader is None:
+        raise InputError(
+            f"{file}: unknown kind {file.suffix!r}; known are {', '.join(_READERS)}; to fix: save it as one of these, "
+            f"or let `stitch init {file.parent}` read the folder, if it is a scan"
+        )
+    text = file.read_text(encoding="utf-8-sig", errors="replace")
+    if not text.strip():
+        raise InputError(f"{file}: empty; export it again")
+    if reader is universal_robots and file.suffix.lower() == ".csv" and not universal_robots.is_recording(text):
+        return _import_tracker(file, text, unit)
+    points: Sequence[TaughtPoint] = reader.read(file, text)
+    if not points:
+        raise NoResultError(f"{file}: no taught points found; export the program with its positions")
+    warnings = _check_frames(file, points, frame, tool)
+    T_base_frame, T_flange_tool = stated_pose(reader.pose, "frame", frame), stated_pose(reader.pose, "tool", tool)
+    rows = view_rows(points, T_base_frame, frames.inverse(T_flange_tool), _MM_IN_UNIT[unit])
+    return ImportedTable("views.csv", csv_text(rows), len(points), reader.CONVENTION, warnings)
+
+
+def _check_frames(file: Path, points: Sequence[TaughtPoint], frame: str | None, tool: str | None) -> tuple[str, ...]:
+    """Points of one frame and tool, or a refusal; a warning where poses need them and none was given."""
+    taught_in = require_one_frame(file, points)
+    if taught_in is None:
+        return ()
+    if (frame is None or tool is None) and taught_in not in NOTHING_IN_FORCE:
+        known = f" ({taught_in})" if taught_in else ""
+        return (
+            f"poses are those of the tool in the frame in which they were taught{known}; give --frame and --tool "
+            "unless both were zero, else they are not the flange in the base",
+        )
+    return ()
+
+
+def _import_tracker(file: Path, text: str, unit: str) -> ImportedTable:
+    """frames.csv from 6D probes; points.csv from reflectors, a new view whenever a name comes again."""
+    measured: list[TrackerPoint] = tracker_csv.read(file, text)
+    if not measured:
+        raise NoResultError(f"{file}: no measurements; export them again")
+    scale = _MM_IN_UNIT[unit]
+    poses = [m.T_sensor_probe for m in measured if m.T_sensor_probe is not None]
+    if poses:
+        rows = [["view", *POSE_COLUMNS]]
+        rows += [
+            [n, *pose_cells(T, scale)] for n, T in zip(numbered_names(m.name for m in measured), poses, strict=True)
+        ]
+        return ImportedTable("frames.csv", csv_text(rows), len(measured), tracker_csv.CONVENTION, ())
+    rows, seen = [["view", "target", "x", "y", "z"]], Counter[str]()
+    for m in measured:
+        seen[m.name] += 1
+        rows.append([f"v{seen[m.name]}", m.name, *(f"{x * scale:.9g}" for x in m.position)])
+    note = (
+        "points.csv: the first measurement of every name is view v1, the second v2; name the views in views.csv alike"
+    )
+    return ImportedTable("points.csv", csv_text(rows), len(measured), tracker_csv.CONVENTION, (note,))

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught import fixed_xyz, pose_from_quaternion
+from stitch.controllers.taught_points import fixed_xyz, pose_from_quaternion
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.reading.csv_number import finite_number
+from stitch.reading.csv_files import finite_number
 
 CONVENTION = "quaternion by its letters, or Rx, Ry, Rz in degrees about fixed x, y, z: Rz·Ry·Rx; mm or m by the header"
 

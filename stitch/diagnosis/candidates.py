@@ -6,14 +6,20 @@ from itertools import product
 
 import numpy as np
 
-from stitch.effects.contract import EFFECTS, Effect, Parameter
+from stitch.effects.contract import (
+    EFFECTS,
+    Effect,
+    Parameter,
+    by_joint,
+    missing_need,
+    one_by_one,
+    parameters_in,
+    without_offset,
+)
 from stitch.effects.empirical import empirical_effects
-from stitch.effects.groups import by_joint, one_by_one, without_offset
-from stitch.effects.in_session import missing_need, parameters_in
 from stitch.frames import Array, Mask
-from stitch.model.term import Term
-from stitch.observations.linear_model import LinearModel
-from stitch.observations.response import PointSums, Response
+from stitch.model.model import Term
+from stitch.observations.linear_model import LinearModel, PointSums, Response
 
 
 @dataclass(frozen=True)

@@ -6,32 +6,37 @@ from dataclasses import replace
 import numpy as np
 
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.conclusion import check_verdict, cross_validate_named
-from stitch.diagnosis.covariate_dependence import dependences
-from stitch.diagnosis.design.next_view import propose_measurements
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.distorted_field import follows_field
-from stitch.diagnosis.plausible_scatter import implausible, scatter_limit
-from stitch.diagnosis.score import Score
-from stitch.diagnosis.selection.pairs import score_pair
-from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.selection.verdict import Selection, select
-from stitch.diagnosis.sensitivity.aliases import alias_matrix, aliases_of
-from stitch.diagnosis.sensitivity.detectable import detectable_sizes
-from stitch.diagnosis.sensitivity.omitted_effect_bias import hand_eye_response, omitted_effect_bias
+from stitch.diagnosis.next_view import propose_measurements
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.residual_structure import BudgetLine, dependences, follows_field, variance_budget
+from stitch.diagnosis.score import Score, implausible, scatter_limit
+from stitch.diagnosis.sensitivity import (
+    alias_matrix,
+    aliases_of,
+    detectable_sizes,
+    hand_eye_response,
+    omitted_effect_bias,
+)
 from stitch.diagnosis.sentences import diagnosis_sentence
 from stitch.diagnosis.thresholds import CROSS_VALIDATED_CANDIDATES, MANY_POSES, MANY_VIEWS
-from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.unnamed_errors import RepeatingError, find_repeating_errors, reportable
-from stitch.diagnosis.validation.cross_validation import CrossValidation, cross_validate
-from stitch.diagnosis.variance_budget import BudgetLine, variance_budget
-from stitch.diagnosis.within_overlaps import find_scanner_error, overlap_misfit_beyond_noise
+from stitch.diagnosis.unnamed_joint_laws import joint_curves
+from stitch.diagnosis.unnamed_time_laws import RepeatingError, find_repeating_errors, reportable
+from stitch.diagnosis.validation import CrossValidation, cross_validate
+from stitch.diagnosis.verdict import (
+    Selection,
+    check_verdict,
+    cross_validate_named,
+    find_scanner_error,
+    overlap_misfit_beyond_noise,
+    score_pair,
+    select,
+)
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.runs.state import RunState
-from stitch.stages.course import linearise
-from stitch.system.heap import return_large_arrays
-from stitch.system.threads import library_threads_off, parallel
+from stitch.runs.run import RunState
+from stitch.stages.assemble import linearise
+from stitch.system.threads import library_threads_off, parallel, return_large_arrays
 
 
 def diagnose_state(state: RunState) -> Diagnosis:
@@ -148,7 +153,7 @@ def _examine_candidates(
     """
     scores, push = [r.score for r in selection.ranked], hand_eye_response(linear)
 
-    def asked(k: int) -> CandidateEffect:
+    def validated(k: int) -> CandidateEffect:
         ranked, candidate = selection.ranked[k], scores[k].candidate
         detectable = detectable_sizes(linear, candidate, tests)
         return CandidateEffect(
@@ -160,7 +165,7 @@ def _examine_candidates(
             hand_eye=omitted_effect_bias(linear, push, candidate, detectable),
         )
 
-    return list(parallel(asked, range(len(scores)), "candidate effects on views left out"))
+    return list(parallel(validated, range(len(scores)), "candidate effects on views left out"))
 
 
 def _cross_validate_fitted(linear: LinearModel, scored: Score) -> CrossValidation | None:

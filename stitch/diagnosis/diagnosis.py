@@ -4,20 +4,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.covariate_dependence import Dependence
-from stitch.diagnosis.design.next_view import Proposal
-from stitch.diagnosis.plausible_scatter import ScatterLimit
-from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.sensitivity.aliases import Alias
+from stitch.diagnosis.next_view import Proposal
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.residual_structure import BudgetLine, Dependence
+from stitch.diagnosis.score import ScatterLimit
+from stitch.diagnosis.sensitivity import Alias
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unknown.joint_curves import JointCurve
-from stitch.diagnosis.unknown.time_curve import TimeCurve
-from stitch.diagnosis.unknown.unnamed_errors import RepeatingError, reportable
-from stitch.diagnosis.validation.cross_validation import CrossValidation
-from stitch.diagnosis.variance_budget import BudgetLine
+from stitch.diagnosis.unnamed_joint_laws import JointCurve
+from stitch.diagnosis.unnamed_time_laws import RepeatingError, TimeCurve, reportable
+from stitch.diagnosis.validation import CrossValidation
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.field_error import FieldError
+from stitch.observations.surfaces.scanner_errors import FieldError
 
 
 @dataclass(frozen=True)

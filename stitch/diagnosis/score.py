@@ -5,19 +5,140 @@ the Wald F test under the form's own REML; forms are counted (Bonferroni). The e
 integrated over amplitudes of plausible size, so that more parameters cost what they could have explained.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import logsumexp
 
-from stitch.diagnosis.candidates import Candidate, Form
-from stitch.diagnosis.form_trial import LONG, FormTrial, Gain, gain_at_null, residual_form_columns, try_form
-from stitch.diagnosis.thresholds import LOG_BAYES_FACTOR
+from stitch.diagnosis.candidates import Candidate, Form, candidate_of
+from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, IMPLAUSIBLE, LOG_BAYES_FACTOR
+from stitch.effects.contract import Effect, find_effect
 from stitch.frames import Array, Mask
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.session import Session
+from stitch.model.model import Model, Term, term_of
+from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.variance_components import MANY_NUMBERS, at_variances
+from stitch.stages.assemble import linearise
+from stitch.statistics.distributions import chi2_limit, f_tail
+from stitch.statistics.parameter_selection import ANY_SIZE, PLAUSIBLE, log_mixture
+from stitch.statistics.reml import MANY_NUMBERS, at_variances, fit_variances
+from stitch.statistics.variance_posterior import satterthwaite
 from stitch.system.threads import parallel
+from stitch.units import METRES
+
+# One form of a candidate beside a model: what it gains, and its free amplitudes.
+#
+# How large an effect is if it is there nobody knows before: its parameters are of plausible size, or all alike three
+# times, a third or a tenth of it, each as likely, or grossly wrong. With plausible sizes alone, six numbers of which
+# the
+# views show a tenth of that were charged for all that they could have been, and effects beyond chance (p = 1e-9)
+# counted
+# for nothing.
+
+# A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
+_FREE = 30.0
+# Among more numbers than this the variances are the same under both priors, and a fit takes half a second.
+LONG = 250
+
+
+def scales_of(linear: LinearModel) -> dict[float, float]:
+    """Of the plausible sizes of an effect's parameters, with the share of belief in each: labelled points show sizes
+    whatever their prior, beside a prior of pose errors any may be the true one."""
+    return ANY_SIZE if linear.pose_errors is not None else PLAUSIBLE
+
+
+@dataclass(frozen=True)
+class FormTrial:
+    """One form against the null."""
+
+    log_bayes_factor: float
+    p_value: float = 1.0
+    values: Array | None = None  # (p,) free fit; None where the form was not worth one
+    covariance: Array | None = None
+    variances: Array | None = None  # (c,)
+    scale: float = 1.0  # of the plausible sizes, the likeliest
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Log Bayes factor of a form at given variances over all its scales, and the likeliest of these."""
+
+    log_bayes_factor: float
+    scale: float
+
+
+def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> FormTrial:
+    """One form with its variances estimated anew.
+
+    Args:
+        start: (c,) variances to begin with.
+        scale: the one that is likeliest there.
+    """
+    mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), _FREE * form.sizes
+    integrated = fit_variances(mixed, G, scale * form.sizes, start=start)
+    scales = scales_of(linear)
+    if mixed.size > LONG and linear.pose_errors is None:
+        scales = {scale: scales[scale]}
+    found = {scale: integrated.deviance}
+    if len(scales) > 1:
+        # What the form explains is no scatter: beside less of it another scale may be the likeliest.
+        found = {s: at_variances(mixed, integrated.variances, G, s * form.sizes).deviance for s in scales}
+        best = min(found, key=lambda s: found[s])
+        if best != scale:
+            scale, integrated = best, fit_variances(mixed, G, best * form.sizes, start=integrated.variances)
+            found[best] = integrated.deviance
+    if mixed.size > LONG or linear.pose_errors is not None:
+        free = at_variances(mixed, integrated.variances, G, wide)
+    else:
+        free = fit_variances(mixed, G, wide, integrated.variances)
+    a = mixed.A.shape[2]
+    theta, covariance = free.mean[a:], free.covariance[a:, a:]
+    rank, square = _wald(theta, covariance, form.sizes)
+    p = f_tail(square / max(rank, 1), max(rank, 1), _scatter_degrees(linear, form, max(mixed.size - a - rank, 1)))
+    gained = 0.5 * linear.null.deviance + log_mixture(-0.5 * np.array(list(found.values())), scales)
+    return FormTrial(gained, p, theta, covariance, integrated.variances, scale)
+
+
+def _scatter_degrees(linear: LinearModel, form: Form, rest: int) -> float:
+    """Degrees of freedom to which the scatter along the columns of a form is known: fewer than numbers are left, where
+    views tell several components apart; among very many numbers as many."""
+    if linear.pose_errors is None and linear.mixed.size > LONG:
+        return rest
+    return max(linear.satterthwaite.degrees_of_freedom(linear.in_blocks(linear.residual(form.columns))), 1.0)
+
+
+def residual_form_columns(linear: LinearModel, candidate: Candidate) -> Iterator[Array]:
+    """(n, p) per form what its columns say beside the model; those of one joint are among those of all."""
+    whole = candidate.forms[0]
+    white = linear.residual(whole.columns)
+    for form in candidate.forms:
+        if form.term is not whole.term:
+            whole, white = form, linear.residual(form.columns)
+        yield white[:, form.keep[whole.keep]]
+
+
+def gain_at_null(linear: LinearModel, form: Form, white: Array) -> Gain:
+    """At the null's variances: cheap, and an upper hand for what cannot help."""
+    white = white * form.sizes
+    told, b = white.T @ white, white.T @ linear.white_residual
+    shares = scales_of(linear)
+    scales = np.array(list(shares))
+    information = np.eye(len(b)) + scales[:, None, None] ** 2 * told
+    squares = scales**2 * (np.linalg.solve(information, np.tile(b[:, None], (len(scales), 1, 1)))[..., 0] @ b)
+    found = 0.5 * (squares - np.linalg.slogdet(information)[1])
+    return Gain(log_mixture(found, shares), float(scales[(found + np.log(list(shares.values()))).argmax()]))
+
+
+def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:
+    """Rank and θᵀC⁻¹θ over the combinations of which the views say more than the wide prior does."""
+    values, vectors = np.linalg.eigh(covariance / np.outer(sizes, sizes))
+    keep = values < 0.5 * _FREE**2
+    projected = vectors[:, keep].T @ (theta / sizes)
+    return int(keep.sum()), float(np.sum(projected**2 / np.maximum(values[keep], 1e-300)))
+
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
 SEEN = 0.5
@@ -164,3 +285,104 @@ def weights_of_masks(masks: Sequence[Mask]) -> Array:
     kept = np.array([keep.sum() for keep in masks])
     whole = kept == kept[0]
     return np.asarray(np.where(whole, (0.5 if (~whole).any() else 1.0) / whole.sum(), 0.5 / max((~whole).sum(), 1)))
+
+
+# Values to begin a fit with: those that the views suggest at first sight.
+
+
+def start_with_effects(
+    session: Session, effects: Sequence[str], arm: ModelFile | None, measurement: Measurement, model: Model, gate: float
+) -> Model:
+    """The model with another run's arm in place of its effects, if any, and with further effects by name.
+
+    Args:
+        gate: largest distance between partners where the session has scans, length_unit.
+    """
+    if arm:
+        known_arm = bind_to_session(arm, measurement)
+        model = replace(model, terms=known_arm.terms, effects_covariance=known_arm.effects_covariance)
+    linear = partial(linearise, session, measurement, model, gate)
+    return model.with_terms(
+        [*model.terms, *_initial_terms(measurement, [find_effect(name) for name in effects], linear)]
+    )
+
+
+def _initial_terms(
+    measurement: Measurement, effects: Sequence[Effect], linear_now: Callable[[], LinearModel]
+) -> list[Term]:
+    """A term for each effect; events and time constants at the value that explains most.
+
+    Args:
+        linear_now: the linear model before these effects, asked only where one has an event or a time constant.
+    """
+    zero = [term_of(measurement, effect) for effect in effects]
+    if not any(term.gridded.any() for term in zero):
+        return zero
+    linear = linear_now()
+    return [_suggest_values(linear, term) if term.gridded.any() else term for term in zero]
+
+
+def _suggest_values(linear: LinearModel, zero: Term) -> Term:
+    candidate = candidate_of(linear, zero.effect)
+    if candidate is None:
+        return zero
+    best = score(linear, candidate)
+    return best.form.at(best.values)
+
+
+# How far the poses of the arm may scatter before something else than repeatability must be there.
+
+
+@dataclass(frozen=True)
+class ScatterLimit:
+    """Standard deviations of the flange poses that are plausible, per axis."""
+
+    rotation: float  # rad
+    translation: float  # length_unit
+    rotation_stated: bool = False
+    translation_stated: bool = False
+
+    @property
+    def stated(self) -> bool:
+        """True if the session states a repeatability: the judgement does not rest on what is usual."""
+        return self.rotation_stated or self.translation_stated
+
+
+def scatter_limit(session: Session) -> ScatterLimit:
+    """What the session states under [robot] repeatability, else the largest that is usual for an arm fit for use."""
+    stated, (rotation, translation) = session.repeatability, IMPLAUSIBLE
+    usual = translation * METRES["mm"] / METRES[session.length_unit]
+    return ScatterLimit(
+        rotation=rotation if stated.sigma_rotation is None else stated.sigma_rotation,
+        translation=usual if stated.sigma_translation is None else stated.sigma_translation,
+        rotation_stated=stated.sigma_rotation is not None,
+        translation_stated=stated.sigma_translation is not None,
+    )
+
+
+def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:
+    """True if the poses scatter as no arm does, or by more than is stated and chance explains.
+
+    All of it counts, what repeats too: the views may not tell which it is. An estimated variance of ν degrees of
+    freedom exceeds a stated one by χ²(ν)/ν at most; ν where the scatter is as stated, since what is large by chance
+    looks well known.
+    """
+    linear = linear.scatter_only
+    for i, (allowed, stated) in enumerate(
+        ((limit.rotation, limit.rotation_stated), (limit.translation, limit.translation_stated))
+    ):
+        chance = 1.0
+        if stated:
+            known = _degrees_of_freedom(linear, i, allowed)
+            chance = float(np.sqrt(chi2_limit(ALPHA_UNKNOWN / 2, known) / known))
+        if np.sqrt(linear.null.variances[i]) > chance * allowed:
+            return True
+    return False
+
+
+def _degrees_of_freedom(linear: LinearModel, component: int, sigma: float) -> float:
+    """To which the variance of a component would be known if its standard deviation were that."""
+    variances = linear.null.variances.copy()
+    variances[component] = sigma**2
+    known = satterthwaite(linear.mixed, at_variances(linear.mixed, variances))
+    return 2 / max(float(known.spread[component, component]), 1e-9)

@@ -1,17 +1,143 @@
 """The diagnosis in one plain sentence with its numbers."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.smooth_sentences import (
-    scanner_clause_before_poses,
-    scanner_clause_if_adequate,
-    scanner_error_sentence,
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.residual_structure import NOT_REPEATING
+from stitch.diagnosis.unnamed_joint_laws import JointCurve
+from stitch.diagnosis.unnamed_time_laws import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
+from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.units import angle_text, duration_text, format_amount, length_text, rounded
+
+# What errs by no known law in words: where in the range of a joint, when in the session.
+
+# Curves of joints that are told in words; the page draws one more.
+_MAX_CURVES = 2
+
+
+def curve_sentences(found: Diagnosis, length_unit: str) -> list[str]:
+    """A sentence for every course that is clear enough to be said, of joints and in time."""
+    shown = found.curves[:_MAX_CURVES]
+    told = [*map(joint_curve_sentence, shown), *_ambiguous_covariates(shown)]
+    in_time = found.time_curve
+    return told if in_time is None else [*told, time_curve_sentence(in_time, length_unit)]
+
+
+def joint_curve_sentence(curve: JointCurve) -> str:
+    """Where in the range a joint errs: Joint 3 is off by -0.25 ± 0.03 mrad at j4 = -48°, and by …"""
+    low, high = (
+        f"{rounded(1e3 * curve.error[i], 1e3 * curve.sigma[i])} ± {1e3 * curve.sigma[i]:.1g} mrad "
+        f"{_place_in_words(curve, i)}"
+        for i in curve.extremes
+    )
+    of_it = f"{curve.share:.0%} of what it does without a name"
+    return f"Joint {curve.joint} is off by {low}, and by {high}, beside its mean: {of_it}."
+
+
+def _ambiguous_covariates(curves: Sequence[JointCurve]) -> list[str]:
+    """What each joint may follow as well as what its course is drawn along."""
+    open_ones = {c.joint: c.may_follow for c in curves if len(c.may_follow) > 1}
+    return [
+        f"These views do not tell whether joint {joint} follows {', '.join(others[:-1])} or {others[-1]}."
+        for joint, others in open_ones.items()
+    ]
+
+
+def _place_in_words(curve: JointCurve, k: int) -> str:
+    """At j4 = -48°, after a move of 12°, 12 min into the session, at view 7, under 31 N m, under 0.3 N m of each kg."""
+    there, name = curve.at[k], curve.covariate
+    match name.split("_", 1)[-1]:
+        case "move_deg":
+            return f"after a move of {there:.0f}°"
+        case "deg":
+            return f"at {name.removesuffix('_deg')} = {there:.0f}°"
+        case "s":
+            return f"{duration_text(there - curve.view_values.min())} into the session"
+        case "view":
+            return f"at view {there:.0f}"
+    load = rounded(there, 0.1 * (curve.at[-1] - curve.at[0]))
+    return f"under {load} N m" + (" of each kg" if name.endswith("_per_kg") else "")
+
+
+def time_curve_sentence(curve: TimeCurve, length_unit: str) -> str:
+    """How far a flange seems to be off in time: It is as if the flange were off by as much as 0.12 ± 0.01 mm …"""
+    there, moved, its_sigma = curve.largest(TRANSLATION_PART)
+    then, turned, sigma = curve.largest(ROTATION_PART)
+    far, turn = format_amount(moved, its_sigma, length_unit), format_amount(turned, sigma, "rad")
+    return (
+        f"It is as if the flange were off by as much as {far} {_time_in_words(curve, there)} and turned by {turn} "
+        f"{_time_in_words(curve, then)}. What goes that way in the cell (a temperature, a machine nearby) could "
+        "name it, as a "
+        "column of views.csv."
+    )
+
+
+def _time_in_words(curve: TimeCurve, k: int) -> str:
+    steps = curve.steps[k] - curve.steps[0]
+    return f"{duration_text(steps * curve.seconds)} into the session" if curve.seconds else f"at view {steps:.0f}"
+
+
+# Smooth errors of the scans themselves in words: the same in every view, or every view's own.
+
+
+def scanner_clause_if_adequate(found: FieldError | None, length_unit: str) -> str:
+    """What stands beside a model to which nothing is missing; empty where nothing is unusual."""
+    if found is None:
+        return ""
+    calibration = "" if found.by_view else ", but a calibration may"
+    return f"; {_scanner_error_clause(found, length_unit)}, which no pose corrects{calibration}"
+
+
+def scanner_clause_before_poses(found: FieldError | None, length_unit: str) -> str:
+    """What is said of the scans before what poses do that has no name; empty where nothing is unusual."""
+    if found is None:
+        return ""
+    follows = f" ({_CAUSES}), so that poses found from them scatter too" if found.by_view else ""
+    return f"{_scanner_error_clause(found, length_unit)}{follows}; "
+
+
+def scanner_error_sentence(found: FieldError | None, length_unit: str) -> str:
+    """Where nothing is named, what the scans err by, and what to do; None: as the views' poses show it."""
+    if found is not None and found.by_view:
+        size = length_text(found.rms_by_view, length_unit, 2)
+        return (
+            f"the scans err smoothly, every view by itself ({size} rms{_drift_clause(found)}): {_CAUSES}; scan "
+            "the first "
+            "pose again at the end: what differs then is of the part or of the time"
+        )
+    size = f" ({length_text(found.rms, length_unit, 2)} rms)" if found is not None else ""
+    more = "" if found is None else _per_view_clause(found)
+    return (
+        f"the scanner errs by where in its field a point is seen, the same in every view{size}{more}; have it "
+        "calibrated, or describe how it errs by an effect of your own"
+    )
+
+
+_CAUSES = (
+    "a part that bends or moves, an arm that still settles while a scan is read, a scanner that warms up or errs by "
+    "range, brightness or a finer law"
 )
-from stitch.diagnosis.unknown.unnamed_errors import reportable
-from stitch.diagnosis.variance_budget import NOT_REPEATING
-from stitch.units import angle_text, format_amount, length_text
+
+
+def _scanner_error_clause(found: FieldError, length_unit: str) -> str:
+    """The clearer of the two kinds, with its size."""
+    if found.by_view:
+        size = length_text(found.rms_by_view, length_unit, 2)
+        return f"the scans err by {size} rms, smoothly and every view by itself{_drift_clause(found)}"
+    size = length_text(found.rms, length_unit, 2)
+    return f"the scanner errs by {size} rms over its field, the same in every view{_per_view_clause(found)}"
+
+
+def _per_view_clause(found: FieldError) -> str:
+    """What views have for themselves besides; how much is uncertain beside what they have in common."""
+    return f", and in part every view by itself{_drift_clause(found)}" if found.rms_by_view else ""
+
+
+def _drift_clause(found: FieldError) -> str:
+    return ", as the session goes on" if found.with_time else ""
 
 
 def diagnosis_sentence(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] | None) -> str:
@@ -27,7 +153,8 @@ def diagnosis_sentence(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranke
         rest = f", and a pose repeatability of {scatter} (standard deviations) explains the rest, {by}"
         return (
             f"The model is adequate: {now} remain where the sensor's noise alone would leave {floor}"
-            f"{rest if _poses_scatter(d) else ''}{scanner_clause_if_adequate(d.scanner_error, length_unit)}{_rejected_effects(d)}."
+            f"{rest if _poses_scatter(d) else ''}{scanner_clause_if_adequate(d.scanner_error, length_unit)}"
+            f"{_rejected_effects(d)}."
         )
     if d.verdict == "missing_effect":
         return _missing_effect_sentence(d, length_unit, now, floor, pair)
@@ -57,7 +184,8 @@ def _missing_effect_sentence(
     more = f" {too}; each is sized beside the other." if pair else ""
     missing = "is missing" if d.certain else "may be missing"
     return (
-        f"{name} {missing} ({fitted_amounts(ranked)}; p = {ranked.adjusted:.1g}{_odds_over_chance(d)}): {now} remain where noise "
+        f"{name} {missing} ({fitted_amounts(ranked)}; p = {ranked.adjusted:.1g}{_odds_over_chance(d)}): {now} "
+        "remain where noise "
         f"would leave {floor}{gain}.{more}{_implausible_sizes(ranked)}"
     )
 
@@ -78,7 +206,10 @@ def _odds_over_chance(d: Diagnosis) -> str:
 
 
 def _unknown_effect_sentence(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str) -> str:
-    start = f"No effect of the library explains what is left ({now}, noise {floor}): {_overlap_misfit_clause(d, length_unit)}"
+    start = (
+        f"No effect of the library explains what is left ({now}, noise {floor}): "
+        f"{_overlap_misfit_clause(d, length_unit)}"
+    )
     if d.follows_field:
         return f"{start}{scanner_error_sentence(d.scanner_error, length_unit)}{_rejected_effects(d)}."
     start += scanner_clause_before_poses(d.scanner_error, length_unit)
@@ -87,7 +218,8 @@ def _unknown_effect_sentence(d: Diagnosis, length_unit: str, now: str, floor: st
     if said := reportable(d.repeating_errors, d.implausible):
         again = " and ".join(u.words for u in said)
         return (
-            f"{start}{follows}the errors of the poses repeat, they {again}{_repeating_error_size(d, length_unit)}, and scatter by "
+            f"{start}{follows}the errors of the poses repeat, they "
+            f"{again}{_repeating_error_size(d, length_unit)}, and scatter by "
             f"{scatter} otherwise{_rejected_effects(d)}{_untested_effects(d)}."
         )
     if not d.implausible:
@@ -107,7 +239,8 @@ def _unknown_effect_sentence(d: Diagnosis, length_unit: str, now: str, floor: st
     )
     return (
         f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, {than}; such errors repeat at "
-        f"the same poses, so that those found on one object correct another{_rejected_effects(d)}{_untested_effects(d)}."
+        "the same poses, so that those found on one object correct "
+        f"another{_rejected_effects(d)}{_untested_effects(d)}."
     )
 
 
@@ -116,7 +249,8 @@ def _overlap_misfit_clause(d: Diagnosis, length_unit: str) -> str:
     if not d.overlap_misfit:
         return ""
     return (
-        f"{length_text(d.overlap_misfit, length_unit, 2)} remain however each view is moved, so that the scanner or the part's "
+        f"{length_text(d.overlap_misfit, length_unit, 2)} remain however each view is moved, so that the scanner "
+        "or the part's "
         "shape is off and not the poses alone; "
     )
 

@@ -10,14 +10,74 @@ themselves. What a function receives and returns depends on the place, `PLACES`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from stitch.effects.specs import Spec
 from stitch.errors import InputError
+from stitch.measurement.measurement import Measurement
 from stitch.units import Amount, format_amount
+
+# How the arguments of an effect's function become parameters: kinds, units, plausible sizes.
+
+# Stands for all views of the session in a grid.
+EVERY_VIEW = (-1.0,)
+
+
+@dataclass(frozen=True)
+class Spec:
+    """How an argument of the function becomes parameters."""
+
+    kind: str  # number | offset | joint | torque | twist
+    unit: str
+    typical: float
+    limit: float
+    grid: tuple[float, ...] = ()
+    unit_shift: str = ""  # of a twist's translation
+    typical_shift: float = 0.0
+    limit_shift: float = 0.0
+
+
+def number(unit: str, typical: float, limit: float, grid: Sequence[float] = ()) -> Spec:
+    """One number."""
+    return Spec("number", unit, typical, limit, tuple(grid))
+
+
+def offset(unit: str, typical: float, limit: float) -> Spec:
+    """A vector (3,) in the reference frame, cx, cy, cz for c; it may be zero where the effect's others are not."""
+    return Spec("offset", unit, typical, limit)
+
+
+def event() -> Spec:
+    """The view from which on something is different; every view that can show it is tried."""
+    return Spec("number", "view", 1.0, float("inf"), EVERY_VIEW)
+
+
+def per_joint(unit: str, typical: float, limit: float) -> Spec:
+    """An array (n,) with one number a joint: `c` becomes c1 … cn."""
+    return Spec("joint", unit, typical, limit)
+
+
+def per_torque(unit: str, typical: float, limit: float) -> Spec:
+    """One number for each gravity torque that `Views.sag` knows: c1 … cn with masses, c2_3 … without."""
+    return Spec("torque", unit, typical, limit)
+
+
+def twist(
+    unit: str, rotation: float, translation: float, limit_rotation: float = 0.02, limit_translation: float = 10.0
+) -> Spec:
+    """A twist (6,), rotation first, named rx … tz; `unit` follows rad and mm, such as "/h"."""
+    return Spec(
+        "twist",
+        f"rad{unit}",
+        rotation,
+        limit_rotation,
+        unit_shift=f"mm{unit}",
+        typical_shift=translation,
+        limit_shift=limit_translation,
+    )
+
 
 PLACES = {
     "sensor": "(points (N, 3) at x*, view: ScanView, parameters) → points (N, 3) that the scanner reports",
@@ -179,3 +239,109 @@ def effect(
         return function
 
     return register
+
+
+# Which parameters of an effect belong together: those of one joint, one number of a link, or all of them.
+
+
+def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """Indices of the parameters of each joint; empty for an effect without joints."""
+    if not any(spec.kind in ("joint", "torque") for spec in effect.specs.values()):
+        return []
+    letters = sorted(effect.specs, key=len, reverse=True)
+    joints: dict[str, list[int]] = {}
+    for i, parameter in enumerate(parameters):
+        letter = next(name for name in letters if parameter.name.startswith(name))
+        joints.setdefault(parameter.name[len(letter) :].split("_")[0], []).append(i)
+    return list(joints.values())
+
+
+def without_offset(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """Indices of all parameters but an offset; empty for an effect without one."""
+    offsets = [f"{key}{axis}" for key, spec in effect.specs.items() if spec.kind == "offset" for axis in "xyz"]
+    return [[i for i, p in enumerate(parameters) if p.name not in offsets]] if offsets else []
+
+
+def one_by_one(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """The smallest parts that can be true without the others."""
+    if effect.place == "links" or effect.tier == "empirical":
+        # One row of a table seldom is wrong altogether, nor a scanner in every term of a polynomial.
+        return [[i] for i in range(len(parameters))]
+    return by_joint(effect, parameters) or [*without_offset(effect, parameters), list(range(len(parameters)))]
+
+
+# An effect in one session: its parameters there, and what it needs that the session may not have.
+
+_EVENT_PLACES = 50
+_WHERE_FROM = {
+    "joints": "joint angles in views.csv and the robot's DH rows or URDF",
+    "torque": "joint angles and the robot's geometry",
+    "velocity": "columns j1_velocity_deg_s … in views.csv",
+    "time": "a column time_s in views.csv",
+    "intensity": "an intensity for every point",
+    "optics": "a sensor with optics that has all points ahead of it (kind area, line or camera under [scanner])",
+    "surfaces": "a sensor that scans surfaces (kind area or line under [scanner])",
+}
+
+
+def describe_need(need: str) -> str:
+    """What an effect needs, as somebody who writes a session knows it."""
+    return _WHERE_FROM.get(need, f"a column {need} in views.csv")
+
+
+def find_effect(name: str) -> Effect:
+    """An effect of the library or of a user's file.
+
+    Raises:
+        InputError: no such effect.
+    """
+    if name not in EFFECTS:
+        raise InputError(f"no effect {name!r}; there are {', '.join(EFFECTS)} (your own: --effects-file)")
+    return EFFECTS[name]
+
+
+def parameters_in(measurement: Measurement, effect: Effect) -> tuple[Parameter, ...]:
+    """The parameters of an effect in a session, at zero; where time stands in for a temperature, rates are per hour."""
+    views = measurement.views
+    found = effect.parameters(views.joints.shape[1], views.torques.names, measurement.length_unit)
+    timed = bool(effect.prefers) and not any(views.has(name) for name in effect.prefers)
+    found = tuple(replace(p, unit=p.unit.replace("°C", "h")) for p in found) if timed else found
+    return tuple(replace(p, grid=_grid(p, views.count), names=views.names if p.discrete else ()) for p in found)
+
+
+def _grid(parameter: Parameter, views: int) -> tuple[float, ...]:
+    if parameter.grid != EVERY_VIEW:
+        return parameter.grid
+    # An event can come before any view but the first two and the last: one view alone shows no event.
+    places = range(2, views - 1)
+    # Among hundreds of views the place of an event matters less than the time to try them all.
+    return tuple(float(v) for v in places[:: max(len(places) // _EVENT_PLACES, 1)])
+
+
+def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
+    """What an effect needs and a session has not; time stands in for a covariate that the effect prefers."""
+    views = measurement.views
+    known_here = {
+        "intensity": measurement.has_intensity,
+        "optics": measurement.has_optics,
+        "surfaces": measurement.has_surfaces,
+    }
+    missing = [need for need in effect.needs if not known_here.get(need, views.has(need))]
+    if effect.prefers and not any(views.has(name) for name in (*effect.prefers, "time")):
+        missing.append("time")
+    return tuple(missing)
+
+
+def require_available(measurement: Measurement, effect: Effect) -> None:
+    """Refuse an effect that a session cannot have.
+
+    Raises:
+        InputError: names what is missing.
+    """
+    missing = missing_need(measurement, effect)
+    if missing:
+        words = " and ".join(map(describe_need, missing))
+        raise InputError(
+            f"effect {effect.name} needs {words}, which session {measurement.capture.name} does not have"
+            "; to fix: state it, or leave the effect out"
+        )

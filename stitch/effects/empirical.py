@@ -11,10 +11,9 @@ from math import prod
 
 import numpy as np
 
-from stitch.effects.contract import Effect
-from stitch.effects.specs import Spec, event, number, twist
+from stitch.effects.contract import Effect, Spec, event, number, twist
 from stitch.frames import Array
-from stitch.measurement.views import ScanView, Views
+from stitch.measurement.measurement import ScanView, Views
 
 # A distortion of the scanner's field by no law.
 FIELD = "distortion_over_field"

@@ -11,20 +11,391 @@ same in views that are neighbours in time.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 
 import numpy as np
+from scipy.optimize import least_squares
 
-from stitch.explanation.dictionary import Dictionary, Ingredient, group_addends
-from stitch.explanation.half import HalfModel
-from stitch.explanation.held_test import TestedSum, test_current_scatter, test_refitted_scatter, with_refitted_scatter
-from stitch.explanation.pursuit import pursue_sums
-from stitch.explanation.refinement import quantities_of, refine_parameters, round_parameters, sum_residual
+from stitch.diagnosis.thresholds import ODDS
+from stitch.diagnosis.validation import explained_basis
+from stitch.explanation.dictionary import Dictionary, Ingredient, Quantity, group_addends, scaled_values
 from stitch.frames import Array, Indices
 from stitch.measurement.scan import even_indices
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.pose_errors import DRIFT_MEMORY
 from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.statistics.distributions import chi2_tail, f_tail
+from stitch.statistics.least_squares import column_space
+from stitch.statistics.reml import NOISE, at_variances
+
+# Some of the views, as one who knows nothing of the others sees them.
+
+# Of a number a view two views show one difference: in that all that differ are alike, but for their size.
+_MIN_VIEWS = 2
+
+
+class HalfModel:
+    """Numbers (n,) of some views in units of their scatter, without what the model explains there."""
+
+    def __init__(self, linear: LinearModel, terms: Dictionary, keep: Indices) -> None:
+        """Of a linear model the views to keep; all others move freely."""
+        self._linear, self._terms, self._keep = linear, terms, keep
+        self._out = np.setdiff1d(np.arange(linear.measurement.views.count), keep)
+        self._of_view = dict[tuple[str, int], Array]()
+
+    @cached_property
+    def _explained(self) -> Array:
+        """(n, r) orthonormal."""
+        linear = self._linear
+        if isinstance(linear.observation, SurfaceObservation):
+            if not len(self._out):
+                return column_space(linear.white_design)
+            return explained_basis(linear, linear.observation, self._out)
+        return column_space(linear.white_design[self._rows])
+
+    @cached_property
+    def _rows(self) -> Indices:
+        """Of the kept views, in the channel of views that are blocks of their own."""
+        rows = self._linear.mixed.z.shape[1]
+        return np.asarray((self._keep[:, None] * rows + np.arange(rows)).ravel())
+
+    @cached_property
+    def z(self) -> Array:
+        """(n,) what was seen."""
+        surfaces = isinstance(self._linear.observation, SurfaceObservation)
+        white = self._linear.white_z if surfaces else self._linear.white_z[self._rows]
+        return np.asarray(white - self._explained @ (self._explained.T @ white))
+
+    @property
+    def free(self) -> int:
+        """How many of the numbers are free."""
+        return len(self.z) - int(self._explained.shape[1])
+
+    def has_room(self, numbers: int = 1) -> bool:
+        """True if these views can tell a sum of so many numbers from others, and leave numbers free beside it."""
+        return len(self._keep) > _MIN_VIEWS and self.free > numbers
+
+    @property
+    def views(self) -> Indices:
+        """Numbers of those kept."""
+        return self._keep
+
+    def residual_columns(self, response: Array) -> Array:
+        """(n, k) whitened columns of a response (·, k), without what the model explains."""
+        surfaces = isinstance(self._linear.observation, SurfaceObservation)
+        white = self._linear.whiten(self._linear.reduce(response), None if surfaces else self._keep)
+        return np.asarray(white - self._explained @ (self._explained.T @ white))
+
+    def columns(self, ingredients: Sequence[Ingredient]) -> Array:
+        """(n, k) of ingredients: from the response to each view's displacement alone, which is worked out once."""
+        out = np.empty((len(self.z), len(ingredients)))
+        at = [(i.place, i.index) for i in ingredients]
+        for own in dict.fromkeys(at):
+            which = [k for k, other in enumerate(at) if other == own]
+            values = np.stack([scaled_values(ingredients[k].quantity)[self._keep] for k in which], axis=1)
+            out[:, which] = self._view_by_view(ingredients[which[0]]) @ values
+        return out
+
+    def _view_by_view(self, ingredient: Ingredient) -> Array:
+        """(n, kept views) of a displacement in one view at a time."""
+        own = ingredient.place, ingredient.index
+        if own not in self._of_view:
+            base = self._terms.base(ingredient).reshape(-1, self._terms.rows)
+            alone = np.zeros((*base.shape, len(self._keep)))
+            alone[self._keep, :, np.arange(len(self._keep))] = base[self._keep]
+            self._of_view[own] = self.residual_columns(alone.reshape(-1, len(self._keep)))
+        return self._of_view[own]
+
+
+# Whether a sum of ingredients that one half of the views suggests is what the other half, which took no part, shows.
+#
+# Beside everything else that poses may err by, under the scatter that is left once the sum is taken out: a χ² test, and
+# how much likelier the numbers of that half are with the sizes that the first half found (a partial Bayes factor;
+# Berger
+# & Pericchi 1996, J. Am. Stat. Assoc. 91:109).
+
+_REJECTED = 0.01
+# A prior of this many sizes as they come out keeps what a half does not see finite.
+_PRIOR_WIDTH = 10.0
+_MIN_PRIOR_SIGMA = 1e-6
+
+
+@dataclass(frozen=True)
+class TestedSum:
+    """A sum of ingredients, and how it stood the test."""
+
+    ingredients: tuple[Ingredient, ...]
+    p_value: float  # in the half that took no part in choosing, all ways counted
+    log_bayes_factor: float  # of that half's numbers with the sizes of the other over none
+    both: float  # the same, with that of the other half's numbers with the sizes of this one
+    instead_of: tuple[Ingredient, ...] = ()  # the sum that stood the test, where all views want another in its place
+
+    @property
+    def holds(self) -> bool:
+        """True if the half that took no part wants it."""
+        return self.p_value < _REJECTED and self.log_bayes_factor > ODDS
+
+
+def test_current_scatter(ingredients: tuple[Ingredient, ...], chosen: HalfModel, other: HalfModel) -> TestedSum:
+    """The test under the present scatter."""
+    return _test_sum(ingredients, *((half.columns(ingredients), half.z) for half in (chosen, other)))
+
+
+def test_refitted_scatter(
+    linear: LinearModel, terms: Dictionary, ingredients: tuple[Ingredient, ...], slow: bool, splits: Sequence[Indices]
+) -> TestedSum:
+    """The test under the scatter that is left beside the sum.
+
+    Args:
+        slow: the sum follows time or what moves with it.
+        splits: views in which the sum was chosen, and those in which it is tested; both leave numbers free beside it.
+    """
+    own = terms.columns(ingredients)
+    other = HalfModel(linear.scatter_only, terms, splits[0])
+    sizes = (
+        _PRIOR_WIDTH * np.abs(np.linalg.lstsq(other.residual_columns(own), other.z, rcond=None)[0]) + _MIN_PRIOR_SIGMA
+    )
+    base = _with_test_scatter(linear, linear.reduce(own), sizes, slow)
+    halves = [HalfModel(base, terms, views) for views in splits]
+    return _test_sum(ingredients, *((half.residual_columns(own), half.z) for half in halves))
+
+
+def fitted_sizes(linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient]) -> Array:
+    """(k,) sizes of scaled columns from all views, under the scatter that they leave."""
+    base, own = with_refitted_scatter(linear, terms, ingredients), linear.reduce(terms.columns(ingredients))
+    return np.asarray(np.linalg.lstsq(base.residual(own), base.white_residual, rcond=None)[0])
+
+
+def with_refitted_scatter(linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient]) -> LinearModel:
+    """The model under the scatter that a sum leaves."""
+    beside = linear.conditioned_on(linear.reduce(terms.columns(ingredients)), np.full(len(ingredients), 1.0))
+    return replace(linear, null=at_variances(linear.mixed, beside.null.variances))
+
+
+def _test_sum(
+    ingredients: tuple[Ingredient, ...], chosen: tuple[Array, Array], tested: tuple[Array, Array]
+) -> TestedSum:
+    """A sum by its columns and the numbers of either half, in units of the scatter."""
+    (A, y), (B, w) = chosen, tested
+    told = np.linalg.pinv(B.T @ B, rcond=1e-12, hermitian=True)
+    square = float((B.T @ w) @ told @ (B.T @ w))
+    factor = _log_predictive_ratio(A, y, B, w)
+    return TestedSum(
+        ingredients, chi2_tail(square, len(ingredients)), factor, factor + _log_predictive_ratio(B, w, A, y)
+    )
+
+
+def _with_test_scatter(linear: LinearModel, own: Array, sizes: Array, slow: bool) -> LinearModel:
+    """Under the scatter that is left beside a sum: what it explains is no scatter. What wanders in time stays."""
+    if slow and linear.pose_errors is None:
+        return linear
+    variances = linear.conditioned_on(own, sizes).null.variances.copy()
+    if slow and linear.pose_errors is not None:
+        wanders = NOISE + 1 + np.flatnonzero(np.isin(linear.pose_errors.names, list(DRIFT_MEMORY)))
+        variances[wanders] = np.maximum(variances, linear.null.variances)[wanders]
+    return replace(linear, null=at_variances(linear.mixed, variances))
+
+
+def _log_predictive_ratio(A: Array, y: Array, B: Array, w: Array) -> float:
+    """Log likelihood ratio of w = B·x for what y = A·x tells of x, over none."""
+    mean = np.asarray(np.linalg.lstsq(A, y, rcond=None)[0], float)
+    precision = A.T @ A + np.diag((_PRIOR_WIDTH * np.abs(mean) + _MIN_PRIOR_SIGMA) ** -2.0)
+    information, vector = B.T @ B, B.T @ w
+    both = precision + information
+    pull = vector + precision @ mean
+    square = pull @ np.linalg.solve(both, pull) - mean @ precision @ mean
+    return float(0.5 * square - 0.5 * (np.linalg.slogdet(both)[1] - np.linalg.slogdet(precision)[1]))
+
+
+# Orthogonal matching pursuit over addends of one or several columns (Pati, Rezaiifar & Krishnaprasad 1993, ACSSC;
+# groups: Lozano, Świrszcz & Abe 2009, NIPS 22).
+
+_AT_MOST = 4  # numbers of a sum, unless one addend has more
+_CHANCE = 0.05  # that an addend which is none is added, all of them counted
+# Columns shorter than this share of the longest lie almost wholly in what the model explains; of a column's length less
+# is another's.
+_MIN_COLUMN_NORM, _INDEPENDENT_SHARE = 1e-6, 0.1
+_WHOLE = 1 - 1e-12  # of what is left, no more is believed to be explained
+
+# Columns (n, k) of a sum, by its numbers.
+SumColumns = Callable[[tuple[int, ...]], Array]
+
+
+def pursue_sums(
+    design: Array,
+    z: Array,
+    free: int,
+    addends: Sequence[tuple[int, ...]],
+    starts: int,
+    refined_columns: SumColumns | None = None,
+) -> set[tuple[int, ...]]:
+    """Sums that explain z (n,), of which so many numbers are free: numbers of their columns in `design` (n, M).
+
+    One for each of the best addends to begin with, and each with a further addend as long as the next explains more
+    than the best of all would by chance. Addends of different size are compared by the Bayesian information criterion
+    (Schwarz 1978), with the scatter unknown.
+
+    Args:
+        refined_columns: columns in the place of those in `design`, which tell what is left for the next addend.
+    """
+    strength = np.linalg.norm(design, axis=0)
+    usable = strength > _MIN_COLUMN_NORM * strength.max(initial=0.0)
+    unit = np.where(usable, design / np.maximum(strength, 1e-300), 0.0)
+    asked = _PursuitProblem(unit, z, free, addends, _group_by_size(addends))
+    worth, _, ranks, _ = asked.score_addends(np.zeros((len(z), 0)))
+    first = np.argsort(-worth)[:starts]
+    every = [asked.sums_from(int(k), refined_columns or (lambda own: design[:, own])) for k in first[ranks[first] > 0]]
+    return {sum_ for sums in every for sum_ in sums}
+
+
+@dataclass(frozen=True)
+class _AddendGroup:
+    """Addends of one size."""
+
+    which: Indices  # (g,)
+    columns: Indices  # (g, k)
+
+
+def _group_by_size(addends: Sequence[tuple[int, ...]]) -> list[_AddendGroup]:
+    sizes = np.array([len(own) for own in addends])
+    every = [np.flatnonzero(sizes == size) for size in np.unique(sizes)]
+    return [_AddendGroup(which, np.array([addends[int(k)] for k in which], np.int64)) for which in every]
+
+
+@dataclass(frozen=True)
+class _PursuitProblem:
+    """What is to be explained, and by which addends."""
+
+    unit: Array  # (n, M) columns of unit length
+    z: Array  # (n,)
+    free: int
+    addends: Sequence[tuple[int, ...]]
+    groups: Sequence[_AddendGroup]
+
+    def sums_from(self, k: int, refined: SumColumns) -> list[tuple[int, ...]]:
+        """The sum of one addend, of that and the best further one, and so on."""
+        sums = [self.addends[k]]
+        while len(sums[-1]) < _AT_MOST:
+            worth, gains, ranks, rest = self.score_addends(_basis(refined(sums[-1])))
+            # What it holds may have moved, and would seem to be wanted once more where it stood.
+            inside = set(sums[-1])
+            held = [inside.issuperset(own) for own in self.addends]
+            worth, ranks = np.where(held, -np.inf, worth), np.where(held, 0, ranks)
+            k = int(worth.argmax())
+            rank = int(ranks[k])
+            left = self.free - len(sums[-1]) - rank
+            if not rank or left < 1:
+                break
+            F = gains[k] / rank / max((rest - gains[k]) / left, 1e-300)
+            if f_tail(F, rank, left) > _CHANCE / len(self.addends):
+                break
+            # Addends may share a number: a spring stands alone and with how it stiffens.
+            sums.append(tuple(dict.fromkeys((*sums[-1], *self.addends[k]))))
+        return sums
+
+    def score_addends(self, basis: Array) -> tuple[Array, Array, Indices, float]:
+        """(G,) worth, gain and rank of every addend beside what lies in a basis (n, r), and the square that is left."""
+        unit, rest = self.unit - basis @ (basis.T @ self.unit), self.z - basis @ (basis.T @ self.z)
+        gains, ranks = _explained_squares(unit, rest, self.groups, len(self.addends))
+        return _information_criterion(gains, ranks, rest, self.free - basis.shape[1]), gains, ranks, float(rest @ rest)
+
+
+def _information_criterion(gains: Array, ranks: Indices, z: Array, free: int) -> Array:
+    """(G,) Bayesian information criterion of every addend, less that of none."""
+    shares = np.minimum(gains / max(float(z @ z), 1e-300), _WHOLE)
+    worth = -free * np.log1p(-shares) - np.log(max(free, 2)) * ranks
+    return np.asarray(np.where(ranks > 0, worth, -np.inf))
+
+
+def _explained_squares(unit: Array, z: Array, groups: Sequence[_AddendGroup], count: int) -> tuple[Array, Indices]:
+    """(G,) squares of z that every addend explains, and its rank; directions of which little is left do not count."""
+    gains, ranks, along = np.zeros(count), np.zeros(count, np.int64), unit.T @ z
+    for group in groups:
+        if group.columns.shape[1] == 1:
+            k = group.columns[:, 0]
+            squares = np.einsum("nk,nk->k", unit[:, k], unit[:, k])
+            told = squares > _INDEPENDENT_SHARE**2
+            gains[group.which] = np.where(told, along[k] ** 2 / np.maximum(squares, 1e-300), 0.0)
+            ranks[group.which] = told
+            continue
+        own = np.moveaxis(unit[:, group.columns], 0, 1)  # (g, n, k)
+        values, vectors = np.linalg.eigh(own.transpose(0, 2, 1) @ own)
+        told = values > _INDEPENDENT_SHARE**2
+        shares = np.einsum("gk,gkr->gr", along[group.columns], vectors) ** 2 / np.maximum(values, 1e-300)
+        gains[group.which], ranks[group.which] = np.where(told, shares, 0.0).sum(axis=1), told.sum(axis=1)
+    return gains, ranks
+
+
+def _basis(columns: Array) -> Array:
+    """(n, r) orthonormal."""
+    unit = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    U, left, _ = np.linalg.svd(unit, full_matrices=False)
+    return np.asarray(U[:, left > _INDEPENDENT_SHARE / 2])  # of a column of which so much is left beside another
+
+
+# Nonlinear parameters of a sum (places, widths, periods) moved to where they explain most, sizes projected out.
+#
+# Golub & Pereyra 1973, SIAM J. Numer. Anal. 10:413 (variable projection). A normal prior about where the search found
+# them keeps finite what the views do not tell.
+
+_MOST = 20  # steps
+# Of teeth, in the spreads of tooth and jump: a tenth of the tooth either way, and all places of the jump.
+_TEETH, _JUMPS = np.linspace(-2, 2, 13), np.linspace(-5, 5, 20, endpoint=False)
+
+
+def refine_parameters(ingredients: Sequence[Ingredient], half: HalfModel) -> tuple[Ingredient, ...]:
+    """The same ingredients, their quantities as some views want them."""
+    ingredients = _scan_teeth(ingredients, half)
+    tuned = [q for q in quantities_of(ingredients) if q.nonlinear]
+    count = sum(len(q.nonlinear) for q in tuned)
+    if not count:
+        return tuple(ingredients)
+    scatter = sum_residual(ingredients, half)
+    # Beside its sum what is left is scatter: of about one where the scatter was known.
+    scale = np.sqrt(float(scatter @ scatter) / max(half.free - len(ingredients) - count, 1))
+
+    def off(steps: Array) -> Array:
+        return np.append(sum_residual(_with_moved_parameters(ingredients, tuned, steps), half) / scale, steps)
+
+    found = least_squares(off, np.zeros(count), method="lm", max_nfev=_MOST * (count + 1))
+    return _with_moved_parameters(ingredients, tuned, found.x)
+
+
+def _scan_teeth(ingredients: Sequence[Ingredient], half: HalfModel) -> Sequence[Ingredient]:
+    """With teeth tried over a grid: where a view passes a jump no slope shows it."""
+    for q in quantities_of(ingredients):
+        if q.kind == "teeth":
+            tried = [_with_moved_parameters(ingredients, [q], np.array(steps)) for steps in product(_TEETH, _JUMPS)]
+            ingredients = min(tried, key=lambda own: float(np.sum(sum_residual(own, half) ** 2)))
+    return ingredients
+
+
+def round_parameters(ingredients: Sequence[Ingredient]) -> tuple[Ingredient, ...]:
+    """With nonlinear parameters that a person can read."""
+    return tuple(replace(i, quantity=i.quantity.rounded()) for i in ingredients)
+
+
+def quantities_of(ingredients: Sequence[Ingredient]) -> list[Quantity]:
+    """All different ones: the axes of a body follow one."""
+    return list({i.quantity.text: i.quantity for i in ingredients}.values())
+
+
+def _with_moved_parameters(
+    ingredients: Sequence[Ingredient], tuned: Sequence[Quantity], steps: Array
+) -> tuple[Ingredient, ...]:
+    ends = np.cumsum([len(q.nonlinear) for q in tuned])[:-1]
+    new = {q.text: q.moved(own) for q, own in zip(tuned, np.split(steps, ends), strict=True)}
+    return tuple(replace(i, quantity=new.get(i.quantity.text, i.quantity)) for i in ingredients)
+
+
+def sum_residual(ingredients: Sequence[Ingredient], half: HalfModel) -> Array:
+    """(n,) what a sum leaves, with the best sizes."""
+    columns = half.columns(ingredients)
+    return np.asarray(half.z - columns @ np.linalg.lstsq(columns, half.z, rcond=1e-9)[0])
+
 
 _FIRST, _TESTED = 8, 3  # addends with which a sum is begun; sums of some views, or of all, that are tested further
 _REPORTED_SUMS = 6  # sums, the likeliest

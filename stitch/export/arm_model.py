@@ -5,25 +5,22 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.effects.in_session import find_effect, missing_need
+from stitch.calibrate.robot import CalibratedRobot, beyond_sentence, calibrated_robot, robot_toml
+from stitch.effects.contract import find_effect, missing_need
 from stitch.errors import InputError
+from stitch.export.hand_eye_formats import xml_comment
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import build_capture
-from stitch.measurement.measurement import Measurement
+from stitch.measurement.measurement import PAYLOAD, Measurement, Torques, Views, no_torques, torques_of, views_of
 from stitch.measurement.robot import Robot
 from stitch.measurement.session import Session
-from stitch.measurement.torques import PAYLOAD, Torques, torques_of
-from stitch.measurement.views import Views, no_torques, views_of
-from stitch.model.arm import ARM_PLACES
-from stitch.model.bound import bind_to_session, convert_unit
-from stitch.model.effects_covariance import EffectsCovariance
 from stitch.model.forward import perturbed_frames
-from stitch.model.model_toml import ModelFile
-from stitch.model.term import Term
+from stitch.model.model import EffectsCovariance, Term
+from stitch.model.model_toml import ARM_PLACES, ModelFile, bind_to_session, convert_unit
 from stitch.reading.session_folder import load_session
-from stitch.stored.run_documents import read_result
-from stitch.stored.trusted_model import trusted_model
+from stitch.stored.stored_run import read_result, trusted_model
+from stitch.writing.urdf_file import to_urdf
 
 
 @dataclass(frozen=True)
@@ -130,3 +127,40 @@ def _arm_measurement(name: str, robot: Robot, T_base_flange: Array, views: Views
     """A measurement of the arm alone; what carries the scanner does not matter."""
     capture = build_capture(name, (), T_base_flange, "eye_in_hand")
     return Measurement(capture, T_base_flange, False, robot, views, (), length_unit)
+
+
+# The calibrated arm as DH rows and as URDF, with the effects that such tables can hold.
+
+
+def arm_dh(arm: ArmModel) -> str:
+    """The [robot] table of session.toml: DH rows in the session's length_unit and degrees.
+
+    Raises:
+        InputError: an arm that came as URDF has no DH rows.
+    """
+    found = calibrated_robot(arm.robot, arm.terms)
+    table = robot_toml(found.robot, ["The [robot] table of session.toml", *_comment_lines(found)])
+    if table is None:
+        raise InputError(f"the arm of session {arm.session} is stated as URDF and has no DH rows; use --to arm-urdf")
+    return table
+
+
+def arm_urdf(arm: ArmModel) -> str:
+    """URDF in m and rad: base_link, link_1 … link_n, flange."""
+    found = calibrated_robot(arm.robot, arm.terms)
+    declaration, chain = to_urdf(found.robot).split("\n", 1)
+    return f"{declaration}\n{xml_comment([f'The arm of session {arm.session}', *_comment_lines(found)])}{chain}\n"
+
+
+def _comment_lines(calibrated: CalibratedRobot) -> list[str]:
+    """What is in it, what is not, and which command fits a table that stands alone."""
+    told = ["with the joint offsets and link errors that the model of the run has.", beyond_sentence(calibrated)]
+    if not calibrated.beyond:
+        return told
+    return [
+        *told,
+        "Without it this may leave more than the nominal arm; stitch calibrate robot fits a table for itself.",
+    ]
+
+
+ARM_FORMATS = {"arm-dh": arm_dh, "arm-urdf": arm_urdf}

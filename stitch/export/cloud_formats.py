@@ -18,7 +18,7 @@ from pykdtree.kdtree import KDTree
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.model.model_toml import read_model
-from stitch.reading.text_file import shortened
+from stitch.reading.text_files import shortened
 from stitch.runs.run import FusedCloud
 from stitch.stored.stored_run import fused_cloud
 from stitch.units import METRES

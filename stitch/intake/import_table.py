@@ -6,18 +6,22 @@ from pathlib import Path
 import numpy as np
 
 from stitch import frames
-from stitch.controllers import tracker_csv, universal
-from stitch.controllers.imported_rows import POSE_COLUMNS, csv_text, numbered_names, pose_cells
-from stitch.controllers.importer import ImportedTable
+from stitch.controllers import tracker_csv, universal_robots
+from stitch.controllers.program import POSE_COLUMNS, ImportedTable, csv_text, numbered_names, pose_cells
 from stitch.errors import InputError
-from stitch.intake.covariates import covariate_columns
-from stitch.intake.layouts import ColumnLayout, possible_layouts
-from stitch.intake.number_table import read_number_table
-from stitch.intake.plausible_units import POSE_UNITS, pose_units
-from stitch.intake.program_poses import PROGRAMS
-from stitch.intake.raw_poses import STRUCTURED, RawPoses, read_raw_poses
-from stitch.intake.readings import Reading, angle_units, readings
-from stitch.intake.stated import StatedTable
+from stitch.intake.first_session import StatedTable
+from stitch.intake.layouts import (
+    POSE_UNITS,
+    ColumnLayout,
+    Reading,
+    angle_units,
+    covariate_columns,
+    pose_units,
+    possible_layouts,
+    readings,
+)
+from stitch.intake.pose_tables import read_number_table
+from stitch.intake.raw_poses import PROGRAMS, STRUCTURED, RawPoses, read_raw_poses
 from stitch.reading.clouds import CLOUD_SUFFIXES
 from stitch.units import METRES
 
@@ -37,7 +41,7 @@ def is_table_of_poses(file: Path) -> bool:
         return True
     told = file.read_text(encoding="utf-8-sig", errors="replace")
     names, _ = tracker_csv.split_header(told)
-    return not universal.is_recording(told) and not all(axis in names for axis in "xyz")
+    return not universal_robots.is_recording(told) and not all(axis in names for axis in "xyz")
 
 
 def import_table(file: Path, unit: str, stated: StatedTable) -> ImportedTable:

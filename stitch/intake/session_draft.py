@@ -11,16 +11,12 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.covariates import covariate_columns
 from stitch.intake.first_session import FirstSession
-from stitch.intake.guesses import Guess
-from stitch.intake.joint_poses import JOINT_ANGLES
-from stitch.intake.plausible_units import POSE_UNITS
-from stitch.intake.targets_in_scans import points_columns
-from stitch.intake.urdf_links import arm_from_urdf
-from stitch.intake.ways import MM
-from stitch.reading.session_toml import SESSION_FORMAT
-from stitch.system.whole_file import whole_file
+from stitch.intake.folder_files import MM, Guess
+from stitch.intake.layouts import JOINT_ANGLES, POSE_UNITS, arm_from_urdf, covariate_columns
+from stitch.intake.scan_targets import points_columns
+from stitch.reading.session_folder import SESSION_FORMAT
+from stitch.system.files import whole_file
 from stitch.units import METRES
 from stitch.writing.session_files import pose_columns, write_table
 

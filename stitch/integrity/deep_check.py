@@ -1,40 +1,180 @@
 """`stitch check --deep`: everything that people do wrong with a session, tried out; no run is made."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 
-from stitch.errors import NoResultError
+import numpy as np
+
+from stitch import frames
+from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
-from stitch.integrity.arm_limits import (
-    apply_displacement_limits,
-    contradiction_in_words,
-    displacement_in_words,
-    poses_contradict_scans,
+from stitch.integrity.conventions import (
+    MotionFit,
+    hypotheses_by_surface,
+    likeliest_hypotheses,
+    proven_hypotheses,
+    rank_hypotheses,
+    register_scan_pairs,
 )
-from stitch.integrity.background import background_problems
-from stitch.integrity.conventions import likeliest_hypotheses, proven_hypotheses, rank_hypotheses
 from stitch.integrity.hypotheses import Hypothesis
-from stitch.integrity.linkage import names_of_views
-from stitch.integrity.motion_fit import MotionFit
 from stitch.integrity.pairing import explain_misplaced
-from stitch.integrity.problems import SessionProblem
-from stitch.integrity.relative_scans import register_scan_pairs
-from stitch.integrity.robot_lengths import length_problem
+from stitch.integrity.placement import names_of_views
+from stitch.integrity.pose_tests import length_problem
+from stitch.integrity.problems import SessionProblem, displacement_text, list_views
+from stitch.integrity.scan_faults import find_occluder, find_static_background
 from stitch.integrity.snooping import MisplacedView, Snooping, snoop_views
-from stitch.integrity.surface_verdict import hypotheses_by_surface
-from stitch.integrity.target_faults import target_problems
-from stitch.integrity.targets import check_targets
-from stitch.integrity.usual_effects import UsualEffects
-from stitch.measurement.capture import Capture, part_size
+from stitch.integrity.target_checks import check_targets, target_problems
+from stitch.integrity.view_model import UsualEffects
+from stitch.measurement.capture import Capture, part_size, sightings_of, thin_session
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Session
-from stitch.measurement.sightings import sightings_of
-from stitch.measurement.thinning import thin_session
 from stitch.model.model import Model
-from stitch.observations.surfaces.free_poses import unconstrained_poses
-from stitch.observations.targets.mislabelled import drop_mislabelled
-from stitch.stages.coarse import find_coarse_hand_eye
-from stitch.stages.correct import icp_hand_eye
+from stitch.observations.pose_errors import usual_twist
+from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
+from stitch.observations.surfaces.view_poses import unconstrained_poses
+from stitch.observations.targets.outliers import drop_mislabelled
+from stitch.runs.run import ExcludedView
+from stitch.stages.correct import Correction, icp_hand_eye
+from stitch.stages.initial_guess import find_coarse_hand_eye
+from stitch.statistics.distributions import chi2_limit, chi2_tail
+from stitch.units import METRES, angle_text, length_text
+
+# What no arm does: scatter, and displacements of single views, beyond which poses and scans contradict each other.
+
+# No arm scatters by more.
+_ROTATION, _TRANSLATION_M = 0.010, 0.005
+# No effect of an arm is believed to displace a single view by more than half of that.
+_VIEW_ROTATION, _VIEW_M = 0.005, 0.0025
+
+
+def apply_displacement_limits(session: Session, found: Snooping) -> Snooping:
+    """Suspected views that are surely off by more than what effects of an arm are believed to do are misplaced."""
+
+    def too_far(m: MisplacedView) -> bool:
+        rotation, distance = m.at_least
+        return rotation > _VIEW_ROTATION or distance * METRES[session.length_unit] > _VIEW_M
+
+    return found.with_misplaced(too_far)
+
+
+def poses_contradict_scans(session: Session, found: Snooping) -> bool:
+    """True if the poses contradict the scans beyond what any arm does."""
+    lost = len(found.not_belonging) > len(session.views) / 2
+    return lost or beyond_any_arm(session, found.rotation, found.translation)
+
+
+def scatter_is_doubtful(session: Session, found: Snooping) -> bool:
+    """True if all poses together scatter by what no arm is believed to do to a single view."""
+    return found.rotation > _VIEW_ROTATION or found.translation * METRES[session.length_unit] > _VIEW_M
+
+
+def beyond_any_arm(session: Session, rotation: float, translation: float) -> bool:
+    """True if a rotation (rad) or a translation (length_unit) is larger than what any arm does."""
+    return rotation > _ROTATION or translation > _TRANSLATION_M / METRES[session.length_unit]
+
+
+def displacement_in_words(session: Session, found: MisplacedView) -> str:
+    """How far a suspected view stands off, in words."""
+    amount = displacement_text(found.at_least, found.at_least, session.length_unit)
+    return f"stands off by at least {amount}" if amount else "stands out, by how much its surface does not tell"
+
+
+def contradiction_in_words(session: Session, found: Snooping) -> str:
+    """By how much the poses contradict the scans, in words."""
+    return f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
+
+
+# What the scans show beside the part: what stands still before the scanner, and what only one of them shows.
+
+
+def background_problems(session: Session, own: Capture, T_mount: Array, found: Snooping) -> list[SessionProblem]:
+    """One problem for each, with the views that show it.
+
+    Args:
+        T_mount: (4, 4) hand-eye under which `found` was made.
+    """
+    out, size, names = list[SessionProblem](), part_size([own]), session.names
+    still = find_static_background(own.scans, own.poses(T_mount), found.tolerance, size)
+    if still is not None:
+        out.append(
+            SessionProblem("foreign", tuple(names_of_views(still.views, names)), still.describe(session.length_unit))
+        )
+    if out or found.left_out or found.steps:
+        # What stands still stands elsewhere on the part in every view, and so does the part itself where a view is off;
+        # without that view it is asked again.
+        return out
+    stray = find_occluder(own.scans, found.unconstrained.poses, size)
+    if stray is not None:
+        out.append(SessionProblem("foreign", tuple(names_of_views(stray.views, names)), stray.describe(names)))
+    return out
+
+
+# Three views, which show no more than two motions: whether their poses agree as poses of arms do.
+#
+# A scan that is off gives another hand-eye there, and a scatter that effects of an arm may cause too: three views do
+# not
+# tell whose fault it is, but that something is wrong.
+
+_VIEWS = 3
+# That poses which repeat as those of arms do are said to disagree.
+_THREE_VIEWS_CHANCE = 1e-4
+
+
+def check_three_views(session: Session, found: Snooping) -> str | None:
+    """What to say of three views whose poses disagree by more than arms repeat; None where they do not."""
+    rotation, translation = usual_twist(session.length_unit)[[0, 3]]
+    if len(session.views) != _VIEWS or _global_model_test(found, np.array([rotation**2, translation**2, 1.0])):
+        return None
+    unit = session.length_unit
+    by = f"{length_text(found.translation, unit, 2)} and {angle_text(found.rotation, 2)}"
+    usual = f"{length_text(translation, unit, 2)} and {angle_text(rotation, 2)}"
+    return (
+        f"Three poses contradict their scans by {by}, where arms repeat to about {usual}: a scan or a row is off, or "
+        "the arm errs, and three views do not tell which. Add views before you believe hand-eye or stitched cloud."
+    )
+
+
+def _global_model_test(found: Snooping, variances: Array) -> bool:
+    """The test of the model as a whole (Baarda 1968): the scatter is known and not taken from the same data."""
+    mixed = found.model.mixed()
+    C, A, z = mixed.covariance(variances)[0], mixed.A[0], mixed.z[0]
+    CA, Cz = np.linalg.solve(C, A), np.linalg.solve(C, z)
+    statistic = z @ Cz - Cz @ A @ np.linalg.solve(A.T @ CA, A.T @ Cz)
+    return chi2_tail(float(statistic), len(z) - A.shape[1]) > _THREE_VIEWS_CHANCE
+
+
+# What is said of a session as a whole before its verdict, though it runs.
+
+_LISTED = 3
+
+
+def snooping_warnings(session: Session, own: Capture, found: Snooping, T_mount: Array) -> tuple[str, ...]:
+    """What is no part, steps, and poses that contradict the scans as no arm of use does.
+
+    Args:
+        T_mount: (4, 4) hand-eye under which `found` was made.
+    """
+    names = session.names
+    beside = (problem.fix for problem in background_problems(session, own, T_mount, found))
+    said = (*beside, *(step.describe(names, session.length_unit) for step in found.steps))
+    if not scatter_is_doubtful(session, found):
+        few = check_three_views(session, found)
+        return said if few is None else (few, *said)
+    twists = frames.log(found.unconstrained.poses @ frames.inverse(own.poses(T_mount)))
+    middles = np.array([points.mean(axis=0) for points in own.visible_points])
+    moved = np.linalg.norm(
+        twists[:, 3:] + np.cross(twists[:, :3], frames.transform(own.poses(T_mount), middles[:, None])[:, 0]), axis=1
+    )
+    worst = [v for v in np.argsort(-moved) if v not in found.left_out][:_LISTED]
+    farthest = ", ".join(f"{names[v]} ({moved[v]:.3g} {session.length_unit})" for v in worst)
+    return (
+        f"No arm scatters by {contradiction_in_words(session, found)}: several rows or scans are wrong, and the "
+        "views hold "
+        f"together by their surfaces alone; hand-eye and pose errors mean little. Look first at {farthest}.",
+        *said,
+    )
+
 
 # Enough points a view to judge millimetres.
 _POINTS = 8000
@@ -157,7 +297,10 @@ def _hypothesis_problem(session: Session, best: Hypothesis, fixes: Sequence[str]
 
 
 def _suspected_problem(session: Session, found: MisplacedView) -> SessionProblem:
-    fix = f"{displacement_in_words(session, found)}, as effects of an arm may do too: run and diagnose, and look at this scan"
+    fix = (
+        f"{displacement_in_words(session, found)}, as effects of an arm may do too: run and diagnose, and look at "
+        "this scan"
+    )
     return SessionProblem("displaced", (session.views[found.view].name,), fix, certain=False)
 
 
@@ -168,3 +311,125 @@ def _unexplained_problem(session: Session, found: Snooping) -> SessionProblem:
         "clouds belong together and how the poses were converted"
     )
     return SessionProblem("displaced", tuple(session.names), fix)
+
+
+# Sessions that no run may use: poses that contradict the scans, another mount's model, too few views that belong.
+
+# A hand-eye that differs by chance alone is refused once in a million.
+_OWN_MODEL_CHANCE = 1e-6
+# Views that show two motions, the fewest that a hand-eye follows from.
+_MOTIONS = 3
+# From this share of the views on, a mistake of the whole session is looked for; a part that was clamped anew, or scans
+# that changed places, leave many views out and a good rest.
+_MAX_EXCLUDED_SHARE = 1 / 3
+_SINGLE_VIEW_KINDS = ("displaced", "disconnected", "foreign", "duplicate_scan", "duplicate_pose")
+_KINDS_LEAVING_A_REST = ("reclamped", "exchanged")
+
+
+def refuse(session: Session, problems: Sequence[SessionProblem]) -> None:
+    """Raise what a deep check found; nothing where it found nothing certain."""
+    for problem in (p for p in problems if p.certain):
+        kind = NoResultError if problem.kind in ("displaced", "disconnected") else InputError
+        raise kind(f"{session.path}: the poses contradict what was measured: {problem.line(session.names)}")
+
+
+def refuse_whole(session: Session) -> list[SessionProblem]:
+    """Refuse a mistake of the whole session, such as a wrong order of angles.
+
+    Returns:
+        What else a deep check found.
+
+    Raises:
+        InputError: there is one.
+    """
+    found = deep_check(session)
+    refuse(session, [p for p in found if p.kind not in (*_SINGLE_VIEW_KINDS, *_KINDS_LEAVING_A_REST)])
+    return found
+
+
+@contextmanager
+def refuse_explained_mistake(session: Session) -> Iterator[None]:
+    """Where views do not overlap, refuse the mistake of the whole session that explains it, if there is one.
+
+    Raises:
+        InputError: there is one.
+        NoResultError: as it was raised inside.
+    """
+    try:
+        yield
+    except NoResultError:
+        # That nothing overlaps under any hand-eye says no more than what was said already.
+        with suppress(NoResultError):
+            refuse_whole(session)
+        raise
+
+
+def require_majority(session: Session, left_out: Sequence[ExcludedView]) -> None:
+    """Refuse a session of which so many views do not belong that the rest cannot say which of them are wrong.
+
+    Args:
+        session: with all its views.
+
+    Raises:
+        InputError: a usual mistake explains it.
+        NoResultError: none does, and half of the views or more do not belong.
+    """
+    if len(left_out) < _MAX_EXCLUDED_SHARE * len(session.views):
+        return
+    found = refuse_whole(session)
+    if 2 * len(left_out) >= len(session.views) and not any(p.kind in _KINDS_LEAVING_A_REST for p in found):
+        gone = {item.view for item in left_out}
+        names = list_views([name for name in session.names if name in gone], session.names)
+        raise NoResultError(
+            f"{session.path}: {len(left_out)} of {len(session.views)} views ({names}) do not belong to the others, and "
+            "which half is right nobody can say; to fix: check that rows and clouds belong together and how the poses "
+            "were converted"
+        )
+
+
+def require_own_model(session: Session, correction: Correction, index: int) -> None:
+    """Refuse a model whose hand-eye is off by more than any arm moves it, as these scans clearly show."""
+    own, T_mount = correction.captures[index], correction.model.T_mount
+    fitted = fit_hand_eye([own], [correction.unconstrained[index]], T_mount)
+    turn, shift = _hand_eye_difference(own, T_mount, fitted.T_mount)
+    if not beyond_any_arm(session, turn, shift):
+        return
+    # Views freed from far off are only on their way, and what they lack would count as scatter: once more from there.
+    freed = unconstrained_poses(own, own.poses(fitted.T_mount), correction.overlaps[index].gate)
+    fitted = fit_hand_eye([own], [freed], fitted.T_mount)
+    turn, shift = _hand_eye_difference(own, T_mount, fitted.T_mount)
+    xi = frames.log(frames.inverse(T_mount) @ fitted.T_mount)
+    clear = xi @ np.linalg.solve(fitted.covariance + correction.model.covariance, xi) > chi2_limit(_OWN_MODEL_CHANCE, 6)
+    if clear and beyond_any_arm(session, turn, shift):
+        raise NoResultError(
+            f"{session.path}: the model's hand-eye is {shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad off "
+            "what these scans say: it belongs to another mount, scanner or unit; to fix: run without --hand-eye"
+        )
+
+
+def require_two_motions(session: Session) -> None:
+    """Refuse two views from which no hand-eye was found: one motion leaves two directions of it open.
+
+    Raises:
+        NoResultError: there are no more.
+    """
+    if len(session.views) < _MOTIONS:
+        raise NoResultError(
+            f"{session.path}: two views show one motion, and no hand-eye was found from it that brings them together; "
+            "to fix: add views turned about another axis, or take the hand-eye of another run (--hand-eye RUN)"
+        )
+
+
+def unexplained_error(session: Session, found: Snooping) -> NoResultError:
+    off = contradiction_in_words(session, found)
+    return NoResultError(
+        f"{session.path}: the poses contradict the scans by {off}, more than any arm, and no usual mistake explains "
+        "it; to fix: check that rows and clouds belong together and how the poses were converted"
+    )
+
+
+def _hand_eye_difference(own: Capture, T_mount: Array, other: Array) -> tuple[float, float]:
+    """Angle (rad) between two hand-eyes, and how far they put the part from each other."""
+    xi = frames.log(frames.inverse(T_mount) @ other)
+    middle = np.mean([scan.points.mean(axis=0) for scan in own.scans], axis=0)
+    return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle)))

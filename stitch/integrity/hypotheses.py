@@ -3,19 +3,117 @@
 Poses that are right after one of these changes, and only then, say which mistake was made.
 """
 
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, permutations, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.integrity.misread_positions import other_columns, other_units
-from stitch.integrity.misread_rotations import degrees_for_radians, other_angles, other_quaternions
 from stitch.measurement.robot import forward
 from stitch.measurement.session import Mount, Session
+
+# Positions whose columns were read in another way than they were written, undone.
+
+_AXES = "xyz"
+
+
+def other_columns(position: Array) -> Iterator[tuple[str, Array]]:
+    """Positions (V, 3) with their columns in other places, then one or two with the other sign, and what that undoes.
+
+    All three with the other sign are a left-handed frame, of poses or of scans.
+    """
+    for order in permutations(range(3)):
+        if order != (0, 1, 2):
+            named = ", ".join(_AXES[i] for i in np.argsort(order))
+            yield f"the columns of the positions are {named}, not x, y, z", position[:, order]
+    for signs in product((1.0, -1.0), repeat=3):
+        wrong = [axis for axis, sign in zip(_AXES, signs, strict=True) if sign < 0]
+        if len(wrong) in (1, 2):
+            have = "has" if len(wrong) == 1 else "have"
+            yield f"{' and '.join(wrong)} of the positions {have} the wrong sign", position * signs
+
+
+def other_units(position: Array, units: Mapping[float, str]) -> Iterator[tuple[str, Array]]:
+    """Positions (V, 3) of which one column is in another unit than the rest, and what that undoes.
+
+    Args:
+        units: factors by which lengths may be too large, and how that comes about.
+    """
+    for column, axis in enumerate(_AXES):
+        for factor, words in units.items():
+            right = np.array(position)
+            right[:, column] /= factor
+            yield f"{axis} of the positions alone is in {words}: convert this column", right
+
+
+# Rotations that were read in another way than they were written, undone.
+#
+# Orders of Euler angles are those of Diebel (2006), "Representing Attitude": six with three axes, six with two.
+
+ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "XYX", "XZX", "YXY", "YZY", "ZXZ", "ZYZ")
+
+
+def other_quaternions(q: Array) -> Iterator[tuple[str, Rotation]]:
+    """Readings (V, 4) x, y, z, w taken for another order."""
+    yield "w, x, y, z, not x, y, z, w", Rotation.from_quat(q[:, [1, 2, 3, 0]])
+    yield "x, y, z, w but were reordered as if w came first", Rotation.from_quat(q[:, [3, 0, 1, 2]])
+
+
+def other_angles(R: Rotation) -> Iterator[tuple[str, Rotation]]:
+    """Angles that were composed in one order and belong into another; columns by place, and by the axis they name."""
+    for order in (*ORDERS, *(o.lower() for o in ORDERS)):
+        angles = _angles(R, order)
+        for right in (*ORDERS, *(o.lower() for o in ORDERS)):
+            if right != order:
+                yield _order_fix(order, right), Rotation.from_euler(right, angles)
+        if len(set(order.upper())) == 3:
+            for right in ORDERS[:6]:
+                if right != order:
+                    named = np.column_stack([angles[:, order.upper().index(axis)] for axis in right])
+                    yield _order_fix(order, right), Rotation.from_euler(right, named)
+        yield "the angles are a rotation vector, not Euler angles", Rotation.from_rotvec(_shortest(angles))
+    for right in (*ORDERS, *(o.lower() for o in ORDERS)):
+        yield (
+            f"the rotation vectors are Euler angles in the order {_order_name(right)}",
+            Rotation.from_euler(right, R.as_rotvec()),
+        )
+
+
+def _order_fix(order: str, right: str) -> str:
+    return f"the Euler angles were turned in the order {_order_name(order)} and belong into {_order_name(right)}"
+
+
+def _order_name(order: str) -> str:
+    """Capitals turn about the axes that turned already (intrinsic)."""
+    return f"{order.lower()}-{'intrinsic' if order.isupper() else 'extrinsic'}"
+
+
+def degrees_for_radians(R: Rotation) -> Iterator[tuple[str, Rotation]]:
+    """Angles in radians that were taken for degrees."""
+    words = "the angles are radians, and were read as degrees"
+    yield words, Rotation.from_rotvec(R.as_rotvec() * 180 / np.pi)
+    for order in ORDERS:
+        yield f"{words} ({_order_name(order)})", Rotation.from_euler(order, _angles(R, order) * 180 / np.pi)
+
+
+def _angles(R: Rotation, order: str) -> Array:
+    with warnings.catch_warnings():
+        # Gimbal lock sets an angle to zero: that reading is one of those to try.
+        warnings.simplefilter("ignore")
+        return np.asarray(R.as_euler(order))
+
+
+def _shortest(angles: Array) -> Array:
+    """Of the two triples of angles about three axes that make one rotation, the shorter: vectors are at most π long."""
+    other = np.stack([angles[:, 0] - np.pi, np.pi - angles[:, 1], angles[:, 2] - np.pi], axis=1)
+    other = (other + np.pi) % (2 * np.pi) - np.pi
+    shorter = np.linalg.norm(other, axis=1) < np.linalg.norm(angles, axis=1)
+    return np.where(shorter[:, None], other, angles)
+
 
 # Factors by which lengths are too large when units are mixed up, and how that comes about.
 UNITS = {
@@ -105,7 +203,8 @@ def _session_mistakes(session: Session, T: Array) -> Iterator[Hypothesis]:
 
 def _mount_or_inverse(mount: Mount) -> str:
     return (
-        f'the poses are T_flange_base: invert them; if they are not, set mount = "{_OTHER_MOUNT[mount]}" in session.toml '
+        f'the poses are T_flange_base: invert them; if they are not, set mount = "{_OTHER_MOUNT[mount]}" in '
+        "session.toml "
         "(these scans cannot tell the two apart, the size of the hand-eye can)"
     )
 

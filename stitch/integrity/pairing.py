@@ -1,20 +1,182 @@
 """Views that do not belong, explained: exchanged rows, a neighbour's joints, a copy, a wrong digit, another part."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from stitch import frames
 from stitch.frames import Array
-from stitch.integrity.amounts import displacement_text
-from stitch.integrity.common_step import find_common_displacement
-from stitch.integrity.linkage import names_of_views
-from stitch.integrity.one_joint import find_wrong_joint
-from stitch.integrity.other_rows import exchange_cycles, exchanged_pairs, find_fitting_rows
-from stitch.integrity.placing import shows_no_surface, surface_of
-from stitch.integrity.problems import SessionProblem
+from stitch.integrity.placement import (
+    CLOSE_SHARE,
+    FEW_SHARED,
+    ReferenceSurface,
+    names_of_views,
+    place_scan,
+    shows_no_surface,
+    surface_of,
+)
+from stitch.integrity.problems import SessionProblem, displacement_text, list_views
 from stitch.integrity.scan_faults import ScanFault, find_copies, find_same_poses, scale_fault, scan_fault
-from stitch.integrity.snooping import MisplacedView, Snooping
-from stitch.integrity.view_names import list_views
+from stitch.integrity.snooping import MisplacedView, Snooping, end_runs
 from stitch.measurement.capture import Capture, part_size
+from stitch.measurement.robot import forward
 from stitch.measurement.session import Session
+
+# Misplaced views that stand off by one and the same displacement: the part was clamped anew, or the scanner moved.
+
+# So many views make a step, and this share of those on its side; displacements agree within this share of their size.
+_FEWEST, _SHARE, _AGREES = 3, 0.7, 0.2
+
+
+def find_common_displacement(
+    capture: Capture, poses: Array, misplaced: Sequence[MisplacedView]
+) -> tuple[range, str] | None:
+    """The views at one end of the list that stand off alike, with what moved: part or scanner; None if none do.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner of the model.
+    """
+    placed = {m.view: m.T for m in misplaced if m.T is not None}
+    runs = end_runs({m.view for m in misplaced}, len(poses))
+    for views in (run for run in runs if len(run) >= _FEWEST):
+        for what in ("part", "scanner"):
+            if _count_sharing_displacement(
+                capture, poses, {v: placed[v] for v in views if v in placed}, what
+            ) >= _SHARE * len(views):
+                return views, what
+    return None
+
+
+def _count_sharing_displacement(capture: Capture, poses: Array, placed: Mapping[int, Array], what: str) -> int:
+    """How many views at most share one displacement: a left twist if the part moved, a right one if the scanner did."""
+    best = 0
+    for v, T in placed.items():
+        back = frames.inverse(poses[v])
+        alike = 0
+        for w, there in placed.items():
+            expected = T @ back @ poses[w] if what == "part" else poses[w] @ back @ T
+            points = capture.scans[w].points[::50]
+            stated, fitted, shared = (frames.transform(pose, points) for pose in (poses[w], there, expected))
+            alike += bool(np.linalg.norm(shared - fitted) < _AGREES * np.linalg.norm(fitted - stated))
+        best = max(best, alike)
+    return best if best >= _FEWEST else 0
+
+
+# Which joint angle, corrected, puts a displaced view where the surfaces want it: a wrong digit, a neighbour's row.
+
+# One joint explains a displacement if it leaves less than this share of it.
+_MAX_REMAINING_SHARE = 0.1
+
+
+def find_wrong_joint(
+    session: Session, capture: Capture, T_mount: Array, m: MisplacedView
+) -> tuple[str, float, float, bool] | None:
+    """The joint that alone explains a displacement: name, degrees stated and that fit, whether a neighbour's."""
+    robot, joints = session.robot, session.views[m.view].joints
+    if robot is None or joints is None or m.T is None:
+        return None
+    points = capture.scans[m.view].points[::50]
+    there = frames.transform(m.T, points)
+
+    def off(q: Array) -> float:
+        T = forward(robot, q)
+        T = frames.inverse(T) if session.mount == "eye_to_hand" else T
+        return float(np.sqrt(((frames.transform(T @ T_mount, points) - there) ** 2).sum(axis=1).mean()))
+
+    start = off(joints)
+    best: tuple[float, int, float] = (np.inf, 0, 0.0)
+    for j in range(len(joints)):
+        unit = np.eye(len(joints))[j]
+        grid = np.linspace(-np.pi, np.pi, 181)
+        near = grid[int(np.argmin([off(joints + a * unit) for a in grid]))]
+        for a in (near, 0.0):
+            fit = minimize_scalar(lambda x, u=unit: off(joints + x * u), bracket=(a - 0.02, a + 0.02))
+            best = min(best, (float(fit.fun), j, float(fit.x)))
+    left, j, turn = best
+    if left > _MAX_REMAINING_SHARE * start:
+        return None
+    fits = joints[j] + turn
+    others = [session.views[r].joints for r in (m.view - 1, m.view + 1) if 0 <= r < len(session.views)]
+    neighbour = any(q is not None and abs(q[j] - joints[j]) < 1e-9 for q in others)
+    return f"j{j + 1}_deg", float(np.degrees(joints[j])), float(np.degrees(fits)), neighbour
+
+
+# Scans that stand in the rows of others: which row's pose each of those that do not belong would fit.
+
+# A scan belongs to another row's pose if it lies this much closer to that than to its own, and this close absolutely
+# (`CLOSE_SHARE` of the part's size).
+_CLOSER_SHARE = 0.2
+
+
+def find_fitting_rows(capture: Capture, found: Snooping, misplaced: Sequence[MisplacedView]) -> dict[int, int | None]:
+    """Of every misplaced scan that fits the part the row to whose pose it belongs, None for no other row's."""
+    some = [m for m in misplaced if m.T is not None]
+    rows = {m.view: _nearest_row(capture, found.expected, m.view, m.T) for m in some if m.T is not None}
+    open_ones = [view for view, row in rows.items() if row is None]
+    if not open_ones or len(misplaced) < 2:
+        return rows
+    # Where scans slide along the part, each came to rest somewhere else than in the row where it would fit as well.
+    core = [v for v in found.linkage.core if v not in found.not_belonging]
+    surface = surface_of(capture.scans, found.unconstrained.poses, core, found.tolerance)
+    every = [m.view for m in misplaced]
+    return rows | {v: _row_where_it_fits(capture, found, surface, v, every) for v in open_ones}
+
+
+def exchanged_pairs(rows: dict[int, int | None], misplaced: Sequence[MisplacedView]) -> list[tuple[int, int]]:
+    """Pairs of views of which the first one's scan fits the second one's pose, and the second's shows too little.
+
+    Args:
+        rows: of `rows_of`, less those of closed rounds.
+    """
+    silent = {m.view for m in misplaced if rows.get(m.view) is None} & set(rows.values())
+    claimed = {row: [v for v, other in rows.items() if other == row] for row in silent}
+    return [(views[0], row) for row, views in claimed.items() if len(views) == 1 and views[0] not in rows.values()]
+
+
+def exchange_cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:
+    """Closed rounds of scans that stand in each other's rows."""
+    out, seen = [], set[int]()
+    for start in sorted(rows):
+        path, at = [start], rows[start]
+        while at is not None and at not in path and at not in seen:
+            path.append(at)
+            at = rows.get(at)
+        if at == start and len(path) > 1:
+            out.append(tuple(path))
+            seen |= set(path)
+    return out
+
+
+def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | None:
+    """The row to whose pose a scan that was placed belongs, if to another one."""
+    off = _pose_distances(capture, view, T, poses)
+    best = int(np.argmin(off))
+    close = off[best] < max(CLOSE_SHARE * part_size([capture]), 1e-12) and off[best] < _CLOSER_SHARE * off[view]
+    return best if close and best != view else None
+
+
+def _row_where_it_fits(
+    capture: Capture, found: Snooping, surface: ReferenceSurface, view: int, rows: Sequence[int]
+) -> int | None:
+    """Of some rows that in which a scan, moved least, fits the others, if not in its own."""
+    near, moved = CLOSE_SHARE * part_size([capture]), dict[int, float]()
+    for row in rows:
+        T = found.expected[row]
+        best = place_scan(capture.scans[view], surface, T[None], near)[0]
+        away = float(_pose_distances(capture, view, best.T, T[None])[0])
+        if best.closure > found.needed and best.near > FEW_SHARED and away < near:
+            moved[row] = away
+    best_row = min(moved, key=lambda row: moved[row], default=view)
+    return best_row if view not in moved and best_row != view else None
+
+
+def _pose_distances(capture: Capture, view: int, T: Array, poses: Array) -> Array:
+    """(P,) rms distance between the points of a scan at one pose (4, 4) and at others (P, 4, 4)."""
+    points = capture.scans[view].points[::50]
+    there = frames.transform(T, points)
+    return np.asarray(np.sqrt(((frames.transform(poses, points) - there) ** 2).sum(axis=2).mean(axis=1)))
+
 
 _TORN = (
     "a part of this scan contradicts the other scans wherever it is put: the part or the scanner moved meanwhile, or "

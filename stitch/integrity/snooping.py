@@ -5,7 +5,7 @@ closes, its pose is wrong and it is known by how much; where it closes nowhere, 
 view in its place, each one's own displacement is tested under the scatter of the others.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -13,19 +13,179 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.integrity.across_steps import place_across_steps
-from stitch.integrity.blunders import BlunderSearch, find_blunders
-from stitch.integrity.expected_poses import expected_poses
-from stitch.integrity.homes import PlacedViews, place_views
-from stitch.integrity.least_displacement import least_displacement
-from stitch.integrity.linkage import Linkage
-from stitch.integrity.placing import evaluate_placement, place_scan, surface_of
-from stitch.integrity.pose_tests import PoseTests, pose_tests
-from stitch.integrity.step import PoseStep
-from stitch.integrity.usual_effects import UsualEffects
-from stitch.integrity.view_model import ViewModel, view_model
+from stitch.integrity.placement import (
+    STILL_CONTRADICTS,
+    Linkage,
+    Placement,
+    evaluate_placement,
+    find_contradicting_views,
+    lies_in_a_line,
+    linkage,
+    needed_closure,
+    place_scan,
+    place_unlinked_views,
+    surface_of,
+)
+from stitch.integrity.pose_tests import (
+    BlunderSearch,
+    PoseStep,
+    PoseTests,
+    expected_poses,
+    find_blunders,
+    least_displacement,
+    pose_tests,
+)
+from stitch.integrity.view_model import UsualEffects, ViewModel, view_model
 from stitch.measurement.capture import Capture, part_size
-from stitch.observations.surfaces.free_poses import UnconstrainedPoses, unconstrained_poses
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
+
+# Views that nothing links because a step stands between them and the others: the linked ones tell it.
+#
+# A step pulls the hand-eye, and the side of it that has fewer views stands farther from the others than what two scans
+# share reaches. Tried wide, such a view would close somewhere on a part that looks alike from several sides, and would
+# be
+# called displaced. One step explains more than that: the views are tried from where it puts them first. The likeliest
+# step is tried whether it stands out among the few views that are linked or not: that it links more of them is the
+# proof.
+
+# Chance at which a step is tried.
+_ANY_CHANCE = 1.0
+
+
+def place_across_steps(
+    capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, usual: UsualEffects | None
+) -> tuple[Array, UnconstrainedPoses]:
+    """Where views are expected, and where overlaps put them: beside a step, if that links more of them.
+
+    Args:
+        T_mount: (4, 4) hand-eye of the model poses from which `unconstrained` is seen.
+
+    Returns:
+        (V, 4, 4) T_reference_scanner, those of the model without a step; and the views freed, seen from these.
+    """
+    model_poses, apart = capture.poses(T_mount), list(linkage(unconstrained.overlaps).unlinked)
+    if not apart:
+        return model_poses, unconstrained
+    model = view_model(capture, T_mount, unconstrained)
+    tests = pose_tests(model, unconstrained, (apart, []), usual, _ANY_CHANCE)
+    if not tests.steps:
+        return model_poses, unconstrained
+    expected = expected_poses(model, model_poses, unconstrained, tests)
+    poses = np.array(unconstrained.poses)
+    poses[apart] = expected[apart]
+    tried = [unconstrained_poses(capture, start, unconstrained.overlaps.gate) for start in (expected, poses)]
+    best = min((unconstrained, *tried), key=lambda found: len(linkage(found.overlaps).unlinked))
+    return (model_poses, unconstrained) if best is unconstrained else (expected, best.relative_to(expected))
+
+
+# Unlinked views at one end of the list, displaced together as one of them was found to be.
+#
+# After a knock of the scanner, or a part clamped anew, each of them alone may overlap too little with the others to be
+# placed, and would be taken for a scan of another part.
+
+
+def place_together(
+    capture: Capture,
+    model_poses: Array,
+    unconstrained: UnconstrainedPoses,
+    placed: Mapping[int, Placement],
+    *,
+    unlinked: Collection[int],
+    tolerance: float,
+) -> UnconstrainedPoses | None:
+    """The views freed from there, if that links them all and none contradicts; None if no common displacement does.
+
+    Args:
+        model_poses: (V, 4, 4) T_reference_scanner by the robot.
+        unconstrained: the views where overlaps alone put them.
+        placed: where some of the unlinked views belong.
+        tolerance: distance that is the same place, length_unit.
+    """
+    for views in end_runs(unlinked, len(model_poses)):
+        for v in sorted(set(views) & set(placed), key=lambda v: -placed[v].closure):
+            T, back = placed[v].T, frames.inverse(model_poses[v])
+            for moved in (model_poses @ back @ T, T @ back @ model_poses):
+                poses = np.array(unconstrained.poses)
+                poses[views] = moved[views]
+                tried = unconstrained_poses(capture, poses, unconstrained.overlaps.gate).relative_to(model_poses)
+                apart = linkage(tried.overlaps).unlinked
+                if not (apart or find_contradicting_views(capture.scans, tried.poses, tolerance, part_size([capture]))):
+                    return tried
+    return None
+
+
+def end_runs(views: Collection[int], count: int) -> list[range]:
+    """The unbroken runs of some views at the end and at the beginning of a list of so many."""
+    rest = [v for v in range(count) if v not in views]
+    return [range(rest[-1] + 1, count), range(rest[0])] if rest else []
+
+
+# Where the views of a capture belong by their surfaces: freed, and those that nothing links tried wide.
+
+# On the surface of the others: four robust sigmas of the overlaps.
+_TOLERANCE_SIGMAS = 4.0
+
+
+@dataclass(frozen=True)
+class PlacedViews:
+    """Views where their surfaces put them."""
+
+    unconstrained: UnconstrainedPoses  # with the views where they belong
+    linkage: Linkage  # at the poses that overlaps alone give, from the model's
+    placed: dict[int, Placement]  # views that nothing linked, and where they belong
+    unplaced: list[int]  # views that belong nowhere
+    torn: tuple[int, ...]  # views that contradict the others, and still do where they belong
+    lines: list[int]  # views whose points lie in a line
+    tolerance: float  # distance from the surface of the others that still lies on it, length_unit
+    needed: float  # closure at which a scan counts as placed
+
+    def seen_from(self, model_poses: Array) -> "PlacedViews":
+        """The same against other poses (V, 4, 4) by the robot."""
+        return replace(self, unconstrained=self.unconstrained.relative_to(model_poses))
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Views that surfaces link, with all in their places."""
+        return linkage(
+            self.unconstrained.overlaps, {*self.lines, *(v for v in self.torn if v in self.unplaced)}
+        ).components
+
+
+def place_views(capture: Capture, model_poses: Array, unconstrained: UnconstrainedPoses) -> PlacedViews:
+    """Try every view that nothing links.
+
+    Args:
+        model_poses: (V, 4, 4) T_reference_scanner by the robot.
+        unconstrained: the views freed from there.
+    """
+    lines = [v for v, scan in enumerate(capture.scans) if lies_in_a_line(scan)]
+    tolerance = _TOLERANCE_SIGMAS * unconstrained.overlaps.gram.scale
+    groups = linkage(unconstrained.overlaps, lines).components
+    torn = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, part_size([capture]), groups=groups)
+    linked = linkage(unconstrained.overlaps, {*lines, *torn})
+    needed = needed_closure(capture, unconstrained.poses, linked, tolerance)
+    placed, homeless = place_unlinked_views(capture, model_poses, unconstrained, linked, (tolerance, needed))
+    apart = linked.unlinked
+    if placed and len(apart) > 1:
+        # One displacement of all explains more than one of each, which may have closed in a wrong place.
+        together = place_together(capture, model_poses, unconstrained, placed, unlinked=apart, tolerance=tolerance)
+        if together is not None:
+            linked = linkage(together.overlaps, lines)
+            return PlacedViews(together, linked, {}, [], (), lines=lines, tolerance=tolerance, needed=needed)
+    if placed:
+        poses = np.array(unconstrained.poses)
+        for v, placement in placed.items():
+            poses[v] = placement.T
+        unconstrained = unconstrained_poses(capture, poses, unconstrained.overlaps.gate).relative_to(model_poses)
+        still = (
+            find_contradicting_views(
+                capture.scans, unconstrained.poses, tolerance, part_size([capture]), STILL_CONTRADICTS
+            )
+            if torn
+            else ()
+        )
+        torn = tuple(v for v in still if v in torn)
+    return PlacedViews(unconstrained, linked, placed, homeless, torn, lines=lines, tolerance=tolerance, needed=needed)
 
 
 @dataclass(frozen=True)

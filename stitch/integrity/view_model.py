@@ -5,15 +5,21 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.optimize import brentq
 
 from stitch import frames
+from stitch.effects.contract import EFFECTS, EVERY_VIEW, Effect, missing_need
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.observations.pose_errors import PoseErrors
-from stitch.observations.surfaces.free_poses import UnconstrainedPoses, visible_directions
+from stitch.measurement.measurement import Measurement
+from stitch.model.model import Model, term_of
+from stitch.observations.pose_errors import DRIFT_MEMORY, PoseErrors, drift_kernel, prior_pose_errors, usual_twist
+from stitch.observations.surfaces.effect_columns import view_responses
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, visible_directions
+from stitch.statistics.distributions import f_limit, f_tail
+from stitch.statistics.kernels import process_covariance
 from stitch.statistics.least_squares import column_space, summed_squares
-from stitch.statistics.restricted_likelihood import MixedModel
-from stitch.statistics.variance_components import VarianceFit, fit_variances
+from stitch.statistics.reml import MixedModel, VarianceFit, fit_variances
 
 # Combinations of parameters weaker than this share of the strongest are not seen.
 SEEN = 1e-6
@@ -137,3 +143,206 @@ def projector(model: ViewModel, fit: VarianceFit, further: Array | None = None) 
     CA, inverse = both[:, : A.shape[1]], both[:, A.shape[1] :]
     P = inverse - CA @ np.linalg.solve(A.T @ CA, CA.T)
     return Projector(P, P @ model.z, len(C) - A.shape[1])
+
+
+# Tests of one view's own displacement, or of a block's, under the scatter of the other poses.
+#
+# The per-view evidence of overlaps is linear: z = X ξ + Σ L_v δ_v + ε, with ξ the hand-eye, δ_v a displacement of view
+# v
+# (left twist in the reference frame) and cov(ε) of pose scatter and sensor noise. With P = C⁻¹ − C⁻¹X(XᵀC⁻¹X)⁻¹XᵀC⁻¹,
+# the
+# statistic of an alternative with columns G is T = uᵀN⁻¹u, u = GᵀPz, N = GᵀPG: χ² with rank(N) degrees of freedom, with
+# non-centrality δᵀNδ where a blunder δ is present (Baarda 1968; Teunissen, Testing Theory, 2000).
+
+
+@dataclass(frozen=True)
+class AlternativeTest:
+    """One alternative, tested."""
+
+    statistic: float  # T
+    degrees: int
+    p_value: float  # under F, the scatter being estimated from the same data
+    estimate: Array  # (6,) displacement, rotations in 1/lever
+    normal: Array  # (6, 6) N: non-centrality of a displacement δ is δᵀNδ
+
+
+def hstack_columns(columns: Array | None, more: Array) -> Array:
+    """(n, ·) columns with more of them, where there are any."""
+    return more if columns is None else np.column_stack([columns, more])
+
+
+def test_alternative(under: Projector, columns: Array) -> AlternativeTest:
+    """The alternative with `columns` (n, 6) under a null hypothesis."""
+    N, u = columns.T @ under.P @ columns, columns.T @ under.projected
+    inverse, degrees = _pseudo_inverse(N)
+    statistic = float(u @ inverse @ u)
+    nu = under.degrees - degrees
+    if degrees == 0 or nu < 1:
+        return AlternativeTest(0.0, degrees, 1.0, np.zeros(len(N)), N)
+    # The scatter is estimated with the view in it: T/ν is a beta variable, told as the F of the left-out estimate.
+    rest = max(under.degrees - statistic, 1e-9 * under.degrees)
+    p = f_tail(statistic / degrees / (rest / nu), degrees, nu)
+    return AlternativeTest(statistic, degrees, p, inverse @ u, N)
+
+
+def _pseudo_inverse(N: Array) -> tuple[Array, int]:
+    """Pseudo-inverse and rank of a symmetric matrix whose units may differ."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(N), 1e-300))
+    values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
+    keep = values > SEEN * max(values[-1], 1e-300)
+    scaled = vectors[:, keep] * scale[:, None]
+    return np.asarray((scaled / values[keep]) @ scaled.T), int(keep.sum())
+
+
+# One view tested under the scatter that the others have without it: it cannot hide in what it inflates itself.
+
+
+def leave_one_out_test(model: ViewModel, columns: Array | None, view: int) -> tuple[AlternativeTest, float]:
+    """One view tested under the scatter that all others have without it, and the chance of that.
+
+    One of six views hides in a scatter that it inflates itself. Rotations and translations share the degrees of freedom
+    of a scatter taken from the rest: half of them count.
+    """
+    own = model.views[view]
+    under = projector(model, model.fit(hstack_columns(columns, own)), columns)
+    # Where a scan slides it rests anywhere.
+    tested = test_alternative(under, model.held_responses[view])
+    free = max((under.degrees - tested.degrees) // 2, 1)
+    return tested, f_tail(tested.statistic / max(tested.degrees, 1), max(tested.degrees, 1), free)
+
+
+# The smallest displacement that evidence admits: what only a weak direction seems to show is no size.
+#
+# A scan that slides along the part, or that few holes keep from turning, comes to rest millimetres from where it
+# belongs,
+# and where all scans slid together each stands off from its pose by that. The estimate of the test knows both: what the
+# views have in common, and how well each direction is held.
+
+# Chance that the evidence tells it from the right one.
+_CHANCE = 0.01
+
+
+def displacement_lower_bound(tested: AlternativeTest, degrees: int) -> Array:
+    """(6,) the displacement nearest to none, rotations in 1/lever, that the evidence tells from the estimate in no more
+    than 1 % of cases; `degrees` of freedom under which the view was tested."""
+    return _shortest_within_limit(tested.normal, tested.estimate, _confidence_limit(tested, degrees))
+
+
+def rotation_shift_lower_bounds(tested: AlternativeTest, degrees: int, carried: Array) -> tuple[float, float]:
+    """The smallest rotation, in 1/lever, and the smallest shift, whatever the other one is.
+
+    Args:
+        carried: (6, 6) from displacements as they were tested to those of the point whose shift counts.
+    """
+    back = np.linalg.inv(carried)
+    N, estimate, limit = back.T @ tested.normal @ back, carried @ tested.estimate, _confidence_limit(tested, degrees)
+    parts = []
+    for own, other in ((slice(0, 3), slice(3, 6)), (slice(3, 6), slice(0, 3))):
+        left = N[own, own] - N[own, other] @ np.linalg.pinv(N[other, other], rcond=1e-9, hermitian=True) @ N[other, own]
+        parts.append(float(np.linalg.norm(_shortest_within_limit(left, estimate[own], limit))))
+    return parts[0], parts[1]
+
+
+def _confidence_limit(tested: AlternativeTest, degrees: int) -> float:
+    return tested.degrees * f_limit(_CHANCE, max(tested.degrees, 1), max(degrees - tested.degrees, 1))
+
+
+def _shortest_within_limit(normal: Array, estimate: Array, limit: float) -> Array:
+    """(k,) the shortest displacement of which the evidence (k, k) is within a limit of that of the estimate (k,)."""
+    held, axes = np.linalg.eigh(normal)
+    held, seen = np.maximum(held, 0.0), axes.T @ estimate
+    if held @ seen**2 <= limit:
+        return np.zeros(len(seen))
+
+    def missed(log_pull: float) -> float:
+        pull = np.exp(log_pull)
+        return float(held @ (pull / (held + pull) * seen) ** 2 - limit)
+
+    # A pull towards none moves the estimate the farther the less a direction is held.
+    strongest = np.log(held[-1])
+    pull = np.exp(brentq(missed, strongest - 60, strongest + 60))
+    return np.asarray(axes @ (held / (held + pull) * seen))
+
+
+# What effects of the library may do to the views of a session before anybody knows of one.
+#
+# A view that stands out from white scatter may do so by a blunder, or because the arm bends as arms do. The second is a
+# random effect (Searle, Casella and McCulloch 1992): every parameter of every effect is zero give or take its size, and
+# the views scatter accordingly, together and not one by one.
+
+# Standard deviation of a parameter, in usual sizes: effects of up to four times the usual size are not rare then.
+_TIMES_USUAL = 2.0
+# Correspondences that tell what an effect does to the views where its size is free.
+_MAX_CORRESPONDENCES = 20_000
+
+
+@dataclass(frozen=True)
+class UsualEffects:
+    """What may happen to the views of a good session."""
+
+    measurement: Measurement
+    model: Model
+
+    def twists(self, unconstrained: UnconstrainedPoses) -> Array:
+        """Left twists of the views about the centre of the correspondences, one column a parameter, at its deviation.
+
+        Returns:
+            (6V, P) twists, reference frame, rad and length_unit.
+        """
+        return _TIMES_USUAL * np.hstack(list(self._by_place(unconstrained).values()))
+
+    def errors(self, unconstrained: UnconstrainedPoses) -> PoseErrors:
+        """The same in sizes that the views show, one for every place of the chain, beside all that arms do.
+
+        Mount and part also wander as slowly as a session is long: they warm up, creep or settle by no law.
+        """
+        own, centre = self.measurement.capture, unconstrained.overlaps.gram.centre
+        errors = prior_pose_errors([self.measurement], self.model, [centre])
+        alike = drift_kernel([self.measurement], max(DRIFT_MEMORY.values()))
+        unit = usual_twist(self.measurement.length_unit)
+        of_mount = frames.adjoint(frames.make(np.eye(3), -centre) @ own.hand_eye_frames(self.model.T_mount))
+        of_part = np.tile(np.eye(6), (len(unconstrained.poses), 1, 1))
+        for name, moved in (("wandering mount", of_mount), ("wandering part", of_part)):
+            errors = errors.with_component(name, process_covariance((moved * unit).reshape(-1, 6), alike), 1.0)
+        for place, columns in self._by_place(_thin_correspondences(unconstrained)).items():
+            errors = errors.with_component(place, columns @ columns.T, 1.0)
+        return errors
+
+    def _by_place(self, unconstrained: UnconstrainedPoses) -> dict[str, Array]:
+        """(6V, P) twists by the effects of each place of the chain, one column a parameter, of usual size."""
+        physical = [e for e in EFFECTS.values() if e.tier == "physical" and not _is_event(e)]
+        terms = [term_of(self.measurement, e) for e in physical if not missing_need(self.measurement, e)]
+        columns = [
+            response.columns[:, ~term.gridded] * term.typical[~term.gridded]
+            for term, response in zip(
+                terms, view_responses(self.measurement, self.model, terms, unconstrained), strict=True
+            )
+        ]
+        places = dict.fromkeys(term.effect.place for term in terms)
+        return {
+            place: np.hstack([c for term, c in zip(terms, columns, strict=True) if term.effect.place == place])
+            for place in places
+        }
+
+
+def _thin_correspondences(unconstrained: UnconstrainedPoses) -> UnconstrainedPoses:
+    """The same with fewer correspondences, each of more weight: what an effect roughly does to poses needs no more."""
+    every = -(-sum(len(m.residual) for m in unconstrained.overlaps.matches) // _MAX_CORRESPONDENCES) or 1
+    thinned = [
+        replace(
+            m,
+            middle=m.middle[::every],
+            normal=m.normal[::every],
+            residual=m.residual[::every],
+            weight=every * m.weight[::every],
+            index_v=m.index_v[::every],
+            index_w=m.index_w[::every],
+        )
+        for m in unconstrained.overlaps.matches
+    ]
+    return replace(unconstrained, overlaps=replace(unconstrained.overlaps, matches=thinned))
+
+
+def _is_event(effect: Effect) -> bool:
+    """True for a step between two views: blocks of views are tested as such."""
+    return any(spec.grid == EVERY_VIEW for spec in effect.specs.values())

@@ -1,6 +1,6 @@
 """Scans and labelled points of one session with the robot's poses: what every stage after reading works on."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -8,11 +8,79 @@ import numpy as np
 
 from stitch import frames
 from stitch.errors import InputError
-from stitch.frames import Array, Indices
-from stitch.measurement.scan import GRAZING_COSINE, Scan, prepare_scan
-from stitch.measurement.session import Scanner, Session, View
-from stitch.measurement.sightings import Sightings, sightings_of
+from stitch.frames import Array, Indices, Mask
+from stitch.measurement.scan import GRAZING_COSINE, Scan, bounding_box, even_indices, prepare_scan, subsample
+from stitch.measurement.session import Cloud, Scanner, Session, View, WholeCloud
 from stitch.system.threads import parallel
+from stitch.units import METRES
+
+# Labelled points of all views in arrays of one shape: S slots a view, empty where a target was not seen.
+
+# Where neither a row nor scanner.noise says how well the sensor sees: what a good one does, in metres. The factor
+# on the noise is estimated from the data anyway.
+_USUAL_SIGMA_M = 1e-5
+# A probe's own targets lie some 20 cm apart: that is how well it knows its direction, unless it says so itself.
+_PROBE_LEVER_M = 0.2
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """What V views show of K targets, sensor frame; lengths in length_unit, angles in rad."""
+
+    targets: tuple[str, ...]  # K
+    target: Indices  # (V, S) which target sits in a slot; −1 in an empty one
+    points: Array  # (V, S, 3); zero in an empty slot
+    sigma: Array  # (V, S) of a coordinate
+    used: Mask  # (V, S): seen, and not an outlier
+    rotation: Array | None = None  # (V, 3, 3) of a 6D probe, R_sensor_probe
+    sigma_rotation: Array | None = None  # (V,)
+
+    @property
+    def view_counts(self) -> Indices:
+        """(K,) number of views that use each target."""
+        return np.asarray(np.bincount(self.target[self.used], minlength=len(self.targets)), np.int64)
+
+    @property
+    def with_outliers(self) -> "Sightings":
+        """The same with the outliers back in."""
+        return replace(self, used=self.target >= 0)
+
+    def points_by_view(self) -> list[Array]:
+        """Per view the points in use, (k, 3); none where it shows nothing."""
+        return [points[used] for points, used in zip(self.points, self.used, strict=True)]
+
+    def without(self, left_out: Indices) -> "Sightings":
+        """The sightings less some views."""
+        keep = np.setdiff1d(np.arange(len(self.points)), left_out)
+        of_views = ("target", "points", "sigma", "used", "rotation", "sigma_rotation")
+        known = {name: values for name in of_views if (values := getattr(self, name)) is not None}
+        return replace(self, **{name: values[keep] for name, values in known.items()})
+
+
+def sightings_of(session: Session) -> Sightings | None:
+    """All labelled points of a session, its views in order; None without any."""
+    seen = [view.sighting for view in session.views]
+    names = sorted({name for s in seen if s is not None for name in s.targets})
+    if not names:
+        return None
+    number = {name: k for k, name in enumerate(names)}
+    V, S = len(seen), max(len(s.targets) for s in seen if s is not None)
+    target, points, sigma = np.full((V, S), -1), np.zeros((V, S, 3)), np.ones((V, S))
+    rotation, turn = np.tile(np.eye(3), (V, 1, 1)), np.full(V, np.nan)
+    for v, s in enumerate(seen):
+        if s is not None:
+            k = len(s.targets)
+            target[v, :k], points[v, :k], sigma[v, :k] = [number[name] for name in s.targets], s.points, s.sigma
+            if s.rotation is not None:
+                rotation[v], turn[v] = s.rotation, s.sigma_rotation
+    metres = METRES[session.length_unit]
+    usual = _USUAL_SIGMA_M / metres if session.scanner.noise is None else session.scanner.noise
+    sigma = np.where(np.isnan(sigma), usual, sigma)
+    found = Sightings(tuple(names), target, points, sigma, target >= 0)
+    if not any(s is not None and s.rotation is not None for s in seen):
+        return found
+    turn = np.where(np.isnan(turn), sigma[:, 0] * metres / _PROBE_LEVER_M, turn)
+    return replace(found, rotation=rotation, sigma_rotation=turn)
 
 
 @dataclass(frozen=True)
@@ -111,3 +179,75 @@ def part_size(captures: Sequence[Capture]) -> float:
     """Median diameter of the scans' point sets: twice the rms distance from their centroids."""
     spread = [np.sqrt(scan.points.var(axis=0).sum()) for c in captures for scan in c.scans]
     return 2 * float(np.median(spread))
+
+
+# Large scans made light: fewer points, each with the surface of all of them; the whole cloud stays where it is.
+#
+# Evidence about poses counts in views, and a view is asked a few thousand times (`overlaps.FINE_SAMPLES`). What remains
+# must be dense enough that the nearest point lies on the same piece of surface; normals, edges and noise come from all
+# points. Only what is fused is every point, and these are read once more when it is their turn.
+
+# Some ten points for every query: √10 spacings of the queries lie between a point and its partner at most. Hand-eye and
+# fused surface are then as near to the truth as with all points (docs/large-sessions.md).
+MAX_POINTS = 39_000
+# Four points for every query still lie within two of their spacings.
+_MIN_POINTS = 12_000
+# Measured: bytes that a point in memory takes until the run is written, as cloud and scan with its tree, and with its
+# share of the correspondences; and what libraries and the slabs take in which everything is fused.
+_BYTES_PER_POINT, _FIXED_BYTES = 220, 1.2e9
+
+
+def points_within(memory: float, views: int) -> int:
+    """How many points of each view may stay in memory.
+
+    Args:
+        memory: bytes for the whole run.
+
+    Raises:
+        InputError: so many views need more.
+    """
+    room = int((memory - _FIXED_BYTES) / (views * _BYTES_PER_POINT))
+    if room < _MIN_POINTS:
+        least = np.ceil((_FIXED_BYTES + views * _BYTES_PER_POINT * _MIN_POINTS) / 1e8) / 10
+        raise InputError(
+            f"memory: {memory / 1e9:.3g} GB are too little for a run of {views} views; to fix: give {least:.1f} GB"
+        )
+    return min(room, MAX_POINTS)
+
+
+def thin_session(session: Session, at_most: int = MAX_POINTS) -> tuple[Session, Capture]:
+    """A session with at most `at_most` points a view, evenly over the scan order, and its capture."""
+
+    def of_view(view: View) -> View:
+        if view.cloud is None:
+            return view
+        return replace(view, cloud=thin_cloud(view.name, view.cloud, at_most, session.scanner))
+
+    session = replace(session, views=tuple(parallel(of_view, session.views)))
+    return session, prepare_capture(session)
+
+
+def thin_cloud(
+    name: str, cloud: Cloud, at_most: int, scanner: Scanner, reload: Callable[[], Cloud] | None = None
+) -> Cloud:
+    """A cloud with at most `at_most` of its points, and where the whole is.
+
+    Args:
+        name: of the view.
+        reload: reads the whole cloud again; None: it stays in memory.
+    """
+    picked = even_indices(len(cloud.points), at_most)
+    if len(picked) == len(cloud.points):
+        return cloud
+    if cloud.whole is not None:
+        return _take_points(cloud, picked, replace(cloud.whole, scan=subsample(cloud.whole.scan, at_most)))
+    scan = prepare_scan(name, cloud.points, picked, scanner.eye(cloud.points))
+    whole = WholeCloud(reload or (lambda: cloud), len(cloud.points), bounding_box(cloud.points), scan)
+    return _take_points(cloud, picked, whole)
+
+
+def _take_points(cloud: Cloud, index: Indices, whole: WholeCloud) -> Cloud:
+    """Some of the points; those of the scan are the same, so that memory holds them once."""
+    normals = None if cloud.normals is None else cloud.normals[index]
+    scalars = {name: values[index] for name, values in cloud.scalars.items()}
+    return Cloud(whole.scan.points, normals, scalars, whole)

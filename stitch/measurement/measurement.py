@@ -6,18 +6,319 @@ A capture keeps this form: `T_reference_mount` holds what stands left of the han
 what stands right of it, and the points are those that sensor and part would have shown without effects.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from stitch import frames
-from stitch.frames import Array
+from stitch.frames import Array, Indices
+from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import Capture
 from stitch.measurement.robot import Robot
 from stitch.measurement.session import Mount, SensorKind, Session
-from stitch.measurement.views import ScanView, Views, views_of
+
+# Columns of views.csv that do not count, since in some views nothing stands there.
+
+
+def gaps_note(session: Session) -> str:
+    """In one sentence, with a view that lacks each; empty where there is no gap."""
+    lacking = dict[str, list[str]]()
+    columns = sorted({name for view in session.views for name in view.covariates})
+    for name, view in zip(session.names, session.views, strict=True):
+        gaps = [column for column in columns if column not in view.covariates]
+        gaps += ["time_s"] if view.time_s is None else []
+        gaps += ["joint angles"] if view.joints is None else []
+        for column in gaps:
+            lacking.setdefault(column, []).append(name)
+    # What no view has is no gap.
+    found = [
+        f"{column} ({views[0]}{f' and {len(views) - 1} more' if len(views) > 1 else ''} without)"
+        for column, views in lacking.items()
+        if len(views) < len(session.views)
+    ]
+    return f"Not used, since some views have none: {', '.join(found)}." if found else ""
+
+
+# Torques that bend the joints of an arm at its views: measured, or of gravity with masses or without.
+
+PAYLOAD = "payload_kg"  # column: what the flange carries, at the centre of mass of [robot] payload, else at the flange
+# Joint angles that show which torques of an arm differ.
+_ANYWHERE = 100
+STILL = 1e-3  # N·m of 1 kg: an axis that gravity does not bend
+
+
+@dataclass(frozen=True)
+class Torques:
+    """Torques under which joints sag: with masses one a joint, without them one a joint and a link beyond."""
+
+    names: tuple[str, ...]
+    joint: tuple[int, ...]  # that the torque bends
+    values: Array  # (V, m) N·m about +z of that joint; of 1 kg at the link's frame where masses are unknown
+    measured: bool = False
+
+
+def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Torques:
+    """Gravity torques at joint angles (V, n); which ones there are is the arm's own, whatever the angles.
+
+    Args:
+        payload: (V,) kg, in place of the mass in [robot] payload.
+    """
+    if payload is None and robot.has_masses:
+        return _each_joint(kinematics.gravity_torques(robot, joints))
+    if payload is None and not robot.payload_mass:
+        return _unit_link_torques(robot, joints)
+    payload = np.full(len(joints), robot.payload_mass) if payload is None else payload
+    carried = payload[:, None] * kinematics.payload_torques(robot, joints)
+    if robot.has_masses:
+        return _each_joint(kinematics.gravity_torques(replace(robot, payload_mass=0.0), joints) + carried)
+    # What the links weigh nobody knows, what they carry is known: a coefficient of its own for every joint it bends.
+    links = _unit_link_torques(robot, joints)
+    bent = np.flatnonzero(np.ptp(kinematics.payload_torques(robot, _sample_joints(robot)), axis=0) > STILL)
+    names = (*links.names, *(str(i + 1) for i in bent))
+    return Torques(names, (*links.joint, *(int(i) for i in bent)), np.hstack([links.values, carried[:, bent]]))
+
+
+def measured_torques(drives: Array) -> Torques:
+    """Of drives (V, n), N·m, as controllers report them: a drive holds the opposite of what bends its joint."""
+    return replace(_each_joint(-drives), measured=True)
+
+
+def torque_columns(covariates: Mapping[str, Array], joints: int) -> Array | None:
+    """(V, n) the columns jN_torque_nm of all joints, or None where one is missing."""
+    names = [f"j{i + 1}_torque_nm" for i in range(joints)]
+    whole = bool(names) and all(name in covariates for name in names)
+    return np.column_stack([covariates[name] for name in names]) if whole else None
+
+
+def payload_note(session: Session) -> str:
+    """Where a payload counts whose centre of mass nobody states; empty where one is stated, or nothing is carried."""
+    robot = session.robot
+    if robot is None or not robot.carries_at_flange or any(view.joints is None for view in session.views):
+        return ""
+    columns = [view.covariates for view in session.views]
+    if all("j1_torque_nm" in column for column in columns):
+        return ""  # drives report what bends the joints
+    loads = [column.get(PAYLOAD, robot.payload_mass) for column in columns]
+    if not any(loads):
+        return ""
+    return (
+        f"The payload, up to {max(loads):g} kg, counts at the flange's origin: [robot] payload states no other centre "
+        "of mass (com)."
+    )
+
+
+def _each_joint(values: Array) -> Torques:
+    n = values.shape[1]
+    return Torques(tuple(str(i + 1) for i in range(n)), tuple(range(n)), values)
+
+
+def _sample_joints(robot: Robot) -> Array:
+    """(N, n) joint angles from everywhere: a coefficient must mean the same in every session of an arm."""
+    return np.random.default_rng(0).uniform(-np.pi, np.pi, (_ANYWHERE, robot.n_joints))
+
+
+def _unit_link_torques(robot: Robot, joints: Array) -> Torques:
+    """Of 1 kg at each link's frame, as far as they differ: without masses the geometry gives their shapes alone."""
+    n = robot.n_joints
+    shapes = kinematics.unit_torques(robot, _sample_joints(robot))
+    keep = [(i, k) for i in range(n) for k in _independent_links(shapes[:, i], range(i, n))]
+    unit = kinematics.unit_torques(robot, joints)
+    values = np.array([unit[:, i, k] for i, k in keep]).T.reshape(len(joints), len(keep))
+    return Torques(tuple(f"{i + 1}_{k + 1}" for i, k in keep), tuple(i for i, _ in keep), values)
+
+
+def _independent_links(torques: Array, links: Sequence[int]) -> list[int]:
+    """The links whose unit torque (V, n) about one joint changes and is no combination of those before it.
+
+    Frames of a wrist share their origin: a second torque from the same place would only make both unknown.
+    """
+    chosen, basis = list[int](), np.zeros((len(torques), 0))
+    for k in links:
+        own = torques[:, k]
+        rest = own - basis @ (basis.T @ own)
+        if np.ptp(own) > STILL and np.linalg.norm(rest) > 1e-6 * np.linalg.norm(own):
+            chosen.append(k)
+            basis = np.column_stack([basis, rest / np.linalg.norm(rest)])
+    return chosen
+
+
+# What is said of a session before anything is fitted: how a stated payload counts, and what does not count.
+
+
+def session_notes(session: Session) -> list[str]:
+    """A sentence each; `check` and `run` say the same."""
+    return [note for note in (payload_note(session), gaps_note(session)) if note]
+
+
+# What effects may know of the views: all of them at once (`Views`), or one with its points (`ScanView`).
+
+
+@dataclass(frozen=True)
+class Views:
+    """All V views of a session, in the order of time; rad, s, length_unit."""
+
+    count: int
+    time: Array  # (V,) since the first view; NaN where the session has no time
+    joints: Array  # (V, n); n = 0 without joints or robot
+    previous: Array  # (V, n) joints of the row before, its own for the first
+    approach: Array  # (V, n) −1, 0, +1
+    velocity: Array | None  # (V, n) from columns jN_velocity_deg_s
+    torques: Torques
+    covariates: dict[str, Array]  # (V,) each, without gaps
+    standoff: float
+    first: dict[str, float]  # the covariates at the session's first view
+    number: Indices  # (V,) of the view in its session, from 0
+    path: Array  # (W, n) joints of all views of the session, by their number
+    names: tuple[str, ...] = ()  # of those
+
+    def sag(self, c: Array) -> Array:
+        """(V, n) joint angles of the compliances c (m,) under the gravity torques."""
+        out = np.zeros_like(self.joints)
+        for k, joint in enumerate(self.torques.joint):
+            out[:, joint] += c[k] * self.torques.values[:, k]
+        return out
+
+    def since_first(self, covariate: str) -> Array:
+        """(V,) a covariate less its value at the first view."""
+        return np.asarray(self.covariates[covariate] - self.first[covariate])
+
+    def behind(self, joint: int, play: float) -> Array:
+        """(V,) rad by which what a joint drives stays behind it where friction holds it within ± `play`.
+
+        It follows the last reversals and not only the last direction: the play operator (Krejčí 1996, "Hysteresis,
+        Convexity and Dissipation in Hyperbolic Equations", ch. II), at rest in the first view of the session.
+        """
+        states = np.append(np.nan, self.path[:, joint])  # before the first view, and after each
+        for v, at in enumerate(self.path[1:, joint], start=2):
+            states[v] = min(max(states[v - 1], at - play), at + play)
+        q, before = self.joints[:, joint], states[self.number]
+        return np.where(self.number > 0, np.clip(before, q - play, q + play) - q, 0.0)
+
+    @property
+    def hours(self) -> Array:
+        """(V,) since the first view."""
+        return self.time / 3600.0
+
+    def only(self, keep: Sequence[int]) -> "Views":
+        """Some of the views; their numbers, the rows before them and the first values stay those of the session."""
+        of_views = {name: getattr(self, name)[keep] for name in ("time", "joints", "previous", "approach", "number")}
+        return replace(
+            self,
+            count=len(keep),
+            velocity=None if self.velocity is None else self.velocity[keep],
+            torques=replace(self.torques, values=self.torques.values[keep]),
+            covariates={name: values[keep] for name, values in self.covariates.items()},
+            **of_views,
+        )
+
+    def has(self, need: str) -> bool:
+        """True if joints, time, torque, velocity or a covariate is known for every view."""
+        known = {
+            "joints": self.joints.shape[1] > 0,
+            "torque": len(self.torques.names) > 0,
+            "velocity": self.velocity is not None,
+            "time": bool(np.isfinite(self.time).all()) and self.count > 1 and float(np.ptp(self.time)) > 0,
+        }
+        return bool(known.get(need, need in self.covariates))
+
+
+@dataclass(frozen=True)
+class ScanView:
+    """One view for the functions of points: N of them in the scanner frame, or the reference frame for `shape`."""
+
+    index: int
+    views: Views
+    cosine: Array  # (N,) of incidence, 0 … 1
+    intensity: Array | None  # (N,) standardised over the session
+    gravity: Array  # (3,) unit vector in the reference frame
+    size: float  # of the part: lengths of shape effects may be counted in it
+    origin: Array = field(default_factory=lambda: np.zeros(3))  # (3,) about which the part grows, reference frame
+    eye: Array = field(default_factory=lambda: np.zeros(3))  # (3,) from where the scanner looks, its own frame
+
+    def along(self, points: Array) -> Array:
+        """(N, 3) unit rays."""
+        away = self.away(points)
+        return np.asarray(away / np.sqrt(np.einsum("ij,ij->i", away, away))[:, None])
+
+    def away(self, points: Array) -> Array:
+        """(N, 3) from the scanner's eye to the points."""
+        return points - self.eye
+
+    def rho2(self, points: Array) -> Array:
+        """(N,) ρ² = a² + b² of (a, b) = (x/z, y/z)."""
+        x, y, z = self.away(points).T
+        return np.asarray((x**2 + y**2) / z**2)
+
+    def since_first(self, covariate: str) -> float:
+        """A covariate of this view less its value at the first one."""
+        return float(self.views.since_first(covariate)[self.index])
+
+    @property
+    def hours(self) -> float:
+        """Since the first view."""
+        return float(self.views.hours[self.index])
+
+
+def views_of(session: Session) -> Views:
+    """Collect what effects may know; joints count only where the robot's kinematics are known too."""
+    rows = session.views
+    count = len(rows)
+    use = session.robot is not None and all(row.joints is not None for row in rows)
+    joints = np.array([row.joints for row in rows]) if use else np.zeros((count, 0))
+    approach = np.array([row.approach for row in rows]) if use else np.zeros((count, 0))
+    previous = np.vstack([joints[:1], joints[:-1]])
+    time = np.array([np.nan if row.time_s is None else row.time_s for row in rows])
+    names = {name for row in rows for name in row.covariates}
+    covariates = {
+        name: np.array([row.covariates[name] for row in rows])
+        for name in sorted(names)
+        if all(name in row.covariates for row in rows)
+    }
+    speeds = [f"j{i + 1}_velocity_deg_s" for i in range(joints.shape[1])]
+    moving = bool(speeds) and all(name in covariates for name in speeds)
+    velocity = np.radians(np.column_stack([covariates.pop(name) for name in speeds])) if moving else None
+    standoff = session.scanner.standoff or _median_range(session)
+    torques = _torques(session.robot, joints, covariates) if use and session.robot else no_torques(count)
+    first = {name: float(course[0]) for name, course in covariates.items()}
+    return Views(
+        count=count,
+        time=time - time[0],
+        joints=joints,
+        previous=previous,
+        approach=approach,
+        velocity=velocity,
+        torques=torques,
+        covariates=covariates,
+        standoff=standoff,
+        first=first,
+        number=np.arange(count),
+        path=joints,
+        names=tuple(session.names),
+    )
+
+
+def no_torques(count: int) -> Torques:
+    """Of an arm that nobody knows."""
+    return Torques((), (), np.zeros((count, 0)))
+
+
+def _torques(robot: Robot, joints: Array, covariates: dict[str, Array]) -> Torques:
+    """As drives report them, where they do; else of gravity, with what the flange carries where that is a column."""
+    drives = torque_columns(covariates, joints.shape[1])
+    if drives is not None:
+        for i in range(joints.shape[1]):
+            del covariates[f"j{i + 1}_torque_nm"]
+        return measured_torques(drives)
+    return torques_of(robot, joints, covariates.get(PAYLOAD))
+
+
+def _median_range(session: Session) -> float:
+    ranges = [np.median(np.linalg.norm(v.cloud.points, axis=1)) for v in session.views if v.cloud]
+    ranges += [np.median(np.linalg.norm(v.sighting.points, axis=1)) for v in session.views if v.sighting]
+    return float(np.median(ranges)) if ranges else 1.0
+
 
 # Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.
 MIN_COSINE = 0.1

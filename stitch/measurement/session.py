@@ -1,16 +1,96 @@
 """What was measured: a session, its views and its scanner."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.measurement.cloud import Cloud
-from stitch.measurement.labelled_points import NominalTargets, Sighting
 from stitch.measurement.robot import Robot
+from stitch.measurement.scan import Scan, bounding_box
+
+# One scan as arrays.
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """One scan in the scanner frame, in the session's length_unit."""
+
+    points: Array  # (N, 3)
+    normals: Array | None = None  # (N, 3) if the file has them
+    scalars: dict[str, Array] = field(default_factory=dict)  # name -> (N,), e.g. intensity, time
+    whole: "WholeCloud | None" = None  # None: these are all points that were scanned
+
+    @property
+    def count(self) -> int:
+        """How many points were scanned."""
+        return len(self.points) if self.whole is None else self.whole.count
+
+    def within(self, box: Array) -> "Cloud":
+        """Its points inside a box (2, 3)."""
+        inside = ((self.points >= box[0]) & (self.points <= box[1])).all(axis=1)
+        scalars = {name: column[inside] for name, column in self.scalars.items()}
+        return Cloud(self.points[inside], None if self.normals is None else self.normals[inside], scalars)
+
+
+@dataclass(frozen=True)
+class WholeCloud:
+    """All points of a scan of which a cloud holds some; they stay where they are, mostly in a file."""
+
+    reload: Callable[[], Cloud]  # reads them
+    count: int
+    box: Array  # (2, 3) its lowest and highest corner, scanner frame
+    scan: Scan  # the points that the cloud holds, with the surface of all of them
+
+    def read(self) -> Cloud:
+        """Every point, in the order in which they were scanned.
+
+        Raises:
+            InputError: the file is not what it was.
+        """
+        cloud = self.reload()
+        if len(cloud.points) != self.count or not np.array_equal(bounding_box(cloud.points), self.box):
+            raise InputError(f"the scan of view {self.scan.name} changed on disk during the run; to fix: run again")
+        return cloud
+
+
+# Points with names: as a sensor shows them in one view, and as a drawing states them.
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What one view shows of named targets, sensor frame; a 6D probe is a target with an orientation."""
+
+    targets: tuple[str, ...]  # k
+    points: Array  # (k, 3) length_unit
+    sigma: Array  # (k,) of a coordinate; NaN where nobody states it
+    rotation: Array | None = None  # (3, 3) R_sensor_probe of the one target
+    sigma_rotation: float = float("nan")  # rad
+
+
+@dataclass(frozen=True)
+class NominalTargets:
+    """Where targets.csv puts the targets, part frame."""
+
+    targets: tuple[str, ...]  # T
+    points: Array  # (T, 3) length_unit
+    sigma: Array  # (T,) of a coordinate; NaN where nobody states it
+
+
+# One scan pixel by pixel: where each pixel lies in space, and how bright it is.
+
+
+@dataclass(frozen=True)
+class RangeImage:
+    """An image of H rows and W columns; lengths in length_unit."""
+
+    points: Array  # (H, W, 3) scanner frame; NaN where nothing was measured
+    grey: NDArray[np.uint8]  # (H, W)
+
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 SensorKind = Literal["area", "line", "tracker", "probe", "camera"]

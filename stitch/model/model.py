@@ -1,13 +1,230 @@
 """The model of a cell in memory: hand-eye with covariance, effects in use, places of targets."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from stitch.frames import Array
-from stitch.model.effects_covariance import EffectsCovariance
-from stitch.model.term import Term
+from stitch import frames
+from stitch.effects.contract import Effect, Parameter, parameters_in
+from stitch.frames import Array, Mask
+from stitch.measurement.measurement import Measurement
+from stitch.units import METRES, value_uncertainty_text
+
+# An effect in use with its named parameters.
+
+
+@dataclass(frozen=True)
+class Term:
+    """An effect in use; P parameters in the order of the effect's arguments."""
+
+    effect: Effect
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def name(self) -> str:
+        """That of the effect."""
+        return self.effect.name
+
+    @property
+    def values(self) -> Array:
+        """(P,) in each parameter's unit."""
+        return values_of([self])
+
+    @property
+    def sigmas(self) -> Array:
+        """(P,) standard deviations; NaN where a parameter is held."""
+        return np.array([p.sigma for p in self.parameters], float)
+
+    @property
+    def typical(self) -> Array:
+        """(P,) plausible sizes."""
+        return sizes_of([self])
+
+    @property
+    def gridded(self) -> Mask:
+        """(P,) bool: tried value by value instead of fitted."""
+        return np.array([bool(p.grid) for p in self.parameters], bool)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Keyword arguments of the effect's function."""
+        return self.effect.arguments(self.parameters)
+
+    def at(self, values: Array, sigmas: Array | None = None) -> "Term":
+        """The term with other values (P,), and sigmas (P,) where they are known."""
+        own = [replace(p, value=float(v)) for p, v in zip(self.parameters, values, strict=True)]
+        if sigmas is not None:
+            own = [replace(p, sigma=float(s)) for p, s in zip(own, sigmas, strict=True)]
+        return replace(self, parameters=tuple(own))
+
+
+def term_of(measurement: Measurement, effect: Effect) -> Term:
+    """The effect at zero; parameters that are tried value by value in the middle of their grid."""
+    found = parameters_in(measurement, effect)
+    return Term(effect, tuple(replace(p, value=p.grid[len(p.grid) // 2] if p.grid else 0.0) for p in found))
+
+
+def stack_parameters(terms: Sequence[Term]) -> tuple[Parameter, ...]:
+    """All parameters of all terms in one row."""
+    return tuple(p for term in terms for p in term.parameters)
+
+
+def values_of(terms: Sequence[Term]) -> Array:
+    """(P,) values of all parameters of all terms, each in its unit."""
+    return np.array([p.value for p in stack_parameters(terms)], float)
+
+
+def sizes_of(terms: Sequence[Term]) -> Array:
+    """(P,) plausible sizes of the same."""
+    return np.array([p.typical for p in stack_parameters(terms)], float)
+
+
+def known_sigmas(terms: Sequence[Term], fitted: Mask, sigmas: Array) -> Array:
+    """(P,) sigmas: found for the `fitted`, as it came for what another run's arm brought, NaN for the rest."""
+    out = np.array([p.sigma if p.kept else np.nan for p in stack_parameters(terms)], float)
+    out[fitted] = sigmas
+    return out
+
+
+def with_parameter_values(terms: Sequence[Term], values: Array, sigmas: Array | None = None) -> tuple[Term, ...]:
+    """The terms with values (P,), and sigmas (P,), of all their parameters in one row."""
+    out, at = [], 0
+    for term in terms:
+        own = slice(at, at + len(term.parameters))
+        out.append(term.at(values[own], None if sigmas is None else sigmas[own]))
+        at = own.stop
+    return tuple(out)
+
+
+# How well the parameters of all effects in use are known together: errors of one go with errors of another.
+
+# A person may edit the sigmas of model.toml; then the matrix of the fit is no longer theirs.
+_SAME_SIGMA = 1e-6
+
+
+@dataclass(frozen=True)
+class EffectsCovariance:
+    """Covariance of K fitted parameters, each in its own unit."""
+
+    names: tuple[str, ...] = ()  # effect.parameter
+    matrix: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (K, K)
+
+    def root(self, terms: Sequence[Term]) -> Array:
+        """(P, K) L with L·Lᵀ the covariance of all parameters of some terms, zero where nothing is known of one.
+
+        Where the sigma of a parameter is another than the matrix has, its sigma counts, alone.
+        """
+        rows = [(f"{term.name}.{p.name}", p) for term in terms for p in term.parameters]
+        at = {name: k for k, name in enumerate(self.names)}
+        sigma = np.sqrt(np.diag(self.matrix))
+        known = [
+            (i, at[name])
+            for i, (name, p) in enumerate(rows)
+            if name in at and p.fitted and abs(p.sigma - sigma[at[name]]) <= _SAME_SIGMA * sigma[at[name]]
+        ]
+        together = {i for i, _ in known}
+        alone = [i for i, (_, p) in enumerate(rows) if p.fitted and i not in together]
+        out = np.zeros((len(rows), len(known) + len(alone)))
+        if known:
+            own, theirs = (list(index) for index in zip(*known, strict=True))
+            size = sigma[theirs]
+            values, vectors = np.linalg.eigh(self.matrix[np.ix_(theirs, theirs)] / np.outer(size, size))
+            out[own, : len(known)] = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        for k, i in enumerate(alone, len(known)):
+            out[i, k] = rows[i][1].sigma
+        return out
+
+
+def kept_root(terms: Sequence[Term], covariance: EffectsCovariance) -> Array:
+    """(P, K) the same root for what another run's arm brought, zero rows for the rest."""
+    kept = np.array([p.kept for term in terms for p in term.parameters], bool)
+    root = covariance.root(terms)
+    root = root * kept[:, None]
+    return np.asarray(root[:, (root != 0).any(axis=0)])
+
+
+def covariance_of_fit(terms: Sequence[Term], fitted: Mask, matrix: Array, kept: Array) -> EffectsCovariance:
+    """Of the fitted parameters (K of P, bool) with their matrix (K, K), beside those kept, with their root (P, L)."""
+    names = [f"{term.name}.{p.name}" for term in terms for p in term.parameters]
+    whole = kept @ kept.T
+    whole[np.ix_(fitted, fitted)] += matrix
+    known = np.diag(whole) > 0
+    return EffectsCovariance(tuple(n for n, k in zip(names, known, strict=True) if k), whole[np.ix_(known, known)])
+
+
+# The uncertainty of a hand-eye in the frame in which it is printed.
+#
+# Its covariance Σ belongs to a right perturbation T·exp(ξ) in the scanner frame. Rotation vector and translation of T
+# in the mount frame move by J·ξ with J = diag(J_r⁻¹, R), so that theirs is J·Σ·Jᵀ (to first order).
+
+# Expanded uncertainty U = k·σ, coverage about 95 % (JCGM 100:2008, GUM).
+COVERAGE_FACTOR = 2.0
+# Of a twist, for central differences: far above rounding, far below the bend of any angle.
+_STEP = 1e-6
+
+
+def printed_covariance(T_mount: Array, covariance: Array) -> Array:
+    """(6, 6) of (rotation vector in rad, translation in length_unit), both in the mount frame.
+
+    Args:
+        T_mount: (4, 4) T_mount_scanner.
+        covariance: (6, 6) of the right perturbation, rotation first.
+    """
+    J = np.zeros((6, 6))
+    J[:3, :3] = frames.right_jacobian_inverse(Rotation.from_matrix(T_mount[:3, :3]).as_rotvec())
+    J[3:, 3:] = T_mount[:3, :3]
+    return J @ covariance @ J.T
+
+
+def numbers_covariance(numbers: Callable[[Array], Array], T_mount: Array, covariance: Array) -> Array:
+    """(n, n) of whatever numbers (n,) a controller writes of a hand-eye, to first order.
+
+    Args:
+        numbers: of a pose (4, 4); near T_mount they must not jump.
+        T_mount: (4, 4) T_mount_scanner.
+        covariance: (6, 6) of the right perturbation, rotation first.
+    """
+    steps = _STEP * np.eye(6)
+    J = [(numbers(T_mount @ frames.exp(e)) - numbers(T_mount @ frames.exp(-e))) / (2 * _STEP) for e in steps]
+    return np.asarray(np.transpose(J) @ covariance @ np.array(J))
+
+
+def expanded_uncertainty(T_mount: Array, covariance: Array) -> Array:
+    """(6,) U (k = 2) of rotation vector (rad) and translation (length_unit) in the mount frame."""
+    return COVERAGE_FACTOR * np.sqrt(np.diag(printed_covariance(T_mount, covariance)))
+
+
+def hand_eye_lines(T_mount: Array, covariance: Array, mount: str, length_unit: str) -> list[str]:
+    """Return text: position in mm and rotation vector in mrad with U (k = 2), in the frame that carries the scanner."""
+    frame = "base" if mount == "eye_to_hand" else "flange"
+    to_mm = METRES[length_unit] * 1e3
+    rotation = Rotation.from_matrix(T_mount[:3, :3]).as_rotvec() * 1e3
+    U = expanded_uncertainty(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
+    position, turn = (
+        ", ".join(f"{axis} {value_uncertainty_text(x, u)}" for axis, x, u in zip("xyz", values, size, strict=True))
+        for values, size in ((T_mount[:3, 3] * to_mm, U[3:]), (rotation, U[:3]))
+    )
+    return [
+        f"Hand-eye T_{frame}_scanner, in the frame of the {frame}, ± U (k = 2) for a complete model:",
+        f"  position {position} mm",
+        f"  rotation vector {turn} mrad",
+    ]
+
+
+def uncertainty_scope(verdict: str | None) -> str:
+    """Of which model U is: a sigma counts no effect that is missing.
+
+    Args:
+        verdict: of the diagnosis; None where there is none yet.
+    """
+    told = {
+        None: "; whether an effect is missing has not been asked",
+        "adequate": "; no effect is found missing",
+    }
+    return f"U of the hand-eye holds for a complete model{told.get(verdict, ', and this one seems to lack something')}."
 
 
 @dataclass(frozen=True)

@@ -15,25 +15,263 @@ White scatter of the flange in every scan, and the sensor's noise, come with the
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import permutations
 
 import numpy as np
 
-from stitch.effects.contract import EFFECTS
+from stitch import frames
+from stitch.effects.contract import EFFECTS, Effect, missing_need
 from stitch.frames import Array, Mask
-from stitch.measurement.measurement import Measurement
-from stitch.model.model import Model
-from stitch.observations.arm_errors import (
-    EFFECT_FAMILY,
-    JOINT_SCATTER,
-    USUAL_JOINT_SCATTER,
-    arm_effects,
-    effect_twists,
-    group_by_family,
+from stitch.measurement.measurement import STILL, Measurement, Torques
+from stitch.model.forward import pose_derivatives
+from stitch.model.model import Model, Term, term_of
+from stitch.statistics.kernels import (
+    SmoothErrors,
+    direction_kernel,
+    load_kernel,
+    ornstein_uhlenbeck,
+    periodic_kernel,
+    process_covariance,
+    rbf_joints,
+    same_stop,
+    short_range_kernel,
+    two_joint_kernel,
 )
-from stitch.observations.flange_errors import DRIFT_MEMORY, drift_kernel, flange_twists, mean_square_per_axis
-from stitch.observations.joint_processes import joint_processes
-from stitch.statistics.kernels import SmoothErrors, process_covariance, rbf_joints, same_stop
-from stitch.statistics.variance_prior import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
+from stitch.statistics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
+
+# What joints and links of any arm do a little wrong: effects of the library, and the twists of the views by them.
+
+# What every joint does anew in every view, and how much of it is usual, as a share of a plausible offset: as much as
+# the flange turns.
+JOINT_SCATTER, USUAL_JOINT_SCATTER = "joint scatter", 0.02
+_OFFSET = "joint_offset"
+# What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
+_ARM_COVARIATES = ("joints", "torque")
+EFFECT_FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
+
+
+def arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
+    """What the library knows of every joint and link, as far as all sessions can have it."""
+    possible = [
+        e
+        for e in EFFECTS.values()
+        if e.tier == "physical" and e.place in ("robot", "links") and e.needs and set(e.needs) <= set(_ARM_COVARIATES)
+    ]
+    per_joint = [e for e in possible if all(spec.kind in ("joint", "torque") for spec in e.specs.values())]
+    return [e for e in per_joint if not any(missing_need(m, e) for m in measurements)]
+
+
+def group_by_family(effects: Sequence[Effect]) -> dict[str, list[Effect]]:
+    """Effects of one cause share a size."""
+    out: dict[str, list[Effect]] = {}
+    for e in effects:
+        out.setdefault(EFFECT_FAMILY.get(e.name, e.name), []).append(e)
+    return out
+
+
+def effect_twists(measurement: Measurement, model: Model, centre: Array, effects: Sequence[Effect]) -> Array:
+    """(6V, P) twists of the views for plausible sizes of all parameters of some effects."""
+    in_use: dict[str, Term] = {term.name: term for term in model.terms}
+    terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
+    found = zip(terms, pose_derivatives(measurement, model, terms, centre), strict=True)
+    return np.hstack([moved.reshape(len(moved), -1).T * term.typical for term, moved in found])
+
+
+def joint_offset_twists(measurement: Measurement, model: Model, centre: Array) -> Array | None:
+    """(6V, n) twists of the views for a plausible offset of every joint; None where no joints are known."""
+    if not measurement.views.has("joints") or _OFFSET not in EFFECTS:
+        return None
+    return effect_twists(measurement, model, centre, [EFFECTS[_OFFSET]])
+
+
+# How a flange errs whatever the joints do: how much it usually turns and moves, and how long that lasts.
+
+# Usual sizes, rad and mm.
+_ROTATION, _TRANSLATION = 2e-5, 0.02
+_PER_MM = {"mm": 1.0, "m": 1e-3}
+# What wanders, with correlation times in steps from view to view: what the next views forget, and what lasts as long as
+# a usual session. Each has a size of its own: how much neighbours differ says how large it is, its memory what of it
+# all views share; with both in one size that was understated.
+DRIFT_MEMORY = {"quickly wandering": 2.0, "slowly wandering": 20.0}
+
+
+def usual_twist(length_unit: str) -> Array:
+    """(6,) how much a flange usually turns (rad) and moves."""
+    return np.repeat([_ROTATION, _TRANSLATION * _PER_MM[length_unit]], 3)
+
+
+def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
+    """(6V, 6) twists of all views of a rig by a flange that turns and moves by its usual sizes, in its own frame.
+
+    Args:
+        centres: per session the point (3,) about which twists count, reference frame.
+    """
+    unit = usual_twist(measurements[0].length_unit)
+    own = [
+        frames.adjoint(frames.make(np.eye(3), -centre) @ m.capture.T_reference_flange)
+        for m, centre in zip(measurements, centres, strict=True)
+    ]
+    return np.asarray(np.concatenate(own).reshape(-1, 6) * unit)
+
+
+def mean_square_per_axis(columns: Array, measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
+    """(2,) mean squares, rad² and length_unit², along an axis of the flange of what columns (6V, n) of twists of the
+    views, of unit variance each, turn and move it by."""
+    flange = flange_twists(measurements, centres).reshape(-1, 6, 6)
+    unit = usual_twist(measurements[0].length_unit)
+    own = unit[:, None] * np.linalg.solve(flange, columns.reshape(len(flange), 6, -1))
+    squares = (own**2).sum(axis=2).mean(axis=0)
+    return np.asarray(squares.reshape(2, 3).mean(axis=1))
+
+
+def drift_kernel(measurements: Sequence[Measurement], memory: float) -> Array:
+    """(V, V) how alike views err that are near in time; sessions are far from each other.
+
+    Args:
+        memory: correlation time in steps from view to view.
+    """
+    counts = [m.views.count for m in measurements]
+    out, at = np.zeros((sum(counts), sum(counts))), 0
+    for m, count in zip(measurements, counts, strict=True):
+        out[at : at + count, at : at + count] = ornstein_uhlenbeck(time_in_steps(m), memory)
+        at += count
+    return out
+
+
+def time_in_steps(measurement: Measurement) -> Array:
+    """(V,) times of the views in usual steps from one to the next; their numbers where no time is stated."""
+    views, step = measurement.views, usual_time_step(measurement)
+    return np.asarray(views.time / step if step > 0 else np.arange(views.count, dtype=float))
+
+
+def usual_time_step(measurement: Measurement) -> float:
+    """From one view to the next, s; 0 where no time is stated."""
+    steps = np.diff(measurement.views.time)
+    return float(np.median(steps)) if measurement.views.has("time") and (steps > 0).any() else 0.0
+
+
+# What one joint may do by no law that anybody wrote down: processes by what it follows, in none of the components of
+# the prior of pose errors.
+
+# What a joint may follow that errs by no law that anybody wrote down: all joint angles smoothly, its own and one other,
+# its own within a few degrees or in waves, the way it came, time, at each pose in another way or in the same, or what
+# bends it.
+ALL_ANGLES, OWN_ANGLE, TRAVEL, WITH_TIME = "all angles", "own angle", "the way it came", "time"
+JOINT_LOAD, TWO_ANGLES, WAVES, TIME_ONLY = "its load", "its angle and another", "waves of its angle", "time alone"
+# A joint that turns less stands still, rad: what follows its angle alone is the same in all views, and has a name.
+_STATIONARY_RANGE = 1e-3
+# Waves along a joint: two over its range at the least, half a wave more or less looks alike, none shorter than 10°.
+_MIN_WAVES, _WAVE_STEP, _SHORTEST_PERIOD, _MAX_WAVES = 2.0, 0.5, float(np.radians(10.0)), 14.0
+
+
+def joint_processes(
+    measurements: Sequence[Measurement], joints: Array, offsets: Array, joint_kernel: Array
+) -> dict[str, SmoothErrors]:
+    """Of every joint, by what it follows, for the sessions of a rig.
+
+    Args:
+        joints: (V, n) rad of all views.
+        offsets: (6V, n) twists of the views per unit of each joint.
+        joint_kernel: (V, V) of a smooth function of all joints.
+    """
+    came = joints - np.concatenate([m.views.previous for m in measurements])
+    slowly = drift_kernel(measurements, DRIFT_MEMORY["slowly wandering"])
+    each = tuple(range(joints.shape[1]))
+    kinds = {ALL_ANGLES: joint_kernel, WITH_TIME: (1 + joint_kernel) / 2 * slowly, TIME_ONLY: slowly}
+    found = {kind: SmoothErrors(offsets, own, each) for kind, own in kinds.items()}
+    found |= (
+        _own_angle_processes(joints, came, offsets)
+        | _angle_pair_processes(joints, offsets)
+        | _periodic_processes(joints, offsets)
+    )
+    return found | _load_processes([m.views.torques for m in measurements], offsets)
+
+
+def _moving_joints(joints: Array) -> Mask:
+    """(n,) joints that do not stand still in all views (V, n), rad."""
+    return np.asarray(np.ptp(joints, axis=0) > _STATIONARY_RANGE)
+
+
+def _own_angle_processes(joints: Array, travel: Array, offsets: Array) -> dict[str, SmoothErrors]:
+    """What each joint does that follows its own angle closely, or the way it came, by these kinds of law; {} where none
+    turns.
+
+    Args:
+        joints: (V, n) rad.
+        travel: (V, n) rad from the view before.
+        offsets: (6V, n) twists of the views per unit of each joint.
+    """
+    own = tuple(map(int, np.flatnonzero(_moving_joints(joints))))
+    if not own:
+        return {}
+    closely = np.array([short_range_kernel(joints[:, k], joints[:, k]) for k in own])
+    in_way = np.array([direction_kernel(joints[:, k], travel[:, k]) for k in own])
+    kinds = {OWN_ANGLE: closely, TRAVEL: in_way}
+    return {kind: SmoothErrors(offsets[:, own], alike, own) for kind, alike in kinds.items()}
+
+
+def _angle_pair_processes(joints: Array, offsets: Array) -> dict[str, SmoothErrors]:
+    """What each joint does that follows its own angle and one other's alone, as joints do that drag each other: of the
+    many numbers that a function of all angles may have in few views it has a few. By that kind of law; {} where no
+    two are known of which one turns.
+
+    Args:
+        joints: (V, n) rad.
+        offsets: (6V, n) twists of the views per unit of each joint.
+    """
+    turns = _moving_joints(joints)
+    pairs = [two for two in permutations(range(joints.shape[1]), 2) if turns[[*two]].any()]
+    if not pairs:
+        return {}
+    own, others = (tuple(of) for of in zip(*pairs, strict=True))
+    alike = np.array([two_joint_kernel(*joints.T[[*two]]) for two in pairs])
+    return {TWO_ANGLES: SmoothErrors(offsets[:, own], alike, own, others)}
+
+
+def _periodic_processes(joints: Array, offsets: Array) -> dict[str, SmoothErrors]:
+    """What each joint does again and again as it turns, as teeth of a gear or of a belt do, by that kind of law; {}
+    where none turns.
+
+    Args:
+        joints: (V, n) rad.
+        offsets: (6V, n) twists of the views per unit of each joint.
+    """
+    found = [
+        (k, period)
+        for k, own in enumerate(np.ptp(joints, axis=0))
+        if own > _STATIONARY_RANGE
+        for period in _candidate_periods(own)
+    ]
+    if not found:
+        return {}
+    own, periods = (tuple(of) for of in zip(*found, strict=True))
+    alike = np.array([periodic_kernel(joints[:, k], joints[:, k], period) for k, period in found])
+    return {WAVES: SmoothErrors(offsets[:, own], alike, own, periods=periods)}
+
+
+def _candidate_periods(turned: float) -> list[float]:
+    """Of waves along a joint that turned so far in all, rad."""
+    most = min(_MAX_WAVES, turned / _SHORTEST_PERIOD)
+    return [turned / waves for waves in np.arange(_MIN_WAVES, most, _WAVE_STEP)]
+
+
+def _load_processes(torques: Sequence[Torques], offsets: Array) -> dict[str, SmoothErrors]:
+    """What each joint that is bent does under its load, by that kind of law; {} where not the same is known of all.
+
+    Args:
+        offsets: (6V, n) twists of the views per unit of each joint.
+    """
+    first = torques[0]
+    if any((own.names, own.measured) != (first.names, first.measured) for own in torques):
+        return {}
+    values, joint = np.concatenate([own.values for own in torques]), np.array(first.joint)
+    changes = np.ptp(values, axis=0) > STILL
+    bent = tuple(int(k) for k in np.unique(joint[changes]))
+    if not bent:
+        return {}
+    alike = np.array([load_kernel(values[:, changes & (joint == k)]) for k in bent])
+    return {JOINT_LOAD: SmoothErrors(offsets[:, bent], alike, bent)}
+
 
 # Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
 # smaller.

@@ -4,16 +4,400 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
+from stitch import frames
+from stitch.diagnosis.candidates import free_masks
+from stitch.diagnosis.next_view import reachable
+from stitch.diagnosis.score import weights_of_masks
+from stitch.diagnosis.thresholds import SEPARATION_LAMBDA
+from stitch.effects.contract import find_effect, require_available
 from stitch.frames import Array
-from stitch.measurement.session import Session
-from stitch.planning.cells import PlannedCell
-from stitch.planning.choose_views import choose_views
-from stitch.planning.further_views import candidate_joints, with_views
-from stitch.planning.goals import Goal, HalvedHandEye, SplitPair, mean_progress, present_progress
-from stitch.planning.outlook import Outlook, feature_in_scanner, view_outlook
-from stitch.planning.view_bed import PossibleViews, possible_views
+from stitch.measurement.capture import build_capture
+from stitch.measurement.robot import forward
+from stitch.measurement.session import Session, View
+from stitch.model.model import sizes_of, term_of
+from stitch.observations.pose_errors import prior_pose_errors
+from stitch.observations.surfaces.effect_columns import view_columns, view_responses
+from stitch.observations.surfaces.hand_eye_fit import hand_eye_jacobian
+from stitch.observations.surfaces.scanner_errors import field_scatter
+from stitch.planning.detection_chances import RIDGE, Outlook, feature_in_scanner, view_outlook
+from stitch.planning.expected_model import (
+    FEWEST,
+    CellModel,
+    PlannedCell,
+    Scatter,
+    SimulatedViews,
+    displacement,
+    expected_scans,
+    simulate_views,
+    thinned_surface,
+)
 from stitch.system.threads import library_threads_off
+
+# Which of many possible views bring most: information about hand-eye and effects, view by view.
+#
+# Every view says its twist against the part, but for a motion that all of them share, with the scanner's noise; poses
+# err as expected, together. A normal matrix of the views chosen so far answers every question; what one more view would
+# add to it is a Schur complement, for all that could be next at once (Fedorov 1972; Atkinson, Donev & Tobias 2007,
+# ch. 12).
+
+# A direction that a view sees less than this share of its clearest one is as good as unseen.
+_UNSEEN = 1e-6
+
+
+@dataclass(frozen=True)
+class TwistChannel:
+    """Twists of N views that could be taken: their covariance, and columns of what is asked and what is in the way."""
+
+    covariance: Array  # (6N, 6N) of pose errors and noise
+    columns: Array  # (6N, q)
+
+    def normal(self, chosen: Sequence[int]) -> Array:
+        """(q, q) normal matrix of some views."""
+        white = self._white(chosen)[1]
+        return np.asarray(white.T @ white)
+
+    def with_each(self, chosen: Sequence[int], others: Sequence[int]) -> Array:
+        """(K, q, q) normal matrices of some views and one more."""
+        half, white = self._white(chosen)
+        rows, more = _rows(chosen), _rows(others)
+        B = solve_triangular(half, self.covariance[np.ix_(rows, more)], lower=True).reshape(len(rows), -1, 6)
+        own = self.covariance.reshape(len(self.covariance) // 6, 6, -1, 6)[others, :, others]
+        left = own - np.einsum("rki,rkj->kij", B, B)
+        columns = self.columns[more].reshape(len(others), 6, -1) - np.einsum("rki,rq->kiq", B, white)
+        fresh = np.linalg.solve(np.linalg.cholesky(left), columns)
+        return np.asarray(white.T @ white + fresh.transpose(0, 2, 1) @ fresh)
+
+    def _white(self, chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Cholesky factor of the chosen rows' covariance, and their columns in units of it."""
+        rows = _rows(chosen)
+        half = np.linalg.cholesky(self.covariance[np.ix_(rows, rows)])
+        return half, np.asarray(solve_triangular(half, self.columns[rows], lower=True))
+
+
+def _rows(views: Sequence[int]) -> Array:
+    return np.asarray((6 * np.asarray(views)[:, None] + np.arange(6)).ravel())
+
+
+def noise_of(information: Array, variance: float, lever: float) -> Array:
+    """(6N, 6N) noise of the twists of N views from their normal matrices; what they do not see is as good as unknown.
+
+    Args:
+        information: (N, 6, 6) Σ w BᵀB of each view's correspondences.
+        variance: of a correspondence.
+        lever: by which a radian counts as a length.
+    """
+    scale = np.array([1 / lever] * 3 + [1.0] * 3)
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
+    known = np.maximum(values, _UNSEEN * values[:, -1:])
+    half = scale[:, None] * vectors * np.sqrt(variance / known)[:, None]
+    out = np.zeros((len(values), 6, len(values), 6))
+    each = np.arange(len(values))
+    out[each, :, each] = half @ half.transpose(0, 2, 1)
+    return out.reshape(6 * len(values), -1)
+
+
+def separations(normal: Array, own: slice, rival: slice) -> Array:
+    """(..., p) squared length of what every column of a pattern keeps when a rival's imitate it, all else being free.
+
+    Args:
+        normal: (..., q, q) normal matrix; columns at plausible sizes.
+        own: of the pattern.
+        rival: of the rival.
+    """
+    q = normal.shape[-1]
+    rest = np.setdiff1d(np.arange(q), np.arange(own.start, own.stop))
+    ridge = np.where((rest >= rival.start) & (rest < rival.stop), RIDGE, 0.0)
+    free = normal[..., rest[:, None], rest] + np.diag(ridge)
+    across = normal[..., rest[:, None], np.arange(own.start, own.stop)]
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(free, axis1=-2, axis2=-1), 1e-300))
+    inverse = np.linalg.pinv(free * scale[..., :, None] * scale[..., None, :], rcond=1e-12, hermitian=True)
+    scaled = across * scale[..., :, None]
+    imitated = np.einsum("...ap,...ab,...bp->...p", scaled, inverse, scaled)
+    left = np.diagonal(normal[..., own, own], axis1=-2, axis2=-1) - imitated
+    return np.asarray(np.maximum(left, 0.0))
+
+
+# All views that a plan may hold, with what they would say of the hand-eye and of rival effects.
+
+# Points on the part and correspondences of a view are few here: there are many pairs, and noise is not what limits.
+_SAMPLES, _POINTS, _MIN_VIEW_SAMPLES = 250, 4000, 25
+
+
+@dataclass(frozen=True)
+class EffectColumns:
+    """One effect of a pair: its columns at plausible sizes, and the forms that it may have."""
+
+    columns: Array  # (6N, P)
+    forms: Array  # (F, P) bool: parameters that are free
+    weights: Array  # (F,) share of the prior of each
+
+
+@dataclass(frozen=True)
+class PossibleViews:
+    """N views: those of the session first, then those that could be added."""
+
+    session: Session
+    cell: CellModel
+    simulated: SimulatedViews
+    scatter: Scatter
+
+    def channel(self, foreign_effects: Sequence[str] = (), columns: Sequence[Array] = ()) -> TwistChannel:
+        """Hand-eye, a common motion, effects in use, further columns; `foreign_effects`: effects that no arm "
+        "has of itself."""
+        m, freed, model = self.simulated.measurement, self.simulated.unconstrained, self.cell.model
+        g = freed.overlaps.gram
+        errors = prior_pose_errors([m], model, [g.centre]).without(set(foreign_effects))
+        sizes = self.scatter.variances(errors.names)
+        covariance = np.einsum("c,cij->ij", sizes[3:], errors.components) + self._white()
+        field = field_scatter(m, freed)
+        covariance += field @ field.T
+        covariance += noise_of(self._information(), sizes[2] * g.variance, max(g.lever, 1e-9))
+        used = view_columns(m, model, freed) * sizes_of(model.terms)
+        common = np.tile(np.eye(6), (g.views, 1))
+        own = hand_eye_jacobian(m.capture.hand_eye_frames(model.T_mount), g.centre)
+        return TwistChannel(covariance, np.hstack([own, common, used, *columns]))
+
+    def effect(self, name: str) -> EffectColumns:
+        """How the views answer to an effect of the library.
+
+        Raises:
+            InputError: one that is not known, or that these views cannot have.
+        """
+        measurement, effect = self.simulated.measurement, find_effect(name)
+        require_available(measurement, effect)
+        term = term_of(measurement, effect)
+        response = view_responses(measurement, self.cell.model, [term], self.simulated.unconstrained)[0].columns
+        masks = free_masks(term)
+        return EffectColumns(response * term.typical, np.array(masks), weights_of_masks(masks))
+
+    def _white(self) -> Array:
+        """(6N, 6N) of the flange's scatter, view by view."""
+        m = self.simulated.measurement
+        to_centre = frames.make(np.eye(3), -self.simulated.unconstrained.overlaps.gram.centre)
+        carried = frames.adjoint(to_centre @ m.capture.T_reference_flange)
+        size = np.repeat([self.scatter.rotation**2, self.scatter.translation**2], 3)
+        out = np.zeros((len(carried), 6, len(carried), 6))
+        each = np.arange(len(carried))
+        out[each, :, each] = (carried * size) @ carried.transpose(0, 2, 1)
+        return out.reshape(6 * len(carried), -1)
+
+    def _information(self) -> Array:
+        """(N, 6, 6) of every view against all others."""
+        g = self.simulated.unconstrained.overlaps.gram
+        out = np.zeros((g.views, 6, 6))
+        for side in (0, 1):
+            np.add.at(out, g.pairs[:, side].astype(np.int64), g.matrix)
+        return out
+
+
+def possible_views(session: Session, cell: CellModel, scatter: Scatter) -> PossibleViews:
+    """A session with all views that could be added.
+
+    Args:
+        scatter: with the errors of the arm that the views are expected to leave open.
+    """
+    coarse = replace(cell, part=thinned_surface(cell.part.points, cell.part.normals, _POINTS))
+    return PossibleViews(session, coarse, simulate_views(session, coarse, _SAMPLES, _MIN_VIEW_SAMPLES), scatter)
+
+
+# What further views are for: a hand-eye known twice as well, two effects told apart; how far some views get.
+
+# Keeps what too few views leave open finite: a radian, and many times any part.
+_OPEN = 1e-8
+# Whatever the unit, no logarithm of a length comes near.
+_NEVER = -50.0
+
+
+@dataclass(frozen=True)
+class HalvedHandEye:
+    """The hand-eye's U at a point, down to a share of what the present views give it."""
+
+    channel: TwistChannel
+    middle: Array  # (3,) scanner frame
+    now: float  # U of the present views, length_unit; NaN where they give none
+    share: float = 0.5
+
+    def U(self, normal: Array) -> Array:
+        """(...) of normal matrices (..., q, q)."""
+        scale = 1 / np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), 1e-300))
+        scaled = normal * scale[..., :, None] * scale[..., None, :]
+        inverse = np.linalg.inv(scaled + _OPEN * np.eye(normal.shape[-1]))
+        covariance = (inverse * scale[..., :, None] * scale[..., None, :])[..., :6, :6]
+        flat = covariance.reshape(-1, 6, 6)
+        return np.array([displacement(C, self.middle) for C in flat]).reshape(covariance.shape[:-2])
+
+    def progress(self, normal: Array) -> Array:
+        """(...) 1 where U has come down to that share; without a present U what its logarithm falls by, never 1."""
+        if not np.isfinite(self.now):
+            return np.asarray(_NEVER - np.log(self.U(normal)))
+        return np.asarray(np.clip(np.log(self.U(normal) / self.now) / np.log(self.share), 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class SplitPair:
+    """Two effects of usual size, each told from the other."""
+
+    channel: TwistChannel
+    names: tuple[str, str]
+    effects: tuple[EffectColumns, EffectColumns]  # their columns are the channel's last
+
+    def progress(self, normal: Array) -> Array:
+        """(...) share of the forms that are told apart, of the effect that is told worse; 1 if all are."""
+        counts = [e.columns.shape[1] for e in self.effects]
+        at = normal.shape[-1] - sum(counts)
+        a, b = slice(at, at + counts[0]), slice(at + counts[0], at + sum(counts))
+        both = []
+        for own, rival, effect in ((a, b, self.effects[0]), (b, a, self.effects[1])):
+            apart = separations(normal, own, rival) @ effect.forms.T
+            both.append(np.minimum(apart / SEPARATION_LAMBDA, 1.0) @ effect.weights)
+        return np.asarray(np.minimum(*both))
+
+
+Goal = HalvedHandEye | SplitPair
+
+
+def mean_progress(goals: Sequence[Goal], chosen: Sequence[int], others: Sequence[int]) -> Array:
+    """(K,) mean progress of all goals with each of some more views."""
+    return np.asarray(np.mean([goal.progress(goal.channel.with_each(chosen, others)) for goal in goals], axis=0))
+
+
+def present_progress(goals: Sequence[Goal], chosen: Sequence[int]) -> float:
+    """The same of the chosen views alone."""
+    return float(np.mean([goal.progress(goal.channel.normal(chosen)) for goal in goals]))
+
+
+# Few views, then little travel: greedy choice, exchange, what is not needed left out, driven the short way round.
+
+# Reached, but for rounding; and what a view must bring to be worth taking.
+_REACHED, _WORTH = 1 - 1e-6, 0.01
+# Among views that bring nearly the same the nearest is taken.
+_NEARLY = 0.95
+_SWEEPS = 2
+
+
+def choose_views(goals: Sequence[Goal], joints: Array, present: int, most: int) -> list[int]:
+    """Indices of further views, in the order in which they are driven.
+
+    Args:
+        joints: (N, n) of all views: those that are there first.
+        present: how many these are.
+        most: views at the most.
+    """
+    before, chosen = list(range(present)), list[int]()
+    now = present_progress(goals, before)
+    while len(chosen) < most and now < _REACHED:
+        others = [k for k in range(present, len(joints)) if k not in chosen]
+        if not others:
+            break
+        gained = mean_progress(goals, [*before, *chosen], others)
+        if gained.max() - now < _WORTH:
+            break
+        k = _nearest_worthwhile(others, gained, now, joints, [*before, *chosen][-1])
+        chosen.append(k)
+        now = float(gained[others.index(k)])
+    for _ in range(_SWEEPS):
+        chosen, now = _exchange_views(goals, joints, before, chosen, now)
+    return travel_order(joints, present - 1, _without_redundant(goals, before, chosen, now))
+
+
+def _nearest_worthwhile(others: Sequence[int], gained: Array, now: float, joints: Array, last: int) -> int:
+    good = np.flatnonzero(gained - now >= _NEARLY * (gained.max() - now))
+    travel = [float(np.abs(joints[others[int(i)]] - joints[last]).sum()) for i in good]
+    return others[int(good[np.argmin(travel)])]
+
+
+def _exchange_views(
+    goals: Sequence[Goal], joints: Array, before: list[int], chosen: list[int], now: float
+) -> tuple[list[int], float]:
+    """Every chosen view against the best in its place."""
+    for i in range(len(chosen)):
+        rest = chosen[:i] + chosen[i + 1 :]
+        others = [k for k in range(len(before), len(joints)) if k not in rest]
+        gained = mean_progress(goals, [*before, *rest], others)
+        best = int(gained.argmax())
+        if gained[best] > now + _WORTH:
+            chosen, now = [*rest[:i], others[best], *rest[i:]], float(gained[best])
+    return chosen, now
+
+
+def _without_redundant(goals: Sequence[Goal], before: list[int], chosen: list[int], now: float) -> list[int]:
+    """Without the views that the others make idle."""
+    for k in list(chosen):
+        rest = [other for other in chosen if other != k]
+        if rest and present_progress(goals, [*before, *rest]) >= min(now, _REACHED):
+            chosen = rest
+    return chosen
+
+
+def travel_order(joints: Array, last: int, chosen: Sequence[int]) -> list[int]:
+    """Views of joint angles (V, n), each the nearest to the one before, beginning at the view `last`."""
+    out, left, at = list[int](), list(chosen), last
+    while left:
+        at = min(left, key=lambda k: float(np.abs(joints[k] - joints[at]).sum()))
+        left.remove(at)
+        out.append(at)
+    return out
+
+
+# Views that could be taken: a session with further rows, at joint angles within reach in which the part is seen.
+
+# A view must show this share of what the others show.
+_SHARE = 0.4
+# So many times as many poses are tried as are asked for.
+_TRIES = 4
+
+
+def with_views(session: Session, joints: Sequence[Array], in_turn: bool = True) -> Session:
+    """The session with further views at joint angles (n,) rad, after the last one, called p01, p02 …
+
+    Args:
+        in_turn: each driven to from the one before; else each from the last view that there is, one of them being next.
+    """
+    assert session.robot is not None
+    last, views = session.views[-1], list(session.views)
+    pause = _pause(session)
+    for k, q in enumerate(joints):
+        before = views[-1] if in_turn else last
+        assert before.joints is not None
+        # As alternatives they come at times that a few views would take.
+        later = pause * (k + 1 if in_turn else k % 6 + 1)
+        views.append(
+            View(
+                name=f"p{k + 1:02d}",
+                cloud=None,
+                T_base_flange=forward(session.robot, q),
+                joints=q,
+                approach=np.sign(q - before.joints),
+                time_s=None if last.time_s is None else last.time_s + later,
+                covariates=dict(last.covariates),
+            )
+        )
+    return replace(session, views=tuple(views))
+
+
+def _pause(session: Session) -> float:
+    times = [view.time_s for view in session.views if view.time_s is not None]
+    return float(np.median(np.diff(times))) if len(times) > 1 else 60.0
+
+
+def candidate_joints(session: Session, cell: CellModel, count: int) -> Array:
+    """(K, n) joint angles near those that are planned in which the scanner would see the part, K ≤ count."""
+    T_mount = cell.model.T_mount
+    driven, T_base_flange = session.joints, np.array([view.T_base_flange for view in session.views])
+    assert driven is not None
+
+    def poses_of(joints: Array) -> Array:
+        assert session.robot is not None
+        return build_capture(session.name, (), forward(session.robot, joints), session.mount).poses(T_mount)
+
+    seen_from = build_capture(session.name, (), T_base_flange, session.mount).poses(T_mount)
+    joints = reachable(driven, poses_of, seen_from, cell.part.centre)
+    least = max(FEWEST, _SHARE * np.median([len(index) for index in expected_scans(cell, seen_from)]))
+    seen = (len(index) >= least for index in expected_scans(cell, poses_of(joints[: _TRIES * count])))
+    return np.asarray(joints[: _TRIES * count][list(seen)][:count])
+
 
 # Fewer views give no hand-eye: two motions about different axes are the least (Tsai & Lenz 1989).
 _MIN_PRESENT_VIEWS = 3

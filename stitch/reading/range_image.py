@@ -1,20 +1,105 @@
 """Scans as images: organised clouds with brightness or colour, and depth images with the colour image beside them."""
 
 import re
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.measurement.range_image import RangeImage
-from stitch.reading.clouds import read_ply
+from stitch.measurement.session import RangeImage
+from stitch.reading.clouds import grid_shape, read_pcd, read_ply, read_zdf_image
 from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image, read_depth
-from stitch.reading.organised import grid_shape
-from stitch.reading.pcd import read_pcd
-from stitch.reading.text_file import reason_of
-from stitch.reading.zdf import read_zdf_image
+from stitch.reading.text_files import import_extra, reason_of
+
+# Poses that stand in the headers of scans: E57, Leica's PTX, PCD; and the times that stand in those of E57.
+#
+# Robot cells that save such files write the flange's pose there; software that has registered the scans already writes
+# the scanner's own.
+
+_HEAD = 4096
+# From here E57 counts seconds (ASTM E2807).
+_GPS_EPOCH, _LATEST_S = datetime(1980, 1, 6), 1e10
+# PTX: sizes and four lines of the scanner's place stand above the matrix.
+_PTX_MATRIX = slice(6, 10)
+
+
+def poses_in_scans(files: list[Path]) -> Array | None:
+    """Poses (N, 4, 4) of scans of one format in the files' own unit; None where one has none, or all are the same.
+
+    Raises:
+        InputError: the package that reads such files is not installed.
+    """
+    readers = {".e57": _e57, ".ptx": _ptx, ".pcd": _pcd}
+    kinds = {file.suffix.lower() for file in files}
+    if len(kinds) != 1 or not kinds <= readers.keys():
+        return None
+    read = readers[kinds.pop()]
+    found = []
+    for file in files:
+        try:
+            T = read(file)
+        except (ValueError, IndexError, OSError):
+            return None
+        if T is None or not frames.is_rigid(T):
+            return None
+        found.append(T)
+    poses = np.stack(found)
+    return None if np.allclose(poses, poses[0]) else poses
+
+
+def times_in_scans(files: list[Path]) -> list[str] | None:
+    """When each scan began, as 2026-12-31T23:59:59.250000, of E57; None where one does not say it.
+
+    Raises:
+        InputError: the package that reads such files is not installed.
+    """
+    if {file.suffix.lower() for file in files} != {".e57"}:
+        return None
+    seconds = [_e57_seconds(file) for file in files]
+    if not all(0 < s < _LATEST_S for s in seconds):
+        return None
+    return [(_GPS_EPOCH + timedelta(seconds=s)).isoformat(timespec="microseconds") for s in seconds]
+
+
+def _e57_seconds(file: Path) -> float:
+    """Zero where the header has no time."""
+    opened = import_extra("pye57", file, "formats").E57(str(file))
+    try:
+        return float(opened.get_header(0).acquisitionStart_dateTimeValue)
+    except Exception:  # of libe57's own kinds: the standard lets the entry out
+        return 0.0
+
+
+def _e57(file: Path) -> Array | None:
+    # A header is good for as long as its file is open.
+    opened = import_extra("pye57", file, "formats").E57(str(file))
+    header = opened.get_header(0)
+    return frames.make(header.rotation_matrix, header.translation) if header.has_pose() else None
+
+
+def _ptx(file: Path) -> Array:
+    """Four lines of a matrix for rows of points: the translation stands in the last of them."""
+    with file.open(encoding="ascii", errors="replace") as stream:
+        lines = [line.split() for _, line in zip(range(_PTX_MATRIX.stop), stream, strict=False)]
+    T = np.array(lines[_PTX_MATRIX], float).T
+    # Seven digits of a rotation are not quite one.
+    return frames.make(Rotation.from_matrix(T[:3, :3]).as_matrix(), T[:3, 3])
+
+
+def _pcd(file: Path) -> Array | None:
+    with file.open("rb") as stream:
+        words = [line.split() for line in stream.read(_HEAD).split(b"\n")]
+    told = next((line[1:] for line in words if line[:1] == [b"VIEWPOINT"]), None)
+    if told is None or len(told) != 7:
+        return None
+    x, y, z, w, *axis = (float(word) for word in told)
+    return frames.make(Rotation.from_quat([*axis, w]).as_matrix(), np.array([x, y, z]))
+
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _COLOUR = re.compile(r"colou?r|rgb|image|gr[ae]y|intensity|texture|left|2d", re.IGNORECASE)

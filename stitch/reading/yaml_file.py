@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from stitch.errors import InputError
-from stitch.reading.csv_number import is_number
+from stitch.reading.csv_files import is_number
 
 _HEAD_OF_OPENCV = re.compile(r"\A%YAML:.*")
 _DEEPEST = 50

@@ -1,5 +1,6 @@
 """What the stages show while they work; a viewer implements `Recorder`, the stages do not know it."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 from stitch.frames import Array
@@ -30,3 +31,33 @@ class SilentRecorder:
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None: ...
     def stage(self, result: StageResult, poses: Array) -> None: ...
     def finish(self, run: Run) -> None: ...
+
+
+# Several recorders as one.
+
+
+class RecorderGroup:
+    """Several recorders at once."""
+
+    def __init__(self, recorders: Sequence[Recorder]) -> None:
+        self.recorders = recorders
+
+    def start(self, session: Session) -> None:
+        """Pass on."""
+        for recorder in self.recorders:
+            recorder.start(session)
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """Pass on."""
+        for recorder in self.recorders:
+            recorder.iteration(stage, index, poses, rms, gate)
+
+    def stage(self, result: StageResult, poses: Array) -> None:
+        """Pass on."""
+        for recorder in self.recorders:
+            recorder.stage(result, poses)
+
+    def finish(self, run: Run) -> None:
+        """Pass on."""
+        for recorder in self.recorders:
+            recorder.finish(run)

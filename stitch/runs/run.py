@@ -1,16 +1,33 @@
 """What a run computed, as plain frozen data; `writing` puts it on disk."""
 
+import re
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from stitch.frames import Array
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
-from stitch.model.model import Model
-from stitch.model.term import Term
-from stitch.observations.surfaces.overlaps import Overlaps
-from stitch.observations.surfaces.pose_channel import Repeatability
+from stitch.model.model import Model, Term
+from stitch.observations.surfaces.hand_eye_fit import Repeatability
+from stitch.observations.surfaces.normal_equations import Overlaps
 from stitch.observations.targets.outliers import Outlier
-from stitch.observations.targets.target_fit import TargetModelFit
+from stitch.observations.targets.target_model import TargetModelFit
+
+# A doubt of a session as a whole in one clause: what it means and what to do stands elsewhere.
+
+_CLAUSE_END = re.compile(r"[:.] ")
+
+
+def doubt_headline(doubt: str) -> str:
+    """A doubt up to its first colon or full stop outside brackets."""
+    ends = (found.start() for found in _CLAUSE_END.finditer(doubt) if _brackets_closed(doubt[: found.start()]))
+    return f"{doubt[: next(ends, len(doubt.rstrip('.')))]}."
+
+
+def _brackets_closed(text: str) -> bool:
+    return text.count("(") == text.count(")")
+
 
 # By which methods register moves single views, for people.
 METHOD_TITLES = {"dpwvm": "DPWVM-style weighted fit", "gicp": "plane to plane (GICP) inside Tukey's biweight"}
@@ -149,3 +166,55 @@ class Run:
             f"Run({self.session.name!r}, {len(self.session.views)} views, residual {self.residual_rms:.4g} {unit}, "
             f"held-out {self.heldout_rms:.4g} {unit}, {self.model!r})"
         )
+
+
+# A run as far as the next question needs it: what was measured, the model, and its history.
+
+
+@dataclass(frozen=True)
+class RunState:
+    """What was measured, the model, and its history."""
+
+    session: Session
+    measurement: Measurement
+    model: Model
+    T_mount_coarse: Array  # (4, 4)
+    gate: float  # largest distance between partners, length_unit; NaN without clouds
+    residual_rms: float
+    noise_floor: float
+    ledger: tuple[LedgerStep, ...]
+    effects_file: str | None
+    left_out: tuple[
+        ExcludedView, ...
+    ] = ()  # views of the session that do not count; session and measurement are without
+    links: ViewLinks = field(default_factory=ViewLinks)
+    doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
+    register: str = ""  # method of register; empty: the usual one
+
+    @property
+    def heldout_rms(self) -> float:
+        """On views left out, length_unit; that of the fit where the history does not know it."""
+        known = self.ledger[-1].heldout_rms if self.ledger else np.nan
+        return known if np.isfinite(known) else self.residual_rms
+
+    def __repr__(self) -> str:
+        return f"State({self.session.name!r}, {len(self.session.views)} views, {self.model!r})"
+
+
+def state_of(run: Run) -> RunState:
+    """The state of a run in memory."""
+    return RunState(
+        session=run.session,
+        measurement=run.measurement,
+        model=run.model,
+        T_mount_coarse=run.T_mount_coarse,
+        gate=float("nan") if run.overlaps is None else run.overlaps.gate,
+        residual_rms=run.residual_rms,
+        noise_floor=run.noise_floor,
+        ledger=run.ledger,
+        effects_file=run.effects_file,
+        left_out=run.left_out,
+        links=run.links,
+        doubts=run.doubts,
+        register=run.register_method,
+    )

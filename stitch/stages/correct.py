@@ -6,32 +6,53 @@ generalised least-squares step weighs the views by the robot's own scatter (`han
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
-from stitch.measurement.capture import Capture
+from stitch.measurement.capture import Capture, part_size
 from stitch.model.model import Model
 from stitch.observations.pose_errors import PoseErrors
-from stitch.observations.surfaces.free_poses import UnconstrainedPoses, unconstrained_poses
-from stitch.observations.surfaces.gram import assemble
-from stitch.observations.surfaces.hand_eye import SCANNER_FIELD, fit_hand_eye
-from stitch.observations.surfaces.hand_eye_solution import step_hand_eye
-from stitch.observations.surfaces.match import sample_points
-from stitch.observations.surfaces.overlaps import (
+from stitch.observations.surfaces.hand_eye_fit import (
+    SCANNER_FIELD,
+    HandEyeFit,
+    Repeatability,
+    capture_repeatability,
+    fit_hand_eye,
+    hand_eye_jacobian,
+    step_hand_eye,
+)
+from stitch.observations.surfaces.matching import sample_points
+from stitch.observations.surfaces.normal_equations import (
     FINE_SAMPLES,
     Overlaps,
+    assemble,
     collect_overlaps,
     common_samples,
     next_gate,
     pooled_rms,
 )
-from stitch.observations.surfaces.pose_channel import Repeatability, hand_eye_jacobian
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.runs.recorder import Recorder, SilentRecorder
-from stitch.stages.correction import Correction
 from stitch.statistics.least_squares import least_squares
+
+# What the correction of a model from overlapping surfaces found.
+
+
+@dataclass(frozen=True)
+class Correction:
+    """The model of a rig; overlaps, freed poses and captures in the order of its sessions."""
+
+    model: Model
+    hand_eye: HandEyeFit  # its statistics
+    overlaps: tuple[Overlaps, ...]
+    unconstrained: tuple[UnconstrainedPoses, ...]  # views moved by the overlaps alone: where register starts
+    history: tuple[float, ...]  # rms per iteration
+    captures: tuple[Capture, ...]  # without the effects in use
+    given: bool = False  # the model is that of another run, nothing was fitted
+
 
 # Queries per view, at most, while the gate closes; the final normal equations take FINE_SAMPLES.
 COARSE_SAMPLES = 600
@@ -164,3 +185,62 @@ def with_noise_factor(capture: Capture, scatter: Repeatability) -> Capture:
     Correspondences share points and normals, so that they never know more than as many independent distances.
     """
     return capture if capture.sightings is None else replace(capture, noise_factor=max(scatter.noise_factor, 1.0))
+
+
+# Use a model that was fitted on another object of the same rig, without correcting again.
+
+# A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
+REUSE_GATE = 0.05
+_TIGHTENINGS = 4
+_GATE_CONVERGED = 0.99
+
+
+def apply_given_hand_eye(captures: Sequence[Capture], model: Model) -> Correction:
+    """Overlaps and pose scatter of `captures` under a model, as `correct` returns them.
+
+    Args:
+        captures: without the model's effects.
+
+    Raises:
+        NoResultError: no two views overlap under the hand-eye.
+    """
+    size = part_size(captures)
+    overlaps = tuple(converged_overlaps(c, model.T_mount, REUSE_GATE * size) for c in captures)
+    poses = [c.poses(model.T_mount) for c in captures]
+    freed = [unconstrained_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True)]
+    scatter = tuple(capture_repeatability(c, f, model.T_mount) for c, f in zip(captures, freed, strict=True))
+    return Correction(
+        model=model,
+        hand_eye=HandEyeFit(model.T_mount, model.covariance, 1.0, scatter, 1.0),
+        overlaps=overlaps,
+        unconstrained=tuple(freed),
+        history=(pooled_rms(overlaps),),
+        captures=tuple(with_noise_factor(c, s) for c, s in zip(captures, scatter, strict=True)),
+        given=True,
+    )
+
+
+def converged_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
+    """Correspondences under a hand-eye that is right but for pose errors; the gate closes to the data's scale.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
+    return collect_overlaps(capture, capture.poses(T_mount), converged_gate(capture, T_mount, gate), samples)
+
+
+def converged_gate(capture: Capture, T_mount: Array, gate: float) -> float:
+    """The distance that partners may have, from one that is too large.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    samples = common_samples(capture.scans, FINE_SAMPLES)
+    poses, overlaps = capture.poses(T_mount), None
+    for _ in range(_TIGHTENINGS):
+        overlaps = collect_overlaps(capture, poses, gate, samples, overlaps)
+        last, gate = gate, float(np.minimum(gate, next_gate(overlaps, capture)))
+        if gate > _GATE_CONVERGED * last:
+            break
+    return gate

@@ -1,6 +1,8 @@
 """The last steps of a run: register single views, fuse them, collect the result."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -9,21 +11,23 @@ from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session
-from stitch.observations.surfaces.gram import RMS_GATE
-from stitch.observations.surfaces.noise_floor import noise_floor
-from stitch.observations.surfaces.overlaps import Overlaps
-from stitch.observations.surfaces.pose_channel import Repeatability, repeatability_from
-from stitch.observations.targets.target_fit import TargetModelFit, rms_of
+from stitch.model.model import Model
+from stitch.model.model_toml import ModelFile
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.hand_eye_fit import Repeatability, repeatability_from
+from stitch.observations.surfaces.normal_equations import RMS_GATE, Overlaps
+from stitch.observations.surfaces.view_poses import noise_floor
+from stitch.observations.targets.target_model import TargetModelFit, rms_of
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import FusedCloud, StageResult
-from stitch.stages.correction import Correction
-from stitch.stages.fuse_whole import RegisteredSession, fuse_every_point
-from stitch.stages.register import Method, register
-from stitch.stages.register_targets import register_targets
+from stitch.stages.correct import Correction
+from stitch.stages.fuse import RegisteredSession, fuse_every_point
+from stitch.stages.initial_guess import CoarseHandEye
+from stitch.stages.register import Method, register, register_targets
 from stitch.stages.sentences import correct_note, register_note, surface_sentence, target_sentence
-from stitch.statistics.robust import MAD_TO_SIGMA
-from stitch.system.mapped_file import release_mapped
-from stitch.system.threads import Clock
+from stitch.stages.target_fit import FittedSession
+from stitch.statistics.distributions import MAD_TO_SIGMA
+from stitch.system.threads import Clock, release_mapped
 
 # Places of the fused cloud that tell its rms to a part in a thousand.
 _RMS_SAMPLES = 2_000_000
@@ -165,3 +169,87 @@ def _fused_rms(residual: Array) -> float:
         return float("nan")
     # As in the overlaps: what lies beyond 4 robust sigmas is an edge, not a distance of surfaces.
     return float(np.sqrt(np.mean(seen[seen < RMS_GATE * MAD_TO_SIGMA * np.median(seen)] ** 2)))
+
+
+# How a run goes with what was observed, and what the fit of a rig found.
+
+# From a measurement, its model and the gate to the model that the fit of effects begins with.
+InitialModel = Callable[[Measurement, Model, float], Model]
+
+
+@dataclass(frozen=True)
+class FittedRig:
+    """The common model of a rig, and its sessions as they count."""
+
+    model: Model  # of labelled points, that of the first session
+    sessions: list[FittedSession]
+    captures: list[Capture]  # without the effects in use
+    correction: Correction | None = None  # of surfaces
+
+    def model_of(self, index: int) -> Model:
+        """Of one session: labelled points of an arm share its effects, and each session has its own hand-eye."""
+        own = self.sessions[index].targets
+        return own.model if self.correction is None and own is not None else self.model
+
+
+class Pipeline(Protocol):
+    """How a run goes with what was observed; a further kind of observation is one more module with these functions."""
+
+    def initial_hand_eyes(
+        self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None
+    ) -> list[CoarseHandEye]:
+        """The hand-eye of every session to begin with."""
+        ...
+
+    def initial_stage(
+        self, measurement: Measurement, start: CoarseHandEye, seconds: float, recorder: Recorder
+    ) -> StageResult:
+        """How well the views agree under it."""
+        ...
+
+    def fit(
+        self,
+        sessions: Sequence[Session],
+        measurements: Sequence[Measurement],
+        starts: Sequence[CoarseHandEye],
+        initial_model: InitialModel | None,
+        recorder: Recorder,
+    ) -> FittedRig:
+        """Hand-eye and effects from the coarse hand-eye on."""
+        ...
+
+    def refit(
+        self,
+        sessions: Sequence[Session],
+        measurements: Sequence[Measurement],
+        model: Model,
+        gates: Sequence[float],
+        recorder: Recorder,
+    ) -> FittedRig:
+        """Hand-eye and the effects of a model fitted anew from where it stands."""
+        ...
+
+    def apply(self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
+        """The sessions under a model of another run as it is."""
+        ...
+
+    def linearise(self, session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+        """What was observed, as one linear model about a model."""
+        ...
+
+    def finish(
+        self,
+        session: Session,
+        fitted: FittedRig,
+        index: int,
+        before: StageResult,
+        recorder: Recorder,
+        seconds: float,
+        register: str,
+    ) -> FinishedSession:
+        """Single views registered by a method, and fused."""
+        ...
+
+    def notes(self, session: Session, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
+        """What a user should know before trusting the result."""
+        ...

@@ -9,11 +9,10 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from stitch.effects.groups import one_by_one
+from stitch.effects.contract import one_by_one
 from stitch.frames import Mask
-from stitch.model.model import Model
-from stitch.model.term import Term, sizes_of
-from stitch.statistics.identifiability import independent
+from stitch.model.model import Model, Term, sizes_of
+from stitch.statistics.least_squares import independent
 from stitch.statistics.parameter_selection import UNSEEN, WhitenedData, select_supported
 
 # Iterations in which it is still open what is fitted.

@@ -18,15 +18,43 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
-from stitch.observations.surfaces.gram import Gram, assemble, gram
-from stitch.observations.surfaces.match import Match, sample_points
-from stitch.observations.surfaces.moved_views import LastStep, has_converged, take_step
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, Overlaps, collect_overlaps, next_gate
-from stitch.observations.surfaces.pose_channel import Repeatability
-from stitch.observations.surfaces.target_pairs import append_targets
+from stitch.observations.surfaces.hand_eye_fit import Repeatability
+from stitch.observations.surfaces.matching import Match, sample_points
+from stitch.observations.surfaces.normal_equations import (
+    FINE_SAMPLES,
+    Gram,
+    Overlaps,
+    append_targets,
+    assemble,
+    collect_overlaps,
+    gram,
+    next_gate,
+)
+from stitch.observations.surfaces.view_poses import LastStep, has_converged, take_step
+from stitch.observations.targets.rows import TargetRows, mixed_model_of_rows
 from stitch.runs.recorder import Recorder, SilentRecorder
-from stitch.stages.correspondence_weights import plane_weights
-from stitch.stages.dpwvm import OffsetSums, dpwvm_weights, with_offsets
+from stitch.stages.correspondence_weights import OffsetSums, dpwvm_weights, plane_weights, with_offsets
+
+# Each view moved by its own most likely error, where its labelled points show one.
+
+
+def register_targets(rows: TargetRows, variances: Array, poses: Array) -> tuple[Array, Array]:
+    """Poses (V, 4, 4) moved by each view's most likely error, and what is left of its targets, (V, S).
+
+    The most likely twist of a view is C·leverᵀ·V⁻¹·(−left) (best linear unbiased prediction, Robinson 1991).
+    """
+    V = len(rows.lever)
+    to_centre = frames.make(np.eye(3), -rows.centre)
+    carried = frames.adjoint(to_centre @ rows.capture.T_reference_flange)
+    scatter = carried * np.repeat(variances[:2], 3) @ carried.transpose(0, 2, 1)
+    covariance = mixed_model_of_rows(rows, rows.hand_eye).covariance(variances)[:V]
+    pushed = np.linalg.solve(covariance, -rows.residual[:V, :, None])
+    twist = (scatter @ rows.lever.transpose(0, 2, 1) @ pushed)[..., 0]
+    moved = frames.inverse(to_centre) @ frames.exp(twist) @ to_centre @ poses
+    left = rows.residual.copy()
+    left[:V] += np.einsum("vmi,vi->vm", rows.lever, twist)
+    return np.asarray(moved), rows.distances(left)
+
 
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 5e-3

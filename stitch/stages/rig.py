@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stitch.effects.in_session import find_effect, parameters_in, require_available
+from stitch.effects.contract import find_effect, parameters_in, require_available
 from stitch.errors import InputError
 from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import Session

@@ -5,15 +5,46 @@ from collections.abc import Sequence
 import numpy as np
 
 from stitch.measurement.session import Session
-from stitch.observations.surfaces.hand_eye import HandEyeFit
-from stitch.observations.surfaces.pose_channel import Repeatability
+from stitch.observations.surfaces.hand_eye_fit import HandEyeFit, Repeatability
 from stitch.observations.targets.outliers import Outlier
-from stitch.observations.targets.target_fit import TargetModelFit
+from stitch.observations.targets.target_model import TargetModelFit
 from stitch.runs.run import ExcludedView
-from stitch.stages.coarse import CoarseHandEye
-from stitch.stages.error_sources import SOURCES
+from stitch.stages.initial_guess import CoarseHandEye
 from stitch.stages.register import Registration
 from stitch.units import angle_text, length_text
+
+# What may be wrong in a hand-eye, in words.
+#
+# The keys are the sources of its variance: white scatter (`error_model.py`), what poses may err beside it
+# (`pose_errors.py`), and what every view repeats (`surface_step.py`) or none shows (`hand_eye.py`).
+
+ANOTHER_ARM = "another run's arm"
+
+SOURCES = {
+    "white rotation": "poses that turn at random",
+    "white translation": "poses that scatter at random",
+    "sensor noise": "the sensor's noise",
+    "joint_offset": "joints that count from a wrong zero",
+    "link_geometry": "links of another length than stated",
+    "joint_compliance": "joints that give way under load",
+    "gears": "gears that do not turn evenly",
+    "play": "play in the joints",
+    "joint scatter": "joints that scatter at random",
+    "smooth": "errors that follow the joint angles by no law",
+    "quickly wandering": "poses that wander, and forget it within a few views",
+    "slowly wandering": "poses that wander slowly all session long",
+    "stop rotation": "turns of the flange that all scans from one pose share",
+    "stop translation": "shifts of the flange that all scans from one pose share",
+    "scanner field": "errors of the scanner that every view repeats",
+    ANOTHER_ARM: "the arm of another run",
+    "unseen": "directions that these views do not show",
+}
+
+
+def unfitted(effect: str) -> str:
+    """What an effect in use may do by parameters that stay at zero, as a source and in words."""
+    return f"numbers of {effect} that stay at zero, since these views hardly tell them from the hand-eye"
+
 
 # Residuals within a quarter of the noise floor's square are noise; above, something else is there.
 _NEAR_FLOOR = 1.1
@@ -67,7 +98,8 @@ def target_sentence(found: TargetModelFit, registered: float, scatter: Repeatabi
         return f"The model puts all targets within {left} rms (3D), which the sensor's own noise ({noise}) explains."
     return (
         f"The model puts the targets within {left} rms (3D), {out} in views left out with their neighbours; the "
-        f"sensor's own noise would leave {noise}. The robot's poses {_scatter_clause(scatter, registered, length_unit)}."
+        f"sensor's own noise would leave {noise}. The robot's poses "
+        f"{_scatter_clause(scatter, registered, length_unit)}."
     )
 
 
@@ -167,7 +199,8 @@ def _unused_points(found: TargetModelFit, outliers: Sequence[Outlier], session: 
     notes = []
     if outliers:
         named_outliers = [
-            f"{outlier_name(o, session)} ({length_text(o.distance, session.length_unit)}, {o.times:.0f} times the usual)"
+            f"{outlier_name(o, session)} ({length_text(o.distance, session.length_unit)}, {o.times:.0f} times the "
+            "usual)"
             for o in outliers
         ]
         more = f" and {len(named_outliers) - _LISTED} more" if len(named_outliers) > _LISTED else ""

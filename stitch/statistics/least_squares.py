@@ -1,11 +1,137 @@
 """Least squares in unknowns of mixed units: columns are equilibrated first, what says nothing drops out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, qr
+from scipy.special import ndtri
 
-from stitch.frames import Array
+from stitch.frames import Array, Indices, Mask
+
+# Anderson acceleration with a memory of one step (Anderson 1965; for ICP: Pavlov et al. 2018).
+#
+# Partners follow a view that moves, so that every step of point-to-plane matching leaves the same share of the way
+# undone. Two steps tell that share, and the next one makes up for it.
+
+# Against steps that hardly shrink: at most twice as far, or half as far where they turn back.
+_FARTHEST, _NEAREST = 1.0, -0.5
+
+
+def anderson_step(step: Array, last_step: Array, last_taken: Array) -> Array:
+    """(N,) the step to take, from what two iterations in turn ask for.
+
+    Args:
+        step: (N,) what the present iteration asks for, all components in one unit.
+        last_step: (N,) what the iteration before asked for.
+        last_taken: (N,) the step that was taken then.
+    """
+    change = step - last_step
+    square = float(change @ change)
+    share = 0.0 if square == 0 else float(np.clip(-(change @ step) / square, _NEAREST, _FARTHEST))
+    return np.asarray(step + share * (last_taken + change))
+
+
+# How much more leaving out samples moves estimates than their covariance says (Efron & Stein 1981).
+
+# Fewer estimates say nothing about their spread.
+_FEWEST = 4
+
+
+def grouped_inflation(left_out: Array, covariance: Array) -> float:
+    """Factor on the covariance, at least 1: the jackknife's over the model's, mean over all directions.
+
+    Args:
+        left_out: (G, K) estimates with one group of samples left out.
+        covariance: (K, K) of the estimates.
+    """
+    count = len(left_out)
+    if count < _FEWEST:
+        return 1.0
+    unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    centred = (left_out - left_out.mean(axis=0)) / unit
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    keep = values > 1e-9
+    squares = (count - 1) / count * ((centred @ vectors[:, keep]) ** 2).sum(axis=0) / values[keep]
+    return float(max(1.0, squares.mean()))
+
+
+# Least squares over blocks: estimates, their covariance, and the same without some views.
+
+
+@dataclass(frozen=True)
+class BlockLeastSquares:
+    """z = X·x + noise in B blocks of m, with a weak prior; the noise's covariance is known.
+
+    Rows weigh by their own variances (working independence, Liang & Zeger 1986): as long as effects are missing
+    the scatter of the views is not the noise it is taken for, and full weights would trade millimetres at the
+    targets for combinations that only look exact. The covariance of the estimates counts all correlations.
+    """
+
+    z: Array  # (B, m)
+    X: Array  # (B, m, k)
+    covariance: Array  # (B, m, m)
+    precision: Array  # (k,) of the prior
+    prior_vector: Array  # (k,) precision times the prior's middle
+
+    @cached_property
+    def scale(self) -> Array:
+        """(k,) equilibrates: parameters count in rad, mm and per hour."""
+        return np.asarray(1 / np.sqrt(np.maximum(np.diag(self.information) + self.precision, 1e-300)))
+
+    @cached_property
+    def weighted(self) -> Array:
+        """(B, m, k) W·X."""
+        return np.asarray(self.X / np.einsum("bii->bi", self.covariance)[..., None])
+
+    @cached_property
+    def information(self) -> Array:
+        """(k, k) XᵀWX."""
+        return _product(self.weighted, self.X)
+
+    @cached_property
+    def vector(self) -> Array:
+        """(k,) XᵀWz."""
+        return _product(self.weighted, self.z[..., None])[:, 0]
+
+    def residual_vectors(self, estimates: Array) -> Array:
+        """(B, k) XᵀW(z − X·x) of every block."""
+        return np.asarray(np.einsum("bmk,bm->bk", self.weighted, self.z - self.X @ estimates))
+
+    def solve(self, left_out: Array | Indices | None = None) -> Array:
+        """(k,) estimates, without some blocks."""
+        M, b = self.information, self.vector
+        if left_out is not None:
+            out = np.asarray(left_out, np.int64)
+            M = M - _product(self.weighted[out], self.X[out])
+            b = b - _product(self.weighted[out], self.z[out][..., None])[:, 0]
+        inverse = _inverse(M + np.diag(self.precision), self.scale)
+        return np.asarray(inverse @ (b + self.prior_vector))
+
+    def estimates_covariance(self) -> Array:
+        """(k, k) of the estimates under the blocks' full covariance."""
+        spread = np.einsum("bmk,bmn,bnl->kl", self.weighted, self.covariance, self.weighted, optimize=True)
+        inverse = _inverse(self.information + np.diag(self.precision), self.scale)
+        return np.asarray(inverse @ (spread + np.diag(self.precision)) @ inverse)
+
+    def shift_by_errors(self, errors: Array) -> Array:
+        """(k, q) how far errors (B, m, q) of the blocks, which nobody models, move the estimates."""
+        pulls = np.einsum("bmk,bmq->kq", self.weighted, errors)
+        return np.asarray(_inverse(self.information + np.diag(self.precision), self.scale) @ pulls)
+
+    def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
+        """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""
+        return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)
+
+
+def _product(X: Array, Y: Array) -> Array:
+    """(k, l) Σ_b XᵀY of (B, m, k) and (B, m, l)."""
+    return np.asarray(X.reshape(-1, X.shape[2]).T @ Y.reshape(-1, Y.shape[2]))
+
+
+def _inverse(M: Array, scale: Array) -> Array:
+    return np.asarray(np.linalg.pinv(M * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale))
 
 
 @dataclass(frozen=True)
@@ -58,3 +184,60 @@ def summed_squares(blocks: Array) -> Array:
     """
     wide = blocks.transpose(1, 0, 2).reshape(blocks.shape[1], -1)
     return np.asarray(wide @ wide.T)
+
+
+# Which parameters the views can know: absolute first, then beside the hand-eye and each other.
+
+
+def independent(base: Array, further: Array, sizes: Array, threshold: float) -> Mask:
+    """(P,) bool: columns that stand out by at least `threshold` sigmas at their size, beside those chosen before.
+
+    The clearest is chosen first (QR with pivoting), so that of two that say the same the better known stays.
+
+    Args:
+        base: (N, a) whitened columns that come first, whatever they say.
+        further: (N, P) whitened columns per unit of their parameters.
+        sizes: (P,) plausible sizes of the parameters.
+    """
+    rest = project_out(base, further * sizes)
+    R, order = qr(rest, mode="r", pivoting=True)
+    clear = np.abs(np.diag(R)) >= threshold
+    chosen = np.zeros(further.shape[1], bool)
+    chosen[order[: len(clear)][clear]] = True
+    return chosen
+
+
+def project_out(base: Array, columns: Array) -> Array:
+    """What is left of `columns` beside the column space of `base`."""
+    if not base.shape[1]:
+        return columns
+    U = column_space(base)
+    return np.asarray(columns - U @ (U.T @ columns))
+
+
+# What one of two models leaves of the mean square error that the other leaves.
+
+
+def mean_square_share(with_it: Array, without: Array) -> tuple[float, float]:
+    """What one model leaves over what another leaves, mean squares, and the standard error of that.
+
+    Args:
+        with_it: (G,) sum of squares of each sample, a group of views or one view, under the one.
+        without: (G,) under the other.
+    """
+    share = float(with_it.sum() / max(without.sum(), 1e-300))
+    spread = np.sum((with_it - share * without) ** 2) * len(without) / max(len(without) - 1, 1)
+    return share, float(np.sqrt(spread) / max(without.sum(), 1e-300))
+
+
+def significantly_smaller(squares: Array, others: Array, chance: float) -> bool:
+    """True if the first are less by more than chance would make them; views where either is not finite do not count.
+
+    Args:
+        squares: (V,) mean square of each view under one model.
+        others: (V,) under another.
+        chance: one-sided, of the normal distribution.
+    """
+    seen = np.isfinite(squares) & np.isfinite(others)
+    share, sigma = mean_square_share(squares[seen], others[seen])
+    return bool(share < 1 - ndtri(1 - chance) * sigma)

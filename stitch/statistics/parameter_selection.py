@@ -9,11 +9,37 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit, logit
+from scipy.special import expit, logit, logsumexp
 
 from stitch.frames import Array, Indices, Mask
-from stitch.statistics.amplitude_scales import PLAUSIBLE, log_mixture
-from stitch.statistics.identifiability import project_out
+from stitch.statistics.least_squares import project_out
+
+# How large an amplitude may be over its plausible size: scales of a normal prior, and the share of belief in each.
+#
+# A mixture of normal distributions has tails that one of them has not (West 1987, Biometrika 74:646): a table of
+# lengths
+# in which a digit is wrong, or a joint mounted a tooth off, is no reason to believe in nothing at all.
+
+# What is grossly wrong: one effect of a hundred.
+GROSS, _GROSS_SHARE = 30.0, 0.01
+# Of plausible size, or grossly wrong.
+PLAUSIBLE = {1.0: 1 - _GROSS_SHARE, GROSS: _GROSS_SHARE}
+# Of any size: what plausible sizes are is a guess.
+ANY_SIZE = dict.fromkeys((1.0, 3.0, 0.3, 0.1), (1 - _GROSS_SHARE) / 4) | {GROSS: _GROSS_SHARE}
+
+
+def log_mixture(logs: Array, scales: dict[float, float]) -> float:
+    """Log evidence over all scales from that of each (s,)."""
+    return float(logsumexp(logs, b=np.array(list(scales.values()))))
+
+
+# The mean of Bayes factors of which one is meant, each as likely before.
+
+
+def log_mean_exp(logs: Sequence[float] | Array) -> Array:
+    """(…) log of the mean over n factors, from their logs (n, …)."""
+    return np.asarray(logsumexp(logs, axis=0) - np.log(len(logs)))
+
 
 # Log Bayes factor that a group must add: 12 to 1, as a name must in the diagnosis.
 _LOG_BAYES_FACTOR = 2.5

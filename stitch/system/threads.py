@@ -4,17 +4,80 @@ Queries of one pair are too small to share out, and two libraries that both spin
 slow each other down twentyfold; so libraries run single-threaded inside a run.
 """
 
+import ctypes
+import mmap
 import os
+import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import chain
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from stitch.system.steps import steps
+from stitch.errors import InputError
+from stitch.system.process import steps
+
+# Memory of large arrays, given back when they are freed.
+
+# As mallopt(3) of glibc numbers them; allocations from the first on are mappings of their own, and what is free at the
+# top of a heap beyond the second goes back.
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
+_LARGE, _TOP = 2_000_000, 20_000_000
+
+
+@cache
+def return_large_arrays() -> None:
+    """Have the system take arrays of 2 MB and more back as they are freed; nothing where there is no glibc.
+
+    Else glibc raises that limit to 32 MB by itself, and columns of thousands of poses stay in the heap of every thread,
+    a third more memory than is in use. It costs a fresh mapping for each, which in small sessions is not worth it.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(_MMAP_THRESHOLD, _LARGE)
+        mallopt(_TRIM_THRESHOLD, _TOP)
+
+
+# Arrays too large for memory, in files without a name that go with the process.
+
+
+def map_parts(parts: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Parts of the same named columns one after the other, each column mapped from a file of its own.
+
+    Raises:
+        InputError: no room in the folder for temporary files.
+    """
+    files: dict[str, Any] = {}
+    layout: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
+    rows = 0
+    for part in parts:
+        for name, values in part.items():
+            if name not in files:
+                files[name] = tempfile.TemporaryFile()  # noqa: SIM115  # the map holds it
+            layout[name] = values.dtype, values.shape[1:]
+            try:
+                np.ascontiguousarray(values).tofile(files[name])
+            except OSError:
+                raise InputError(
+                    f"{tempfile.gettempdir()}: no room for what does not fit in memory; to fix: make room, or name "
+                    "another folder in the environment variable TMPDIR"
+                ) from None
+        rows += len(next(iter(part.values())))
+    return {name: np.memmap(files[name], kind, "r", shape=(rows, *rest)) for name, (kind, rest) in layout.items()}
+
+
+def release_mapped(array: NDArray[Any]) -> None:
+    """Give back the memory of a mapped array that was looked at; it comes again from its file. Others stay."""
+    held = getattr(array, "_mmap", None)
+    if isinstance(array, np.memmap) and held is not None and hasattr(mmap, "MADV_DONTNEED"):
+        held.madvise(mmap.MADV_DONTNEED)
+
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

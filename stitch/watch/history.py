@@ -5,16 +5,194 @@ state to writing the next. Tables are plain, for those who ask by SQL: runs, est
 covariates, alarms; `states` are the filter's own.
 """
 
+import hashlib
 import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from stitch import frames
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
-from stitch.watch.run_record import RunRecord
+from stitch.model.model_toml import ModelFile, read_model
+from stitch.reading.csv_files import is_number, read_csv_lines
+from stitch.reading.session_tables import covariate_names
+from stitch.stages.initial_guess import REUSED
+from stitch.stored.stored_run import read_result
+from stitch.watch.run_record import Estimate, RunRecord
+
+# When a session was measured, and under which conditions: the means of its covariates.
+
+# A time_s beyond counts seconds since 1970 (this is 2001); below, since the session began.
+_EPOCH = 1e9
+
+
+@dataclass(frozen=True)
+class SessionConditions:
+    """Of one session."""
+
+    time: float  # s since 1970, UTC
+    time_from: str
+    covariates: dict[str, float]  # means over the views
+
+
+def session_conditions(session: Path, result: Path) -> SessionConditions:
+    """What views.csv says; where it has gone, the time of a run's result.json.
+
+    Raises:
+        InputError: views.csv is no table.
+    """
+    file = session / "views.csv"
+    if not file.is_file():
+        return SessionConditions(result.stat().st_mtime, "file time of result.json", {})
+    header, lines = read_csv_lines(file)
+    rows = [(line, dict(zip(header, cells, strict=True))) for line, cells in lines]
+    if not rows:
+        raise InputError(f"{file}: no views; write one row per scan")
+    names = [*covariate_names(header, rows), *(["time_s"] if "time_s" in header else [])]
+    columns = {name: _column_numbers([row[name] for _, row in rows]) for name in names}
+    times = columns.pop("time_s", [])
+    covariates = {name: float(np.mean(numbers)) for name, numbers in columns.items() if numbers}
+    if times and min(times) > _EPOCH:
+        return SessionConditions(float(np.mean(times)), "time_s of views.csv", covariates)
+    return SessionConditions(file.stat().st_mtime, "file time of views.csv", covariates)
+
+
+def _column_numbers(cells: list[str]) -> list[float]:
+    numbers = [float(cell) for cell in cells if is_number(cell)]
+    return [x for x in numbers if np.isfinite(x)]
+
+
+# The hand-eye of a run as six numbers that can be compared from day to day: a twist about the part.
+#
+# About the scanner's own origin, a turn of the mount and a shift of it are hardly told apart: their errors go together.
+# About the middle of what the scanner looks at they are: the shift is what moves there. So the mount's motion since the
+# first run is counted about that point, in the axes of the frame that carries the scanner (base or flange).
+
+TWIST_NAMES = ("rx", "ry", "rz", "x", "y", "z")
+
+
+def mount_twist(T_mount: Array, T_mount_first: Array, centre_scanner: Array) -> Array:
+    """(6,) log of the mount's motion since the first run: rad, length_unit; axes of the mount frame, about the centre.
+
+    Args:
+        centre_scanner: (3,) the middle of what the first run saw, scanner frame.
+    """
+    about = _watch_frame(T_mount_first, centre_scanner)
+    return np.asarray(frames.log(frames.inverse(about) @ T_mount @ frames.inverse(T_mount_first) @ about))
+
+
+def twist_covariance(covariance: Array, T_mount: Array, T_mount_first: Array, centre_scanner: Array) -> Array:
+    """(6, 6) of `mount_twist` from that of the right perturbation T_mount·exp(ξ), to first order."""
+    J = frames.adjoint(frames.inverse(_watch_frame(T_mount_first, centre_scanner)) @ T_mount)
+    return np.asarray(J @ covariance @ J.T)
+
+
+def middle_in_scanner(poses: Array, middle: Array) -> Array:
+    """(3,) where on average the scanner has the middle of the part before it.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner.
+        middle: (3,) of the part, reference frame.
+    """
+    return np.asarray(frames.transform(frames.inverse(poses), middle[None])[:, 0].mean(axis=0))
+
+
+def _watch_frame(T_mount_first: Array, centre_scanner: Array) -> Array:
+    """(4, 4) axes of the mount frame at the centre."""
+    return frames.make(np.eye(3), frames.transform(T_mount_first, centre_scanner[None])[0])
+
+
+# A run folder as the record of its cell's history: parameters with sigmas, when, under which conditions, of what.
+
+# Tables by which a session is known again; its clouds may be gigabytes.
+_TABLES = ("session.toml", "views.csv", "points.csv", "frames.csv", "targets.csv")
+
+
+def read_record(folder: Path, at: float | None = None) -> RunRecord:
+    """What a run folder says.
+
+    Args:
+        at: s since 1970, when the session was measured; default: what its files say.
+
+    Raises:
+        InputError: no run of one session, damaged, or one that used the model of another run as it is.
+    """
+    document, model = read_result(folder), read_model(folder)
+    reused = any(REUSED in stage.get("note", "") for stage in document["stages"][:1])
+    if reused and np.array_equal(model.T_mount, model.T_mount_coarse):
+        raise InputError(
+            f"{folder}: uses the hand-eye of another run as it is, so nothing was measured anew; to fix: run its "
+            "session without --hand-eye"
+        )
+    session = Path(document["session"])
+    found = session_conditions(session, folder / "result.json")
+    run_hash = _files_hash([folder / "model.toml", folder / "result.json"])
+    own = [session / name for name in _TABLES if (session / name).is_file()]
+    repeatability = document["repeatability"]
+    return RunRecord(
+        path=folder.resolve(),
+        session=document["session"],
+        name=document.get("name") or session.name,
+        run_hash=run_hash,
+        session_hash=_files_hash(own) if own else run_hash,
+        time=found.time if at is None else at,
+        time_from=found.time_from if at is None else "stated",
+        length_unit=model.length_unit,
+        mount=model.mount,
+        T_mount=model.T_mount,
+        covariance=model.covariance,
+        estimates=tuple(_estimates(model)),
+        covariates=found.covariates,
+        numbers={name: document[name] for name in ("residual_rms", "noise_floor")}
+        | {f"repeatability_{name}": repeatability[name] for name in ("rotation", "translation")},
+        document=document,
+    )
+
+
+def _estimates(model: ModelFile) -> list[Estimate]:
+    return [
+        Estimate(f"{effect}.{name}", p.unit, p.value, p.sigma)
+        for effect, own in model.effects.items()
+        for name, p in own.items()
+        if np.isfinite(p.value) and np.isfinite(p.sigma) and p.sigma > 0
+    ]
+
+
+def _files_hash(files: Sequence[Path]) -> str:
+    found = hashlib.sha256()
+    for file in files:
+        found.update(file.name.encode() + b"\0" + file.read_bytes())
+    return found.hexdigest()
+
+
+def scanned_middle(record: RunRecord) -> tuple[Array, float]:
+    """(3,) middle of what a run saw, scanner frame, and how far its points lie from there, rms."""
+    points = _points(record)
+    middle = points.mean(axis=0)
+    poses = np.array([view["pose"] for view in record.document["views"]], float)
+    centre = middle_in_scanner(poses, middle) if len(poses) else np.zeros(3)
+    return centre, float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1))))
+
+
+def _points(record: RunRecord) -> Array:
+    """(n, 3) of the stitched cloud, or the targets; reference frame."""
+    targets = record.document.get("targets") or []
+    if targets:
+        return np.array([target["position"] for target in targets], float)
+    if not (record.path / "stitched.ply").is_file():
+        return np.zeros((1, 3))
+    # The libraries that read clouds are asked for once in the life of a cell.
+    from stitch.stored.stored_run import fused_cloud
+
+    return fused_cloud(record.path / "stitched.ply").points
+
 
 HISTORY_FILE = "history.sqlite"
 HISTORY_FORMAT = "stitch-history/1"
@@ -170,3 +348,38 @@ def insert_run(history: History, record: RunRecord, numbers_hash: str) -> int:
     columns = "time, time_from, name, run, session, run_hash, session_hash, numbers_hash, hand_eye, covariance, numbers"
     text = f"INSERT INTO runs ({columns}) VALUES ({', '.join('?' * 11)}) RETURNING id"
     return int(history.sql(text, *row, json.dumps(record.numbers))[0][0])
+
+
+# What people state of a cell: which calibration it uses, and when a run was measured.
+
+
+def use_calibration(history: History, run_hash: str) -> None:
+    """From now on the cell uses the calibration of this run."""
+    with history.writing():
+        history.state({"in_use": run_hash})
+
+
+def known_run_hash(history: History, run: Path, added: Sequence[RunRecord]) -> str:
+    """The hash of a run that is in the history, or will be.
+
+    Raises:
+        InputError: it is not.
+    """
+    run_hash = read_record(run).run_hash
+    known = history.sql("SELECT 1 FROM runs WHERE run_hash = ?", run_hash)
+    if not known and run_hash not in {record.run_hash for record in added}:
+        raise InputError(f"{run}: is not in the history of {history.folder}; to fix: append it with --add first")
+    return run_hash
+
+
+def measured_at(text: str) -> float:
+    """Seconds since 1970 of an ISO 8601 time; without a zone it is UTC.
+
+    Raises:
+        InputError: no such time.
+    """
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        raise InputError(f"--at {text}: no time; to fix: write 2026-03-01T06:30+01:00") from None
+    return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from stitch.comparison.model_history import effect_changes, model_history
+from stitch.comparison.disagreement_field import effect_changes, model_history
 from stitch.comparison.run_verdict import run_verdict
-from stitch.model.hand_eye_uncertainty import hand_eye_lines
+from stitch.model.model import hand_eye_lines
 from stitch.runs.run import Run
 from stitch.units import angle_text, length_text, uncertainty_text
 
@@ -52,7 +52,7 @@ def _errors(run: Run) -> list[str]:
 def _effects(run: Run) -> list[str]:
     """Parameters that were fitted or tried."""
     known = [(term.name, p) for term in run.terms for p in term.parameters if p.fitted or p.grid]
-    return [f"{f'{effect}.{p.name}:':<30}{p.told}" for effect, p in known]
+    return [f"{f'{effect}.{p.name}:':<30}{p.formatted}" for effect, p in known]
 
 
 def _history(run: Run) -> list[str]:

@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 
 from stitch.frames import Array
-from stitch.model.hand_eye_uncertainty import expanded_uncertainty
-from stitch.planning.expected_hand_eye import ExpectedHandEye
-from stitch.planning.outlook import EffectOutlook, Outlook
+from stitch.model.model import expanded_uncertainty
+from stitch.planning.detection_chances import EffectOutlook, EffectPair, Outlook
+from stitch.planning.expected_model import ExpectedHandEye
 from stitch.planning.plan import Plan, ProposedView
-from stitch.planning.rivals import EffectPair
 from stitch.writing.session_files import pose_columns
 
 FORMAT = "stitch-plan/1"

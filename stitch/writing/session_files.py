@@ -19,8 +19,8 @@ from plyfile import PlyData, PlyElement
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.measurement.cloud import Cloud
-from stitch.reading.session_toml import SESSION_FORMAT
+from stitch.measurement.session import Cloud
+from stitch.reading.session_folder import SESSION_FORMAT
 
 TableColumns = Mapping[str, Sequence[object] | Array]  # a table by its header; text as it stands, floats with 12 digits
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from stitch.api.arrays import cloud_of, poses_of, sighting_of
 from stitch.errors import InputError
-from stitch.measurement.cloud import Cloud
+from stitch.measurement.session import Cloud
 from stitch.reading.clouds import read_cloud
 
 RNG = np.random.default_rng(0)
@@ -184,8 +184,8 @@ def test_labelled_points_of_a_view():
 
 
 def test_a_thinned_cloud_gives_all_of_its_points():
+    from stitch.measurement.capture import thin_cloud
     from stitch.measurement.session import Scanner
-    from stitch.measurement.thinning import thin_cloud
 
     dense = RNG.normal(size=(500, 3)) + np.array([0, 0, 500.0])
     thin = thin_cloud("v", Cloud(dense), 100, Scanner(None, None, None, np.array([0, 0, 1.0])))

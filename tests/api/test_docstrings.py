@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import stitch
-from stitch.measurement.cloud import Cloud
+from stitch.measurement.session import Cloud
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 METHODS = ("Session.from_arrays", "Session.save", "Run.save")

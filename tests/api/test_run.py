@@ -17,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 import stitch
 from stitch import frames
 from stitch.api import run as api_run
-from stitch.comparison.tables import comparison_document
+from stitch.comparison.residual_tables import comparison_document
 from stitch.errors import InputError
 from stitch.reading.clouds import read_cloud
 from stitch.writing.diagnosis_document import diagnosis_document

@@ -6,7 +6,7 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.batch import one_session
+from stitch.batch import run_batch
 from stitch.cli.main import main
 from stitch.pipeline import run
 
@@ -38,7 +38,7 @@ def ran(monkeypatch, result):
         names.append(loaded.path.name)
         return replace(result, session=loaded)
 
-    monkeypatch.setattr(one_session, "run", noted)
+    monkeypatch.setattr(run_batch, "run", noted)
     return names
 
 

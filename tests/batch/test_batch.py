@@ -7,11 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stitch.batch import cluster, one_session
-from stitch.batch.job import BatchJob
-from stitch.batch.one_session import run_session
-from stitch.batch.results import run_jobs
-from stitch.batch.session_row import SessionRow
+from stitch.batch import cluster, run_batch
+from stitch.batch.run_batch import BatchJob, SessionRow, run_jobs, run_session
 from viz.batch_page import write_page
 from viz.unbroken import unbroken
 
@@ -26,7 +23,7 @@ def test_it_goes_on_after_whatever_befalls_one_session(sessions, result, monkeyp
             raise ZeroDivisionError("by\nzero")
         return replace(result, session=loaded)
 
-    monkeypatch.setattr(one_session, "run", fails_once)
+    monkeypatch.setattr(run_batch, "run", fails_once)
     batch(*sessions, "--json", code=1)
     bad, good = json.loads(capsys.readouterr().out)["sessions"]
     assert bad["error"] == "ZeroDivisionError: by zero" and good["error"] is None
@@ -82,10 +79,10 @@ def test_an_interrupt_keeps_what_is_finished(sessions, ran, monkeypatch, capsys,
         yield run_session(jobs[0])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("stitch.cli.actions.batch_sessions.results", stopped)
+    monkeypatch.setattr("stitch.cli.batch.results", stopped)
     batch(*sessions, code=1)
     assert "stitch: stopped with 1 of 2 sessions" in capsys.readouterr().err.splitlines()[-1]
-    monkeypatch.setattr("stitch.cli.actions.batch_sessions.results", run_jobs)
+    monkeypatch.setattr("stitch.cli.batch.results", run_jobs)
     batch(*sessions)
     assert ran == ["monday", "tuesday"]
 

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from data_synth.fixtures.edits import edit
-from stitch.batch import finished, one_session
-from stitch.batch.job import BatchJob
-from stitch.batch.one_session import run_session
+from stitch.batch import run_batch
+from stitch.batch.run_batch import BatchJob, run_session
 from stitch.cli.main import main
 from stitch.writing.run_folder import write_with_page
 
@@ -63,19 +62,19 @@ def test_all_that_a_run_reads_counts_as_content(sessions):
     seen = []
     for text in ("solid", "solid again"):
         part.write_text(text)
-        seen.append(finished.session_content_hash(sessions[0]))
+        seen.append(run_batch.session_content_hash(sessions[0]))
     assert None not in seen and seen[0] != seen[1]
-    assert finished.session_content_hash(sessions[0] / "nowhere") is None
+    assert run_batch.session_content_hash(sessions[0] / "nowhere") is None
 
 
 def test_one_that_was_given_up_and_still_writes_is_waited_for(sessions, ran, tmp_path):
     """As after a worker that the scheduler has lost but that lives: the second finds what the first wrote."""
     job = BatchJob(sessions[0], tmp_path / "runs" / "monday", "a", recording=False)
-    content = finished.session_content_hash(job.session)
-    result = one_session.run(one_session.load_session(job.session), None)
-    with one_session.run_folder.new_folder(job.run, [job.session]) as scratch:
+    content = run_batch.session_content_hash(job.session)
+    result = run_batch.run(run_batch.load_session(job.session), None)
+    with run_batch.run_folder.new_folder(job.run, [job.session]) as scratch:
         write_with_page(result, scratch)
-        finished.write_mark(job, content, scratch)
+        run_batch.write_mark(job, content, scratch)
     kept = job.run.rename(tmp_path / "kept")
     held = os.open(job.run.parent / ".monday.lock", os.O_RDWR | os.O_CREAT)
     fcntl.flock(held, fcntl.LOCK_EX)

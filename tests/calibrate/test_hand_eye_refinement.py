@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.calibrate.hand_eye_refinement import refine_axzb
-from stitch.closed_form.axzb import shah
+from stitch.calibrate.tracker import refine_axzb
+from stitch.closed_form.hand_eye import shah
 from stitch.errors import NoResultError
 
 NOISE = np.array([1e-3] * 3 + [0.2] * 3)

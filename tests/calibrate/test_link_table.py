@@ -8,7 +8,7 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.calibrate.link_table import link_table
+from stitch.calibrate.robot import link_table
 from stitch.cli.main import main
 from stitch.measurement.robot import forward
 from stitch.pipeline import run

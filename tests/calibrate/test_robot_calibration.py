@@ -12,18 +12,16 @@ from data_synth.fixtures.labelled_arm import (
     labelled_cell,
 )
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.calibrate.robot_calibration import calibrated_robot_of_run
-from stitch.calibrate.robot_table import dh_rows
+from stitch.calibrate.robot import calibrated_robot_of_run, dh_rows
 from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.robot import forward
 from stitch.model.forward import corrected_capture
-from stitch.model.term import term_of
+from stitch.model.model import term_of
 from stitch.pipeline import run
-from stitch.reading.dh_rows import robot_from_dh
-from stitch.reading.urdf import robot_from_urdf
+from stitch.reading.robot_description import robot_from_dh, robot_from_urdf
 from stitch.writing.urdf_file import to_urdf
 
 

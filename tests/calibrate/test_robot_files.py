@@ -8,10 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.calibrate.link_table import LinkTable
-from stitch.calibrate.robot_calibration import calibrated_robot_of_run
-from stitch.calibrate.robot_files import robot_document, write_robot
-from stitch.cli.terminal.calibration_summary import show_robot
+from stitch.calibrate.robot import LinkTable, calibrated_robot_of_run, robot_document, write_robot
+from stitch.cli.calibrate import show_robot
 from stitch.measurement.robot import forward
 from stitch.measurement.session import StatedRepeatability
 from stitch.pipeline import run

@@ -8,11 +8,8 @@ import pytest
 
 from data_synth.fixtures.sphere_scans import RADIUS, SphereCell, area_scan, sphere_cell, write_spheres
 from stitch import frames
-from stitch.calibrate.sphere_calibration import calibrate_sphere
-from stitch.calibrate.sphere_fit import fit_sphere
-from stitch.calibrate.sphere_report import sphere_document
-from stitch.calibrate.sphere_start import global_start, solve_decoupled
-from stitch.calibrate.sphere_views import arc_normal, centres, sphere_view
+from stitch.calibrate.sphere import calibrate_sphere, sphere_document
+from stitch.calibrate.sphere_fit import arc_normal, centres, fit_sphere, global_start, solve_decoupled, sphere_view
 from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
 from stitch.reading.session_folder import load_session

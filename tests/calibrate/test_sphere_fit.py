@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.sphere_scans import RADIUS, area_scan, line_scan
-from stitch.calibrate.sphere_views import sphere_view
-from stitch.detection.ball import fit_ball
+from stitch.calibrate.sphere_fit import sphere_view
+from stitch.detection.balls import fit_ball
 from stitch.errors import InputError
 
 

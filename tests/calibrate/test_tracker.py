@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.calibrate.tracker_calibration import calibrate_tracker, tracker_document
+from stitch.calibrate.tracker import calibrate_tracker, tracker_document
 from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
 from stitch.reading.session_folder import load_session

@@ -13,12 +13,8 @@ from data_synth.scanning import scan
 from data_synth.shapes import build_shape
 from data_synth.shapes.casting import around, with_stock
 from stitch import frames
-from stitch.cells.window.allowance import AllowancePrior, allowance_sentence, read_allowance
-from stitch.cells.window.biweight import TUKEY, biweight
-from stitch.cells.window.cad import cad_surface, nearest_partners
-from stitch.cells.window.cad_fit import fit_cad
-from stitch.cells.window.cell_weights import cell_weights
-from stitch.cells.window.joined_scans import JoinedScans, join_scans
+from stitch.cells.cad import TUKEY, JoinedScans, biweight, cad_surface, cell_weights, join_scans, nearest_partners
+from stitch.cells.scan_to_cad import AllowancePrior, allowance_sentence, fit_cad, read_allowance
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.measurement.scan import prepare_scan

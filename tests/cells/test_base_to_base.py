@@ -8,12 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stitch.cells.base_to_base.contradiction import compare_distances
-from stitch.cells.base_to_base.stand import Stand, TouchedPoints
-from stitch.cells.base_to_base.stand_file import read_stand
-from stitch.cells.base_to_base.stand_fit import fit_stand
-from stitch.cells.base_to_base.stand_projection import project
-from stitch.cells.base_to_base.stand_solution import solve_stand
+from stitch.cells.base_to_base import read_stand, solve_stand
+from stitch.cells.stand import Stand, TouchedPoints, compare_distances, fit_stand, project
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 

@@ -24,7 +24,7 @@ import viz.cells.window_fit
 import viz.cells.window_seam
 from data_synth.drilling_cell import DrillingCell, Sizes
 from data_synth.drilling_job import write_job
-from stitch.cells import outputs
+from stitch.cells import job_files
 from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.reading.session_folder import load_session
@@ -65,7 +65,7 @@ def handed_out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cells")
     part = {"stitch.cell_recordings": "record", "stitch.cell_reports": "write_page"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(outputs, "entry_points", lambda group, name: [Offer(getattr(VIEWERS[name], part[group]))])
+        patch.setattr(job_files, "entry_points", lambda group, name: [Offer(getattr(VIEWERS[name], part[group]))])
         rr.set_strict_mode(True)
         try:
             for command, job in JOBS.items():
@@ -225,7 +225,7 @@ def test_refused_readings_get_a_page_that_shows_the_contradiction(tmp_path, monk
     text = JOBS["base"].read_text()
     (tmp_path / "bad.toml").write_text(text.replace("length = 4.4084", "length = 4.2084"))
     assert text != (tmp_path / "bad.toml").read_text()
-    monkeypatch.setattr(outputs, "entry_points", lambda group, name: [Offer(viz.cells.base_to_base.write_page)])
+    monkeypatch.setattr(job_files, "entry_points", lambda group, name: [Offer(viz.cells.base_to_base.write_page)])
     with pytest.raises(SystemExit) as stop:
         main(["base", str(tmp_path / "bad.toml"), "--report", str(tmp_path / "page.html")])
     assert stop.value.code == 1
@@ -234,8 +234,7 @@ def test_refused_readings_get_a_page_that_shows_the_contradiction(tmp_path, monk
 
 def test_expected_shape_is_what_the_commanded_clamps_do():
     """A clamp that is lifted by what its three points need leaves nothing; one point alone cannot turn it."""
-    from stitch.cells.panel.panel_job import read_panel_job
-    from stitch.cells.panel.panel_solution import solve_panel_job
+    from stitch.cells.panel import read_panel_job, solve_panel_job
 
     job = read_panel_job(JOBS["panel"])
     result = solve_panel_job(job)
@@ -252,10 +251,10 @@ def test_session_never_overwrites(handed_out, capsys):
 
 
 def test_page_into_a_missing_folder_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(outputs, "entry_points", lambda group, name: [Offer(viz.cells.drilling.write_page)])
+    monkeypatch.setattr(job_files, "entry_points", lambda group, name: [Offer(viz.cells.drilling.write_page)])
     with pytest.raises(InputError, match="its folder does not exist"):
-        outputs.write_recording_and_page("drill", None, tmp_path / "nowhere" / "page.html")
-    monkeypatch.setattr(outputs, "entry_points", lambda group, name: [])
+        job_files.write_recording_and_page("drill", None, tmp_path / "nowhere" / "page.html")
+    monkeypatch.setattr(job_files, "entry_points", lambda group, name: [])
     with pytest.raises(InputError, match="no writer for `stitch drill`"):
-        outputs.write_recording_and_page("drill", tmp_path / "x.rrd", None)
+        job_files.write_recording_and_page("drill", tmp_path / "x.rrd", None)
     assert not list(tmp_path.iterdir())

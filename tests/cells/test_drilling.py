@@ -11,18 +11,29 @@ from data_synth.drilling_cell import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, 
 from data_synth.drilling_image import ellipse_centres, render_plate
 from data_synth.drilling_job import write_job
 from stitch import frames
-from stitch.cells.drilling import hole_image
-from stitch.cells.drilling.base_frame import base_frame, fit_circle
-from stitch.cells.drilling.camera_effects import select_effects
-from stitch.cells.drilling.camera_model import HoleObservations, distort, undistort
-from stitch.cells.drilling.compensation import compensate_group
-from stitch.cells.drilling.drill_job import read_drill_job
-from stitch.cells.drilling.drill_procedure import calibrate_sensors, run_group
-from stitch.cells.drilling.drill_solution import solve_drill_job
-from stitch.cells.drilling.hole_frame import drive_pose, euler_zyx, hole_rotation
-from stitch.cells.drilling.homography import fit_homography, leave_one_out, to_plane
-from stitch.cells.drilling.rangers import Rangers, fit_ranged_plane, fit_ranger
-from stitch.cells.drilling.servo import FlangeSensors, align_tool_axis, servo_to_hole
+from stitch.cells import drilling_sensors
+from stitch.cells.drilling import calibrate_sensors, read_drill_job, run_group, solve_drill_job
+from stitch.cells.drilling_sensors import (
+    FlangeSensors,
+    HoleObservations,
+    Rangers,
+    align_tool_axis,
+    base_frame,
+    compensate_group,
+    distort,
+    drive_pose,
+    euler_zyx,
+    fit_circle,
+    fit_homography,
+    fit_ranged_plane,
+    fit_ranger,
+    hole_rotation,
+    leave_one_out,
+    select_effects,
+    servo_to_hole,
+    to_plane,
+    undistort,
+)
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 
@@ -245,7 +256,7 @@ def test_nine_holes_in_a_rendered_image():
     """Found centres against the exact conics: 2 grey levels of noise on some 10⁴ pixels give about 0.01 pixels."""
     pytest.importorskip("cv2")
     cell = DrillingCell(0)
-    found = hole_image.order_grid(hole_image.find_holes(render_plate(cell)))
+    found = drilling_sensors.order_grid(drilling_sensors.find_holes(render_plate(cell)))
     assert np.abs(found - ellipse_centres(cell)).max() < 0.1
     # As hand-eye: the ellipse's centre is not the hole's, by about 0.2 pixels of 0.04 mm.
     H = fit_homography(NINE, found)
@@ -256,12 +267,12 @@ def test_nine_holes_in_a_rendered_image():
 def test_without_opencv_the_image_finder_says_what_to_do(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(InputError, match="opencv-python-headless"):
-        hole_image.find_holes(np.zeros((10, 10), np.uint8))
+        drilling_sensors.find_holes(np.zeros((10, 10), np.uint8))
 
 
 def test_too_few_holes_in_the_image():
     with pytest.raises(NoResultError, match="8 holes found"):
-        hole_image.order_grid(np.zeros((8, 2)))
+        drilling_sensors.order_grid(np.zeros((8, 2)))
 
 
 def experiment(seed):

@@ -12,15 +12,28 @@ from data_synth import hexapod, panel_job
 from data_synth.panel_cell import NAMES, PanelCell, Sizes
 from data_synth.shell import Laminate, Shell
 from stitch import frames
-from stitch.cells.panel.errors_along import errors_along_motion
-from stitch.cells.panel.global_model import ReflectorReadings, RobotModel, calibrate_robot
-from stitch.cells.panel.laser_tracker import LaserTracker
-from stitch.cells.panel.layout import ClampLayout, clamp_contacts
-from stitch.cells.panel.legs import Legs, find_leg_offset, leg_jacobian, true_flanges
-from stitch.cells.panel.panel_loops import PanelSetup, run_pose, run_shape
-from stitch.cells.panel.panel_motion import adjust_pose, follow, preposition
-from stitch.cells.panel.rigid_fit import rigid_fit
-from stitch.cells.panel.shape_control import ControlPoints, shape_step
+from stitch.cells.panel_model import (
+    ClampLayout,
+    ControlPoints,
+    LaserTracker,
+    Legs,
+    PanelSetup,
+    ReflectorReadings,
+    RobotModel,
+    adjust_pose,
+    calibrate_robot,
+    clamp_contacts,
+    errors_along_motion,
+    find_leg_offset,
+    follow,
+    leg_jacobian,
+    preposition,
+    rigid_fit,
+    run_pose,
+    run_shape,
+    shape_step,
+    true_flanges,
+)
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 

@@ -13,16 +13,10 @@ from data_synth import window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from stitch import frames
-from stitch.cells.window.cad import cad_surface, nearest_partners
-from stitch.cells.window.cad_fit import fit_cad
-from stitch.cells.window.cad_start import find_cad_start
-from stitch.cells.window.deviation import measure_deviations
-from stitch.cells.window.edge import find_edge
-from stitch.cells.window.instances import split_instances
-from stitch.cells.window.joined_scans import join_scans
-from stitch.cells.window.path_correction import correct_path
-from stitch.cells.window.regions import Box, Regions
-from stitch.cells.window.seam import Limits, Station, measure_seam
+from stitch.cells.cad import Box, Regions, cad_surface, join_scans, nearest_partners
+from stitch.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations, split_instances
+from stitch.cells.seam import Limits, Station, find_edge, measure_seam
+from stitch.cells.window import correct_path
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.measurement.scan import prepare_scan
@@ -246,12 +240,12 @@ def test_bad_job_is_refused_in_one_line(tmp_path, capsys, command, name, old, ne
 
 
 def test_expected_region_without_points_is_no_fit(pane_cad):
-    from stitch.cells.window.regions import coverage
+    from stitch.cells.cad import coverage
 
     box = Box("corner", np.array([-1e3, -1e3, -1e3]), np.array([1e3, 1e3, 1e3]))
     assert coverage(box, pane_cad, np.array([[5e3, 0, 0.0]]), np.array([[0, 1.0, 0]])) == 0.0
     with pytest.raises(InputError, match="not found"):
-        from stitch.cells.window.window_jobs import read_fit_job
+        from stitch.cells.window import read_fit_job
 
         read_fit_job("nowhere.toml")
 

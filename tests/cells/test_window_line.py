@@ -10,7 +10,7 @@ from data_synth.window_line import EXACT, Errors, WindowLine
 from data_synth.window_line_job import write_line, write_seam
 from data_synth.window_scans import Weld, true_seam
 from stitch import frames
-from stitch.cells.window.seam import Station
+from stitch.cells.seam import Station
 from stitch.cli.main import main
 
 # Half a minute; the pieces of the line have tests of their own.

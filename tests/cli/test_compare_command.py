@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from stitch.cli.actions.compared_run import show_comparison
+from stitch.cli.compare import show_comparison
 from tests.comparison.compared_views import compared
 
 STATE = SimpleNamespace(

@@ -12,7 +12,7 @@ from data_synth.scene import load_scene
 from data_synth.write import write_session, write_truth
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.stored.load_state import load_state
+from stitch.stored.stored_run import load_state
 
 
 @pytest.fixture(scope="module")

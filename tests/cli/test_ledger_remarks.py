@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from stitch.cli.terminal.ledger_summary import remarks
+from stitch.cli.change import remarks
 
 
 def with_effect(sigmas: float, heldout: float) -> SimpleNamespace:

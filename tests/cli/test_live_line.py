@@ -10,9 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from stitch.cli.terminal import live_line
-from stitch.cli.terminal.live_line import TimeLeft, time_left_text
-from stitch.system.steps import steps, watched
+from stitch.cli import terminal as live_line
+from stitch.cli.terminal import TimeLeft, time_left_text
+from stitch.system.process import steps, watched
 from stitch.system.threads import parallel
 
 
@@ -61,8 +61,8 @@ def test_nobody_watches_nobody_counts(said):
 
 CODE = """
 import time
-from stitch.cli.terminal.live_line import TimeLeft, doing
-from stitch.system.steps import steps, watched
+from stitch.cli.terminal import TimeLeft, doing
+from stitch.system.process import steps, watched
 with watched(TimeLeft()), doing("diagnosing [2]"):
     time.sleep(0.8)
     for _ in steps("scans", range(4)): time.sleep(0.4)

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from stitch.cli.main import main
-from stitch.system.whole_file import whole_file
-from stitch.system.whole_folder import rewrite_folder
+from stitch.system.files import rewrite_folder, whole_file
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="nobody may make a folder in /proc")

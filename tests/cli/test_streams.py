@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from stitch.cli.terminal.streams import emit, stdout_for_results
+from stitch.cli.terminal import emit, stdout_for_results
 
 PRINTS = """
 import os, sys

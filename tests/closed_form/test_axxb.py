@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.closed_form.axxb import AXXB_SOLVERS
-from stitch.closed_form.relative_motions import axis_spread
+from stitch.closed_form.hand_eye import AXXB_SOLVERS, axis_spread
 from stitch.errors import NoResultError
 
 

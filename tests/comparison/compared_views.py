@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from stitch.comparison.table import table_of
-from stitch.comparison.tables import ResidualTables, equal_count_bins
-from stitch.comparison.view_scatter import view_statistics
+from stitch.comparison.residual_tables import ResidualTables, equal_count_bins, table_of, view_statistics
 
 
 def compared(errors, properties, rms=1.0):

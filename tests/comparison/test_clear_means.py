@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.comparison.tables import comparison_document, equal_count_bins, property_varies
+from stitch.comparison.residual_tables import comparison_document, equal_count_bins, property_varies
 from tests.comparison.compared_views import compared
 
 

@@ -5,9 +5,9 @@ import pytest
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
-from stitch.comparison.compare_surfaces import compare_surfaces
+from stitch.comparison.residual_tables import compare_surfaces
 from stitch.pipeline import run
-from stitch.runs.state import state_of
+from stitch.runs.run import state_of
 
 
 def blade_run(seed, hidden, mount="eye_to_hand", views=12):

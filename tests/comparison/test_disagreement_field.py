@@ -10,15 +10,12 @@ from data_synth.made_session import make
 from data_synth.simulate import simulate
 from data_synth.write import write_session
 from stitch import frames
-from stitch.comparison.model_history import model_history
-from stitch.comparison.patches import patches_of
-from stitch.observations.surfaces.match import sample_points, signed_distances
-from stitch.observations.surfaces.overlaps import collect_overlaps
-from stitch.pipeline import run
+from stitch.comparison.disagreement_field import model_history, patches_of
+from stitch.observations.surfaces.matching import sample_points, signed_distances
+from stitch.observations.surfaces.normal_equations import collect_overlaps
+from stitch.pipeline import add, run
 from stitch.reading.session_folder import load_session
-from stitch.revision import add
-from stitch.stored.load_state import load_state
-from stitch.stored.stored_run import stored_run
+from stitch.stored.stored_run import load_state, stored_run
 from stitch.writing.result_document import result_document
 from stitch.writing.run_folder import write_run
 

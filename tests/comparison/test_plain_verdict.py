@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from stitch.comparison.plain_verdict import plain_verdict
+from stitch.comparison.run_verdict import plain_verdict
 
 
 def history(*names):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from stitch.comparison.view_scatter import view_statistics
+from stitch.comparison.residual_tables import view_statistics
 
 ROWS = 1000.0  # of a view
 

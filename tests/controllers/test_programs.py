@@ -8,11 +8,11 @@ import pytest
 
 from stitch import frames
 from stitch.cli import main as cli
-from stitch.controllers.importer import import_file
-from stitch.controllers.taught import fixed_xyz, quaternion_w_first, rotation_vector, zyx
+from stitch.controllers.program import import_file
+from stitch.controllers.taught_points import fixed_xyz, quaternion_w_first, rotation_vector, zyx
 from stitch.errors import InputError, NoResultError
-from stitch.reading.dh_rows import robot_from_dh
-from stitch.reading.views_csv import read_views
+from stitch.reading.robot_description import robot_from_dh
+from stitch.reading.session_tables import read_views
 from tests.controllers.program_samples import ABB, FANUC, KUKA_DAT, KUKA_SRC, UR
 
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.controllers.importer import import_file
+from stitch.controllers.program import import_file
 
 
 def test_tracker_probe_with_decimal_commas(tmp_path):

@@ -10,8 +10,8 @@ from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.write import write_session
 from stitch import frames, pipeline
 from stitch.measurement.capture import prepare_capture
-from stitch.observations.surfaces.match import sample_points
-from stitch.observations.surfaces.overlaps import FINE_SAMPLES, collect_overlaps
+from stitch.observations.surfaces.matching import sample_points
+from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, collect_overlaps
 from stitch.reading.session_folder import load_session
 from stitch.system.threads import library_threads_off
 

@@ -6,7 +6,7 @@ import pytest
 
 from data_synth import commands, made_session, write
 from data_synth import demo as told
-from stitch.cli.actions import changed_run, diagnosed_run, run_sessions
+from stitch.cli import change, diagnose, run
 from stitch.errors import InputError
 
 
@@ -15,8 +15,8 @@ def test_the_next_command_is_the_last_line_and_the_only_one(tmp_path, monkeypatc
     monkeypatch.setattr(made_session, "make", lambda *_: SimpleNamespace(clouds=[None] * 3))
     for module, name in ((write, "write_session"), (write, "write_truth"), (commands, "reveal")):
         monkeypatch.setattr(module, name, lambda *_: None)
-    monkeypatch.setattr(run_sessions, "run_sessions", lambda sessions, options: asked.append(options.says_next))
-    for module, name in ((diagnosed_run, "diagnosed_run"), (changed_run, "add_chosen")):
+    monkeypatch.setattr(run, "run_sessions", lambda sessions, options: asked.append(options.says_next))
+    for module, name in ((diagnose, "diagnosed_run"), (change, "add_chosen")):
         monkeypatch.setattr(module, name, lambda *_, says_next=True, **others: asked.append(says_next))
     told.demo(tmp_path / "demo here")
     lines = capsys.readouterr().err.splitlines()

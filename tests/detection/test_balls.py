@@ -6,9 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.ball_scans import Table, scan_table, table_poses
 from stitch import frames
-from stitch.detection.ball_labels import ViewBalls, label_balls
-from stitch.detection.ball_points import ball_sightings
-from stitch.detection.balls import find_balls
+from stitch.detection.balls import ViewBalls, ball_sightings, find_balls, label_balls
 from stitch.errors import InputError
 from stitch.reading.clouds import read_cloud
 

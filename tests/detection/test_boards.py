@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.board_scans import board_print, checkerboard_print, poses_before, scan_print
-from stitch.detection.board import parse_board
-from stitch.detection.board_points import board_sightings, boards_in
-from stitch.detection.lift import lift_points
+from stitch.detection.boards import board_sightings, boards_in, lift_points, parse_board
 from stitch.errors import InputError
-from stitch.measurement.range_image import RangeImage
+from stitch.measurement.session import RangeImage
 
 cv2 = pytest.importorskip("cv2")
 CHARUCO = "charuco:8x6:12:9:DICT_4X4_50"

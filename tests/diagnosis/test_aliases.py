@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.diagnosis.sensitivity.aliases import imitated_share
+from stitch.diagnosis.sensitivity import imitated_share
 
 
 def test_a_pattern_in_the_plane_of_two_columns_is_imitated_by_the_cosine_of_its_angle_to_it():

@@ -9,9 +9,8 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.pipeline import diagnose, run
-from stitch.revision import add
-from stitch.runs.state import state_of
+from stitch.pipeline import add, diagnose, run
+from stitch.runs.run import state_of
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json
 

@@ -12,14 +12,18 @@ from numpy.polynomial import Polynomial
 from data_synth import kinematics
 from data_synth.ordinary_arm import draw_arm, with_memory
 from stitch import frames
-from stitch.diagnosis.course_sentences import curve_sentences, joint_curve_sentence
+from stitch.diagnosis.residual_structure import variance_budget
+from stitch.diagnosis.sentences import curve_sentences, joint_curve_sentence
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unknown.clear_joints import significant_laws
-from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.joint_laws import ANY_SIZE, joint_laws, laws_of_kinds, log_posterior_of_any
-from stitch.diagnosis.variance_budget import variance_budget
-from stitch.observations.flange_errors import usual_time_step
-from stitch.observations.joint_processes import JOINT_LOAD, TIME_ONLY, TRAVEL, TWO_ANGLES, WAVES, WITH_TIME
+from stitch.diagnosis.unnamed_joint_laws import (
+    ANY_SIZE,
+    joint_curves,
+    joint_laws,
+    laws_of_kinds,
+    log_posterior_of_any,
+    significant_laws,
+)
+from stitch.observations.pose_errors import JOINT_LOAD, TIME_ONLY, TRAVEL, TWO_ANGLES, WAVES, WITH_TIME, usual_time_step
 from tests.diagnosis.freed_blade import freed_blade
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from data_synth.fixtures.in_memory import session_of
-from stitch.diagnosis.covariate_dependence import covariate_values
+from stitch.diagnosis.residual_structure import covariate_values
 from stitch.measurement.measurement import measurement_of
 
 

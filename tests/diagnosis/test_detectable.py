@@ -5,11 +5,10 @@ import pytest
 from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
-from stitch.diagnosis.sensitivity.detectable import least_noncentrality
+from stitch.diagnosis.sensitivity import least_noncentrality
 from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR
-from stitch.statistics.restricted_likelihood import MixedModel
-from stitch.statistics.satterthwaite import satterthwaite
-from stitch.statistics.variance_components import VarianceFit, fit_variances
+from stitch.statistics.reml import MixedModel, VarianceFit, fit_variances
+from stitch.statistics.variance_posterior import satterthwaite
 
 
 def test_known_scatter_and_one_parameter_need_what_two_quantiles_say():

@@ -11,7 +11,7 @@ from stitch.diagnosis.diagnose import diagnose_state
 from stitch.effects.empirical import FIELD, empirical_effects
 from stitch.measurement.measurement import measurement_of
 from stitch.pipeline import run
-from stitch.runs.state import state_of
+from stitch.runs.run import state_of
 
 
 def said_of(measured, seen=lambda points: points):

@@ -5,13 +5,13 @@ import numpy as np
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.diagnosis.selection.exchange import find_exchange
-from stitch.diagnosis.selection.ranking import is_certain, rank_one
-from stitch.diagnosis.selection.verdict import _rejection_notes
-from stitch.diagnosis.validation.extrapolation import Extrapolation, extrapolate, untested_ends_reason
+from stitch.diagnosis.ranking import is_certain, rank_one
+from stitch.diagnosis.stepwise_selection import find_exchange
+from stitch.diagnosis.validation import Extrapolation, extrapolate, untested_ends_reason
+from stitch.diagnosis.verdict import _rejection_notes
 from stitch.effects.contract import EFFECTS
 from stitch.pipeline import run
-from stitch.runs.state import state_of
+from stitch.runs.run import state_of
 from stitch.statistics.folds import JointEnd
 
 

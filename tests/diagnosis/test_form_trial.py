@@ -8,11 +8,10 @@ from scipy.stats import multivariate_normal
 
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.form_trial import try_form
-from stitch.diagnosis.score import score
+from stitch.diagnosis.score import score, try_form
 from stitch.effects.contract import EFFECTS
-from stitch.statistics.amplitude_scales import ANY_SIZE
-from stitch.statistics.variance_prior import log_prior
+from stitch.statistics.parameter_selection import ANY_SIZE
+from stitch.statistics.reml import log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
 VIEWS = 16

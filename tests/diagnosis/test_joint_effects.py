@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_cell
-from stitch.diagnosis.selection.backward_elimination import find_effect_to_drop
-from stitch.pipeline import diagnose, run
-from stitch.revision import add
-from stitch.runs.state import state_of
-from stitch.stepwise import suggest
+from stitch.diagnosis.stepwise_selection import find_effect_to_drop
+from stitch.pipeline import add, diagnose, run, suggest
+from stitch.runs.run import state_of
 
 
 def test_a_hidden_joint_offset_is_named_and_found():

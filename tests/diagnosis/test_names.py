@@ -12,16 +12,14 @@ from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.conclusion import decide
-from stitch.diagnosis.plausible_scatter import ScatterLimit
+from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
-from stitch.diagnosis.unknown.clear_joints import significant_laws
-from stitch.diagnosis.unknown.joint_curves import joint_curves
-from stitch.diagnosis.unknown.joint_laws import joint_laws, laws_of_kinds
-from stitch.diagnosis.unknown.unnamed_errors import find_repeating_errors
+from stitch.diagnosis.unnamed_joint_laws import joint_curves, joint_laws, laws_of_kinds, significant_laws
+from stitch.diagnosis.unnamed_time_laws import find_repeating_errors
+from stitch.diagnosis.verdict import decide
 from stitch.effects.contract import EFFECTS
-from stitch.observations.joint_processes import ALL_ANGLES, JOINT_LOAD, OWN_ANGLE, WITH_TIME
-from stitch.statistics.variance_prior import MAY_BE_ABSENT, NOISE, log_prior
+from stitch.observations.pose_errors import ALL_ANGLES, JOINT_LOAD, OWN_ANGLE, WITH_TIME
+from stitch.statistics.reml import MAY_BE_ABSENT, NOISE, log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
 # Effects that move views as wholes; those of points take longer to ask for.

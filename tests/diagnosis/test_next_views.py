@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import Growth, labelled_cell
-from stitch.diagnosis.design import next_view
-from stitch.diagnosis.design.candidate_views import candidate_measurement
+from stitch.diagnosis import next_view
+from stitch.diagnosis.next_view import candidate_measurement
 from stitch.effects.contract import EFFECTS
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of

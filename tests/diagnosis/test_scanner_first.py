@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from stitch.diagnosis import scanner_first
-from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.selection.verdict import Selection
-from stitch.observations.surfaces.field_error import FieldError
+from stitch.diagnosis import verdict as scanner_first
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.verdict import Selection
+from stitch.observations.surfaces.scanner_errors import FieldError
 
 
 def named(gain: float) -> Selection:

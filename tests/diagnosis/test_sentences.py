@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.plausible_scatter import ScatterLimit
-from stitch.diagnosis.selection.verdict import Selection
+from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.sentences import diagnosis_sentence, odds_text
+from stitch.diagnosis.verdict import Selection
 
 
 @pytest.mark.parametrize("verdict", ["adequate", "unknown_effect"])

@@ -2,12 +2,8 @@
 
 import pytest
 
-from stitch.diagnosis.smooth_sentences import (
-    scanner_clause_before_poses,
-    scanner_clause_if_adequate,
-    scanner_error_sentence,
-)
-from stitch.observations.surfaces.field_error import FieldError
+from stitch.diagnosis.sentences import scanner_clause_before_poses, scanner_clause_if_adequate, scanner_error_sentence
+from stitch.observations.surfaces.scanner_errors import FieldError
 
 SAME = FieldError(0.02, 0.0, 9.0, over_noise=False)
 BOTH = FieldError(0.02, 0.01, 9.0, over_noise=True, with_time=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.diagnosis.plausible_scatter import scatter_limit
+from stitch.diagnosis.score import scatter_limit
 from stitch.measurement.session import StatedRepeatability
 from stitch.pipeline import diagnose, run
 

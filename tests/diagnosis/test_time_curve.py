@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from stitch import frames
-from stitch.diagnosis.course_sentences import time_curve_sentence
-from stitch.diagnosis.unknown.time_curve import TimeCurve, time_curve
-from stitch.diagnosis.unknown.time_laws import significant_time_law
+from stitch.diagnosis.sentences import time_curve_sentence
+from stitch.diagnosis.unnamed_time_laws import TimeCurve, significant_time_law, time_curve
 from tests.diagnosis.freed_blade import freed_blade
 
 VIEWS = 18

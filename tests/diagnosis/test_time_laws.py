@@ -11,15 +11,18 @@ from scipy.stats import multivariate_normal
 from data_synth.ordinary_arm import with_memory
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.conclusion import decide
-from stitch.diagnosis.plausible_scatter import ScatterLimit
+from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
-from stitch.diagnosis.unknown.time_laws import likeliest_time_law, significant_time_law
-from stitch.diagnosis.unknown.time_processes import time_processes
-from stitch.diagnosis.unknown.unnamed_errors import find_repeating_errors
+from stitch.diagnosis.unnamed_time_laws import (
+    find_repeating_errors,
+    likeliest_time_law,
+    significant_time_law,
+    time_processes,
+)
+from stitch.diagnosis.verdict import decide
 from stitch.effects.contract import EFFECTS
-from stitch.observations.flange_errors import DRIFT_MEMORY
-from stitch.statistics.variance_prior import log_prior
+from stitch.observations.pose_errors import DRIFT_MEMORY
+from stitch.statistics.reml import log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
 VIEWS = 18

@@ -8,7 +8,7 @@ from data_synth.fixtures.labelled_arm import TARGETS, flange, joints_of, labelle
 from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
-from stitch.diagnosis.unknown.unnamed_courses import least_log_bayes_factor, unnamed_courses
+from stitch.diagnosis.unnamed_time_laws import least_log_bayes_factor, unnamed_courses
 from stitch.pipeline import diagnose, run
 
 VIEWS, SEED = 120, 31

@@ -4,10 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from stitch.diagnosis.selection.ranking import Ranked
-from stitch.diagnosis.selection.upheld import validate_named
-from stitch.diagnosis.selection.verdict import Selection
-from stitch.diagnosis.validation.cross_validation import CrossValidation
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.validation import CrossValidation
+from stitch.diagnosis.verdict import Selection, validate_named
 
 HELPS = CrossValidation(inside=0.5, heldout=0.6, poses=0.4, poses_sigma=0.1, steadiness=0.9)
 USELESS = CrossValidation(inside=0.5, heldout=1.0, poses=1.0, poses_sigma=0.1, steadiness=0.9)

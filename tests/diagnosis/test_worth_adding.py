@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from stitch.diagnosis.selection import forward_selection
-from stitch.diagnosis.selection.ranking import Ranked
+from stitch.diagnosis import stepwise_selection
+from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.thresholds import MAX_REMAINING_SHARE
-from stitch.diagnosis.validation.cross_validation import CrossValidation
+from stitch.diagnosis.validation import CrossValidation
 
 
 def leaving(poses: float, sigma: float = 1e-3) -> CrossValidation:
@@ -30,7 +30,7 @@ def ranked(name: str) -> Ranked:
 )
 def test_what_is_told_helps_and_what_is_idle_is_said(monkeypatch, left, named, idle):
     monkeypatch.setattr(
-        forward_selection, "without", lambda linear, chosen, one: [r.name for r in chosen if r.name != one.name]
+        stepwise_selection, "without", lambda linear, chosen, one: [r.name for r in chosen if r.name != one.name]
     )
     asked, scored = [], []
 
@@ -42,10 +42,10 @@ def test_what_is_told_helps_and_what_is_idle_is_said(monkeypatch, left, named, i
         scored.append((candidate.name, beside))
         return ranked(candidate.name)
 
-    monkeypatch.setattr(forward_selection, "cross_validate", cross_validated)
-    monkeypatch.setattr(forward_selection, "ranked_one", again)
-    monkeypatch.setattr(forward_selection, "certain", lambda r: True)
-    kept, why = forward_selection.keep_worth_adding(None, [ranked(name) for name in left], 20)
+    monkeypatch.setattr(stepwise_selection, "cross_validate", cross_validated)
+    monkeypatch.setattr(stepwise_selection, "ranked_one", again)
+    monkeypatch.setattr(stepwise_selection, "certain", lambda r: True)
+    kept, why = stepwise_selection.keep_worth_adding(None, [ranked(name) for name in left], 20)
     assert [r.name for r in kept] == named and list(why) == idle
     assert asked[0] == ("part_sag", [name for name in left if name != "part_sag"])  # beside all that are missing
     assert all("hardly helps on views left out" in text for text in why.values())

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.effects.contract import EFFECTS
-from stitch.effects.in_session import missing_need, require_available
+from stitch.effects.contract import EFFECTS, missing_need, require_available
 from stitch.errors import InputError
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of

@@ -6,7 +6,7 @@ import pytest
 
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import find_effect, parameters_in, require_available
+from stitch.effects.contract import find_effect, parameters_in, require_available
 from stitch.errors import InputError
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of

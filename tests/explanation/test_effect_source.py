@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.effects.contract import EFFECTS
-from stitch.effects.in_session import missing_need
+from stitch.effects.contract import EFFECTS, missing_need
 from stitch.effects.user_file import load
-from stitch.explanation.dictionary import Ingredient, coefficient
-from stitch.explanation.effect_source import effect_source, formula_text
-from stitch.explanation.quantities import view_quantities
-from stitch.measurement.views import no_torques, views_of
+from stitch.explanation.dictionary import Ingredient, coefficient, view_quantities
+from stitch.explanation.explain import effect_source, formula_text
+from stitch.measurement.measurement import no_torques, views_of
 from tests.explanation.test_explain import evidence
 
 SHIFT = 8e-5  # m, where the payload is largest

@@ -9,14 +9,12 @@ from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.explanation.dictionary import build_dictionary
+from stitch.explanation.dictionary import backlash_lag, build_dictionary, view_quantities
 from stitch.explanation.explain import explain
-from stitch.explanation.quantities import view_quantities
 from stitch.explanation.search import search_sums
-from stitch.explanation.shapes import backlash_lag
-from stitch.measurement.views import views_of
+from stitch.measurement.measurement import views_of
 from stitch.pipeline import run
-from stitch.runs.state import state_of
+from stitch.runs.run import state_of
 
 SIZE = 3e-4  # rad
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from stitch.explanation.pursuit import pursue_sums
+from stitch.explanation.search import pursue_sums
 
 NUMBERS = 60
 

@@ -7,15 +7,11 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.explanation.dictionary import Ingredient, build_dictionary
+from stitch.explanation.dictionary import Ingredient, Nonlinear, build_dictionary, bump_of_joint, view_quantities
 from stitch.explanation.explain import explain
-from stitch.explanation.half import HalfModel
-from stitch.explanation.quantities import view_quantities
-from stitch.explanation.quantity import Nonlinear
-from stitch.explanation.refinement import refine_parameters, round_parameters
-from stitch.explanation.shapes import bump_of_joint
+from stitch.explanation.search import HalfModel, refine_parameters, round_parameters
 from stitch.pipeline import run
-from stitch.runs.state import state_of
+from stitch.runs.run import state_of
 from tests.diagnosis.freed_blade import freed_blade
 
 MIDDLE, WIDTH, HEIGHT = 0.31, 0.13, 6e-4  # rad: between the places and beside the widths that are tried

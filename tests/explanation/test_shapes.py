@@ -7,14 +7,11 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.explanation.dictionary import build_dictionary
+from stitch.explanation.dictionary import Quantity, build_dictionary, nonlinear_torque, saw_of_joint, view_quantities
 from stitch.explanation.explain import explain
-from stitch.explanation.quantities import view_quantities
-from stitch.explanation.quantity import Quantity
-from stitch.explanation.shapes import nonlinear_torque, saw_of_joint
-from stitch.measurement.views import views_of
+from stitch.measurement.measurement import views_of
 from stitch.pipeline import run
-from stitch.runs.state import state_of
+from stitch.runs.run import state_of
 
 TOOTH, HEIGHT = 0.33, 8e-4  # rad
 

@@ -9,10 +9,9 @@ from data_synth.arms import ARMS
 from data_synth.fixtures.true_arm import drawn, true_flanges
 from data_synth.write import robot_table
 from stitch.effects import EFFECTS
-from stitch.export.arm_formats import ARM_FORMATS
-from stitch.export.arm_model import ArmModel
-from stitch.model.term import Term
-from stitch.reading.dh_rows import robot_from_dh
+from stitch.export.arm_model import ARM_FORMATS, ArmModel
+from stitch.model.model import Term
+from stitch.reading.robot_description import robot_from_dh
 
 ARM = ARMS["ABB IRB 120"]
 TABLE = robot_table(ARM)

@@ -11,7 +11,7 @@ from plyfile import PlyData, PlyElement
 from data_synth.fixtures.run_folders import bare_run
 from stitch.cli.main import main
 from stitch.runs.run import FusedCloud
-from stitch.writing.tables import write_cloud
+from stitch.writing.run_folder import write_cloud
 from tests.needs import needs
 
 RNG = np.random.default_rng(0)

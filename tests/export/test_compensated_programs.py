@@ -16,18 +16,15 @@ from data_synth.fixtures.run_folders import bare_run
 from data_synth.fixtures.true_arm import drawn, true_flanges
 from data_synth.write import robot_table
 from stitch.cli.main import main
-from stitch.controllers.importer import import_file
-from stitch.controllers.program import read_program
-from stitch.controllers.taught import program_bytes
+from stitch.controllers.program import import_file, read_program
+from stitch.controllers.taught_points import program_bytes
 from stitch.effects import EFFECTS
 from stitch.errors import InputError, NoResultError
 from stitch.export.arm_model import ArmModel
-from stitch.export.compensated_program import compensated_program
-from stitch.export.compensation import compensate_targets
-from stitch.export.program_copy import compensated_texts
-from stitch.measurement.torques import torques_of
-from stitch.model.term import Term
-from stitch.reading.dh_rows import robot_from_dh
+from stitch.export.robot_program import compensate_targets, compensated_program, compensated_texts
+from stitch.measurement.measurement import torques_of
+from stitch.model.model import Term
+from stitch.reading.robot_description import robot_from_dh
 from tests.controllers.program_samples import ABB, FANUC, KUKA_DAT, KUKA_SRC, UR
 
 ARM = ARMS["KUKA KR30-3"]

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from data_synth.fixtures.run_folders import bare_run
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.export.hand_eye import hand_eye_of_run
-from stitch.export.hand_eye_formats import HAND_EYE_FORMATS
+from stitch.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_of_run
 
 NUMBER = r"(-?\d+\.\d+)"
 COVARIANCE = np.diag([1e-4, 2e-4, 3e-4, 0.02, 0.05, 0.04]) ** 2

@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.intake.bag_session import write_bag_session
-from stitch.intake.transform_tree import TransformTree
+from stitch.intake.ros_bag import TransformTree, write_bag_session
 from stitch.reading.range_image import read_range_image
 from stitch.reading.session_folder import load_session
 

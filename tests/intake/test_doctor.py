@@ -11,9 +11,8 @@ from data_synth.fixtures.raw_folders import Convention, raw_folder, session_pose
 from data_synth.write import write_session
 from stitch import frames
 from stitch.errors import InputError
-from stitch.intake.first_session import first_session
+from stitch.intake.first_session import StatedFolder, first_session
 from stitch.intake.session_draft import write_draft
-from stitch.intake.stated import StatedFolder
 from stitch.reading.clouds import read_cloud
 from stitch.reading.session_folder import load_session
 

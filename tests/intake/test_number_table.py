@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stitch.errors import InputError
-from stitch.intake.number_table import read_number_table
+from stitch.intake.pose_tables import read_number_table
 
 ROWS = [[111.5, -331.25, 317.0, -2.5, 0.125, 3.0], [114.0, -358.5, 360.75, -2.75, 0.25, -3.0]]
 

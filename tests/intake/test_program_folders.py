@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.robot_programs import program
-from stitch.intake.found_files import find_folder_files
-from stitch.intake.program_poses import is_program, program_poses
-from stitch.intake.raw_poses import read_raw_poses
+from stitch.intake.folder_files import find_folder_files
+from stitch.intake.raw_poses import is_program, program_poses, read_raw_poses
 
 POSES = [np.array([[0.0, -1, 0, 900 + 10 * i], [1, 0, 0, 20], [0, 0, 1, 700], [0, 0, 0, 1]]) for i in range(4)]
 DATA = "DEFDAT WORK\n" + "".join(

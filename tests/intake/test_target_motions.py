@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.intake.target_motions import target_motions
-from stitch.measurement.labelled_points import Sighting
+from stitch.intake.scan_targets import target_motions
+from stitch.measurement.session import Sighting
 
 FLAT = np.array([[0.0, 0, 0], [100, 0, 0], [100, 70, 0], [0, 70, 0], [50, 30, 0]])
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from stitch import frames
-from stitch.measurement.sightings import Sightings
+from stitch.measurement.capture import Sightings
 
 VIEWS, SIGMA = 14, 0.01
 PLACES = np.array([[0, 0, 0], [120, 10, 0], [0, 90, 30], [80, 70, -20], [40, -60, 50.0]])

@@ -10,18 +10,15 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch import frames
 from stitch.errors import InputError, NoResultError
-from stitch.integrity.admission import ViewScreening
-from stitch.integrity.admitted_fit import fit_screened_views
+from stitch.integrity.view_screening import ViewScreening, fit_screened_views
 from stitch.measurement.capture import prepare_capture
-from stitch.measurement.cloud import Cloud
-from stitch.measurement.labelled_points import Sighting
 from stitch.measurement.measurement import measurement_of
+from stitch.measurement.session import Cloud, Sighting
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
-from stitch.pipeline import run
-from stitch.revision import add
-from stitch.stages.fitted import FittedRig
-from stitch.stages.outlier_removal import FittedSession
+from stitch.pipeline import add, run
+from stitch.stages.finish import FittedRig
+from stitch.stages.target_fit import FittedSession
 
 
 @pytest.fixture(scope="module")

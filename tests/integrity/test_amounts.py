@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.integrity.amounts import displacement_text
+from stitch.integrity.problems import displacement_text
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stitch import frames
-from stitch.integrity.common_step import find_common_displacement
+from stitch.integrity.pairing import find_common_displacement
 from stitch.integrity.snooping import MisplacedView
 
 SLIP = np.array([0.05, -0.03, 0.02, 3.0, -5.0, 2.0])

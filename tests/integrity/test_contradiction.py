@@ -3,7 +3,7 @@
 import numpy as np
 
 from stitch import frames
-from stitch.integrity.contradiction import find_contradicting_views
+from stitch.integrity.placement import find_contradicting_views
 from stitch.measurement.scan import prepare_scan
 
 POSES = np.tile(np.eye(4), (3, 1, 1))

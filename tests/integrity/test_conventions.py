@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch import frames
-from stitch.integrity.conventions import likeliest_hypotheses, proven_hypotheses, rank_hypotheses
+from stitch.integrity.conventions import RelativeScans, likeliest_hypotheses, proven_hypotheses, rank_hypotheses
 from stitch.integrity.hypotheses import hypotheses
-from stitch.integrity.relative_scans import RelativeScans
-from stitch.integrity.targets import check_targets
+from stitch.integrity.target_checks import check_targets
 from tests.integrity.mistakes import MISTAKES, with_poses
 
 

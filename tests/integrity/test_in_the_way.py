@@ -9,10 +9,10 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.integrity.deep_check import deep_check
-from stitch.integrity.in_the_way import find_occluder
+from stitch.integrity.scan_faults import find_occluder
 from stitch.measurement.capture import part_size, prepare_capture
-from stitch.measurement.cloud import Cloud
 from stitch.measurement.scan import prepare_scan
+from stitch.measurement.session import Cloud
 from stitch.pipeline import run
 
 VIEWS, SIDE, COUNT = 10, 8.0, 300

@@ -10,11 +10,10 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated, with_part
 from data_synth.scene import load_scene
 from stitch import frames
-from stitch.integrity.blunders import find_blunders
-from stitch.integrity.least_displacement import least_displacement
+from stitch.integrity.pose_tests import find_blunders, least_displacement
 from stitch.integrity.view_model import ViewModel
 from stitch.pipeline import run
-from stitch.statistics.variance_components import at_variances
+from stitch.statistics.reml import at_variances
 
 VIEWS, SIGMA, OFF = 20, 0.02, 7
 

@@ -8,8 +8,8 @@ import pytest
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
-from stitch.measurement.labelled_points import Sighting
-from stitch.observations.targets.mislabelled import find_mislabelled
+from stitch.measurement.session import Sighting
+from stitch.observations.targets.outliers import find_mislabelled
 from stitch.pipeline import run
 from tests.integrity.targets import PLACES, VIEWS, sightings
 

@@ -9,10 +9,9 @@ from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch import frames
 from stitch.comparison.run_verdict import run_light, run_verdict
 from stitch.errors import NoResultError
-from stitch.pipeline import diagnose, run
-from stitch.revision import change
-from stitch.runs.state import state_of
-from stitch.writing.plain_finding import plain_finding, suggested_command
+from stitch.pipeline import change, diagnose, run
+from stitch.runs.run import state_of
+from stitch.writing.diagnosis_document import plain_finding, suggested_command
 from stitch.writing.result_document import model_of
 
 

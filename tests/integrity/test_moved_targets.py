@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.integrity.moved_targets import find_moved_targets
+from stitch.integrity.target_checks import find_moved_targets
 from tests.integrity.targets import PLACES, SIGMA, VIEWS, sightings
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stitch.integrity.other_rows import exchange_cycles, exchanged_pairs
+from stitch.integrity.pairing import exchange_cycles, exchanged_pairs
 from stitch.integrity.snooping import MisplacedView
 
 

@@ -3,8 +3,7 @@
 import numpy as np
 
 from stitch import frames
-from stitch.integrity.linkage import Link, linkage_of_links
-from stitch.integrity.placed_groups import place_groups
+from stitch.integrity.placement import Link, linkage_of_links, place_groups
 
 SLIP = np.array([0.004, -0.003, 0.005, 2.0, -2.0, 1.0])
 

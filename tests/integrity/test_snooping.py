@@ -7,8 +7,8 @@ import pytest
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
-from stitch.integrity.placing import lies_in_a_line
-from stitch.integrity.relative_scans import register_scan_pairs
+from stitch.integrity.conventions import register_scan_pairs
+from stitch.integrity.placement import lies_in_a_line
 from stitch.integrity.snooping import snoop_views
 from stitch.measurement.scan import prepare_scan
 

@@ -8,13 +8,13 @@ import pytest
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
-from stitch.comparison.model_history import model_history
+from stitch.comparison.disagreement_field import model_history
 from stitch.comparison.run_verdict import run_verdict
 from stitch.integrity.deep_check import deep_check
-from stitch.integrity.standing_still import find_static_background
+from stitch.integrity.scan_faults import find_static_background
 from stitch.measurement.capture import part_size, prepare_capture
-from stitch.measurement.cloud import Cloud
 from stitch.measurement.scan import prepare_scan
+from stitch.measurement.session import Cloud
 from stitch.pipeline import run
 
 TOLERANCE = 0.1

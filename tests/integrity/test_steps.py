@@ -9,16 +9,13 @@ from scipy import stats
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
-from stitch.comparison.model_history import model_history
+from stitch.comparison.disagreement_field import model_history
 from stitch.comparison.run_verdict import run_verdict
-from stitch.integrity.blunders import find_blunders
-from stitch.integrity.expected_poses import expected_poses
-from stitch.integrity.pose_tests import PoseTests
-from stitch.integrity.steps import find_steps
+from stitch.integrity.pose_tests import PoseTests, expected_poses, find_blunders, find_steps
 from stitch.integrity.view_model import ViewModel
-from stitch.measurement.cloud import Cloud
+from stitch.measurement.session import Cloud
 from stitch.observations.pose_errors import PoseErrors
-from stitch.observations.surfaces.free_poses import UnconstrainedPoses
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.pipeline import run
 
 VIEWS, SIGMA, MEMORY = 18, 0.02, 20.0

@@ -6,8 +6,8 @@ import numpy as np
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.integrity.deep_check import deep_check
-from stitch.integrity.target_faults import target_warnings
-from stitch.measurement.sightings import sightings_of
+from stitch.integrity.target_checks import target_warnings
+from stitch.measurement.capture import sightings_of
 
 VIEWS, START = 16, 9
 

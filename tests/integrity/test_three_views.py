@@ -7,7 +7,7 @@ import pytest
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
-from stitch.measurement.cloud import Cloud
+from stitch.measurement.session import Cloud
 from stitch.pipeline import run
 
 

@@ -1,7 +1,6 @@
 """Lists of views in messages stay readable, however many there are."""
 
-from stitch.integrity.problems import SessionProblem
-from stitch.integrity.view_names import list_views
+from stitch.integrity.problems import SessionProblem, list_views
 
 NAMES = [f"v{v:03d}" for v in range(104)]
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from stitch.integrity.blunders import find_blunders
-from stitch.integrity.view_model import ViewModel, projector
-from stitch.integrity.view_test import test_alternative
-from stitch.statistics.variance_components import at_variances
+from stitch.integrity.pose_tests import find_blunders
+from stitch.integrity.view_model import ViewModel, projector, test_alternative
+from stitch.statistics.reml import at_variances
 
 test_alternative.__test__ = False  # a function of the library, not a case
 VIEWS, SIGMA = 20, 0.02

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.measurement.views import views_of
+from stitch.measurement.measurement import views_of
 
 THERE_AND_BACK = np.array([0.0, 0.1, 0.5, 1.0, 0.9, 0.7, 0.5, 0.6, 0.9])
 # Within 0.2: dragged from 0.5 on; at rest at 0.8 until the joint is below 0.6; dragged back to 0.7; at rest again.

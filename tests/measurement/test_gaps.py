@@ -3,8 +3,7 @@
 from dataclasses import replace
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.measurement.gaps import gaps_note
-from stitch.measurement.views import views_of
+from stitch.measurement.measurement import gaps_note, views_of
 
 
 def test_a_column_with_a_gap_is_told_and_not_used():

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from stitch import frames
-from stitch.measurement.imperfect_arm import Links, exact_links, flange_slopes, forward_with_errors
-from stitch.measurement.robot import forward, jacobian
-from stitch.reading.dh_rows import robot_from_dh
+from stitch.measurement.robot import Links, exact_links, flange_slopes, forward, forward_with_errors, jacobian
+from stitch.reading.robot_description import robot_from_dh
 
 GRAVITY = np.array([0, 0, -9.81])
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import flange, labelled_cell
-from stitch.cli.actions.checked_sessions import session_summary
-from stitch.measurement.torques import payload_note, torques_of
-from stitch.measurement.views import views_of
+from stitch.cli.check import session_summary
+from stitch.measurement.measurement import payload_note, torques_of, views_of
 from stitch.pipeline import run
 
 GRAVITY = 9.81

@@ -11,8 +11,7 @@ from stitch.measurement.robot import (
     joint_axes,
     link_frames,
 )
-from stitch.reading.dh_rows import robot_from_dh
-from stitch.reading.urdf import robot_from_urdf
+from stitch.reading.robot_description import robot_from_dh, robot_from_urdf
 from stitch.writing.urdf_file import to_urdf
 
 ROWS = [

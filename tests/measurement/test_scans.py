@@ -8,7 +8,7 @@ import pytest
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import missing_need
+from stitch.effects.contract import missing_need
 from stitch.errors import InputError
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of

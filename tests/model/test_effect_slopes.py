@@ -8,14 +8,11 @@ import pytest
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import missing_need, parameters_in
+from stitch.effects.contract import missing_need, parameters_in
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
-from stitch.model.forward import perturbed_frames
-from stitch.model.jacobian import pose_derivatives
-from stitch.model.model import Model
-from stitch.model.point_slopes import PointSlopes
-from stitch.model.term import Term, term_of
+from stitch.model.forward import PointSlopes, perturbed_frames, pose_derivatives
+from stitch.model.model import Model, Term, term_of
 
 
 def chain_for(measured):

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from stitch.effects import EFFECTS
-from stitch.model.bound import convert_unit
-from stitch.model.effects_covariance import EffectsCovariance, covariance_of_fit, kept_root
-from stitch.model.model_toml import ModelFile
-from stitch.model.term import Term
+from stitch.model.model import EffectsCovariance, Term, covariance_of_fit, kept_root
+from stitch.model.model_toml import ModelFile, convert_unit
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.model.hand_eye_uncertainty import expanded_uncertainty, printed_covariance
+from stitch.model.model import expanded_uncertainty, printed_covariance
 
 
 @pytest.mark.parametrize("angle", [1e-5, 0.8, 3.1])

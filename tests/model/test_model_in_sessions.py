@@ -7,14 +7,13 @@ import pytest
 
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
-from stitch.effects.in_session import parameters_in
+from stitch.effects.contract import parameters_in
 from stitch.errors import InputError
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.robot import unit_torques
-from stitch.model.bound import bind_to_session
-from stitch.model.model_toml import ModelFile
-from stitch.model.term import term_of
+from stitch.model.model import term_of
+from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.pipeline import run_rig
 from stitch.stages.rig import require_effects
 

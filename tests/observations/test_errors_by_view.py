@@ -13,14 +13,19 @@ from stitch import pipeline
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.errors_by_view import PER_VIEW, part_of_view, view_error_likelihood
-from stitch.observations.surfaces.field_error import field_error
-from stitch.observations.surfaces.gram import gram
-from stitch.observations.surfaces.match import Match
-from stitch.observations.surfaces.moved_views import displacement_factors
-from stitch.observations.surfaces.shown_errors import SmoothErrorLikelihood
-from stitch.observations.surfaces.smooth_errors import COARSE, sum_smooth_errors
-from stitch.runs.state import state_of
+from stitch.observations.surfaces.matching import Match
+from stitch.observations.surfaces.normal_equations import gram
+from stitch.observations.surfaces.scanner_errors import (
+    COARSE,
+    PER_VIEW,
+    SmoothErrorLikelihood,
+    field_error,
+    part_of_view,
+    sum_smooth_errors,
+    view_error_likelihood,
+)
+from stitch.observations.surfaces.view_poses import displacement_factors
+from stitch.runs.run import state_of
 
 VIEWS = 12
 # What moves the points (N, 3) of view v, scanner frame, mm.

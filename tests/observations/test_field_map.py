@@ -11,9 +11,8 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from stitch import pipeline
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.observations.surfaces.field_error import FieldError, field_error
-from stitch.observations.surfaces.field_map import FieldMap, robust_pass_share
-from stitch.runs.state import state_of
+from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap, field_error, robust_pass_share
+from stitch.runs.run import state_of
 
 # mm along the ray at places (N,) of the field, −1 … 1 both ways.
 Law = Callable[[np.ndarray, np.ndarray], np.ndarray]

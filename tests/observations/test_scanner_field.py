@@ -11,9 +11,8 @@ from data_synth.fixtures.quiet_scenes import Measured, simulated
 from data_synth.scene import load_scene
 from stitch import frames, pipeline
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.observations.surfaces.field_error import field_error
-from stitch.observations.surfaces.scanner_field import field_scatter
-from stitch.runs.state import state_of
+from stitch.observations.surfaces.scanner_errors import field_error, field_scatter
+from stitch.runs.run import state_of
 
 SEEDS = 2
 

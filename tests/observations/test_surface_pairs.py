@@ -8,13 +8,10 @@ from scipy.spatial import cKDTree
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
-from stitch.observations.surfaces.free_poses import unconstrained_poses
-from stitch.observations.surfaces.gram import assemble, gram, pair_squares
-from stitch.observations.surfaces.hand_eye import capture_repeatability
-from stitch.observations.surfaces.match import match_pairs, sample_points
-from stitch.observations.surfaces.overlapping_pairs import overlapping_pairs
-from stitch.observations.surfaces.overlaps import collect_overlaps
-from stitch.observations.surfaces.pose_channel import hand_eye_jacobian
+from stitch.observations.surfaces.hand_eye_fit import capture_repeatability, hand_eye_jacobian
+from stitch.observations.surfaces.matching import match_pairs, overlapping_pairs, sample_points
+from stitch.observations.surfaces.normal_equations import assemble, collect_overlaps, gram, pair_squares
+from stitch.observations.surfaces.view_poses import unconstrained_poses
 
 
 @pytest.fixture(scope="module")

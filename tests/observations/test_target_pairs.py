@@ -10,16 +10,13 @@ from data_synth.fixtures.drilled_plate import VIEWS, measured_plate
 from data_synth.fixtures.in_memory import labelled_session_of
 from stitch import frames
 from stitch.effects.contract import EFFECTS
-from stitch.measurement.capture import prepare_capture
+from stitch.measurement.capture import Sightings, prepare_capture
 from stitch.measurement.measurement import measurement_of
-from stitch.measurement.sightings import Sightings
 from stitch.model.forward import corrected_capture
-from stitch.model.model import Model
-from stitch.model.term import term_of
-from stitch.observations.surfaces.free_poses import solve_views, unconstrained_poses
-from stitch.observations.surfaces.gram import Gram, assemble
-from stitch.observations.surfaces.target_pairs import append_targets, target_pairs
-from stitch.observations.surfaces.view_responses import view_responses
+from stitch.model.model import Model, term_of
+from stitch.observations.surfaces.effect_columns import view_responses
+from stitch.observations.surfaces.normal_equations import Gram, append_targets, assemble, target_pairs
+from stitch.observations.surfaces.view_poses import solve_views, unconstrained_poses
 
 
 def scattered(seed, views=7, targets=4):

@@ -7,18 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.effects.contract import EFFECTS
-from stitch.effects.in_session import missing_need
+from stitch.effects.contract import EFFECTS, missing_need
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
-from stitch.model.forward import corrected_capture, target_correction
-from stitch.model.model import Model
-from stitch.model.point_slopes import PointSlopes
-from stitch.model.term import term_of
-from stitch.observations.targets.closed_form import closed_form_hand_eye
-from stitch.observations.targets.effect_rows import effect_rows
-from stitch.observations.targets.landmarks import initial_landmarks
-from stitch.observations.targets.rows import target_rows
+from stitch.model.forward import PointSlopes, corrected_capture, target_correction
+from stitch.model.model import Model, term_of
+from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
+from stitch.observations.targets.rows import effect_rows, initial_landmarks, target_rows
 
 
 def off(T, true):

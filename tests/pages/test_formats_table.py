@@ -3,8 +3,7 @@
 import re
 from pathlib import Path
 
-from stitch.intake.program_poses import PROGRAMS
-from stitch.intake.raw_poses import STRUCTURED, TABLES
+from stitch.intake.raw_poses import PROGRAMS, STRUCTURED, TABLES
 from stitch.reading.clouds import CLOUD_SUFFIXES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"

@@ -13,12 +13,16 @@ from data_synth.fixtures.in_memory import session_of
 from stitch.diagnosis.candidates import candidates_of
 from stitch.errors import NoResultError
 from stitch.model.model import Model
-from stitch.planning.chances import ExpectedDiagnosis
-from stitch.planning.expected_hand_eye import expected_hand_eye
-from stitch.planning.expected_model import CellModel, expected_model, simulate_views
-from stitch.planning.expected_scan import FieldOfView
-from stitch.planning.planned_part import surface_of_mesh
-from stitch.planning.scatter import Scatter
+from stitch.planning.detection_chances import ExpectedDiagnosis
+from stitch.planning.expected_model import (
+    CellModel,
+    FieldOfView,
+    Scatter,
+    expected_hand_eye,
+    expected_model,
+    simulate_views,
+    surface_of_mesh,
+)
 
 ROTATION, TRANSLATION = 5e-5, 0.03
 DRAWS = 40

@@ -6,8 +6,7 @@ import trimesh
 
 from data_synth.fixtures.ideal_scanner import facing
 from stitch.errors import InputError
-from stitch.planning.expected_scan import FieldOfView, expected_scan
-from stitch.planning.planned_part import block_surface, surface_of_file, surface_of_mesh
+from stitch.planning.expected_model import FieldOfView, block_surface, expected_scan, surface_of_file, surface_of_mesh
 
 WIDE = FieldOfView(np.array([2.0, 2.0]), 1.0, 1e4, standoff=500.0, axis=np.array([0.0, 0.0, 1.0]))
 

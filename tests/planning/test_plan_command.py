@@ -14,13 +14,11 @@ from data_synth.write import write_session
 from stitch import frames
 from stitch.cli.main import main
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.conclusion import decide
-from stitch.diagnosis.plausible_scatter import scatter_limit
+from stitch.diagnosis.score import scatter_limit
+from stitch.diagnosis.verdict import decide
 from stitch.observations.surfaces.surface_model import surface_model
-from stitch.planning.cells import cell_of_session
-from stitch.planning.expected_model import simulate_views
-from stitch.planning.further_views import with_views
-from stitch.planning.plan import PlanRequest, plan_further_views
+from stitch.planning.expected_model import cell_of_session, simulate_views
+from stitch.planning.plan import PlanRequest, plan_further_views, with_views
 from stitch.reading.session_folder import load_session
 
 VIEWS = 6

@@ -5,9 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from stitch.planning.choose_views import choose_views, travel_order
-from stitch.planning.goals import HalvedHandEye
-from stitch.planning.view_search import TwistChannel, noise_of, separations
+from stitch.planning.plan import HalvedHandEye, TwistChannel, choose_views, noise_of, separations, travel_order
 
 
 @pytest.fixture

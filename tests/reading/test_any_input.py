@@ -11,12 +11,17 @@ from hypothesis import strategies as st
 
 from stitch.errors import InputError
 from stitch.reading.clouds import read_cloud
-from stitch.reading.frames_csv import read_frames
-from stitch.reading.points_csv import read_points
-from stitch.reading.scanner_toml import read_crop_box, read_scanner
-from stitch.reading.session_toml import cad_file, positive_number, read_robot, read_session_document, session_name
-from stitch.reading.views_csv import read_views
-from stitch.stored.run_documents import read_ledger, read_result
+from stitch.reading.session_folder import (
+    cad_file,
+    positive_number,
+    read_crop_box,
+    read_robot,
+    read_scanner,
+    read_session_document,
+    session_name,
+)
+from stitch.reading.session_tables import read_frames, read_points, read_views
+from stitch.stored.stored_run import read_ledger, read_result
 
 quick = settings(
     max_examples=60, deadline=timedelta(seconds=5), suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -9,8 +9,8 @@ import pytest
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model
 from stitch.reading.session_folder import load_session
-from stitch.reading.text_file import read_text
-from stitch.stored.run_documents import read_ledger, read_result
+from stitch.reading.text_files import read_text
+from stitch.stored.stored_run import read_ledger, read_result
 
 
 @pytest.fixture

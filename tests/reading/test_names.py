@@ -3,8 +3,8 @@
 import pytest
 
 from stitch.errors import InputError
-from stitch.reading.names import require_folder_name, require_name
 from stitch.reading.session_folder import load_session
+from stitch.reading.text_files import require_folder_name, require_name
 
 
 @pytest.mark.parametrize("name", ["..", ".", "../x", "/abs", "a/b", "a\\b", "", " ", ".hidden", " a", "µ" * 150])

@@ -9,8 +9,7 @@ from data_synth.fixtures.edits import edit
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.errors import InputError
 from stitch.reading.clouds import read_cloud
-from stitch.reading.plausible import check_scale
-from stitch.reading.session_folder import load_session
+from stitch.reading.session_folder import check_scale, load_session
 
 
 def moved(session, change):

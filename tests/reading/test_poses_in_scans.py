@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from stitch.errors import InputError
-from stitch.intake.first_session import first_session
-from stitch.intake.stated import StatedFolder
+from stitch.intake.first_session import StatedFolder, first_session
 from stitch.reading.clouds import read_cloud
-from stitch.reading.poses_in_scans import poses_in_scans, times_in_scans
+from stitch.reading.range_image import poses_in_scans, times_in_scans
 from tests.needs import needs
 
 POINTS = "0 0 100 0.5\n10 0 100 0.25\n0 10 100 1\n10 10 100 1\n"

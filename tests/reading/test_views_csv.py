@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from data_synth.fixtures.edits import edit
 from stitch.errors import InputError
 from stitch.measurement.robot import forward
-from stitch.reading.dh_rows import robot_from_dh
+from stitch.reading.robot_description import robot_from_dh
 from stitch.reading.session_folder import load_session
 
 JOINTS = [

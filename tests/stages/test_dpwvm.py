@@ -7,11 +7,10 @@ import pytest
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
-from stitch.observations.surfaces.gram import gram
-from stitch.observations.surfaces.match import Match, sample_points
-from stitch.observations.surfaces.overlaps import collect_overlaps
-from stitch.observations.surfaces.pose_channel import Repeatability
-from stitch.stages.dpwvm import (
+from stitch.observations.surfaces.hand_eye_fit import Repeatability
+from stitch.observations.surfaces.matching import Match, sample_points
+from stitch.observations.surfaces.normal_equations import collect_overlaps, gram
+from stitch.stages.correspondence_weights import (
     OffsetSums,
     class_scale,
     dpwvm_weights,

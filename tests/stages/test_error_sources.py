@@ -11,9 +11,9 @@ from stitch import pipeline
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
-from stitch.observations.error_model import WHITE_COMPONENTS
+from stitch.observations.linear_model import WHITE_COMPONENTS
 from stitch.observations.pose_errors import STOP_COMPONENTS, prior_pose_errors, usual_sizes
-from stitch.stages.error_sources import SOURCES, unfitted
+from stitch.stages.sentences import SOURCES, unfitted
 
 
 def test_every_component_has_words():

@@ -7,15 +7,12 @@ from scipy.spatial import KDTree
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
-from stitch.measurement.capture import prepare_capture
+from stitch.measurement.capture import points_within, prepare_capture, thin_session
 from stitch.measurement.measurement import measurement_of
-from stitch.measurement.thinning import points_within, thin_session
 from stitch.model.forward import corrected_capture
-from stitch.model.model import Model
-from stitch.model.term import term_of
+from stitch.model.model import Model, term_of
 from stitch.reading.session_folder import load_session
-from stitch.stages.fuse import fuse
-from stitch.stages.fuse_whole import RegisteredSession, fuse_every_point
+from stitch.stages.fuse import RegisteredSession, fuse, fuse_every_point
 
 
 def registered(session, measured, effect=None):

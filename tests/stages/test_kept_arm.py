@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
-from stitch.model.arm import keep_arm_effects
+from stitch.model.model_toml import keep_arm_effects
 from stitch.pipeline import run
 from stitch.writing.result_document import model_of
 

@@ -9,9 +9,8 @@ from scipy.stats import chi2
 
 from data_synth.fixtures.drilled_plate import measured_plate
 from data_synth.fixtures.in_memory import clouds_of, labelled_session_of, points_of
-from stitch.measurement.labelled_points import Sighting
-from stitch.pipeline import run
-from stitch.revision import add
+from stitch.measurement.session import Sighting
+from stitch.pipeline import add, run
 
 # Minutes of work: `make check` runs it, `make test` does not.
 pytestmark = pytest.mark.slow

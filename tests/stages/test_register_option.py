@@ -7,13 +7,11 @@ import pytest
 
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.pipeline import run
+from stitch.pipeline import change, run
 from stitch.reading.session_folder import load_session
-from stitch.revision import change
-from stitch.runs.state import state_of
+from stitch.runs.run import state_of
 from stitch.stages.register import DEFAULT, METHODS
-from stitch.stored.load_state import load_state
-from stitch.stored.stored_run import stored_run
+from stitch.stored.stored_run import load_state, stored_run
 from stitch.writing.run_folder import write_run
 from viz.run_markdown import run_markdown
 

@@ -7,9 +7,9 @@ import pytest
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
-from stitch.observations.surfaces.pose_channel import Repeatability
+from stitch.observations.surfaces.hand_eye_fit import Repeatability
 from stitch.stages.register import GICP, register
-from stitch.statistics.robust import tukey
+from stitch.statistics.distributions import tukey
 
 SCATTER = Repeatability(2e-4, 0.1, 1.0)
 

@@ -13,12 +13,11 @@ from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
 from stitch.errors import InputError
 from stitch.model.forward import corrected_capture
-from stitch.model.model import Model
-from stitch.model.term import term_of
-from stitch.observations.targets.landmarks import initial_landmarks
+from stitch.model.model import Model, term_of
+from stitch.observations.targets.rows import initial_landmarks
 from stitch.pipeline import run, run_rig
-from stitch.runs.state import state_of
-from stitch.stages.fit_targets import TargetStart, _TargetProblem
+from stitch.runs.run import state_of
+from stitch.stages.target_fit import TargetStart, _TargetProblem
 
 OFFSET = np.array([0, 1e-3, -0.7e-3, 0, 0.8e-3, 0])
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.statistics.acceleration import anderson_step
+from stitch.statistics.least_squares import anderson_step
 
 
 def left_after(steps, undone, accelerate):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from stitch.statistics.amplitude_scales import ANY_SIZE, PLAUSIBLE, log_mixture
+from stitch.statistics.parameter_selection import ANY_SIZE, PLAUSIBLE, log_mixture
 
 
 @pytest.mark.parametrize("scales", [PLAUSIBLE, ANY_SIZE])

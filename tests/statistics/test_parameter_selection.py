@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from stitch.statistics.identifiability import independent
+from stitch.statistics.least_squares import independent
 from stitch.statistics.parameter_selection import WhitenedData, omitted_rms, select_supported
 
 

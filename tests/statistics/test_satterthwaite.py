@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from stitch.statistics.restricted_likelihood import MixedModel
-from stitch.statistics.satterthwaite import satterthwaite
-from stitch.statistics.variance_components import VarianceFit
+from stitch.statistics.reml import MixedModel, VarianceFit
+from stitch.statistics.variance_posterior import satterthwaite
 
 GROUPS = (30, 20, 500)
 

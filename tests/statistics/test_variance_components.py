@@ -4,11 +4,18 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, minimize_scalar
 
-from stitch.statistics.inverse import invert_covariance
-from stitch.statistics.restricted_likelihood import MixedModel, deviance, reml_problem
-from stitch.statistics.variance_components import at_variances, fit_variances
-from stitch.statistics.variance_prior import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
-from stitch.statistics.variance_scoring import fisher_scoring
+from stitch.statistics.reml import (
+    ALWAYS_PRESENT,
+    MAY_BE_ABSENT,
+    FurtherPrior,
+    MixedModel,
+    at_variances,
+    deviance,
+    fisher_scoring,
+    fit_variances,
+    invert_covariance,
+    reml_problem,
+)
 
 
 def test_variances_are_found_again():

@@ -5,10 +5,8 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from stitch.statistics.restricted_likelihood import MixedModel
-from stitch.statistics.variance_components import fit_variances
+from stitch.statistics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior, MixedModel, fit_variances
 from stitch.statistics.variance_posterior import mean_variances
-from stitch.statistics.variance_prior import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
 
 N, SCALE = 40, 0.5
 

@@ -9,8 +9,7 @@ from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.pipeline import run as stitched
 from stitch.reading.session_folder import load_session
-from stitch.stored.load_state import load_state
-from stitch.stored.stored_run import stored_run
+from stitch.stored.stored_run import load_state, stored_run
 from stitch.writing.result_document import model_of
 from stitch.writing.run_folder import write_run
 from viz.run_page import write_report

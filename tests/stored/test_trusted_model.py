@@ -10,11 +10,9 @@ from data_synth.fixtures.labelled_files import write_labelled
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model
-from stitch.pipeline import run
+from stitch.pipeline import add, drop, run
 from stitch.reading.session_folder import load_session
-from stitch.revision import add, drop
-from stitch.stored.load_state import load_state
-from stitch.stored.trusted_model import trusted_model
+from stitch.stored.stored_run import load_state, trusted_model
 from stitch.writing import run_folder
 
 EFFECT = """

@@ -21,7 +21,7 @@ def loaded(code):
 
 @pytest.mark.parametrize(
     ("module", "also_without"),
-    [("stitch", {"numpy"}), ("stitch.cli.main", LIGHT), ("stitch.cli.actions.run_sessions", set())],
+    [("stitch", {"numpy"}), ("stitch.cli.main", LIGHT), ("stitch.cli.run", set())],
 )
 def test_dear_libraries_are_loaded_when_they_are_needed(module, also_without):
     assert not loaded(f"import {module}") & (DEAR | also_without)
@@ -61,4 +61,4 @@ def test_an_arm_without_meshes_needs_no_library_of_meshes():
 
 
 def test_a_batch_on_one_process_needs_no_cluster():
-    assert not loaded("import stitch.cli.actions.batch_sessions") & {"distributed", "dask", "tornado", "asyncio"}
+    assert not loaded("import stitch.cli.batch") & {"distributed", "dask", "tornado", "asyncio"}

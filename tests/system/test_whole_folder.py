@@ -7,9 +7,8 @@ import sys
 import pytest
 
 from stitch.errors import InputError
-from stitch.system import whole_folder
-from stitch.system.locks import only_writer
-from stitch.system.whole_folder import claim_folder, rewrite_folder
+from stitch.system import files
+from stitch.system.files import claim_folder, only_writer, rewrite_folder
 
 
 def ours(inside):
@@ -50,7 +49,7 @@ def rewrite(run):
 def test_only_what_is_ours_is_replaced(run, tmp_path, monkeypatch, way):
     path = run
     if way == "two renames":
-        monkeypatch.setattr(whole_folder, "exchange", lambda *_: False)
+        monkeypatch.setattr(files, "exchange", lambda *_: False)
     elif way == "in place":
         monkeypatch.chdir(run)
     elif way == "link":
@@ -69,7 +68,7 @@ def test_only_what_is_ours_is_replaced(run, tmp_path, monkeypatch, way):
 def test_what_is_new_is_on_the_disk_before_it_takes_its_place(run, monkeypatch):
     seen = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: seen.append(os.readlink(f"/proc/self/fd/{descriptor}")))
-    monkeypatch.setattr(whole_folder, "exchange", lambda *_: bool(seen.append("exchanged")))
+    monkeypatch.setattr(files, "exchange", lambda *_: bool(seen.append("exchanged")))
     rewrite(run)
     assert any(name.endswith("/model") for name in seen[: seen.index("exchanged")])
 
@@ -111,7 +110,7 @@ def test_a_second_process_is_refused_until_the_first_has_ended(tmp_path):
     code = f"""
 import sys, time
 from pathlib import Path
-from stitch.system.locks import only_writer
+from stitch.system.files import only_writer
 with only_writer(Path({str(lock)!r}), Path("r")):
     print("held", flush=True)
     time.sleep(60)

@@ -10,13 +10,12 @@ from data_synth import kinematics
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.score import score
-from stitch.diagnosis.variance_budget import BudgetLine
 from stitch.effects.contract import EFFECTS
-from stitch.observations.surfaces.field_error import FieldError
-from stitch.observations.surfaces.field_map import FieldMap
+from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap
 from stitch.pipeline import diagnose, run
-from stitch.writing.run_contents import is_run_file
+from stitch.writing.json_file import is_run_file
 from tests.diagnosis.freed_blade import freed_blade
 from viz import captions
 from viz.budget_figure import budget

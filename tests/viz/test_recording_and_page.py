@@ -14,8 +14,8 @@ from rerun.chunk import RrdReader
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.write import write_session
-from stitch.comparison.model_history import model_history
-from stitch.diagnosis.unknown.joint_curves import JointCurve
+from stitch.comparison.disagreement_field import model_history
+from stitch.diagnosis.unnamed_joint_laws import JointCurve
 from stitch.pipeline import diagnose, run
 from stitch.runs.run import Note
 from stitch.units import length_text

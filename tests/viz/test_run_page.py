@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from markupsafe import escape
 
-from stitch.comparison.model_history import model_history
-from stitch.comparison.plain_verdict import check_tolerance, plain_verdict
-from stitch.comparison.run_verdict import run_headline
+from stitch.comparison.disagreement_field import model_history
+from stitch.comparison.run_verdict import check_tolerance, plain_verdict, run_headline
 from stitch.writing.result_document import result_document
 from tests.in_browser import require_for_everybody
 from viz.filled_templates import render

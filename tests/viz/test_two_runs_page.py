@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from stitch import frames
 from stitch.cli.main import main
-from stitch.comparison.model_history import model_history
+from stitch.comparison.disagreement_field import model_history
 from stitch.comparison.two_runs import compare_runs, comparison_sentence, hand_eye_change
 from stitch.errors import InputError
 from tests.in_browser import WAYS, require_for_everybody, shown

@@ -5,11 +5,9 @@ import pytest
 
 from data_synth.cell_history import CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
-from stitch.watch.append import append_runs
-from stitch.watch.cell_assessment import cell_report
-from stitch.watch.cell_course import cell_trend
 from stitch.watch.history import open_history
-from stitch.watch.sentences import headline
+from stitch.watch.report import cell_report, cell_trend, headline
+from stitch.watch.update import append_runs
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,9 @@ import pytest
 
 from data_synth.cell_history import CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
-from stitch.watch.append import append_runs
-from stitch.watch.cell_assessment import cell_report
-from stitch.watch.dfq import dfq_text
 from stitch.watch.history import open_history
-from stitch.watch.openmetrics import openmetrics
+from stitch.watch.report import cell_report, dfq_text, openmetrics
+from stitch.watch.update import append_runs
 
 
 @pytest.fixture(scope="module")

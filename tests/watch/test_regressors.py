@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stitch.watch.regressors import chosen_channels, regressor_prior_sigmas, regressors
+from stitch.watch.update import chosen_channels, regressor_prior_sigmas, regressors
 
 HOUR = 3600.0
 

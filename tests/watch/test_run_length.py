@@ -3,15 +3,18 @@
 import numpy as np
 import pytest
 
-from stitch.watch.control_charts import (
+from stitch.watch.tracking import (
     CUSUM_REFERENCES,
     EWMA_WEIGHT,
     chart_limits,
+    cusum_limit,
+    cusum_run_length,
     empty_charts,
+    ewma_limit,
+    ewma_run_length,
     limit_shares,
     updated_charts,
 )
-from stitch.watch.run_length import cusum_limit, cusum_run_length, ewma_limit, ewma_run_length
 
 
 # Montgomery, Introduction to Statistical Quality Control, table 9.3 and 9.4: both sides together, from Brook & Evans.

@@ -4,9 +4,17 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from stitch.watch.follow import Sessions, first_state, next_state
-from stitch.watch.smoother import smoothed_states
-from stitch.watch.state_bank import MEMBERS, empty_bank, predicted_bank, updated_bank, with_parameters
+from stitch.watch.tracking import (
+    MEMBERS,
+    Sessions,
+    empty_bank,
+    first_state,
+    next_state,
+    predicted_bank,
+    smoothed_states,
+    updated_bank,
+    with_parameters,
+)
 
 
 def random_sessions(seed: int, n: int, P: int = 2, steps: float = 0.05) -> Sessions:

@@ -12,10 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.run_folders import bare_run
 from stitch.cli.main import main
-from stitch.watch.append import append_runs
-from stitch.watch.history import open_history
-from stitch.watch.mount_twist import mount_twist, twist_covariance
-from stitch.watch.read_record import read_record
+from stitch.watch.history import mount_twist, open_history, read_record, twist_covariance
+from stitch.watch.update import append_runs
 
 SIGMA = np.diag([2e-5] * 3 + [0.01] * 3) ** 2
 

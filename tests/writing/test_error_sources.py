@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from stitch.cli.terminal.budget_table import budget_table
-from stitch.diagnosis.variance_budget import BudgetLine
-from stitch.observations.surfaces.field_error import FieldError
-from stitch.observations.surfaces.field_map import FieldMap
-from stitch.writing.diagnosis_document import _field_map
-from stitch.writing.error_sources import largest_error_sources
+from stitch.cli.diagnose import budget_table
+from stitch.diagnosis.residual_structure import BudgetLine
+from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap
+from stitch.writing.diagnosis_document import _field_map, largest_error_sources
 
 SHARES = {"sensor noise": 0.1, "backlash": 0.885, "smooth, unnamed": 0.009, "scanner field": 0.006, "joint_offset": 0.0}
 BUDGET = tuple(BudgetLine(name, share, 0.02 * share**0.5, "mm") for name, share in SHARES.items())

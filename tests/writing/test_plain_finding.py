@@ -5,15 +5,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import stitch.stepwise as stepwise
-import stitch.writing.plain_finding as plain
+import stitch.pipeline as stepwise
+import stitch.writing.diagnosis_document as plain
 from bench.docs.page_blocks import refused
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.validation.cross_validation import CrossValidation
+from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
-from stitch.observations.surfaces.field_error import FieldError
-from stitch.writing.plain_effects import effect_in_words
-from stitch.writing.plain_finding import plain_finding, suggested_command
+from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.writing.diagnosis_document import effect_in_words, plain_finding, suggested_command
 
 
 def test_every_effect_of_the_library_has_words():
@@ -27,7 +26,7 @@ def test_every_effect_of_the_library_has_words():
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
 @pytest.mark.parametrize(("curves", "time_curve"), [((), None), (("of joint 3",), None), ((), "of the flange")])
 def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve):
-    monkeypatch.setattr("stitch.writing.plain_finding.group_share", lambda linear, group: (0.7, 0.1))
+    monkeypatch.setattr("stitch.writing.diagnosis_document.group_share", lambda linear, group: (0.7, 0.1))
     found = SimpleNamespace(
         verdict=verdict,
         curves=curves,

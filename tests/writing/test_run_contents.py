@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from stitch.errors import InputError
-from stitch.writing.run_contents import is_run_file, require_free, sessions_in
+from stitch.writing.json_file import is_run_file, require_free, sessions_in
 
 
 @pytest.fixture

@@ -10,16 +10,14 @@ from matplotlib.figure import Figure
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.write import write_session
-from stitch.cli.actions import changed_run
+from stitch.cli import change as changed_run
 from stitch.cli.main import main
 from stitch.errors import NoResultError
 from stitch.model.model_toml import read_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
-from stitch.runs.run import LedgerStep
-from stitch.runs.state import state_of
-from stitch.stored.load_state import load_state
-from stitch.stored.stored_run import stored_run
+from stitch.runs.run import LedgerStep, state_of
+from stitch.stored.stored_run import load_state, stored_run
 from stitch.writing.run_folder import write_run
 from viz import run_page, sections
 

@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from stitch import frames
-from stitch.cells.base_to_base.contradiction import compare_distances
-from stitch.cells.base_to_base.stand import Stand
-from stitch.cells.base_to_base.stand_solution import CONTRADICTION_SIGMAS, BaseResult, comparison_text
-from stitch.comparison.plain_verdict import ToleranceVerdict
+from stitch.cells.base_to_base import CONTRADICTION_SIGMAS, BaseResult, comparison_text
+from stitch.cells.stand import Stand, compare_distances
+from stitch.comparison.run_verdict import ToleranceVerdict
 from stitch.frames import Array
 from stitch.units import MICROMETRES
 from viz.cells import stage

@@ -8,9 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from stitch import frames
-from stitch.cells.base_to_base.contradiction import DistanceComparison
-from stitch.cells.base_to_base.stand import Stand, rod_points
-from stitch.cells.base_to_base.stand_solution import CONTRADICTION_SIGMAS, BaseResult
+from stitch.cells.base_to_base import CONTRADICTION_SIGMAS, BaseResult
+from stitch.cells.stand import DistanceComparison, Stand, rod_points
 from stitch.frames import Array
 from viz.colours import BLUE, GREEN, ORANGE
 from viz.drawing import above

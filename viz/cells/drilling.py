@@ -4,9 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.cells.drilling.drill_job import DrillJob
-from stitch.cells.drilling.drill_sentences import correction_sentence, significant_effect_sentences
-from stitch.cells.drilling.drill_solution import DrillResult, Drive
+from stitch.cells.drilling import DrillJob, DrillResult, Drive, correction_sentence, significant_effect_sentences
 from stitch.frames import transform
 from viz.cells import stage
 from viz.cells.drilling_figures import holes, magnified, plate, references_of
@@ -85,7 +83,8 @@ def record(job: DrillJob, result: DrillResult, path: Path) -> None:
 def _words(job: DrillJob, result: DrillResult) -> str:
     notes = "\n".join(f"- {note}" for note in significant_effect_sentences(result, job.length_unit))
     return (
-        f"# Drilling\n\n{correction_sentence(result, job.length_unit)}\n\n{notes}\n\nGrey: drawing. Blue: reference holes as "
+        f"# Drilling\n\n{correction_sentence(result, job.length_unit)}\n\n{notes}\n\nGrey: drawing. Blue: "
+        "reference holes as "
         "measured. Green: corrected drives. Red and green arrows: errors before and after, "
         f"{magnified(job, result):g} times larger."
     )

@@ -4,8 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch.cells.drilling.drill_job import DrillJob, Hole
-from stitch.cells.drilling.drill_solution import DrillResult
+from stitch.cells.drilling import DrillJob, DrillResult, Hole
 from stitch.frames import Array, transform
 from viz.colours import BLUE, GREEN, ORANGE
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from stitch.reading.session_hash import UNKNOWN, content_hash
+from stitch.reading.session_folder import UNKNOWN, content_hash
 from viz.identity import Row, page_written, versions
 
 

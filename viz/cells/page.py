@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from stitch.comparison.plain_verdict import ToleranceVerdict
+from stitch.comparison.run_verdict import ToleranceVerdict
 from viz.cells.job_identity import job_identity
 from viz.identity import Row
 from viz.page_head import Head, Subject, write_page

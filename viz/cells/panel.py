@@ -5,10 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from stitch import frames
-from stitch.cells.panel.panel_job import PanelJob
-from stitch.cells.panel.panel_sentences import leg_sentence, shape_sentence
-from stitch.cells.panel.panel_solution import PanelResult
-from stitch.comparison.plain_verdict import ToleranceVerdict
+from stitch.cells.panel import PanelJob, PanelResult, leg_sentence, shape_sentence
+from stitch.comparison.run_verdict import ToleranceVerdict
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write

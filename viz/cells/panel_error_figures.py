@@ -8,9 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch.cells.panel.errors_along import MotionErrors
-from stitch.cells.panel.panel_job import PanelJob
-from stitch.cells.panel.panel_solution import PanelResult
+from stitch.cells.panel import PanelJob, PanelResult
+from stitch.cells.panel_model import MotionErrors
 from stitch.frames import Array
 from viz.colours import BLUE, DARK, GREEN, ORANGE, YELLOW
 

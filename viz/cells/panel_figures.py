@@ -5,8 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stitch import frames
-from stitch.cells.panel.panel_job import PanelJob
-from stitch.cells.panel.panel_solution import PanelResult
+from stitch.cells.panel import PanelJob, PanelResult
 from stitch.frames import Array, Indices
 from viz.colours import BLUE, GREEN, ORANGE, SIGNED
 from viz.drawing import above

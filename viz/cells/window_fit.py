@@ -6,12 +6,9 @@ import numpy as np
 import rerun as rr
 
 from stitch import frames
-from stitch.cells.window.allowance import allowance_sentence
-from stitch.cells.window.deviation import Deviations
-from stitch.cells.window.fit_sentences import agreement_sentence, with_unit
-from stitch.cells.window.window_jobs import FitJob
-from stitch.cells.window.window_solution import FittedPart
-from stitch.comparison.plain_verdict import ToleranceVerdict
+from stitch.cells.scan_to_cad import Deviations, allowance_sentence
+from stitch.cells.window import FitJob, FittedPart, agreement_sentence, with_unit
+from stitch.comparison.run_verdict import ToleranceVerdict
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write

@@ -3,8 +3,8 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from stitch.cells.window.deviation import Deviations
-from stitch.cells.window.window_solution import FittedPart
+from stitch.cells.scan_to_cad import Deviations
+from stitch.cells.window import FittedPart
 from viz.colours import BLUE, ORANGE, SIGNED
 
 # An STL has no unit.

@@ -7,10 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stitch import frames
-from stitch.cells.window.seam import VERDICTS, Limits, Seam, Station
-from stitch.cells.window.seam_sentences import limits_text, stations_sentence
-from stitch.cells.window.window_jobs import SeamJob
-from stitch.comparison.plain_verdict import ToleranceVerdict
+from stitch.cells.seam import VERDICTS, Limits, Seam, Station
+from stitch.cells.window import SeamJob, limits_text, stations_sentence
+from stitch.comparison.run_verdict import ToleranceVerdict
 from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write

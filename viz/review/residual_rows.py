@@ -11,8 +11,8 @@ import pyarrow.parquet as pq
 
 from stitch.errors import InputError
 from stitch.frames import Array, Indices
-from stitch.observations.surfaces.gram import RMS_GATE
-from stitch.statistics.robust import MAD_TO_SIGMA
+from stitch.observations.surfaces.normal_equations import RMS_GATE
+from stitch.statistics.distributions import MAD_TO_SIGMA
 
 # Correspondences that are kept; of more, every n-th.
 _AT_MOST = 150_000

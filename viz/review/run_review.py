@@ -10,7 +10,7 @@ from typing import Any
 
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model
-from stitch.system.whole_file import whole_file
+from stitch.system.files import whole_file
 from stitch.units import MICROMETRES
 from viz.review.chosen_field import Choice
 from viz.review.known_residuals import KnownResiduals, known_residuals

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from stitch.comparison.model_history import effect_changes
+from stitch.comparison.disagreement_field import effect_changes
 from stitch.comparison.run_verdict import shorten_doubts
 from stitch.errors import InputError
-from stitch.reading.text_file import shortened
+from stitch.reading.text_files import shortened
 from stitch.runs.run import LedgerStep
-from stitch.stored.run_documents import read_documents
+from stitch.stored.stored_run import read_documents
 from stitch.units import MICROMETRES, format_amount
-from stitch.writing.plain_effects import effect_in_words
+from stitch.writing.diagnosis_document import effect_in_words
 from viz.review.told_candidates import told_diagnosis
 from viz.review.undo_history import undo_history
 

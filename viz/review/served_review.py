@@ -9,7 +9,7 @@ from pathlib import Path
 import uvicorn
 
 from stitch.errors import InputError
-from stitch.stored.run_documents import read_documents
+from stitch.stored.stored_run import read_documents
 from viz.review.run_review import RunReview
 from viz.review.web_app import review_app
 

@@ -3,7 +3,7 @@
 from typing import Any
 
 from stitch.units import format_amount
-from stitch.writing.plain_effects import effect_description
+from stitch.writing.diagnosis_document import effect_description
 
 # The clearest parameters of an effect that are told.
 _TOLD = 3

@@ -6,12 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from stitch.system.whole_file import whole_file
+from stitch.system.files import whole_file
 from stitch.units import rounded
-from stitch.watch.cell_course import CellTrend
-from stitch.watch.cell_report import CellReport, ParameterReport
-from stitch.watch.sentences import day_text, event_sentences, report_notes, size_text
-from stitch.watch.table_units import table_unit
+from stitch.watch.report import (
+    CellReport,
+    CellTrend,
+    ParameterReport,
+    day_text,
+    event_sentences,
+    report_notes,
+    size_text,
+    table_unit,
+)
 from viz import captions
 from viz.drawing import covariate
 from viz.filled_templates import render

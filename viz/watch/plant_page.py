@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from os.path import relpath
 from pathlib import Path
 
-from stitch.system.whole_file import whole_file
-from stitch.watch.cell_report import CellReport
-from stitch.watch.sentences import day_text, event_sentences
+from stitch.system.files import whole_file
+from stitch.watch.report import CellReport, day_text, event_sentences
 from viz.filled_templates import render
 from viz.watch.cell_page import light
 

@@ -9,9 +9,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.watch.cell_course import CellTrend
-from stitch.watch.sentences import day_text
-from stitch.watch.table_units import table_unit
+from stitch.watch.report import CellTrend, day_text, table_unit
 from viz.watch.time_axis import time_marks, value_marks
 
 Array = NDArray[np.float64]

@@ -5,17 +5,129 @@ twist δ of the view about `centre` moves them by lever·δ, the landmarks by th
 are further blocks of three rows: the target less its place in the drawing.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.frames import Array, Mask
-from stitch.measurement.capture import Capture
-from stitch.measurement.sightings import Sightings
-from stitch.observations.targets.landmarks import Landmarks
-from stitch.statistics.restricted_likelihood import MixedModel
+from stitch.frames import Array, Indices, Mask
+from stitch.measurement.capture import Capture, Sightings
+from stitch.measurement.measurement import Measurement
+from stitch.measurement.session import NominalTargets
+from stitch.model.forward import PointSlopes, moves_points, pose_derivatives
+from stitch.model.model import Model, Term
+from stitch.statistics.least_squares import BlockLeastSquares
+from stitch.statistics.reml import MixedModel, fit_variances
+
+# Distances between the targets of one view: what they are wherever the arm stood, whatever the hand-eye is.
+
+# More targets hold each other, so that a wrong one pulls little; to compare all their pairs takes minutes.
+COMPARED_TARGETS = 24
+
+
+def target_positions(sightings: Sightings) -> Array:
+    """(V, K, 3) targets in the frame of the sensor, NaN where a view does not show one."""
+    places = np.full((len(sightings.target), len(sightings.targets), 3), np.nan)
+    view, slot = np.nonzero(sightings.used)
+    places[view, sightings.target[view, slot]] = sightings.points[view, slot]
+    return places
+
+
+def target_distances(places: Array) -> Array:
+    """(V, K, K) between targets, NaN where a view does not show both."""
+    return np.asarray(np.linalg.norm(places[:, :, None] - places[:, None], axis=3))
+
+
+def distance_sigma(sightings: Sightings) -> float:
+    """What the noise of two coordinates leaves of a distance, length_unit."""
+    return float(np.sqrt(2) * np.median(sightings.sigma[sightings.used]))
+
+
+# What the views see: positions of targets, the orientation of a probe, the place of a drawing; all unknown.
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Nominal targets among those seen: measurements of them in the part frame."""
+
+    target: Indices  # (T,) number of the target
+    points: Array  # (T, 3) part frame
+    sigma: Array  # (T,)
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """K targets in the reference frame; the unknowns are 3K positions, 3 of a probe's turn, 6 of a drawing."""
+
+    positions: Array  # (K, 3)
+    orientation: Array | None = None  # (3, 3) R_reference_probe
+    drawing: Drawing | None = None
+    T_reference_part: Array | None = None  # (4, 4) where the drawing lies
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.positions.size + 3 * (self.orientation is not None) + 6 * (self.drawing is not None)
+
+    def updated(self, by: Array) -> "Landmarks":
+        """After a step of all unknowns: shifts, a left rotation vector, a left twist of the drawing."""
+        split = self.positions.size
+        orientation, T, at = self.orientation, self.T_reference_part, split
+        if orientation is not None:
+            orientation = Rotation.from_rotvec(by[at : at + 3]).as_matrix() @ orientation
+            at += 3
+        if T is not None:
+            T = frames.exp(by[at : at + 6]) @ T
+        return replace(
+            self, positions=self.positions + by[:split].reshape(-1, 3), orientation=orientation, T_reference_part=T
+        )
+
+
+def drawing_of(nominal: NominalTargets | None, sightings: Sightings) -> Drawing | None:
+    """The drawing of the targets seen; where it states no sigma, a target is as good as one sighting of it."""
+    if nominal is None:
+        return None
+    names, usual = sightings.targets, float(np.median(sightings.sigma[sightings.used]))
+    pairs = [(names.index(name), i) for i, name in enumerate(nominal.targets) if name in names]
+    target, rows = (np.array(column) for column in zip(*pairs, strict=True))
+    sigma = nominal.sigma[rows]
+    return Drawing(target, nominal.points[rows], np.where(np.isnan(sigma), usual, sigma))
+
+
+def initial_landmarks(own: Capture, T_mount: Array, drawing: Drawing | None = None) -> Landmarks:
+    """Landmarks in the middle (median) of where the views put them under a hand-eye; NaN for one that nobody sees.
+
+    Args:
+        own: without the effects in use.
+    """
+    s = own.sightings
+    assert s is not None
+    poses = own.poses(T_mount)
+    placed = frames.transform(poses, s.points)
+    positions = np.full((len(s.targets), 3), np.nan)
+    for k in range(len(s.targets)):
+        here = placed[s.used & (s.target == k)]
+        if len(here):
+            positions[k] = np.median(here, axis=0)
+    orientation = None
+    if s.rotation is not None:
+        turned = (poses[:, :3, :3] @ s.rotation)[s.used.any(axis=1)]
+        first = frames.nearest_rotation(np.median(turned, axis=0))
+        # The middle of the turns against a first guess: medians of matrices lean.
+        off = Rotation.from_matrix(turned @ first.T).as_rotvec()
+        orientation = Rotation.from_rotvec(np.median(off, axis=0)).as_matrix() @ first
+    T = None if drawing is None else fit_rigid_motion(drawing.points, positions[drawing.target])
+    return Landmarks(positions, orientation, drawing, T)
+
+
+def fit_rigid_motion(points: Array, targets: Array) -> Array:
+    """(4, 4) the rigid motion that brings points (N, 3) closest to targets (N, 3), least squares (Kabsch 1976)."""
+    known = np.isfinite(targets).all(axis=1)
+    a, b = points[known], targets[known]
+    R = frames.nearest_rotation((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
+    return frames.make(R, b.mean(axis=0) - R @ a.mean(axis=0))
 
 
 @dataclass(frozen=True)
@@ -159,3 +271,68 @@ def mixed_model_of_rows(rows: TargetRows, A: Array) -> MixedModel:
     # A view errs in six ways, whatever it shows; what it shows beyond that, the landmarks take up.
     independent = int(np.minimum(rows.used.sum(axis=1), 6).sum()) + max(rows.landmarks.shape[2] - 6, 0)
     return MixedModel(-rows.residual, A, components, fixed, independent)
+
+
+# How the rows of labelled points answer to the parameters of effects.
+
+
+def effect_rows(rows: TargetRows, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Array]:
+    """Per term (B, m, P) how the rows answer to its parameters, at `model`."""
+    of_views = pose_derivatives(measurement, model, [t for t in terms if not moves_points([t])], rows.centre)
+    out = []
+    for term in terms:
+        if moves_points([term]):
+            out.append(_point_rows(rows, measurement, model, term))
+        else:
+            moved = next(of_views)
+            out.append(rows.from_twists(moved.reshape(len(moved), -1).T))
+    return out
+
+
+def _point_rows(rows: TargetRows, measurement: Measurement, model: Model, term: Term) -> Array:
+    """(B, m, P) of an effect that changes the points."""
+    poses = rows.capture.poses(rows.T_mount)
+    slopes = frames.rotate(poses, PointSlopes.about_model(measurement, model, [term]).at_targets(poses))  # (P, V, S, 3)
+    out = np.zeros((*rows.residual.shape, len(slopes)))
+    out[: len(poses), : rows.positions] = slopes.reshape(*slopes.shape[:2], -1).transpose(1, 2, 0)
+    out[: len(poses)][~rows.used] = 0.0
+    return out
+
+
+def effect_columns(rows: TargetRows, measurement: Measurement, model: Model) -> Array:
+    """(B, m, P) how the rows answer to all parameters of the effects in use."""
+    found = effect_rows(rows, measurement, model, model.terms)
+    return np.concatenate([np.zeros((*rows.residual.shape, 0)), *found], axis=2)
+
+
+# Where the targets lie, and how well that is known, under a hand-eye that is given.
+
+
+def fit_landmarks(own: Capture, T_mount: Array) -> tuple[Landmarks, BlockLeastSquares, Array]:
+    """The landmarks by least squares under a hand-eye, the blocks of that fit, and the scatter.
+
+    Args:
+        own: without the effects in use.
+
+    Returns:
+        The scatter as variances (3,) of rotation, of translation, and the factor on the sensor's noise.
+    """
+    landmarks = initial_landmarks(own, T_mount)
+    rows = target_rows(own, T_mount, landmarks)
+    mixed = mixed_model_of_rows(rows, rows.landmarks)
+    variances = fit_variances(mixed, both_starts=True).variances
+    assert own.sightings is not None
+    # One working distance for what nobody sees.
+    distance = float(np.median(np.linalg.norm(np.concatenate(own.sightings.points_by_view()), axis=1)))
+    precision = np.full(landmarks.size, distance**-2.0)
+    blocks = BlockLeastSquares(
+        mixed.z, rows.landmarks, mixed.covariance(variances), precision, np.zeros(landmarks.size)
+    )
+    return landmarks.updated(blocks.solve()), blocks, variances
+
+
+def landmarks_covariance(blocks: BlockLeastSquares, rows: TargetRows, hand_eye: Array) -> Array:
+    """(U, U) by the scatter of the poses, the sensor's noise and the uncertainty (6, 6) of the hand-eye."""
+    pull = np.einsum("bmk,bmi->ki", blocks.weighted, rows.hand_eye)
+    moved = np.linalg.solve(blocks.information + np.diag(blocks.precision), pull)
+    return np.asarray(blocks.estimates_covariance() + moved @ hand_eye @ moved.T)

@@ -12,9 +12,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from stitch.comparison.compare_surfaces import compare_surfaces
-from stitch.comparison.tables import comparison_document
-from stitch.stored.load_state import load_state
+from stitch.comparison.residual_tables import compare_surfaces, comparison_document
+from stitch.stored.stored_run import load_state
 from stitch.writing.json_file import write_json
 
 

@@ -1,0 +1,367 @@
+"""Both solutions of one stand, after the check that its readings belong together."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.table import Table
+from scipy.stats import norm
+
+from stitch import frames
+from stitch.cells.job_files import (
+    JsonOption,
+    RecordingOption,
+    ReportOption,
+    SessionOption,
+    check_keys,
+    choice,
+    finite,
+    points_table,
+    read_job_file,
+    table,
+    vectors,
+    write_recording_and_page,
+)
+from stitch.cells.stand import (
+    BaseFit,
+    DistanceComparison,
+    Projection,
+    Stand,
+    TouchedPoints,
+    compare_distances,
+    cylinder_covariance,
+    cylinder_points,
+    fit_stand,
+    project,
+    rail_direction,
+    rod_points,
+)
+from stitch.errors import InputError, NoResultError
+from stitch.frames import Array
+from stitch.system.process import console
+from stitch.units import METRES
+from stitch.writing.session_files import SessionFiles, pose_columns, write_session
+
+# `stitch base FILE`: where the second robot stands as seen from the first.
+
+
+def base(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Readings of the stand, TOML.")],
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the transform between two robot bases from a stand with a measuring rod.
+
+    \b
+    Examples:
+      stitch base stand.toml --report page.html
+    """
+
+    run_base(file, recording, report, session, as_json)
+
+
+# A distance that differs by more than this many sigmas is a wrong reading, not noise (one in two million).
+CONTRADICTION_SIGMAS = 5.0
+
+
+@dataclass(frozen=True)
+class BaseResult:
+    """Both solutions and the comparisons behind them."""
+
+    length_unit: str
+    fit: BaseFit
+    projection: Projection | None
+    no_projection: str | None  # why there is none
+    comparisons: tuple[DistanceComparison, ...]
+
+
+def solve_stand(stand: Stand) -> BaseResult:
+    """Check, then solve by least squares and, where it applies, by the source's projection.
+
+    Raises:
+        NoResultError: the readings contradict each other, or leave the second base open.
+    """
+    comparisons = compare_distances(stand)
+    wrong = [c for c in comparisons if c.sigmas > CONTRADICTION_SIGMAS]
+    if wrong:
+        raise NoResultError(
+            "rod and joints contradict each other: "
+            + "; ".join(comparison_text(c, stand.length_unit) for c in wrong)
+            + ". No transform is given; read these points again"
+        )
+    solution = fit_stand(stand)
+    if solution.p_value < 2 * norm.sf(CONTRADICTION_SIGMAS):
+        raise NoResultError(
+            f"the readings contradict each other: chi-square {solution.chi_square:.1f} with {solution.redundancy} "
+            f"redundant readings; {_worst(stand, solution)}. Read that point again, or state larger sigmas"
+        )
+    try:
+        return BaseResult(stand.length_unit, solution, project(stand), None, comparisons)
+    except NoResultError as error:
+        return BaseResult(stand.length_unit, solution, None, str(error), comparisons)
+
+
+def comparison_text(c: DistanceComparison, unit: str) -> str:
+    """One comparison in words and numbers."""
+    a, b = c.pair
+    return (
+        f"{a} to {b} is {c.by_stand:.4f} {unit} by the stand and {c.by_robot:.4f} {unit} by the robot, a difference of "
+        f"{c.difference:+.4f} {unit} or {c.sigmas:.1f} sigma"
+    )
+
+
+def base_document(result: BaseResult) -> dict[str, Any]:
+    """Plain numbers for JSON: lengths in length_unit, angles in rad."""
+    solution, projection = result.fit, result.projection
+    return {
+        "length_unit": result.length_unit,
+        "T_base1_base2": solution.T_base1_base2.tolist(),
+        "sigma": {"rotation": solution.sigma[:3].tolist(), "translation": solution.sigma[3:].tolist()},
+        "covariance": solution.covariance.tolist(),
+        "T_base1_stand": solution.T_base1_stand.tolist(),
+        "rail_residuals": solution.rail_residuals.tolist(),
+        "rod_residuals": solution.rod_residuals.tolist(),
+        "chi_square": solution.chi_square,
+        "redundancy": solution.redundancy,
+        "p_value": solution.p_value,
+        "projection": None if projection is None else _projection_document(projection),
+        "no_projection": result.no_projection,
+        "distances": [
+            {"pair": c.pair, "by_stand": c.by_stand, "by_robot": c.by_robot, "sigma": c.sigma, "sigmas": c.sigmas}
+            for c in result.comparisons
+        ],
+    }
+
+
+def _projection_document(projection: Projection) -> dict[str, Any]:
+    return {
+        "T_base1_base2": projection.T_base1_base2.tolist(),
+        "gamma_beta_alpha": [None if np.isnan(a) else float(a) for a in projection.gamma_beta_alpha],
+        "offsets": projection.offsets.tolist(),
+    }
+
+
+def _worst(stand: Stand, solution: BaseFit) -> str:
+    names = stand.rail.names + stand.rod.names
+    sizes = np.linalg.norm(np.vstack([solution.rail_residuals, solution.rod_residuals]), axis=1)
+    worst = int(np.argmax(sizes))
+    return f"the largest misfit is {sizes[worst]:.4g} {stand.length_unit} at {names[worst]}"
+
+
+# The rod's readings as a points session: the stand measures a cup, the second robot says where its tip touches it.
+
+
+def rod_session(stand: Stand, result: BaseResult) -> SessionFiles:
+    """One view for each rod setting; the sensor's frame is the stand's.
+
+    The readings tell where the tip was, not how it was turned: its frame is taken parallel to the base, which changes
+    nothing, because the target lies in its origin.
+    """
+    cups = rod_points(stand.slide, stand.angle, stand.length, stand.turn)
+    across = stand.length * stand.sigma_angle
+    sigma = np.sqrt((stand.sigma_length**2 + across**2 + stand.sigma_slide**2) / 3)
+    T_base2_stand = frames.inverse(result.fit.T_base1_base2) @ result.fit.T_base1_stand
+    T_base2_tip = frames.make(np.tile(np.eye(3), (len(cups), 1, 1)), stand.rod.points)
+    names = stand.rod.names
+    return SessionFiles(
+        name="rod",
+        length_unit=stand.length_unit,
+        mount="eye_to_hand",
+        tables={"scanner": {"pose": T_base2_stand.tolist()}},
+        views={"view": names, **pose_columns(T_base2_tip)},
+        points=points_table(names, ["tip"] * len(names), cups, sigma),
+        targets={"tip": np.zeros(3)},
+    )
+
+
+# A stand file (TOML) -> `Stand`; every check of the input is made here.
+
+STAND_FORMAT = "stitch-base/1"
+# Sigmas of a careful operator where the file states none: the source sees 0.1 to 0.2 mm as the smallest distance
+# that an eye can tell, and calls its distance and angle sensors better than that.
+_POINT, _SLIDE, _LENGTH, _ANGLE, _LEVEL = 1e-4, 1e-4, 1e-4, 1e-4, 1e-3
+
+_KEYS = {"format", "length_unit", "angle_unit", "main", "second", "rod", "level"}
+_TURN = {"clockwise": 1.0, "anticlockwise": -1.0}
+_CYLINDER = ("joint1", "radius", "height")
+
+
+def read_stand(file: Path | str) -> Stand:
+    """Read and check a stand file.
+
+    Raises:
+        InputError: the file is missing, not TOML, or an entry is missing, unknown, not a number or impossible.
+    """
+    file = Path(file)
+    document = read_job_file(file, STAND_FORMAT, _KEYS, "examples/base_to_base.toml")
+    unit, to_rad = _units(file, document)
+    main, second = table(file, document, "main"), table(file, document, "second")
+    rail, rail_entries = _touched_points(file, "main", main, unit, to_rad)
+    rod, rod_entries = _touched_points(file, "second", second, unit, to_rad)
+    settings = table(file, document, "rod")
+    check_keys(file, "rod", settings, {"turn", "sigma_slide", "sigma_angle", "sigma_length"})
+    turn = choice(file, "rod.turn", settings.get("turn", "clockwise"), tuple(_TURN))
+    level = document.get("level", {})
+    check_keys(file, "level", level, {"stand", "second_base"})
+    base = finite(file, "level.second_base", level["second_base"], positive=True) if "second_base" in level else None
+    stand = Stand(
+        length_unit=str(document["length_unit"]),
+        rail=rail,
+        rail_slide=_column(file, "main", rail_entries, "slide", optional=True),
+        rod=rod,
+        slide=_column(file, "second", rod_entries, "slide"),
+        angle=_column(file, "second", rod_entries, "angle") * to_rad,
+        length=_column(file, "second", rod_entries, "length", positive=True),
+        turn=_TURN[turn],
+        sigma_slide=_sigma(file, "rod", settings, "sigma_slide", _SLIDE / unit),
+        sigma_angle=_sigma(file, "rod", settings, "sigma_angle", _ANGLE / to_rad) * to_rad,
+        sigma_length=_sigma(file, "rod", settings, "sigma_length", _LENGTH / unit),
+        sigma_level_stand=_sigma(file, "level", level, "stand", _LEVEL / to_rad) * to_rad,
+        sigma_level_base=None if base is None else base * to_rad,
+        file=file,
+    )
+    _check_geometry(file, stand)
+    return stand
+
+
+def _units(file: Path, document: dict[str, Any]) -> tuple[float, float]:
+    """Metres per length unit and rad per angle unit."""
+    length = choice(file, "length_unit", document.get("length_unit"), tuple(METRES))
+    angle = choice(file, "angle_unit", document.get("angle_unit"), ("rad", "deg"))
+    return METRES[length], 1.0 if angle == "rad" else float(np.pi / 180)
+
+
+def _touched_points(
+    file: Path, name: str, robot: dict[str, Any], unit: float, to_rad: float
+) -> tuple[TouchedPoints, list[dict[str, Any]]]:
+    """The points of one robot, from coordinates or from joint 1, radius and height."""
+    check_keys(file, name, robot, {"points", "sigma"})
+    entries = robot.get("points")
+    if not isinstance(entries, list) or len(entries) < 2:
+        raise InputError(f"{file}: [[{name}.points]] needs at least two entries")
+    readings = {"slide"} if name == "main" else {"slide", "angle", "length"}
+    sigma = robot.get("sigma", {})
+    check_keys(file, f"{name}.sigma", sigma, {"point", *_CYLINDER})
+    points: list[Array] = []
+    covariances: list[Array] = []
+    for i, entry in enumerate(entries):
+        place = f"{name}.points[{i + 1}]"
+        check_keys(file, place, entry, {"name", "point", *_CYLINDER, *readings})
+        if "point" in entry:
+            form = "three numbers [x, y, z] in the robot's base frame"
+            points.append(vectors(file, f"{place}.point", entry["point"], (3,), form))
+            covariances.append(np.eye(3) * _sigma(file, f"{name}.sigma", sigma, "point", _POINT / unit) ** 2)
+            continue
+        joint1, radius, height = (_entry(file, place, entry, key) for key in _CYLINDER)
+        points.append(cylinder_points(np.array(joint1 * to_rad), np.array(radius), np.array(height)))
+        default = sigma.get("point", _POINT / unit)
+        spread = (
+            _sigma(file, f"{name}.sigma", sigma, "joint1", default / radius / to_rad) * to_rad,
+            _sigma(file, f"{name}.sigma", sigma, "radius", default),
+            _sigma(file, f"{name}.sigma", sigma, "height", default),
+        )
+        covariances.append(cylinder_covariance(np.array(joint1 * to_rad), np.array(radius), spread))
+    names = tuple(str(entry.get("name", f"{name} {i + 1}")) for i, entry in enumerate(entries))
+    return TouchedPoints(names, np.array(points, float), np.array(covariances, float)), entries
+
+
+def _entry(file: Path, place: str, entry: dict[str, Any], key: str) -> float:
+    if key not in entry:
+        raise InputError(f"{file}: {place}.{key} is missing; give point = [x, y, z] or joint1, radius and height")
+    return finite(file, f"{place}.{key}", entry[key], positive=key == "radius")
+
+
+def _column(
+    file: Path, name: str, entries: list[dict[str, Any]], key: str, optional: bool = False, positive: bool = False
+) -> Array:
+    values = []
+    for i, entry in enumerate(entries):
+        place = f"{name}.points[{i + 1}].{key}"
+        if key not in entry and not optional:
+            raise InputError(f"{file}: {place} is missing; every point of the rod needs slide, angle and length")
+        values.append(finite(file, place, entry[key], positive) if key in entry else np.nan)
+    return np.array(values, float)
+
+
+def _sigma(file: Path, place: str, entries: dict[str, Any], key: str, default: float) -> float:
+    return finite(file, f"{place}.{key}", entries.get(key, default), positive=True)
+
+
+def _check_geometry(file: Path, stand: Stand) -> None:
+    """Points that leave the rail without a line, a zero or a level."""
+    rail = stand.rail.points
+    extent = float(np.linalg.norm(rail - rail.mean(axis=0), axis=1).max())
+    if extent < 100 * np.sqrt(np.trace(stand.rail.covariance[0]) / 3):
+        raise InputError(f"{file}: main.points lie within {2 * extent:.3g}; a rail's direction needs points far apart")
+    if not np.isfinite(stand.rail_slide).any():
+        raise InputError(f"{file}: no main point has a slide reading; write slide = 0 at the one that sets the zero")
+    x = rail_direction(rail)
+    read = stand.rail_slide[np.isfinite(stand.rail_slide)]
+    if np.isnan(stand.rail_slide[-1]) or (np.diff(rail @ x) <= 0).any() or (np.diff(read) <= 0).any():
+        raise InputError(
+            f"{file}: main.points must be listed in the direction in which the slide grows, the last with its slide "
+            "reading; reorder them, or correct a slide reading"
+        )
+    if abs(x[2]) > 0.9:
+        raise InputError(f"{file}: the rail stands upright in the main base; it must lie, or the rod has no level")
+
+
+# What `stitch base` does: a stand solved, shown, drawn, and as a session.
+
+
+def run_base(file: Path, recording: Path | None, report: Path | None, session: Path | None, as_json: bool) -> None:
+    """Solve a stand and hand out what was asked for.
+
+    Raises:
+        InputError, NoResultError: as `stitch base` ends.
+    """
+    stand = read_stand(file)
+    try:
+        result = solve_stand(stand)
+    except NoResultError:
+        # The page shows which readings contradict each other.
+        write_recording_and_page("base", None, report, stand, None)
+        raise
+    if session is not None:
+        write_session(session, rod_session(stand, result))
+    write_recording_and_page("base", recording, report, stand, result)
+    if as_json:
+        print(json.dumps(base_document(result), indent=1))
+    else:
+        _print_solution(result)
+
+
+def _print_solution(result: BaseResult) -> None:
+    terminal = console()
+    unit, solution = result.length_unit, result.fit
+    table = Table(title="T_base1_base2, translation and turn about the axes of base 1", title_justify="left")
+    for heading in ("solution", f"x y z / {unit}", "rotation vector / rad"):
+        table.add_column(heading)
+    table.add_row("least squares", *_pose_cells(solution.T_base1_base2))
+    table.add_row("  1 σ", _number_text(solution.sigma[3:], 5), _number_text(solution.sigma[:3], 6))
+    if result.projection is not None:
+        table.add_row("projection", *_pose_cells(result.projection.T_base1_base2))
+    terminal.print(table)
+    terminal.print(
+        f"chi-square {solution.chi_square:.2f} with {solution.redundancy} redundant readings, p = "
+        f"{solution.p_value:.2g}."
+    )
+    for comparison in result.comparisons:
+        terminal.print(comparison_text(comparison, unit) + ".")
+    if result.no_projection:
+        terminal.print(f"No projection: {result.no_projection}.")
+    for row in solution.T_base1_base2:
+        print(" ".join(f"{value:.9g}" for value in row))
+
+
+def _pose_cells(T: np.ndarray) -> tuple[str, str]:
+    return _number_text(T[:3, 3], 5), _number_text(frames.log(T)[:3], 6)
+
+
+def _number_text(values: np.ndarray, digits: int) -> str:
+    return "  ".join(f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0)

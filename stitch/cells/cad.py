@@ -1,0 +1,372 @@
+"""The CAD surface: nearest places for scanned points, told apart by the side they look to."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import igl
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pykdtree.kdtree import KDTree
+
+from stitch import frames
+from stitch.cells.job_files import POSE_COLUMNS, poses_from_columns, read_columns
+from stitch.errors import InputError
+from stitch.frames import Array, Indices
+from stitch.measurement.scan import Scan, prepare_scan
+from stitch.reading.clouds import read_cloud
+from stitch.reading.session_folder import load_session
+from stitch.reading.text_files import reason_of
+from stitch.units import METRES
+
+# Scans of a part from several robot poses, joined in the robot's base frame.
+
+# Fewer points have no neighbourhoods from which normals could be taken.
+_MIN_SCAN_POINTS = 50
+
+
+@dataclass(frozen=True)
+class PlacedScans:
+    """V scans as they came; where only the scanner's own poses are known, the scanner counts as the flange."""
+
+    names: tuple[str, ...]
+    clouds: tuple[Array, ...]  # (N, 3) each, scanner frame
+    T_base_flange: Array  # (V, 4, 4) reported
+    T_flange_scanner: Array  # (4, 4)
+    length_unit: str = "mm"  # as a session states it; a table of scans does not
+
+    @property
+    def T_base_scanner(self) -> Array:
+        """(V, 4, 4)."""
+        return np.asarray(self.T_base_flange @ self.T_flange_scanner)
+
+
+@dataclass(frozen=True)
+class JoinedScans:
+    """N points of all scans, base frame, length_unit."""
+
+    points: Array  # (N, 3)
+    normals: Array  # (N, 3) unit, towards the scanner
+    usable: NDArray[np.bool_]  # (N,) neither edge nor crease nor grazing
+    area: Array  # (N,) surface per point
+    spacing: float
+    noise: float  # 1-sigma across the surface, from the scans themselves
+
+    def take(self, keep: NDArray[np.bool_] | Indices) -> "JoinedScans":
+        """The points of a mask or of indices."""
+        return JoinedScans(
+            self.points[keep], self.normals[keep], self.usable[keep], self.area[keep], self.spacing, self.noise
+        )
+
+
+def join_scans(scans: Sequence[Scan], T_base_scanner: Array) -> JoinedScans:
+    """One cloud of scans in their scanner frames and their poses (V, 4, 4)."""
+    pairs = list(zip(scans, T_base_scanner, strict=True))
+    return JoinedScans(
+        np.vstack([frames.transform(T, scan.points) for scan, T in pairs]),
+        np.vstack([frames.rotate(T, scan.normals) for scan, T in pairs]),
+        np.concatenate([scan.usable for scan in scans]).astype(bool),
+        np.concatenate([scan.area for scan in scans]),
+        float(np.median([scan.spacing for scan in scans])),
+        float(np.median([scan.noise for scan in scans])),
+    )
+
+
+def assemble_scans(placed: PlacedScans) -> JoinedScans:
+    """Normals, edges and noise of each scan, then one cloud."""
+    pairs = zip(placed.names, placed.clouds, strict=True)
+    return join_scans([prepare_scan(name, points) for name, points in pairs], placed.T_base_scanner)
+
+
+def read_scan_table(file: Path) -> PlacedScans:
+    """A table of scans: `file` and the scanner's pose in the base, x y z a_deg b_deg c_deg.
+
+    Raises:
+        InputError: the table or a cloud is missing or malformed, or a cloud has too few points.
+    """
+    table = read_columns(file, "file", POSE_COLUMNS)
+    clouds = []
+    for name in table.texts["file"]:
+        points = read_cloud(file.parent / name).points
+        if len(points) < _MIN_SCAN_POINTS:
+            raise InputError(f"{file.parent / name}: {len(points)} points are too few; scan again or drop its row")
+        clouds.append(points)
+    names = [Path(name).stem for name in table.texts["file"]]
+    if len(set(names)) < len(names):
+        names = [f"{i + 1:03}-{name}" for i, name in enumerate(names)]
+    return PlacedScans(tuple(names), tuple(clouds), poses_from_columns(table), np.eye(4))
+
+
+def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
+    """Scans of a session (scanner on the flange) placed by its reported poses and a hand-eye from a JSON file.
+
+    Raises:
+        InputError: session or hand-eye is missing or malformed, or they do not belong together.
+    """
+    session = load_session(folder, at_most=None)
+    if session.mount != "eye_in_hand":
+        raise InputError(f"{folder / 'session.toml'}: mount is {session.mount!r}; the scanner must ride on the flange")
+    clouds = []
+    for view in session.views:
+        if view.cloud is None or len(view.cloud.points) < _MIN_SCAN_POINTS:
+            raise InputError(f"{folder / 'views.csv'}: view {view.name} has too few points; scan again or drop its row")
+        clouds.append(view.cloud.points)
+    poses = np.array([view.T_base_flange for view in session.views])
+    T_flange_scanner = read_hand_eye(hand_eye, session.length_unit)
+    names = tuple(session.names)
+    return PlacedScans(names, tuple(clouds), poses, T_flange_scanner, session.length_unit)
+
+
+def read_hand_eye(file: Path, length_unit: str) -> Array:
+    """T_flange_scanner (4, 4) in `length_unit` from what `stitch calibrate` or `stitch run` wrote.
+
+    Raises:
+        InputError: the file is missing, holds no hand-eye, or one of a scanner that stands in the cell.
+    """
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+        T, unit = np.array(document["hand_eye"], float), METRES[document["length_unit"]]
+        mount = document.get("mount", "eye_in_hand")
+    except FileNotFoundError:
+        raise InputError(f"{file}: not found; `stitch calibrate sphere SESSION -o {file.name}` writes one") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{file}: holds no hand_eye with length_unit; name what stitch calibrate wrote") from None
+    if not frames.is_rigid(T) or mount != "eye_in_hand":
+        raise InputError(f"{file}: hand_eye must be a rigid motion of a scanner on the flange (eye_in_hand)")
+    T[:3, 3] *= unit / METRES[length_unit]
+    return T
+
+
+# Normals of scan and CAD may differ by 45°: more is the other side of the sheet, or a wall.
+_SAME_SIDE = np.cos(np.radians(45.0))
+_FAR_SIDE = -0.5
+_MOST_SAMPLES = 400_000
+
+
+@dataclass(frozen=True)
+class CadSurface:
+    """A triangle mesh with two ways to search it; part frame."""
+
+    mesh: Any  # trimesh.Trimesh
+    boxes: Any  # igl.AABB: tree of bounding boxes over the triangles
+    centre: Array  # (3,)
+    size: float  # diagonal of the bounding box
+    spacing: float  # of the samples
+    samples: Array  # (S, 3) on the surface
+    normals: Array  # (S, 3) outwards
+    tree: Any  # KDTree over (samples, reach · normals)
+    reach: float  # distance that counts as much as normals one radian apart
+
+
+@dataclass(frozen=True)
+class NearestPartners:
+    """For N points: signed distance along the CAD's normal, that normal, and whether the place is a partner."""
+
+    distance: Array  # (N,) positive outside
+    normal: Array  # (N, 3)
+    accept: NDArray[np.bool_]  # (N,)
+
+
+def read_cad(file: Path) -> CadSurface:
+    """Read a mesh (STL, PLY, OBJ …) in length_unit.
+
+    Raises:
+        InputError: missing, unreadable or without triangles.
+    """
+    if not file.is_file():
+        raise InputError(f"{file}: not found; name the CAD model as a mesh, STL, PLY or OBJ")
+    try:
+        mesh = trimesh.load_mesh(file)
+    except Exception as error:
+        raise InputError(f"{file}: cannot be read ({reason_of(error)}); export the mesh again") from None
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{file}: holds no triangles; export the CAD model as a triangle mesh")
+    return cad_surface(mesh)
+
+
+def cad_surface(mesh: Any) -> CadSurface:
+    """Make a trimesh ready for searching."""
+    centre = mesh.bounds.mean(axis=0)
+    size = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
+    boxes = igl.AABB()
+    boxes.init(*_arrays(mesh))
+    count = int(min(_MOST_SAMPLES, max(5000, mesh.area / (size / 800) ** 2)))
+    samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
+    normals, reach = np.asarray(mesh.face_normals[faces]), size / 30
+    return CadSurface(
+        mesh,
+        boxes,
+        centre,
+        size=size,
+        spacing=float(np.sqrt(mesh.area / count)),
+        samples=np.asarray(samples),
+        normals=normals,
+        tree=KDTree(np.hstack([samples, reach * normals])),
+        reach=reach,
+    )
+
+
+def nearest_partners(cad: CadSurface, points: Array, normals: Array) -> NearestPartners:
+    """Partners of points (N, 3) with normals (N, 3), part frame.
+
+    First the nearest triangle; where that is a thin sheet's far side, the nearest of samples that look the same way.
+    A normal that lies between is smeared over an edge and has no partner.
+    """
+    _, face, place = cad.boxes.squared_distance(*_arrays(cad.mesh), np.ascontiguousarray(points, float))
+    normal = np.array(cad.mesh.face_normals[face])
+    distance, accept = _accept_partners(points - place, normal, normals, 1e-3 * cad.spacing)
+    other = np.flatnonzero(np.einsum("ij,ij->i", normal, normals) < _FAR_SIDE)
+    if len(other):
+        index = sample_partners(cad, points[other], normals[other])
+        normal[other] = cad.normals[index]
+        off = points[other] - cad.samples[index]
+        distance[other], accept[other] = _accept_partners(off, normal[other], normals[other], 2 * cad.spacing)
+    return NearestPartners(distance, normal, accept)
+
+
+def _arrays(mesh: Any) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices and faces as libigl takes them."""
+    return np.ascontiguousarray(mesh.vertices, float), np.ascontiguousarray(mesh.faces, np.int64)
+
+
+def sample_partners(cad: CadSurface, points: Array, normals: Array) -> NDArray[np.int64]:
+    """Index of the sample nearest in place and direction to each point (N, 3) with normal (N, 3)."""
+    query = np.ascontiguousarray(np.hstack([points, cad.reach * normals]))
+    return np.asarray(cad.tree.query(query, k=1)[1], np.int64)
+
+
+def _accept_partners(off: Array, normal: Array, scan_normals: Array, loose: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Distance along the normal; a partner lies straight below its point, not beyond an edge of the surface."""
+    distance = np.einsum("ij,ij->i", off, normal)
+    aside = np.linalg.norm(off - distance[:, None] * normal, axis=1)
+    same = np.einsum("ij,ij->i", normal, scan_normals) > _SAME_SIDE
+    return distance, same & (aside <= 0.5 * np.abs(distance) + loose)
+
+
+# Boxes of the part frame: where the scan must show the part, and where nothing of it may be believed.
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-parallel box of the part frame."""
+
+    name: str
+    low: Array  # (3,)
+    high: Array  # (3,)
+
+    def holds(self, points: Array) -> NDArray[np.bool_]:
+        """(N,) which points (N, 3) lie inside."""
+        return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=1))
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Expected: the fit rests on them alone, and the scan must cover them. Forbidden: clamps, glue, other parts."""
+
+    expected: tuple[Box, ...] = field(default=())
+    forbidden: tuple[Box, ...] = field(default=())
+
+    def used(self, points: Array) -> NDArray[np.bool_]:
+        """(N,) which points (N, 3), part frame, the fit may use."""
+        inside = np.ones(len(points), bool)
+        if self.expected:
+            inside = np.any([box.holds(points) for box in self.expected], axis=0)
+        for box in self.forbidden:
+            inside &= ~box.holds(points)
+        return inside
+
+
+def coverage(box: Box, cad: CadSurface, points: Array, normals: Array) -> float:
+    """Share of the CAD in the box, on its better seen side, that has a scanned point (N, 3) close by; part frame.
+
+    Of a thin sheet only one side can be seen, so samples that look the way the scan's points in the box look count.
+    """
+    inside = box.holds(points)
+    samples = np.flatnonzero(box.holds(cad.samples))
+    if not len(samples) or not inside.any():
+        return 0.0
+    facing = cad.normals[samples] @ normals[inside].mean(axis=0) > 0.5
+    cell = max(3 * cad.spacing, float(np.ptp(cad.samples[samples], axis=0).max()) / 20)
+    wanted = {tuple(c) for c in np.floor(cad.samples[samples[facing]] / cell).astype(int)}
+    seen = {tuple(c) for c in np.floor(points[inside] / cell).astype(int)}
+    return len(wanted & seen) / max(len(wanted), 1)
+
+
+# Tukey's biweight: 95 % efficient on normal noise, no pull at all beyond its limit (Huber & Ronchetti 2009).
+
+# Limit of the weights in 1-sigma scales, and a normal sigma per median absolute deviation.
+TUKEY, MAD = 4.685, 1.4826
+
+
+def biweight(u: Array) -> Array:
+    """(...,) Tukey's weights, 1 at zero and 0 from |u| = 1 on."""
+    return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0))
+
+
+def biweight_slope(u: Array) -> Array:
+    """(...,) change of weight · u with u, for the normal matrix of a robust fit's covariance (Huber & Ronchetti)."""
+    return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) * (1 - 5 * u**2), 0.0))
+
+
+# Robust weights of whole cells of the surface: a cell's mean shows a shift that no single point can.
+
+# Cells with fewer points have no mean worth judging; their points keep their own weights.
+_MIN_CELL_POINTS = 5
+
+
+def cell_weights(points: Array, partners: NearestPartners, used: NDArray[np.bool_], cell: float, scale: float) -> Array:
+    """(N,) weight of each point's cell: a cube of edge `cell` (part frame) and a side that its points look to.
+
+    The scale is the cells' own spread (median), at least what the points' `scale` leaves in a mean: where a scan is
+    only as good as its robot, all cells are off a little and none is thrown out for it.
+    """
+    key = np.hstack([np.floor(points / cell), np.round(partners.normal)]).astype(np.int64)
+    _, where = np.unique(key, axis=0, return_inverse=True)
+    where = where.ravel()
+    count = np.bincount(where, used)
+    mean = np.bincount(where, used * partners.distance) / np.maximum(count, 1)
+    full = count >= _MIN_CELL_POINTS
+    if not full.any():
+        return np.ones(len(points))
+    floor = scale / np.sqrt(np.median(count[full]))
+    spread = max(MAD * float(np.median(np.abs(mean[full]))), float(floor))
+    weight = np.where(full, biweight(mean / (TUKEY * spread)), 1.0)
+    return np.asarray(weight[where])
+
+
+# Points that look all ways: normal-space sampling (Rusinkiewicz & Levoy 2001).
+#
+# On a large smooth sheet the few points of its flanks alone hold it in its plane.
+
+_SAMPLED_POINTS = 20_000
+# Normals are sorted into cells of a quarter of their unit length: about 15°.
+_DIRECTIONS = 4
+
+
+def sample_normal_space(scan: JoinedScans, T_base_part: Array) -> Indices:
+    """(n,) indices of at most 20,000 usable points, as many of each direction as there are to share out.
+
+    Args:
+        T_base_part: (4, 4) near where the part lies: directions count in its frame.
+    """
+    usable = np.flatnonzero(scan.usable)
+    directions = np.round(frames.rotate(frames.inverse(T_base_part), scan.normals[usable]) * _DIRECTIONS)
+    _, bucket, counts = np.unique(directions.astype(int), axis=0, return_inverse=True, return_counts=True)
+    quota, bucket = _quota(counts), bucket.ravel()
+    order = np.argsort(bucket, kind="stable")
+    first = np.cumsum(counts) - counts
+    picked = [order[f + np.linspace(0, c - 1, min(quota, c)).astype(int)] for f, c in zip(first, counts, strict=True)]
+    chosen: Indices = usable[np.sort(np.concatenate(picked))] if picked else usable
+    return chosen
+
+
+def _quota(counts: Indices) -> int:
+    """The largest share per direction that keeps the sum within _POINTS."""
+    low, high = 1, _SAMPLED_POINTS
+    while low < high:
+        middle = (low + high + 1) // 2
+        low, high = (middle, high) if np.minimum(counts, middle).sum() <= _SAMPLED_POINTS else (low, middle - 1)
+    return low

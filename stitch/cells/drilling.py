@@ -1,0 +1,593 @@
+"""A drilling job from its readings to the corrected drives."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stitch import frames
+from stitch.cells.drilling_sensors import (
+    CameraEffectTest,
+    EffectSelection,
+    FlangeSensors,
+    GroupCompensation,
+    HoleObservations,
+    RangerFit,
+    Rangers,
+    ServoResult,
+    ToolAxis,
+    align_tool_axis,
+    base_frame,
+    compensate_group,
+    drive_pose,
+    euler_zyx,
+    find_tool_axis,
+    fit_homography,
+    fit_ranger,
+    hole_coordinate,
+    hole_rotation,
+    leave_one_out,
+    measure_hole,
+    select_effects,
+    servo_to_hole,
+    to_plane,
+)
+from stitch.cells.job_files import (
+    POSE_COLUMNS,
+    CsvColumns,
+    JobFile,
+    JsonOption,
+    RecordingOption,
+    ReportOption,
+    SessionOption,
+    choice,
+    finite,
+    points_table,
+    poses_from_columns,
+    read_columns,
+    read_job_file,
+    require_unique,
+    resolve_file,
+    vectors,
+    write_columns,
+    write_recording_and_page,
+)
+from stitch.errors import InputError, NoResultError
+from stitch.frames import Array
+from stitch.system.process import console
+from stitch.units import METRES, value_uncertainty_text
+from stitch.writing.session_files import SessionFiles, pose_columns, write_session
+
+# `stitch drill JOB`: where the robot must be sent so that the holes come where they belong.
+
+
+def drill(
+    file: JobFile,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="CSV", help="Write the drives.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Correct the drives of holes from reference holes that the robot has seen.
+
+    \b
+    Examples:
+      stitch drill job.toml --report page.html
+    """
+
+    run_drill(file, output, recording, report, session, as_json=as_json)
+
+
+# A drilling job on disk (TOML and CSV) -> `Job`; every check of the input is made here.
+
+DRILL_FORMAT = "stitch-drill/1"
+_FILES = {"plate", "holes", "placed", "rangers", "joint1", "joint6", "checks"}
+_KEYS = {"format", "length_unit", "height", "image_size", *_FILES}
+# Cosine of the largest angle between tool and hole that a small error explains.
+_ALONG = float(np.cos(np.radians(30)))
+_NEEDED = ("plate", "holes", "placed")
+
+
+@dataclass(frozen=True)
+class Hole:
+    """One hole as the part's drawing puts it in the base frame."""
+
+    name: str
+    group: str
+    reference: bool
+    position: Array  # (3,)
+    direction: Array  # (3,) unit vector into the part
+
+
+@dataclass(frozen=True)
+class PlacedTool:
+    """Where the servo loop ended on a reference hole, and what the camera and the rangers saw there."""
+
+    T_base_tool: Array  # (4, 4) reported
+    uv: Array  # (2,) pixels
+    height: float  # of the hole along the flange's z, h' of the source
+
+
+@dataclass(frozen=True)
+class DrillJob:
+    """Everything of one drilling job. Lengths in length_unit."""
+
+    length_unit: str
+    height: float
+    plate_xyz: Array  # (N, 3) flange frame
+    plate_uv: Array  # (N, 2)
+    holes: tuple[Hole, ...]
+    placed: dict[str, PlacedTool]  # by the reference hole
+    rangers: dict[str, tuple[Array, Array]]  # planes (M, 4), readings (M,)
+    marker_paths: tuple[Array, Array] | None  # joint 6, joint 1, in the measuring system
+    checks: HoleObservations | None  # plate and check holes together
+    file: Path | None = None  # that was read
+
+
+def read_drill_job(file: Path | str) -> DrillJob:
+    """Read a job file and the tables it names, whose paths are relative to it.
+
+    Raises:
+        InputError: anything missing, unknown, contradictory or not a number; names the file, the place and what to do.
+    """
+    file = Path(file)
+    document = read_job_file(file, DRILL_FORMAT, _KEYS, "examples/drilling/job.toml")
+    paths = {key: resolve_file(file, key, document[key]) for key in _FILES if key in document}
+    for key in _NEEDED:
+        if key not in paths:
+            raise InputError(f"{file}: {key} is missing; name the CSV file")
+    plate = read_columns(paths["plate"], "", "x y z u v")
+    holes = _read_holes(paths["holes"])
+    return DrillJob(
+        length_unit=choice(file, "length_unit", document.get("length_unit"), tuple(METRES)),
+        height=finite(file, "height", document.get("height"), positive=True),
+        plate_xyz=plate.stack("x y z"),
+        plate_uv=plate.stack("u v"),
+        holes=holes,
+        placed=_read_placed_tools(paths["placed"], holes),
+        rangers=_read_ranger_tables(paths.get("rangers")),
+        marker_paths=_read_marker_paths(file, paths),
+        checks=_read_check_holes(file, document, paths, plate),
+        file=file,
+    )
+
+
+def _read_holes(file: Path) -> tuple[Hole, ...]:
+    table = read_columns(file, "hole group kind", "x y z i j k")
+    positions, directions = table.stack("x y z"), table.stack("i j k")
+    holes = []
+    for row, (name, group, kind) in enumerate(zip(*(table.texts[c] for c in ("hole", "group", "kind")), strict=True)):
+        size = np.linalg.norm(directions[row])
+        if abs(size - 1) > 0.01:
+            raise InputError(f"{file}: direction of hole {name} has length {size:.4f}; i, j, k must be a unit vector")
+        if kind not in ("reference", "drill"):
+            raise InputError(f"{file}: kind of hole {name} is {kind!r}; write reference or drill")
+        holes.append(Hole(name, group, kind == "reference", positions[row], directions[row] / size))
+    pairs = [(hole.name, hole.group) for hole in holes]
+    for pair in pairs:
+        if pairs.count(pair) > 1:
+            raise InputError(f"{file}: hole {pair[0]} stands twice in group {pair[1]}; leave one of them out")
+    return tuple(holes)
+
+
+def _read_placed_tools(file: Path, holes: tuple[Hole, ...]) -> dict[str, PlacedTool]:
+    table = read_columns(file, "hole", f"{POSE_COLUMNS} u v height")
+    poses, names = poses_from_columns(table), table.texts["hole"]
+    require_unique(file, "hole", names)
+    for hole in holes:
+        if hole.reference and hole.name not in names:
+            raise InputError(f"{file}: reference hole {hole.name} is missing; add where the robot ended on it")
+        if hole.reference and poses[names.index(hole.name), :3, 2] @ hole.direction < _ALONG:
+            raise InputError(
+                f"{file}: on hole {hole.name} the tool's z lies more than 30° off the hole's direction; directions "
+                "point into the part, and a, b, c turn about z, y', x''"
+            )
+    seen = zip(names, poses, table.stack("u v"), table.numbers["height"].tolist(), strict=True)
+    return {name: PlacedTool(T_base_tool, uv, height) for name, T_base_tool, uv, height in seen}
+
+
+def _read_ranger_tables(file: Path | None) -> dict[str, tuple[Array, Array]]:
+    if file is None:
+        return {}
+    table = read_columns(file, "ranger", "a b c d reading")
+    planes, readings, names = table.stack("a b c d"), table.numbers["reading"], np.array(table.texts["ranger"])
+    if (np.linalg.norm(planes[:, :3], axis=1) == 0).any():
+        raise InputError(f"{file}: a plane has a = b = c = 0; write its normal there")
+    return {str(name): (planes[names == name], readings[names == name]) for name in dict.fromkeys(names)}
+
+
+def _read_marker_paths(file: Path, paths: dict[str, Path]) -> tuple[Array, Array] | None:
+    if ("joint1" in paths) != ("joint6" in paths):
+        raise InputError(f"{file}: joint1 and joint6 belong together; name both marker paths or neither")
+    if "joint1" not in paths:
+        return None
+    return tuple(read_columns(paths[key], "", "x y z").stack("x y z") for key in ("joint6", "joint1"))  # type: ignore[return-value]
+
+
+def _read_check_holes(
+    file: Path, document: dict[str, Any], paths: dict[str, Path], plate: CsvColumns
+) -> HoleObservations | None:
+    """Holes of the plate and check holes together."""
+    if "checks" not in paths:
+        return None
+    form = "[width, height] in pixels, which the checks need"
+    size = vectors(file, "image_size", document.get("image_size"), (2,), form)
+    width, height = (finite(file, "image_size", value, positive=True) for value in size.tolist())
+    tables = plate, read_columns(paths["checks"], "", "x y z u v")
+    return HoleObservations(
+        xyz=np.vstack([table.stack("x y z") for table in tables]),
+        uv=np.vstack([table.stack("u v") for table in tables]),
+        on_plate=np.repeat([True, False], [table.rows for table in tables]),
+        image_size=(width, height),
+    )
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Where the robot is sent to drill one hole."""
+
+    hole: Hole
+    position: Array  # (3,)
+    direction: Array  # (3,) of the hole
+    rotation: Array  # (3, 3) reported orientation of the tool
+
+    @property
+    def angles(self) -> Array:
+        """(3,) in rad about z, y', x''."""
+        return euler_zyx(self.rotation)
+
+
+@dataclass(frozen=True)
+class DrillResult:
+    """Everything a job gives. Lengths in length_unit."""
+
+    H: Array  # (3, 3) work plane to image
+    leave_one_out_errors: Array  # (N, 2) of the plate's holes, in the work plane
+    groups: dict[str, GroupCompensation]
+    drives: tuple[Drive, ...]
+    rangers: dict[str, RangerFit]
+    T_measuring_base: Array | None
+    effects: EffectSelection | None  # of the camera; None without check holes
+    tool_axis: ToolAxis | None
+
+
+def solve_drill_job(job: DrillJob) -> DrillResult:
+    """Homography, compensation of every group, and what else the job holds readings for.
+
+    What the check holes show of the camera is taken out of the reference holes' places.
+
+    Raises:
+        NoResultError: a step has too few or degenerate readings; names the step.
+    """
+    xy = job.plate_xyz[:, :2]
+    H = fit_homography(xy, job.plate_uv)
+    effects = select_effects(job.checks) if job.checks is not None else None
+    groups: dict[str, GroupCompensation] = {}
+    for group in dict.fromkeys(hole.group for hole in job.holes):
+        references = [hole for hole in job.holes if hole.group == group and hole.reference]
+        if len(references) < 3:
+            raise NoResultError(f"group {group}: {len(references)} reference holes; a group needs three or more")
+        actual = np.array([_measured_hole(job, H, effects, hole.name) for hole in references])
+        groups[group] = compensate_group(np.array([hole.position for hole in references]), actual)
+    tool_axis = _fitted_tool_axis(job, groups)
+    return DrillResult(
+        H,
+        leave_one_out_errors=leave_one_out(xy, job.plate_uv) if len(xy) > 4 else np.empty((0, 2)),
+        groups=groups,
+        drives=tuple(_corrected_drive(hole, groups[hole.group], tool_axis) for hole in job.holes if not hole.reference),
+        rangers={name: fit_ranger(*readings) for name, readings in job.rangers.items()},
+        T_measuring_base=base_frame(*job.marker_paths) if job.marker_paths else None,
+        effects=effects,
+        tool_axis=tool_axis,
+    )
+
+
+def _fitted_tool_axis(job: DrillJob, groups: dict[str, GroupCompensation]) -> ToolAxis | None:
+    """From each reference hole once, whatever number of groups it serves."""
+    references = {hole.name: hole for hole in job.holes if hole.reference}
+    directions = [groups[h.group].T_actual_nominal[:3, :3] @ h.direction for h in references.values()]
+    return find_tool_axis(np.array([job.placed[name].T_base_tool[:3, :3] for name in references]), np.array(directions))
+
+
+def _corrected_drive(hole: Hole, group: GroupCompensation, tool_axis: ToolAxis | None) -> Drive:
+    position, direction = (found[0] for found in group.apply(hole.position[None], hole.direction[None]))
+    R = hole_rotation(direction)
+    return Drive(hole, position, direction, R if tool_axis is None else tool_axis.orient(R))
+
+
+def _measured_hole(job: DrillJob, H: Array, effects: EffectSelection | None, name: str) -> Array:
+    """Drive coordinate (3,) of a reference hole from where the robot ended and what it saw there."""
+    placed = job.placed[name]
+    offset = np.append(hole_in_plane(job, H, effects, name), placed.height - job.height)
+    return hole_coordinate(placed.T_base_tool, offset)
+
+
+def hole_in_plane(job: DrillJob, H: Array, effects: EffectSelection | None, name: str) -> Array:
+    """x, y (2,) in the flange frame at which the camera saw a reference hole.
+
+    Where check holes have shown the camera beyond its work plane, at the hole's own height and without the effects that
+    were selected; else as if the hole lay in the work plane: a camera tilted by 25° is then off by 0.47 mm for each mm.
+    """
+    placed = job.placed[name]
+    if effects is not None:
+        return np.asarray(effects.camera.plane(placed.uv[None], placed.height)[0])
+    return np.asarray(to_plane(H, placed.uv[None])[0])
+
+
+# What a drilling job found, as a document and as a table that a person or a controller can read.
+
+
+def write_drives(result: DrillResult, file: Path) -> None:
+    """Write the holes to drill as CSV: position, angles in degrees, and the shift against the drawing."""
+    columns: dict[str, list[str]] = {
+        "hole": [drive.hole.name for drive in result.drives],
+        "group": [drive.hole.group for drive in result.drives],
+    }
+    numbers = [[*d.position, *np.degrees(d.angles), *(d.position - d.hole.position)] for d in result.drives]
+    names = ("x", "y", "z", "a_deg", "b_deg", "c_deg", "dx", "dy", "dz")
+    columns |= {name: [f"{row[i]:.5f}" for row in numbers] for i, name in enumerate(names)}
+    write_columns(file, columns)
+
+
+def drill_document(result: DrillResult) -> dict[str, Any]:
+    """Plain numbers for JSON: lengths in length_unit, angles in degrees."""
+    measuring, tool_axis = result.T_measuring_base, result.tool_axis
+    return {
+        "homography": result.H.tolist(),
+        "leave_one_out": np.linalg.norm(result.leave_one_out_errors, axis=1).tolist(),
+        "groups": {name: _group_document(c) for name, c in result.groups.items()},
+        "drives": [_drive_document(d) for d in result.drives],
+        "rangers": {
+            name: {"origin": r.origin.tolist(), "direction": r.direction.tolist(), "rms": r.rms}
+            for name, r in result.rangers.items()
+        },
+        "T_measuring_base": None if measuring is None else measuring.tolist(),
+        "tool_axis": None if tool_axis is None else _tool_axis_document(tool_axis),
+        "camera_effects": None if result.effects is None else [vars(trial) for trial in result.effects.trials],
+    }
+
+
+def _group_document(c: GroupCompensation) -> dict[str, Any]:
+    return {
+        "T_actual_nominal": c.T_actual_nominal.tolist(),
+        "drive_errors": np.linalg.norm(c.errors, axis=1).tolist(),
+        "residuals": np.linalg.norm(c.residuals, axis=1).tolist(),
+    }
+
+
+def _drive_document(d: Drive) -> dict[str, Any]:
+    return {
+        "hole": d.hole.name,
+        "group": d.hole.group,
+        "position": d.position.tolist(),
+        "direction": d.direction.tolist(),
+        "angles_deg": np.degrees(d.angles).tolist(),
+    }
+
+
+def _tool_axis_document(tool: ToolAxis) -> dict[str, Any]:
+    return {
+        "axis": tool.axis.tolist(),
+        "tilt_deg": float(np.degrees(tool.tilt)),
+        "sigma_deg": float(np.degrees(tool.sigma)),
+        "p_value": tool.p_value,
+        "accepted": tool.accepted,
+    }
+
+
+# The whole procedure on any cell: calibrate, servo onto the reference holes, compensate, set the holes upright.
+
+# Position (3,) and inward direction (3,) by hole name.
+Holes = Mapping[str, tuple[Array, Array]]
+# Moves to T_base_tool over the named hole; ranges (n,) and image point (2,).
+MeasureHole = Callable[[str, Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class HoleGroup:
+    """One group after compensation."""
+
+    placed: dict[str, ServoResult]  # reference holes
+    compensation: GroupCompensation
+    drives: dict[str, Array]  # T_base_tool (4, 4) of the holes to drill
+
+
+def calibrate_sensors(
+    plate_xyz: Array, plate_uv: Array, planes: Array, readings: Array, height: float
+) -> FlangeSensors:
+    """Sensors from the nine-hole plate (N, 3), (N, 2), and from planes (M, 4) with readings (rangers, M).
+
+    Raises:
+        NoResultError: too few or degenerate holes or planes.
+    """
+    beams = [fit_ranger(planes, row) for row in readings]
+    rangers = Rangers(np.array([b.origin for b in beams]), np.array([b.direction for b in beams]))
+    return FlangeSensors(rangers, fit_homography(plate_xyz[:, :2], plate_uv), height)
+
+
+def run_group(
+    measure: MeasureHole, sensors: FlangeSensors, nominal: Holes, references: Sequence[str], targets: Sequence[str]
+) -> HoleGroup:
+    """Servo onto the references, compensate the targets, then turn each target upright by the rangers.
+
+    Raises:
+        NoResultError: a servo loop does not converge, or the references fix no rigid motion.
+    """
+    placed = {
+        name: servo_to_hole(lambda T, name=name: measure(name, T), sensors, drive_pose(*nominal[name]))  # type: ignore[misc]
+        for name in references
+    }
+    actual = np.array([placed[name].hole for name in references])
+    found = compensate_group(np.array([nominal[name][0] for name in references]), actual)
+    positions, directions = found.apply(*(np.array([nominal[name][i] for name in targets]) for i in (0, 1)))
+    drives = {
+        name: turn_upright(lambda T, name=name: measure(name, T), sensors, drive_pose(p, v))  # type: ignore[misc]
+        for name, p, v in zip(targets, positions, directions, strict=True)
+    }
+    return HoleGroup(placed, found, drives)
+
+
+def turn_upright(measure: Callable[[Array], tuple[Array, Array]], sensors: FlangeSensors, T_base_tool: Array) -> Array:
+    """The pose (4, 4) turned twice by what the rangers see: the second turn takes up what the first one's size left."""
+    for _ in range(2):
+        T_base_tool = align_tool_axis(T_base_tool, measure_hole(sensors, *measure(T_base_tool)).normal)
+    return T_base_tool
+
+
+# What a drilling job found, in sentences: the same on the terminal, on the page and in the recording.
+
+_ABSENT_EFFECTS = {"plate_height": "No error of the plate's height", "k1": "No distortion of the lens"}
+
+
+def correction_sentence(result: DrillResult, length_unit: str) -> str:
+    """What the correction is worth."""
+    before = np.concatenate([np.linalg.norm(c.errors, axis=1) for c in result.groups.values()])
+    after = np.concatenate([np.linalg.norm(c.residuals, axis=1) for c in result.groups.values()])
+    return (
+        f"{len(result.drives)} holes to drill in {len(result.groups)} groups. By the drawing the drives miss the "
+        f"reference holes by {before.min():.2f} to {before.max():.2f} {length_unit}; after the correction "
+        f"{after.max():.2f} {length_unit} at most is left."
+    )
+
+
+def hand_eye_sentences(result: DrillResult, length_unit: str) -> Iterator[str]:
+    """What camera and plate are worth; nothing where four holes leave none to test with."""
+    if len(result.leave_one_out_errors):
+        sizes = np.linalg.norm(result.leave_one_out_errors, axis=1)
+        yield (
+            "Hand-eye: each hole of the plate mapped by the others is off by "
+            f"{sizes.mean():.3f} {length_unit} on average, {sizes.max():.3f} {length_unit} at most."
+        )
+
+
+def significant_effect_sentences(result: DrillResult, length_unit: str) -> Iterator[str]:
+    """Effects of camera and tool that are taken out."""
+    for trial in result.effects.trials if result.effects else ():
+        if trial.accepted:
+            yield f"{_camera_effect_sentence(trial, length_unit)} (1 σ; p = {trial.p_value:.1g}). That is taken out."
+    if result.tool_axis is not None and result.tool_axis.accepted:
+        yield (
+            f"The tool's true axis lies {_tool_tilt_sentence(result.tool_axis)} off its frame's z (1 σ); the drives "
+            "take it up."
+        )
+
+
+def absent_effect_sentences(result: DrillResult) -> Iterator[str]:
+    """Effects of camera and tool that were looked for in vain."""
+    for trial in result.effects.trials if result.effects else ():
+        if not trial.accepted:
+            yield f"{_ABSENT_EFFECTS[trial.effect]} beyond chance (p = {trial.p_value:.1g})."
+    if (tool := result.tool_axis) is not None and not tool.accepted:
+        yield f"No tilt of the tool's axis beyond chance ({_tool_tilt_sentence(tool)}, 1 σ; p = {tool.p_value:.1g})."
+
+
+def _camera_effect_sentence(effect_test: CameraEffectTest, length_unit: str) -> str:
+    """What an effect of the camera is, and its size."""
+    if effect_test.effect == "plate_height":
+        return (
+            f"The plate of holes is {value_uncertainty_text(effect_test.value, effect_test.sigma)} {length_unit} off "
+            "its stated height"
+        )
+    size = value_uncertainty_text(100 * effect_test.value, 100 * effect_test.sigma)
+    return f"The lens shifts the image's corners by {size} % of their way from its middle"
+
+
+def _tool_tilt_sentence(tool: ToolAxis) -> str:
+    return f"{np.degrees(tool.tilt):.2f} ± {np.degrees(tool.sigma):.2f}°"
+
+
+# The reference holes as a points session: sensors on the flange see holes that are fixed in the cell.
+
+
+def hole_session(job: DrillJob, result: DrillResult) -> SessionFiles:
+    """One view for each reference hole; the sensors' frame is the flange's, and the drawing gives the targets.
+
+    The sigma is what leaving one hole of the plate out says of the camera; the rangers' height has none of its own.
+    """
+    T_tool_flange = frames.make(np.eye(3), np.array([0.0, 0.0, -job.height]))
+    names = tuple(job.placed)
+    views = [f"at-{name}" for name in names]
+    T_base_flange = np.array([job.placed[name].T_base_tool @ T_tool_flange for name in names])
+    places = [np.append(hole_in_plane(job, result.H, result.effects, name), job.placed[name].height) for name in names]
+    errors = result.leave_one_out_errors
+    sigma = np.full(len(names), np.sqrt((errors**2).mean())) if len(errors) else None
+    return SessionFiles(
+        name="drilling",
+        length_unit=job.length_unit,
+        mount="eye_in_hand",
+        tables={"scanner": {"pose": np.eye(4).tolist()}},
+        views={"view": views, **pose_columns(T_base_flange)},
+        points=points_table(views, names, np.array(places), sigma),
+        targets={hole.name: hole.position for hole in job.holes if hole.name in names},
+    )
+
+
+# What `stitch drill` does: a job solved, shown, drawn, as a table of drives and as a session.
+
+
+def run_drill(
+    file: Path, output: Path | None, recording: Path | None, report: Path | None, session: Path | None, *, as_json: bool
+) -> None:
+    """Solve a job and hand out what was asked for.
+
+    Raises:
+        InputError, NoResultError: as `stitch drill` ends.
+    """
+    job = read_drill_job(file)
+    result = solve_drill_job(job)
+    if output is not None:
+        write_drives(result, output)
+    if session is not None:
+        write_session(session, hole_session(job, result))
+    write_recording_and_page("drill", recording, report, job, result)
+    if as_json:
+        print(json.dumps(drill_document(result), indent=1))
+    else:
+        _print_result(console(), result, job.length_unit)
+        if output is not None:
+            print(output)
+
+
+def _print_result(terminal: Console, result: DrillResult, unit: str) -> None:
+    terminal.print(correction_sentence(result, unit))
+    for line in (
+        *hand_eye_sentences(result, unit),
+        *significant_effect_sentences(result, unit),
+        *absent_effect_sentences(result),
+    ):
+        terminal.print(line)
+    if result.rangers:
+        terminal.print(_ranger_table(result, unit))
+    terminal.print(_drive_table(result, unit))
+
+
+def _ranger_table(result: DrillResult, unit: str) -> Table:
+    table = Table(title="Beams of the range sensors, in the frame of the flange", title_justify="left")
+    for heading in ("sensor", f"origin x y z / {unit}", "direction", f"rms / {unit}"):
+        table.add_column(heading)
+    for name, beam in result.rangers.items():
+        table.add_row(name, _number_text(beam.origin, 3), _number_text(beam.direction, 4), f"{beam.rms:.3f}")
+    return table
+
+
+def _drive_table(result: DrillResult, unit: str) -> Table:
+    """Corrected poses of the tool, and how far each went from where the drawing has it."""
+    table = Table(title="Drives: T_base_tool, angles about z, y', x''", title_justify="left")
+    for heading in ("hole", "group", f"x y z / {unit}", "a b c / °", f"shift / {unit}"):
+        table.add_column(heading)
+    for drive in result.drives:
+        shift = float(np.linalg.norm(drive.position - drive.hole.position))
+        place, angles = _number_text(drive.position, 3), _number_text(np.degrees(drive.angles), 3)
+        table.add_row(drive.hole.name, drive.hole.group, place, angles, f"{shift:.3f}")
+    return table
+
+
+def _number_text(values: np.ndarray, digits: int) -> str:
+    return " ".join(f"{value:.{digits}f}" for value in values)

@@ -1,1 +1,0 @@
-"""A large panel held by six parallel robots: global model with a laser tracker, pose and shape."""

@@ -1,0 +1,439 @@
+"""The stand and what was read on it.
+
+Stand frame S: origin at slide zero, x along the rail away from P1, z the pivot axis of the rod, y = z × x.
+At angle 0 the rod lies on the rail and points back to P1, towards −x.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from stitch import frames
+from stitch.errors import NoResultError
+from stitch.frames import Array
+
+
+@dataclass(frozen=True)
+class TouchedPoints:
+    """Points that one robot touched, in its own base frame, with their covariance."""
+
+    names: tuple[str, ...]
+    points: Array  # (N, 3), length unit
+    covariance: Array  # (N, 3, 3)
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Everything that was read. Lengths in length_unit, angles in rad.
+
+    `rail` holds the points of the main robot, listed along the rail from P1 on; `rail_slide` the slide reading of the
+    cup touched there, NaN where none was read. `rod` holds the points of the second robot, one per rod setting.
+    """
+
+    length_unit: str
+    rail: TouchedPoints
+    rail_slide: Array  # (N,)
+    rod: TouchedPoints
+    slide: Array  # (M,) position of the pivot along the rail
+    angle: Array  # (M,) from the rail
+    length: Array  # (M,) pivot to cup
+    turn: float  # +1: the angle grows clockwise seen from above, −1: anticlockwise
+    sigma_slide: float
+    sigma_angle: float
+    sigma_length: float
+    sigma_level_stand: float  # how well the rod's swing is horizontal across the rail
+    sigma_level_base: float | None  # how well the two bases are parallel in tilt; None: not known
+    file: Path | None = None  # that was read
+
+
+def cylinder_points(joint1: Array, radius: Array, height: Array) -> Array:
+    """Points (N, 3) of a robot that reaches `radius` and `height` at the joint-1 angle, right-handed about z."""
+    return np.stack([radius * np.cos(joint1), radius * np.sin(joint1), height], axis=-1)
+
+
+def cylinder_covariance(joint1: Array, radius: Array, sigma: tuple[float, float, float]) -> Array:
+    """Covariance (N, 3, 3) of `cylinder_points` from the sigmas of joint 1 (rad), radius and height."""
+    c, s, zero = np.cos(joint1), np.sin(joint1), np.zeros_like(joint1)
+    jacobian = np.stack(
+        [
+            np.stack([-radius * s, c, zero], -1),
+            np.stack([radius * c, s, zero], -1),
+            np.stack([zero, zero, zero + 1], -1),
+        ],
+        axis=-2,
+    )
+    return np.asarray(jacobian @ np.diag(np.square(sigma)) @ np.swapaxes(jacobian, -1, -2))
+
+
+def rod_points(slide: Array, angle: Array, length: Array, turn: float) -> Array:
+    """Rod cup (M, 3) in the stand frame (formulas 5 and 6 of the source, with the slide added)."""
+    across = turn * length * np.sin(angle)
+    return np.stack([slide - length * np.cos(angle), across, np.zeros_like(slide)], axis=-1)
+
+
+def level_stand(rail: Array, rail_slide: Array) -> Array:
+    """T_base1_stand (4, 4) from points (N, 3) on the rail, with the rod's swing horizontal across the rail.
+
+    The source's choice: the line R–S of its figure 6 is perpendicular to the vertical plane through the rail.
+    """
+    x = rail_direction(rail)
+    y = np.cross([0.0, 0.0, 1.0], x)
+    y /= np.linalg.norm(y)
+    known = np.isfinite(rail_slide)
+    origin = np.mean(rail[known] - rail_slide[known, None] * x, axis=0)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.stack([x, y, np.cross(x, y)], axis=-1), origin
+    return T
+
+
+def rail_direction(rail: Array) -> Array:
+    """(3,) unit direction of growing slide, in which the points (N, 3) are listed."""
+    line = np.linalg.svd(rail - rail.mean(axis=0), full_matrices=False)[2][0]
+    return np.asarray(line * np.sign(line @ (rail[-1] - rail[0])))
+
+
+# Distances that two instruments give independently: where they differ, one of them is wrong.
+#
+# The distance between two settings of the rod follows from slide, angle and length alone, whatever the bases are; the
+# second robot measures the same distance by its joints. So the comparison needs no fit and names its pair of points.
+
+
+@dataclass(frozen=True)
+class DistanceComparison:
+    """One distance, by the stand and by a robot's joints."""
+
+    pair: tuple[str, str]
+    by_stand: float
+    by_robot: float
+    sigma: float  # of the difference
+
+    @property
+    def difference(self) -> float:
+        """By robot minus by stand."""
+        return self.by_robot - self.by_stand
+
+    @property
+    def sigmas(self) -> float:
+        """|difference| over its sigma."""
+        return abs(self.difference) / self.sigma
+
+
+def compare_distances(stand: Stand) -> tuple[DistanceComparison, ...]:
+    """Every pair of rod settings, and every pair of rail points whose slide was read; largest contradiction first."""
+    found = [_compare_rod_pair(stand, i, j) for i, j in combinations(range(len(stand.slide)), 2)]
+    known = np.flatnonzero(np.isfinite(stand.rail_slide)).tolist()
+    found += [_compare_rail_pair(stand, i, j) for i, j in combinations(known, 2)]
+    return tuple(sorted(found, key=lambda c: -c.sigmas))
+
+
+def _compare_rod_pair(stand: Stand, i: int, j: int) -> DistanceComparison:
+    """Both slides count as one reading where they are equal: the pivot was not moved."""
+    cups = rod_points(stand.slide, stand.angle, stand.length, stand.turn)
+    apart = cups[j] - cups[i]
+    distance = float(np.linalg.norm(apart))
+    unit = apart / max(distance, np.finfo(float).tiny)
+    variance = 0.0 if stand.slide[i] == stand.slide[j] else 2 * (unit[0] * stand.sigma_slide) ** 2
+    for k in (i, j):
+        along = np.array([-np.cos(stand.angle[k]), stand.turn * np.sin(stand.angle[k]), 0.0])
+        across = np.array([-along[1], along[0], 0.0])
+        variance += (unit @ along * stand.sigma_length) ** 2
+        variance += (unit @ across * stand.length[k] * stand.sigma_angle) ** 2
+    return _distance_comparison(stand.rod, i, j, distance, variance)
+
+
+def _compare_rail_pair(stand: Stand, i: int, j: int) -> DistanceComparison:
+    distance = abs(float(stand.rail_slide[j] - stand.rail_slide[i]))
+    return _distance_comparison(stand.rail, i, j, distance, 2 * stand.sigma_slide**2)
+
+
+def _distance_comparison(
+    touched: TouchedPoints, i: int, j: int, by_stand: float, variance: float
+) -> DistanceComparison:
+    apart: Array = touched.points[j] - touched.points[i]
+    by_robot = float(np.linalg.norm(apart))
+    unit = apart / max(by_robot, np.finfo(float).tiny)
+    variance += float(unit @ (touched.covariance[i] + touched.covariance[j]) @ unit)
+    return DistanceComparison((touched.names[i], touched.names[j]), by_stand, by_robot, float(np.sqrt(variance)))
+
+
+# All readings of the stand as one least-squares problem, every reading with its own sigma.
+
+_TOLERANCES = {"xtol": 1e-10, "ftol": 1e-10, "gtol": 1e-10}
+
+
+@dataclass(frozen=True)
+class BaseFit:
+    """T_base1_base2 with its uncertainty about the axes of base 1."""
+
+    T_base1_base2: Array  # (4, 4)
+    T_base1_stand: Array  # (4, 4)
+    covariance: Array  # (6, 6): rotation (rad) and translation, T = Trans(t + δ) · Rot(φ) · R
+    rail_residuals: Array  # (N, 3) touched minus fitted, base 1
+    rod_residuals: Array  # (M, 3) touched minus fitted, base 2
+    chi_square: float
+    redundancy: int  # readings beyond what the unknowns need
+
+    @property
+    def p_value(self) -> float:
+        """Chance of so large a misfit if the stated sigmas hold; 1 without redundancy."""
+        return float(chi2.sf(self.chi_square, self.redundancy)) if self.redundancy else 1.0
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) sigmas of rotation (rad) and translation."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def fit_stand(stand: Stand) -> BaseFit:
+    """Maximum likelihood over both base poses and over the true values of all rod readings.
+
+    Raises:
+        NoResultError: the readings leave a direction of the second base open.
+    """
+    start = _initial_poses(stand)
+    solution = least_squares(
+        lambda x: _residuals(stand, start, x),
+        np.zeros(_unknown_count(stand)),
+        jac=lambda x: _jacobian(stand, start, x),
+        x_scale=_unknown_scales(stand),
+        method="trf",
+        **_TOLERANCES,
+    )
+    jacobian = solution.jac * _unknown_scales(stand)
+    U, values, Vt = np.linalg.svd(jacobian, full_matrices=False)
+    if len(U) < len(Vt) or values[-1] < 1e-7 * values[0]:
+        raise NoResultError(
+            "turning the second base about the line through its points changes no reading; touch a third point "
+            "off that line, or state level.second_base"
+        )
+    covariance = (Vt.T / values**2) @ Vt * np.outer(_unknown_scales(stand), _unknown_scales(stand))
+    T_stand, T_base, *_ = _unpack(stand, start, solution.x)
+    rail, rod = _point_misfits(stand, start, solution.x)
+    return BaseFit(
+        T_base,
+        T_stand,
+        covariance[6:12, 6:12],
+        rail_residuals=rail,
+        rod_residuals=rod,
+        chi_square=float(2 * solution.cost),
+        redundancy=len(U) - len(Vt),
+    )
+
+
+def _initial_poses(stand: Stand) -> tuple[Array, Array]:
+    """Level stand, and the second base from its points; bases upright where the points leave that open."""
+    T_stand = level_stand(stand.rail.points, stand.rail_slide)
+    here = frames.transform(T_stand, _corrected_rod_points(stand.slide, stand))
+    there = stand.rod.points
+    # The upright pair only decides what two points leave open: a thousandth of the points' spread.
+    up = 1e-3 * np.linalg.norm(there - there.mean(axis=0)) * np.array([[0.0, 0.0, 1.0]])
+    turn = Rotation.align_vectors(
+        np.vstack([here - here.mean(axis=0), up]), np.vstack([there - there.mean(axis=0), up])
+    )[0]
+    R = turn.as_matrix()
+    return T_stand, frames.make(R, here.mean(axis=0) - R @ there.mean(axis=0))
+
+
+def _corrected_rod_points(slide: Array, stand: Stand) -> Array:
+    return rod_points(slide, stand.angle, stand.length, stand.turn)
+
+
+def _unknown_count(stand: Stand) -> int:
+    return 12 + len(stand.rail.points) + 3 * len(stand.slide)
+
+
+def _unknown_scales(stand: Stand) -> Array:
+    """Typical size of each unknown's error, for conditioning: rad for rotations, length elsewhere."""
+    length = max(stand.sigma_length, stand.sigma_slide)
+    pose = np.repeat([stand.sigma_angle, length], 3)
+    along = np.full(len(stand.rail.points), length)
+    rod = np.repeat([stand.sigma_slide, stand.sigma_angle, stand.sigma_length], len(stand.slide))
+    return np.concatenate([pose, pose, along, rod])
+
+
+def _unpack(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, ...]:
+    """Poses, positions along the rail, and corrections of slide, angle and length; x is (..., n)."""
+    N, M = len(stand.rail.points), len(stand.slide)
+    poses = []
+    for T0, step in zip(start, (x[..., :6], x[..., 6:12]), strict=True):
+        turn = frames.exp(np.concatenate([step[..., :3], np.zeros_like(step[..., :3])], axis=-1))[..., :3, :3]
+        poses.append(frames.make(turn @ T0[:3, :3], T0[:3, 3] + step[..., 3:]))
+    along = frames.transform(frames.inverse(start[0]), stand.rail.points)[:, 0] + x[..., 12 : 12 + N]
+    return poses[0], poses[1], along, *np.moveaxis(x[..., 12 + N :].reshape(*x.shape[:-1], 3, M), -2, 0)
+
+
+def _point_misfits(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, Array]:
+    """Touched minus fitted points, each in the base of the robot that touched them."""
+    T_stand, T_base, along, slide, angle, length = _unpack(stand, start, x)
+    rail = frames.transform(T_stand, along[..., None] * np.array([1.0, 0.0, 0.0]))
+    cup = rod_points(stand.slide + slide, stand.angle + angle, stand.length + length, stand.turn)
+    rod = frames.transform(frames.inverse(T_base) @ T_stand, cup)
+    return stand.rail.points - rail, stand.rod.points - rod
+
+
+def _residuals(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
+    """Everything over its sigma: touched points, rod readings, level of the stand and of the second base."""
+    T_stand, T_base, along, slide, angle, length = _unpack(stand, start, x)
+    rail, rod = _point_misfits(stand, start, x)
+    known = np.isfinite(stand.rail_slide)
+    rows = [
+        _whiten(rail, stand.rail.covariance),
+        _whiten(rod, stand.rod.covariance),
+        (along[..., known] - stand.rail_slide[known]) / stand.sigma_slide,
+        slide / stand.sigma_slide,
+        angle / stand.sigma_angle,
+        length / stand.sigma_length,
+        T_stand[..., 2, 1:2] / stand.sigma_level_stand,
+    ]
+    if stand.sigma_level_base is not None:
+        rows.append(T_base[..., :2, 2] / stand.sigma_level_base)
+    return np.concatenate(rows, axis=-1)
+
+
+def _jacobian(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
+    """Central differences, all columns in one evaluation; a step is a hundredth of a typical error."""
+    steps = np.diag(1e-2 * _unknown_scales(stand))
+    both = _residuals(stand, start, x + np.stack([steps, -steps]))
+    return np.asarray((both[0] - both[1]).T / (2e-2 * _unknown_scales(stand)))
+
+
+def _whiten(residuals: Array, covariance: Array) -> Array:
+    white = np.linalg.solve(np.linalg.cholesky(covariance), residuals[..., None])
+    return np.asarray(white.reshape(*residuals.shape[:-2], -1))
+
+
+# The source's solution: project the polyhedron of points and origins onto X-Y, X-Z and Y-Z (formulas 5 to 11).
+#
+# The X-Y plane is solved by the cosine rule, letter for letter but for two misprints: |O2R2| is printed with the
+# coordinates of R1, and |O1e| with |O1P1| where its triangle has the side |O1P2|. Both pairs are equal in the
+# source's experiments. The source's γ counts clockwise; `project` returns right-handed angles, so its γ is −γz.
+#
+# For X-Z and Y-Z the source says only "likewise". With the cosine rule that is 0/0 for its own experiments, where P1
+# and P2 fall on one point of the X-Z plane. Here each of these planes is solved from the vectors R1R2 that rod and
+# second robot give, which is the same triangle; an angle whose R1R2 falls on a point of its plane is taken as level.
+
+# The formulas hold for the source's arrangement only, and elsewhere give any number without a sign of it. So the
+# solution must carry R1 and R2 onto the rod's cup within this share of the rod's length: far above all noise.
+_GAP = 0.05
+# R1R2 shorter in a plane than this share of its length gives no angle there.
+_SHORT = 0.05
+_ARRANGEMENT = "rod and joints contradict each other, or the stand is not placed as the source places it"
+
+
+@dataclass(frozen=True)
+class Projection:
+    """What the three planes give; angles in rad, right-handed; NaN where a plane shows no angle."""
+
+    T_base1_base2: Array  # (4, 4), formula 11
+    gamma_beta_alpha: Array  # (3,)
+    offsets: Array  # (3, 2): px1, py1; px2, pz1; py2, pz2
+
+
+def project(stand: Stand) -> Projection:
+    """T_base1_base2 from exactly two points per robot by the source's three projections.
+
+    Raises:
+        NoResultError: other than two points per robot, a slide that moved between R1 and R2, or triangles that do
+            not close as in the source's arrangement.
+    """
+    if len(stand.rail.points) != 2 or len(stand.rod.points) != 2 or np.ptp(stand.slide) > 0:
+        raise NoResultError(
+            "the projection takes two points per robot and one slide; the least squares takes any number"
+        )
+    R_base1 = frames.transform(level_stand(stand.rail.points, stand.rail_slide), _measured_rod_points(stand))
+    gamma, p_xy = _plane_xy(stand)
+    turned = stand.rod.points @ _rotation(2, gamma).T
+    beta, p_xz = _plane(R_base1, turned, (2, 0), 1)
+    turned = stand.rod.points @ (_rotation(2, gamma) @ _rotation(1, _level(beta))).T
+    alpha, p_zy = _plane(R_base1, turned, (1, 2), 0)
+    rotation = _rotation(2, gamma) @ _rotation(1, _level(beta)) @ _rotation(0, _level(alpha))
+    offsets = np.array([p_xy, p_xz[::-1], p_zy])
+    mean = [(p_xy[0] + p_xz[1]) / 2, (p_xy[1] + p_zy[0]) / 2, (p_xz[0] + p_zy[1]) / 2]
+    T = frames.make(rotation, np.array(mean))
+    gap = float(np.linalg.norm(frames.transform(T, stand.rod.points) - R_base1, axis=1).max())
+    if not gap < _GAP * stand.length.max():
+        raise NoResultError(f"the projection misses the rod's cup by {gap:.3g}; {_ARRANGEMENT}")
+    return Projection(T, np.array([gamma, beta, alpha]), offsets)
+
+
+def _plane_xy(stand: Stand) -> tuple[float, Array]:
+    """γ and (px1, py1) by formulas 5 to 10 and the cosine rules after them.
+
+    Written for the source's side: seen from above, the rod turns clockwise. The other side is its mirror image.
+    """
+    mirror = np.array([1.0, stand.turn, 1.0])
+    P, R = stand.rail.points * mirror, stand.rod.points * mirror
+    rod, theta = _projected_rod(P, stand.angle, stand.length)
+    P2e = (stand.slide[0] - stand.rail_slide[1]) * np.cos(_slope(P))
+    Pr, Rr = np.arctan2(P[:, 1], P[:, 0]), -np.arctan2(R[:, 1], R[:, 0])
+    O1P, O2R = np.hypot(P[:, 0], P[:, 1]), np.hypot(R[:, 0], R[:, 1])
+    P1P2, R1R2 = _third_side(O1P[0], O1P[1], abs(Pr[0] - Pr[1])), _third_side(O2R[0], O2R[1], abs(Rr[0] - Rr[1]))
+    C1, C3 = _angle(O1P[0], P1P2, O1P[1]), _angle(O2R[0], R1R2, O2R[1])
+    C2, C4, C7 = np.pi - (C1 + Pr[0]), np.pi - (C3 + Rr[0]), np.pi - (C3 + abs(Rr[0] - Rr[1]))
+    C5, C6 = _angle(rod[0], R1R2, rod[1]), _angle(R1R2, rod[1], rod[0])
+    gamma_z = C2 + C4 + theta[0] - C5
+    O2e = _third_side(O2R[1], rod[1], C7 + C6)
+    C8 = _angle(O2e, rod[1], O2R[1])
+    C13 = C1 + abs(Pr[0] - Pr[1])
+    O1e = _third_side(P2e, O1P[1], C13)
+    C10 = _angle(P2e, O1e, O1P[1])
+    side = np.sign(Pr[1])
+    er = side * (np.pi - (C13 + C10)) + Pr[1]
+    C9 = C10 + theta[1] - C8
+    O1O2 = _third_side(O2e, O1e, C9)
+    C11 = _angle(O1O2, O1e, O2e)
+    bearing = side * (abs(er) - C11)
+    gamma = float(np.arctan2(np.sin(-gamma_z), np.cos(-gamma_z))) * stand.turn
+    return gamma, O1O2 * np.array([np.cos(bearing), stand.turn * np.sin(bearing)])
+
+
+def _projected_rod(P: Array, angle: Array, length: Array) -> tuple[Array, Array]:
+    """Length and angle of the rod in the X-Y plane, formulas 5 to 10."""
+    RS, ES = length * np.sin(angle), length * np.cos(angle)
+    DE = ES * np.cos(_slope(P))
+    return np.hypot(RS, DE), np.arctan2(RS, DE)
+
+
+def _slope(P: Array) -> float:
+    """Angle of P1P2 against the X-Y plane, formula 7."""
+    return float(np.arctan2(P[0, 2] - P[1, 2], np.hypot(P[0, 0] - P[1, 0], P[0, 1] - P[1, 1])))
+
+
+def _third_side(a: float, b: float, between: float) -> float:
+    return float(np.sqrt(a * a + b * b - 2 * a * b * np.cos(between)))
+
+
+def _angle(a: float, b: float, opposite: float) -> float:
+    """Angle between the sides a and b of a triangle."""
+    cosine = (a * a + b * b - opposite * opposite) / (2 * a * b) if a * b > 0 else np.nan
+    # A triangle that lies flat may miss ±1 by rounding; one that misses more does not close.
+    if not abs(cosine) < 1 + 1e-12:
+        raise NoResultError(f"projection: sides {a:.4f}, {b:.4f} and {opposite:.4f} make no triangle; {_ARRANGEMENT}")
+    return float(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def _plane(R_base1: Array, R_turned: Array, axes: tuple[int, int], normal: int) -> tuple[float, Array]:
+    """Angle about the axis `normal` and the two offsets, from the direction of R1R2 in the plane `axes`."""
+    here, there = R_base1[:, axes], R_turned[:, axes]
+    d1, d2 = here[1] - here[0], there[1] - there[0]
+    seen = np.linalg.norm(d2) > _SHORT * np.linalg.norm(R_turned[1] - R_turned[0])
+    angle = float(np.arctan2(d2[0] * d1[1] - d2[1] * d1[0], d2 @ d1)) if seen else float("nan")
+    turned = R_turned @ _rotation(normal, _level(angle)).T
+    return angle, np.asarray((R_base1 - turned).mean(axis=0)[list(axes)])
+
+
+def _level(angle: float) -> float:
+    return 0.0 if np.isnan(angle) else angle
+
+
+def _rotation(axis: int, angle: float) -> Array:
+    return np.asarray(frames.exp(np.concatenate([angle * np.eye(3)[axis], np.zeros(3)]))[:3, :3])
+
+
+def _measured_rod_points(stand: Stand) -> Array:
+    return rod_points(stand.slide, stand.angle, stand.length, stand.turn)

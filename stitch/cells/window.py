@@ -1,0 +1,586 @@
+"""Both window jobs from their readings to their results and files."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from stitch import frames
+from stitch.cells.cad import (
+    Box,
+    CadSurface,
+    JoinedScans,
+    PlacedScans,
+    Regions,
+    assemble_scans,
+    coverage,
+    read_cad,
+    read_placed_session,
+    read_scan_table,
+)
+from stitch.cells.job_files import (
+    POSE_COLUMNS,
+    JobFile,
+    JsonOption,
+    RecordingOption,
+    ReportOption,
+    SessionOption,
+    check_keys,
+    choice,
+    finite,
+    pose_from_table,
+    poses_from_columns,
+    read_columns,
+    read_job_file,
+    require_unique,
+    resolve_file,
+    rows_from_poses,
+    vectors,
+    write_columns,
+    write_poses,
+    write_recording_and_page,
+)
+from stitch.cells.scan_to_cad import (
+    Allowance,
+    AllowancePrior,
+    CadFit,
+    CadStart,
+    Deviations,
+    allowance_sentence,
+    find_cad_start,
+    fit_cad,
+    measure_deviations,
+    read_allowance,
+    split_instances,
+    write_deviation_csv,
+    write_deviation_ply,
+)
+from stitch.cells.seam import VERDICTS, Limits, Seam, Station, measure_seam
+from stitch.errors import InputError, NoResultError
+from stitch.frames import Array
+from stitch.measurement.session import Cloud
+from stitch.system.process import console
+from stitch.units import uncertainty_text
+from stitch.writing.session_files import SessionFiles, pose_columns, write_session
+
+# `stitch fit JOB`: where the parts lie, how they differ from their CAD, and the robot path that follows them.
+
+
+def fit(
+    file: JobFile,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="For map and path.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    allowance: Annotated[
+        str | None,
+        typer.Option(
+            metavar="free|varying|SIZE", help="Stock on a casting, outside = plus: found evenly, varying, or stated."
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit scans onto a CAD model without a guess: pose, deviation map and corrected robot path.
+
+    \b
+    Examples:
+      stitch fit fit.toml --report page.html
+      stitch fit casting.toml --allowance free
+    """
+
+    run_fit(file, allowance, output, recording, report, session=session, as_json=as_json)
+
+
+# A robot path moved along with the part.
+
+
+def correct_path(T_base_tool: Array, T_base_part_nominal: Array, T_base_part: Array) -> Array:
+    """Poses (N, 4, 4) that stand to the found part as the programmed ones stand to the nominal part.
+
+    T_base_tool' = T_base_part · T_base_part_nominal⁻¹ · T_base_tool.
+    """
+    return T_base_part @ frames.inverse(T_base_part_nominal) @ T_base_tool
+
+
+# Job files of `stitch fit` and `stitch seam` (TOML); every check of the input is made here.
+
+FIT_FORMAT, SEAM_FORMAT = "stitch-fit/1", "stitch-seam/1"
+_SCANS = {"scans", "session", "hand_eye"}
+_FIT_KEYS = {"format", *_SCANS, "cad", "length_unit"}
+_FIT_KEYS |= {"instances", "tolerance", "cell", "region", "nominal", "path", "coverage"}
+_SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma"}
+
+
+@dataclass(frozen=True)
+class FitJob:
+    """Scans onto one CAD model; lengths in the CAD's unit, `length_unit` where somebody says which that is."""
+
+    placed: PlacedScans
+    scan: JoinedScans  # the same as one cloud
+    cad: CadSurface
+    cad_file: Path
+    instances: int
+    tolerance: float
+    cell: float
+    regions: Regions
+    coverage: float  # share of every expected region that must be seen
+    T_base_part_nominal: Array | None  # (4, 4)
+    path: tuple[list[str], Array] | None  # names and T_base_tool (N, 4, 4)
+    file: Path | None = None  # that was read
+    allowance_prior: AllowancePrior = field(default_factory=AllowancePrior)  # of the stock on the part
+    length_unit: str | None = None
+
+
+@dataclass(frozen=True)
+class SeamJob:
+    """Scans of a seam, where the part lies and where to measure; mm."""
+
+    placed: PlacedScans
+    scan: JoinedScans  # the same as one cloud
+    T_base_part: Array  # (4, 4)
+    stations: tuple[Station, ...]
+    limits: Limits
+    pose_sigma: float
+    file: Path | None = None  # that was read
+
+
+def read_fit_job(file: Path | str) -> FitJob:
+    """Read and check a job of `stitch fit`.
+
+    Raises:
+        InputError: a file is missing or malformed; an entry is missing, unknown or impossible.
+    """
+    file = Path(file)
+    document = read_job_file(file, FIT_FORMAT, _FIT_KEYS, "examples/window/fit.toml")
+    nominal = pose_from_table(file, "nominal", document["nominal"]) if "nominal" in document else None
+    if "path" in document and nominal is None:
+        raise InputError(f"{file}: path needs [nominal]: the part's pose for which the path was programmed")
+    path = None
+    if "path" in document:
+        rows = read_columns(resolve_file(file, "path", document["path"]), "name", POSE_COLUMNS)
+        path = (rows.texts["name"], poses_from_columns(rows))
+    instances = document.get("instances", 1)
+    if not isinstance(instances, int) or isinstance(instances, bool) or instances < 1:
+        raise InputError(f"{file}: instances is {instances!r}; write how many parts are in the scan, 1 or more")
+    cad_file = resolve_file(file, "cad", document.get("cad"))
+    cad, placed = read_cad(cad_file), _read_scans(file, document)
+    unit = placed.length_unit if "session" in document else None  # else neither scans nor CAD name it
+    if "length_unit" in document:
+        unit = choice(file, "length_unit", document["length_unit"], (unit,) if unit else ("mm", "m"))
+    return FitJob(
+        placed=placed,
+        scan=assemble_scans(placed),
+        cad=cad,
+        cad_file=cad_file,
+        instances=instances,
+        tolerance=finite(file, "tolerance", document.get("tolerance", 0.5), positive=True),
+        cell=finite(file, "cell", document.get("cell", cad.size / 60), positive=True),
+        regions=_read_regions(file, document.get("region", [])),
+        coverage=finite(file, "coverage", document.get("coverage", 0.5)),
+        T_base_part_nominal=nominal,
+        path=path,
+        file=file,
+        length_unit=unit,
+    )
+
+
+def read_seam_job(file: Path | str) -> SeamJob:
+    """Read and check a job of `stitch seam`.
+
+    Raises:
+        InputError: a file is missing or malformed; an entry is missing, unknown or impossible.
+    """
+    file = Path(file)
+    document = read_job_file(file, SEAM_FORMAT, _SEAM_KEYS, "examples/window/seam.toml")
+    if ("part" in document) == ("fit" in document):
+        raise InputError(f"{file}: say where the part lies: either [part] with its pose, or fit = the fit.json of it")
+    T_base_part = (
+        pose_from_table(file, "part", document["part"]) if "part" in document else _fitted_pose(file, document["fit"])
+    )
+    limits = document.get("limits", {})
+    check_keys(file, "limits", limits, set(Limits.__dataclass_fields__))
+    values = {key: finite(file, f"limits.{key}", value, positive="tolerance" in key) for key, value in limits.items()}
+    placed = _read_scans(file, document)
+    return SeamJob(
+        placed=placed,
+        scan=assemble_scans(placed),
+        T_base_part=T_base_part,
+        stations=_read_stations(resolve_file(file, "stations", document.get("stations"))),
+        limits=Limits(**values),
+        pose_sigma=abs(finite(file, "pose_sigma", document.get("pose_sigma", 0.0))),
+        file=file,
+    )
+
+
+def _read_scans(file: Path, document: dict[str, Any]) -> PlacedScans:
+    """From a table of scanner poses, or from a session and a hand-eye."""
+    if ("scans" in document) == ("session" in document):
+        raise InputError(f"{file}: say where the scans are: scans = a table of them, or session = a session folder")
+    if "scans" in document and "hand_eye" in document:
+        raise InputError(f"{file}: hand_eye goes with session; the poses of a table of scans are the scanner's own")
+    if "scans" in document:
+        return read_scan_table(resolve_file(file, "scans", document["scans"]))
+    if "hand_eye" not in document:
+        raise InputError(f"{file}: session needs hand_eye = what `stitch calibrate sphere -o` wrote")
+    return read_placed_session(*(resolve_file(file, key, document[key]) for key in ("session", "hand_eye")))
+
+
+def _read_regions(file: Path, entries: Any) -> Regions:
+    boxes: dict[str, list[Box]] = {"expected": [], "forbidden": []}
+    if not isinstance(entries, list):
+        raise InputError(f"{file}: region must be written as [[region]], one for each box")
+    for i, entry in enumerate(entries):
+        place = f"region[{i + 1}]"
+        check_keys(file, place, entry, {"name", "kind", "low", "high"})
+        kind = choice(file, f"{place}.kind", entry.get("kind"), tuple(boxes))
+        form = "[x, y, z] in the part's frame"
+        low, high = (vectors(file, f"{place}.{key}", entry.get(key), (3,), form) for key in ("low", "high"))
+        if (low >= high).any():
+            raise InputError(f"{file}: {place}.low must lie below its high in x, y and z; the box is empty")
+        boxes[kind].append(Box(str(entry.get("name", place)), low, high))
+    return Regions(tuple(boxes["expected"]), tuple(boxes["forbidden"]))
+
+
+def _fitted_pose(job: Path, name: Any) -> Array:
+    """T_base_part (4, 4) of the first part of a fit.json."""
+    file = resolve_file(job, "fit", name)
+    try:
+        T = np.array(json.loads(file.read_text(encoding="utf-8"))["parts"][0]["T_base_part"], float)
+    except FileNotFoundError:
+        raise InputError(f"{file}: not found; run stitch fit with -o first, or give [part]") from None
+    except (ValueError, KeyError, IndexError, TypeError):
+        raise InputError(f"{file}: holds no parts[0].T_base_part; name the fit.json that stitch fit wrote") from None
+    if not frames.is_rigid(T):
+        raise InputError(f"{file}: parts[0].T_base_part is no rigid motion; run stitch fit again")
+    return T
+
+
+def _read_stations(file: Path) -> tuple[Station, ...]:
+    columns = read_columns(file, "station", "x y z across_x across_y across_z out_x out_y out_z")
+    names = columns.texts["station"]
+    middle = columns.stack("x y z")
+    across, out = columns.stack("across_x across_y across_z"), columns.stack("out_x out_y out_z")
+    require_unique(file, "station", names)
+    for i, name in enumerate(names):
+        if np.linalg.norm(np.cross(across[i], out[i])) < 0.5 or abs(np.linalg.norm(out[i]) - 1) > 0.05:
+            raise InputError(f"{file}: station {name}: across and out must be unit vectors at right angles")
+    return tuple(Station(n, m, a, o) for n, m, a, o in zip(names, middle, across, out, strict=True))
+
+
+@dataclass(frozen=True)
+class FittedPart:
+    """One part found in the scan."""
+
+    start: CadStart
+    fit: CadFit
+    deviations: Deviations
+    coverage: dict[str, float]  # of expected regions
+    forbidden: dict[str, int]  # usable points in forbidden regions
+    path: Array | None  # (N, 4, 4) corrected T_base_tool
+
+
+def fit_parts(job: FitJob) -> list[FittedPart]:
+    """Start, fit and map every part; largest first.
+
+    Raises:
+        NoResultError: a part is not found, or an expected region is not covered.
+    """
+    return [_fit_part(job, scan) for scan in split_instances(job.scan, job.cad, job.instances)]
+
+
+def _fit_part(job: FitJob, scan: Any) -> FittedPart:
+    start = find_cad_start(scan, job.cad)
+    found = fit_cad(scan, job.cad, start.T_base_part, job.regions, job.allowance_prior)
+    T = frames.inverse(found.T_base_part)
+    local, normals = frames.transform(T, scan.points[scan.usable]), frames.rotate(T, scan.normals[scan.usable])
+    covered = {box.name: coverage(box, job.cad, local, normals) for box in job.regions.expected}
+    for name, share in covered.items():
+        if share < job.coverage:
+            raise NoResultError(
+                f"expected region {name}: only {share:.0%} of it was scanned, {job.coverage:.0%} wanted; scan it, or "
+                "lower `coverage`"
+            )
+    forbidden = {box.name: int(box.holds(local).sum()) for box in job.regions.forbidden}
+    path = None
+    if job.path is not None and job.T_base_part_nominal is not None:
+        path = correct_path(job.path[1], job.T_base_part_nominal, found.T_base_part)
+    mapped = measure_deviations(
+        scan, job.cad, found.T_base_part, tolerance=job.tolerance, cell=job.cell, allowance=found.allowance
+    )
+    return FittedPart(start, found, mapped, coverage=covered, forbidden=forbidden, path=path)
+
+
+def fit_document(job: FitJob, parts: list[FittedPart]) -> dict[str, Any]:
+    """Plain data for JSON; length_unit of the CAD, degrees."""
+    return {"format": "stitch-fit-result/1", "noise": job.scan.noise, "parts": [_part_document(p) for p in parts]}
+
+
+def _part_document(part: FittedPart) -> dict[str, Any]:
+    cells = part.deviations.cells
+    worst = int(np.argmax(np.abs(cells.mean))) if len(cells.mean) else None
+    pose = rows_from_poses(part.fit.T_base_part[None])[0].tolist()
+    return {
+        "T_base_part": part.fit.T_base_part.tolist(),
+        "pose": dict(zip(POSE_COLUMNS.split(), pose, strict=True)),
+        "sigma": part.fit.sigma[3:].tolist(),
+        "sigma_deg": np.degrees(part.fit.sigma[:3]).tolist(),
+        "scale": part.fit.scale,
+        "rms": part.fit.rms,
+        "inliers": part.fit.inliers,
+        "points": part.fit.points,
+        "start_share": part.start.share,
+        "start_runner_up": part.start.runner_up,
+        "cells": len(cells.mean),
+        "cells_outside": int(part.deviations.outside.sum()),
+        "worst": None if worst is None else {"at": cells.middle[worst].tolist(), "deviation": float(cells.mean[worst])},
+        "coverage": part.coverage,
+        "points_in_forbidden": part.forbidden,
+        **({} if part.fit.allowance is None else {"allowance": _allowance_document(part.fit.allowance)}),
+    }
+
+
+def _allowance_document(allowance: Allowance) -> dict[str, Any]:
+    return {
+        "value": allowance.value,
+        "sigma": allowance.sigma,
+        "kind": "varying" if allowance.prior.varying else "free" if allowance.prior.free else "stated",
+        "lowest": allowance.lowest,
+        "highest": allowance.highest,
+        "sigma_field": allowance.sigma_field,
+        "told_apart": allowance.separable_share,
+    }
+
+
+def write_fit(job: FitJob, parts: list[FittedPart], folder: Path) -> list[str]:
+    """fit.json, and for each part its map and path; returns the files' names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "fit.json").write_text(json.dumps(fit_document(job, parts), indent=1) + "\n", encoding="utf-8")
+    written = ["fit.json"]
+    for i, part in enumerate(parts):
+        tail = f"-{i + 1}" if len(parts) > 1 else ""
+        names = [f"deviation{tail}.ply", f"deviation{tail}.csv"]
+        write_deviation_ply(folder / names[0], part.deviations)
+        write_deviation_csv(folder / names[1], part.deviations)
+        if part.path is not None and job.path is not None:
+            names.append(f"path{tail}.csv")
+            write_poses(folder / names[-1], "name", job.path[0], part.path)
+        written += names
+    return written
+
+
+def solve_seam(job: SeamJob) -> list[Seam]:
+    """Flush and gap at every station.
+
+    Raises:
+        NoResultError: no station could be measured.
+    """
+    seams = measure_seam(job.scan, job.T_base_part, job.stations, job.limits, job.pose_sigma)
+    if all(seam.verdict == "not measured" for seam in seams):
+        raise NoResultError(f"no station could be measured; the first: {seams[0].reason}")
+    return seams
+
+
+def write_seam(seams: list[Seam], file: Path) -> None:
+    """One row per station."""
+    names = ("station", "flush", "gap", "sigma_flush", "sigma_gap", "verdict", "reason")
+    write_columns(file, {name: [getattr(seam, name) for seam in seams] for name in names})
+
+
+# What a fit found, in sentences: the same on the terminal, on the page and in the recording.
+
+NO_UNIT = "Lengths in the unit of the CAD, whose file names none; length_unit in the job states it."
+
+
+def with_unit(job: FitJob, size: str) -> str:
+    """A length with its unit, where that is known."""
+    return f"{size} {job.length_unit}" if job.length_unit else size
+
+
+def agreement_sentence(job: FitJob, part: FittedPart, name: str) -> str:
+    """How well the part lies on its CAD, and how many cells of the map are out."""
+    bad, cells = part.deviations.outside, part.deviations.cells
+    where = f"its points scatter about the CAD by {with_unit(job, f'{part.fit.scale:.3f}')} (1 σ)"
+    if not bad.any():
+        limit = with_unit(job, f"{part.deviations.tolerance:g}")
+        return f"{name} is found; {where}, and all {len(bad)} cells of the map are within {limit}."
+    worst = with_unit(job, f"{cells.mean[int(np.argmax(np.abs(cells.mean)))]:+.2f}")
+    return f"{name} is found; {where}, but {bad.sum()} of {len(bad)} cells of the map are out, by {worst} at most."
+
+
+def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
+    """Pose with its sigma, stock, doubt, the worst cell and what did not count."""
+    yield _pose_sentence(job, part)
+    if part.fit.allowance is not None:
+        yield allowance_sentence(part.fit.allowance, job.length_unit)
+    if part.start.runner_up > 0.9 * part.start.share:
+        yield (
+            f"Another pose meets {part.start.runner_up:.0%} of the scan, this one {part.start.share:.0%}: the part is "
+            "nearly symmetric, or too little of it was scanned."
+        )
+    if part.deviations.outside.any():
+        cells = part.deviations.cells
+        worst = int(np.argmax(np.abs(cells.mean)))
+        at = ", ".join(f"{axis} {value:.0f}" for axis, value in zip("xyz", cells.middle[worst], strict=True))
+        yield (
+            f"Worst cell: {with_unit(job, f'{cells.mean[worst]:+.2f}')} at {with_unit(job, at)} of the part's frame "
+            "(plus: outside the CAD)."
+        )
+    for name, count in part.forbidden.items():
+        if count:
+            yield f"{count} points in forbidden region {name} did not count."
+
+
+def _pose_sentence(job: FitJob, part: FittedPart) -> str:
+    x, y, z, a, b, c = rows_from_poses(part.fit.T_base_part[None])[0]
+    shift, turn = part.fit.sigma[3:].max(), np.degrees(part.fit.sigma[:3]).max()
+    place = with_unit(job, f"x {x:.3f}, y {y:.3f}, z {z:.3f}")
+    return (
+        f"T_base_part: {place}, ± {uncertainty_text(shift)} at most; a {a:.4f}, b {b:.4f}, c {c:.4f}° about z, y', "
+        f"x'', ± {uncertainty_text(turn)}° at most (1 σ)."
+    )
+
+
+# The scans of a part or a seam as a cloud session, with the hand-eye that placed them and their CAD.
+
+
+def scan_session(name: str, placed: PlacedScans, cad: Path | None = None) -> SessionFiles:
+    """One view for each scan; where the job knew only the scanner's poses, the scanner itself counts as the flange."""
+    files = [f"clouds/{view}.ply" for view in placed.names]
+    tables = {"scanner": {"pose": placed.T_flange_scanner.tolist()}}
+    if cad is not None:
+        tables["part"] = {"cad": cad.name, "cad_unit": placed.length_unit}
+    return SessionFiles(
+        name=name,
+        length_unit=placed.length_unit,
+        mount="eye_in_hand",
+        tables=tables,
+        views={"view": placed.names, "cloud": files, **pose_columns(placed.T_base_flange)},
+        clouds={file: Cloud(points) for file, points in zip(files, placed.clouds, strict=True)},
+        copies=() if cad is None else (cad,),
+    )
+
+
+# What `stitch fit` does: parts fitted, shown, drawn, as map and path and as a session.
+
+
+def run_fit(
+    file: Path,
+    allowance: str | None,
+    output: Path | None,
+    recording: Path | None,
+    report: Path | None,
+    *,
+    session: Path | None,
+    as_json: bool,
+) -> None:
+    """Fit the parts of a job and hand out what was asked for.
+
+    Raises:
+        InputError, NoResultError: as `stitch fit` ends.
+    """
+    wanted = read_allowance(allowance)
+    job = replace(read_fit_job(file), allowance_prior=wanted)
+    parts = fit_parts(job)
+    written = write_fit(job, parts, output) if output is not None else []
+    if session is not None:
+        write_session(session, scan_session(file.stem, job.placed, job.cad_file))
+    write_recording_and_page("fit", recording, report, job, parts)
+    if as_json:
+        print(json.dumps(fit_document(job, parts), indent=1))
+        return
+    _print_parts(console(), job, parts)
+    for name in written:
+        print(f"{output}/{name}")
+
+
+def _print_parts(terminal: Console, job: FitJob, parts: list[FittedPart]) -> None:
+    for i, part in enumerate(parts):
+        terminal.print(agreement_sentence(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))
+        for line in detail_sentences(job, part):
+            terminal.print(f"  {line}")
+    if job.length_unit is None:
+        terminal.print(NO_UNIT)
+
+
+# What a seam's stations say, in sentences: the same on the terminal, on the page and in the recording.
+
+
+def limits_text(limits: Limits) -> str:
+    """What is allowed."""
+    flush, gap = f"{limits.flush:g} ± {limits.flush_tolerance:g}", f"{limits.gap:g} ± {limits.gap_tolerance:g}"
+    return f"flush {flush} mm, gap {gap} mm"
+
+
+def stations_sentence(limits: Limits, seams: list[Seam]) -> str:
+    """How many stations are good."""
+    counts = {verdict: sum(s.verdict == verdict for s in seams) for verdict in VERDICTS}
+    found = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+    return f"{len(seams)} stations: {found}. Allowed: {limits_text(limits)}."
+
+
+# What `stitch seam` does: stations measured, shown, drawn, as a table and as a session.
+
+
+def run_seam(
+    file: Path, output: Path | None, recording: Path | None, report: Path | None, session: Path | None, *, as_json: bool
+) -> None:
+    """Measure the stations of a seam and hand out what was asked for.
+
+    Raises:
+        InputError, NoResultError: as `stitch seam` ends.
+    """
+    job = read_seam_job(file)
+    seams = solve_seam(job)
+    if output is not None:
+        write_seam(seams, output)
+    if session is not None:
+        write_session(session, scan_session(file.stem, job.placed))
+    write_recording_and_page("seam", recording, report, job, seams)
+    if as_json:
+        rows = [{k: None if isinstance(v, float) and np.isnan(v) else v for k, v in asdict(s).items()} for s in seams]
+        print(json.dumps(rows, indent=1))
+        return
+    _print_seams(seams, job.limits)
+    if output is not None:
+        print(output)
+
+
+def _print_seams(seams: list[Seam], limits: Limits) -> None:
+    table = Table(title="Stations, ± 1 σ", title_justify="left")
+    for heading in ("station", "flush / mm", "gap / mm", "verdict"):
+        table.add_column(heading)
+    for s in seams:
+        values = (f"{s.flush:+.3f} ± {s.sigma_flush:.3f}", f"{s.gap:.3f} ± {s.sigma_gap:.3f}")
+        table.add_row(
+            s.station, *(("", "") if s.reason else values), f"{s.verdict}{': ' if s.reason else ''}{s.reason}"
+        )
+    terminal = console()
+    terminal.print(stations_sentence(limits, seams))
+    terminal.print(table)
+
+
+# `stitch seam JOB`: flush and gap around a window.
+
+
+def seam(
+    file: JobFile,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="CSV", help="Write the stations.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure flush and gap at the stations of a seam, with uncertainty and verdict.
+
+    \b
+    Examples:
+      stitch seam seam.toml --report page.html
+    """
+
+    run_seam(file, output, recording, report, session, as_json=as_json)

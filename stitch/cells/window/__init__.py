@@ -1,1 +1,0 @@
-"""A window in a car body: scan onto CAD, deviation map, corrected path, flush and gap of the seam."""

@@ -1,1 +1,0 @@
-"""What the commands do, each loaded when its command is called."""

@@ -1,1 +1,0 @@
-"""What to measure next: candidate views and what they would tell apart."""

@@ -1,0 +1,268 @@
+"""On what the unexplained part of the poses depends: every covariate, with the shape as binned means."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.diagnosis.ranking import Ranked, rank_all
+from stitch.diagnosis.score import Score, score
+from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, ODDS
+from stitch.diagnosis.unnamed_joint_laws import FittedProcess
+from stitch.diagnosis.unnamed_time_laws import RepeatingError
+from stitch.effects.empirical import FIELD
+from stitch.frames import Array
+from stitch.measurement.measurement import Views
+from stitch.model.forward import moves_points, scan_correction
+from stitch.observations.linear_model import WHITE_COMPONENTS, LinearModel
+from stitch.observations.pose_errors import DRIFT_MEMORY, JOINT_SCATTER, PoseErrors
+from stitch.observations.surfaces.matching import Match, signed_distances
+from stitch.observations.surfaces.scanner_errors import field_scatter
+from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.statistics.least_squares import column_space, project_out
+from stitch.statistics.reml import fit_variances
+from stitch.statistics.variance_posterior import mean_variances
+
+# A scanner that errs by where in its field a point is seen, by no law of the library.
+#
+# Axes of unequal scale or not at right angles, a plane of focus that is bent to one side: the same in every view, so
+# that
+# overlaps show it, and joints, mount or time only seem to have a part in it.
+
+
+def follows_field(empirical: Sequence[Ranked], unnamed: Sequence[RepeatingError]) -> bool:
+    """True if the field is the likeliest of all shapes without a cause, 20 to 1 over errors of poses that repeat.
+
+    Args:
+        empirical: best first.
+        unnamed: what poses do again without a name; both are over scatter and what an arm usually errs by.
+    """
+    best = next(iter(empirical), None)
+    if best is None or best.name != FIELD or best.adjusted >= ALPHA_UNKNOWN:
+        return False
+    others = [r.score.log_bayes_factor for r in empirical[1:2]] + [u.log_bayes_factor for u in unnamed]
+    return bool(best.score.log_bayes_factor > max([0.0, *others]) + ODDS)
+
+
+# What a candidate effect would leave between the surfaces, correspondence by correspondence.
+
+
+def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Array | None:
+    """(M,) signed distances of all correspondences under the model, and the best form of a candidate with it.
+
+    In the linear approximation, hand-eye and effects in use fitted anew beside the candidate, as `add` fits them: poses
+    scatter independently. Beside all that an arm may do the hand-eye may lie far off, and what the arm then does is in
+    no prediction. The candidate is scored anew for that: another of its forms may explain most where poses scatter
+    independently than beside all that an arm may do, and that one `add` reaches.
+
+    In the order of the matches to which the views were freed. None without clouds.
+    """
+    surfaces = linear.observation
+    if not isinstance(surfaces, SurfaceObservation):
+        return None
+    fitted = linear.scatter_only
+    if scored is not None and fitted is not linear:
+        scored = score(fitted, scored.candidate)
+    linear = fitted
+    freed = surfaces.unconstrained
+    poses = surfaces.capture.poses(linear.model.T_mount)
+    points = [scan.points for scan in surfaces.capture.scans]
+    twists = linear.design @ linear.baseline_trial.solve()
+    if scored is not None:
+        X, sums = np.hstack([linear.design, scored.form.response]), scored.candidate.points
+        found = linear.trial(X, None if sums is None else sums.select(scored.form.keep)).solve()
+        k = scored.form.response.shape[1]
+        term = scored.form.at(found[-k:])
+        if moves_points([term]):
+            # Such an effect changes the points, and the views only as hand-eye and the others follow.
+            twists = X[:, :-k] @ found[:-k]
+            measurement, every = linear.measurement, slice(None)
+            points = [p + scan_correction(measurement, [term], v, poses[v], every) for v, p in enumerate(points)]
+        else:
+            twists = X @ found
+    matches, centre = freed.overlaps.matches, freed.overlaps.gram.centre
+    return signed_distances(matches, poses, points) + _along_normals(matches, centre, twists.reshape(-1, 6))
+
+
+def _along_normals(matches: Sequence[Match], centre: Array, twists: Array) -> Array:
+    """(M,) B(δ_v − δ_w) of `gram.py`: what twists (V, 6) about `centre` do to the distances.
+
+    Not by moving the views: where hand-eye and links can stand in for one another, both move far and their common
+    motion alone counts.
+    """
+    out = []
+    for m in matches:
+        turned, moved = np.split(twists[m.v] - twists[m.w], 2)
+        out.append(np.cross(m.middle - centre, m.normal) @ turned + m.normal @ moved)
+    return np.concatenate(out)
+
+
+# What the poses leave, by source: named effects, a course of time, smooth errors, wandering, white scatter, noise.
+
+# Sources that are new in every view, or no error of the poses.
+NOT_REPEATING = ("sensor noise", "white repeatability", "scanner field")
+# Components as people call them; the arm's own keep the name of their effects.
+_SOURCE_NAMES = {
+    "sensor noise": "sensor noise",
+    "white rotation": "white repeatability",
+    "white translation": "white repeatability",
+    JOINT_SCATTER: "white repeatability",
+    "smooth": "smooth, unnamed",
+    **dict.fromkeys(DRIFT_MEMORY, "wandering in time"),
+    "stop rotation": "shared by the scans of a stop",
+    "stop translation": "shared by the scans of a stop",
+}
+
+
+@dataclass(frozen=True)
+class BudgetLine:
+    """One source of what the poses leave."""
+
+    source: str
+    variance_share: float  # of all sources; they add up to 1
+    sigma: float  # rms over the directions that are seen
+    unit: str
+
+
+def variance_budget(
+    linear: LinearModel, named: Sequence[Score] = (), course: FittedProcess | None = None
+) -> tuple[BudgetLine, ...]:
+    """Shares of what effects in use took away and of what remains, largest first; () where poses have no prior.
+
+    Args:
+        named: candidates that are said to be missing: what they explain is theirs.
+        course: of the flange in time, where one is said to be there.
+    """
+    if (errors := linear.pose_errors) is None:
+        return ()
+    linear = _with_observed_field(linear)
+    hand_eye = linear.reduce(linear.design[:, :6])
+    squares: dict[str, float] = {}
+    for term, response in zip(linear.model.terms, linear.responses(linear.model.terms), strict=True):
+        squares[term.name] = _unexplained_square(hand_eye, linear.reduce(response.columns) @ term.values)
+    for effect in named:
+        squares[effect.name] = _unexplained_square(hand_eye, effect.form.columns @ effect.values)
+    explained = [s.form.columns for s in named]
+    if course is not None:
+        squares["one course of time"] = _unexplained_square(hand_eye, course.numbers)
+        explained.append(course.columns)
+    for name, square in _remaining_squares(linear, errors, explained):
+        squares[name] = squares.get(name, 0.0) + square
+    total, unit, n = sum(squares.values()), linear.measurement.length_unit, linear.mixed.size
+    lines = [BudgetLine(s, x / max(total, 1e-300), float(np.sqrt(max(x, 0.0) / n)), unit) for s, x in squares.items()]
+    return tuple(sorted(lines, key=lambda line: -line.variance_share))
+
+
+def _with_observed_field(linear: LinearModel) -> LinearModel:
+    """With smooth errors of the scanner as large as the overlaps show them; an alarm allows for larger ones."""
+    seen = linear.observation
+    if linear.mixed.fixed is None or not isinstance(seen, SurfaceObservation):
+        return linear
+    field = linear.reduce(field_scatter(linear.measurement, seen.unconstrained, share=None))
+    return replace(linear, mixed=replace(linear.mixed, fixed=(field @ field.T)[None]))
+
+
+def _remaining_squares(linear: LinearModel, errors: PoseErrors, named: Sequence[Array]) -> Iterator[tuple[str, float]]:
+    """Sums of squares that each component leaves beside the model and what is named."""
+    U = column_space(np.hstack([linear.reduce(linear.design), *named]))
+    mixed = replace(linear.mixed, A=U[None])
+    sizes = mean_variances(mixed, fit_variances(mixed, both_starts=True))
+    of_every_joint = {component for component, _ in errors.effects.values()}
+    called = _SOURCE_NAMES | {component: f"{component} of every joint" for component in of_every_joint}
+    for name, size, C in zip((*WHITE_COMPONENTS, *errors.names), sizes, mixed.components[:, 0], strict=True):
+        yield called.get(name, name), float(size * (np.trace(C) - np.sum(U * (C @ U))))
+    if linear.mixed.fixed is not None:
+        C = linear.mixed.fixed[0]
+        yield "scanner field", float(np.trace(C) - np.sum(U * (C @ U)))
+
+
+def _unexplained_square(base: Array, numbers: Array) -> float:
+    """What no hand-eye explains of numbers (n,), squared."""
+    return float(np.sum(project_out(base, numbers[:, None]) ** 2))
+
+
+_BINS = 5
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """One covariate; bins, mean and sigma show the shape along the direction that follows it most."""
+
+    covariate: str
+    score: float  # share of the views' unexplained scatter that follows it, 0 … 1
+    p_value: float  # family-wise over all covariates and shapes
+    bins: Array  # (B,) middle of each bin
+    mean: Array  # (B,) displacement at the part, length_unit
+    sigma: Array  # (B,)
+    shape: str  # the empirical form that fits best, in words
+
+
+def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Dependence]:
+    """The best empirical form of every covariate, clearest first.
+
+    Over scatter alone: what follows a covariate may also be an error of the poses that repeats; this says where it is.
+    """
+    if linear.pose_errors is not None:
+        linear = linear.scatter_only
+        empirical = rank_all(linear, [r.score.candidate for r in empirical])[1]
+    views = linear.measurement.views
+    best: dict[str, Ranked] = {}
+    for r in empirical:
+        group = r.score.candidate.effect.group
+        if group not in best or r.score.log_bayes_factor > best[group].score.log_bayes_factor:
+            best[group] = r
+    found = [
+        _dependence(linear, r, course)
+        for name, r in best.items()
+        if (course := covariate_values(views, name)) is not None
+    ]
+    return sorted(found, key=lambda d: (d.p_value, -d.score))
+
+
+def covariate_values(views: Views, name: str) -> Array | None:
+    """(V,) values of a covariate, a joint angle in degrees, the time, or the order of the views for an event."""
+    if name == "time_s":
+        return views.time
+    if name == "an event":
+        return np.arange(views.count, dtype=float)
+    if joint := re.fullmatch(r"j(\d+)_deg", name):
+        return np.asarray(np.degrees(views.joints[:, int(joint[1]) - 1]))
+    return views.covariates.get(name)
+
+
+def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependence:
+    scored = ranked.score
+    white = linear.residual(scored.form.columns)
+    basis, s, _ = np.linalg.svd(white, full_matrices=False)
+    basis = basis[:, s > 1e-9 * max(float(s[0]), 1e-300)]
+    share = float(np.sum((basis.T @ linear.white_residual) ** 2) / max(float(np.sum(linear.white_residual**2)), 1e-300))
+    displacement = linear.view_displacements()
+    # The direction in which the displacements follow the fitted shape most.
+    fitted = linear.observation.part_displacements(scored.form.columns @ scored.values)
+    direction = np.linalg.svd(fitted, full_matrices=False)[2][0]
+    y = displacement @ direction
+    if np.dot(y, fitted @ direction) < 0:
+        y = -y
+    centres, mean, sigma = bin_means(course, y)
+    effect = scored.candidate.effect
+    return Dependence(
+        covariate=effect.group if effect.group != "an event" else "view order",
+        score=share,
+        p_value=ranked.adjusted,
+        bins=centres,
+        mean=mean,
+        sigma=sigma,
+        shape=effect.formula,
+    )
+
+
+def bin_means(x: Array, y: Array, bins: int = _BINS) -> tuple[Array, Array, Array]:
+    """Middle, mean and standard error of y in bins of x with equal counts; views are the samples."""
+    order = np.argsort(x, kind="stable")
+    parts = [p for p in np.array_split(order, min(bins, max(len(x) // 2, 1))) if len(p)]
+    spread = float(np.std(y, ddof=1)) if len(y) > 1 else 0.0
+    middle = np.array([x[p].mean() for p in parts])
+    mean = np.array([y[p].mean() for p in parts])
+    sigma = np.array([(np.std(y[p], ddof=1) if len(p) > 2 else spread) / np.sqrt(len(p)) for p in parts])
+    return middle, mean, sigma

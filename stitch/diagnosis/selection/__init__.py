@@ -1,1 +1,0 @@
-"""From scores to a verdict: ranking, forward selection, backward elimination."""

@@ -1,0 +1,198 @@
+"""The smallest size of an effect that these views would show: both tests in use pass with 80 % probability.
+
+An effect of true parameters θ shifts the squared length of its whitened columns' projection by λ = θᵀIθ. The
+scatter is known to ν degrees of freedom only, and takes its share of what the effect does: the test statistic q
+is non-central F, and the log evidence ½ ν log(1 + q/ν) in place of ½ q. For one parameter, known scatter and the
+p-value alone this is |θ| = (z_{1−α/2K} + z_{power})/√I.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import brentq
+
+from stitch import frames
+from stitch.diagnosis.candidates import Candidate
+from stitch.diagnosis.score import Score, form_weights, scales_of
+from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR, POWER
+from stitch.frames import Array
+from stitch.observations.linear_model import LinearModel
+from stitch.statistics.distributions import f_limit, noncentral_f_tail
+
+# Which candidates are aliases in these views: correlation of what they do, hand-eye and model projected out.
+
+
+@dataclass(frozen=True)
+class Alias:
+    """Another effect that could do what this one does."""
+
+    name: str
+    correlation: float  # of this one's fitted pattern with the best that the other can do
+
+
+def effect_pattern(linear: LinearModel, scored: Score) -> Array:
+    """(n,) what the fitted candidate does to the views, in units of their scatter."""
+    white = linear.residual(scored.form.columns)
+    if np.any(scored.values):
+        return np.asarray(white @ scored.values)
+    # Nothing fitted: the most visible combination of plausible size.
+    U, s, _ = np.linalg.svd(white * scored.form.sizes, full_matrices=False)
+    return np.asarray(U[:, 0] * s[0])
+
+
+def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
+    """(K, K): how much of the fitted pattern of row k the effect of the column can imitate, 0 … 1.
+
+    The other effect may use all its parameters, but none beyond ten times its plausible size.
+    """
+    patterns = [effect_pattern(linear, s) for s in scores]
+    whites = [linear.residual(s.candidate.forms[0].columns) for s in scores]
+    out = np.eye(len(scores))
+    for i, y in enumerate(patterns):
+        for j, (white, scored) in enumerate(zip(whites, scores, strict=True)):
+            if i != j:
+                out[i, j] = imitated_share(y, white * scored.candidate.forms[0].sizes)
+    return out
+
+
+def aliases_of(k: int, matrix: Array, scores: Sequence[Score], least: float = 0.7) -> list[Alias]:
+    """The most similar effects of candidate k."""
+    order = np.argsort(-matrix[k])
+    return [Alias(scores[j].name, float(matrix[k, j])) for j in order if j != k and matrix[k, j] > least][:5]
+
+
+def imitated_share(y: Array, X: Array) -> float:
+    """How much of a pattern (n,) columns (n, p) of plausible size can do, 0 … 1; nothing at all is like nothing."""
+    length = float(np.linalg.norm(y))
+    if length == 0 or not X.size:
+        return 0.0
+    # Ridge at ten plausible sizes: what is invisible cannot be blown up to imitate anything.
+    M = X.T @ X + 0.01 * np.eye(X.shape[1])
+    fitted = X @ np.linalg.solve(M, X.T @ y)
+    alike = float(np.linalg.norm(fitted))
+    return float(np.clip(fitted / alike @ (y / length), 0.0, 1.0)) if alike > 0 else 0.0
+
+
+# How far an effect that is too small to be seen would push the hand-eye: what its sigma does not hold.
+
+
+def hand_eye_response(linear: LinearModel) -> Array:
+    """(3, n) how whitened numbers (n,) displace the middle of the scanner's field through the fitted hand-eye."""
+    middle = np.mean([points.mean(axis=0) for points in linear.measurement.capture.point_sets], axis=0)
+    lever = np.hstack([-frames.skew(middle), np.eye(3)])
+    length = np.linalg.norm(linear.white_design, axis=0)
+    scale = np.where(length > 0, length, 1.0)
+    return np.asarray(lever @ (np.linalg.pinv(linear.white_design / scale, rcond=1e-10) / scale[:, None])[:6])
+
+
+def omitted_effect_bias(
+    linear: LinearModel, push: Array, candidate: Candidate, detectable: dict[str, float]
+) -> float | None:
+    """Largest displacement (length_unit) of the middle of the scanner's field by the error of the hand-eye.
+
+    Each parameter in turn is there unseen, at its smallest detectable size or, where that is larger, at its plausible
+    one; the hand-eye takes up of it what generalised least squares gives it. None if these views show no parameter.
+
+    Args:
+        push: of the same linear model (`hand_eye_response`).
+    """
+    found = []
+    for form in candidate.forms:
+        for p, moved in zip(form.free, (push @ linear.whiten(form.columns)).T, strict=True):
+            if np.isfinite(detectable.get(p.name, np.inf)):
+                found.append(min(detectable[p.name], p.typical) * float(np.linalg.norm(moved)))
+    return max(found, default=None)
+
+
+# Squares, in units of the scatter, beyond which an effect is of no plausible size: its prior holds back all of it.
+_UNDETECTABLE = 1e6
+# Of plausible size and nothing else.
+SINGLE_SCALE = {1.0: 1.0}
+
+
+def least_noncentrality(
+    white: Array,
+    weight: float,
+    tests: int,
+    degrees_of_freedom: float,
+    scales: Mapping[float, float] = SINGLE_SCALE,
+) -> float:
+    """θᵀIθ that a form needs to be detected.
+
+    Args:
+        white: (n, p) whitened columns at their plausible sizes.
+        weight: share of the candidate's prior that the form has.
+        tests: number of candidates.
+        degrees_of_freedom: degrees of freedom of the scatter along the columns.
+        scales: of the plausible sizes, with their shares (`amplitude_scales.py`).
+    """
+    information = np.linalg.eigvalsh(white.T @ white)
+    rank = int((information > 1e-2).sum())
+    if rank == 0:
+        return float("inf")
+    by_p = rank * f_limit(ALPHA_NAME * weight / max(tests, 1), rank, max(degrees_of_freedom, 1.0))
+    factor, told = LOG_BAYES_FACTOR - float(np.log(weight)), information.clip(0)
+    by_factor = [_squares_for(factor - float(np.log(y)), s**2 * told, degrees_of_freedom) for s, y in scales.items()]
+    needed = max(by_p, min(by_factor))
+    if needed > _UNDETECTABLE:
+        return float("inf")
+
+    def missed(shift: float) -> float:
+        return noncentral_f_tail(needed / rank, rank, degrees_of_freedom, shift) - POWER
+
+    # From below: the series of the distribution fails for shifts far beyond what is needed.
+    enough = needed + 10.0
+    while missed(enough) < 0:
+        enough *= 1.5
+    return float(brentq(missed, 1e-9, enough))
+
+
+def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -> float:
+    """Squared length of the projection at which a form gains that log Bayes factor beside what it could have been.
+
+    Args:
+        information: (p,) of its parameters per unit of their prior; where it is little, the prior keeps back a share.
+    """
+    kept = float(np.sum(information**2 / (1 + information)) / max(float(information.sum()), 1e-300))
+    charged = (factor + 0.5 * float(np.log1p(information).sum())) / max(kept, 1e-3)
+    return degrees_of_freedom * float(np.expm1(min(2 * charged / degrees_of_freedom, 500.0)))
+
+
+@dataclass(frozen=True)
+class FormInformation:
+    """What the views show of one form of a candidate."""
+
+    names: tuple[str, ...]  # of its free parameters (p,)
+    white: Array  # (n, p) whitened columns per unit
+    sizes: Array  # (p,) plausible ones
+    weight: float  # share of the candidate's prior
+    degrees_of_freedom: float  # of the scatter along the columns
+    scales: Mapping[float, float] = field(
+        default_factory=lambda: SINGLE_SCALE
+    )  # of the plausible sizes, with their shares
+
+
+def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
+    """Smallest detectable size of every free parameter of a candidate among so many."""
+    linear = linear.without([candidate.name])
+    shown = []
+    for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
+        white = linear.residual(form.columns)
+        known = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
+        names = tuple(p.name for p in form.free)
+        shown.append(FormInformation(names, white, form.sizes, float(weight), known, scales_of(linear)))
+    return detectable_sizes_by_form(shown, tests)
+
+
+def detectable_sizes_by_form(forms: Sequence[FormInformation], tests: int) -> dict[str, float]:
+    """Per parameter the size that is detectable when it alone is not zero, by the form that shows it best."""
+    found: dict[str, dict[tuple[str, ...], list[float]]] = {}
+    for form in forms:
+        white, known = form.white * form.sizes, form.degrees_of_freedom
+        least = least_noncentrality(white, form.weight, tests, known, form.scales)
+        for name, length in zip(form.names, np.linalg.norm(form.white, axis=0), strict=True):
+            size = float(np.sqrt(least) / length) if length > 0 else float("inf")
+            found.setdefault(name, {}).setdefault(form.names, []).append(size)
+    # Forms of the same parameters differ in when something happened: any of them could be true.
+    return {name: min(float(np.median(own)) for own in by_form.values()) for name, by_form in found.items()}

@@ -1,0 +1,347 @@
+"""What a candidate would leave, in the fit and on views left out, in the linear approximation."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.diagnosis.candidates import Form
+from stitch.diagnosis.score import Score, score
+from stitch.diagnosis.thresholds import HALVES_P_VALUE, MAX_REMAINING_SHARE, MIN_STEADINESS
+from stitch.frames import Array, Indices
+from stitch.observations.linear_model import CoefficientPrior, LinearModel, LinearTrial
+from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.statistics.distributions import chi2_tail, normal_tail
+from stitch.statistics.folds import JointEnd, halves_of
+from stitch.statistics.least_squares import column_space, mean_square_share
+
+# Whether a candidate helps where nothing was measured: at ends of joints' ranges that were left out.
+#
+# A wrong effect may imitate among the measured poses what is not known, and err beyond them; left-out neighbours in
+# time or pose lie among the others and do not show it. The ends judge together. Where more than one thing is missing, a
+# right effect takes away what hid another at some end and makes that one a little worse; an imitation helps at many
+# ends
+# and is far off at others. So a further end must be likely to become better, the ends being samples of it.
+
+# Odds of three to one that an end of which nobody knows would be predicted better.
+_LIKELY_SHARE = 0.75
+# Of Student's t, and a prior so wide that all views find what they can see.
+_FREEDOM, _WIDE = 4.0, 10.0
+
+
+@dataclass(frozen=True)
+class Extrapolation:
+    """What a candidate leaves at the ends, each predicted from all other views."""
+
+    share: float  # mean square distance over that of the present model, all ends together
+    sigma: float  # standard error of `share`, ends as samples
+    worst: JointEnd
+    worst_share: float  # the same at the end that is made worse most clearly
+    worst_sigma: float  # standard error of `worst_share`, views as samples
+    likely: float  # probability that a further end is predicted better
+
+    @property
+    def helps(self) -> bool:
+        """True if the ends together are predicted better by more than a standard error, and a further one probably."""
+        return self.share <= 1 - self.sigma and self.likely >= _LIKELY_SHARE
+
+    @property
+    def errs_somewhere(self) -> bool:
+        """True if an end is predicted worse by more than a standard error."""
+        return self.worst_share > 1 + self.worst_sigma
+
+    @property
+    def unseen(self) -> bool:
+        """True if the ends together are as well predicted with the effect as without."""
+        return MAX_REMAINING_SHARE <= self.share <= 1 / MAX_REMAINING_SHARE
+
+    def rejection_reason(self, name: str) -> str:
+        """What speaks against an effect that explains much."""
+        return (
+            f"{name} would help among the poses that were measured, but not beyond: at ends of joints' ranges that are "
+            f"left out it leaves {self.share:.2f} ± {self.sigma:.2f} of the mean square error, "
+            f"{self.worst_share:.2f} ± {self.worst_sigma:.2f} in {self.worst.name}; a further end would become better "
+            f"with a probability of {self.likely:.0%}"
+        )
+
+
+def untested_ends_reason(names: Sequence[str]) -> str:
+    """What speaks against effects of which the ends together tell nothing."""
+    return (
+        f"{', '.join(names[:-1])} and {names[-1]} would help among the poses that were measured, but not beyond: ends "
+        f"of joints' ranges that are left out change by less than {1 - MAX_REMAINING_SHARE:.0%} together, for "
+        "better or worse"
+    )
+
+
+def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
+    """The best form of a candidate at the ends; None where the views are too few to leave one out."""
+    ends = linear.observation.joint_ends(linear.measurement.views.joints)
+    if not ends:
+        return None
+    a, X = linear.design.shape[1], np.hstack([linear.design, scored.form.response])
+    prior = _student_prior(linear, X, np.append(linear.sizes, scored.sizes))
+    trials = (
+        linear.trial(X, None, prior),
+        linear.trial(X[:, :a], None, CoefficientPrior(prior.precision[:a], prior.mean[:a])),
+    )
+    squares = [[t.squares(t.solve(end.views))[end.views] for t in trials] for end in ends]
+    shares = [mean_square_share(with_it, without) for with_it, without in squares]
+    worst = max(range(len(ends)), key=lambda k: (shares[k][0] - 1) / max(shares[k][1], 1e-300))
+    total = mean_square_share(*np.array([[own.sum() for own in row] for row in squares]).T)
+    logs = np.log([max(share, 1e-300) for share, _ in shares])
+    spread = np.std(logs, ddof=1) * np.sqrt(1 + 1 / len(logs)) if len(logs) > 1 else 0.0
+    likely = normal_tail(float(np.mean(logs) / max(spread, 1e-12)))
+    return Extrapolation(*total, ends[worst], *shares[worst], likely)
+
+
+def _student_prior(linear: LinearModel, X: Array, sizes: Array) -> CoefficientPrior:
+    """A prior of the parameters' plausible sizes with the tails of Student's t, for fits that lack an end.
+
+    What the other views hardly see would otherwise be anything, and the end would judge that instead of the effect. The
+    normal prior that stands for t with ν degrees of freedom at an estimate θ has the variance (ν·s² + θ²)/(ν + 1)
+    (Lange, Little & Taylor 1989, J. Am. Stat. Assoc. 84:881).
+    """
+    middle = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
+    free = 1 / (_WIDE * sizes) ** 2
+    found = linear.trial(X, None, CoefficientPrior(free, middle)).solve() - middle
+    known = np.where(np.isfinite(sizes), found, 0.0)
+    return CoefficientPrior((_FREEDOM + 1) / (_FREEDOM * sizes**2 + known**2), middle)
+
+
+# Of a plausible size: what was not found has some size, or its prior would have none.
+_NEGLIGIBLE_SQUARE = 1e-6
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Mean square of what remains over that of the present model."""
+
+    inside: float  # fitted on all views
+    heldout: float  # each fold judged by a fit without it
+    poses: float  # the same for where the views were freed to, in units of their scatter, without the sensor's noise
+    poses_sigma: float  # spread of `poses` over folds; each view is in two of them: some 0.6 standard errors
+    steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
+
+    @property
+    def helps(self) -> bool:
+        """True if views left out are predicted better, by more than folds differ."""
+        return self.poses <= 1 - self.poses_sigma
+
+    def rejection_reason(self, name: str) -> str | None:
+        """Why an effect should not be in a model of many poses, if it should not: these show even what hardly helps."""
+        if self.helps and self.poses <= MAX_REMAINING_SHARE:
+            return None
+        share = f"{self.poses:.3f} ± {self.poses_sigma:.3f}"
+        return f"{name} hardly helps on views left out (mean square error {share} of without)"
+
+
+def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
+    """Add the best form of a candidate to the model, in the linear approximation.
+
+    What would be left is told of the fit that `add` makes, in which poses scatter independently; whether views left out
+    are predicted, beside everything else that poses may err by.
+    """
+    fitted = linear.scatter_only
+    beside = scored.base_model or linear
+    trial, shares, weights, scatter = _residual_shares_by_fold(beside, scored)
+    whole = trial
+    if beside is not fitted:
+        whole, shares, weights, _ = _residual_shares_by_fold(fitted, score(fitted, scored.candidate))
+    poses, poses_sigma = mean_square_share(*scatter)
+    present = fitted.baseline_trial
+    return CrossValidation(
+        inside=float(whole.squares(whole.solve()).sum() / present.squares(present.solve()).sum()),
+        heldout=float(np.average(shares, weights=weights)),
+        poses=poses,
+        poses_sigma=poses_sigma,
+        steadiness=_steadiness(beside, trial, _model_and_candidate_columns(beside, scored), trial.solve()),
+    )
+
+
+def _model_and_candidate_columns(linear: LinearModel, scored: Score) -> Array:
+    """(·, a + k) response to the model and the candidate."""
+    return np.hstack([linear.design, scored.form.response])
+
+
+def _residual_shares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, list[float], list[float], Array]:
+    """The fit with a candidate; per fold the share of its squares that a fit without it leaves, their weights, and
+    (2, G) scatter of its poses."""
+    X, points = _model_and_candidate_columns(linear, scored), scored.candidate.points
+    own = None if points is None else points.select(scored.form.keep)
+    trial, present = linear.trial(X, own), linear.baseline_trial
+    believed = linear.trial(X, own, prior_of_sizes(linear, scored))
+    shares, weights, scatter = [], [], np.zeros((2, 0))
+    for fold in linear.observation.folds():
+        touched = linear.observation.affected_squares(fold)
+        without = [t.solve(fold) for t in (believed, present)]
+        squares = [t.squares(x)[touched].sum() for t, x in zip((trial, present), without, strict=True)]
+        shares.append(squares[0] / max(squares[1], 1e-300))
+        weights.append(squares[1])
+        off = [t.scatter(fold, x) for t, x in zip((trial, present), without, strict=True)]
+        scatter = np.column_stack([scatter, off])
+    return trial, shares, weights, scatter
+
+
+def prior_of_sizes(linear: LinearModel, scored: Score) -> CoefficientPrior:
+    """Prior for model and candidate in fits without some views.
+
+    Views that carry most of an effect leave little to predict it from where they are left out. So without them the
+    effect is believed to be as large as it was found with all views, of either sign, and no larger: what little is
+    left to see does not count for more than that.
+    """
+    size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
+    size = np.maximum(size, _NEGLIGIBLE_SQUARE * scored.form.sizes)
+    precision = np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
+    return CoefficientPrior(precision, np.zeros(len(precision)))
+
+
+def _steadiness(linear: LinearModel, trial: LinearTrial, X: Array, whole: Array) -> float:
+    """A combination of parameters that one view carries alone vanishes without it."""
+    size = X.shape[1] - linear.design.shape[1]
+    theta = whole[-size:]
+    if not theta.any():
+        return 0.0
+    white = linear.residual(linear.reduce(X[:, -size:]))
+    strength = float(np.sum((white @ theta) ** 2))
+    shares = [
+        float((white @ theta) @ (white @ trial.solve(np.array([v]))[-size:])) / max(strength, 1e-300)
+        for v in trial.influential_views(whole)
+    ]
+    return min(shares)
+
+
+# Whether effects that cannot be told apart predict views left out, all of them together.
+
+
+def group_helps(share: float, sigma: float) -> bool:
+    """True if a group leaves less on views left out, by more than folds differ."""
+    return share <= 1 - sigma
+
+
+def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, float]:
+    """How far left-out poses lie from what the group predicts over how far from the present model, mean square.
+
+    Returns:
+        The share, and its standard error with folds as samples. Effects of points count by what they do to poses.
+    """
+    a = linear.design.shape[1]
+    precision = np.concatenate([np.zeros(a), *(prior_of_sizes(linear, own).precision[a:] for own in group)])
+    prior = CoefficientPrior(precision, np.zeros(len(precision)))
+    trial = linear.trial(np.hstack([linear.design, *(own.form.response for own in group)]), None, prior)
+    pairs = [(t, t.solve(fold), fold) for fold in linear.observation.folds() for t in (trial, linear.baseline_trial)]
+    off = np.array([t.scatter(fold, found) for t, found, fold in pairs]).reshape(-1, 2)
+    return mean_square_share(off[:, 0], off[:, 1])
+
+
+# Whether an effect holds in halves of the views: found in one, judged in the other, which took no part in choosing it.
+#
+# The views are halved in the order of time, by the region of their poses, and alternately. In each half the form of the
+# effect is chosen anew and its sizes are fitted; the other half says how much likelier its numbers are with that effect
+# than without (partial Bayes factor; Berger & Pericchi 1996, J. Am. Stat. Assoc. 91:109). What imitates something else
+# among all the views has another size or sign in each half. All of it beside the pose errors that remain with the
+# effect.
+
+# A prior of this many plausible sizes keeps what a half does not see finite, and moves nothing else.
+_FREE = 30.0
+
+
+@dataclass(frozen=True)
+class Halves:
+    """What the halves say of an effect that all views together suggest."""
+
+    log_bayes_factor: float  # of what each half predicts of the other, mean over the ways to halve
+    p_value: float  # that the sizes in both halves are one and the same, Bonferroni over the ways to halve
+    share: float  # smallest share of the effect of all views that a half finds; < 0: the sign changes
+
+    def rejection_reason(self, name: str) -> str | None:
+        """What speaks against an effect that explains much, if anything does."""
+        if self.log_bayes_factor <= 0:
+            return f"{name} found in one half of the views does not help in the other"
+        # A clear effect whose form is not quite right differs a little, beyond chance: it is there all the same.
+        if self.p_value < HALVES_P_VALUE and self.share < MIN_STEADINESS:
+            return f"{name} has another size or sign in each half of the views (p = {self.p_value:.1g})"
+        return None
+
+
+@dataclass(frozen=True)
+class _HalfEvidence:
+    """What some views say of the parameters (p,) of a form: log likelihood vᵀθ − ½ θᵀIθ."""
+
+    information: Array  # (p, p)
+    vector: Array  # (p,)
+
+    def fitted(self, prior: Array) -> tuple[Array, Array]:
+        """Mean (p,) and precision (p, p) with a prior (p,) around zero."""
+        precision = self.information + np.diag(prior**-2)
+        return np.asarray(np.linalg.solve(precision, self.vector), float), precision
+
+
+def validate_in_halves(scored: Score) -> Halves | None:
+    """The best form of a candidate, and all its forms, in halves of the views; None where pose errors have no prior."""
+    base = scored.base_model
+    if base is None or not isinstance(base.observation, SurfaceObservation):
+        return None
+    surfaces = base.observation
+    gains, p_values, shares = [], [], []
+    ways = halves_of(surfaces.capture.T_reference_mount, surfaces.unconstrained.overlaps.gram.lever)
+    for way in ways:
+        bases = [explained_basis(base, surfaces, other) for other in reversed(way)]
+        gains.append(sum(_predictive_factor(scored, base, *pair) for pair in (bases, bases[::-1])))
+        a, b = (_half_evidence(base, U, scored.form) for U in bases)
+        p_values.append(_size_consistency(a, b, scored.form.sizes))
+        shares.append(_least_confirmed_share(a, b, scored.form.sizes))
+    return Halves(float(np.mean(gains)), min(1.0, len(ways) * min(p_values)), min(shares))
+
+
+def explained_basis(base: LinearModel, surfaces: SurfaceObservation, out: Indices) -> Array:
+    """(n, r) orthonormal basis of what the model, and the views that are left out moving freely, explain."""
+    free = np.eye(surfaces.reduced_poses.reduction.shape[1])[:, (6 * out[:, None] + np.arange(6)).ravel()]
+    return column_space(np.hstack([base.white_design, base.whiten(surfaces.reduce(free))]))
+
+
+def _half_evidence(base: LinearModel, explained: Array, form: Form) -> _HalfEvidence:
+    white = base.whiten(form.columns)
+    white = white - explained @ (explained.T @ white)
+    return _HalfEvidence(white.T @ white, white.T @ base.white_z)
+
+
+def _predictive_factor(scored: Score, base: LinearModel, chosen_in: Array, tested_in: Array) -> float:
+    """Log Bayes factor in one half of the form that the other half prefers, at the sizes found there; before any view
+    these are of the scale that all views together prefer."""
+    forms = scored.candidate.forms
+    seen, priors = (
+        [_half_evidence(base, chosen_in, form) for form in forms],
+        [scored.scale * form.sizes for form in forms],
+    )
+    best = max(range(len(forms)), key=lambda i: _log_predictive_gain(seen[i], 0 * priors[i], np.diag(priors[i] ** -2)))
+    mean, precision = seen[best].fitted(priors[best])
+    return _log_predictive_gain(_half_evidence(base, tested_in, forms[best]), mean, precision)
+
+
+def _log_predictive_gain(seen: _HalfEvidence, mean: Array, precision: Array) -> float:
+    """Log of the likelihood over that of no effect, averaged over a normal prior."""
+    scale = 1 / np.sqrt(np.diag(precision))
+    units = np.outer(scale, scale)
+    P, told, v, m = precision * units, seen.information * units, seen.vector * scale, mean / scale
+    pull = v + P @ m
+    square = pull @ np.linalg.solve(told + P, pull) - m @ P @ m
+    return float(0.5 * square - 0.5 * (np.linalg.slogdet(told + P)[1] - np.linalg.slogdet(P)[1]))
+
+
+def _size_consistency(a: _HalfEvidence, b: _HalfEvidence, sizes: Array) -> float:
+    """p-value of a χ² test of the difference, over the combinations that both halves see."""
+    (mean_a, one), (mean_b, other) = (s.fitted(_FREE * sizes) for s in (a, b))
+    d = (mean_a - mean_b) / sizes
+    covariance = sum(np.linalg.inv(p * np.outer(sizes, sizes)) for p in (one, other))
+    values, vectors = np.linalg.eigh(covariance)
+    told = values < 0.5 * _FREE**2
+    return chi2_tail(float(np.sum((vectors.T @ d)[told] ** 2 / values[told])), int(told.sum())) if told.any() else 1.0
+
+
+def _least_confirmed_share(a: _HalfEvidence, b: _HalfEvidence, sizes: Array) -> float:
+    """Of what both together find, the share that the one finds that finds less, along its direction."""
+    told = a.information + b.information
+    both = _HalfEvidence(told, a.vector + b.vector).fitted(sizes)[0]
+    along = told @ both / max(float(both @ told @ both), 1e-300)
+    return min(float(along @ s.fitted(sizes)[0]) for s in (a, b))

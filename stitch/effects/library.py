@@ -1,0 +1,180 @@
+"""Effects of the arm: the true joint angles q* and the true links."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from stitch.effects.contract import effect, event, number, offset, per_joint, per_torque, twist
+from stitch.frames import Array
+from stitch.measurement.measurement import ScanView, Views
+from stitch.measurement.robot import Links
+
+# Effects of the scanner's mount: the true one is M·exp(twist).
+
+
+@effect("mount", needs=("time",), xi=twist("/h", 1e-3, 0.4))
+def mount_drift(views: Views, xi: Array) -> Array:
+    """M·exp(ξ (t−t₀)/3600 s)"""
+    return np.outer(views.hours, xi)
+
+
+@effect(
+    "mount",
+    needs=("time",),
+    xi=twist("", 6e-4, 0.2),
+    T_c=number("s", typical=600.0, limit=1e5, grid=(150.0, 300.0, 600.0, 1200.0)),
+)
+def mount_warmup(views: Views, xi: Array, T_c: float) -> Array:
+    """M·exp(ξ (1−e^(−(t−t₀)/T_c)))"""
+    return np.outer(1 - np.exp(-views.time / max(T_c, 1.0)), xi)
+
+
+@effect("robot", needs=("velocity",), dt=number("s", typical=2e-3, limit=0.5))
+def latency(joints: Array, views: Views, dt: float) -> Array:
+    """q* = q + q̇ Δt: pose taken at t, scan at t+Δt"""
+    assert views.velocity is not None
+    return joints + views.velocity * dt
+
+
+@effect("robot", needs=("joints",), d=per_joint("rad", typical=1e-3, limit=0.02))
+def joint_offset(joints: Array, views: Views, d: Array) -> Array:
+    """q* = q + δ"""
+    return joints + d
+
+
+@effect(
+    "links",
+    needs=("joints",),
+    da=per_joint("mm", 0.3, 5.0),
+    dd=per_joint("mm", 0.3, 5.0),
+    dalpha=per_joint("rad", 6e-4, 0.02),
+)
+def link_geometry(links: Links, views: Views, da: Array, dd: Array, dalpha: Array) -> Links:
+    """DH a, d, α off by Δ"""
+    return replace(links, da=links.da + da, dd=links.dd + dd, dalpha=links.dalpha + dalpha)
+
+
+@effect("robot", needs=("torque",), c=per_torque("rad/(N m)", typical=5e-6, limit=2e-4))
+def joint_compliance(joints: Array, views: Views, c: Array) -> Array:
+    """q*_i = q_i + c_i τ_i(q), τ the gravity torque"""
+    return joints + views.sag(c)
+
+
+@effect("robot", needs=("joints",), A=per_joint("rad", 4e-4, 0.01), B=per_joint("rad", 4e-4, 0.01))
+def gear_eccentricity(joints: Array, views: Views, A: Array, B: Array) -> Array:
+    """q*_i = q_i + A_i sin q_i + B_i cos q_i"""
+    return np.asarray(joints + A * np.sin(views.joints) + B * np.cos(views.joints))
+
+
+@effect("robot", needs=("joints",), A=per_joint("rad", 4e-4, 0.01), B=per_joint("rad", 4e-4, 0.01))
+def gear_harmonic(joints: Array, views: Views, A: Array, B: Array) -> Array:
+    """q*_i = q_i + A_i sin 2q_i + B_i cos 2q_i"""
+    return np.asarray(joints + A * np.sin(2 * views.joints) + B * np.cos(2 * views.joints))
+
+
+@effect("robot", needs=("joints",), b=per_joint("rad", 3e-4, 0.005))
+def backlash(joints: Array, views: Views, b: Array) -> Array:
+    """q*_i = q_i − b_i·approach_i"""
+    return joints - b * views.approach
+
+
+@effect("robot", needs=("joints",), s=per_joint("1", 5e-4, 0.02))
+def settling(joints: Array, views: Views, s: Array) -> Array:
+    """q*_i = q_i + s_i·(q_i − q_i of the previous row)"""
+    return joints + s * (views.joints - views.previous)
+
+
+@effect("links", needs=("joints",), prefers=("robot_temperature_c",), g=number("1/°C", typical=2e-5, limit=2e-4))
+def robot_thermal_growth(links: Links, views: Views, g: float) -> Links:
+    """DH lengths ×(1+g·ΔT), ΔT from robot_temperature_c; without it g per hour"""
+    return replace(links, scale=links.scale * (1 + g * warmer(views, "robot_temperature_c")))
+
+
+def warmer(views: Views, covariate: str) -> Array:
+    """(V,) ΔT since the first view, or hours where nobody measured."""
+    return views.since_first(covariate) if covariate in views.covariates else views.hours
+
+
+# Effects of the part: it creeps, slips, grows or sags in the reference frame.
+
+
+@effect("part", needs=("time",), xi=twist("/h", 1e-3, 0.4))
+def fixture_drift(views: Views, xi: Array) -> Array:
+    """exp(ξ (t−t₀)/3600 s) in the reference frame"""
+    return np.outer(views.hours, xi)
+
+
+@effect("part", xi=twist("", 6e-4, 0.2), v=event())
+def part_slip(views: Views, xi: Array, v: float) -> Array:
+    """from view v on (counted from 0), the part sits displaced by ξ"""
+    return np.outer(views.number >= v, xi)
+
+
+@effect(
+    "shape",
+    prefers=("part_temperature_c",),
+    g=number("1/°C", typical=3e-5, limit=5e-4),
+    c=offset("mm/°C", typical=3e-3, limit=0.2),
+)
+def part_growth(points: Array, view: ScanView, g: float, c: Array) -> Array:
+    """x = x* + ((x*−o)·g + c)·ΔT, o the flange or the middle of the scans; ΔT of part_temperature_c, else hours
+
+    Scaled about its frame's origin, where no session says: the point at −c/g from o stands still.
+    """
+    return points + ((points - view.origin) * g + c) * float(warmer(view.views, "part_temperature_c")[view.index])
+
+
+@effect("shape", kappa=number("1/mm", typical=5e-6, limit=1e-3))
+def part_sag(points: Array, view: ScanView, kappa: float) -> Array:
+    """point at distance h from the clamp plane (part z=0) moves κ·h² along gravity"""
+    return points + kappa * points[:, 2:] ** 2 * view.gravity
+
+
+# Effects of the scanner: where it reports a point that is at x*. A tracker or its probe has none of them.
+
+
+@effect("sensor", needs=("optics",), s=number("1", typical=1e-3, limit=0.02))
+def range_scale(points: Array, view: ScanView, s: float) -> Array:
+    """x = (1+s) x*"""
+    return points * (1 + s)
+
+
+@effect("sensor", needs=("optics",), k=number("mm", typical=5.0, limit=100.0))
+def range_nonlinearity(points: Array, view: ScanView, k: float) -> Array:
+    """x = x* + u·k·(r/r₀−1)², r₀ the standoff"""
+    u = view.along(points)
+    r = (view.away(points) * u).sum(axis=1)
+    return np.asarray(points + u * (k * (r / view.views.standoff - 1) ** 2)[:, None])
+
+
+@effect("sensor", needs=("surfaces",), b=number("mm", typical=0.1, limit=1.0))
+def incidence_bias(points: Array, view: ScanView, b: float) -> Array:
+    """x = x* + u·b·(1/cos α − 1)"""
+    return points + view.along(points) * (b * (1 / view.cosine - 1))[:, None]
+
+
+@effect("sensor", needs=("intensity", "surfaces"), k=number("mm", typical=0.1, limit=1.0))
+def intensity_bias(points: Array, view: ScanView, k: float) -> Array:
+    """x = x* + u·k·(I−Ī)/σ_I"""
+    assert view.intensity is not None
+    return points + view.along(points) * (k * view.intensity)[:, None]
+
+
+@effect("sensor", needs=("optics",), k=number("mm", typical=5.0, limit=100.0))
+def field_curvature(points: Array, view: ScanView, k: float) -> Array:
+    """x = x* + u·k·ρ²"""
+    return points + view.along(points) * (k * view.rho2(points))[:, None]
+
+
+@effect("sensor", needs=("optics",), k1=number("1", typical=0.05, limit=1.0))
+def lens_distortion(points: Array, view: ScanView, k1: float) -> Array:
+    """(a,b) → (a,b)(1+k₁ρ²), z kept"""
+    out = points.copy()
+    out[:, :2] *= (1 + k1 * view.rho2(points))[:, None]
+    return out
+
+
+@effect("sensor", needs=("scanner_temperature_c", "optics"), k=number("1/°C", typical=2e-4, limit=5e-3))
+def scanner_thermal_scale(points: Array, view: ScanView, k: float) -> Array:
+    """x = (1+k(T−T₀)) x*, T = scanner_temperature_c"""
+    return points * (1 + k * view.since_first("scanner_temperature_c"))

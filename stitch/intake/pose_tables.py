@@ -1,0 +1,348 @@
+"""Plain tables of numbers as people write them: any separator, decimal commas, with a header or none."""
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.frames import Array
+from stitch.reading.text_files import read_any_text, shortened
+
+# Cells of a table as people write them, and the numbers in them.
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+# A pose as Universal Robots writes it: p[0.1, 0.2, …].
+_POSE_OF_UR = re.compile(r"(?<!\w)p\s*\[(?=\s*[+-]?\.?\d)")
+_BRACKETS = str.maketrans("[](){}", " " * 6)
+
+
+def split_cells(line: str, separator: str) -> list[str]:
+    """Cells of a line, trimmed."""
+    line = _POSE_OF_UR.sub("[", line).translate(_BRACKETS).strip()
+    if separator == " ":
+        return line.split()
+    row = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return [cell.strip().strip('"') for cell in row]
+
+
+def parse_number(cell: str) -> float | None:
+    """The number in a cell, with a point or a comma; None if there is none."""
+    cell = cell.rstrip("°").strip()
+    if _NUMBER.fullmatch(cell):
+        return float(cell)
+    if DECIMAL_COMMA.fullmatch(cell):
+        return float(cell.replace(",", "."))
+    return None
+
+
+def without_trailing_blanks(cells: list[str]) -> list[str]:
+    """Cells without the empty ones at the end."""
+    last = max((i for i, cell in enumerate(cells) if cell), default=-1)
+    return cells[: last + 1]
+
+
+# Rows of a spreadsheet brought to one length: empty cells at the end, titles above, units below the names.
+
+# Line of the file, and its cells.
+NumberedRows = list[tuple[int, list[str]]]
+_SEVERAL = 3
+
+
+def trimmed_rows(rows: NumberedRows) -> NumberedRows:
+    """Without empty cells at the end, but for those below a name that only some rows have a remark under."""
+    numbered = [cells for _, cells in rows if _number_count(cells) >= _SEVERAL]
+    if not numbered:
+        return [(line, short) for line, cells in rows if (short := without_trailing_blanks(cells))]
+    written = Counter(len(cells) for cells in numbered).most_common(1)[0][0]
+    width = max(len(without_trailing_blanks(cells)) for cells in numbered)
+    out = []
+    for line, cells in rows:
+        some = sum(bool(cell) for cell in cells)
+        of_table = len(cells) == written and (_number_count(cells) >= _SEVERAL or 2 * some > width)
+        short = cells[:width] if of_table else without_trailing_blanks(cells)
+        out += [(line, short)] if some else []
+    return out
+
+
+def rows_below_titles(rows: NumberedRows) -> NumberedRows:
+    """Without what people write above a table: rows of another length with hardly a number among their words."""
+    width = Counter(len(row) for _, row in rows).most_common(1)[0][0] if rows else 0
+    first = 0
+    while first < len(rows) - 1 and len(rows[first][1]) != width:
+        known = [parse_number(cell) is not None for cell in rows[first][1]]
+        if all(known) or sum(known) > 1:
+            break
+        first += 1
+    return rows[first:]
+
+
+def names_with_units(names: list[str], cells: list[str]) -> list[str] | None:
+    """Names with the units that stand in a row of their own below them; None where that row is none of units."""
+    if len(cells) > len(names) or _number_count(cells):
+        return None
+    below = [*cells, *[""] * (len(names) - len(cells))]
+    return [f"{name} [{cell.strip('[]() ')}]" if cell else name for name, cell in zip(names, below, strict=True)]
+
+
+def _number_count(cells: list[str]) -> int:
+    return sum(parse_number(cell) is not None for cell in cells)
+
+
+# What the names of columns say: position, rotation, joint angles, units.
+
+# Words that say nothing about which number a column holds.
+_FILLERS = {"pose", "tcp", "robot", "flange", "tool", "tool0", "actual", "target", "base", "in", "of", "the", "coord"}
+_FILLERS |= {"lage", "koordinate", "verschiebung", "roboter", "flansch", "achse", "um", "ist", "soll", "wert"}
+_FILLERS |= {"position", "pos", "translation", "trans", "t", "p", "transform", "vector", "point", "cartesian", "end"}
+_ROTATION = {"rotation", "orientation", "quaternion", "quat", "rot", "euler", "angles", "angle", "rpy", "rotvec", "o"}
+_ROTATION |= {"drehung", "winkel", "orientierung"}
+_LENGTHS = {"mm": "mm", "millimeter": "mm", "millimetre": "mm", "m": "m", "meter": "m", "metre": "m", "cm": "cm"}
+_LENGTHS |= {"inch": "inch", "in": "inch", "inches": "inch"}
+_ANGLES = {"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radian": "rad", "radians": "rad"}
+# In German degrees, elsewhere a four-hundredth of a turn: the unit of an angle, whichever.
+_ANGULAR = {*_ANGLES, "grad"}
+_UNIT = re.compile(r"[\[(]\s*([^\])]*)\s*[\])]|[_\s](mm|cm|deg|rad|inch|°|grad|(?<=\s)m)$")
+_JOINT = re.compile(r"(?:j|joint|axis|theta|jt)_?([1-9])")
+
+# Triples of angles and quadruples of quaternions by name; a rotation stated by its names alone, or None.
+_NAMED = {
+    ("qx", "qy", "qz", "qw"): "quaternion-xyzw",
+    ("q0", "q1", "q2", "q3"): "quaternion-wxyz",
+    ("q1", "q2", "q3", "q4"): "quaternion-wxyz",
+    ("rotx", "roty", "rotz", "rotw"): "quaternion-xyzw",
+    ("w", "p", "r"): "xyz-extrinsic",
+    ("roll", "pitch", "yaw"): "xyz-extrinsic",
+    ("yaw", "pitch", "roll"): "zyx-intrinsic",
+    ("rx", "ry", "rz"): None,
+    ("rz", "ry", "rx"): None,
+    ("a", "b", "c"): None,
+    ("u", "v", "w"): None,
+    ("alpha", "beta", "gamma"): None,
+    ("rotx", "roty", "rotz"): None,
+    ("rotz", "roty", "rotx"): None,
+    ("rot0", "rot1", "rot2"): None,
+    ("rot0", "rot1", "rot2", "rot3"): None,
+}
+
+
+@dataclass(frozen=True)
+class NamedColumns:
+    """Columns whose meaning their names tell; indices into the columns."""
+
+    position: tuple[int, ...] = ()
+    rotation: tuple[int, ...] = ()
+    joints: tuple[int, ...] = ()
+    convention: str | None = None  # of the rotation, where the names alone tell it
+    length_unit: str | None = None  # of the position
+    angle_unit: str | None = None  # of rotation or joints
+    rest: dict[str, int] = field(default_factory=dict)  # other named columns: times, temperatures
+
+
+def read_names(header: Sequence[str]) -> NamedColumns:
+    """What a header says."""
+    plain, units = zip(*(_bare_name(name) for name in header), strict=True)
+    where: dict[str, int] = {}
+    for i, name in enumerate(plain):
+        where.setdefault(name, i)
+    joints = _joint_columns(header)
+    position = tuple(where[a] for a in "xyz") if all(a in where for a in "xyz") else ()
+    rotation, convention = _rotation_columns(where, set(position) | set(joints))
+    matrix = _matrix_columns(header) if not rotation else ()
+    if matrix:
+        rotation, position, convention = matrix, (), None
+    used = {*position, *rotation, *joints}
+    return NamedColumns(
+        position=position,
+        rotation=rotation,
+        joints=joints,
+        convention=convention,
+        length_unit=next((_LENGTHS[units[i]] for i in position if units[i] in _LENGTHS), None),
+        angle_unit=next((_ANGLES[units[i]] for i in (*rotation, *joints) if units[i] in _ANGLES), None),
+        rest={header[i]: i for i in range(len(header)) if i not in used and header[i] not in ("", "-")},
+    )
+
+
+def _bare_name(name: str) -> tuple[str, str]:
+    """A name without its unit and fillers, and its unit."""
+    found = _UNIT.search(name.strip())
+    unit = (found[1] or found[2] or "").strip().lower() if found else ""
+    if found:
+        name = name.strip()[: found.start()]
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)  # camelCase
+    words = [w for w in re.split(r"[._\s/\-]+", name.lower()) if w]
+    unit = unit or next((w for w in words if w in ("mm", "deg", "rad", "cm", "inch")), "")
+    if not unit and "m" in words and len(words) > 1:
+        unit = "m"
+    turned = any(w in _ROTATION for w in words)
+    words = [w for w in words if w != unit]
+    kept = [w for w in words if w not in _FILLERS and w not in _ROTATION and w not in ("xyzw", "wxyz", "xyz")]
+    if not kept:
+        return (words[-1] if len(words) == 1 else ""), unit
+    last = re.sub(r"^(?:[pt]|pos)_?([xyz])$", r"\1", kept[-1])
+    order = next((w for w in words if w in ("xyzw", "wxyz")), None)
+    if order and last in ("0", "1", "2", "3"):
+        return f"q{order[int(last)]}", unit
+    if last in ("0", "1", "2") and not turned and any(w in words for w in ("position", "pos", "translation", "t")):
+        return "xyz"[int(last)], unit
+    # An axis with the unit of an angle is a turn, in whatever language it is named: "Drehung um Z [°]".
+    turned = turned if last in ("w", "0", "1", "2", "3") else last in ("x", "y", "z") and (turned or unit in _ANGULAR)
+    return (f"rot{last}" if turned else last), unit
+
+
+def _rotation_columns(where: dict[str, int], taken: set[int]) -> tuple[tuple[int, ...], str | None]:
+    for names, convention in sorted(_NAMED.items(), key=lambda item: -len(item[0])):
+        index = [where.get(name, -1) for name in names]
+        # Angles by place: the triple counts in the order in which its columns stand.
+        ordered = len(names) == 4 or index == sorted(index)
+        if min(index) >= 0 and not taken & {*index} and ordered:
+            return tuple(index), convention
+    return (), None
+
+
+def _joint_columns(header: Sequence[str]) -> tuple[int, ...]:
+    found: dict[int, int] = {}
+    for i, name in enumerate(header):
+        lower = name.strip().lower()
+        match = _JOINT.match(lower) or re.match(r"(?:.*joints?|.*_q|q|a)[._\s\[]*(\d)\b", lower)
+        if match:
+            found.setdefault(int(match[1]), i)
+    first = min(found, default=1)
+    count = len(found)
+    complete = count >= 4 and sorted(found) == list(range(first, first + count))
+    return (
+        tuple(found[k] for k in sorted(found))
+        if complete and (count >= 5 or "j" in header[found[first]].lower())
+        else ()
+    )
+
+
+def _matrix_columns(header: Sequence[str]) -> tuple[int, ...]:
+    """Columns m00 … m33, r11 … t3 or 0 … 15 in the order of the file, if they are 12 or 16."""
+    named = [
+        i for i, name in enumerate(header) if re.search(r"(?:^|[._])(?:[mtr]?_?\d{1,2}|t[xyz1-3])\]?$", name.lower())
+    ]
+    return tuple(named) if len(named) in (12, 16) else ()
+
+
+_SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
+_COMMENTS = ("#", "%", "//")
+_MAX_TABLE_MB = 50
+
+
+@dataclass(frozen=True)
+class NumberTable:
+    """Numbers in rows, as one file has them."""
+
+    file: Path
+    header: tuple[str, ...] | None  # names of the columns of numbers
+    numbers: Array  # (n, C)
+    labels: tuple[tuple[str, ...], ...]  # texts of every row, from columns that hold no numbers
+    lines: tuple[int, ...]  # line number of every row
+    words: str  # how it was read
+
+
+def read_number_table(file: Path) -> NumberTable:
+    """Read a table of numbers.
+
+    Raises:
+        InputError: no numbers in rows, rows of different length, or a cell without a number; names the line.
+    """
+    return parse_number_table(file, read_any_text(file, "name a table of poses", _MAX_TABLE_MB))
+
+
+def parse_number_table(file: Path, content: str) -> NumberTable:
+    """The same of a text that was read from a file."""
+    kept = [(i, line.strip()) for i, line in enumerate(content.splitlines(), 1) if line.strip()]
+    body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
+    if not body:
+        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+    separator = max(
+        _SEPARATORS, key=lambda s: sum(parse_number(c) is not None for _, line in body for c in split_cells(line, s))
+    )
+    read = trimmed_rows([(i, split_cells(line, separator)) for i, line in body])
+    rows = rows_below_titles(read)
+    above = len(read) - len(rows)
+    comments = [(i, line) for i, line in kept if line.startswith(_COMMENTS) and i < body[0][0]]
+    header, rows = _split_header(file, rows, comments[-1][1] if comments else "", separator)
+    text, numeric = _text_and_number_columns(rows)
+    if len(numeric) < 3:
+        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+    numbers = np.array([[_cell_number(file, i, row[c]) for c in numeric] for i, row in rows])
+    _require_one_decimal_mark(file, rows, numeric)
+    decimal = any(DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
+    words = f"separated by {_SEPARATORS[separator]}{', decimal commas' * decimal}"
+    words += ", with a header" if header else ", without a header"
+    if above:
+        words += f", {above} line{'s' * (above > 1)} of words above it passed over"
+    return NumberTable(
+        file=file,
+        header=tuple(header[c] for c in numeric) if header else None,
+        numbers=numbers,
+        labels=tuple(tuple(row[c] for c in text) for _, row in rows),
+        lines=tuple(i for i, _ in rows),
+        words=words,
+    )
+
+
+def _cell_number(file: Path, line: int, cell: str) -> float:
+    found = parse_number(cell)
+    if found is None or not abs(found) < 1e30:
+        raise InputError(f"{file} line {line}: {shortened(cell)} is no number; to fix: write one there")
+    return found
+
+
+def _require_one_decimal_mark(file: Path, rows: Sequence[tuple[int, list[str]]], numeric: Sequence[int]) -> None:
+    """Refuse a column with commas before the decimals in which a point stands too: 1.269 may mean a thousand."""
+    for c in numeric:
+        pointed = [(i, row[c]) for i, row in rows if "." in row[c]]
+        if pointed and any("," in row[c] for _, row in rows):
+            line, cell = pointed[0]
+            raise InputError(
+                f"{file} line {line}: {shortened(cell)} has a point, other numbers of its column have a comma before "
+                "their decimals; to fix: write all alike, without marks for thousands"
+            )
+
+
+def _split_header(
+    file: Path, rows: list[tuple[int, list[str]]], comment: str, separator: str
+) -> tuple[list[str] | None, list[tuple[int, list[str]]]]:
+    """The header's names, from the first row or the comment above it, and the rows of numbers, all of one length."""
+    header: list[str] | None = None
+    if not rows:
+        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+    top, first = rows[0]
+    below = rows[1:] or rows
+    width = Counter(len(row) for _, row in [*below, rows[0]]).most_common(1)[0][0]
+    typical = next(
+        (row for _, row in below if len(row) == width and any(parse_number(c) is not None for c in row)), first
+    )
+    texts = [parse_number(cell) is None for cell in first]
+    if len(rows) > 1 and any(t and parse_number(c) is not None for t, c in zip(texts, typical, strict=False)):
+        header, rows = first, rows[1:]
+        units = names_with_units(header, rows[0][1]) if len(rows) > 1 else None
+        if units is not None:
+            header, rows = units, rows[1:]
+    elif comment:
+        names = split_cells(comment.lstrip("#%/ "), separator)
+        header = names if len(names) == width and all(parse_number(name) is None for name in names) else None
+    odd = next(((i, row) for i, row in rows if len(row) != width), None)
+    if odd is not None:
+        raise InputError(
+            f"{file} line {odd[0]}: {len(odd[1])} cells, other rows have {width}; to fix: write one number a column"
+        )
+    if header is not None and len(header) != width:
+        raise InputError(f"{file} line {top}: {len(header)} names for {width} columns; to fix: name every column once")
+    return header, rows
+
+
+def _text_and_number_columns(rows: Sequence[tuple[int, list[str]]]) -> tuple[list[int], list[int]]:
+    """Columns of text, and of numbers: a column with numbers in more than half of its cells is one of numbers."""
+    width = len(rows[0][1])
+    share = [sum(parse_number(row[c]) is not None for _, row in rows) / len(rows) for c in range(width)]
+    return [c for c in range(width) if share[c] <= 0.5], [c for c in range(width) if share[c] > 0.5]

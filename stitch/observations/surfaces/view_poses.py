@@ -1,0 +1,182 @@
+"""Where each view would go if the robot did not hold it: the evidence about poses, view by view.
+
+One linear step at the model's poses would understate it: nearest neighbours along the surface follow
+the error. Matching anew until nothing moves removes that pull. Directions that the overlaps cannot
+see (a sphere turned in itself) stay where the robot put them.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array, Mask
+from stitch.measurement.capture import Capture
+from stitch.observations.surfaces.matching import sample_points
+from stitch.observations.surfaces.normal_equations import Gram, Overlaps, assemble, collect_overlaps, next_gate
+from stitch.statistics.least_squares import anderson_step
+
+# Views moved by one step of an iteration after another.
+
+# The step (6V,) that was asked for, and the one that was taken, as displacements; None before the first.
+LastStep = tuple[Array, Array] | None
+
+
+def displacement_factors(g: Gram) -> Array:
+    """(6,) factors that make a twist about the centre displacements: rotations count at the correspondences' lever."""
+    return np.array([max(g.lever, 1e-300)] * 3 + [1.0] * 3)
+
+
+def take_step(poses: Array, g: Gram, step: Array, last: LastStep) -> tuple[Array, LastStep]:
+    """T_reference_scanner (V, 4, 4) after a step (V, 6) about the centre, which makes up for what the last one left."""
+    unit = displacement_factors(g)
+    asked = (step * unit).ravel()
+    taken = asked if last is None else anderson_step(asked, *last)
+    to_centre = frames.make(np.eye(3), -g.centre)
+    return frames.inverse(to_centre) @ frames.exp(taken.reshape(-1, 6) / unit) @ to_centre @ poses, (asked, taken)
+
+
+def has_converged(g: Gram, step: Array, share: float) -> bool:
+    """True if a step (V, 6) moves the views by less than a share of the robust sigma, rms."""
+    return bool(np.sqrt(np.mean(step[:, 3:] ** 2)) < share * g.scale)
+
+
+# What the sensor's own noise would leave in the overlaps if every pose were perfect.
+
+
+def noise_floor(capture: Capture, overlaps: Overlaps, stated: float | None = None) -> float:
+    """Rms of (p − q)·n for perfect poses: √(σ_v² + σ_w²) over all correspondences.
+
+    σ of each view is measured in its own scan, across local quadrics; where the scans are too small
+    for that, `stated` (scanner.noise of the session) stands in. Noise cannot leave more than what was left
+    once every view was free to move: where quadrics took a shape for noise, that is the floor.
+
+    Args:
+        overlaps: of the registered views.
+    """
+    sigma = np.array([scan.noise for scan in capture.scans])
+    sigma = np.where(np.isfinite(sigma), sigma, np.nan if stated is None else stated)
+    pairs = overlaps.gram.pairs[~overlaps.gram.labelled]
+    count = overlaps.gram.count[~overlaps.gram.labelled]
+    variance = sigma[pairs[:, 0]] ** 2 + sigma[pairs[:, 1]] ** 2
+    measured = float(np.sqrt(np.average(variance, weights=np.maximum(count, 1))))
+    spare = 1 - 6 * (len(sigma) - 1) / max(count.sum(), 1)
+    return min(measured, overlaps.gram.rms / np.sqrt(spare)) if spare > 0 else measured
+
+
+# Queries per view.
+SAMPLES = 1500
+_MAXIMUM_ITERATIONS = 12
+_CONVERGED = 5e-3
+# Directions of H weaker than this share of the strongest (as displacements) carry no evidence: what
+# little they have comes from the noise of the normals. Gap seen on real parts: 3e-4 (noise on a
+# sphere and a cone) against 5e-3 (their weakest true directions). Labelled points have no such bias: what they
+# see is known by their sigma, as long as the lever is not noise itself: a three-hundredth of the part's.
+_NEAR_NULL = 1e-3
+_NULL = 1e-5
+
+
+@dataclass(frozen=True)
+class UnconstrainedPoses:
+    """Views moved by overlaps and common targets alone."""
+
+    poses: Array  # (V, 4, 4) T_reference_scanner
+    twists: Array  # (V, 6) about the centre of `overlaps.gram`: from the model's poses to these
+    overlaps: Overlaps  # at `poses`
+
+    def relative_to(self, model_poses: Array) -> "UnconstrainedPoses":
+        """The same views against another model, (V, 4, 4): where they are freed to does not depend on it."""
+        to_centre = frames.make(np.eye(3), -self.overlaps.gram.centre)
+        return replace(self, twists=frames.log(to_centre @ self.poses @ frames.inverse(to_centre @ model_poses)))
+
+
+def unconstrained_poses(capture: Capture, model_poses: Array, gate: float) -> UnconstrainedPoses:
+    """Move all views until overlaps and common targets agree, without regard to the robot.
+
+    Args:
+        model_poses: T_reference_scanner (V, 4, 4).
+        gate: first distance between partners, length_unit.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    picked = [sample_points(scan, SAMPLES) for scan in capture.scans]
+    poses = np.array(model_poses)
+    overlaps = collect_overlaps(capture, poses, gate, picked)
+    last: LastStep = None
+    for _ in range(_MAXIMUM_ITERATIONS):
+        step = visible_step(overlaps.gram)
+        if has_converged(overlaps.gram, step, _CONVERGED):
+            break
+        poses, last = take_step(poses, overlaps.gram, step, last)
+        gate = min(gate, next_gate(overlaps, capture))
+        overlaps = collect_overlaps(capture, poses, gate, picked, overlaps)
+    return UnconstrainedPoses(poses, np.zeros((len(poses), 6)), overlaps).relative_to(model_poses)
+
+
+def visible_directions(g: Gram) -> tuple[Array, Array, Array]:
+    """Eigenvalues (n,), eigenvectors (6V, n) of the scaled H, and the scale (6V,).
+
+    Twists are scale · U · z: rotations count as displacements at the correspondences' lever.
+    """
+    scale = np.tile(1 / displacement_factors(g), g.views)
+    values, vectors = _dominant_eigenpairs(_scaled_hessian(g, ~g.labelled, scale), _NEAR_NULL)
+    if g.labelled.any():
+        targets = _scaled_hessian(g, g.labelled, scale)
+        basis = np.hstack([vectors, _target_only_directions(targets, vectors)])
+        values, within = np.linalg.eigh(basis.T @ ((vectors * values) @ vectors.T + targets) @ basis)
+        vectors = basis @ within
+    return values, vectors, scale
+
+
+def _target_only_directions(H: Array, vectors: Array) -> Array:
+    """(6V, k) orthonormal: what targets see of the directions in which surfaces, `vectors` (6V, n), see nothing.
+
+    A ball's centre sees its own surface turn no more than the two centres lie apart, which is noise.
+    """
+    unseen = np.linalg.svd(vectors, full_matrices=True)[0][:, vectors.shape[1] :]
+    if not unseen.shape[1]:
+        return unseen
+    values, within = np.linalg.eigh(unseen.T @ H @ unseen)
+    return np.asarray(unseen @ within[:, values > _NULL * np.linalg.eigvalsh(H)[-1]])
+
+
+def visible_step(g: Gram) -> Array:
+    """(V, 6) Gauss–Newton step of all views in the directions that overlaps and targets see."""
+    return -solve_views(g, g.vector[..., None]).reshape(-1, 6)
+
+
+def solve_views(g: Gram, pair_vectors: Array) -> Array:
+    """(6V, K) twists H⁺b of the views when pulls (P, 6, K), Σ w Bᵀg, act on the pairs."""
+
+    def on_views(keep: Mask) -> Array:
+        b = np.zeros((g.views, 6, pair_vectors.shape[2]))
+        v, w = g.pairs[keep].astype(np.int64).T
+        np.add.at(b, v, pair_vectors[keep])
+        np.subtract.at(b, w, pair_vectors[keep])
+        return b.reshape(6 * g.views, -1)
+
+    return solve_view_sums(g, on_views(~g.labelled), on_views(g.labelled))
+
+
+def solve_view_sums(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:
+    """(6V, K) the same where pulls on the views are given: (6V, K) of surfaces, and of labelled points."""
+    values, vectors, scale = visible_directions(g)
+    b, named = scale[:, None] * by_surfaces, scale[:, None] * by_targets
+    if g.labelled.any():
+        # Where surfaces see nothing, their pull is noise of normals: there the targets' own counts alone.
+        seen = _dominant_eigenpairs(_scaled_hessian(g, ~g.labelled, scale), _NEAR_NULL)[1]
+        b = named + seen @ (seen.T @ b)
+    return np.asarray(scale[:, None] * (vectors @ ((vectors.T @ b) / values[:, None])))
+
+
+def _scaled_hessian(g: Gram, keep: Mask, scale: Array) -> Array:
+    """(6V, 6V) H of some pairs in scaled twists."""
+    return np.asarray(assemble(g, keep)[0] * scale[:, None] * scale[None, :])
+
+
+def _dominant_eigenpairs(H: Array, share: float) -> tuple[Array, Array]:
+    """Eigenvalues above a share of the largest, with their eigenvectors."""
+    values, vectors = np.linalg.eigh(H)
+    keep = values > share * values[-1]
+    return values[keep], vectors[:, keep]
