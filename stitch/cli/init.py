@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stitch.cli.detect import BallOption, BoardOption
 from stitch.cli.options import split_names
 from stitch.cli.terminal import emit
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
-    from stitch.cli.detect import BallOption, BoardOption
     from stitch.intake.first_session import FirstSession, StatedFolder
     from stitch.intake.folder_files import Guess
 

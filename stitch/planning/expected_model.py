@@ -247,7 +247,7 @@ class CellModel:
 class ExpectedModel(LinearModel):
     """A linear model of views that nobody has taken: nothing is fitted, the scatter is the one that is expected."""
 
-    def refitted(self) -> Self:
+    def refit(self) -> Self:
         """The variances that the remaining errors had in the model this was taken from."""
         source = self.full_model or self
         assert source.pose_errors is not None and self.pose_errors is not None

@@ -148,7 +148,7 @@ def test_what_is_added_and_dropped_is_what_the_commands_write(found, cell_folder
     better.save(python, recording=False)
     assert same_folder(command, python)
     stitch_command("drop", command, "range_scale", "--no-recording")
-    stitch.drop_views(better, "range_scale").save(python, recording=False)
+    stitch.drop(better, "range_scale").save(python, recording=False)
     assert same_folder(command, python)
 
 
@@ -203,7 +203,7 @@ def test_exports_are_those_of_the_command(found, tmp_path, stitch_command):
 def test_effects_are_asked_for_by_name(found):
     for call, says in (
         (lambda: stitch.add(found, "no_such"), "no_such"),
-        (lambda: stitch.drop_views(found, "range_scale"), "is not in the model of s"),
+        (lambda: stitch.drop(found, "range_scale"), "is not in the model of s"),
         (lambda: stitch.add(stitch.add(found, "range_scale"), "range_scale"), "in the model of s already"),
         (lambda: stitch.run(found.session, effects=["no_such"]), "no_such"),
     ):

@@ -110,7 +110,7 @@ def test_weights_do_not_change_with_an_offset_nor_with_the_order_of_views(cell):
     matches = collect_overlaps(capture, poses, 1.0, [sample_points(s, 1000) for s in capture.scans]).matches
     weights = np.concatenate(dpwvm_weights(matches, capture, poses))
     raised = [replace(m, residual=m.residual + 0.3 * (m.v == 0)) for m in matches]
-    turned = [m.turned() for m in matches]
+    turned = [m.swapped() for m in matches]
     assert np.concatenate(dpwvm_weights(raised, capture, poses)) == pytest.approx(weights, abs=1e-9)
     assert np.concatenate(dpwvm_weights(turned, capture, poses)) == pytest.approx(weights, abs=1e-9)
     assert weights.max() > 0.5
