@@ -1,4 +1,7 @@
-"""Effects of the arm: the true joint angles q* and the true links."""
+"""The library of physical effects, in the order of the chain of frames: arm, mount, part, scanner.
+
+Candidates are tried and listed in this order.
+"""
 
 from dataclasses import replace
 
@@ -9,24 +12,7 @@ from stitch.frames import Array
 from stitch.measurement.measurement import ScanView, Views
 from stitch.measurement.robot import Links
 
-# Effects of the scanner's mount: the true one is M·exp(twist).
-
-
-@effect("mount", needs=("time",), xi=twist("/h", 1e-3, 0.4))
-def mount_drift(views: Views, xi: Array) -> Array:
-    """M·exp(ξ (t−t₀)/3600 s)"""
-    return np.outer(views.hours, xi)
-
-
-@effect(
-    "mount",
-    needs=("time",),
-    xi=twist("", 6e-4, 0.2),
-    T_c=number("s", typical=600.0, limit=1e5, grid=(150.0, 300.0, 600.0, 1200.0)),
-)
-def mount_warmup(views: Views, xi: Array, T_c: float) -> Array:
-    """M·exp(ξ (1−e^(−(t−t₀)/T_c)))"""
-    return np.outer(1 - np.exp(-views.time / max(T_c, 1.0)), xi)
+# Effects of the arm: the true joint angles q* and the true links.
 
 
 @effect("robot", needs=("velocity",), dt=number("s", typical=2e-3, limit=0.5))
@@ -93,6 +79,26 @@ def robot_thermal_growth(links: Links, views: Views, g: float) -> Links:
 def warmer(views: Views, covariate: str) -> Array:
     """(V,) ΔT since the first view, or hours where nobody measured."""
     return views.since_first(covariate) if covariate in views.covariates else views.hours
+
+
+# Effects of the scanner's mount: the true one is M·exp(twist).
+
+
+@effect("mount", needs=("time",), xi=twist("/h", 1e-3, 0.4))
+def mount_drift(views: Views, xi: Array) -> Array:
+    """M·exp(ξ (t−t₀)/3600 s)"""
+    return np.outer(views.hours, xi)
+
+
+@effect(
+    "mount",
+    needs=("time",),
+    xi=twist("", 6e-4, 0.2),
+    T_c=number("s", typical=600.0, limit=1e5, grid=(150.0, 300.0, 600.0, 1200.0)),
+)
+def mount_warmup(views: Views, xi: Array, T_c: float) -> Array:
+    """M·exp(ξ (1−e^(−(t−t₀)/T_c)))"""
+    return np.outer(1 - np.exp(-views.time / max(T_c, 1.0)), xi)
 
 
 # Effects of the part: it creeps, slips, grows or sags in the reference frame.
