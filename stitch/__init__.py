@@ -6,7 +6,7 @@ session = stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", unit="m
 run = stitch.run(session)
 print(run)
 print(stitch.diagnose(run).sentence)
-run = stitch.add(run, "joint_compliance")
+run = stitch.add(run, "range_scale")
 run.save("runs/blade-17")
 """
 

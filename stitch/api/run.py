@@ -30,7 +30,7 @@ from stitch.writing.run_folder import recordings, residual_table
 
 
 class AtPart(NamedTuple):
-    """How well the part is placed: expanded uncertainty U (k = 2) over all directions."""
+    """Expanded uncertainty U (k = 2) over all directions."""
 
     mm: float  # of the middle of what the scanner saw
     mrad: float
@@ -174,7 +174,7 @@ class RunView:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Run(runs.Run):
-    """Everything that a run found of one session; lengths in the session's length_unit, angles in rad.
+    """Results of a run of one session; lengths in the session's length_unit, angles in rad.
 
     `print(run)` writes it as one block; in a notebook the last line of a cell shows the part as report.html does.
 
@@ -291,7 +291,7 @@ class Run(runs.Run):
 
 
 class ReplayRecorder:
-    """A recorder that keeps its calls, so that a recording can be written once the run is saved."""
+    """Recorder that keeps its calls, so that a recording can be written once the run is saved."""
 
     def __init__(self, other: Recorder | None = None) -> None:
         self.other = other  # gets every call too

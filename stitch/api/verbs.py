@@ -132,7 +132,7 @@ def load_run(folder: Path | str, effects_file: Path | None = None, trust: bool =
 
 
 def diagnose(run: runs.Run | RunState) -> Diagnosis:
-    """Say which effect is missing in the model of a run, as `stitch diagnose` does.
+    """Find which effect is missing in the model of a run, as `stitch diagnose` does.
 
     Args:
         run: a run, or the state of one.
@@ -207,7 +207,7 @@ def drop(run: runs.Run | RunState, *effects: str, recorder: Recorder | None = No
 
 
 def compare(run: runs.Run | RunState) -> ResidualTables:
-    """Set the residuals of a run against everything that is known of its views, as `stitch compare` does.
+    """Compute how the residuals of a run depend on everything known of its views, as `stitch compare` does.
 
     Returns:
         Tables by view, pair, joint, place on the part (reference frame), field, time; lengths in length_unit.
@@ -225,7 +225,7 @@ def compare(run: runs.Run | RunState) -> ResidualTables:
 
 
 def explain(run: runs.Run | RunState) -> Explanation:
-    """Look for a formula of what the model of a run leaves, as `stitch explain` does.
+    """Find a formula of what the model of a run leaves, as `stitch explain` does.
 
     Returns:
         `found`, `why` in a sentence, `formula` in rad and length_unit, and `source`, a Python file of effects.
@@ -259,7 +259,7 @@ def plan(
     size: float | None = None,
     field: float | None = None,
 ) -> Plan:
-    """Say what views would tell before they are taken, and which further ones bring most, as `stitch plan` does.
+    """Compute what views would tell before they are taken and which further ones bring most, as `stitch plan` does.
 
     Args:
         cell: a run, which knows its cell, or a session whose views are planned.
@@ -301,7 +301,7 @@ def export_run(
     child: str = "scanner",
     diagnosis: Diagnosis | None = None,
 ) -> str | None:
-    """Give what a run found to other programs, as `stitch export RUN --to` does.
+    """Write what a run found for other programs, as `stitch export RUN --to` does.
 
     It is not called `stitch.export`, which is the package that does it.
 

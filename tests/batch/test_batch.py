@@ -50,7 +50,7 @@ def test_the_workers_of_a_scheduler(sessions, tmp_path):
 
 def test_no_answer_is_one_line(sessions, monkeypatch, capsys, batch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "_ANSWER", 0.3)
+    monkeypatch.setattr(cluster, "_ANSWER_SECONDS", 0.3)
     batch(*sessions, "--scheduler", "tcp://127.0.0.1:9", code=2)
     told = capsys.readouterr().err
     assert told.startswith("stitch: --scheduler tcp://127.0.0.1:9: no answer") and told.count("\n") == 1
@@ -79,10 +79,10 @@ def test_an_interrupt_keeps_what_is_finished(sessions, ran, monkeypatch, capsys,
         yield run_session(jobs[0])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("stitch.cli.batch.results", stopped)
+    monkeypatch.setattr("stitch.batch.run_batch.run_jobs", stopped)
     batch(*sessions, code=1)
     assert "stitch: stopped with 1 of 2 sessions" in capsys.readouterr().err.splitlines()[-1]
-    monkeypatch.setattr("stitch.cli.batch.results", run_jobs)
+    monkeypatch.setattr("stitch.batch.run_batch.run_jobs", run_jobs)
     batch(*sessions)
     assert ran == ["monday", "tuesday"]
 

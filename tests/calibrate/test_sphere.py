@@ -146,7 +146,7 @@ def test_sides_given_by_the_session_lead_to_the_decoupled_start(tmp_path):
     cell = sphere_cell(8, "line", pause=4, turns=0.6)
     normal = np.array([arc_normal(cloud, np.array([0.0, 1, 0])) @ [0, 1, 0] for cloud in cell.clouds])
     result = calibrate_sphere(
-        load_session(write_spheres(cell, tmp_path / "s", effect_twists=("sphere_side", normal.astype(int))))
+        load_session(write_spheres(cell, tmp_path / "s", extra=("sphere_side", normal.astype(int))))
     )
     assert result.start.startswith("decoupled") and not result.sides_found
     assert np.linalg.norm(twist(cell, result.fit.T_mount)[:3]) < 0.02
@@ -184,9 +184,7 @@ def test_refusals_name_the_reason(tmp_path):
     with pytest.raises(InputError, match="larger than the sphere's"):
         calibrate_sphere(load_session(write_spheres(cell, tmp_path / "small", radius=20.0)))
     with pytest.raises(InputError, match="sphere_side is 2"):
-        calibrate_sphere(
-            load_session(write_spheres(cell, tmp_path / "side", effect_twists=("sphere_side", [2] * len(cell.G))))
-        )
+        calibrate_sphere(load_session(write_spheres(cell, tmp_path / "side", extra=("sphere_side", [2] * len(cell.G)))))
     still = sphere_cell(2, "area", turns=0.0)
     with pytest.raises(NoResultError, match="one orientation"):
         calibrate_sphere(load_session(write_spheres(still, tmp_path / "still")))

@@ -61,9 +61,9 @@ def test_nobody_watches_nobody_counts(said):
 
 CODE = """
 import time
-from stitch.cli.terminal import TimeLeft, doing
+from stitch.cli.terminal import TimeLeft, show_activity
 from stitch.system.process import steps, watched
-with watched(TimeLeft()), doing("diagnosing [2]"):
+with watched(TimeLeft()), show_activity("diagnosing [2]"):
     time.sleep(0.8)
     for _ in steps("scans", range(4)): time.sleep(0.4)
     time.sleep(1.2)

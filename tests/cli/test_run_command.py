@@ -35,7 +35,7 @@ def test_an_existing_folder_that_is_no_run_is_not_touched(session, tmp_path):
 
 
 def test_a_run_cannot_take_the_place_of_the_folder_one_stands_in(session, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("stitch.cli.run.run_rig", lambda *_: pytest.fail("computed first"))
+    monkeypatch.setattr("stitch.pipeline.run_rig", lambda *_: pytest.fail("computed first"))
     (tmp_path / "here" / "inner").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here" / "inner")
     for target in (".", "..", tmp_path / "here" / "inner"):

@@ -16,7 +16,7 @@ def test_the_next_command_is_the_last_line_and_the_only_one(tmp_path, monkeypatc
     for module, name in ((write, "write_session"), (write, "write_truth"), (commands, "reveal")):
         monkeypatch.setattr(module, name, lambda *_: None)
     monkeypatch.setattr(run, "run_sessions", lambda sessions, options: asked.append(options.says_next))
-    for module, name in ((diagnose, "diagnosed_run"), (change, "add_chosen")):
+    for module, name in ((diagnose, "run_diagnose"), (change, "add_diagnosed")):
         monkeypatch.setattr(module, name, lambda *_, says_next=True, **others: asked.append(says_next))
     told.demo(tmp_path / "demo here")
     lines = capsys.readouterr().err.splitlines()

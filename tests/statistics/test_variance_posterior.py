@@ -61,7 +61,7 @@ def test_the_average_is_the_integral(size, kin, shape, monkeypatch):
     # 400 rounds know the mean of what spreads by as much as itself to a twentieth; of one size and a factor on it, of
     # which each follows the other, more are asked.
     monkeypatch.setattr("stitch.statistics.variance_posterior._ROUNDS", 2000 if kin else 400)
-    mixed = shared_errors(size, common_factor=kin, shape=shape)
+    mixed = shared_errors(size, kin=kin, shape=shape)
     found = mean_variances(mixed, fit_variances(mixed))
     assert found[2:] == pytest.approx(on_a_grid(mixed), rel=1 / 20, abs=0.01)
     assert (found[:2] == 0).all() or (found[:2] < 1e-100).all()

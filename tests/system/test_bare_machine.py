@@ -35,7 +35,7 @@ def test_scan_motions_mesh_and_cad_in_a_stripped_environment():
     said = run_python("""
         import numpy as np
         from data_synth.fixtures.blade_cells import captured_blade
-        from stitch.cells.window import cad, cad_start, instances
+        from stitch.cells import cad, scan_to_cad
         from stitch.stages.fuse import fuse
         from stitch.stages.initial_guess import motion_candidates
         from stitch.writing.mesh import mesh_of
@@ -43,7 +43,7 @@ def test_scan_motions_mesh_and_cad_in_a_stripped_environment():
         assert motion_candidates([capture])
         fused = fuse(capture, measured.T_reference_scanner)
         assert len(mesh_of(fused.points, fused.normals).triangles)
-        found = cad.nearest(cad.surface(measured.mesh), fused.points, fused.normals)
+        found = cad.nearest_partners(cad.cad_surface(measured.mesh), fused.points, fused.normals)
         print(float(np.median(np.abs(found.distance))) < 0.1)
     """)
     assert said == "True"

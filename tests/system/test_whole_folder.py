@@ -49,7 +49,7 @@ def rewrite(run):
 def test_only_what_is_ours_is_replaced(run, tmp_path, monkeypatch, way):
     path = run
     if way == "two renames":
-        monkeypatch.setattr(files, "exchange", lambda *_: False)
+        monkeypatch.setattr(files, "exchange_paths", lambda *_: False)
     elif way == "in place":
         monkeypatch.chdir(run)
     elif way == "link":
@@ -68,7 +68,7 @@ def test_only_what_is_ours_is_replaced(run, tmp_path, monkeypatch, way):
 def test_what_is_new_is_on_the_disk_before_it_takes_its_place(run, monkeypatch):
     seen = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: seen.append(os.readlink(f"/proc/self/fd/{descriptor}")))
-    monkeypatch.setattr(files, "exchange", lambda *_: bool(seen.append("exchanged")))
+    monkeypatch.setattr(files, "exchange_paths", lambda *_: bool(seen.append("exchanged")))
     rewrite(run)
     assert any(name.endswith("/model") for name in seen[: seen.index("exchanged")])
 

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.write import write_session
-from stitch.cli import change as changed_run
+from stitch import pipeline
+from stitch.cli import diagnose as diagnose_command
 from stitch.cli.main import main
 from stitch.errors import NoResultError
 from stitch.model.model_toml import read_model
@@ -18,6 +19,7 @@ from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import LedgerStep, state_of
 from stitch.stored.stored_run import load_state, stored_run
+from stitch.writing import diagnosis_document
 from stitch.writing.run_folder import write_run
 from viz import run_page, sections
 
@@ -61,7 +63,7 @@ def test_a_model_that_is_used_as_it_is_stays_as_it_is(folder):
 
 def test_an_effect_named_twice_counts_once(folder):
     assert json.loads((folder / "r" / "ledger.json").read_text())[0]["effects"] == [EFFECT]
-    ledger = changed_run.change(load_state(folder / "q"), ["range_scale", "range_scale"]).ledger
+    ledger = pipeline.change(load_state(folder / "q"), ["range_scale", "range_scale"]).ledger
     assert ledger[-1].effects == ("range_scale",)
 
 
@@ -114,7 +116,7 @@ def changing(folder, tmp_path, monkeypatch):
     for name in (*STALE, "pictures/budget.png"):
         (run / name).write_text("of the old model")
     result = replace(stored_run(run, load_state(run)), ledger=())
-    monkeypatch.setattr(changed_run, "change", lambda state, effects, recorder: result)
+    monkeypatch.setattr(pipeline, "change", lambda state, effects, recorder: result)
     return run, result
 
 
@@ -136,7 +138,7 @@ def test_a_change_that_fails_leaves_the_run_as_it_was(changing, monkeypatch, err
         (scratch / "recording.rrd").write_text("half")
         raise error
 
-    monkeypatch.setattr(changed_run, "change", fails)
+    monkeypatch.setattr(pipeline, "change", fails)
     with pytest.raises(SystemExit) as stop:
         main(["drop", str(run), EFFECT, "--no-recording"])
     assert stop.value.code
@@ -148,10 +150,10 @@ def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch
     run, result = changing
     step, last = LedgerStep((), 0.1, 0.1, 0.1, np.eye(4)), LedgerStep((), 0.1, result.heldout_rms, 0.1, result.T_mount)
     fitted = replace(result, ledger=(step, step))
-    monkeypatch.setattr(changed_run, "change", lambda s, *_: replace(result, ledger=(*s.ledger, last)))
-    monkeypatch.setattr(changed_run, "suggest", lambda state, at_most: (fitted, [], None))
-    monkeypatch.setattr(changed_run, "write_diagnosis", lambda found, state, run: {})
-    monkeypatch.setattr(changed_run, "next_step", lambda found, run: "")
+    monkeypatch.setattr(pipeline, "change", lambda s, *_: replace(result, ledger=(*s.ledger, last)))
+    monkeypatch.setattr(pipeline, "suggest", lambda state, at_most: (fitted, [], None))
+    monkeypatch.setattr(diagnose_command, "write_diagnosis", lambda found, state, run: {})
+    monkeypatch.setattr(diagnosis_document, "suggested_command", lambda found, run: "")
     stitch_command("add", run, "--suggested")
     steps = json.loads((run / "ledger.json").read_text())
     assert len(steps) == len(fitted.ledger)
@@ -160,8 +162,8 @@ def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch
 
 def test_where_nothing_is_to_be_added_the_present_result_is_printed(changing, monkeypatch, stitch_command):
     run, result = changing
-    monkeypatch.setattr(changed_run, "suggest", lambda state, at_most: (None, [], None))
-    monkeypatch.setattr(changed_run, "write_diagnosis", lambda found, state, run: {})
+    monkeypatch.setattr(pipeline, "suggest", lambda state, at_most: (None, [], None))
+    monkeypatch.setattr(diagnose_command, "write_diagnosis", lambda found, state, run: {})
     assert json.loads(stitch_command("add", run, "--suggested", "--json")) == told(run)
     assert state_of(result).model.T_mount.tolist() == told(run)["hand_eye"]
 
