@@ -13,7 +13,8 @@ from data_synth.scene import Scene, load_scene
 from data_synth.simulate import Measured, simulate
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.score import form_weights, scales_of
+from stitch.diagnosis.regime import regime_of
+from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.sensitivity import least_noncentrality
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need
@@ -119,7 +120,7 @@ def smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float 
                 float(weight),
                 len(EFFECTS),
                 degrees_of_freedom,
-                scales_of(linear),
+                regime_of(linear).scales,
             )
             found.append((off, np.sqrt(least) / max(float(np.linalg.norm(white @ values[form.keep])), 1e-12)))
     nearest = min(off for off, _ in found)

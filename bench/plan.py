@@ -24,8 +24,8 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.simulate import Measured
 from stitch import frames
 from stitch.diagnosis.candidates import Candidate, candidates_of
+from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit
-from stitch.diagnosis.verdict import decide
 from stitch.frames import Array
 from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.model.model import Model
@@ -119,7 +119,7 @@ def diagnosed(measured: Measured, predicted: Row) -> Row:
     freed = unconstrained_poses(capture, capture.poses(measured.T_mount), 4 * capture.spacing)
     model = Model(measured.T_mount)
     linear = surface_model(measurement, model, capture, freed)
-    selection = decide(linear, candidates_of(linear)[0], scatter_limit(session))
+    selection = gather_evidence(linear, candidates_of(linear)[0], scatter_limit(session))
     out: Row = {"verdict": selection.verdict, "said": [r.name for r in selection.named]}
     if not measured.hidden:
         errors = prior_pose_errors([measurement], model, [freed.overlaps.gram.centre])

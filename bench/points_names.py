@@ -25,8 +25,9 @@ from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
 from stitch.diagnosis.candidates import candidates_of
+from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit
-from stitch.diagnosis.verdict import Selection, decide
+from stitch.diagnosis.verdict import Evidence
 from stitch.frames import Array
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
@@ -76,7 +77,7 @@ def known(kind: str, size: float, rng: np.random.Generator) -> dict[str, Any]:
     return {"gears": lambda q: own * np.sin(q + phase)} if kind == "eccentric gear" else {}
 
 
-def said(kind: str, size: float, seed: int, views: int) -> Selection:
+def said(kind: str, size: float, seed: int, views: int) -> Evidence:
     """What is concluded of one cell with an error of some kind in it."""
     joints, rng = joints_of(np.random.default_rng(seed), views), np.random.default_rng([seed, KINDS.index(kind)])
     own = kind.removesuffix(BESIDE)
@@ -84,7 +85,7 @@ def said(kind: str, size: float, seed: int, views: int) -> Selection:
     errors = errors_of(unnamed, size, joints, rng)
     session, T_mount, _ = labelled_cell(seed, views=views, errors=errors, **known(own, size, rng))
     linear = target_model(measurement_of(session, prepare_capture(session)), Model(T_mount), None)
-    return decide(linear, candidates_of(linear)[0], scatter_limit(session))
+    return gather_evidence(linear, candidates_of(linear)[0], scatter_limit(session))
 
 
 def share(count: int, total: int) -> str:

@@ -22,9 +22,9 @@ from unknown_cells import Asked, World, asked, seen
 
 from data_synth import nature
 from stitch.diagnosis.candidates import Form
+from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import ALPHA_NAME, IMPLAUSIBLE, POWER
-from stitch.diagnosis.verdict import decide
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need
 from stitch.observations.linear_model import LinearModel
@@ -81,7 +81,7 @@ def found(a: Asked, effect: str, multiple: float, k: int) -> bool | None:
         return None
     laws = nature.draw({effect: multiple * size}, 1.0, a.cell.plan, np.random.default_rng([chance_of_law, 2]))[0]
     linear = seen(a, World(laws), rng)
-    return decide(linear, a.candidates, ScatterLimit(*IMPLAUSIBLE)).verdict != "adequate"
+    return gather_evidence(linear, a.candidates, ScatterLimit(*IMPLAUSIBLE)).verdict != "adequate"
 
 
 def row(effect: str, cells: list[Asked], draws: int) -> tuple[str, int, float]:

@@ -20,10 +20,11 @@ from unknown_cells import Asked, World, asked, seen, with_overlaps_of
 from unknown_trials import HEAD, Trial, shares
 from unknown_worlds import MULTIPLES, PARTS
 
+from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
 from stitch.diagnosis.unnamed_time_laws import find_repeating_errors
-from stitch.diagnosis.verdict import Selection, decide
+from stitch.diagnosis.verdict import Evidence
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
@@ -51,7 +52,7 @@ def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: in
             continue  # these views do not show it at any size
         linear, begun = seen(a, world, rng), time.process_time()
         linear = linear.scatter_only if as_before else linear
-        found = decide(linear, a.candidates, USUAL)
+        found = gather_evidence(linear, a.candidates, USUAL)
         names = tuple(r.name for r in found.named) + ((found.second.name,) if found.second else ())
         then, group = named_after(a, world, linear, found) if part in AGAIN else ((), ())
         also = () if world.arm is None else OF_THE_ARM
@@ -64,7 +65,7 @@ def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: in
 
 
 def named_after(
-    asked: Asked, world: World, linear: LinearModel, found: Selection
+    asked: Asked, world: World, linear: LinearModel, found: Evidence
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What is named next, and next again, when the effect that was named is added, as `stitch add` would; and the
     group that cannot be told apart, if it ends with one."""
@@ -76,7 +77,7 @@ def named_after(
         world = replace(world, laws=world.laws.without(name))
         linear = with_overlaps_of(asked, world, linear).conditioned_on(form.columns, form.sizes)
         candidates = [c for c in candidates if c.name != name]
-        found = decide(linear, candidates, USUAL)
+        found = gather_evidence(linear, candidates, USUAL)
         then += [found.named[0].name] if found.verdict == "missing_effect" else []
     return tuple(then), tuple(r.name for r in found.named) if found.verdict == "cannot_tell" else ()
 

@@ -8,7 +8,7 @@ from stitch.diagnosis.diagnose import diagnose_state
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.score import start_with_effects
 from stitch.diagnosis.stepwise_selection import find_effect_to_drop
-from stitch.diagnosis.thresholds import HELDOUT_RISE, MANY_VIEWS
+from stitch.diagnosis.thresholds import HELDOUT_RISE
 from stitch.diagnosis.validation import group_helps, group_share
 from stitch.integrity.deep_check import refuse_explained_mistake
 from stitch.integrity.model_transfer import (
@@ -22,6 +22,7 @@ from stitch.measurement.capture import part_size, prepare_capture
 from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.measurement.session import Session
 from stitch.model.model_toml import ModelFile, arm_model, convert_unit
+from stitch.observations.pose_errors import MANY_VIEWS
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.runs.run import Run, RunState, StageResult, state_of
 from stitch.stages.assemble import FitSummary, assemble_run, pipeline_for

@@ -1,4 +1,4 @@
-"""The whole diagnosis: linear model, candidates, selection, what to measure next, one plain sentence."""
+"""The whole diagnosis: linear model, candidates, evidence, verdict, what to measure next, one plain sentence."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -7,10 +7,19 @@ import numpy as np
 
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.diagnosis.evidence import (
+    challenge,
+    cross_validate_named,
+    find_scanner_error,
+    overlap_misfit_beyond_noise,
+    score_pair,
+    select,
+)
 from stitch.diagnosis.next_view import propose_measurements
 from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.residual_structure import BudgetLine, dependences, follows_field, variance_budget
-from stitch.diagnosis.score import Score, implausible, scatter_limit
+from stitch.diagnosis.score import Score, scatter_limit
 from stitch.diagnosis.sensitivity import (
     alias_matrix,
     aliases_of,
@@ -19,19 +28,11 @@ from stitch.diagnosis.sensitivity import (
     omitted_effect_bias,
 )
 from stitch.diagnosis.sentences import diagnosis_sentence
-from stitch.diagnosis.thresholds import CROSS_VALIDATED_CANDIDATES, MANY_POSES, MANY_VIEWS
+from stitch.diagnosis.thresholds import CROSS_VALIDATED_CANDIDATES, MANY_POSES
 from stitch.diagnosis.unnamed_joint_laws import joint_curves
 from stitch.diagnosis.unnamed_time_laws import RepeatingError, find_repeating_errors, reportable
 from stitch.diagnosis.validation import CrossValidation, cross_validate
-from stitch.diagnosis.verdict import (
-    Selection,
-    check_verdict,
-    cross_validate_named,
-    find_scanner_error,
-    overlap_misfit_beyond_noise,
-    score_pair,
-    select,
-)
+from stitch.diagnosis.verdict import Evidence
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.run import RunState
@@ -54,24 +55,22 @@ def diagnose_state(state: RunState) -> Diagnosis:
 def _diagnose(state: RunState) -> Diagnosis:
     linear, limit = linear_model_of(state), scatter_limit(state.session)
     candidates, missing = candidates_of(linear)
-    selection = select(linear, candidates, limit)
-    left_out = cross_validate_named(linear, selection)
-    selection, smooth = check_verdict(linear, candidates, selection, left_out)
-    matrix = alias_matrix(linear, [r.score for r in selection.ranked])
-    examined = _examine_candidates(linear, selection, matrix, sum(not c.empirical for c in candidates), left_out)
+    evidence = select(linear, candidates, limit)
+    left_out = cross_validate_named(linear, evidence)
+    evidence = challenge(linear, candidates, evidence, left_out)
     within = overlap_misfit_beyond_noise(linear, state.session.scanner.noise)
-    if within and selection.verdict == "adequate":
-        selection = replace(selection, verdict="unknown_effect")
-    unknown = selection.verdict == "unknown_effect"
-    unnamed = _repeating_errors(linear, selection) if unknown else ()
-    of_field = unknown and (smooth is not None or follows_field(selection.empirical, unnamed))
+    evidence = replace(evidence, overlap_misfit=within)
+    matrix = alias_matrix(linear, [r.score for r in evidence.ranked])
+    examined = _examine_candidates(linear, evidence, matrix, sum(not c.empirical for c in candidates), left_out)
+    unknown = evidence.verdict == "unknown_effect"
+    unnamed = _repeating_errors(linear, evidence) if unknown else ()
+    of_field = unknown and (evidence.scanner_error is not None or follows_field(evidence.empirical, unnamed))
     curves = joint_curves([law for kind in unnamed for law in kind.laws])
-    beyond = implausible(linear, limit)
-    said = reportable(unnamed, beyond)
+    said = reportable(unnamed, evidence.implausible_scatter)
     rotation, translation = _pose_scatter(linear, said)
     found = Diagnosis(
-        verdict=selection.verdict,
-        effects=tuple(r.name for r in selection.named),
+        verdict=evidence.verdict,
+        effects=tuple(r.name for r in evidence.named),
         sentence="",
         residual_rms=state.residual_rms,
         heldout_rms=state.heldout_rms,
@@ -80,40 +79,40 @@ def _diagnose(state: RunState) -> Diagnosis:
         translation=translation,
         candidates=tuple(examined),
         matrix=matrix,
-        depends_on=tuple(dependences(linear, selection.empirical)),
-        next=tuple(propose_measurements(linear, selection)),
+        depends_on=tuple(dependences(linear, evidence.empirical)),
+        next=tuple(propose_measurements(linear, evidence)),
         missing=missing,
         linear=linear,
-        notes=selection.notes,
+        notes=evidence.notes,
         scatter_limit=limit,
-        implausible=beyond,
+        implausible=evidence.implausible_scatter,
         repeating_errors=unnamed,
         curves=curves,
-        log_odds_over_nothing=selection.log_odds_over_nothing,
+        log_odds_over_nothing=evidence.log_odds_over_nothing,
         overlap_misfit=within,
         follows_field=of_field,
-        scanner_error=smooth or (find_scanner_error(linear) if unknown else None),
+        scanner_error=evidence.scanner_error or (find_scanner_error(linear) if unknown else None),
         doubts=state.doubts,
-        budget=_error_budget(linear, selection, said),
+        budget=_error_budget(linear, evidence, said),
     )
     return replace(
-        found, sentence=diagnosis_sentence(found, state.session.length_unit, _rescore_pair(linear, selection))
+        found, sentence=diagnosis_sentence(found, state.session.length_unit, _rescore_pair(linear, evidence))
     )
 
 
-def _rescore_pair(linear: LinearModel, selection: Selection) -> tuple[Ranked, Ranked] | None:
+def _rescore_pair(linear: LinearModel, evidence: Evidence) -> tuple[Ranked, Ranked] | None:
     """Two effects that are missing; of many views they were chosen beside each other."""
-    if selection.second is None:
+    if evidence.second is None:
         return None
-    first, second = selection.named[0], selection.second
-    if linear.measurement.views.count >= MANY_VIEWS:
+    first, second = evidence.named[0], evidence.second
+    if regime_of(linear).many_views:
         return first, second
-    return score_pair(linear, first, second, len(selection.ranked))
+    return score_pair(linear, first, second, len(evidence.ranked))
 
 
-def _repeating_errors(linear: LinearModel, selection: Selection) -> tuple[RepeatingError, ...]:
+def _repeating_errors(linear: LinearModel, evidence: Evidence) -> tuple[RepeatingError, ...]:
     """What repeats without a name, asked only where the verdict did not rest on it."""
-    return find_repeating_errors(linear) if selection.repeating_errors is None else selection.repeating_errors
+    return find_repeating_errors(linear) if evidence.repeating_errors is None else evidence.repeating_errors
 
 
 def _pose_scatter(linear: LinearModel, reported: Sequence[RepeatingError]) -> tuple[float, float]:
@@ -125,11 +124,11 @@ def _pose_scatter(linear: LinearModel, reported: Sequence[RepeatingError]) -> tu
 
 
 def _error_budget(
-    linear: LinearModel, selection: Selection, reported: Sequence[RepeatingError]
+    linear: LinearModel, evidence: Evidence, reported: Sequence[RepeatingError]
 ) -> tuple[BudgetLine, ...]:
     """Of what the poses leave, with what is named first and what is said to err without a name."""
     process = reported[0].process if reported else None
-    return variance_budget(_with_joint_law(linear, reported), [r.score for r in selection.named[:1]], process)
+    return variance_budget(_with_joint_law(linear, reported), [r.score for r in evidence.named[:1]], process)
 
 
 def _with_joint_law(linear: LinearModel, reported: Sequence[RepeatingError]) -> LinearModel:
@@ -144,17 +143,17 @@ def linear_model_of(state: RunState) -> LinearModel:
 
 
 def _examine_candidates(
-    linear: LinearModel, selection: Selection, matrix: Array, tests: int, left_out: Mapping[str, CrossValidation]
+    linear: LinearModel, evidence: Evidence, matrix: Array, tests: int, left_out: Mapping[str, CrossValidation]
 ) -> list[CandidateEffect]:
     """Every candidate with what it would leave on views left out, what looks like it, and its detectable sizes.
 
     Args:
         left_out: of those that may be named, beside all that they were named beside; the others are asked alone.
     """
-    scores, push = [r.score for r in selection.ranked], hand_eye_response(linear)
+    scores, push = [r.score for r in evidence.ranked], hand_eye_response(linear)
 
     def validated(k: int) -> CandidateEffect:
-        ranked, candidate = selection.ranked[k], scores[k].candidate
+        ranked, candidate = evidence.ranked[k], scores[k].candidate
         detectable = detectable_sizes(linear, candidate, tests)
         return CandidateEffect(
             ranked=ranked,

@@ -17,7 +17,7 @@ from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.sensitivity import alias_matrix
 from stitch.diagnosis.thresholds import ALIAS_CORRELATION, SEPARATION_LAMBDA
-from stitch.diagnosis.verdict import Selection
+from stitch.diagnosis.verdict import Evidence
 from stitch.frames import Array, Indices
 from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import Sightings, build_capture
@@ -254,9 +254,9 @@ class Proposal:
     views: int | None = None  # how many such views are needed
 
 
-def propose_measurements(linear: LinearModel, selection: Selection) -> list[Proposal]:
+def propose_measurements(linear: LinearModel, evidence: Evidence) -> list[Proposal]:
     """What would tell the named group apart; without a group, the clearest candidate from what resembles it."""
-    group = _effects_to_separate(linear, selection)
+    group = _effects_to_separate(linear, evidence)
     names = tuple(score.name for score in group)
     artefacts = [Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS]
     found = _best_pose(linear, group) if _can_move(linear.measurement) else None
@@ -269,14 +269,14 @@ def propose_measurements(linear: LinearModel, selection: Selection) -> list[Prop
     return [pose, *artefacts]
 
 
-def _effects_to_separate(linear: LinearModel, selection: Selection) -> list[Score]:
+def _effects_to_separate(linear: LinearModel, evidence: Evidence) -> list[Score]:
     """What to separate: the group that was named, or the best candidate and its nearest alias; else nothing."""
-    if len(selection.named) > 1:
-        return [r.score for r in selection.named]
-    seen = [r for r in selection.ranked if r.score.observable and r.score.fitted][:6]
-    if selection.verdict == "adequate" or len(seen) < 2:
+    if len(evidence.named) > 1:
+        return [r.score for r in evidence.named]
+    seen = [r for r in evidence.ranked if r.score.observable and r.score.fitted][:6]
+    if evidence.verdict == "adequate" or len(seen) < 2:
         return []
-    first: Ranked = selection.named[0] if selection.named else seen[0]
+    first: Ranked = evidence.named[0] if evidence.named else seen[0]
     others = [r.score for r in seen if r.name != first.name]
     row = alias_matrix(linear, [first.score, *others])[0, 1:]
     return [first.score, others[int(row.argmax())]] if row.max() > ALIAS_CORRELATION else []

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate, Form, candidate_of
+from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, IMPLAUSIBLE, LOG_BAYES_FACTOR
 from stitch.effects.contract import Effect, find_effect
 from stitch.frames import Array, Mask
@@ -23,8 +24,8 @@ from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.observations.linear_model import LinearModel
 from stitch.stages.assemble import linearise
 from stitch.statistics.distributions import chi2_limit, f_tail
-from stitch.statistics.parameter_selection import ANY_SIZE, PLAUSIBLE, log_mixture
-from stitch.statistics.reml import MANY_NUMBERS, at_variances, fit_variances
+from stitch.statistics.parameter_selection import log_mixture
+from stitch.statistics.reml import at_variances, fit_variances
 from stitch.statistics.variance_posterior import satterthwaite
 from stitch.system.threads import parallel
 from stitch.units import METRES
@@ -40,14 +41,6 @@ from stitch.units import METRES
 
 # A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
 _FREE = 30.0
-# Among more numbers than this the variances are the same under both priors, and a fit takes half a second.
-LONG = 250
-
-
-def scales_of(linear: LinearModel) -> dict[float, float]:
-    """Of the plausible sizes of an effect's parameters, with the share of belief in each: labelled points show sizes
-    whatever their prior, beside a prior of pose errors any may be the true one."""
-    return ANY_SIZE if linear.pose_errors is not None else PLAUSIBLE
 
 
 @dataclass(frozen=True)
@@ -79,8 +72,9 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
     """
     mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), _FREE * form.sizes
     integrated = fit_variances(mixed, G, scale * form.sizes, start=start)
-    scales = scales_of(linear)
-    if mixed.size > LONG and linear.pose_errors is None:
+    regime = regime_of(linear)
+    scales = regime.scales
+    if regime.long_without_prior:
         scales = {scale: scales[scale]}
     found = {scale: integrated.deviance}
     if len(scales) > 1:
@@ -90,7 +84,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
         if best != scale:
             scale, integrated = best, fit_variances(mixed, G, best * form.sizes, start=integrated.variances)
             found[best] = integrated.deviance
-    if mixed.size > LONG or linear.pose_errors is not None:
+    if regime.free_fit_keeps_variances:
         free = at_variances(mixed, integrated.variances, G, wide)
     else:
         free = fit_variances(mixed, G, wide, integrated.variances)
@@ -105,7 +99,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
 def _scatter_degrees(linear: LinearModel, form: Form, rest: int) -> float:
     """Degrees of freedom to which the scatter along the columns of a form is known: fewer than numbers are left, where
     views tell several components apart; among very many numbers as many."""
-    if linear.pose_errors is None and linear.mixed.size > LONG:
+    if regime_of(linear).long_without_prior:
         return rest
     return max(linear.satterthwaite.degrees_of_freedom(linear.in_blocks(linear.residual(form.columns))), 1.0)
 
@@ -124,7 +118,7 @@ def gain_at_null(linear: LinearModel, form: Form, white: Array) -> Gain:
     """At the null's variances: cheap, and an upper hand for what cannot help."""
     white = white * form.sizes
     told, b = white.T @ white, white.T @ linear.white_residual
-    shares = scales_of(linear)
+    shares = regime_of(linear).scales
     scales = np.array(list(shares))
     information = np.eye(len(b)) + scales[:, None, None] ** 2 * told
     squares = scales**2 * (np.linalg.solve(information, np.tile(b[:, None], (len(scales), 1, 1)))[..., 0] @ b)
@@ -142,15 +136,8 @@ def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:
 
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
 SEEN = 0.5
-# Forms that do not gain under the null's variances do not gain under their own either.
-_HOPELESS = -4.0
-# Under several variances, of which one is nearly that of the maximum, they gain half a nat at the most.
-_HOPELESS_ANYWHERE = -1.5
 # Forms so far (nats) behind the best one of their candidate add less than a per cent to it.
 _FAR = 6.0
-# With thousands of numbers the variances hardly move, and each fit takes a second: the best forms must do, and a
-# wide prior in place of that of plausible sizes moves the variances not at all.
-_REFITTED, _AMONG_MANY = 20_000, 2
 
 
 @dataclass(frozen=True)
@@ -203,8 +190,8 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     likely = quick.max(axis=1)
     # Under a scatter that holds an effect itself no plausible size is seen, and yet a gross one gains.
     seen = seen or bool(likely.max() > LOG_BAYES_FACTOR)
-    least = max(_HOPELESS if base.pose_errors is None else _HOPELESS_ANYWHERE, likely.max() - _FAR)
-    worth = [i for i in np.argsort(-likely, kind="stable")[: _count_refitted_forms(linear)] if likely[i] >= least]
+    least = max(regime_of(base).least_quick_gain, likely.max() - _FAR)
+    worth = [i for i in np.argsort(-likely, kind="stable")[: regime_of(linear).forms_refitted] if likely[i] >= least]
     tried = [
         try_form(base, form, starts[start].null.variances, gained[start][i].scale)
         if i in worth and candidate.forms[i].columns.any()
@@ -232,14 +219,6 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
         scale=best.scale,
         base_model=_base_with_candidate(base, best),
     )
-
-
-def _count_refitted_forms(linear: LinearModel) -> int:
-    """How many forms of a candidate are worth a fit of their own."""
-    size = linear.mixed.size
-    if linear.pose_errors is not None and size > LONG:
-        return 1
-    return _AMONG_MANY if size > MANY_NUMBERS else _REFITTED // size
 
 
 def _base_with_candidate(base: LinearModel, best: FormTrial) -> LinearModel | None:

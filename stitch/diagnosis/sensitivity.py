@@ -14,7 +14,8 @@ from scipy.optimize import brentq
 
 from stitch import frames
 from stitch.diagnosis.candidates import Candidate
-from stitch.diagnosis.score import Score, form_weights, scales_of
+from stitch.diagnosis.regime import regime_of
+from stitch.diagnosis.score import Score, form_weights
 from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR, POWER
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
@@ -181,7 +182,7 @@ def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> d
         white = linear.residual(form.columns)
         known = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
         names = tuple(p.name for p in form.free)
-        shown.append(FormInformation(names, white, form.sizes, float(weight), known, scales_of(linear)))
+        shown.append(FormInformation(names, white, form.sizes, float(weight), known, regime_of(linear).scales))
     return detectable_sizes_by_form(shown, tests)
 
 

@@ -6,6 +6,7 @@ from functools import partial
 
 from stitch.diagnosis.candidates import Candidate, candidate_as_fitted
 from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, conditioned_without, is_certain, rank, rank_one
+from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import promising, score
 from stitch.diagnosis.thresholds import CANDIDATES_TRIED, MANY_POSES, MAX_JOINT_EFFECTS
 from stitch.diagnosis.validation import Extrapolation, cross_validate, extrapolate, untested_ends_reason
@@ -212,7 +213,7 @@ def _eliminate_backward(
 ) -> tuple[list[Ranked], dict[str, Extrapolation | None]]:
     """The effects that can still be named beside all the others, and what each does beyond the measured poses."""
 
-    near = conditioned_on_effects(linear, chosen) if linear.pose_errors is None else None
+    near = conditioned_on_effects(linear, chosen) if not regime_of(linear).prior else None
 
     def extrapolated(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
         beside = conditioned_without(linear, among, r, near)

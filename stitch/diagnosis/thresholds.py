@@ -14,8 +14,6 @@ PRIOR_NOTHING, PRIOR_PHYSICAL, PRIOR_UNKNOWN = 0.5, 0.45, 0.05
 # Probability with which the smallest detectable size is detected (custom in power analysis).
 POWER = 0.8
 
-# Views from which on several missing effects can be told at once, and an effect that others made idle is dropped.
-MANY_VIEWS = 100
 # Beyond so many, columns of candidates take a megabyte each, and all of them half a gigabyte.
 MANY_POSES = 1000
 # Effects that are sought at once, and candidates tried in earnest for each of them: what a minute allows.
@@ -41,3 +39,12 @@ ALIAS_CORRELATION = 0.9
 SEPARATION_LAMBDA = 5.4
 # Candidates whose prediction on left-out views is computed; the others explain nothing.
 CROSS_VALIDATED_CANDIDATES = 8
+
+# Numbers in the channel beyond which variances are the same under both priors of sizes, and a fit takes half a second.
+LONG = 250
+# Nats: forms that lose so many under the null's variances do not gain under their own either; under several variances,
+# of which one is nearly that of the maximum, they gain half a nat at the most.
+HOPELESS_GAIN, HOPELESS_GAIN_WITH_PRIOR = -4.0, -1.5
+# Numbers times forms that are fitted for a candidate (some seconds). With thousands of numbers the variances hardly
+# move, and each fit takes a second: the best forms must do.
+REFITTED_NUMBERS, FORMS_REFITTED_WITH_MANY_NUMBERS = 20_000, 2

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from stitch.diagnosis import unnamed_joint_laws
+from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
 from stitch.diagnosis.unnamed_joint_laws import (
@@ -309,7 +310,7 @@ _PAIRED_JOINTS, _COURSES_FITTED = 2, 2
 
 def unnamed_courses(linear: LinearModel) -> tuple[FittedProcess, ...]:
     """The likeliest of them beside a model; () where pose errors have a prior."""
-    if linear.pose_errors is not None:
+    if regime_of(linear).prior:
         return ()
     found = [size_process(linear, wandering_flange(linear))]
     if linear.measurement.views.has("joints"):

@@ -278,8 +278,11 @@ def _load_processes(torques: Sequence[Torques], offsets: Array) -> dict[str, Smo
 _ARM_SCALE, SMOOTH_SCALE = 0.1, 0.03
 # What the scans of a stop share.
 STOP_COMPONENTS = ("stop rotation", "stop translation")
-# Dense matrices of more views take minutes; there the scatter alone must do.
+# Dense matrices of more views take minutes in a fit; there the scatter alone must do.
 _MOST_VIEWS = 150
+# A diagnosis scores every candidate beside all errors that poses may have, which takes a minute for so many views. From
+# there on poses count as scattering independently, and effects are sought several at once (`diagnosis/regime.py`).
+MANY_VIEWS = 100
 _CONSTANT_EFFECTS = ("joint_offset", "link_geometry")
 
 

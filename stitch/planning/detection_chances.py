@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.diagnosis.score import SEEN, form_weights, scales_of
+from stitch.diagnosis.regime import regime_of
+from stitch.diagnosis.score import SEEN, form_weights
 from stitch.diagnosis.sensitivity import detectable_sizes
 from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR, ODDS, PRIOR_PHYSICAL, SEPARATION_LAMBDA
 from stitch.diagnosis.unnamed_joint_laws import TIMES, law_covariances, log_posterior_of_any
@@ -81,7 +82,7 @@ def test_of_candidate(linear: LinearModel, candidate: Candidate, tests: int) -> 
     Args:
         linear: the candidate is none of its pose errors.
     """
-    forms, scales = zip(candidate.forms, form_weights(candidate), strict=True), scales_of(linear)
+    forms, scales = zip(candidate.forms, form_weights(candidate), strict=True), regime_of(linear).scales
     found = [
         _form_test(linear, scale * form.columns * form.sizes, float(weight), tests, share)
         for form, weight in forms

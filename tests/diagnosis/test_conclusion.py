@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from stitch.diagnosis import verdict as conclusion
+from stitch.diagnosis import evidence as gathering
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.validation import CrossValidation
-from stitch.diagnosis.verdict import Selection
+from stitch.diagnosis.verdict import Evidence
 
 HELPS = CrossValidation(inside=0.5, heldout=0.6, poses=0.4, poses_sigma=0.1, steadiness=0.9)
 USELESS = CrossValidation(inside=0.5, heldout=1.0, poses=1.0, poses_sigma=0.1, steadiness=0.9)
@@ -22,37 +22,40 @@ def ranked(name, beside=None, adjusted=1e-6):
 
 
 FIRST, SECOND = ranked("range_nonlinearity"), ranked("lens_distortion")
-ALONE = Selection("missing_effect", (FIRST,), (FIRST, SECOND), ())
-PAIR = replace(ALONE, second=SECOND)
-SMOOTH = SimpleNamespace(gain=50.0)
+ALONE = Evidence((FIRST, SECOND), (), alarm=True, explanation=(FIRST,))
+PAIR = replace(ALONE, further=SECOND)
+SMOOTH = SimpleNamespace(gain=50.0, over_noise=False)
 
 
 @pytest.fixture(autouse=True)
 def without_halves(monkeypatch):
-    monkeypatch.setattr(conclusion, "halves", lambda score: None)
-    monkeypatch.setattr(conclusion, "cross_validate", lambda linear, score: HELPS)
+    monkeypatch.setattr(gathering, "validate_in_halves", lambda score: None)
+    monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: HELPS)
 
 
-def upheld(monkeypatch, selection, *, together, refused):
-    """With what the views say of two effects together, and selections that the scanner's own error outweighs."""
+def upheld(monkeypatch, evidence, *, together, refused):
+    """With what the views say of two effects together, and evidences that the scanner's own error outweighs."""
 
-    def scanner_first(linear, s):
-        return (replace(s, verdict="unknown_effect", named=(), second=None), SMOOTH) if s in refused else (s, None)
+    def with_scanner_error(linear, e):
+        return replace(e, scanner_error=SMOOTH) if e in refused else e
 
-    monkeypatch.setattr(conclusion, "_together", lambda *asked: together)
-    monkeypatch.setattr(conclusion, "scanner_first", scanner_first)
-    return conclusion.check_verdict(None, (), selection, conclusion.cross_validate_named(None, selection))
+    pair = together and (together.explanation[0], together.further)
+    monkeypatch.setattr(gathering, "regime_of", lambda linear: SimpleNamespace(many_views=False))
+    monkeypatch.setattr(gathering, "find_missing_pair", lambda *asked: pair)
+    monkeypatch.setattr(gathering, "pair_is_validated", lambda *asked: True)
+    monkeypatch.setattr(gathering, "with_scanner_error", with_scanner_error)
+    return gathering.challenge(None, (), evidence, gathering.cross_validate_named(None, evidence))
 
 
 def test_what_looks_like_an_error_of_the_scanner_may_be_a_second_effect(monkeypatch):
-    found, smooth = upheld(monkeypatch, ALONE, together=PAIR, refused=[ALONE])
-    assert (found.named, found.second, smooth) == ((FIRST,), SECOND, None)
+    found = upheld(monkeypatch, ALONE, together=PAIR, refused=[ALONE])
+    assert (found.named, found.second, found.scanner_error) == ((FIRST,), SECOND, None)
 
 
 @pytest.mark.parametrize("together", [None, PAIR])
 def test_what_two_effects_do_not_explain_stays_the_scanners(monkeypatch, together):
-    found, smooth = upheld(monkeypatch, ALONE, together=together, refused=[ALONE, PAIR])
-    assert found.verdict == "unknown_effect" and not found.named and smooth is SMOOTH
+    found = upheld(monkeypatch, ALONE, together=together, refused=[ALONE, PAIR])
+    assert found.verdict == "unknown_effect" and not found.named and found.scanner_error is SMOOTH
 
 
 @pytest.mark.parametrize("alone", [HELPS, USELESS])
@@ -60,9 +63,9 @@ def test_a_second_effect_without_the_first_is_asked_alone(monkeypatch, alone):
     first, second = ranked("backlash", beside=SECOND), ranked("fixture_drift", beside=FIRST)
     by_itself = ranked("fixture_drift")
     said = {id(first.score): USELESS, id(second.score): HELPS, id(by_itself.score): alone}
-    monkeypatch.setattr(conclusion, "cross_validate", lambda linear, score: said[id(score)])
-    selection = Selection("missing_effect", (first,), (ranked("backlash"), by_itself), (), second=second)
-    found, _ = upheld(monkeypatch, selection, together=None, refused=[])
+    monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: said[id(score)])
+    evidence = Evidence((ranked("backlash"), by_itself), (), alarm=True, explanation=(first,), further=second)
+    found = upheld(monkeypatch, evidence, together=None, refused=[])
     assert found.named == ((by_itself,) if alone is HELPS else ())
     assert "backlash" in found.notes[0]
 
@@ -70,8 +73,8 @@ def test_a_second_effect_without_the_first_is_asked_alone(monkeypatch, alone):
 def test_a_second_effect_that_alone_may_be_chance_gets_no_name(monkeypatch):
     first, second = ranked("backlash", beside=SECOND), ranked("fixture_drift", beside=FIRST)
     by_itself = ranked("fixture_drift", adjusted=0.2)
-    monkeypatch.setattr(conclusion, "cross_validate", lambda linear, score: USELESS if score is first.score else HELPS)
-    selection = Selection("missing_effect", (first,), (ranked("backlash"), by_itself), (), second=second)
-    found, _ = upheld(monkeypatch, selection, together=None, refused=[])
+    monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: USELESS if score is first.score else HELPS)
+    evidence = Evidence((ranked("backlash"), by_itself), (), alarm=True, explanation=(first,), further=second)
+    found = upheld(monkeypatch, evidence, together=None, refused=[])
     assert found.verdict == "unknown_effect" and not found.named
     assert "backlash" in found.notes[0]

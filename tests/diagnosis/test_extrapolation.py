@@ -8,7 +8,6 @@ from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.ranking import is_certain, rank_one
 from stitch.diagnosis.stepwise_selection import find_exchange
 from stitch.diagnosis.validation import Extrapolation, extrapolate, untested_ends_reason
-from stitch.diagnosis.verdict import _rejection_notes
 from stitch.effects.contract import EFFECTS
 from stitch.pipeline import run
 from stitch.runs.run import state_of
@@ -58,10 +57,6 @@ def test_effects_that_no_end_tells_of_are_refused_in_one_sentence():
         assert Extrapolation(share, 0.1, end, 1.2, 0.1, 0.5).unseen == unseen
     told = untested_ends_reason(["backlash", "mount_warmup", "settling"])
     assert told.startswith("backlash, mount_warmup and settling would help") and "less than 2% together" in told
-    assert _rejection_notes({"backlash": told, "settling": told, "mount_drift": "mount_drift does not"}) == (
-        told,
-        "mount_drift does not",
-    )
 
 
 def exchanged(session, name, rivals):

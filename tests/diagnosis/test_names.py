@@ -12,11 +12,11 @@ from data_synth.ordinary_arm import with_memory
 from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.diagnosis.unnamed_joint_laws import joint_curves, joint_laws, laws_of_kinds, significant_laws
 from stitch.diagnosis.unnamed_time_laws import find_repeating_errors
-from stitch.diagnosis.verdict import decide
 from stitch.effects.contract import EFFECTS
 from stitch.observations.pose_errors import ALL_ANGLES, JOINT_LOAD, OWN_ANGLE, WITH_TIME
 from stitch.statistics.reml import MAY_BE_ABSENT, NOISE, log_prior
@@ -47,7 +47,7 @@ def said_of(cell, T_base_flange):
     """Verdict and linear model where the flange truly is there."""
     linear = cell.seen(T_base_flange)
     candidates = [c for name in ASKED if (c := candidate_of(linear, EFFECTS[name])) is not None]
-    return decide(linear, candidates, ScatterLimit(*IMPLAUSIBLE)), linear
+    return gather_evidence(linear, candidates, ScatterLimit(*IMPLAUSIBLE)), linear
 
 
 def test_an_offset_of_one_joint_is_named(cell):

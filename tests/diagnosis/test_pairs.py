@@ -6,8 +6,8 @@ import pytest
 from data_synth import kinematics
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.evidence import find_missing_pair, pair_is_validated
 from stitch.diagnosis.ranking import is_certain, rank_all
-from stitch.diagnosis.verdict import find_missing_pair, pair_is_validated
 from stitch.effects.contract import EFFECTS
 from tests.diagnosis.freed_blade import freed_blade
 

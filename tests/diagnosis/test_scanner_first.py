@@ -4,23 +4,23 @@ from types import SimpleNamespace
 
 import pytest
 
-from stitch.diagnosis import verdict as scanner_first
+from stitch.diagnosis import evidence as gathering
 from stitch.diagnosis.ranking import Ranked
-from stitch.diagnosis.verdict import Selection
+from stitch.diagnosis.verdict import Evidence
 from stitch.observations.surfaces.scanner_errors import FieldError
 
 
-def named(gain: float) -> Selection:
+def named(gain: float) -> Evidence:
     """An effect of a joint that the data want by so many nats."""
     term = SimpleNamespace(effect=SimpleNamespace(place="robot"))
     score = SimpleNamespace(name="backlash", log_bayes_factor=gain, form=SimpleNamespace(term=term))
     ranked = Ranked(score, adjusted=1e-6, log_posterior=gain, posterior=0.99)
-    return Selection("missing_effect", (ranked,), (ranked,), ())
+    return Evidence((ranked,), (), alarm=True, explanation=(ranked,))
 
 
-def held(monkeypatch: pytest.MonkeyPatch, selection: Selection, shown: FieldError | None) -> Selection:
-    monkeypatch.setattr(scanner_first, "scanner_error", lambda linear, beside=(): shown)
-    return scanner_first.check_scanner_errors(None, selection)[0]
+def held(monkeypatch: pytest.MonkeyPatch, evidence: Evidence, shown: FieldError | None) -> Evidence:
+    monkeypatch.setattr(gathering, "find_scanner_error", lambda linear, other_terms=(): shown)
+    return gathering.with_scanner_error(None, evidence)
 
 
 def error(gain: float, over_noise: bool = True) -> FieldError:
@@ -34,7 +34,7 @@ def test_the_clearer_of_the_two_is_said(monkeypatch):
 
 
 def test_only_more_than_the_noise_is_not_adequate(monkeypatch):
-    nothing = Selection("adequate", (), (), ())
+    nothing = Evidence((), ())
     assert held(monkeypatch, nothing, None).verdict == "adequate"
     assert held(monkeypatch, nothing, error(8.0, over_noise=False)).verdict == "adequate"
     assert held(monkeypatch, nothing, error(8.0)).verdict == "unknown_effect"

@@ -8,7 +8,7 @@ import pytest
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.sentences import diagnosis_sentence, odds_text
-from stitch.diagnosis.verdict import Selection
+from stitch.diagnosis.verdict import Evidence
 
 
 @pytest.mark.parametrize("verdict", ["adequate", "unknown_effect"])
@@ -21,10 +21,10 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "missing": {},
         "depends_on": (),
         "implausible": False,
-        "unnamed": (),
-        "within": 0.0,
-        "of_field": False,
-        "smooth": None,
+        "repeating_errors": (),
+        "overlap_misfit": 0.0,
+        "follows_field": False,
+        "scanner_error": None,
         "scatter_limit": ScatterLimit(2.5e-4, 0.12),
     }
     told = diagnosis_sentence(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)
@@ -81,9 +81,9 @@ def test_so_may_a_group(odds, said):
 def test_of_a_group_one_is_enough():
     """Odds add up: two at 10 to 1 each are 20 to 1 that one is there."""
     each = SimpleNamespace(log_odds_over_nothing=np.log(10.0))
-    group = Selection("cannot_tell", (each, each), (), ())
+    group = Evidence((each, each), (), alarm=True, explanation=(each, each))
     assert group.log_odds_over_nothing == pytest.approx(np.log(20.0))
-    assert Selection("adequate", (), (), ()).log_odds_over_nothing == np.inf
+    assert Evidence((), ()).log_odds_over_nothing == np.inf
 
 
 def test_odds_are_told_as_far_as_anybody_can_vouch_for_them():

@@ -11,6 +11,7 @@ from scipy.stats import multivariate_normal
 from data_synth.ordinary_arm import with_memory
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
 from stitch.diagnosis.unnamed_time_laws import (
@@ -19,7 +20,6 @@ from stitch.diagnosis.unnamed_time_laws import (
     significant_time_law,
     time_processes,
 )
-from stitch.diagnosis.verdict import decide
 from stitch.effects.contract import EFFECTS
 from stitch.observations.pose_errors import DRIFT_MEMORY
 from stitch.statistics.reml import log_prior
@@ -45,7 +45,7 @@ def linear_of(cell, errors):
 
 def verdict_of(linear):
     candidates = [c for name in ASKED if (c := candidate_of(linear, EFFECTS[name])) is not None]
-    return decide(linear, candidates, ScatterLimit(*IMPLAUSIBLE))
+    return gather_evidence(linear, candidates, ScatterLimit(*IMPLAUSIBLE))
 
 
 @pytest.mark.parametrize("period", [4.0, 5.5, 8.0])

@@ -4,9 +4,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from stitch.diagnosis.evidence import with_validation
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.validation import CrossValidation
-from stitch.diagnosis.verdict import Selection, validate_named
+from stitch.diagnosis.verdict import Evidence
 
 HELPS = CrossValidation(inside=0.5, heldout=0.6, poses=0.4, poses_sigma=0.1, steadiness=0.9)
 USELESS = CrossValidation(inside=0.5, heldout=1.0, poses=1.0, poses_sigma=0.1, steadiness=0.9)
@@ -15,8 +16,8 @@ ON_ONE_VIEW = CrossValidation(inside=0.5, heldout=0.6, poses=0.4, poses_sigma=0.
 
 def told(found: CrossValidation) -> tuple[str, tuple[str, ...]]:
     named = Ranked(SimpleNamespace(name="backlash"), adjusted=1e-3, log_posterior=5.0, posterior=0.99)
-    selection = Selection("missing_effect", (named,), (named,), ())
-    upheld = validate_named(selection, {"backlash": found}, {"backlash": None})
+    evidence = Evidence((named,), (), alarm=True, explanation=(named,))
+    upheld = with_validation(evidence, {"backlash": found}, {"backlash": None})
     return upheld.verdict, upheld.notes
 
 

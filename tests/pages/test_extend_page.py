@@ -31,7 +31,7 @@ from stitch import frames
 from stitch.diagnosis import candidates
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.score import ScatterLimit
-from stitch.diagnosis.verdict import select
+from stitch.diagnosis.evidence import select
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.effects import EFFECTS
 from stitch.measurement.capture import capture

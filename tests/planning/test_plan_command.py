@@ -14,8 +14,8 @@ from data_synth.write import write_session
 from stitch import frames
 from stitch.cli.main import main
 from stitch.diagnosis.candidates import candidates_of
+from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit
-from stitch.diagnosis.verdict import decide
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.planning.expected_model import cell_of_session, simulate_views
 from stitch.planning.plan import PlanRequest, plan_further_views, with_views
@@ -154,5 +154,5 @@ def _named(session, cell, measured, draw):
     poses = true @ cell.model.T_mount
     freed = replace(found.unconstrained, poses=poses).relative_to(found.unconstrained.poses)
     linear = surface_model(found.measurement, cell.model, found.measurement.capture, freed)
-    selection = decide(linear, candidates_of(linear)[0], scatter_limit(session_of(measured)))
+    selection = gather_evidence(linear, candidates_of(linear)[0], scatter_limit(session_of(measured)))
     return selection.verdict == "missing_effect" and selection.named[0].name == "joint_compliance"

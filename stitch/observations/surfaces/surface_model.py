@@ -11,7 +11,7 @@ from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model, Term, sizes_of, values_of
 from stitch.observations.linear_model import CoefficientPrior, LinearModel, PointSums, Response, with_pose_errors
-from stitch.observations.pose_errors import prior_pose_errors
+from stitch.observations.pose_errors import MANY_VIEWS, prior_pose_errors
 from stitch.observations.surfaces.effect_columns import PointGram, view_columns, view_responses
 from stitch.observations.surfaces.hand_eye_fit import (
     ReducedPoses,
@@ -87,9 +87,6 @@ class SurfaceTrial:
 
 # Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
 _UNSEEN = 0.25
-# Scoring every candidate beside all errors that poses may have takes a minute for so many views; there poses count as
-# scattering independently, and effects are sought several at once.
-_MOST_VIEWS = 100
 
 
 @dataclass(frozen=True)
@@ -181,7 +178,7 @@ def surface_model(
     mixed = replace(hand_eye_mixed_model(channel, channel.reduction @ extra[:, seen]), fixed=alone.fixed)
     design = np.hstack([hand_eye_jacobian(frames_of_mount, g.centre), extra[:, seen]])
     errors = None
-    if measurement.views.count < _MOST_VIEWS:
+    if measurement.views.count < MANY_VIEWS:
         errors = prior_pose_errors([measurement], model, [g.centre]).project(channel.reduction)
         mixed = with_pose_errors(mixed, errors)
     null = _null_fit(mixed, () if errors is None else errors.names, variances)
