@@ -108,7 +108,7 @@ def test_diagnosis_of_a_real_object_says_that_poses_dominate_and_joints_are_not_
     assert found.verdict in ("unknown_effect", "cannot_tell")
     assert "pose errors dominate" in found.sentence
     assert "repeat" in found.sentence
-    assert "joint effects" in found.sentence
+    assert "Joint effects" in found.sentence
     assert "joint_compliance" in found.missing
 
 

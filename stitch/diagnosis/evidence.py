@@ -182,8 +182,8 @@ def _log_bayes_factor(linear: LinearModel, candidate: Candidate) -> float:
 
 # Errors of one and two periods a turn have a name; those of three and four have not.
 _GEARS, _NAMELESS_ORDERS = ("gear_eccentricity", "gear_harmonic"), ("fourier_3", "fourier_4")
-_NOT_REQUIRED = "{}: an error without a name, smooth in the joint angles or in time, explains these views as well"
-_LESS_CLEAR = "{} is less clear than that"
+_NOT_REQUIRED = "{}: an unnamed error, smooth in the joint angles or in time, explains these views as well"
+_LESS_CLEAR = "{} explains less than the scanner's own error"
 
 
 def gather_evidence(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:
@@ -394,10 +394,10 @@ def pair_is_validated(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
 def _rejection_reason(named: Ranked, left_out: CrossValidation | None, halves: Halves | None) -> str | None:
     """Why an effect does not stand the test of views left out."""
     if left_out is not None and left_out.steadiness < MIN_STEADINESS:
-        return f"{named.name} rests on a single view: without it {max(left_out.steadiness, 0):.0%} of it remain"
+        return f"{named.name} rests on one view: without it {max(left_out.steadiness, 0):.0%} of the effect remain"
     if left_out is not None and not left_out.helps:
         share = f"{left_out.poses:.2f} ± {left_out.poses_sigma:.2f}"
-        return f"{named.name} would not help on views left out (mean square pose error {share} of now)"
+        return f"{named.name} does not help on views left out: it leaves a mean square pose error of {share} of now"
     return None if halves is None else halves.rejection_reason(named.name)
 
 

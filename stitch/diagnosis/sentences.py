@@ -1,49 +1,224 @@
-"""The diagnosis in one plain sentence with its numbers."""
+"""The diagnosis in plain sentences with its numbers: one fact each, what was found first, what to do last."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.residual_structure import NOT_REPEATING
+from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
 from stitch.diagnosis.unnamed_joint_laws import JointCurve
 from stitch.diagnosis.unnamed_time_laws import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
 from stitch.observations.surfaces.scanner_errors import FieldError
 from stitch.units import angle_text, duration_text, format_amount, length_text, rounded
 
-# What errs by no known law in words: where in the range of a joint, when in the session.
-
 # Curves of joints that are told in words; the page draws one more.
 _MAX_CURVES = 2
 
 
+def diagnosis_sentence(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] | None) -> str:
+    """Return what was found, how much is left, where it comes from and what to do.
+
+    Args:
+        pair: two effects that are missing, each beside the other; the first is the one that is named.
+    """
+    match d.verdict:
+        case "adequate":
+            found = _adequate(d, length_unit)
+        case "missing_effect":
+            found = _missing_effect(d, length_unit, pair)
+        case "cannot_tell":
+            found = _ambiguous_group(d, length_unit)
+        case _:
+            found = _unknown_effect(d, length_unit)
+    return " ".join(sentence for sentence in found if sentence)
+
+
+def _adequate(d: Diagnosis, length_unit: str) -> Iterator[str]:
+    yield f"The model is adequate. {_residual_sentence(d, length_unit)}"
+    if _poses_scatter(d):
+        yield f"The robot's poses scatter by {_pose_scatter(d, length_unit)} (1 σ), which explains the rest."
+        limits = _scatter_limits(d, length_unit)
+        if d.scatter_limit.stated:
+            yield f"The stated repeatability allows {limits}."
+        else:
+            yield f"No repeatability is stated under [robot]; usual arms stay below {limits}."
+    if d.scanner_error is not None:
+        calibration = "" if d.scanner_error.by_view else ", but a calibration may"
+        yield f"{scanner_error_sentence(d.scanner_error, length_unit)} No pose corrects that{calibration}."
+    yield _rejected_effects(d)
+
+
+def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] | None) -> Iterator[str]:
+    candidate = next(c for c in d.candidates if c.name == d.effects[0])
+    ranked = pair[0] if pair else candidate.ranked
+    yield f"{candidate.name} {_is_missing(d)} ({fitted_amounts(ranked)}; p = {ranked.adjusted:.1g})."
+    yield _odds_over_chance(d)
+    yield _residual_sentence(d, length_unit)
+    if candidate.cross_validation is not None:
+        inside, heldout = (length_text(x, length_unit) for x in d.rms_if_added(candidate.cross_validation))
+        yield f"With the effect it should be {inside}, and on views left out {heldout}."
+    if pair:
+        yield f"{pair[1].name} seems to be missing too ({fitted_amounts(pair[1])})."
+        yield "Both sizes hold for a model with both effects."
+    yield _implausible_sizes(ranked)
+
+
+def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:
+    yield f"Something {_is_missing(d)}: {' or '.join(d.effects)}. These views cannot tell which."
+    yield _odds_over_chance(d)
+    yield _residual_sentence(d, length_unit)
+    if d.next:
+        yield f"To tell them apart, {d.next[0].do}."
+
+
+def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
+    yield f"No effect of the library explains what is left. {_residual_sentence(d, length_unit)}"
+    if d.overlap_misfit:
+        size = length_text(d.overlap_misfit, length_unit, 2)
+        yield f"However each view is moved, the overlaps keep a misfit of {size}."
+        yield "So the scanner or the part's shape is off, and not only the poses."
+    if d.follows_field:
+        yield from scanner_advice(d.scanner_error, length_unit)
+        yield _rejected_effects(d)
+        return
+    if d.scanner_error is not None:
+        yield scanner_error_sentence(d.scanner_error, length_unit)
+        if d.scanner_error.by_view:
+            yield f"Poses found from such scans scatter too. {_CAUSES}"
+    clear = [x.covariate for x in d.depends_on if x.p_value < CLEAR_DEPENDENCE][:3]
+    if clear:
+        yield f"What is left follows {_listed(clear, 'and')}."
+    yield from _poses_of_unknown(d, length_unit)
+    yield _rejected_effects(d)
+    untested = [name for name, needs in d.missing.items() if "joints" in needs or "torque" in needs]
+    if untested:
+        yield f"Joint effects were not tested ({', '.join(untested)}): they need joint angles and the robot's geometry."
+
+
+def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
+    """What the poses do where nothing is named."""
+    scatter = _pose_scatter(d, length_unit)
+    if said := reportable(d.repeating_errors, d.implausible):
+        size = np.sqrt(sum(line.sigma**2 for line in d.budget if line.source not in NOT_REPEATING))
+        amount = f" ({length_text(float(size), length_unit, 2)})" if size > 0 else ""
+        yield f"The pose errors repeat{amount}: they {' and '.join(u.words for u in said)}."
+        yield f"Apart from that the poses scatter by {scatter}."
+    elif not d.implausible:
+        yield f"The poses scatter by {scatter}." if _poses_scatter(d) else "The measured points do not show the poses."
+    elif d.overlap_misfit:
+        yield f"The poses scatter by {scatter}; how much of that is the robot's shows once the misfit is corrected."
+    else:
+        limit = f"{'stated' if d.scatter_limit.stated else 'usual'}: up to {_scatter_limits(d, length_unit)}"
+        yield f"The robot's pose errors dominate: they scatter by {scatter} ({limit})."
+        yield "Such errors repeat at the same poses, so a correction found on one object holds for another."
+
+
+def _residual_sentence(d: Diagnosis, length_unit: str) -> str:
+    now, floor = (length_text(x, length_unit) for x in (d.residual_rms, d.noise_floor))
+    return f"The residual is {now}; the sensor's noise alone would leave {floor}."
+
+
+def _is_missing(d: Diagnosis) -> str:
+    return "is missing" if d.certain else "may be missing"
+
+
+def _odds_over_chance(d: Diagnosis) -> str:
+    """How much likelier than chance it is, where that is little."""
+    return "" if d.certain else f"The odds that it is more than chance are {odds_text(d.log_odds_over_nothing)}."
+
+
+def _implausible_sizes(ranked: Ranked) -> str:
+    """What is larger than anybody would expect."""
+    s = ranked.score
+    large = [p.name for p, v in zip(s.form.free, s.values, strict=True) if abs(v) > p.limit] if s.fitted else []
+    if not large:
+        return ""
+    return f"{_listed(large, 'and')} {'is' if len(large) == 1 else 'are'} larger than plausible: check session.toml."
+
+
+def _pose_scatter(d: Diagnosis, length_unit: str) -> str:
+    return f"{length_text(d.translation, length_unit)} and {angle_text(d.rotation)}"
+
+
+def _scatter_limits(d: Diagnosis, length_unit: str) -> str:
+    return f"{length_text(d.scatter_limit.translation, length_unit)} and {angle_text(d.scatter_limit.rotation)}"
+
+
+def _poses_scatter(d: Diagnosis) -> bool:
+    """True unless what was seen is the same wherever the poses are."""
+    return d.rotation > 0 or d.translation > 0
+
+
+def _rejected_effects(d: Diagnosis) -> str:
+    """Effects that explain much and are not named, and why: an alarm that did not stand is no silence."""
+    return " ".join(f"Not named: {note}." for note in d.notes)
+
+
+def _listed(names: Sequence[str], last: str) -> str:
+    """a, b and c."""
+    return f" {last} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+# Smooth errors of the scans themselves: the same in every view, or every view's own.
+
+_CAUSES = (
+    "Possible causes: a part that bends, an arm still settling during the scan, a scanner that warms up or errs by "
+    "range or brightness."
+)
+
+
+def scanner_error_sentence(found: FieldError, length_unit: str) -> str:
+    """Return the clearer of the two kinds with its size; how much views err by themselves besides is uncertain."""
+    if found.by_view:
+        size = length_text(found.rms_by_view, length_unit, 2)
+        return f"Each scan has a smooth error of its own{_drift_clause(found)}: {size} rms."
+    size = length_text(found.rms, length_unit, 2)
+    common = f"The scanner errs over its field, the same in every view: {size} rms."
+    return f"{common} In part each view errs by itself{_drift_clause(found)}." if found.rms_by_view else common
+
+
+def scanner_advice(found: FieldError | None, length_unit: str) -> Iterable[str]:
+    """Return what the scans err by where nothing else is named, and what to do; None: only the poses show it."""
+    if found is not None and found.by_view:
+        return (
+            scanner_error_sentence(found, length_unit),
+            _CAUSES,
+            "Scan the first pose again at the end: what differs then comes from the part or from time.",
+        )
+    where = "What is left depends on where in the scanner's field a point is seen, the same in every view."
+    size = "" if found is None else scanner_error_sentence(found, length_unit)
+    return where, size, "Have the scanner calibrated, or describe its error by an effect of your own."
+
+
+def _drift_clause(found: FieldError) -> str:
+    return ", larger as the session goes on" if found.with_time else ""
+
+
+# Errors without a name: where in the range of a joint, when in the session.
+
+
 def curve_sentences(found: Diagnosis, length_unit: str) -> list[str]:
-    """A sentence for every course that is clear enough to be said, of joints and in time."""
+    """Return a sentence for every course that is clear enough, of joints and in time."""
     shown = found.curves[:_MAX_CURVES]
-    told = [*map(joint_curve_sentence, shown), *_ambiguous_covariates(shown)]
-    in_time = found.time_curve
-    return told if in_time is None else [*told, time_curve_sentence(in_time, length_unit)]
+    told = [joint_curve_sentence(curve) for curve in shown]
+    open_ones = {c.joint: c.may_follow for c in shown if len(c.may_follow) > 1}
+    told += [
+        f"These views do not tell whether joint {joint} follows {_listed(others, 'or')}."
+        for joint, others in open_ones.items()
+    ]
+    return told if found.time_curve is None else [*told, time_curve_sentence(found.time_curve, length_unit)]
 
 
 def joint_curve_sentence(curve: JointCurve) -> str:
-    """Where in the range a joint errs: Joint 3 is off by -0.25 ± 0.03 mrad at j4 = -48°, and by …"""
+    """Return where in the range a joint errs: Joint 3 is off by -0.25 ± 0.03 mrad at j4 = -48°, and by …"""
     low, high = (
         f"{rounded(1e3 * curve.error[i], 1e3 * curve.sigma[i])} ± {1e3 * curve.sigma[i]:.1g} mrad "
         f"{_place_in_words(curve, i)}"
         for i in curve.extremes
     )
-    of_it = f"{curve.share:.0%} of what it does without a name"
-    return f"Joint {curve.joint} is off by {low}, and by {high}, beside its mean: {of_it}."
-
-
-def _ambiguous_covariates(curves: Sequence[JointCurve]) -> list[str]:
-    """What each joint may follow as well as what its course is drawn along."""
-    open_ones = {c.joint: c.may_follow for c in curves if len(c.may_follow) > 1}
-    return [
-        f"These views do not tell whether joint {joint} follows {', '.join(others[:-1])} or {others[-1]}."
-        for joint, others in open_ones.items()
-    ]
+    return f"Joint {curve.joint} is off by {low}, and by {high}. That is {curve.share:.0%} of its error without a name."
 
 
 def _place_in_words(curve: JointCurve, k: int) -> str:
@@ -63,231 +238,20 @@ def _place_in_words(curve: JointCurve, k: int) -> str:
 
 
 def time_curve_sentence(curve: TimeCurve, length_unit: str) -> str:
-    """How far a flange seems to be off in time: It is as if the flange were off by as much as 0.12 ± 0.01 mm …"""
-    there, moved, its_sigma = curve.largest(TRANSLATION_PART)
-    then, turned, sigma = curve.largest(ROTATION_PART)
-    far, turn = format_amount(moved, its_sigma, length_unit), format_amount(turned, sigma, "rad")
+    """Return how far a flange seems to be off in time, and what could name the cause."""
+    moved_at, moved, moved_sigma = curve.largest(TRANSLATION_PART)
+    turned_at, turned, turned_sigma = curve.largest(ROTATION_PART)
     return (
-        f"It is as if the flange were off by as much as {far} {_time_in_words(curve, there)} and turned by {turn} "
-        f"{_time_in_words(curve, then)}. What goes that way in the cell (a temperature, a machine nearby) could "
-        "name it, as a "
-        "column of views.csv."
+        f"The flange seems off by up to {format_amount(moved, moved_sigma, length_unit)} "
+        f"{_time_in_words(curve, moved_at)}, and turned by up to {format_amount(turned, turned_sigma, 'rad')} "
+        f"{_time_in_words(curve, turned_at)}. If something in the cell varies like that (a temperature, a machine "
+        "nearby), add it to views.csv as a column."
     )
 
 
 def _time_in_words(curve: TimeCurve, k: int) -> str:
     steps = curve.steps[k] - curve.steps[0]
     return f"{duration_text(steps * curve.seconds)} into the session" if curve.seconds else f"at view {steps:.0f}"
-
-
-# Smooth errors of the scans themselves in words: the same in every view, or every view's own.
-
-
-def scanner_clause_if_adequate(found: FieldError | None, length_unit: str) -> str:
-    """What stands beside a model to which nothing is missing; empty where nothing is unusual."""
-    if found is None:
-        return ""
-    calibration = "" if found.by_view else ", but a calibration may"
-    return f"; {_scanner_error_clause(found, length_unit)}, which no pose corrects{calibration}"
-
-
-def scanner_clause_before_poses(found: FieldError | None, length_unit: str) -> str:
-    """What is said of the scans before what poses do that has no name; empty where nothing is unusual."""
-    if found is None:
-        return ""
-    follows = f" ({_CAUSES}), so that poses found from them scatter too" if found.by_view else ""
-    return f"{_scanner_error_clause(found, length_unit)}{follows}; "
-
-
-def scanner_error_sentence(found: FieldError | None, length_unit: str) -> str:
-    """Where nothing is named, what the scans err by, and what to do; None: as the views' poses show it."""
-    if found is not None and found.by_view:
-        size = length_text(found.rms_by_view, length_unit, 2)
-        return (
-            f"the scans err smoothly, every view by itself ({size} rms{_drift_clause(found)}): {_CAUSES}; scan "
-            "the first "
-            "pose again at the end: what differs then is of the part or of the time"
-        )
-    size = f" ({length_text(found.rms, length_unit, 2)} rms)" if found is not None else ""
-    more = "" if found is None else _per_view_clause(found)
-    return (
-        f"the scanner errs by where in its field a point is seen, the same in every view{size}{more}; have it "
-        "calibrated, or describe how it errs by an effect of your own"
-    )
-
-
-_CAUSES = (
-    "a part that bends or moves, an arm that still settles while a scan is read, a scanner that warms up or errs by "
-    "range, brightness or a finer law"
-)
-
-
-def _scanner_error_clause(found: FieldError, length_unit: str) -> str:
-    """The clearer of the two kinds, with its size."""
-    if found.by_view:
-        size = length_text(found.rms_by_view, length_unit, 2)
-        return f"the scans err by {size} rms, smoothly and every view by itself{_drift_clause(found)}"
-    size = length_text(found.rms, length_unit, 2)
-    return f"the scanner errs by {size} rms over its field, the same in every view{_per_view_clause(found)}"
-
-
-def _per_view_clause(found: FieldError) -> str:
-    """What views have for themselves besides; how much is uncertain beside what they have in common."""
-    return f", and in part every view by itself{_drift_clause(found)}" if found.rms_by_view else ""
-
-
-def _drift_clause(found: FieldError) -> str:
-    return ", as the session goes on" if found.with_time else ""
-
-
-def diagnosis_sentence(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] | None) -> str:
-    """One sentence for each verdict.
-
-    Args:
-        pair: two effects that are missing, each beside the other; the first is the one that is named.
-    """
-    now, floor = (length_text(x, length_unit) for x in (d.residual_rms, d.noise_floor))
-    scatter = f"{length_text(d.translation, length_unit)} and {angle_text(d.rotation)}"
-    if d.verdict == "adequate":
-        by = _scatter_limit_clause(d, length_unit)
-        rest = f", and a pose repeatability of {scatter} (standard deviations) explains the rest, {by}"
-        return (
-            f"The model is adequate: {now} remain where the sensor's noise alone would leave {floor}"
-            f"{rest if _poses_scatter(d) else ''}{scanner_clause_if_adequate(d.scanner_error, length_unit)}"
-            f"{_rejected_effects(d)}."
-        )
-    if d.verdict == "missing_effect":
-        return _missing_effect_sentence(d, length_unit, now, floor, pair)
-    if d.verdict == "cannot_tell":
-        return _ambiguous_group_sentence(d, now, floor)
-    return _unknown_effect_sentence(d, length_unit, now, floor, scatter)
-
-
-def _ambiguous_group_sentence(d: Diagnosis, now: str, floor: str) -> str:
-    missing = "is missing" if d.certain else "may be missing"
-    start = f"Something {missing} ({now} remain, noise {floor}{_odds_over_chance(d)})"
-    then = f"; {d.next[0].do}." if d.next else "."
-    return f"{start}, but these views cannot tell {' or '.join(d.effects)} apart{then}"
-
-
-def _missing_effect_sentence(
-    d: Diagnosis, length_unit: str, now: str, floor: str, pair: tuple[Ranked, Ranked] | None
-) -> str:
-    name = d.effects[0]
-    candidate = next(s for s in d.candidates if s.name == name)
-    ranked = pair[0] if pair else candidate.ranked
-    gain = ""
-    if candidate.cross_validation is not None:
-        left, out = (length_text(x, length_unit) for x in d.rms_if_added(candidate.cross_validation))
-        gain = f"; adding it should leave about {left}, {out} on views left out"
-    too = f"{pair[1].name} seems to be there too ({fitted_amounts(pair[1])})" if pair else ""
-    more = f" {too}; each is sized beside the other." if pair else ""
-    missing = "is missing" if d.certain else "may be missing"
-    return (
-        f"{name} {missing} ({fitted_amounts(ranked)}; p = {ranked.adjusted:.1g}{_odds_over_chance(d)}): {now} "
-        "remain where noise "
-        f"would leave {floor}{gain}.{more}{_implausible_sizes(ranked)}"
-    )
-
-
-def _implausible_sizes(ranked: Ranked) -> str:
-    """What is larger than anybody would expect."""
-    s = ranked.score
-    large = [p.name for p, v in zip(s.form.free, s.values, strict=True) if abs(v) > p.limit] if s.fitted else []
-    if not large:
-        return ""
-    are = "is" if len(large) == 1 else "are"
-    return f" {' and '.join(large)} {are} beyond what is plausible: is what the session states right?"
-
-
-def _odds_over_chance(d: Diagnosis) -> str:
-    """How much likelier than chance it is, where that is little."""
-    return "" if d.certain else f", {odds_text(d.log_odds_over_nothing)} that it is more than chance"
-
-
-def _unknown_effect_sentence(d: Diagnosis, length_unit: str, now: str, floor: str, scatter: str) -> str:
-    start = (
-        f"No effect of the library explains what is left ({now}, noise {floor}): "
-        f"{_overlap_misfit_clause(d, length_unit)}"
-    )
-    if d.follows_field:
-        return f"{start}{scanner_error_sentence(d.scanner_error, length_unit)}{_rejected_effects(d)}."
-    start += scanner_clause_before_poses(d.scanner_error, length_unit)
-    clear = [x.covariate for x in d.depends_on if x.p_value < 0.01][:3]
-    follows = f"it follows {', '.join(clear)}; " if clear else ""
-    if said := reportable(d.repeating_errors, d.implausible):
-        again = " and ".join(u.words for u in said)
-        return (
-            f"{start}{follows}the errors of the poses repeat, they "
-            f"{again}{_repeating_error_size(d, length_unit)}, and scatter by "
-            f"{scatter} otherwise{_rejected_effects(d)}{_untested_effects(d)}."
-        )
-    if not d.implausible:
-        otherwise = (
-            f"the poses scatter by {scatter} otherwise"
-            if _poses_scatter(d)
-            else "what was seen does not show the poses"
-        )
-        return f"{start}{follows}{otherwise}{_rejected_effects(d)}{_untested_effects(d)}."
-    if d.overlap_misfit:
-        poses = f"until that is corrected nothing is known of the poses, which scatter by {scatter}"
-        return f"{start}{follows}{poses}{_rejected_effects(d)}{_untested_effects(d)}."
-    than = (
-        f"more than {_scatter_limits(d, length_unit)} as stated"
-        if d.scatter_limit.stated
-        else "which no sound arm does"
-    )
-    return (
-        f"{start}{follows}the robot's pose errors dominate, they scatter by {scatter}, {than}; such errors repeat at "
-        "the same poses, so that those found on one object correct "
-        f"another{_rejected_effects(d)}{_untested_effects(d)}."
-    )
-
-
-def _overlap_misfit_clause(d: Diagnosis, length_unit: str) -> str:
-    """What no motion of the views takes away."""
-    if not d.overlap_misfit:
-        return ""
-    return (
-        f"{length_text(d.overlap_misfit, length_unit, 2)} remain however each view is moved, so that the scanner "
-        "or the part's "
-        "shape is off and not the poses alone; "
-    )
-
-
-def _repeating_error_size(d: Diagnosis, length_unit: str) -> str:
-    """How large the errors are that repeat without a name."""
-    size = np.sqrt(sum(line.sigma**2 for line in d.budget if line.source not in NOT_REPEATING))
-    return f" ({length_text(float(size), length_unit, 2)})" if size > 0 else ""
-
-
-def _poses_scatter(d: Diagnosis) -> bool:
-    """True unless what was seen is the same wherever the poses are."""
-    return d.rotation > 0 or d.translation > 0
-
-
-def _scatter_limit_clause(d: Diagnosis, length_unit: str) -> str:
-    """What "adequate" is measured against."""
-    if d.scatter_limit.stated:
-        return f"within {_scatter_limits(d, length_unit)} as stated"
-    usual = _scatter_limits(d, length_unit)
-    return f"judged by what is usual for an arm (up to {usual}): no repeatability is stated under [robot]"
-
-
-def _scatter_limits(d: Diagnosis, length_unit: str) -> str:
-    return f"{length_text(d.scatter_limit.translation, length_unit)} and {angle_text(d.scatter_limit.rotation)}"
-
-
-def _rejected_effects(d: Diagnosis) -> str:
-    """Effects that explain much and are not named, and why: an alarm that did not stand is no silence."""
-    return "".join(f"; {note}" for note in d.notes)
-
-
-def _untested_effects(d: Diagnosis) -> str:
-    untested = [name for name, needs in d.missing.items() if "joints" in needs or "torque" in needs]
-    if not untested:
-        return ""
-    return f"; without joint angles and the robot's geometry joint effects ({', '.join(untested)}) cannot be tested"
 
 
 def odds_text(log_odds: float) -> str:

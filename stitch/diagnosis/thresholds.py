@@ -37,6 +37,8 @@ CLEAR_SIGMAS, FAINT_SIGMAS = 4.0, 2.0
 ALIAS_CORRELATION = 0.9
 # λ with P(correct) = Φ(√(λ/2)) = 0.95 between two effects.
 SEPARATION_LAMBDA = 5.4
+# p-value below which what is left is said to follow a covariate (custom).
+CLEAR_DEPENDENCE = 0.01
 # Candidates whose prediction on left-out views is computed; the others explain nothing.
 CROSS_VALIDATED_CANDIDATES = 8
 

@@ -58,19 +58,18 @@ class Extrapolation:
     def rejection_reason(self, name: str) -> str:
         """What speaks against an effect that explains much."""
         return (
-            f"{name} would help among the poses that were measured, but not beyond: at ends of joints' ranges that are "
-            f"left out it leaves {self.share:.2f} ± {self.sigma:.2f} of the mean square error, "
-            f"{self.worst_share:.2f} ± {self.worst_sigma:.2f} in {self.worst.name}; a further end would become better "
-            f"with a probability of {self.likely:.0%}"
+            f"{name} helps among the measured poses, but not beyond. At ends of joint ranges left out it leaves "
+            f"{self.share:.2f} ± {self.sigma:.2f} of the mean square error (worst, {self.worst.name}: "
+            f"{self.worst_share:.2f} ± {self.worst_sigma:.2f}). A further end would improve with a probability of "
+            f"{self.likely:.0%}"
         )
 
 
 def untested_ends_reason(names: Sequence[str]) -> str:
     """What speaks against effects of which the ends together tell nothing."""
     return (
-        f"{', '.join(names[:-1])} and {names[-1]} would help among the poses that were measured, but not beyond: ends "
-        f"of joints' ranges that are left out change by less than {1 - MAX_REMAINING_SHARE:.0%} together, for "
-        "better or worse"
+        f"{', '.join(names[:-1])} and {names[-1]} help among the measured poses, but not beyond. Ends of "
+        f"joint ranges left out change by less than {1 - MAX_REMAINING_SHARE:.0%} together"
     )
 
 
@@ -133,7 +132,7 @@ class CrossValidation:
         if self.helps and self.poses <= MAX_REMAINING_SHARE:
             return None
         share = f"{self.poses:.3f} ± {self.poses_sigma:.3f}"
-        return f"{name} hardly helps on views left out (mean square error {share} of without)"
+        return f"{name} hardly helps on views left out: it leaves {share} of the mean square error"
 
 
 def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
@@ -257,7 +256,7 @@ class Halves:
     def rejection_reason(self, name: str) -> str | None:
         """What speaks against an effect that explains much, if anything does."""
         if self.log_bayes_factor <= 0:
-            return f"{name} found in one half of the views does not help in the other"
+            return f"{name}, found in one half of the views, does not help in the other"
         # A clear effect whose form is not quite right differs a little, beyond chance: it is there all the same.
         if self.p_value < HALVES_P_VALUE and self.share < MIN_STEADINESS:
             return f"{name} has another size or sign in each half of the views (p = {self.p_value:.1g})"

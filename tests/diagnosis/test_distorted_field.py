@@ -43,7 +43,7 @@ def tilted(points):
 def test_a_scanner_of_bad_axes_or_focus_gets_no_name(measured, seen):
     found = said_of(measured, seen)
     assert found.verdict == "unknown_effect" and not found.effects
-    assert "the scanner errs by where in its field a point is seen" in found.sentence
+    assert "where in the scanner's field a point is seen" in found.sentence
     assert "pose errors dominate" not in found.sentence
 
 
@@ -61,7 +61,7 @@ def test_a_seam_in_the_field_is_not_adequate(measured):
 
     found = said_of(measured, seen)
     assert found.verdict == "unknown_effect" and 0.06 < found.overlap_misfit < 0.6
-    assert "remain however each view is moved" in found.sentence
+    assert "However each view is moved" in found.sentence
 
 
 def test_points_move_by_the_polynomial_that_is_stated(measured):

@@ -56,7 +56,7 @@ def test_effects_that_no_end_tells_of_are_refused_in_one_sentence():
     for share, unseen in ((0.95, False), (0.985, True), (1.0, True), (1.015, True), (1.5, False)):
         assert Extrapolation(share, 0.1, end, 1.2, 0.1, 0.5).unseen == unseen
     told = untested_ends_reason(["backlash", "mount_warmup", "settling"])
-    assert told.startswith("backlash, mount_warmup and settling would help") and "less than 2% together" in told
+    assert told.startswith("backlash, mount_warmup and settling help") and "less than 2% together" in told
 
 
 def exchanged(session, name, rivals):

@@ -28,10 +28,10 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "scatter_limit": ScatterLimit(2.5e-4, 0.12),
     }
     told = diagnosis_sentence(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)
-    assert "20 µm and 0.02 mrad" in told and told.endswith("; a note.")
+    assert "20 µm and 0.02 mrad" in told and told.endswith("Not named: a note.")
     silent = diagnosis_sentence(SimpleNamespace(**common, rotation=0.0, translation=0.0), "mm", None)
-    assert "13.2 µm" in silent and "mrad" not in silent and "repeatability" not in silent
-    assert silent.endswith("; a note.")
+    assert "13.2 µm" in silent and "mrad" not in silent and "scatter" not in silent
+    assert silent.endswith("Not named: a note.")
 
 
 NOT_FITTED = SimpleNamespace(fitted=False)
@@ -58,7 +58,7 @@ def said_at(odds: float, verdict: str, *effects: str, score=NOT_FITTED) -> str:
 @pytest.mark.parametrize(("odds", "said"), [(25.0, "is missing ("), (4.0, "may be missing (")])
 def test_a_name_less_than_twenty_to_one_over_chance_may_be_missing(odds, said):
     told = said_at(odds, "missing_effect", "settling")
-    assert said in told and ("4 to 1 that it is more than chance" in told) == (odds < 20)
+    assert said in told and ("more than chance are 4 to 1." in told) == (odds < 20)
 
 
 def test_what_is_larger_than_anybody_would_expect_is_asked_about():
@@ -68,14 +68,14 @@ def test_what_is_larger_than_anybody_would_expect_is_asked_about():
     score = SimpleNamespace(fitted=True, form=form, values=np.array([0.1, -8.0]), sigmas=np.array([0.02, 0.02]))
     told = said_at(1e9, "missing_effect", "link_geometry", score=score)
     assert "da2 = -8 ± 0.02 mm" in told
-    assert told.endswith(" da2 is beyond what is plausible: is what the session states right?")
+    assert told.endswith(" da2 is larger than plausible: check session.toml.")
 
 
-@pytest.mark.parametrize(("odds", "said"), [(25.0, "Something is missing ("), (4.0, "Something may be missing (")])
+@pytest.mark.parametrize(("odds", "said"), [(25.0, "Something is missing: "), (4.0, "Something may be missing: ")])
 def test_so_may_a_group(odds, said):
     told = said_at(odds, "cannot_tell", "settling", "backlash")
-    assert told.startswith(said) and ("4 to 1 that it is more than chance" in told) == (odds < 20)
-    assert told.endswith("cannot tell settling or backlash apart.")
+    assert told.startswith(said) and ("more than chance are 4 to 1." in told) == (odds < 20)
+    assert "missing: settling or backlash. These views cannot tell which." in told
 
 
 def test_of_a_group_one_is_enough():

@@ -1,8 +1,6 @@
-"""What is said of scans that err smoothly: the clearer of the two kinds first, and never in place of the poses."""
+"""What is said of scans that err smoothly: the clearer of the two kinds, with its size."""
 
-import pytest
-
-from stitch.diagnosis.sentences import scanner_clause_before_poses, scanner_clause_if_adequate, scanner_error_sentence
+from stitch.diagnosis.sentences import scanner_advice, scanner_error_sentence
 from stitch.observations.surfaces.scanner_errors import FieldError
 
 SAME = FieldError(0.02, 0.0, 9.0, over_noise=False)
@@ -10,16 +8,14 @@ BOTH = FieldError(0.02, 0.01, 9.0, over_noise=True, with_time=True)
 OWN = FieldError(0.0, 0.03, 9.0, over_noise=True, by_view=True)
 
 
-@pytest.mark.parametrize("said", [scanner_clause_if_adequate, scanner_clause_before_poses, scanner_error_sentence])
-def test_the_clearer_kind_is_said_with_its_size(said):
-    assert "20 µm" in said(SAME, "mm") and "the same in every view" in said(SAME, "mm")
-    assert "by itself" not in said(SAME, "mm")
-    both = said(BOTH, "mm")
-    assert "the same in every view" in both and "in part every view by itself, as the session goes on" in both
-    assert "30 µm" in said(OWN, "mm") and "every view by itself" in said(OWN, "mm") and "same" not in said(OWN, "mm")
+def test_the_clearer_kind_is_said_with_its_size():
+    same, both, own = (scanner_error_sentence(found, "mm") for found in (SAME, BOTH, OWN))
+    assert "the same in every view: 20 µm" in same and "by itself" not in same
+    assert "the same in every view" in both and "each view errs by itself, larger as the session goes on" in both
+    assert "of its own: 30 µm" in own and "same" not in own
 
 
-def test_nothing_is_said_of_usual_scans():
-    assert scanner_clause_if_adequate(None, "mm") == scanner_clause_before_poses(None, "mm") == ""
-    # Named by the views' poses alone: without a size.
-    assert "rms" not in scanner_error_sentence(None, "mm")
+def test_what_the_poses_alone_show_has_no_size():
+    assert "rms" not in " ".join(scanner_advice(None, "mm"))
+    assert "20 µm rms" in " ".join(scanner_advice(SAME, "mm"))
+    assert "again at the end" in " ".join(scanner_advice(OWN, "mm"))

@@ -36,6 +36,6 @@ def test_scatter_beyond_what_is_stated_is_not_adequate():
         stated: diagnose(replace(found, session=replace(session, repeatability=StatedRepeatability(position=stated))))
         for stated in (None, 0.08, 0.02)
     }
-    assert told[None].verdict == "adequate" and "no repeatability is stated" in told[None].sentence
-    assert told[0.08].verdict == "adequate" and "as stated" in told[0.08].sentence
-    assert told[0.02].verdict == "unknown_effect" and "as stated" in told[0.02].sentence
+    assert told[None].verdict == "adequate" and "No repeatability is stated" in told[None].sentence
+    assert told[0.08].verdict == "adequate" and "The stated repeatability allows" in told[0.08].sentence
+    assert told[0.02].verdict == "unknown_effect" and "(stated: up to" in told[0.02].sentence

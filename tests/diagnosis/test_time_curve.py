@@ -57,8 +57,8 @@ def test_it_reads_with_its_sizes_and_places():
     error, sigma = np.zeros((3, 6)), np.full((3, 6), 1e-5)
     error[1, :3], error[2, 3:], sigma[:, 3:] = (0, 3e-4, 4e-4), (0.06, -0.08, 0), 0.01
     curve = TimeCurve(np.array([2.0, 4.0, 6.0]), 90.0, error, sigma)
-    assert "0.1 ± 0.01 mm 6 min into the session and turned by 0.5 ± 0.01 mrad 3 min" in time_curve_sentence(
+    assert "0.1 ± 0.01 mm 6 min into the session, and turned by up to 0.5 ± 0.01 mrad 3 min" in time_curve_sentence(
         curve, "mm"
     )
     by_number = TimeCurve(curve.steps, 0.0, error, sigma)
-    assert "mm at view 4 and turned by 0.5 ± 0.01 mrad at view 2" in time_curve_sentence(by_number, "mm")
+    assert "mm at view 4, and turned by up to 0.5 ± 0.01 mrad at view 2" in time_curve_sentence(by_number, "mm")

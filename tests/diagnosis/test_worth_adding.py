@@ -30,7 +30,9 @@ def ranked(name: str) -> Ranked:
 )
 def test_what_is_told_helps_and_what_is_idle_is_said(monkeypatch, left, named, idle):
     monkeypatch.setattr(
-        stepwise_selection, "without", lambda linear, chosen, one: [r.name for r in chosen if r.name != one.name]
+        stepwise_selection,
+        "conditioned_without",
+        lambda linear, chosen, one: [r.name for r in chosen if r.name != one.name],
     )
     asked, scored = [], []
 
@@ -43,8 +45,8 @@ def test_what_is_told_helps_and_what_is_idle_is_said(monkeypatch, left, named, i
         return ranked(candidate.name)
 
     monkeypatch.setattr(stepwise_selection, "cross_validate", cross_validated)
-    monkeypatch.setattr(stepwise_selection, "ranked_one", again)
-    monkeypatch.setattr(stepwise_selection, "certain", lambda r: True)
+    monkeypatch.setattr(stepwise_selection, "rank_one", again)
+    monkeypatch.setattr(stepwise_selection, "is_certain", lambda r: True)
     kept, why = stepwise_selection.keep_worth_adding(None, [ranked(name) for name in left], 20)
     assert [r.name for r in kept] == named and list(why) == idle
     assert asked[0] == ("part_sag", [name for name in left if name != "part_sag"])  # beside all that are missing
