@@ -23,6 +23,7 @@ from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.measurement.session import Session
 from stitch.model.model_toml import ModelFile, arm_model, convert_unit
 from stitch.observations.pose_errors import MANY_VIEWS
+from stitch.planning.next_view import propose_measurements
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.runs.run import Run, RunState, StageResult, state_of
 from stitch.stages.assemble import FitSummary, assemble_run, pipeline_for
@@ -212,7 +213,8 @@ def diagnose(run: Run | RunState) -> Diagnosis:
     Raises:
         NoResultError: no two views overlap.
     """
-    return diagnose_state(state_of(run) if isinstance(run, Run) else run)
+    found = diagnose_state(state_of(run) if isinstance(run, Run) else run)
+    return replace(found, next=propose_measurements(found))
 
 
 # Diagnose, add, and again, until nothing is left to add; then drop what later effects have made idle.

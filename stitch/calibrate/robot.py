@@ -11,13 +11,13 @@ import numpy as np
 import tomli_w
 
 from stitch import frames
-from stitch.diagnosis.next_view import candidate_measurement, candidate_rows, nearby
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.measurement.robot import Robot, elementary, forward
 from stitch.measurement.session import Session, StatedRepeatability, View
 from stitch.model.model import Term, stack_parameters
 from stitch.pipeline import run
+from stitch.planning.candidate_views import candidate_measurement, candidate_rows, nearby
 from stitch.reading.robot_description import robot_from_dh, robot_from_urdf
 from stitch.reading.session_tables import has_reported_poses
 from stitch.runs.run import Run

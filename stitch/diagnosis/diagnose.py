@@ -15,7 +15,6 @@ from stitch.diagnosis.evidence import (
     score_pair,
     select,
 )
-from stitch.diagnosis.next_view import propose_measurements
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.residual_structure import BudgetLine, dependences, follows_field, variance_budget
@@ -70,7 +69,7 @@ def _diagnose(state: RunState) -> Diagnosis:
     rotation, translation = _pose_scatter(linear, said)
     found = Diagnosis(
         verdict=evidence.verdict,
-        effects=tuple(r.name for r in evidence.named),
+        named=evidence.named,
         sentence="",
         residual_rms=state.residual_rms,
         heldout_rms=state.heldout_rms,
@@ -80,7 +79,6 @@ def _diagnose(state: RunState) -> Diagnosis:
         candidates=tuple(examined),
         matrix=matrix,
         depends_on=tuple(dependences(linear, evidence.empirical)),
-        next=tuple(propose_measurements(linear, evidence)),
         missing=missing,
         linear=linear,
         notes=evidence.notes,

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.diagnosis.next_view import Proposal
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.residual_structure import BudgetLine, Dependence
 from stitch.diagnosis.score import ScatterLimit
@@ -16,6 +15,16 @@ from stitch.diagnosis.validation import CrossValidation
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.scanner_errors import FieldError
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One measurement."""
+
+    do: str  # plain words
+    separates: tuple[str, ...]
+    joints_deg: list[float] | None = None
+    views: int | None = None  # how many such views are needed
 
 
 @dataclass(frozen=True)
@@ -47,7 +56,7 @@ class Diagnosis:
     """
 
     verdict: str
-    effects: tuple[str, ...]
+    named: tuple[Ranked, ...]  # the effect that is missing, or the group that these views cannot tell apart
     sentence: str
     residual_rms: float
     heldout_rms: float  # the same on views left out
@@ -57,11 +66,11 @@ class Diagnosis:
     candidates: tuple[CandidateEffect, ...]
     matrix: Array  # (S, S) alias matrix of the candidates
     depends_on: tuple[Dependence, ...]
-    next: tuple[Proposal, ...]
     missing: dict[str, tuple[str, ...]]  # effects that cannot be tested, and what they lack
     linear: LinearModel
     scatter_limit: ScatterLimit  # what "adequate" is measured against
     implausible: bool  # the poses scatter by more than that
+    next: tuple[Proposal, ...] = ()  # what to measure next, once `stitch.diagnose` has planned it
     notes: tuple[str, ...] = ()
     repeating_errors: tuple[RepeatingError, ...] = ()  # kinds of errors that repeat, where nothing is named
     budget: tuple[BudgetLine, ...] = ()  # of what the poses leave
@@ -75,6 +84,11 @@ class Diagnosis:
     doubts: tuple[
         str, ...
     ] = ()  # of the session as a whole, as sentences: what is found may be no more than their mark
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """The names of what is missing."""
+        return tuple(r.name for r in self.named)
 
     @property
     def certain(self) -> bool:

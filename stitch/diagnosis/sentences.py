@@ -69,8 +69,6 @@ def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:
     yield f"Something {_is_missing(d)}: {' or '.join(d.effects)}. These views cannot tell which."
     yield _odds_over_chance(d)
     yield _residual_sentence(d, length_unit)
-    if d.next:
-        yield f"To tell them apart, {d.next[0].do}."
 
 
 def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:

@@ -33,6 +33,7 @@ from stitch.planning.expected_model import (
     simulate_views,
     with_scatter,
 )
+from stitch.planning.information import RIDGE
 from stitch.statistics.distributions import f_limit
 from stitch.statistics.parameter_selection import log_mean_exp
 
@@ -128,9 +129,6 @@ def _factor(covariance: Array) -> Array:
 #
 # Two effects are told apart by what of one's pattern the other cannot imitate, λ in units of the scatter; it grows with
 # the square of the size. The other may take all its parameters, each up to about ten times its plausible size.
-
-# Precision of ten plausible sizes.
-RIDGE = 0.01
 
 
 @dataclass(frozen=True)

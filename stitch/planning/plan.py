@@ -4,120 +4,32 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from stitch import frames
 from stitch.diagnosis.candidates import free_masks
-from stitch.diagnosis.next_view import reachable
 from stitch.diagnosis.score import weights_of_masks
 from stitch.diagnosis.thresholds import SEPARATION_LAMBDA
 from stitch.effects.contract import find_effect, require_available
 from stitch.frames import Array
-from stitch.measurement.capture import build_capture
-from stitch.measurement.robot import forward
-from stitch.measurement.session import Session, View
+from stitch.measurement.session import Session
 from stitch.model.model import sizes_of, term_of
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.effect_columns import view_columns, view_responses
 from stitch.observations.surfaces.hand_eye_fit import hand_eye_jacobian
 from stitch.observations.surfaces.scanner_errors import field_scatter
-from stitch.planning.detection_chances import RIDGE, Outlook, feature_in_scanner, view_outlook
+from stitch.planning.candidate_views import candidate_joints, with_views
+from stitch.planning.detection_chances import Outlook, feature_in_scanner, view_outlook
 from stitch.planning.expected_model import (
-    FEWEST,
     CellModel,
     PlannedCell,
     Scatter,
     SimulatedViews,
     displacement,
-    expected_scans,
     simulate_views,
     thinned_surface,
 )
+from stitch.planning.information import TwistChannel, noise_of, separations
 from stitch.system.threads import library_threads_off
-
-# Which of many possible views bring most: information about hand-eye and effects, view by view.
-#
-# Every view says its twist against the part, but for a motion that all of them share, with the scanner's noise; poses
-# err as expected, together. A normal matrix of the views chosen so far answers every question; what one more view would
-# add to it is a Schur complement, for all that could be next at once (Fedorov 1972; Atkinson, Donev & Tobias 2007,
-# ch. 12).
-
-# A direction that a view sees less than this share of its clearest one is as good as unseen.
-_UNSEEN = 1e-6
-
-
-@dataclass(frozen=True)
-class TwistChannel:
-    """Twists of N views that could be taken: their covariance, and columns of what is asked and what is in the way."""
-
-    covariance: Array  # (6N, 6N) of pose errors and noise
-    columns: Array  # (6N, q)
-
-    def normal(self, chosen: Sequence[int]) -> Array:
-        """(q, q) normal matrix of some views."""
-        white = self._white(chosen)[1]
-        return np.asarray(white.T @ white)
-
-    def with_each(self, chosen: Sequence[int], others: Sequence[int]) -> Array:
-        """(K, q, q) normal matrices of some views and one more."""
-        half, white = self._white(chosen)
-        rows, more = _rows(chosen), _rows(others)
-        B = solve_triangular(half, self.covariance[np.ix_(rows, more)], lower=True).reshape(len(rows), -1, 6)
-        own = self.covariance.reshape(len(self.covariance) // 6, 6, -1, 6)[others, :, others]
-        left = own - np.einsum("rki,rkj->kij", B, B)
-        columns = self.columns[more].reshape(len(others), 6, -1) - np.einsum("rki,rq->kiq", B, white)
-        fresh = np.linalg.solve(np.linalg.cholesky(left), columns)
-        return np.asarray(white.T @ white + fresh.transpose(0, 2, 1) @ fresh)
-
-    def _white(self, chosen: Sequence[int]) -> tuple[Array, Array]:
-        """Cholesky factor of the chosen rows' covariance, and their columns in units of it."""
-        rows = _rows(chosen)
-        half = np.linalg.cholesky(self.covariance[np.ix_(rows, rows)])
-        return half, np.asarray(solve_triangular(half, self.columns[rows], lower=True))
-
-
-def _rows(views: Sequence[int]) -> Array:
-    return np.asarray((6 * np.asarray(views)[:, None] + np.arange(6)).ravel())
-
-
-def noise_of(information: Array, variance: float, lever: float) -> Array:
-    """(6N, 6N) noise of the twists of N views from their normal matrices; what they do not see is as good as unknown.
-
-    Args:
-        information: (N, 6, 6) Σ w BᵀB of each view's correspondences.
-        variance: of a correspondence.
-        lever: by which a radian counts as a length.
-    """
-    scale = np.array([1 / lever] * 3 + [1.0] * 3)
-    values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
-    known = np.maximum(values, _UNSEEN * values[:, -1:])
-    half = scale[:, None] * vectors * np.sqrt(variance / known)[:, None]
-    out = np.zeros((len(values), 6, len(values), 6))
-    each = np.arange(len(values))
-    out[each, :, each] = half @ half.transpose(0, 2, 1)
-    return out.reshape(6 * len(values), -1)
-
-
-def separations(normal: Array, own: slice, rival: slice) -> Array:
-    """(..., p) squared length of what every column of a pattern keeps when a rival's imitate it, all else being free.
-
-    Args:
-        normal: (..., q, q) normal matrix; columns at plausible sizes.
-        own: of the pattern.
-        rival: of the rival.
-    """
-    q = normal.shape[-1]
-    rest = np.setdiff1d(np.arange(q), np.arange(own.start, own.stop))
-    ridge = np.where((rest >= rival.start) & (rest < rival.stop), RIDGE, 0.0)
-    free = normal[..., rest[:, None], rest] + np.diag(ridge)
-    across = normal[..., rest[:, None], np.arange(own.start, own.stop)]
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(free, axis1=-2, axis2=-1), 1e-300))
-    inverse = np.linalg.pinv(free * scale[..., :, None] * scale[..., None, :], rcond=1e-12, hermitian=True)
-    scaled = across * scale[..., :, None]
-    imitated = np.einsum("...ap,...ab,...bp->...p", scaled, inverse, scaled)
-    left = np.diagonal(normal[..., own, own], axis1=-2, axis2=-1) - imitated
-    return np.asarray(np.maximum(left, 0.0))
-
 
 # All views that a plan may hold, with what they would say of the hand-eye and of rival effects.
 
@@ -339,64 +251,6 @@ def travel_order(joints: Array, last: int, chosen: Sequence[int]) -> list[int]:
         left.remove(at)
         out.append(at)
     return out
-
-
-# Views that could be taken: a session with further rows, at joint angles within reach in which the part is seen.
-
-# A view must show this share of what the others show.
-_SHARE = 0.4
-# So many times as many poses are tried as are asked for.
-_TRIES = 4
-
-
-def with_views(session: Session, joints: Sequence[Array], in_turn: bool = True) -> Session:
-    """The session with further views at joint angles (n,) rad, after the last one, called p01, p02 …
-
-    Args:
-        in_turn: each driven to from the one before; else each from the last view that there is, one of them being next.
-    """
-    assert session.robot is not None
-    last, views = session.views[-1], list(session.views)
-    pause = _pause(session)
-    for k, q in enumerate(joints):
-        before = views[-1] if in_turn else last
-        assert before.joints is not None
-        # As alternatives they come at times that a few views would take.
-        later = pause * (k + 1 if in_turn else k % 6 + 1)
-        views.append(
-            View(
-                name=f"p{k + 1:02d}",
-                cloud=None,
-                T_base_flange=forward(session.robot, q),
-                joints=q,
-                approach=np.sign(q - before.joints),
-                time_s=None if last.time_s is None else last.time_s + later,
-                covariates=dict(last.covariates),
-            )
-        )
-    return replace(session, views=tuple(views))
-
-
-def _pause(session: Session) -> float:
-    times = [view.time_s for view in session.views if view.time_s is not None]
-    return float(np.median(np.diff(times))) if len(times) > 1 else 60.0
-
-
-def candidate_joints(session: Session, cell: CellModel, count: int) -> Array:
-    """(K, n) joint angles near those that are planned in which the scanner would see the part, K ≤ count."""
-    T_mount = cell.model.T_mount
-    driven, T_base_flange = session.joints, np.array([view.T_base_flange for view in session.views])
-    assert driven is not None
-
-    def poses_of(joints: Array) -> Array:
-        assert session.robot is not None
-        return build_capture(session.name, (), forward(session.robot, joints), session.mount).poses(T_mount)
-
-    seen_from = build_capture(session.name, (), T_base_flange, session.mount).poses(T_mount)
-    joints = reachable(driven, poses_of, seen_from, cell.part.centre)
-    least = max(FEWEST, _SHARE * np.median([len(index) for index in expected_scans(cell, seen_from)]))
-    seen = (len(index) >= least for index in expected_scans(cell, poses_of(joints[: _TRIES * count])))
-    return np.asarray(joints[: _TRIES * count][list(seen)][:count])
 
 
 # Fewer views give no hand-eye: two motions about different axes are the least (Tsai & Lenz 1989).

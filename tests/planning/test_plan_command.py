@@ -17,8 +17,9 @@ from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit
 from stitch.observations.surfaces.surface_model import surface_model
+from stitch.planning.candidate_views import with_views
 from stitch.planning.expected_model import cell_of_session, simulate_views
-from stitch.planning.plan import PlanRequest, plan_further_views, with_views
+from stitch.planning.plan import PlanRequest, plan_further_views
 from stitch.reading.session_folder import load_session
 
 VIEWS = 6

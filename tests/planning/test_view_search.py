@@ -5,7 +5,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from stitch.planning.plan import HalvedHandEye, TwistChannel, choose_views, noise_of, separations, travel_order
+from stitch.planning.information import TwistChannel, noise_of, separations
+from stitch.planning.plan import HalvedHandEye, choose_views, travel_order
 
 
 @pytest.fixture

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import Growth, labelled_cell
-from stitch.diagnosis import next_view
-from stitch.diagnosis.next_view import candidate_measurement
 from stitch.effects.contract import EFFECTS
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
+from stitch.planning import next_view
+from stitch.planning.candidate_views import candidate_measurement
 
 
 def test_views_not_taken_yet_come_after_those_that_were():
