@@ -8,7 +8,7 @@ import numpy as np
 
 from stitch.diagnosis.ranking import Ranked, rank_all
 from stitch.diagnosis.score import Score, score
-from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, ODDS
+from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, DEPENDENCE_BINS, ODDS
 from stitch.diagnosis.unnamed_joint_laws import FittedProcess
 from stitch.diagnosis.unnamed_time_laws import RepeatingError
 from stitch.effects.empirical import FIELD
@@ -182,9 +182,6 @@ def _unexplained_square(base: Array, numbers: Array) -> float:
     return float(np.sum(project_out(base, numbers[:, None]) ** 2))
 
 
-_BINS = 5
-
-
 @dataclass(frozen=True)
 class Dependence:
     """One covariate; bins, mean and sigma show the shape along the direction that follows it most."""
@@ -257,7 +254,7 @@ def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependenc
     )
 
 
-def bin_means(x: Array, y: Array, bins: int = _BINS) -> tuple[Array, Array, Array]:
+def bin_means(x: Array, y: Array, bins: int = DEPENDENCE_BINS) -> tuple[Array, Array, Array]:
     """Middle, mean and standard error of y in bins of x with equal counts; views are the samples."""
     order = np.argsort(x, kind="stable")
     parts = [p for p in np.array_split(order, min(bins, max(len(x) // 2, 1))) if len(p)]

@@ -14,7 +14,14 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis.candidates import Candidate, Form, candidate_of
 from stitch.diagnosis.regime import regime_of
-from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, IMPLAUSIBLE, LOG_BAYES_FACTOR
+from stitch.diagnosis.thresholds import (
+    ALPHA_UNKNOWN,
+    FREE_SIZES,
+    IMPLAUSIBLE,
+    LOG_BAYES_FACTOR,
+    NEGLIGIBLE_NATS,
+    SEEN_SIGMAS,
+)
 from stitch.effects.contract import Effect, find_effect
 from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
@@ -38,9 +45,6 @@ from stitch.units import METRES
 # views show a tenth of that were charged for all that they could have been, and effects beyond chance (p = 1e-9)
 # counted
 # for nothing.
-
-# A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
-_FREE = 30.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
         start: (c,) variances to begin with.
         scale: the one that is likeliest there.
     """
-    mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), _FREE * form.sizes
+    mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), FREE_SIZES * form.sizes
     integrated = fit_variances(mixed, G, scale * form.sizes, start=start)
     regime = regime_of(linear)
     scales = regime.scales
@@ -129,15 +133,9 @@ def gain_at_null(linear: LinearModel, form: Form, white: Array) -> Gain:
 def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:
     """Rank and θᵀC⁻¹θ over the combinations of which the views say more than the wide prior does."""
     values, vectors = np.linalg.eigh(covariance / np.outer(sizes, sizes))
-    keep = values < 0.5 * _FREE**2
+    keep = values < 0.5 * FREE_SIZES**2
     projected = vectors[:, keep].T @ (theta / sizes)
     return int(keep.sum()), float(np.sum(projected**2 / np.maximum(values[keep], 1e-300)))
-
-
-# A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas.
-SEEN = 0.5
-# Forms so far (nats) behind the best one of their candidate add less than a per cent to it.
-_FAR = 6.0
 
 
 @dataclass(frozen=True)
@@ -190,7 +188,7 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     likely = quick.max(axis=1)
     # Under a scatter that holds an effect itself no plausible size is seen, and yet a gross one gains.
     seen = seen or bool(likely.max() > LOG_BAYES_FACTOR)
-    least = max(regime_of(base).least_quick_gain, likely.max() - _FAR)
+    least = max(regime_of(base).least_quick_gain, likely.max() - NEGLIGIBLE_NATS)
     worth = [i for i in np.argsort(-likely, kind="stable")[: regime_of(linear).forms_refitted] if likely[i] >= least]
     tried = [
         try_form(base, form, starts[start].null.variances, gained[start][i].scale)
@@ -233,7 +231,7 @@ def _gains_at_null(base: LinearModel, at: LinearModel, candidate: Candidate) -> 
     gains, seen = list[Gain](), False
     for form, white in zip(candidate.forms, residual_form_columns(at, candidate), strict=True):
         if not gains:
-            seen = bool((np.linalg.norm(white * form.sizes, axis=0) > SEEN).any())
+            seen = bool((np.linalg.norm(white * form.sizes, axis=0) > SEEN_SIGMAS).any())
         gain, here = gain_at_null(at, form, white), 0.5 * (base.null.deviance - at.null.deviance)
         gains.append(replace(gain, log_bayes_factor=gain.log_bayes_factor + here))
     return gains, seen

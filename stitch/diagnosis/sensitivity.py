@@ -16,7 +16,13 @@ from stitch import frames
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import Score, form_weights
-from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR, POWER
+from stitch.diagnosis.thresholds import (
+    ALPHA_NAME,
+    LISTED_ALIAS_CORRELATION,
+    LOG_BAYES_FACTOR,
+    POWER,
+    UNDETECTABLE_SQUARE,
+)
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.distributions import f_limit, noncentral_f_tail
@@ -57,7 +63,7 @@ def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
     return out
 
 
-def aliases_of(k: int, matrix: Array, scores: Sequence[Score], least: float = 0.7) -> list[Alias]:
+def aliases_of(k: int, matrix: Array, scores: Sequence[Score], least: float = LISTED_ALIAS_CORRELATION) -> list[Alias]:
     """The most similar effects of candidate k."""
     order = np.argsort(-matrix[k])
     return [Alias(scores[j].name, float(matrix[k, j])) for j in order if j != k and matrix[k, j] > least][:5]
@@ -106,8 +112,6 @@ def omitted_effect_bias(
     return max(found, default=None)
 
 
-# Squares, in units of the scatter, beyond which an effect is of no plausible size: its prior holds back all of it.
-_UNDETECTABLE = 1e6
 # Of plausible size and nothing else.
 SINGLE_SCALE = {1.0: 1.0}
 
@@ -136,7 +140,7 @@ def least_noncentrality(
     factor, told = LOG_BAYES_FACTOR - float(np.log(weight)), information.clip(0)
     by_factor = [_squares_for(factor - float(np.log(y)), s**2 * told, degrees_of_freedom) for s, y in scales.items()]
     needed = max(by_p, min(by_factor))
-    if needed > _UNDETECTABLE:
+    if needed > UNDETECTABLE_SQUARE:
         return float("inf")
 
     def missed(shift: float) -> float:

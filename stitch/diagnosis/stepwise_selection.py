@@ -8,7 +8,7 @@ from stitch.diagnosis.candidates import Candidate, candidate_as_fitted
 from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, conditioned_without, is_certain, rank, rank_one
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import promising, score
-from stitch.diagnosis.thresholds import CANDIDATES_TRIED, MANY_POSES, MAX_JOINT_EFFECTS
+from stitch.diagnosis.thresholds import CANDIDATES_TRIED, MANY_POSES, MAX_JOINT_EFFECTS, NEAR_BEST_GAIN
 from stitch.diagnosis.validation import Extrapolation, cross_validate, extrapolate, untested_ends_reason
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
@@ -198,7 +198,7 @@ def _next_effect(base: LinearModel, others: Sequence[Candidate]) -> Ranked | Non
     has its turn again.
     """
     likely = promising(base, others, CANDIDATES_TRIED)
-    near = [c for c, gain in likely if gain >= 0.5 * likely[0][1]]
+    near = [c for c, gain in likely if gain >= NEAR_BEST_GAIN * likely[0][1]]
     for tried in (near, [c for c, _ in likely if c not in near]):
         # Preselected by what they gain: all that were looked at count as tests.
         ranked, _ = rank(list(parallel(partial(score, base), tried)), tests=len(others))

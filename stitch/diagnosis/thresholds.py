@@ -2,6 +2,8 @@
 
 import numpy as np
 
+# Alarm and names.
+
 # Family-wise error over all candidates (5 %, custom), shared between names and the alarm without one.
 ALPHA = 0.05
 ALPHA_NAME, ALPHA_UNKNOWN = 0.8 * ALPHA, 0.2 * ALPHA
@@ -13,35 +15,20 @@ ODDS = float(np.log(20.0))
 PRIOR_NOTHING, PRIOR_PHYSICAL, PRIOR_UNKNOWN = 0.5, 0.45, 0.05
 # Probability with which the smallest detectable size is detected (custom in power analysis).
 POWER = 0.8
-
-# Beyond so many, columns of candidates take a megabyte each, and all of them half a gigabyte.
-MANY_POSES = 1000
-# Effects that are sought at once, and candidates tried in earnest for each of them: what a minute allows.
-MAX_JOINT_EFFECTS, CANDIDATES_TRIED = 6, 5
-
+# Squares in units of the scatter; an effect that needs more is of no plausible size: its prior holds back all of it.
+UNDETECTABLE_SQUARE = 1e6
 # No arm that is fit for use scatters more than this (rad, mm): several times the repeatability of data sheets
 # (ISO 9283, 0.02 to 0.1 mm); larger is something systematic.
 IMPLAUSIBLE = (2.5e-4, 0.12)
-# Smallest share of an effect that must remain when one view is left out.
-MIN_STEADINESS = 0.25
-# A p-value below which two halves of the views do not find one and the same: one right effect of a hundred is lost.
-HALVES_P_VALUE = 0.01
-# An effect must shorten the distances on views left out by more than a hundredth to stay in a model (mean square).
-MAX_REMAINING_SHARE = 0.99**2
-# New matches alone change a held-out residual by a few per cent: it rises if it does by more, and falls if below.
-HELDOUT_RISE, HELDOUT_FALL = 1.05, 0.995
-# An effect so many sigmas from zero is there although no residual shows it; below the second it can be dropped.
-CLEAR_SIGMAS, FAINT_SIGMAS = 4.0, 2.0
 
-# Effects whose patterns correlate more than this are aliases in these views.
-ALIAS_CORRELATION = 0.9
-# λ with P(correct) = Φ(√(λ/2)) = 0.95 between two effects.
-SEPARATION_LAMBDA = 5.4
-# p-value below which what is left is said to follow a covariate (custom).
-CLEAR_DEPENDENCE = 0.01
-# Candidates whose prediction on left-out views is computed; the others explain nothing.
-CROSS_VALIDATED_CANDIDATES = 8
+# Scores of candidates.
 
+# A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas (custom).
+SEEN_SIGMAS = 0.5
+# A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
+FREE_SIZES = 30.0
+# Forms so many nats behind the best one of their candidate add less than a per cent to it (e^-6 = 0.0025).
+NEGLIGIBLE_NATS = 6.0
 # Numbers in the channel beyond which variances are the same under both priors of sizes, and a fit takes half a second.
 LONG = 250
 # Nats: forms that lose so many under the null's variances do not gain under their own either; under several variances,
@@ -50,3 +37,84 @@ HOPELESS_GAIN, HOPELESS_GAIN_WITH_PRIOR = -4.0, -1.5
 # Numbers times forms that are fitted for a candidate (some seconds). With thousands of numbers the variances hardly
 # move, and each fit takes a second: the best forms must do.
 REFITTED_NUMBERS, FORMS_REFITTED_WITH_MANY_NUMBERS = 20_000, 2
+# Views beyond which columns of candidates take a megabyte each, and all of them half a gigabyte.
+MANY_POSES = 1000
+# Effects that are sought at once, and candidates tried in earnest for each of them: what a minute allows.
+MAX_JOINT_EFFECTS, CANDIDATES_TRIED = 6, 5
+# Share of the largest gain below which a candidate is fitted only where nothing else can be named (time).
+NEAR_BEST_GAIN = 0.5
+
+# Views left out, halves of the views, ends of joint ranges.
+
+# Smallest share of an effect that must remain when one view is left out.
+MIN_STEADINESS = 0.25
+# A p-value below which two halves of the views do not find one and the same: one right effect of a hundred is lost.
+HALVES_P_VALUE = 0.01
+# An effect must shorten the distances on views left out by more than a hundredth to stay in a model (mean square).
+MAX_REMAINING_SHARE = 0.99**2
+# Share of a plausible size, squared: what was not found has some size, or its prior would have none.
+NEGLIGIBLE_SIZE = 1e-6
+# Probability that a further end is predicted better: odds of three to one.
+LIKELY_TO_HELP = 0.75
+# Degrees of freedom of Student's t, and plausible sizes so wide that all views find what they can see.
+END_PRIOR_FREEDOM, END_PRIOR_SIZES = 4.0, 10.0
+# Candidates whose prediction on left-out views is computed; the others explain nothing.
+CROSS_VALIDATED_CANDIDATES = 8
+
+# Effects in a model: added, kept or dropped.
+
+# New matches alone change a held-out residual by a few per cent: it rises if it does by more, and falls if below.
+HELDOUT_RISE, HELDOUT_FALL = 1.05, 0.995
+# An effect so many sigmas from zero is there although no residual shows it; below the second it can be dropped.
+CLEAR_SIGMAS, FAINT_SIGMAS = 4.0, 2.0
+
+# What looks alike, and what separates it.
+
+# Effects whose patterns correlate more than this are aliases in these views; beyond the second they are listed as such.
+ALIAS_CORRELATION, LISTED_ALIAS_CORRELATION = 0.9, 0.7
+# λ with P(correct) = Φ(√(λ/2)) = 0.95 between two effects.
+SEPARATION_LAMBDA = 5.4
+# A view that adds less than this share of λ separates nothing: it would have to be repeated a thousand times.
+WORTHWHILE_GAIN = 1e-3
+# p-value below which what is left is said to follow a covariate (custom), and bins that show the shape.
+CLEAR_DEPENDENCE, DEPENDENCE_BINS = 0.01, 5
+
+# Errors of joints without a name.
+
+# Columns of a process at the most, and the share of its largest variance that the last of them has at least.
+PROCESS_COLUMNS, PROCESS_LEAST_VARIANCE = 96, 1e-3
+# Views whose covariance is drawn apart; beyond so many the others follow these (time: cubic).
+PROCESS_KNOTS = 400
+# Laws whose size is sought with all variances, the likeliest (time).
+JOINT_LAWS_FITTED = 12
+# Multiples of the usual variance at which the search for a law's size begins.
+LAW_VARIANCES = (0.01, 1.0, 30.0)
+# Share of what a joint does by its law that a curve must carry to say where in the range it errs.
+CURVE_LEAST_SHARE = 0.1
+
+# Errors in time without a name.
+
+# Whole swings that a session must have seen, and swings per step: faster ones look like slower ones (Nyquist: 0.5).
+LEAST_SWINGS, FASTEST_SWING = 2.0, 0.45
+# Frequencies nearer to each other than half a swing over the session look alike; of a session with long breaks there
+# would be thousands.
+FREQUENCY_STEP, MOST_FREQUENCIES = 0.5, 150
+# Standard deviation of the shortest stretch in steps, and of the longest as a share of the session; views in each.
+SHORTEST_STRETCH, LONGEST_STRETCH, STRETCH_VIEWS = 1.5, 0.2, 2
+# Courses whose size is sought with all variances, the likeliest (time); without a prior of pose errors the second.
+TIME_LAWS_FITTED, COURSES_FITTED = 3, 2
+# Multiples of its own size that a process may have beside an effect.
+COURSE_SIZES = (1.0, 0.3, 0.1, 0.01)
+# Joints for which a second one is sought that theirs may follow (time).
+PAIRED_JOINTS = 2
+
+# Formulas (`stitch explain`).
+
+# p-value below which views that took no part in finding a formula refute it (custom).
+REJECTED_FORMULA = 0.01
+# Probability that an addend which is none is added, all of them counted (custom).
+FALSE_ADDEND = 0.05
+# rad; no gear, spring or clearance does more to a joint. Larger addends are differences of two that look alike.
+LARGEST_JOINT_ADDEND = 0.01
+# Plausible sizes beyond which nobody would believe a parameter of a formula.
+FORMULA_LIMIT_SIZES = 10.0

@@ -21,7 +21,16 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.special import logsumexp
 
-from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
+from stitch.diagnosis.thresholds import (
+    CURVE_LEAST_SHARE,
+    JOINT_LAWS_FITTED,
+    LAW_VARIANCES,
+    ODDS,
+    PRIOR_UNKNOWN,
+    PROCESS_COLUMNS,
+    PROCESS_KNOTS,
+    PROCESS_LEAST_VARIANCE,
+)
 from stitch.effects.contract import EFFECTS
 from stitch.frames import Array, Indices
 from stitch.measurement.measurement import STILL
@@ -62,10 +71,6 @@ from stitch.statistics.reml import MixedModel, VarianceFit, at_variances, fit_va
 # Smooth processes by which a joint or the flange may err, as columns of the channel with unit coefficients: the
 # leading eigenvectors of their covariance between views.
 
-# Columns of a process, and the share of its largest variance that the last of them has at least.
-_MOST, _LEAST = 96, 1e-3
-# Of so many views the covariance is drawn apart, and the others follow these.
-_KNOTS = 400
 # Of so many processes what takes longest is kept: those of a session with six or seven joints.
 _KEPT = 64
 
@@ -121,7 +126,7 @@ def wandering_flange(linear: LinearModel) -> SmoothProcess:
     knots = _knots(len(time))
     alike = ornstein_uhlenbeck(time, DRIFT_MEMORY["slowly wandering"], time[knots])
     carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(alike), 6, 6)
-    return SmoothProcess(None, carried, alike @ _leading_courses(alike[knots], _MOST // 6))
+    return SmoothProcess(None, carried, alike @ _leading_courses(alike[knots], PROCESS_COLUMNS // 6))
 
 
 def _smooth_courses(angles: Array, reach: float = REACH) -> Array:
@@ -136,11 +141,11 @@ def _smooth_courses(angles: Array, reach: float = REACH) -> Array:
 def _leading_courses_cached(angles: bytes, views: int, reach: float) -> Array:
     """(K, R) of the knots whose angles these are: the same in every diagnosis of a session."""
     knots = np.frombuffer(angles).reshape(views, -1)
-    return _leading_courses(rbf_joints(knots, knots, reach), _MOST)
+    return _leading_courses(rbf_joints(knots, knots, reach), PROCESS_COLUMNS)
 
 
 def _knots(views: int) -> Indices:
-    return np.unique(np.linspace(0, views - 1, min(views, _KNOTS)).astype(np.int64))
+    return np.unique(np.linspace(0, views - 1, min(views, PROCESS_KNOTS)).astype(np.int64))
 
 
 def _leading_courses(covariance: Array, most: int) -> Array:
@@ -148,7 +153,7 @@ def _leading_courses(covariance: Array, most: int) -> Array:
     last = len(covariance) - 1
     values, vectors = eigh(covariance, subset_by_index=(max(last + 1 - most, 0), last))
     values, vectors = values[::-1], vectors[:, ::-1]
-    keep = values > _LEAST * values[0]
+    keep = values > PROCESS_LEAST_VARIANCE * values[0]
     return np.asarray(vectors[:, keep] / np.sqrt(values[keep]))
 
 
@@ -224,10 +229,6 @@ def fit_process(linear: LinearModel, sized: SizedProcess, tried: int) -> FittedP
     return FittedProcess(linear, sized.process, columns, size, fit, gained)
 
 
-# Of all laws those whose size is sought with all variances.
-_FITTED = 12
-# Of how many usual variances such a law may be where the search for its size begins.
-TIMES = (0.01, 1.0, 30.0)
 # What not knowing its size costs a law, nats: as much as an effect (`form_trial.py`), so that neither has an advantage.
 ANY_SIZE = -float(np.log(parameter_selection.ANY_SIZE[1.0]))
 
@@ -317,7 +318,7 @@ def laws_of_kinds(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
         for process in range(len(of_one_joint[follows].joints))
     ]
     tried.sort(key=lambda law: -law.log_bayes_factor)
-    tried = [law.fitted() if k < _FITTED else law for k, law in enumerate(tried)]
+    tried = [law.fitted() if k < JOINT_LAWS_FITTED else law for k, law in enumerate(tried)]
     every: dict[tuple[int, str], list[JointLaw]] = {}
     for law in tried:
         every.setdefault((law.joint, law.follows), []).append(law)
@@ -341,7 +342,7 @@ def _law_at_null(base: LinearModel, follows: str, process: int) -> JointLaw:
 def _fit_law(base: LinearModel, mixed: MixedModel) -> VarianceFit:
     """At the maximum, sought from the likeliest of several starts."""
     nulls = [at.null.variances for at in (base, *base.alternative_starts)]
-    starts: list[Array] = [np.append(null, times * SMOOTH_SCALE**2) for null in nulls for times in TIMES]
+    starts: list[Array] = [np.append(null, times * SMOOTH_SCALE**2) for null in nulls for times in LAW_VARIANCES]
     return fit_variances(mixed, start=min(starts, key=lambda start: at_variances(mixed, start).deviance))
 
 
@@ -541,8 +542,6 @@ def _law_with_alternatives(laws: Sequence[JointLaw], together: float) -> JointLa
 # bands.
 
 _PLACES = 25  # over the range of a joint
-# Courses that carry less of what the joint does by its law say nothing about where.
-_WORTH = 0.1
 
 
 @dataclass(frozen=True)
@@ -576,7 +575,7 @@ def joint_curves(laws: Sequence[JointLaw]) -> tuple[JointCurve, ...]:
         alike = law.errors.kernel_of(law.process)
         whole = float(_law_given_views(law, alike, alike)[0].var())
         found += [_curve_along(law, along, whole) for along in covariates_of_law(law)]
-    return tuple(sorted((c for c in found if c.share > _WORTH), key=lambda c: -c.share))
+    return tuple(sorted((c for c in found if c.share > CURVE_LEAST_SHARE), key=lambda c: -c.share))
 
 
 def _curve_along(law: JointLaw, along: LawCovariate, whole: float) -> JointCurve:

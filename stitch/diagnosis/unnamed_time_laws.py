@@ -9,7 +9,22 @@ import numpy as np
 from stitch.diagnosis import unnamed_joint_laws
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import Score
-from stitch.diagnosis.thresholds import ODDS, PRIOR_UNKNOWN
+from stitch.diagnosis.thresholds import (
+    COURSE_SIZES,
+    COURSES_FITTED,
+    FASTEST_SWING,
+    FREE_SIZES,
+    FREQUENCY_STEP,
+    LEAST_SWINGS,
+    LONGEST_STRETCH,
+    MOST_FREQUENCIES,
+    ODDS,
+    PAIRED_JOINTS,
+    PRIOR_UNKNOWN,
+    SHORTEST_STRETCH,
+    STRETCH_VIEWS,
+    TIME_LAWS_FITTED,
+)
 from stitch.diagnosis.unnamed_joint_laws import (
     ANY_SIZE,
     JOINT_ANGLES,
@@ -39,13 +54,6 @@ from stitch.statistics.reml import NOISE, at_variances, fit_variances
 from stitch.system.threads import parallel
 from stitch.units import duration_text
 
-# Whole swings that a session must have seen, and per step: faster ones look like slower ones.
-_LEAST_SWINGS, _FASTEST = 2.0, 0.45
-# Frequencies nearer to each other than half a swing over the session look alike; of a session with long breaks there
-# would be thousands.
-_APART, _MOST_FREQUENCIES = 0.5, 150
-# Standard deviation of the shortest stretch in steps, and of the longest as a share of the session; views in each.
-_SHORTEST, _LONGEST, _LEAST_VIEWS = 1.5, 0.2, 2
 # Of a Gaussian its full width at half maximum.
 _FULL_WIDTH = 2.355
 
@@ -77,8 +85,8 @@ def time_processes(linear: LinearModel) -> list[TimeProcess]:
     """All that are tried, of any size and direction in the flange's frame."""
     time = time_in_steps(linear.measurement)
     span = _span(time)
-    apart = max(_APART / span, _FASTEST / _MOST_FREQUENCIES)
-    frequencies = np.arange(_LEAST_SWINGS / span, _FASTEST, apart)
+    apart = max(FREQUENCY_STEP / span, FASTEST_SWING / MOST_FREQUENCIES)
+    frequencies = np.arange(LEAST_SWINGS / span, FASTEST_SWING, apart)
     at_once = _swings_in_phase(linear, frequencies)
     return _processes(linear, time, [*_swings(linear, frequencies), *at_once, *_stretches(linear, time)])
 
@@ -87,7 +95,7 @@ def processes_near_period(linear: LinearModel, swing: TimeProcess) -> list[TimeP
     """A swing, and others between it and the next ones that are tried."""
     assert swing.frequency is not None
     time = time_in_steps(linear.measurement)
-    reach = _APART / _span(time)
+    reach = FREQUENCY_STEP / _span(time)
     return _processes(linear, time, _swings(linear, swing.frequency + np.linspace(-reach, reach, _PERIOD_REFINEMENT)))
 
 
@@ -130,15 +138,15 @@ def _wave(waves: _TimeCourse, phase: float, time: Array) -> Array:
 
 def _stretches(linear: LinearModel, time: Array) -> Iterator[_DescribedCourse]:
     """Bumps that begin and end within the session, in words."""
-    first, last, width = float(time.min()), float(time.max()), _SHORTEST
+    first, last, width = float(time.min()), float(time.max()), SHORTEST_STRETCH
     views = linear.measurement.views
-    while width <= _LONGEST * (last - first):
+    while width <= LONGEST_STRETCH * (last - first):
         # A grid of this width within the session, where there are views: it may hold breaks of days.
         steps = np.floor((time - first) / width)
         middles = first + width * np.unique([steps, steps + 1])
         for middle in middles[(middles > first) & (middles < last - width / 2)]:
             away = np.abs(time - middle) / width
-            if np.count_nonzero(away < _FULL_WIDTH / 2) >= _LEAST_VIEWS:
+            if np.count_nonzero(away < _FULL_WIDTH / 2) >= STRETCH_VIEWS:
                 name = views.names[views.number[away.argmin()]]
                 words = f"are off for a stretch of {_duration_in_words(linear, _FULL_WIDTH * width)} about view {name}"
                 yield _STRETCH, words, partial(_bump, middle, width), None
@@ -164,9 +172,6 @@ def _duration_in_words(linear: LinearModel, steps: float) -> str:
 # size throughout does that. Beside such a prior they count as white scatter, and a model that left 0.1 mrad of them was
 # adequate; or an effect that goes with time got its name from a part of a swing.
 
-# Of all courses those whose size is sought with all variances.
-_TIME_LAWS_FITTED = 3
-
 
 @dataclass(frozen=True)
 class TimeLaw:
@@ -189,7 +194,7 @@ def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
         return None
     sized = [size_process(linear, course.process) for course in courses]
     gains = np.array([own.gain for own in sized])
-    found = {k: fit_process(linear, sized[k], tried=1) for k in np.argsort(-gains)[:_TIME_LAWS_FITTED]}
+    found = {k: fit_process(linear, sized[k], tried=1) for k in np.argsort(-gains)[:TIME_LAWS_FITTED]}
     for k, own in found.items():
         gains[k] = max(gains[k], own.log_bayes_factor)
     best = max(found, key=lambda k: gains[k])
@@ -247,9 +252,6 @@ def unnamed_law_log_posterior(base: LinearModel) -> float:
 # When in a session the flange errs that follows a course of time without a name: what it does then, with bands.
 
 _PLACES = 6  # from one view to the next
-# Turning and moving have one size in the law, and that of the other would shrink what is said of either: a prior of so
-# many sizes is as good as none, and keeps the unseen finite.
-_FREE = 30.0
 ROTATION_PART, TRANSLATION_PART = slice(3), slice(3, 6)
 
 
@@ -277,7 +279,7 @@ def time_curve(law: TimeLaw) -> TimeCurve:
     places = np.linspace(0, len(time) - 1, _PLACES * (len(time) - 1) + 1)
     steps = np.interp(places, np.arange(len(time)), time)
     shapes, found = law.course.course(steps), law.fitted
-    G, wide = linear.in_blocks(found.columns), np.full(found.columns.shape[1], _FREE * found.size)
+    G, wide = linear.in_blocks(found.columns), np.full(found.columns.shape[1], FREE_SIZES * found.size)
     fit = at_variances(linear.mixed, found.fit.variances, G, wide)
     # Of every motion of the flange one coefficient for each shape.
     coefficients = fit.mean[-len(wide) :].reshape(6, -1)
@@ -302,11 +304,6 @@ def time_curve(law: TimeLaw) -> TimeCurve:
 # and beside a flange that wanders in time: smooth processes of few numbers each (the leading eigenvectors of their
 # covariance) and of a size that the views tell.
 
-# Beside an effect a process may be that much smaller than alone.
-_SMALLER = (1.0, 0.3, 0.1, 0.01)
-# Joints for which a second one is sought that theirs may follow, and processes whose size is sought with all variances.
-_PAIRED_JOINTS, _COURSES_FITTED = 2, 2
-
 
 def unnamed_courses(linear: LinearModel) -> tuple[FittedProcess, ...]:
     """The likeliest of them beside a model; () where pose errors have a prior."""
@@ -319,9 +316,9 @@ def unnamed_courses(linear: LinearModel) -> tuple[FittedProcess, ...]:
             [size_process(linear, process) for process in own] for own in single_joint_processes(linear, motions)
         ]
         found += [course for own in by_joint for course in own]
-        first = sorted(range(len(by_joint)), key=lambda k: -max(course.gain for course in by_joint[k]))[:_PAIRED_JOINTS]
+        first = sorted(range(len(by_joint)), key=lambda k: -max(course.gain for course in by_joint[k]))[:PAIRED_JOINTS]
         found += [size_process(linear, process) for k in first for process in joint_pair_processes(linear, motions, k)]
-    likeliest = sorted(found, key=lambda course: -course.gain)[:_COURSES_FITTED]
+    likeliest = sorted(found, key=lambda course: -course.gain)[:COURSES_FITTED]
     courses = parallel(lambda c: fit_process(linear, c, len(found)), likeliest)
     return tuple(sorted(courses, key=lambda c: -c.log_bayes_factor))
 
@@ -349,7 +346,7 @@ def _factor_with_course(linear: LinearModel, course: FittedProcess, scored: Scor
         _deviance_with_columns(
             linear, both, np.append(np.full(course.columns.shape[1], times * course.size), scored.sizes)
         )
-        for times in _SMALLER
+        for times in COURSE_SIZES
     ]
     return 0.5 * (course.fit.deviance - min(tried))
 

@@ -7,7 +7,16 @@ import numpy as np
 
 from stitch.diagnosis.candidates import Form
 from stitch.diagnosis.score import Score, score
-from stitch.diagnosis.thresholds import HALVES_P_VALUE, MAX_REMAINING_SHARE, MIN_STEADINESS
+from stitch.diagnosis.thresholds import (
+    END_PRIOR_FREEDOM,
+    END_PRIOR_SIZES,
+    FREE_SIZES,
+    HALVES_P_VALUE,
+    LIKELY_TO_HELP,
+    MAX_REMAINING_SHARE,
+    MIN_STEADINESS,
+    NEGLIGIBLE_SIZE,
+)
 from stitch.frames import Array, Indices
 from stitch.observations.linear_model import CoefficientPrior, LinearModel, LinearTrial
 from stitch.observations.surfaces.surface_model import SurfaceObservation
@@ -22,11 +31,6 @@ from stitch.statistics.least_squares import column_space, mean_square_share
 # right effect takes away what hid another at some end and makes that one a little worse; an imitation helps at many
 # ends
 # and is far off at others. So a further end must be likely to become better, the ends being samples of it.
-
-# Odds of three to one that an end of which nobody knows would be predicted better.
-_LIKELY_SHARE = 0.75
-# Of Student's t, and a prior so wide that all views find what they can see.
-_FREEDOM, _WIDE = 4.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Extrapolation:
     @property
     def helps(self) -> bool:
         """True if the ends together are predicted better by more than a standard error, and a further one probably."""
-        return self.share <= 1 - self.sigma and self.likely >= _LIKELY_SHARE
+        return self.share <= 1 - self.sigma and self.likely >= LIKELY_TO_HELP
 
     @property
     def errs_somewhere(self) -> bool:
@@ -102,14 +106,10 @@ def _student_prior(linear: LinearModel, X: Array, sizes: Array) -> CoefficientPr
     (Lange, Little & Taylor 1989, J. Am. Stat. Assoc. 84:881).
     """
     middle = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
-    free = 1 / (_WIDE * sizes) ** 2
+    free = 1 / (END_PRIOR_SIZES * sizes) ** 2
     found = linear.trial(X, None, CoefficientPrior(free, middle)).solve() - middle
     known = np.where(np.isfinite(sizes), found, 0.0)
-    return CoefficientPrior((_FREEDOM + 1) / (_FREEDOM * sizes**2 + known**2), middle)
-
-
-# Of a plausible size: what was not found has some size, or its prior would have none.
-_NEGLIGIBLE_SQUARE = 1e-6
+    return CoefficientPrior((END_PRIOR_FREEDOM + 1) / (END_PRIOR_FREEDOM * sizes**2 + known**2), middle)
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def prior_of_sizes(linear: LinearModel, scored: Score) -> CoefficientPrior:
     left to see does not count for more than that.
     """
     size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
-    size = np.maximum(size, _NEGLIGIBLE_SQUARE * scored.form.sizes)
+    size = np.maximum(size, NEGLIGIBLE_SIZE * scored.form.sizes)
     precision = np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
     return CoefficientPrior(precision, np.zeros(len(precision)))
 
@@ -240,9 +240,6 @@ def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, flo
 # than without (partial Bayes factor; Berger & Pericchi 1996, J. Am. Stat. Assoc. 91:109). What imitates something else
 # among all the views has another size or sign in each half. All of it beside the pose errors that remain with the
 # effect.
-
-# A prior of this many plausible sizes keeps what a half does not see finite, and moves nothing else.
-_FREE = 30.0
 
 
 @dataclass(frozen=True)
@@ -330,11 +327,11 @@ def _log_predictive_gain(seen: _HalfEvidence, mean: Array, precision: Array) -> 
 
 def _size_consistency(a: _HalfEvidence, b: _HalfEvidence, sizes: Array) -> float:
     """p-value of a χ² test of the difference, over the combinations that both halves see."""
-    (mean_a, one), (mean_b, other) = (s.fitted(_FREE * sizes) for s in (a, b))
+    (mean_a, one), (mean_b, other) = (s.fitted(FREE_SIZES * sizes) for s in (a, b))
     d = (mean_a - mean_b) / sizes
     covariance = sum(np.linalg.inv(p * np.outer(sizes, sizes)) for p in (one, other))
     values, vectors = np.linalg.eigh(covariance)
-    told = values < 0.5 * _FREE**2
+    told = values < 0.5 * FREE_SIZES**2
     return chi2_tail(float(np.sum((vectors.T @ d)[told] ** 2 / values[told])), int(told.sum())) if told.any() else 1.0
 
 

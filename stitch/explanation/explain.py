@@ -11,6 +11,7 @@ import numpy as np
 
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.score import Score, score
+from stitch.diagnosis.thresholds import FORMULA_LIMIT_SIZES, LARGEST_JOINT_ADDEND
 from stitch.diagnosis.validation import cross_validate, extrapolate
 from stitch.effects.contract import EFFECTS, TWIST
 from stitch.effects.user_file import load
@@ -21,8 +22,6 @@ from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
 # A formula as a Python file of effects that a person can read, doubt, edit and add.
-
-_LIMIT = 10.0  # sizes: beyond that nobody would believe it
 
 
 def formula_text(ingredients: Sequence[Ingredient], coefficients: Sequence[float]) -> str:
@@ -73,7 +72,7 @@ def effect_source(name: str, ingredients: Sequence[Ingredient], coefficients: Se
     place = ingredients[0].place
     letters = _letter_names(len(ingredients))
     specs = "".join(
-        f'    {a}=number("{i.unit}", typical={size:.2g}, limit={_LIMIT * size:.2g}),\n'
+        f'    {a}=number("{i.unit}", typical={size:.2g}, limit={FORMULA_LIMIT_SIZES * size:.2g}),\n'
         for a, i, size in zip(letters, ingredients, np.abs(coefficients), strict=True)
     )
     head = (
@@ -111,8 +110,6 @@ def _twist_code(ingredients: Sequence[Ingredient], letters: Sequence[str]) -> li
 
 
 EFFECT_NAME = "explained"
-# rad; no gear, spring or clearance does more to a joint. Larger addends are differences of two that look alike.
-_MOST = 0.01
 _TINY = 1e-12
 
 
@@ -159,8 +156,10 @@ def _try_sum(linear: LinearModel, terms: Dictionary, chosen: TestedSum, origin: 
     if not chosen.holds:
         return Explanation(False, _no_formula_sentence(chosen, text))
     turns = [abs(v if i.quantity.bounded else x) for i, v, x in zip(own, values, scaled, strict=True)]
-    if own[0].place == "robot" and max(turns) > _MOST:
-        return Explanation(False, f"{text} would turn a joint by more than {1e3 * _MOST:.0f} mrad: no arm does that.")
+    if own[0].place == "robot" and max(turns) > LARGEST_JOINT_ADDEND:
+        return Explanation(
+            False, f"{text} would turn a joint by more than {1e3 * LARGEST_JOINT_ADDEND:.0f} mrad: no arm does that."
+        )
     source = effect_source(EFFECT_NAME, own, values, f"{origin} {text}")
     scored = _score_effect(linear, source)
     left_out, beyond = cross_validate(linear, scored), extrapolate(linear, scored)

@@ -19,7 +19,7 @@ from itertools import product
 import numpy as np
 from scipy.optimize import least_squares
 
-from stitch.diagnosis.thresholds import ODDS
+from stitch.diagnosis.thresholds import FALSE_ADDEND, ODDS, REJECTED_FORMULA
 from stitch.diagnosis.validation import explained_basis
 from stitch.explanation.dictionary import Dictionary, Ingredient, Quantity, group_addends, scaled_values
 from stitch.frames import Array, Indices
@@ -117,7 +117,6 @@ class HalfModel:
 # Berger
 # & Pericchi 1996, J. Am. Stat. Assoc. 91:109).
 
-_REJECTED = 0.01
 # A prior of this many sizes as they come out keeps what a half does not see finite.
 _PRIOR_WIDTH = 10.0
 _MIN_PRIOR_SIGMA = 1e-6
@@ -136,7 +135,7 @@ class TestedSum:
     @property
     def holds(self) -> bool:
         """True if the half that took no part wants it."""
-        return self.p_value < _REJECTED and self.log_bayes_factor > ODDS
+        return self.p_value < REJECTED_FORMULA and self.log_bayes_factor > ODDS
 
 
 def test_current_scatter(ingredients: tuple[Ingredient, ...], chosen: HalfModel, other: HalfModel) -> TestedSum:
@@ -214,7 +213,6 @@ def _log_predictive_ratio(A: Array, y: Array, B: Array, w: Array) -> float:
 # groups: Lozano, Świrszcz & Abe 2009, NIPS 22).
 
 _AT_MOST = 4  # numbers of a sum, unless one addend has more
-_CHANCE = 0.05  # that an addend which is none is added, all of them counted
 # Columns shorter than this share of the longest lie almost wholly in what the model explains; of a column's length less
 # is another's.
 _MIN_COLUMN_NORM, _INDEPENDENT_SHARE = 1e-6, 0.1
@@ -290,7 +288,7 @@ class _PursuitProblem:
             if not rank or left < 1:
                 break
             F = gains[k] / rank / max((rest - gains[k]) / left, 1e-300)
-            if f_tail(F, rank, left) > _CHANCE / len(self.addends):
+            if f_tail(F, rank, left) > FALSE_ADDEND / len(self.addends):
                 break
             # Addends may share a number: a spring stands alone and with how it stiffens.
             sums.append(tuple(dict.fromkeys((*sums[-1], *self.addends[k]))))

@@ -14,10 +14,18 @@ import numpy as np
 
 from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.diagnosis.regime import regime_of
-from stitch.diagnosis.score import SEEN, form_weights
+from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.sensitivity import detectable_sizes
-from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR, ODDS, PRIOR_PHYSICAL, SEPARATION_LAMBDA
-from stitch.diagnosis.unnamed_joint_laws import TIMES, law_covariances, log_posterior_of_any
+from stitch.diagnosis.thresholds import (
+    ALPHA_NAME,
+    LAW_VARIANCES,
+    LOG_BAYES_FACTOR,
+    ODDS,
+    PRIOR_PHYSICAL,
+    SEEN_SIGMAS,
+    SEPARATION_LAMBDA,
+)
+from stitch.diagnosis.unnamed_joint_laws import law_covariances, log_posterior_of_any
 from stitch.frames import Array, Mask
 from stitch.measurement.session import Session
 from stitch.observations.linear_model import LinearModel
@@ -255,7 +263,7 @@ class ExpectedDiagnosis:
         """(D,) whether a candidate is ahead of joints that follow by no law (`joint_laws.py`)."""
         own = self._test({self.candidates[k].name}, self.candidates[k])
         if k not in self._laws:
-            found, sizes = law_covariances(own.linear), np.sqrt(TIMES)
+            found, sizes = law_covariances(own.linear), np.sqrt(LAW_VARIANCES)
             self._laws[k] = [[covariance_tests(own.linear, C, sizes) for C in kind] for kind in found]
         kinds = self._laws[k]
         if not kinds:
@@ -279,7 +287,7 @@ def _best_log_factor(law: Sequence[CandidateTest], numbers: Array) -> Array:
 def _is_visible(linear: LinearModel, candidate: Candidate) -> bool:
     """True if one parameter at its plausible size is half a sigma at the least, as a diagnosis has it."""
     white = linear.without([candidate.name]).residual(candidate.forms[0].columns) * candidate.forms[0].sizes
-    return bool((np.linalg.norm(white, axis=0) > SEEN).any())
+    return bool((np.linalg.norm(white, axis=0) > SEEN_SIGMAS).any())
 
 
 def usual_shifts(candidate: Candidate, rng: np.random.Generator, draws: int = DRAWS) -> Array:

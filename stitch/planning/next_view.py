@@ -16,7 +16,7 @@ from stitch import frames
 from stitch.diagnosis.diagnosis import Diagnosis, Proposal
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.sensitivity import alias_matrix
-from stitch.diagnosis.thresholds import ALIAS_CORRELATION, SEPARATION_LAMBDA
+from stitch.diagnosis.thresholds import ALIAS_CORRELATION, SEPARATION_LAMBDA, WORTHWHILE_GAIN
 from stitch.frames import Array
 from stitch.measurement.capture import build_capture
 from stitch.measurement.measurement import Measurement
@@ -97,7 +97,7 @@ def _best_pose(linear: LinearModel, group: Sequence[Score]) -> tuple[Array, int,
     they separate; None if poses cannot separate anything.
     """
     pairs = [(gains, (a.name, b.name)) for a, b in combinations(group, 2) if (gains := _gains(linear, a, b))]
-    pairs = [(gains, names) for gains, names in pairs if gains.of_views.max() > 1e-3 * SEPARATION_LAMBDA]
+    pairs = [(gains, names) for gains, names in pairs if gains.of_views.max() > WORTHWHILE_GAIN * SEPARATION_LAMBDA]
     if not pairs:
         return None
     k = int(np.min([gains.of_views for gains, _ in pairs], axis=0).argmax())

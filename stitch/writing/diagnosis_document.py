@@ -8,7 +8,7 @@ import numpy as np
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.sentences import odds_text
-from stitch.diagnosis.thresholds import HELDOUT_FALL, MAX_REMAINING_SHARE
+from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, HELDOUT_FALL, MAX_REMAINING_SHARE
 from stitch.diagnosis.unnamed_joint_laws import JointCurve
 from stitch.diagnosis.unnamed_time_laws import TimeCurve
 from stitch.diagnosis.validation import CrossValidation, group_helps, group_share
@@ -86,9 +86,6 @@ def effect_in_words(name: str) -> str:
 #
 # Terminal, page, recording and review all say it so; the diagnosis' own sentence stands below as evidence.
 
-# What is left follows a covariate: p-value below which everybody is told, as in the diagnosis' own sentence.
-_DEPENDENCE_P_VALUE = 0.01
-
 
 def plain_finding(found: Diagnosis, length_unit: str) -> str:
     """What is doubted of the session as a whole, what is missing, and how far the error should fall with it."""
@@ -162,7 +159,7 @@ def _error_location(found: Diagnosis) -> str:
         return ": the poses err in the course of time, by a law that has no name"
     if found.overlap_misfit:
         return ": the scanner or the part's shape is off, and not the poses alone"
-    follows = [x.covariate for x in found.depends_on if x.p_value < _DEPENDENCE_P_VALUE]
+    follows = [x.covariate for x in found.depends_on if x.p_value < CLEAR_DEPENDENCE]
     if follows:
         return f": what is left follows {' and '.join(follows[:2])}"
     # The likeliest name, and why it does not hold.
