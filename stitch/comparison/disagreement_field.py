@@ -88,8 +88,7 @@ def _mean_over_views(values: Array) -> Array:
 # Patches of the part on which the field of disagreement is read, as small as the noise allows.
 #
 # A patch is a Gaussian mean over its neighbourhood on the same side of the part. Its radius is the smallest at which
-# the
-# standard error of nearly all patches is below a step of the colours. All states of a model are read by the same
+# the standard error of nearly all patches is below a step of the colours. All states of a model are read by the same
 # correspondences on the same patches, so that the difference of two fields is that of the models alone.
 
 # Radii of the patches that are tried, as shares of the part's longest side.

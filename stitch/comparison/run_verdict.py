@@ -24,17 +24,17 @@ class ToleranceVerdict(NamedTuple):
 
 
 def plain_verdict(history: ModelHistory, length_unit: str) -> str:
-    """How far the views disagree on the part, what the effects in use brought, what is left in the stitched cloud."""
+    """Return how far the views disagree on the part, what effects brought, and what the stitched cloud keeps."""
     models = history.models
     told = (length_text(s.field.mean_abs, length_unit) for s in (models[0], models[-1], history.steps[-1]))
     before, now, left = told
-    rest = f"with each view moved by its own correction, {left} remain in the stitched cloud."
+    rest = f"In the stitched cloud, where each view has its own correction, {left} remain."
     changes = _added_effects([step.name for step in models[1:]])
     if not changes:
-        return f"On average over the part, the views disagree by {now}; {rest}"
+        return f"On average over the part, the views disagree by {now}. {rest}"
     return (
         f"Adding {' and '.join(changes)} brought the views from {before} to {now} of each other, on average over the "
-        f"part; {rest}"
+        f"part. {rest}"
     )
 
 
@@ -51,7 +51,7 @@ def _added_effects(changes: Sequence[str]) -> list[str]:
 
 
 def check_tolerance(history: ModelHistory, tolerance: float, length_unit: str) -> ToleranceVerdict:
-    """Whether 95 % of the part agree within a tolerance (length_unit), in the stitched cloud and under the model."""
+    """Return whether 95 % of the part agree within a tolerance (length_unit), stitched and under the model."""
     model, cloud = (_field_reach(s.field) for s in (history.models[-1], history.steps[-1]))
     allowed = length_text(tolerance, length_unit, 4)
     told = f"{length_text(model, length_unit)} under the model, {length_text(cloud, length_unit)} in the stitched cloud"
@@ -60,8 +60,8 @@ def check_tolerance(history: ModelHistory, tolerance: float, length_unit: str) -
     if model > tolerance:
         return ToleranceVerdict(
             "check",
-            f"The stitched cloud is within {allowed}, the model alone is not: 95 % of the part agree to {told}; "
-            "do not carry the model to another part yet.",
+            f"The stitched cloud is within {allowed}, the model alone is not: 95 % of the part agree to {told}. "
+            "Do not use the model for another part yet.",
         )
     return ToleranceVerdict("good", f"Within {allowed}: 95 % of the part agree to {told}.")
 
@@ -72,7 +72,7 @@ def _field_reach(field: DisagreementField) -> float:
 
 
 def run_verdict(run: Run, history: ModelHistory | None) -> str:
-    """For everybody: what is wrong with the session, how far its views disagree, and what the effects in use brought.
+    """Return for everybody what is wrong with the session, how far its views disagree, and what effects brought.
 
     Args:
         history: of this run; None without clouds.
@@ -81,12 +81,12 @@ def run_verdict(run: Run, history: ModelHistory | None) -> str:
 
 
 def run_headline(run: Run, history: ModelHistory | None) -> str:
-    """The same, of every doubt no more than its first clause: what it means and what to do stands elsewhere."""
+    """Return the same, of every doubt no more than its first clause: what it means and what to do stands elsewhere."""
     return shorten_doubts(run_verdict(run, history), run.doubts)
 
 
 def shorten_doubts(verdict: str, doubts: Sequence[str]) -> str:
-    """A verdict as result.json has it, of every doubt in it no more than its first clause."""
+    """Return a verdict as result.json has it, of every doubt in it no more than its first clause."""
     for doubt in doubts:
         verdict = verdict.replace(doubt, doubt_headline(doubt), 1)
     return verdict
@@ -97,19 +97,19 @@ def _agreement_sentence(run: Run, history: ModelHistory | None) -> str:
     if history is not None:
         return plain_verdict(history, unit)
     if run.targets is not None and run.targets.uninformative:
-        return "Every target is seen in one view alone, so that the views cannot disagree."
+        return "Each target is seen in one view alone, so the views cannot disagree."
     now, floor = (length_text(x, unit) for x in (run.residual_rms, run.noise_floor))
-    rest = f"rms over all views; the sensor's noise alone would leave {floor}."
+    rest = f"rms over all views. The sensor's noise alone would leave {floor}."
     changes = [effect_changes(run.ledger, i) for i in range(1, len(run.ledger))]
     added = [effect for effect in run.effects if f"+ {effect}" in ", ".join(changes).split(", ")]
     if not added:
-        return f"The views see the targets {now} off their place, {rest}"
+        return f"The targets lie {now} off their place, {rest}"
     before = length_text(run.ledger[0].residual_rms, unit)
     return f"Adding {' and '.join(added)} brought the targets from {before} to {now} off their place, {rest}"
 
 
 def run_light(run: Run, history: ModelHistory | None, tolerance: float) -> ToleranceVerdict | None:
-    """Whether 95 % of the part, or of what was seen of the targets, agree within a tolerance (length_unit).
+    """Return whether 95 % of the part, or of what was seen of the targets, agree within a tolerance (length_unit).
 
     None where neither surfaces nor targets say anything of it.
     """

@@ -78,7 +78,7 @@ class TwoRuns:
 
 
 def compare_runs(runs: Sequence[Run], names: Sequence[str]) -> TwoRuns:
-    """Two runs with the names of their folders.
+    """Return two runs with the names of their folders.
 
     Raises:
         InputError: their numbers mean different things: unit, mount, or surfaces against labelled points.
@@ -106,7 +106,7 @@ def _seen_points(run: Run) -> str:
 
 
 def hand_eye_change(a: Run, b: Run) -> HandEyeChange:
-    """The difference of two hand-eyes with what is known of both, to first order in their errors."""
+    """Return the difference of two hand-eyes with what is known of both, to first order in their errors."""
     same = np.array_equal(a.T_mount, b.T_mount)  # else rounding would make a difference of it
     D = np.eye(4) if same else frames.inverse(a.T_mount) @ b.T_mount
     # exp(−ξ_A)·D·exp(ξ_B) = exp(Ad_D·ξ_B − ξ_A)·D for small ξ.
@@ -126,7 +126,7 @@ def hand_eye_change(a: Run, b: Run) -> HandEyeChange:
 
 
 def comparison_sentence(both: TwoRuns) -> str:
-    """What changed from A to B, for everybody."""
+    """Return what changed from A to B, for everybody."""
     unit = both.a.run.session.length_unit
     off_a, off_b = (length_text(side.error, unit) for side in (both.a, both.b))
     where = "rms over the labelled points" if both.a.history is None else "on average over the part"
@@ -135,7 +135,7 @@ def comparison_sentence(both: TwoRuns) -> str:
         "" if both.same_data else ", on other data"
     )
     seen = "targets" if both.a.history is None else "part"
-    return f"{subject}, the views of B disagree {told}, {where}; {_hand_eye_sentence(both.hand_eye, unit, seen)}."
+    return f"{subject}, the views of B disagree {told}, {where}. {_hand_eye_sentence(both.hand_eye, unit, seen)}."
 
 
 def _effects_difference(a: Sequence[str], b: Sequence[str]) -> str:
@@ -148,9 +148,9 @@ def _effects_difference(a: Sequence[str], b: Sequence[str]) -> str:
 
 def _hand_eye_sentence(change: HandEyeChange, length_unit: str, seen: str) -> str:
     if not change.twist.any():
-        return "both have the same hand-eye"
-    apart = f"the hand-eyes put the {seen} {length_text(change.at_part, length_unit)} apart"
+        return "Both have the same hand-eye"
+    apart = f"The hand-eyes put the {seen} {length_text(change.at_part, length_unit)} apart"
     if np.isnan(change.p_value):
-        return f"{apart}, and how well they are known is not stated"
+        return f"{apart}; their uncertainty is not stated"
     beyond = "more than" if change.p_value < _CHANCE else "no more than"
     return f"{apart}, {beyond} their uncertainties explain"

@@ -76,9 +76,8 @@ class Diagnosis:
     budget: tuple[BudgetLine, ...] = ()  # of what the poses leave
     curves: tuple[JointCurve, ...] = ()  # where single joints err without a name, along angles and moves
     log_odds_over_nothing: float = np.inf  # log odds of what is named over nothing being missing
-    overlap_misfit: float = (
-        0.0  # rms that remains beside the noise however the views are moved, where it is more; length_unit
-    )
+    # rms that remains beside the noise however the views are moved, where it is more; length_unit
+    overlap_misfit: float = 0.0
     follows_field: bool = False  # nothing is named, and what is left follows the place in the scanner's field
     scanner_error: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer
     doubts: tuple[

@@ -122,8 +122,7 @@ def score_pair(linear: LinearModel, first: Ranked, second: Ranked, tests: int) -
 #
 # A candidate is scored without its own share of the pose errors (`score.py`), while every other joint and link may err
 # by as much as the views show. What two effects can both do no single one is wanted for, since the errors that remain
-# do
-# the other's part: then the smallest set is sought without which the views cannot do.
+# do the other's part: then the smallest set is sought without which the views cannot do.
 
 
 def rescore_contenders(linear: LinearModel, contenders: Sequence[Ranked]) -> tuple[list[Ranked], LinearModel]:

@@ -27,8 +27,7 @@ from stitch.statistics.variance_posterior import mean_variances
 # A scanner that errs by where in its field a point is seen, by no law of the library.
 #
 # Axes of unequal scale or not at right angles, a plane of focus that is bent to one side: the same in every view, so
-# that
-# overlaps show it, and joints, mount or time only seem to have a part in it.
+# that overlaps show it, and joints, mount or time only seem to have a part in it.
 
 
 def follows_field(empirical: Sequence[Ranked], unnamed: Sequence[RepeatingError]) -> bool:

@@ -41,10 +41,8 @@ from stitch.units import METRES
 #
 # How large an effect is if it is there nobody knows before: its parameters are of plausible size, or all alike three
 # times, a third or a tenth of it, each as likely, or grossly wrong. With plausible sizes alone, six numbers of which
-# the
-# views show a tenth of that were charged for all that they could have been, and effects beyond chance (p = 1e-9)
-# counted
-# for nothing.
+# the views show a tenth of that were charged for all that they could have been, and effects beyond chance (p = 1e-9)
+# counted for nothing.
 
 
 @dataclass(frozen=True)
@@ -150,9 +148,8 @@ class Score:
     values: Array  # (p,) of the best form, free fit
     covariance: Array  # (p, p); NaN where no form was worth a fit
     scale: float = 1.0  # of the plausible sizes of its parameters, the likeliest
-    base_model: LinearModel | None = (
-        None  # with the pose errors that remain beside the best form, where these have a prior
-    )
+    # with the pose errors that remain beside the best form, where these have a prior
+    base_model: LinearModel | None = None
 
     @property
     def name(self) -> str:

@@ -55,9 +55,8 @@ def _test_effect(state: RunState, term: Term) -> tuple[float, str | None]:
 # An effect that errs at some end gives way to one that does the same and is likelier to hold beyond.
 #
 # Two effects may each leave nothing to the other among the measured poses. What an imitation gains is no measure then:
-# it
-# has the more parameters, gains more, and is far off where nothing was measured. Ends that were left out tell the two
-# apart as far as these poses can.
+# it has the more parameters, gains more, and is far off where nothing was measured. Ends that were left out tell the
+# two apart as far as these poses can.
 
 
 @dataclass(frozen=True)

@@ -110,8 +110,8 @@ PAIRED_JOINTS = 2
 
 # Formulas (`stitch explain`).
 
-# p-value below which views that took no part in finding a formula refute it (custom).
-REJECTED_FORMULA = 0.01
+# p-value of "no such formula" in the half of the views that took no part in finding it: below, it holds (custom).
+CONFIRMED_FORMULA = 0.01
 # Probability that an addend which is none is added, all of them counted (custom).
 FALSE_ADDEND = 0.05
 # rad; no gear, spring or clearance does more to a joint. Larger addends are differences of two that look alike.

@@ -481,12 +481,10 @@ def _factor_of_one_angle(some: Array, others: Array) -> Array:
 # All joints and links following the pose at once can do what one joint does, and beside them its law gains nothing. But
 # where one joint alone explains the views at least as well as all of them together, the errors live there. Compared are
 # maxima of likelihood and prior: the sizes of all together are charged some three nats for being there at all. An arm
-# of
-# which every joint and link is off is hardly ever explained by one of its joints alone.
+# of which every joint and link is off is hardly ever explained by one of its joints alone.
 #
 # Of all kinds of laws of all joints one may be there, each as likely before: what counts is their mean Bayes factor,
-# and
-# of a joint the mean of its kinds.
+# and of a joint the mean of its kinds.
 
 
 def significant_laws(linear: LinearModel) -> tuple[JointLaw, ...]:

@@ -167,10 +167,9 @@ def _duration_in_words(linear: LinearModel, steps: float) -> str:
 # Laws without a name in time: a flange that swings to and fro, or that stands off for a stretch of views.
 #
 # A cabinet that cools in turns, air that is conditioned in turns, a draught, somebody who leans on the cell. Errors
-# half
-# a period apart are opposite, and a stretch of large errors lies amid small ones: no process that forgets and has one
-# size throughout does that. Beside such a prior they count as white scatter, and a model that left 0.1 mrad of them was
-# adequate; or an effect that goes with time got its name from a part of a swing.
+# half a period apart are opposite, and a stretch of large errors lies amid small ones: no process that forgets and has
+# one size throughout does that. Beside such a prior they count as white scatter, and a model that left 0.1 mrad of them
+# was adequate; or an effect that goes with time got its name from a part of a swing.
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from stitch.statistics.least_squares import column_space, mean_square_share
 # A wrong effect may imitate among the measured poses what is not known, and err beyond them; left-out neighbours in
 # time or pose lie among the others and do not show it. The ends judge together. Where more than one thing is missing, a
 # right effect takes away what hid another at some end and makes that one a little worse; an imitation helps at many
-# ends
-# and is far off at others. So a further end must be likely to become better, the ends being samples of it.
+# ends and is far off at others. So a further end must be likely to become better, the ends being samples of it.
 
 
 @dataclass(frozen=True)

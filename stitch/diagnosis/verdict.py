@@ -27,9 +27,8 @@ class Evidence:
     further: Ranked | None = None  # an effect that is missing too, beside the first of `explanation`
     unnamed_explains_it: bool = False  # an error without a name explains these views as well as `explanation`
     refuted: bool = False  # `explanation` fails on views left out, in halves of the views, or rests on one view
-    scanner_error: FieldError | None = (
-        None  # smooth errors of the scans, beside `explanation`; None: usual or not asked
-    )
+    # smooth errors of the scans, beside `explanation`; None: usual or not asked
+    scanner_error: FieldError | None = None
     repeating_errors: tuple[RepeatingError, ...] | None = None  # pose errors without a name; None: not asked
     implausible_scatter: bool = False  # the poses scatter by more than is stated, or than any sound arm does
     overlap_misfit: float = 0.0  # rms that no motion of the views removes, where it exceeds the noise; length_unit

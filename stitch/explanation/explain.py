@@ -145,7 +145,7 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
             # What does not hold in the other views needs no further test.
             if not chosen.holds:
                 break
-        return first or Explanation(False, "Nothing that the cell knows of its views explains what is left.")
+        return first or Explanation(False, "No joint angle, time or column of views.csv explains what is left.")
 
 
 def _try_sum(linear: LinearModel, terms: Dictionary, chosen: TestedSum, origin: str) -> Explanation:
@@ -158,14 +158,14 @@ def _try_sum(linear: LinearModel, terms: Dictionary, chosen: TestedSum, origin: 
     turns = [abs(v if i.quantity.bounded else x) for i, v, x in zip(own, values, scaled, strict=True)]
     if own[0].place == "robot" and max(turns) > LARGEST_JOINT_ADDEND:
         return Explanation(
-            False, f"{text} would turn a joint by more than {1e3 * LARGEST_JOINT_ADDEND:.0f} mrad: no arm does that."
+            False, f"{text} would turn a joint by more than any arm errs, {1e3 * LARGEST_JOINT_ADDEND:.0f} mrad."
         )
     source = effect_source(EFFECT_NAME, own, values, f"{origin} {text}")
     scored = _score_effect(linear, source)
     left_out, beyond = cross_validate(linear, scored), extrapolate(linear, scored)
     share = left_out.heldout
     if not left_out.helps or share >= 1:
-        return Explanation(False, f"{text} explains much, but not in views that are left out with their neighbours.")
+        return Explanation(False, f"{text} explains the views, but not those left out with their neighbours.")
     if beyond is not None and not beyond.helps:
         return Explanation(False, f"{beyond.rejection_reason(text)}.")
     tested = _tested_formula(linear, terms, chosen, text)
@@ -192,10 +192,10 @@ def _tested_formula(linear: LinearModel, terms: Dictionary, chosen: TestedSum, t
 def _test_sentence(p_value: float, text: str, tested: str) -> str:
     """How a formula that is told stood the test, or which one did."""
     if tested == text:
-        return f"found in some of the views, it holds in the others ({_p_value_text(p_value)})"
+        return f"found in one half of the views, it holds in the other ({_p_value_text(p_value)})"
     return (
-        f"likeliest in all views, but not what was tested: {tested}, found in some of them, holds in the others "
-        f"({_p_value_text(p_value)}, of this one alone)"
+        f"likeliest in all views, but not the one tested. Found in one half and holding in the other: {tested} "
+        f"({_p_value_text(p_value)}, for this one alone)"
     )
 
 
@@ -214,15 +214,13 @@ def _p_value_text(p_value: float) -> str:
 
 
 def _no_formula_sentence(chosen: TestedSum, text: str) -> str:
-    return (
-        f"No formula holds: {text}, found in some of the views, is not what the others show (p = {chosen.p_value:.2g})."
-    )
+    return f"No formula holds: {text}, found in one half of the views, fails in the other (p = {chosen.p_value:.2g})."
 
 
 def _too_few_sentence(views: int) -> str:
     return (
-        f"Nothing can be said from {views} views: a formula is found in some of them and tested in the others, and "
-        "either are too few to tell one formula from another beside what is fitted anyway."
+        f"Nothing can be said from {views} views. A formula is found in one half and tested in the other; each half "
+        "is too small."
     )
 
 

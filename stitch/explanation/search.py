@@ -19,7 +19,7 @@ from itertools import product
 import numpy as np
 from scipy.optimize import least_squares
 
-from stitch.diagnosis.thresholds import FALSE_ADDEND, ODDS, REJECTED_FORMULA
+from stitch.diagnosis.thresholds import CONFIRMED_FORMULA, FALSE_ADDEND, ODDS
 from stitch.diagnosis.validation import explained_basis
 from stitch.explanation.dictionary import Dictionary, Ingredient, Quantity, group_addends, scaled_values
 from stitch.frames import Array, Indices
@@ -114,8 +114,7 @@ class HalfModel:
 #
 # Beside everything else that poses may err by, under the scatter that is left once the sum is taken out: a χ² test, and
 # how much likelier the numbers of that half are with the sizes that the first half found (a partial Bayes factor;
-# Berger
-# & Pericchi 1996, J. Am. Stat. Assoc. 91:109).
+# Berger & Pericchi 1996, J. Am. Stat. Assoc. 91:109).
 
 # A prior of this many sizes as they come out keeps what a half does not see finite.
 _PRIOR_WIDTH = 10.0
@@ -135,7 +134,7 @@ class TestedSum:
     @property
     def holds(self) -> bool:
         """True if the half that took no part wants it."""
-        return self.p_value < REJECTED_FORMULA and self.log_bayes_factor > ODDS
+        return self.p_value < CONFIRMED_FORMULA and self.log_bayes_factor > ODDS
 
 
 def test_current_scatter(ingredients: tuple[Ingredient, ...], chosen: HalfModel, other: HalfModel) -> TestedSum:

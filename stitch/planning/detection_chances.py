@@ -48,8 +48,7 @@ from stitch.statistics.parameter_selection import log_mean_exp
 # One candidate beside a model of planned views: its log Bayes factor and its F test on whatever these may see.
 #
 # The variances are the expected ones and stay as they are, so that a test is a few small matrices and thousands of
-# draws
-# cost nothing.
+# draws cost nothing.
 
 # Combinations that views see less than this share of a sigma, at plausible size, count in no p-value.
 _MIN_INFORMATION = 1e-2

@@ -75,9 +75,7 @@ def surface_of_file(file: Path, scale: float) -> PlannedPart:
         return surface_of_mesh(mesh)
     cloud = read_cloud(file, scale)
     if cloud.normals is None:
-        raise InputError(
-            f"{file}: a cloud without normals has no outside; to fix: name a mesh, or stitched.ply of a run"
-        )
+        raise InputError(f"{file}: the cloud has no normals; to fix: name a mesh, or stitched.ply of a run")
     return thinned_surface(cloud.points, cloud.normals)
 
 
@@ -291,8 +289,8 @@ def simulate_views(session: Session, cell: CellModel, samples: int = SAMPLES, fe
     blind = next((view.name for view, index in zip(session.views, shown, strict=True) if len(index) < fewest), None)
     if blind is not None:
         raise NoResultError(
-            f"view {blind} would see next to nothing of the part; check scanner.pose, scanner.standoff and the part, "
-            "or leave the view out"
+            f"view {blind} would see next to nothing of the part; to fix: check scanner.pose, scanner.standoff and the "
+            "part, or leave the view out"
         )
     scans = tuple(_simulated_scan(cell, T, index) for T, index in zip(poses, shown, strict=True))
     capture = replace(bare, scans=scans)
@@ -370,13 +368,11 @@ def cell_of_session(
     """
     file, scanner = session.path / "session.toml", session.scanner
     if scanner.T_mount is None:
-        raise InputError(f"{file}: no scanner.pose; to fix: state about where the scanner sits, a plan begins there")
+        raise InputError(f"{file}: no scanner.pose; to fix: state roughly where the scanner sits")
     if scanner.standoff is None:
-        raise InputError(f"{file}: no scanner.standoff; to fix: state the distance at which the scanner sees the part")
+        raise InputError(f"{file}: no scanner.standoff; to fix: state the distance from scanner to part")
     if scanner.kind not in (None, "area", "line"):
-        raise InputError(
-            f"{file}: scanner.kind is {scanner.kind}; plans are made for scans; to fix: run it, then stitch next"
-        )
+        raise InputError(f"{file}: scanner.kind is {scanner.kind}, not a scan; to fix: stitch run, then stitch next")
     scatter, assumed = stated_scatter(session), list[str]()
     half = np.tan(np.radians((field_deg or USUAL_FIELD_DEG) / 2))
     if field_deg is None:
@@ -402,7 +398,7 @@ def cell_of_run(state: RunState, folder: Path) -> PlannedCell:
         InputError: a run of labelled points, or one without its cloud.
     """
     if not state.session.has_clouds:
-        raise InputError(f"{folder}: a run of labelled points; plans are made for scans; to fix: stitch next {folder}")
+        raise InputError(f"{folder}: a run of labelled points, not of scans; to fix: stitch next {folder}")
     file = folder / "stitched.ply"
     cloud = read_cloud(file)
     if cloud.normals is None:
@@ -444,7 +440,7 @@ def _part_of_session(session: Session, part: Path | None, size_mm: float | None)
     if session.cad is not None:
         return surface_of_file(session.cad, METRES[session.cad_unit or session.length_unit] / unit), []
     raise InputError(
-        f"{session.path}: nobody says what is scanned; to fix: --part MESH, or --size MM of its longest side"
+        f"{session.path}: the scanned part is not stated; to fix: --part MESH, or --size MM of its longest side"
     )
 
 

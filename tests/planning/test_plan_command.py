@@ -65,7 +65,7 @@ def test_before_any_scan_it_says_what_views_tell_and_which_to_add(planned, measu
 @pytest.mark.parametrize(
     ("change", "options", "words"),
     [
-        (None, [], ["nobody says what is scanned", "--part", "--size"]),
+        (None, [], ["the scanned part is not stated", "--part", "--size"]),
         (None, ["--size", "-3"], ["--size -3", "to fix"]),
         (None, ["--size", "9", "--views", "0"], ["--views 0", "to fix"]),
         (None, ["--size", "9", "--field", "200"], ["--field 200", "to fix"]),

@@ -104,7 +104,7 @@ def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, caps
         assert f'class="{light}"' in page
         assert unbroken(result["plain"]).replace("'", "&#39;") in page
     of_two = told(capsys, "report", before, run, "--tolerance", 1.01 * reach)
-    assert f"by {rms[1]} instead of {rms[0]}, rms over the labelled points; the hand-eyes put the targets" in of_two
+    assert f"by {rms[1]} instead of {rms[0]}, rms over the labelled points. The hand-eyes put the targets" in of_two
     page = (run / "two-runs.html").read_text()
     assert re.findall(r'class="light (\w+)"', page) == ["bad", "good"]
     assert "views of B" in page and "<canvas" not in page

@@ -79,7 +79,7 @@ def test_the_sentence_says_what_changed_and_whether_the_data_did(pair, tmp_path)
     a, b = pair
     same = comparison_sentence(compare_runs((a, a), ("a", "a")))
     assert same.startswith("With the same effects in the model, the views of B disagree as far as those of A, by")
-    assert same.endswith("both have the same hand-eye.")
+    assert same.endswith("Both have the same hand-eye.")
     elsewhere = replace(b, session=replace(b.session, path=tmp_path))
     both = compare_runs((a, elsewhere), ("a", "b"))
     assert not both.same_data
