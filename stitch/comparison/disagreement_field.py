@@ -57,7 +57,7 @@ class DisagreementField:
 
     @property
     def noise(self) -> float:
-        """What `mean_abs` would be if noise were all there is."""
+        """Return what `mean_abs` would be if noise were all there is."""
         if not np.isfinite(self.sigma).any():
             return float("nan")
         return _MEAN_OF_NORMAL * float(np.nanmean(_mean_over_views(self.sigma)))
@@ -74,7 +74,7 @@ def full_colour_distance(field: DisagreementField) -> float:
 
 
 def largest_standard_error(sigma: Array) -> float:
-    """What nearly all standard errors stay below."""
+    """Return the limit that nearly all standard errors stay below."""
     return float(np.nanquantile(sigma, 0.9))
 
 
@@ -272,7 +272,7 @@ def _build_history(run: Run) -> ModelHistory | None:
 
 
 def effect_changes(ledger: Sequence[LedgerStep], i: int) -> str:
-    """What step i brought or took: + joint_compliance."""
+    """Return what step i added or dropped: + joint_compliance."""
     if i == 0:
         return ", ".join(ledger[0].effects) or HAND_EYE_ONLY
     new = [f"+ {e}" for e in ledger[i].effects if e not in ledger[i - 1].effects]
@@ -333,7 +333,7 @@ def target_history(run: Run) -> tuple[TargetStep, ...]:
 
 
 def _target_step(name: str, s: Sightings, placed: Array) -> TargetStep:
-    """Of targets (V, S, 3) as the views place them: each about the middle of all views, the place of least squares."""
+    """Return one step: targets (V, S, 3) as the views place them, each about the middle of all views."""
     own = np.full(s.used.shape, np.nan)
     for k in range(len(s.targets)):
         here = s.used & (s.target == k)

@@ -205,7 +205,7 @@ class ResidualTables:
 
     @cached_property
     def means(self) -> int:
-        """How many means of bins are asked whether they are zero.
+        """Return how many means of bins are tested.
 
         Bins of the same rows count once in whichever table they stand, and so do a bin and all that lies outside it:
         the sums of the two differ in their sign alone.
@@ -215,7 +215,7 @@ class ResidualTables:
         return len(ordered) and 1 + int((np.diff(ordered) > _SAME_VALUE * ordered[-1]).sum())
 
     def p_of_all(self, table: ResidualTable) -> float:
-        """That chance makes any of all the means as clear as the clearest of this table (Bonferroni)."""
+        """Return the p-value of the clearest mean of a table, over all means (Bonferroni)."""
         return min(1.0, max(self.means, 1) * table.least_p)
 
     def is_clear(self, table: ResidualTable) -> bool:
@@ -234,7 +234,7 @@ def view_properties(views: Views) -> list[tuple[str, str, Array]]:
 
 
 def _unit_of(covariate: str) -> str:
-    """As the name says it: scanner_temperature_c, humidity_percent."""
+    """Return the unit that the name ends in: scanner_temperature_c, humidity_percent."""
     return next((unit for ending, unit in _ENDINGS.items() if covariate.endswith(ending)), "")
 
 
@@ -460,7 +460,7 @@ def compare_targets(state: RunState) -> ResidualTables:
 
 
 def _target_offsets(state: RunState) -> _Offsets:
-    """With the targets where hand-eye and effects of the model put them best."""
+    """Return offsets from where hand-eye and effects put the targets best."""
     own = corrected_capture(state.measurement, state.model)
     s = own.sightings
     assert s is not None

@@ -33,7 +33,7 @@ class ComparedRun:
 
     @property
     def error(self) -> float:
-        """How far the views are off one another under the model: mean on the part, or rms of labelled points."""
+        """Return how far the views disagree under the model: mean on the part, or rms of labelled points."""
         return self.run.residual_rms if self.history is None else self.history.models[-1].field.mean_abs
 
 
@@ -53,7 +53,7 @@ class HandEyeChange:
 
     @property
     def p_value(self) -> float:
-        """That so large a twist comes about by the stated uncertainties; NaN where none is stated."""
+        """Return the p-value of so large a twist under the stated uncertainties; NaN where none is stated."""
         if not np.isfinite(self.covariance).all() or not (rank := np.linalg.matrix_rank(self.covariance)):
             return float("nan")
         return chi2_tail(float(self.twist @ np.linalg.pinv(self.covariance) @ self.twist), float(rank))
@@ -73,7 +73,7 @@ class TwoRuns:
 
     @cached_property
     def hand_eye(self) -> HandEyeChange:
-        """How far the hand-eyes differ."""
+        """Return how far the hand-eyes differ."""
         return hand_eye_change(self.a.run, self.b.run)
 
 
@@ -139,7 +139,7 @@ def comparison_sentence(both: TwoRuns) -> str:
 
 
 def _effects_difference(a: Sequence[str], b: Sequence[str]) -> str:
-    """With joint_compliance and without backlash in the model."""
+    """Return: With joint_compliance and without backlash in the model."""
     gained, lost = [e for e in b if e not in a], [e for e in a if e not in b]
     parts = [f"with {' and '.join(gained)}"] * bool(gained) + [f"without {' and '.join(lost)}"] * bool(lost)
     told = " and ".join(parts) or "with the same effects"

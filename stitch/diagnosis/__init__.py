@@ -1,1 +1,1 @@
-"""Which effect is missing: candidates scored, a verdict selected and validated, the next view designed."""
+"""Which effect is missing: candidates scored, evidence gathered, a verdict decided, plain sentences."""

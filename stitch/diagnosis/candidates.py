@@ -68,7 +68,7 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """That of the effect."""
+        """Return the name of the effect."""
         return self.effect.name
 
     @property

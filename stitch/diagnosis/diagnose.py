@@ -1,4 +1,4 @@
-"""The whole diagnosis: linear model, candidates, evidence, verdict, what to measure next, one plain sentence."""
+"""The whole diagnosis: linear model, candidates, evidence, verdict, plain sentences."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -18,7 +18,7 @@ from stitch.diagnosis.evidence import (
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.residual_structure import BudgetLine, dependences, follows_field, variance_budget
-from stitch.diagnosis.score import Score, scatter_limit
+from stitch.diagnosis.score import scatter_limit
 from stitch.diagnosis.sensitivity import (
     alias_matrix,
     aliases_of,
@@ -40,7 +40,7 @@ from stitch.system.threads import library_threads_off, parallel, return_large_ar
 
 
 def diagnose_state(state: RunState) -> Diagnosis:
-    """Which effect is missing in the model of a run.
+    """Find which effect is missing in the model of a run; what to measure next is planned elsewhere.
 
     Raises:
         NoResultError: no two views overlap.
@@ -62,7 +62,9 @@ def _diagnose(state: RunState) -> Diagnosis:
     matrix = alias_matrix(linear, [r.score for r in evidence.ranked])
     examined = _examine_candidates(linear, evidence, matrix, sum(not c.empirical for c in candidates), left_out)
     unknown = evidence.verdict == "unknown_effect"
-    unnamed = _repeating_errors(linear, evidence) if unknown else ()
+    unnamed = evidence.repeating_errors or ()
+    if unknown and evidence.repeating_errors is None:
+        unnamed = find_repeating_errors(linear)
     of_field = unknown and (evidence.scanner_error is not None or follows_field(evidence.empirical, unnamed))
     curves = joint_curves([law for kind in unnamed for law in kind.laws])
     said = reportable(unnamed, evidence.implausible_scatter)
@@ -108,13 +110,8 @@ def _rescore_pair(linear: LinearModel, evidence: Evidence) -> tuple[Ranked, Rank
     return score_pair(linear, first, second, len(evidence.ranked))
 
 
-def _repeating_errors(linear: LinearModel, evidence: Evidence) -> tuple[RepeatingError, ...]:
-    """What repeats without a name, asked only where the verdict did not rest on it."""
-    return find_repeating_errors(linear) if evidence.repeating_errors is None else evidence.repeating_errors
-
-
 def _pose_scatter(linear: LinearModel, reported: Sequence[RepeatingError]) -> tuple[float, float]:
-    """Of the poses, rad and length_unit: what is left beside errors that are said to repeat, or else all of it."""
+    """Return the scatter of the poses (rad, length_unit): beside errors said to repeat, or else all of it."""
     process = reported[0].process if reported else None
     beside = _with_joint_law(linear, reported) if reported else linear.scatter_only
     rotation, translation = np.sqrt(process.flange_scatter if process else beside.flange_scatter(beside.null))
@@ -124,7 +121,7 @@ def _pose_scatter(linear: LinearModel, reported: Sequence[RepeatingError]) -> tu
 def _error_budget(
     linear: LinearModel, evidence: Evidence, reported: Sequence[RepeatingError]
 ) -> tuple[BudgetLine, ...]:
-    """Of what the poses leave, with what is named first and what is said to err without a name."""
+    """Return shares of what the poses leave, with what is named first and what is said to err without a name."""
     process = reported[0].process if reported else None
     return variance_budget(_with_joint_law(linear, reported), [r.score for r in evidence.named[:1]], process)
 
@@ -136,7 +133,7 @@ def _with_joint_law(linear: LinearModel, reported: Sequence[RepeatingError]) -> 
 
 
 def linear_model_of(state: RunState) -> LinearModel:
-    """What a session says beside the model of a run."""
+    """Linearise a session under the model of a run."""
     return linearise(state.session, state.measurement, state.model, state.gate)
 
 
@@ -153,17 +150,13 @@ def _examine_candidates(
     def validated(k: int) -> CandidateEffect:
         ranked, candidate = evidence.ranked[k], scores[k].candidate
         detectable = detectable_sizes(linear, candidate, tests)
+        asked = k < CROSS_VALIDATED_CANDIDATES and scores[k].observable and scores[k].fitted
         return CandidateEffect(
             ranked=ranked,
             aliases=tuple(aliases_of(k, matrix, scores)),
-            cross_validation=left_out.get(ranked.name)
-            or (_cross_validate_fitted(linear, scores[k]) if k < CROSS_VALIDATED_CANDIDATES else None),
+            cross_validation=left_out.get(ranked.name) or (cross_validate(linear, scores[k]) if asked else None),
             detectable=detectable,
             hand_eye=omitted_effect_bias(linear, push, candidate, detectable),
         )
 
     return list(parallel(validated, range(len(scores)), "candidate effects on views left out"))
-
-
-def _cross_validate_fitted(linear: LinearModel, scored: Score) -> CrossValidation | None:
-    return cross_validate(linear, scored) if scored.observable and scored.fitted else None

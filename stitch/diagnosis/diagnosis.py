@@ -39,7 +39,7 @@ class CandidateEffect:
 
     @property
     def name(self) -> str:
-        """That of the effect."""
+        """Return the name of the effect."""
         return self.ranked.name
 
 
@@ -95,7 +95,7 @@ class Diagnosis:
         return self.log_odds_over_nothing > ODDS
 
     def rms_if_added(self, validation: CrossValidation) -> tuple[float, float]:
-        """With an effect, in the fit and on views left out, length_unit: shares of what the model leaves there."""
+        """Return the rms with an effect, in the fit and on views left out (length_unit)."""
         return self.residual_rms * validation.inside**0.5, self.heldout_rms * validation.heldout**0.5
 
     @property
@@ -105,7 +105,7 @@ class Diagnosis:
 
     @property
     def time_curve(self) -> TimeCurve | None:
-        """What the flange does in a course of time that is said."""
+        """Return the motion of the flange in time, where it is reported."""
         return next((u.curve for u in reportable(self.repeating_errors, self.implausible) if u.curve is not None), None)
 
     def __repr__(self) -> str:

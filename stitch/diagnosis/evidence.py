@@ -135,7 +135,7 @@ def rescore_contenders(linear: LinearModel, contenders: Sequence[Ranked]) -> tup
 
 
 def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:
-    """The same candidate with its score in another model; it counts among as many as before."""
+    """Score a candidate in another model; it counts among as many as before."""
     own = score(base, ranked.score.candidate)
     return replace(
         ranked,
@@ -165,7 +165,9 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
         others = [name for name in families if name in known and name not in removed]
         if not others:
             return ()
-        removed.add(max(others, key=lambda name: _log_bayes_factor(linear.without({*removed, name}), known[best.name])))
+        removed.add(
+            max(others, key=lambda name: score(linear.without({*removed, name}), known[best.name]).log_bayes_factor)
+        )
     base = linear.without(removed)
     again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
     if unnamed_law_log_posterior(base) > again[0].log_posterior - ODDS:
@@ -173,10 +175,6 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
     near = [r for r in again if is_contender(r) and r.log_posterior > again[0].log_posterior - ODDS]
     # One that is far ahead of the others is still not wanted beside them, all of them being a little wrong.
     return tuple(near) if len(near) > 1 else again
-
-
-def _log_bayes_factor(linear: LinearModel, candidate: Candidate) -> float:
-    return score(linear, candidate).log_bayes_factor
 
 
 # Errors of one and two periods a turn have a name; those of three and four have not.
@@ -202,7 +200,11 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     if shape is None and not any(is_certain(r) for r in ranked):
         # No effect is certain by itself: several of which some are required, errors without a name, or nothing.
         group = required_group(linear, candidates, len(ranked))
-        return replace(found, explanation=group) if group else _with_repeating_errors(linear, found)
+        return (
+            replace(found, explanation=group)
+            if group
+            else replace(found, repeating_errors=find_repeating_errors(linear))
+        )
     found = replace(found, alarm=True)
     contenders, base = rescore_contenders(linear, [r for r in ranked if is_contender(r)])
     if not contenders:
@@ -215,7 +217,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
         effects, refused, other = _select_jointly(linear, candidates, best, shape)
         found = replace(found, notes=tuple(dict.fromkeys(refused.values())))  # what speaks against several is said once
         if not effects:
-            return found if other else _with_repeating_errors(linear, replace(found, alarm=False))
+            return found if other else replace(found, alarm=False, repeating_errors=find_repeating_errors(linear))
         best, *others = effects
         second = others[0] if others else None
     elif _beaten_by_unnamed(best, shape, law):
@@ -242,7 +244,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
 def _select_jointly(
     linear: LinearModel, candidates: Sequence[Candidate], best: Ranked, empirical: Ranked | None
 ) -> tuple[list[Ranked], dict[str, str], bool]:
-    """Of many views: effects that are missing at once, the one first that is to be named; what is not among them, and
+    """Select effects that are missing at once, the one to be named first; what is not among them, and
     why; and whether there is something of another form."""
     found = forward_selection(linear, candidates, best)
     explained = max(found.explained, best.log_posterior)
@@ -252,10 +254,6 @@ def _select_jointly(
     if not regime_of(linear).prior:
         effects, idle = keep_worth_adding(linear, effects, sum(not c.empirical for c in candidates))
     return effects, found.refused | idle, False
-
-
-def _with_repeating_errors(linear: LinearModel, evidence: Evidence) -> Evidence:
-    return replace(evidence, repeating_errors=find_repeating_errors(linear))
 
 
 def _certain_shape(empirical: Sequence[Ranked]) -> Ranked | None:
@@ -330,7 +328,7 @@ def challenge(
 
 
 def cross_validate_named(linear: LinearModel, evidence: Evidence) -> dict[str, CrossValidation]:
-    """What each effect that may be named does on views left out: beside all that it was named beside, or, where pose
+    """Cross-validate each effect that may be named, beside all that it was named beside, or, where pose
     errors have no prior, alone, as it would be added next."""
     alone = {r.name: r.score for r in evidence.ranked}
     asked = {r.name: r.score if r.score.base_model else alone[r.name] for r in _named_effects(evidence)}
@@ -351,8 +349,10 @@ def with_scanner_error(linear: LinearModel, evidence: Evidence) -> Evidence:
 
 
 def _validated(linear: LinearModel, evidence: Evidence, left_out: Mapping[str, CrossValidation]) -> Evidence:
-    """What holds on views left out and in halves. A second effect that is named without the first is asked alone, and
-    is refuted where alone it is not certain."""
+    """Keep what holds on views left out and in halves.
+
+    A second effect that is named without the first is asked alone, and is refuted where alone it is not certain.
+    """
     halves = {r.name: validate_in_halves(r.score) for r in _named_effects(evidence)}
     held = with_validation(evidence, left_out, halves)
     if held.refuted or held.named[0] is evidence.named[0]:

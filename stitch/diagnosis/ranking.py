@@ -32,7 +32,7 @@ class Ranked:
 
     @property
     def name(self) -> str:
-        """That of the effect."""
+        """Return the name of the effect."""
         return self.score.name
 
     @property
@@ -76,7 +76,7 @@ def rank_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tupl
 
 
 def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: float) -> tuple[Ranked, ...]:
-    """The same where something else has this log posterior in the model of `best`: all shares make room for it."""
+    """Return the ranking where something else has this log posterior beside `best`: all shares make room."""
     here = next(r for r in ranked if r.name == best.name).posterior
     room = 1 + here * float(np.exp(min(log_posterior - best.log_posterior, 700.0)))
     return tuple(replace(r, posterior=r.posterior / room) for r in ranked)

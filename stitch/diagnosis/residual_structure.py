@@ -154,7 +154,7 @@ def variance_budget(
 
 
 def _with_observed_field(linear: LinearModel) -> LinearModel:
-    """With smooth errors of the scanner as large as the overlaps show them; an alarm allows for larger ones."""
+    """Replace smooth errors of the scanner by those that the overlaps show; an alarm allows for larger ones."""
     seen = linear.observation
     if linear.mixed.fixed is None or not isinstance(seen, SurfaceObservation):
         return linear
@@ -177,7 +177,7 @@ def _remaining_squares(linear: LinearModel, errors: PoseErrors, named: Sequence[
 
 
 def _unexplained_square(base: Array, numbers: Array) -> float:
-    """What no hand-eye explains of numbers (n,), squared."""
+    """Return the sum of squares of numbers (n,) that no hand-eye explains."""
     return float(np.sum(project_out(base, numbers[:, None]) ** 2))
 
 

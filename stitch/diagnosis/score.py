@@ -153,7 +153,7 @@ class Score:
 
     @property
     def name(self) -> str:
-        """That of the effect."""
+        """Return the name of the effect."""
         return self.candidate.name
 
     @property
@@ -223,8 +223,8 @@ def _base_with_candidate(base: LinearModel, best: FormTrial) -> LinearModel | No
 
 
 def _gains_at_null(base: LinearModel, at: LinearModel, candidate: Candidate) -> tuple[list[Gain], bool]:
-    """What its forms (F,) gain over the base at given variances, which refitted variances can only raise; and whether
-    the first form, of all its parameters, is seen."""
+    """Return the gain of each form (F,) over the base at given variances, which a refit can only raise; and whether the
+    first form, of all its parameters, is seen."""
     gains, seen = list[Gain](), False
     for form, white in zip(candidate.forms, residual_form_columns(at, candidate), strict=True):
         if not gains:
@@ -323,7 +323,7 @@ class ScatterLimit:
 
 
 def scatter_limit(session: Session) -> ScatterLimit:
-    """What the session states under [robot] repeatability, else the largest that is usual for an arm fit for use."""
+    """Return what the session states under [robot] repeatability, else the largest usual scatter."""
     stated, (rotation, translation) = session.repeatability, IMPLAUSIBLE
     usual = translation * METRES["mm"] / METRES[session.length_unit]
     return ScatterLimit(
@@ -355,7 +355,7 @@ def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:
 
 
 def _degrees_of_freedom(linear: LinearModel, component: int, sigma: float) -> float:
-    """To which the variance of a component would be known if its standard deviation were that."""
+    """Return the degrees of freedom of a component's variance if its standard deviation were `sigma`."""
     variances = linear.null.variances.copy()
     variances[component] = sigma**2
     known = satterthwaite(linear.mixed, at_variances(linear.mixed, variances))

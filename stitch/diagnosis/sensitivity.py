@@ -70,7 +70,7 @@ def aliases_of(k: int, matrix: Array, scores: Sequence[Score], least: float = LI
 
 
 def imitated_share(y: Array, X: Array) -> float:
-    """How much of a pattern (n,) columns (n, p) of plausible size can do, 0 … 1; nothing at all is like nothing."""
+    """Return the share of a pattern (n,) that columns (n, p) of plausible size imitate, 0 … 1."""
     length = float(np.linalg.norm(y))
     if length == 0 or not X.size:
         return 0.0

@@ -96,7 +96,7 @@ def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
 
 
 def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
-    """What the poses do where nothing is named."""
+    """Say what the poses do where nothing is named."""
     scatter = _pose_scatter(d, length_unit)
     if said := reportable(d.repeating_errors, d.implausible):
         size = np.sqrt(sum(line.sigma**2 for line in d.budget if line.source not in NOT_REPEATING))
@@ -123,12 +123,12 @@ def _is_missing(d: Diagnosis) -> str:
 
 
 def _odds_over_chance(d: Diagnosis) -> str:
-    """How much likelier than chance it is, where that is little."""
+    """Say how much likelier than chance it is, where that is little."""
     return "" if d.certain else f"The odds that it is more than chance are {odds_text(d.log_odds_over_nothing)}."
 
 
 def _implausible_sizes(ranked: Ranked) -> str:
-    """What is larger than anybody would expect."""
+    """Say which sizes are larger than plausible."""
     s = ranked.score
     large = [p.name for p, v in zip(s.form.free, s.values, strict=True) if abs(v) > p.limit] if s.fitted else []
     if not large:

@@ -224,7 +224,7 @@ def _eliminate_backward(
     for r, at_once in zip(chosen, list(parallel(extrapolated, chosen)), strict=True):
         own, found = at_once if as_asked else extrapolated(r, kept)
         others = [other for other in kept if other.name != r.name]
-        if not _certain_in_same_form(r, own):
+        if not (is_certain(own) and own.score.form is r.score.form):
             beyond, as_asked = {}, False  # what was asked of the others was asked beside this one
         kept = [*others, own] if is_certain(own) else others
         if is_certain(own):
@@ -233,8 +233,3 @@ def _eliminate_backward(
         if r.name not in beyond:
             beyond[r.name] = extrapolate(conditioned_without(linear, kept, r, near), r.score)
     return kept, {r.name: beyond[r.name] for r in kept}
-
-
-def _certain_in_same_form(r: Ranked, again: Ranked) -> bool:
-    """True if an effect is certain again, in the same form."""
-    return is_certain(again) and again.score.form is r.score.form

@@ -185,7 +185,7 @@ class FittedProcess:
 
     @property
     def joint(self) -> int | None:
-        """That follows it, counted from 1; None: the flange, in time."""
+        """Return the joint that follows it, counted from 1; None: the flange, in time."""
         return self.process.joint
 
     @property
@@ -217,7 +217,7 @@ def size_process(linear: LinearModel, process: SmoothProcess) -> SizedProcess:
 
 
 def fit_process(linear: LinearModel, sized: SizedProcess, tried: int) -> FittedProcess:
-    """With all variances sought anew: what a process explains is no scatter, and where the scatter is less it is
+    """Fit all variances anew: what a process explains is no scatter, and where the scatter is less it is
     likelier of another size."""
     columns = sized.process.columns(linear)
     G, unit = linear.in_blocks(columns), np.ones(columns.shape[1])
@@ -247,13 +247,13 @@ class JointLaw:
 
     @property
     def errors(self) -> SmoothErrors:
-        """Of its kind, of all joints."""
+        """Return the errors of its kind, of all joints."""
         assert self.base.pose_errors is not None
         return self.base.pose_errors.joint_processes[self.follows]
 
     @cached_property
     def model(self) -> LinearModel:
-        """With the law as the last of its pose errors, all sizes fitted."""
+        """Return the model with the law as the last pose error, all sizes fitted."""
         errors = self.base.pose_errors
         assert errors is not None
         own = self.base.reduce(self.base.reduce(self.errors.twist_covariance(self.process)).T)
@@ -263,14 +263,13 @@ class JointLaw:
         return replace(self.base, mixed=mixed, pose_errors=every, null=null, full_model=None)
 
     def fitted(self) -> "JointLaw":
-        """With all variances sought anew: what a law explains is no scatter."""
+        """Fit all variances anew: what a law explains is no scatter."""
         null = self.model.null
         return replace(self, log_bayes_factor=0.5 * (self.base.null.deviance - null.deviance), fit=null)
 
 
 def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
-    """What a law of each kind of each joint explains beside a model, likeliest first; () without joints or prior of
-    errors.
+    """Find what a law of each kind of each joint explains, likeliest first; () without joints or prior of errors.
 
     Its size is fitted with all others; `some_law` charges it for that.
     """
@@ -278,7 +277,7 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 
 
 def joint_law_log_posterior(base: LinearModel) -> float:
-    """That some joint follows such a law, of any kind, as those of effects in the same model
+    """Return the log posterior that some joint follows such a law, as those of effects in the same model
     (`Ranked`); −∞ where the views tell of none."""
     laws = joint_laws(base)
     return float(log_posterior_of_any(np.array([law.log_bayes_factor for law in laws]))) if laws else -np.inf
@@ -306,7 +305,7 @@ def _kinds(base: LinearModel) -> Sequence[str]:
 
 
 def laws_of_kinds(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
-    """Of every joint, by each of these kinds that the views tell of.
+    """Return the laws of every joint, by each of these kinds that the views show.
 
     All variances are sought anew for the likeliest few; for the others their likelihood at the null's is a bound.
     """
@@ -369,7 +368,7 @@ def covariates_of_law(law: JointLaw) -> list[LawCovariate]:
 
 
 def covariates_in_words(law: JointLaw) -> str:
-    """The same as people say it: the joint angles, the way it came, time, its load."""
+    """Return what a law follows in words: the joint angles, the way it came, time, its load."""
     return _COVARIATES_OF_KIND[law.follows][0]
 
 
@@ -449,7 +448,7 @@ def _joint_load(law: JointLaw) -> list[LawCovariate]:
 
 
 def _load_name(torque: str) -> str:
-    """Of a torque by its name: of what is known to weigh something, or of 1 kg at a link."""
+    """Name a torque: of what is known to weigh something, or of 1 kg at a link."""
     return f"j{torque}_torque_nm" + ("_per_kg" if "_" in torque else "")
 
 
@@ -497,7 +496,7 @@ def significant_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
 
 
 def _laws_without_arm_errors(linear: LinearModel) -> tuple[JointLaw, ...]:
-    """Of which one, where neither joints nor links err but by it, is 20 to 1 likelier than none and explains no less
+    """Return laws of which one, where joints and links err by it alone, is 20 to 1 over none and explains no less
     than all of them together."""
     if linear.pose_errors is None or not linear.pose_errors.joint_processes:
         return ()
@@ -510,7 +509,7 @@ def _laws_without_arm_errors(linear: LinearModel) -> tuple[JointLaw, ...]:
 
 
 def _likeliest_law_per_joint(laws: Sequence[JointLaw]) -> tuple[JointLaw, ...]:
-    """Of every joint that 20 to 1 does not tell from the likeliest its likeliest law, () where none is so much
+    """Return the likeliest law of every joint within 20 to 1 of the likeliest; () where none is so much
     likelier than nothing.
 
     Args:

@@ -100,7 +100,7 @@ def processes_near_period(linear: LinearModel, swing: TimeProcess) -> list[TimeP
 
 
 def _span(time: Array) -> float:
-    """Of the session in steps, one at the least."""
+    """Return the length of the session in steps, one at least."""
     return max(float(np.ptp(time)), 1.0)
 
 
@@ -119,7 +119,7 @@ def _swings(linear: LinearModel, frequencies: Array) -> Iterator[_DescribedCours
 
 
 def _swings_in_phase(linear: LinearModel, frequencies: Array) -> Iterator[_DescribedCourse]:
-    """The same with one phase for all motions, as where one temperature moves them: half as many numbers."""
+    """Yield swings with one phase for all motions, as where one temperature moves them: half as many numbers."""
     for _, words, waves, f in _swings(linear, frequencies):
         for phase in np.arange(_PHASES) * np.pi / _PHASES:
             yield _SWING_IN_PHASE, words, partial(_wave, waves, phase), f
@@ -203,8 +203,7 @@ def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
 
 
 def time_law_log_posterior(linear: LinearModel) -> float:
-    """Of such a law, as those of effects in the same model (`Ranked`); −∞ where there is none. None of the sizes is
-    known."""
+    """Return the log posterior of such a law, none of its sizes known; −∞ where there is none."""
     law = likeliest_time_law(linear)
     return -np.inf if law is None else law.log_bayes_factor - ANY_SIZE + float(np.log(PRIOR_UNKNOWN))
 
@@ -222,7 +221,7 @@ def significant_time_law(linear: LinearModel) -> TimeLaw | None:
 
 
 def _law_replacing_wander(linear: LinearModel) -> TimeLaw | None:
-    """That of a flange that does not wander but by it: 20 to 1 likelier than none, and no less likely than all that
+    """Return the law of a flange that wanders only by it: 20 to 1 likelier than none, and no less likely than all that
     wanders, which can do what a stretch does, so that beside it a stretch gains nothing."""
     steady = linear.without_drift
     law = likeliest_time_law(steady)
@@ -233,7 +232,7 @@ def _law_replacing_wander(linear: LinearModel) -> TimeLaw | None:
 
 
 def _refine_period(law: TimeLaw) -> TimeLaw:
-    """What is known of it was asked for one of the periods that are tried, and stays as it is."""
+    """Refine the period between those that were tried; its evidence stays."""
     beside = replace(law.base, null=law.fitted.fit)
     near = [(course, size_process(beside, course.process)) for course in processes_near_period(law.base, law.course)]
     course, sized = max(near, key=lambda own: own[1].gain)
@@ -244,7 +243,7 @@ def _refine_period(law: TimeLaw) -> TimeLaw:
 
 
 def unnamed_law_log_posterior(base: LinearModel) -> float:
-    """Of the likelier, as those of effects in the same model (`Ranked`); −∞ where there is none."""
+    """Return the log posterior of the likelier, as those of effects (`Ranked`); −∞ where there is none."""
     return max(unnamed_joint_laws.joint_law_log_posterior(base), time_law_log_posterior(base))
 
 
@@ -264,7 +263,7 @@ class TimeCurve:
     sigma: Array  # (G, 6)
 
     def largest(self, of: slice) -> tuple[int, float, float]:
-        """Where the rotation, `TURNED`, or the translation, `MOVED`, is largest, how large it is there, its sigma."""
+        """Return where rotation or translation is largest, how large it is there, and its sigma."""
         size = np.linalg.norm(self.error[:, of], axis=1)
         k = int(size.argmax())
         along = self.error[k, of] / max(float(size[k]), 1e-300)
@@ -414,7 +413,7 @@ def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
 
 
 def _joint_law_errors(linear: LinearModel) -> RepeatingError | None:
-    """That of one joint, beside all that the prior holds or in place of what an arm does."""
+    """Return the error of one joint, beside all that the prior holds or in place of what an arm does."""
     laws = significant_laws(linear)
     if not laws:
         return None
@@ -428,7 +427,7 @@ def _joint_law_errors(linear: LinearModel) -> RepeatingError | None:
 
 
 def _time_law_errors(linear: LinearModel) -> RepeatingError | None:
-    """That of the flange in time."""
+    """Return the error of the flange in time."""
     law = significant_time_law(linear)
     if law is None:
         return None
@@ -437,7 +436,7 @@ def _time_law_errors(linear: LinearModel) -> RepeatingError | None:
 
 
 def _likelier_errors(joint: RepeatingError | None, time: RepeatingError | None) -> RepeatingError | None:
-    """Of a joint's law and one in time, which can stand in for each other; both where 20 to 1 tells neither."""
+    """Choose between a joint's law and one in time; both where 20 to 1 tells neither."""
     found = sorted((u for u in (joint, time) if u is not None), key=lambda u: -u.log_bayes_factor)
     if len(found) == 2 and found[0].log_bayes_factor - found[1].log_bayes_factor < ODDS:
         return replace(found[0], words=f"{found[0].words}, or {found[1].words}")
@@ -445,7 +444,7 @@ def _likelier_errors(joint: RepeatingError | None, time: RepeatingError | None) 
 
 
 def _course_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
-    """Where poses count as scattering independently."""
+    """Return errors of poses that count as scattering independently."""
     course = significant_course(linear)
     if course is None:
         return ()
@@ -458,7 +457,7 @@ def _log_evidence_gain(linear: LinearModel, deviance: float) -> float:
 
 
 def _deviance_without(linear: LinearModel, kind: tuple[str, ...]) -> float:
-    """Of the null without some components."""
+    """Return the deviance of the null without some components."""
     assert linear.pose_errors is not None and linear.mixed.further is not None
     keep = np.array([name not in kind for name in linear.pose_errors.names], bool)
     every = np.append(np.ones(NOISE + 1, bool), keep)

@@ -59,7 +59,7 @@ class Extrapolation:
         return MAX_REMAINING_SHARE <= self.share <= 1 / MAX_REMAINING_SHARE
 
     def rejection_reason(self, name: str) -> str:
-        """What speaks against an effect that explains much."""
+        """Say what speaks against an effect that explains much."""
         return (
             f"{name} helps among the measured poses, but not beyond. At ends of joint ranges left out it leaves "
             f"{self.share:.2f} ± {self.sigma:.2f} of the mean square error (worst, {self.worst.name}: "
@@ -69,7 +69,7 @@ class Extrapolation:
 
 
 def untested_ends_reason(names: Sequence[str]) -> str:
-    """What speaks against effects of which the ends together tell nothing."""
+    """Say what speaks against effects that the ends cannot judge."""
     return (
         f"{', '.join(names[:-1])} and {names[-1]} help among the measured poses, but not beyond. Ends of "
         f"joint ranges left out change by less than {1 - MAX_REMAINING_SHARE:.0%} together"
@@ -218,7 +218,7 @@ def group_helps(share: float, sigma: float) -> bool:
 
 
 def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, float]:
-    """How far left-out poses lie from what the group predicts over how far from the present model, mean square.
+    """Return the mean square error of left-out poses with the group over that of the present model.
 
     Returns:
         The share, and its standard error with folds as samples. Effects of points count by what they do to poses.
@@ -250,7 +250,7 @@ class Halves:
     share: float  # smallest share of the effect of all views that a half finds; < 0: the sign changes
 
     def rejection_reason(self, name: str) -> str | None:
-        """What speaks against an effect that explains much, if anything does."""
+        """Say what speaks against an effect that explains much, if anything does."""
         if self.log_bayes_factor <= 0:
             return f"{name}, found in one half of the views, does not help in the other"
         # A clear effect whose form is not quite right differs a little, beyond chance: it is there all the same.
@@ -335,7 +335,7 @@ def _size_consistency(a: _HalfEvidence, b: _HalfEvidence, sizes: Array) -> float
 
 
 def _least_confirmed_share(a: _HalfEvidence, b: _HalfEvidence, sizes: Array) -> float:
-    """Of what both together find, the share that the one finds that finds less, along its direction."""
+    """Return the smaller share that a half finds of what both find together, along its direction."""
     told = a.information + b.information
     both = _HalfEvidence(told, a.vector + b.vector).fitted(sizes)[0]
     along = told @ both / max(float(both @ told @ both), 1e-300)

@@ -66,7 +66,7 @@ class Quantity:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What its code reads of `views`, as effects call it."""
+        """Return what its code reads of `views`, as effects call it."""
         made_of = [_MADE_OF[kind] for kind in self.kind.split("·") if kind in _MADE_OF]
         return tuple(dict.fromkeys([*made_of, *self.columns]))
 
@@ -88,7 +88,7 @@ class Quantity:
         return Quantity(text, code, unit, kind, None, self.values * other.values, columns=columns)
 
     def moved(self, steps: Array) -> "Quantity":
-        """The same with its nonlinear parameters so many spreads off."""
+        """Return the quantity with its nonlinear parameters moved by so many spreads."""
         return self._of([p.at(float(s)) for p, s in zip(self.nonlinear, steps, strict=True)])
 
     def nearly(self, other: "Quantity") -> bool:
@@ -99,7 +99,7 @@ class Quantity:
         return all(a.near(b.value) for a, b in zip(self.nonlinear, other.nonlinear, strict=True))
 
     def rounded(self) -> "Quantity":
-        """The same with nonlinear parameters that a person can read."""
+        """Return the quantity with nonlinear parameters rounded for people."""
         return self._of([float(f"{p.value:.{_DIGITS}g}") for p in self.nonlinear])
 
     def _of(self, parameters: list[float]) -> "Quantity":
@@ -131,7 +131,7 @@ def bump_of_joint(views: Views, k: int, middle: float, width: float) -> Quantity
 
 
 def saw_of_joint(views: Views, k: int, tooth: float, jump: float) -> Quantity:
-    """From −1/2 to 1/2 along each tooth of so many rad, back at once where joint k passes `jump`; rad.
+    """Return −1/2 to 1/2 along each tooth of so many rad, back at once where joint k passes `jump`; rad.
 
     Of its jumps the one next to the middle of the joint's range is told: there tooth and jump hardly depend on each
     other.
@@ -151,7 +151,7 @@ def saw_of_joint(views: Views, k: int, tooth: float, jump: float) -> Quantity:
 
 
 def nonlinear_torque(torque: Quantity, power: Callable[[Array], Array], text: str, code: str) -> Quantity | None:
-    """What a power of a torque does that no line does, in these views: the line is the part of the zero and of a
+    """Return what a power of a torque does that no line does, in these views: the line is the part of the zero and of a
     spring that does not stiffen, and far from zero nearly all of the power. None where the views show nothing of it.
 
     Args:
@@ -182,7 +182,7 @@ def bump_in_time(views: Views, middle: float, width: float) -> Quantity:
 
 
 def backlash_lag(views: Views, k: int, play: float) -> Quantity:
-    """What stays behind joint k, from 0, within a play of so many rad."""
+    """Return what stays behind joint k, from 0, within a play of so many rad."""
     return Quantity(
         f"stays ({np.degrees(play):.2g}° of play) behind q{k + 1}",
         f"views.behind({k}, {play:.6g})",
@@ -355,13 +355,13 @@ class Ingredient:
 
     @property
     def unit(self) -> str:
-        """Of the coefficient, in mm where it is a length."""
+        """Return the unit of the coefficient, mm where it is a length."""
         own = "mm" if self.place != "robot" and self.index >= 3 else "rad"
         return f"{own}/({self.quantity.unit})" if self.quantity.unit else own
 
     @property
     def what(self) -> str:
-        """What is displaced."""
+        """Return what is displaced."""
         return f"q*{self.index + 1}" if self.place == "robot" else f"{self.place} {TWIST[self.index]}"
 
 
@@ -438,7 +438,7 @@ def scaled_values(quantity: Quantity) -> Array:
 
 
 def coefficient(ingredient: Ingredient, of_scaled: float, length_unit: str) -> float:
-    """In the ingredient's unit, of one for its scaled column, whose lengths are in length_unit."""
+    """Convert the size of a scaled column into the ingredient's unit; its lengths are in length_unit."""
     to_mm = METRES[length_unit] / METRES["mm"] if ingredient.unit.startswith("mm") else 1.0
     return to_mm * of_scaled / _scale(ingredient.quantity)
 
@@ -458,7 +458,7 @@ def _joints(joints: Array, views: Views, d: Array) -> Array:
 
 
 def _twists(views: Views, xi: Array) -> Array:
-    """The same twist in every view."""
+    """Return the same twist in every view."""
     return np.tile(xi, (views.count, 1))
 
 

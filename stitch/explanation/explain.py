@@ -58,7 +58,7 @@ def _body_text(addend: Sequence[tuple[Ingredient, float]]) -> str:
 
 
 def _letter_names(count: int) -> list[str]:
-    """Of the sizes: a, b, … or a1, a2, … where there are more than four."""
+    """Return names of the sizes: a, b, … or a1, a2, … where there are more than four."""
     return list("abcd"[:count]) if count <= 4 else [f"a{k + 1}" for k in range(count)]
 
 
@@ -85,7 +85,7 @@ def effect_source(name: str, ingredients: Sequence[Ingredient], coefficients: Se
 
 
 def _needed_views(ingredients: Sequence[Ingredient]) -> str:
-    """What the file's code reads of the views, as the tuple that the library asks for."""
+    """Return what the file's code reads of the views, as the tuple that the library asks for."""
     own = ["joints"] if ingredients[0].place == "robot" else []
     names = dict.fromkeys([*own, *(need for i in ingredients for need in i.quantity.needs)])
     quoted = [f'"{name}"' for name in names]
@@ -111,6 +111,9 @@ def _twist_code(ingredients: Sequence[Ingredient], letters: Sequence[str]) -> li
 
 EFFECT_NAME = "explained"
 _TINY = 1e-12
+_TOO_FEW = (
+    "Nothing can be said from {} views. A formula is found in one half and tested in the other; each is too small."
+)
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,7 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
     with library_threads_off():
         terms, first = build_dictionary(linear, view_quantities(linear.measurement.views)), None
         if not enough_views(linear, terms):
-            return Explanation(False, _too_few_sentence(linear.measurement.views.count))
+            return Explanation(False, _TOO_FEW.format(linear.measurement.views.count))
         for chosen in search_sums(linear, terms):
             tried = _try_sum(linear, terms, chosen, origin)
             if tried.found:
@@ -154,7 +157,8 @@ def _try_sum(linear: LinearModel, terms: Dictionary, chosen: TestedSum, origin: 
     values = _coefficients(linear, own, scaled)
     text = formula_text(own, values)
     if not chosen.holds:
-        return Explanation(False, _no_formula_sentence(chosen, text))
+        failed = f"{text}, found in one half of the views, fails in the other (p = {chosen.p_value:.2g})"
+        return Explanation(False, f"No formula holds: {failed}.")
     turns = [abs(v if i.quantity.bounded else x) for i, v, x in zip(own, values, scaled, strict=True)]
     if own[0].place == "robot" and max(turns) > LARGEST_JOINT_ADDEND:
         return Explanation(
@@ -176,7 +180,7 @@ def _try_sum(linear: LinearModel, terms: Dictionary, chosen: TestedSum, origin: 
 
 
 def _coefficients(linear: LinearModel, ingredients: Sequence[Ingredient], scaled: Array) -> list[float]:
-    """In each ingredient's unit, of sizes (k,) of scaled columns."""
+    """Convert sizes (k,) of scaled columns into each ingredient's unit."""
     unit = linear.measurement.length_unit
     return [coefficient(i, float(x), unit) for i, x in zip(ingredients, scaled, strict=True)]
 
@@ -190,7 +194,7 @@ def _tested_formula(linear: LinearModel, terms: Dictionary, chosen: TestedSum, t
 
 
 def _test_sentence(p_value: float, text: str, tested: str) -> str:
-    """How a formula that is told stood the test, or which one did."""
+    """Say how the reported formula stood the test, or which one did."""
     if tested == text:
         return f"found in one half of the views, it holds in the other ({_p_value_text(p_value)})"
     return (
@@ -211,17 +215,6 @@ def _are_same_sum(some: Sequence[Ingredient], others: Sequence[Ingredient]) -> b
 def _p_value_text(p_value: float) -> str:
     """A p-value, as far as anybody can vouch for the tails of a distribution."""
     return f"p = {p_value:.1g}" if p_value > _TINY else f"p < {_TINY:g}"
-
-
-def _no_formula_sentence(chosen: TestedSum, text: str) -> str:
-    return f"No formula holds: {text}, found in one half of the views, fails in the other (p = {chosen.p_value:.2g})."
-
-
-def _too_few_sentence(views: int) -> str:
-    return (
-        f"Nothing can be said from {views} views. A formula is found in one half and tested in the other; each half "
-        "is too small."
-    )
 
 
 def _score_effect(linear: LinearModel, source: str) -> Score:

@@ -41,7 +41,7 @@ class HalfModel:
     """Numbers (n,) of some views in units of their scatter, without what the model explains there."""
 
     def __init__(self, linear: LinearModel, terms: Dictionary, keep: Indices) -> None:
-        """Of a linear model the views to keep; all others move freely."""
+        """Restrict a linear model to the views to keep; all others move freely."""
         self._linear, self._terms, self._keep = linear, terms, keep
         self._out = np.setdiff1d(np.arange(linear.measurement.views.count), keep)
         self._of_view = dict[tuple[str, int], Array]()
@@ -58,7 +58,7 @@ class HalfModel:
 
     @cached_property
     def _rows(self) -> Indices:
-        """Of the kept views, in the channel of views that are blocks of their own."""
+        """Return the numbers of the kept views, where each view is a block of its own."""
         rows = self._linear.mixed.z.shape[1]
         return np.asarray((self._keep[:, None] * rows + np.arange(rows)).ravel())
 
@@ -71,7 +71,7 @@ class HalfModel:
 
     @property
     def free(self) -> int:
-        """How many of the numbers are free."""
+        """Return how many of the numbers are free."""
         return len(self.z) - int(self._explained.shape[1])
 
     def has_room(self, numbers: int = 1) -> bool:
@@ -344,7 +344,7 @@ _TEETH, _JUMPS = np.linspace(-2, 2, 13), np.linspace(-5, 5, 20, endpoint=False)
 
 
 def refine_parameters(ingredients: Sequence[Ingredient], half: HalfModel) -> tuple[Ingredient, ...]:
-    """The same ingredients, their quantities as some views want them."""
+    """Refine the quantities of ingredients for some views."""
     ingredients = _scan_teeth(ingredients, half)
     tuned = [q for q in quantities_of(ingredients) if q.nonlinear]
     count = sum(len(q.nonlinear) for q in tuned)
@@ -362,7 +362,7 @@ def refine_parameters(ingredients: Sequence[Ingredient], half: HalfModel) -> tup
 
 
 def _scan_teeth(ingredients: Sequence[Ingredient], half: HalfModel) -> Sequence[Ingredient]:
-    """With teeth tried over a grid: where a view passes a jump no slope shows it."""
+    """Try teeth over a grid: where a view passes a jump no slope shows it."""
     for q in quantities_of(ingredients):
         if q.kind == "teeth":
             tried = [_with_moved_parameters(ingredients, [q], np.array(steps)) for steps in product(_TEETH, _JUMPS)]
@@ -371,7 +371,7 @@ def _scan_teeth(ingredients: Sequence[Ingredient], half: HalfModel) -> Sequence[
 
 
 def round_parameters(ingredients: Sequence[Ingredient]) -> tuple[Ingredient, ...]:
-    """With nonlinear parameters that a person can read."""
+    """Round nonlinear parameters for people."""
     return tuple(replace(i, quantity=i.quantity.rounded()) for i in ingredients)
 
 
@@ -465,7 +465,7 @@ def _view_splits(linear: LinearModel, slow: bool) -> list[tuple[Indices, Indices
 def _sums_of_all_views(
     linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient], held: TestedSum, every: Indices
 ) -> list[TestedSum]:
-    """Where a sum holds, there is something: which sum it is all views know better than some of them. Those that they
+    """Choose among sums once one holds: all views know better than some which sum it is. Those that they
     suggest of the same ingredients, likeliest first (Bayesian information criterion), beside the scatter that it
     leaves."""
     base = with_refitted_scatter(linear, terms, held.ingredients)
@@ -504,7 +504,7 @@ def _thinned_views(views: Indices, halves: int = 1) -> Indices:
 def _search_split(
     linear: LinearModel, terms: Dictionary, ingredients: Sequence[Ingredient], chosen: HalfModel, other: HalfModel
 ) -> list[TestedSum]:
-    """What a half suggests, begun with each of its best addends, and how it stands the test in the other."""
+    """Find what a half suggests, begun with each of its best addends, and test it in the other."""
     suggested = [
         sum_
         for sum_ in _suggested_sums(chosen, ingredients)

@@ -85,7 +85,7 @@ class CandidateTest:
 
 
 def test_of_candidate(linear: LinearModel, candidate: Candidate, tests: int) -> CandidateTest:
-    """Of a candidate that is one of so many.
+    """Build the test of a candidate that is one of so many.
 
     Args:
         linear: the candidate is none of its pose errors.
@@ -100,13 +100,13 @@ def test_of_candidate(linear: LinearModel, candidate: Candidate, tests: int) -> 
 
 
 def covariance_tests(linear: LinearModel, covariance: Array, sigmas: Array) -> tuple[CandidateTest, ...]:
-    """Of errors that have a covariance (n, n) in the channel, times the square of each sigma (s,)."""
+    """Build tests of errors with a covariance (n, n) in the channel, times the square of each sigma (s,)."""
     half = _factor(covariance)
     return tuple(CandidateTest(linear, (_form_test(linear, sigma * half, 1.0, 1),)) for sigma in sigmas)
 
 
 def _form_test(linear: LinearModel, columns: Array, weight: float, tests: int, share: float = 1.0) -> _FormTest:
-    """Of columns (n, p) at a scale that has such a share of belief; all scales are one test."""
+    """Build the test of columns (n, p) at one scale with its share of the prior; all scales are one test."""
     white = linear.residual(columns)
     known = max(linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white)), 1.0)
     information = white.T @ white
@@ -222,7 +222,7 @@ class ExpectedDiagnosis:
         return np.asarray(self._half @ rng.standard_normal(shift.shape) + shift)
 
     def chance(self, effect: str, shift: Array, rng: np.random.Generator) -> Chance:
-        """What would be said of an effect that shifts the channel by (n, D)."""
+        """Return what would be said of an effect that shifts the channel by (n, D)."""
         numbers = self.simulate_numbers(shift, rng)
         own = [self._test({c.name}, c).evaluate(numbers) for c in self.candidates]
         factor, significant = np.array([f for f, _ in own]), np.array([s for _, s in own])
@@ -315,7 +315,7 @@ class EffectOutlook:
 
     @property
     def multiple(self) -> float:
-        """Of its usual size from which the parameter that shows best is detected; infinite where none does."""
+        """Return the multiple of usual size at which the clearest parameter is detected; infinite where none is."""
         return min((self.detectable[name] / self.usual[name] for name in self.detectable), default=float("inf"))
 
 
@@ -339,7 +339,7 @@ def view_outlook(
     feature: Array | None = None,
     chances: bool = True,
 ) -> Outlook:
-    """What the views of a session would tell.
+    """Return what the views of a session would tell.
 
     Args:
         fitted_scatter: errors of the arm; None: as large as these views leave them open where it scatters only.
@@ -369,7 +369,7 @@ def view_outlook(
 
 
 def _ordinary_scatter(scatter: Scatter) -> Scatter:
-    """With errors as large as those of a usual arm, where they are not larger anyway."""
+    """Raise errors to those of a usual arm, where they are not larger anyway."""
     usual = usual_sizes()
     return replace(scatter, errors=scatter.errors | {k: max(v, scatter.errors.get(k, 0.0)) for k, v in usual.items()})
 

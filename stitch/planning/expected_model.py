@@ -86,7 +86,7 @@ def thinned_surface(points: Array, normals: Array, at_most: int = _POINTS) -> Pl
 
 
 def block_surface(size: float) -> PlannedPart:
-    """What stands for a part of which only the largest side is known: a block of 1 : 0.7 : 0.5 about the origin."""
+    """Return a block of 1 : 0.7 : 0.5 about the origin, for a part of which only the largest side is known."""
     return surface_of_mesh(trimesh.creation.box(extents=size * _SIDES))
 
 
@@ -183,7 +183,7 @@ class Scatter:
 
 
 def stated_scatter(session: Session) -> Scatter:
-    """As session.toml states it, or as is usual; beside it the arm does nothing wrong."""
+    """Return the scatter that session.toml states, or the usual one; no errors that repeat."""
     unit, stated, assumed = session.length_unit, session.repeatability, list[str]()
     mm = METRES["mm"] / METRES[unit]
     rotation, translation, noise = stated.sigma_rotation, stated.sigma_translation, session.scanner.noise
@@ -222,7 +222,7 @@ def mean_scatter(linear: LinearModel, noise: float, variances: Sequence[tuple[Ar
 
 
 def scatter_of_run(linear: LinearModel, noise: float) -> FittedScatter:
-    """As the views of a run show it."""
+    """Return the scatter that the views of a run show."""
     return mean_scatter(linear, noise, [(linear.null.variances, mean_variances(linear.mixed, linear.null))])
 
 
@@ -254,7 +254,7 @@ class ExpectedModel(LinearModel):
         return self.at(np.append(source.null.variances[: NOISE + 1], kept))
 
     def at(self, variances: Array) -> Self:
-        """The same under other variances (c,)."""
+        """Return the model under other variances (c,)."""
         return replace(self, null=at_variances(self.mixed, variances), full_model=None)
 
 
@@ -272,7 +272,7 @@ def expected_scans(cell: CellModel, T_reference_scanner: Array) -> list[Indices]
 
 
 def simulate_views(session: Session, cell: CellModel, samples: int = SAMPLES, fewest: int = FEWEST) -> SimulatedViews:
-    """What the views of a session would show, whatever clouds it has.
+    """Simulate what the views of a session would show, whatever clouds it has.
 
     Args:
         samples: points of every view that are matched; information is that of SAMPLES.
@@ -473,7 +473,7 @@ def displacement(covariance: Array, middle: Array) -> float:
 
 
 def expected_hand_eye(linear: ExpectedModel, simulated: SimulatedViews, middle: Array | None = None) -> ExpectedHandEye:
-    """As `fit_hand_eye` would have it: least squares under the scatter alone, the covariance under all errors.
+    """Predict the fit of `fit_hand_eye`: least squares under the scatter alone, the covariance under all errors.
 
     Args:
         middle: (3,) scanner frame, whose displacement U counts; None: the middle of what the views see.
@@ -519,7 +519,7 @@ _DRAWS = ((150, 3), (400, 1))
 
 
 def expected_scatter(linear: ExpectedModel, noise: float) -> FittedScatter:
-    """What runs of these views would find, on average, where the scatter is the expected one.
+    """Return what runs of these views would find, on average, under the expected scatter.
 
     Args:
         noise: of the scans.
@@ -536,6 +536,6 @@ def expected_scatter(linear: ExpectedModel, noise: float) -> FittedScatter:
 
 
 def with_scatter(linear: ExpectedModel, scatter: Scatter) -> ExpectedModel:
-    """The same views under another scatter."""
+    """Return the same views under another scatter."""
     names = () if linear.pose_errors is None else linear.pose_errors.names
     return linear.at(scatter.variances(names))

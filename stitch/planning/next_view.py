@@ -65,7 +65,8 @@ def propose_measurements(found: Diagnosis) -> tuple[Proposal, ...]:
 def _propose(linear: LinearModel, group: Sequence[Score]) -> list[Proposal]:
     names = tuple(score.name for score in group)
     artefacts = [Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS]
-    found = _best_pose(linear, group) if _can_move(linear.measurement) else None
+    can_move = linear.measurement.robot is not None and linear.measurement.views.joints.shape[1] > 0
+    found = _best_pose(linear, group) if can_move else None
     if found is None:
         return artefacts
     joints, count, separated = found
@@ -86,10 +87,6 @@ def _effects_to_separate(found: Diagnosis) -> list[Score]:
     others = [r.score for r in seen if r.name != first.name]
     row = alias_matrix(found.linear, [first.score, *others])[0, 1:]
     return [first.score, others[int(row.argmax())]] if row.max() > ALIAS_CORRELATION else []
-
-
-def _can_move(measurement: Measurement) -> bool:
-    return measurement.robot is not None and measurement.views.joints.shape[1] > 0
 
 
 def _best_pose(linear: LinearModel, group: Sequence[Score]) -> tuple[Array, int, tuple[str, ...]] | None:

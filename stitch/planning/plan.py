@@ -72,7 +72,7 @@ class PossibleViews:
         return TwistChannel(covariance, np.hstack([own, common, used, *columns]))
 
     def effect(self, name: str) -> EffectColumns:
-        """How the views answer to an effect of the library.
+        """Return how the views answer to an effect of the library.
 
         Raises:
             InputError: one that is not known, or that these views cannot have.
@@ -176,7 +176,7 @@ def mean_progress(goals: Sequence[Goal], chosen: Sequence[int], others: Sequence
 
 
 def present_progress(goals: Sequence[Goal], chosen: Sequence[int]) -> float:
-    """The same of the chosen views alone."""
+    """Return the mean progress of the chosen views alone."""
     return float(np.mean([goal.progress(goal.channel.normal(chosen)) for goal in goals]))
 
 
@@ -379,7 +379,7 @@ def _hardest_pair_goal(views: PossibleViews, now: Outlook) -> list[Goal]:
 def _proposed_views(
     goals: Sequence[Goal], chosen: Sequence[int], further: Session, U_after: float
 ) -> tuple[ProposedView, ...]:
-    """What the views bring one after the other.
+    """Return what the views bring one after the other.
 
     Args:
         U_after: with all of them, of their whole scans; the search has thinner ones.
