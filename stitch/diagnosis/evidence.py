@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.ranking import (
     Ranked,
@@ -19,13 +20,6 @@ from stitch.diagnosis.ranking import (
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import ScatterLimit, implausible, score
 from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
-from stitch.diagnosis.thresholds import (
-    ALPHA_UNKNOWN,
-    LOG_BAYES_FACTOR,
-    MIN_STEADINESS,
-    ODDS,
-    PRIOR_PHYSICAL,
-)
 from stitch.diagnosis.unnamed_time_laws import (
     find_repeating_errors,
     least_log_bayes_factor,
@@ -76,7 +70,9 @@ def find_scanner_error(linear: LinearModel, other_terms: Sequence[Term] = ()) ->
     """
     if not isinstance(linear.observation, SurfaceObservation):
         return None
-    found = field_error(linear.measurement, linear.model, linear.observation.unconstrained, ALPHA_UNKNOWN, other_terms)
+    found = field_error(
+        linear.measurement, linear.model, linear.observation.unconstrained, limits.ALPHA_UNKNOWN, other_terms
+    )
     return found if found.unusual else None
 
 
@@ -102,7 +98,9 @@ def find_missing_pair(
         return None
     others = [c for c in candidates if c.name != second.name and not c.empirical]
     first, *rest = rank_all(conditioned_on_effects(linear, [second]), others)[0]
-    if not is_certain(first) or any(is_contender(r) and r.log_posterior > first.log_posterior - ODDS for r in rest):
+    if not is_certain(first) or any(
+        is_contender(r) and r.log_posterior > first.log_posterior - limits.ODDS for r in rest
+    ):
         return None
     again = rank_one(conditioned_on_effects(linear, [first]), second.score.candidate, tests=len(others))
     return (first, again) if is_certain(again) else None
@@ -170,9 +168,9 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
         )
     base = linear.without(removed)
     again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
-    if unnamed_law_log_posterior(base) > again[0].log_posterior - ODDS:
+    if unnamed_law_log_posterior(base) > again[0].log_posterior - limits.ODDS:
         return ()
-    near = [r for r in again if is_contender(r) and r.log_posterior > again[0].log_posterior - ODDS]
+    near = [r for r in again if is_contender(r) and r.log_posterior > again[0].log_posterior - limits.ODDS]
     # One that is far ahead of the others is still not wanted beside them, all of them being a little wrong.
     return tuple(near) if len(near) > 1 else again
 
@@ -231,7 +229,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
         return replace(found, explanation=(best,), unnamed_explains_it=True, notes=notes)
     if _gear_order_ambiguous(base, best, empirical):
         return replace(found, explanation=(best,), unnamed_explains_it=True, notes=())
-    likely = (r for r in contenders if r.log_posterior > best.log_posterior - ODDS)
+    likely = (r for r in contenders if r.log_posterior > best.log_posterior - limits.ODDS)
     near = (r for r in likely if r.name != best.name and r.name not in refused)
     group = (best, *(() if second is not None else near))
     if len(group) > 1 and not regime_of(linear).many_views:
@@ -248,7 +246,9 @@ def _select_jointly(
     why; and whether there is something of another form."""
     found = forward_selection(linear, candidates, best)
     explained = max(found.explained, best.log_posterior)
-    if (empirical is not None and empirical.log_posterior > explained + ODDS) or (found.refused and not found.effects):
+    if (empirical is not None and empirical.log_posterior > explained + limits.ODDS) or (
+        found.refused and not found.effects
+    ):
         return [], found.refused, True
     effects, idle = list(found.effects or (best,)), dict[str, str]()
     if not regime_of(linear).prior:
@@ -259,7 +259,7 @@ def _select_jointly(
 def _certain_shape(empirical: Sequence[Ranked]) -> Ranked | None:
     """The best shape without a cause, where it is certain."""
     for r in empirical[:1]:
-        if r.adjusted < ALPHA_UNKNOWN and r.score.log_bayes_factor > LOG_BAYES_FACTOR:
+        if r.adjusted < limits.ALPHA_UNKNOWN and r.score.log_bayes_factor > limits.LOG_BAYES_FACTOR:
             return r
     return None
 
@@ -278,15 +278,15 @@ def _beaten_by_unnamed(
     """
     known = best.log_posterior
     if second is not None:
-        known += second.score.log_bayes_factor + float(np.log(PRIOR_PHYSICAL / tests))
-    return (empirical is not None and empirical.log_posterior > known + ODDS) or law > known - ODDS
+        known += second.score.log_bayes_factor + float(np.log(limits.PRIOR_PHYSICAL / tests))
+    return (empirical is not None and empirical.log_posterior > known + limits.ODDS) or law > known - limits.ODDS
 
 
 def _required(linear: LinearModel, best: Ranked, others: Sequence[Ranked]) -> bool:
     """True if an effect is 20 to 1 wanted beside others and any course without a name; a prior of pose errors has
     asked already."""
     return regime_of(linear).prior or (
-        least_log_bayes_factor(conditioned_on_effects(linear, others), best.score) > ODDS
+        least_log_bayes_factor(conditioned_on_effects(linear, others), best.score) > limits.ODDS
     )
 
 
@@ -295,7 +295,7 @@ def _gear_order_ambiguous(base: LinearModel, best: Ranked, empirical: Sequence[R
     nameless = [r for r in empirical if r.name.startswith(_NAMELESS_ORDERS)] if best.name in _GEARS else []
     if regime_of(base).prior:
         nameless = [rescored_in(base, r) for r in nameless]
-    return any(r.log_posterior > best.log_posterior - ODDS for r in nameless)
+    return any(r.log_posterior > best.log_posterior - limits.ODDS for r in nameless)
 
 
 # A name, held against views left out, halves of the views and what the scanner itself may do wrong.
@@ -392,7 +392,7 @@ def pair_is_validated(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
 
 def _rejection_reason(named: Ranked, left_out: CrossValidation | None, halves: Halves | None) -> str | None:
     """Why an effect does not stand the test of views left out."""
-    if left_out is not None and left_out.steadiness < MIN_STEADINESS:
+    if left_out is not None and left_out.steadiness < limits.MIN_STEADINESS:
         return f"{named.name} rests on one view: without it {max(left_out.steadiness, 0):.0%} of the effect remain"
     if left_out is not None and not left_out.helps:
         share = f"{left_out.poses:.2f} ± {left_out.poses_sigma:.2f}"

@@ -7,15 +7,9 @@ from functools import partial
 import numpy as np
 from scipy.special import logsumexp
 
+from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import Score, score
-from stitch.diagnosis.thresholds import (
-    ALPHA_NAME,
-    LOG_BAYES_FACTOR,
-    PRIOR_NOTHING,
-    PRIOR_PHYSICAL,
-    PRIOR_UNKNOWN,
-)
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import parallel
 
@@ -43,7 +37,7 @@ class Ranked:
     @property
     def log_odds_over_nothing(self) -> float:
         """Log odds over nothing being missing."""
-        return self.log_posterior - float(np.log(PRIOR_NOTHING))
+        return self.log_posterior - float(np.log(limits.PRIOR_NOTHING))
 
 
 def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
@@ -56,10 +50,10 @@ def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple
     known = [s for s in scores if not s.candidate.empirical]
     other = [s for s in scores if s.candidate.empirical and s.observable]
     tests = max(tests, 1)
-    weights = [(s, PRIOR_PHYSICAL / tests, tests) for s in known]
-    weights += [(s, PRIOR_UNKNOWN / len(other), len(other)) for s in other]
+    weights = [(s, limits.PRIOR_PHYSICAL / tests, tests) for s in known]
+    weights += [(s, limits.PRIOR_UNKNOWN / len(other), len(other)) for s in other]
     logs = [s.log_bayes_factor + float(np.log(prior)) if s.observable else -np.inf for s, prior, _ in weights]
-    total = float(logsumexp([*logs, np.log(PRIOR_NOTHING)]))
+    total = float(logsumexp([*logs, np.log(limits.PRIOR_NOTHING)]))
     out = [
         Ranked(s, min(1.0, s.p_value * family), log, float(np.exp(log - total)), family)
         for (s, _, family), log in zip(weights, logs, strict=True)
@@ -94,12 +88,12 @@ def is_contender(r: Ranked) -> bool:
     does not know how many were tried.
     """
     s = r.score
-    return r.physical and s.observable and r.adjusted < ALPHA_NAME and s.log_bayes_factor > 0
+    return r.physical and s.observable and r.adjusted < limits.ALPHA_NAME and s.log_bayes_factor > 0
 
 
 def is_certain(r: Ranked) -> bool:
     """Enough for an alarm."""
-    return is_contender(r) and r.score.log_bayes_factor > LOG_BAYES_FACTOR
+    return is_contender(r) and r.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
 
 
 def conditioned_without(

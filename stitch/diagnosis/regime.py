@@ -8,13 +8,7 @@ count as scattering independently. Many views tell several effects apart at once
 
 from dataclasses import dataclass
 
-from stitch.diagnosis.thresholds import (
-    FORMS_REFITTED_WITH_MANY_NUMBERS,
-    HOPELESS_GAIN,
-    HOPELESS_GAIN_WITH_PRIOR,
-    LONG,
-    REFITTED_NUMBERS,
-)
+from stitch.diagnosis import thresholds as limits
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import MANY_VIEWS
 from stitch.statistics.parameter_selection import ANY_SIZE, PLAUSIBLE
@@ -38,24 +32,28 @@ class Regime:
     @property
     def long_without_prior(self) -> bool:
         """So many numbers that the variances are known to as many degrees of freedom, and one scale is enough."""
-        return not self.prior and self.numbers > LONG
+        return not self.prior and self.numbers > limits.LONG
 
     @property
     def free_fit_keeps_variances(self) -> bool:
         """The free fit takes the variances of the fit with plausible sizes: they are the same, or many and slow."""
-        return self.prior or self.numbers > LONG
+        return self.prior or self.numbers > limits.LONG
 
     @property
     def least_quick_gain(self) -> float:
         """Nats at the null's variances below which a form is not worth a fit of its own."""
-        return HOPELESS_GAIN_WITH_PRIOR if self.prior else HOPELESS_GAIN
+        return limits.HOPELESS_GAIN_WITH_PRIOR if self.prior else limits.HOPELESS_GAIN
 
     @property
     def forms_refitted(self) -> int:
         """Forms of a candidate that are worth a fit of their own."""
-        if self.prior and self.numbers > LONG:
+        if self.prior and self.numbers > limits.LONG:
             return 1
-        return FORMS_REFITTED_WITH_MANY_NUMBERS if self.numbers > MANY_NUMBERS else REFITTED_NUMBERS // self.numbers
+        return (
+            limits.FORMS_REFITTED_WITH_MANY_NUMBERS
+            if self.numbers > MANY_NUMBERS
+            else limits.REFITTED_NUMBERS // self.numbers
+        )
 
 
 def regime_of(linear: LinearModel) -> Regime:

@@ -12,16 +12,9 @@ from functools import partial
 import numpy as np
 from scipy.special import logsumexp
 
+from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, Form, candidate_of
 from stitch.diagnosis.regime import regime_of
-from stitch.diagnosis.thresholds import (
-    ALPHA_UNKNOWN,
-    FREE_SIZES,
-    IMPLAUSIBLE,
-    LOG_BAYES_FACTOR,
-    NEGLIGIBLE_NATS,
-    SEEN_SIGMAS,
-)
 from stitch.effects.contract import Effect, find_effect
 from stitch.frames import Array, Mask
 from stitch.measurement.measurement import Measurement
@@ -72,7 +65,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
         start: (c,) variances to begin with.
         scale: the one that is likeliest there.
     """
-    mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), FREE_SIZES * form.sizes
+    mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), limits.FREE_SIZES * form.sizes
     integrated = fit_variances(mixed, G, scale * form.sizes, start=start)
     regime = regime_of(linear)
     scales = regime.scales
@@ -131,7 +124,7 @@ def gain_at_null(linear: LinearModel, form: Form, white: Array) -> Gain:
 def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:
     """Rank and θᵀC⁻¹θ over the combinations of which the views say more than the wide prior does."""
     values, vectors = np.linalg.eigh(covariance / np.outer(sizes, sizes))
-    keep = values < 0.5 * FREE_SIZES**2
+    keep = values < 0.5 * limits.FREE_SIZES**2
     projected = vectors[:, keep].T @ (theta / sizes)
     return int(keep.sum()), float(np.sum(projected**2 / np.maximum(values[keep], 1e-300)))
 
@@ -184,8 +177,8 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
     quick, seen = np.array([[gain.log_bayes_factor for gain in own] for own in gained]).T, any(shown)
     likely = quick.max(axis=1)
     # Under a scatter that holds an effect itself no plausible size is seen, and yet a gross one gains.
-    seen = seen or bool(likely.max() > LOG_BAYES_FACTOR)
-    least = max(regime_of(base).least_quick_gain, likely.max() - NEGLIGIBLE_NATS)
+    seen = seen or bool(likely.max() > limits.LOG_BAYES_FACTOR)
+    least = max(regime_of(base).least_quick_gain, likely.max() - limits.NEGLIGIBLE_NATS)
     worth = [i for i in np.argsort(-likely, kind="stable")[: regime_of(linear).forms_refitted] if likely[i] >= least]
     tried = [
         try_form(base, form, starts[start].null.variances, gained[start][i].scale)
@@ -228,7 +221,7 @@ def _gains_at_null(base: LinearModel, at: LinearModel, candidate: Candidate) -> 
     gains, seen = list[Gain](), False
     for form, white in zip(candidate.forms, residual_form_columns(at, candidate), strict=True):
         if not gains:
-            seen = bool((np.linalg.norm(white * form.sizes, axis=0) > SEEN_SIGMAS).any())
+            seen = bool((np.linalg.norm(white * form.sizes, axis=0) > limits.SEEN_SIGMAS).any())
         gain, here = gain_at_null(at, form, white), 0.5 * (base.null.deviance - at.null.deviance)
         gains.append(replace(gain, log_bayes_factor=gain.log_bayes_factor + here))
     return gains, seen
@@ -324,7 +317,7 @@ class ScatterLimit:
 
 def scatter_limit(session: Session) -> ScatterLimit:
     """Return what the session states under [robot] repeatability, else the largest usual scatter."""
-    stated, (rotation, translation) = session.repeatability, IMPLAUSIBLE
+    stated, (rotation, translation) = session.repeatability, limits.IMPLAUSIBLE
     usual = translation * METRES["mm"] / METRES[session.length_unit]
     return ScatterLimit(
         rotation=rotation if stated.sigma_rotation is None else stated.sigma_rotation,
@@ -348,7 +341,7 @@ def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:
         chance = 1.0
         if stated:
             known = _degrees_of_freedom(linear, i, allowed)
-            chance = float(np.sqrt(chi2_limit(ALPHA_UNKNOWN / 2, known) / known))
+            chance = float(np.sqrt(chi2_limit(limits.ALPHA_UNKNOWN / 2, known) / known))
         if np.sqrt(linear.null.variances[i]) > chance * allowed:
             return True
     return False

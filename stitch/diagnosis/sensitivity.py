@@ -13,16 +13,10 @@ import numpy as np
 from scipy.optimize import brentq
 
 from stitch import frames
+from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import Score, form_weights
-from stitch.diagnosis.thresholds import (
-    ALPHA_NAME,
-    LISTED_ALIAS_CORRELATION,
-    LOG_BAYES_FACTOR,
-    POWER,
-    UNDETECTABLE_SQUARE,
-)
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.statistics.distributions import f_limit, noncentral_f_tail
@@ -63,7 +57,9 @@ def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
     return out
 
 
-def aliases_of(k: int, matrix: Array, scores: Sequence[Score], least: float = LISTED_ALIAS_CORRELATION) -> list[Alias]:
+def aliases_of(
+    k: int, matrix: Array, scores: Sequence[Score], least: float = limits.LISTED_ALIAS_CORRELATION
+) -> list[Alias]:
     """The most similar effects of candidate k."""
     order = np.argsort(-matrix[k])
     return [Alias(scores[j].name, float(matrix[k, j])) for j in order if j != k and matrix[k, j] > least][:5]
@@ -136,15 +132,15 @@ def least_noncentrality(
     rank = int((information > 1e-2).sum())
     if rank == 0:
         return float("inf")
-    by_p = rank * f_limit(ALPHA_NAME * weight / max(tests, 1), rank, max(degrees_of_freedom, 1.0))
-    factor, told = LOG_BAYES_FACTOR - float(np.log(weight)), information.clip(0)
+    by_p = rank * f_limit(limits.ALPHA_NAME * weight / max(tests, 1), rank, max(degrees_of_freedom, 1.0))
+    factor, told = limits.LOG_BAYES_FACTOR - float(np.log(weight)), information.clip(0)
     by_factor = [_squares_for(factor - float(np.log(y)), s**2 * told, degrees_of_freedom) for s, y in scales.items()]
     needed = max(by_p, min(by_factor))
-    if needed > UNDETECTABLE_SQUARE:
+    if needed > limits.UNDETECTABLE_SQUARE:
         return float("inf")
 
     def missed(shift: float) -> float:
-        return noncentral_f_tail(needed / rank, rank, degrees_of_freedom, shift) - POWER
+        return noncentral_f_tail(needed / rank, rank, degrees_of_freedom, shift) - limits.POWER
 
     # From below: the series of the distribution fails for shifts far beyond what is needed.
     enough = needed + 10.0

@@ -21,16 +21,7 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.special import logsumexp
 
-from stitch.diagnosis.thresholds import (
-    CURVE_LEAST_SHARE,
-    JOINT_LAWS_FITTED,
-    LAW_VARIANCES,
-    ODDS,
-    PRIOR_UNKNOWN,
-    PROCESS_COLUMNS,
-    PROCESS_KNOTS,
-    PROCESS_LEAST_VARIANCE,
-)
+from stitch.diagnosis import thresholds as limits
 from stitch.effects.contract import EFFECTS
 from stitch.frames import Array, Indices
 from stitch.measurement.measurement import STILL
@@ -126,7 +117,7 @@ def wandering_flange(linear: LinearModel) -> SmoothProcess:
     knots = _knots(len(time))
     alike = ornstein_uhlenbeck(time, DRIFT_MEMORY["slowly wandering"], time[knots])
     carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(alike), 6, 6)
-    return SmoothProcess(None, carried, alike @ _leading_courses(alike[knots], PROCESS_COLUMNS // 6))
+    return SmoothProcess(None, carried, alike @ _leading_courses(alike[knots], limits.PROCESS_COLUMNS // 6))
 
 
 def _smooth_courses(angles: Array, reach: float = REACH) -> Array:
@@ -141,11 +132,11 @@ def _smooth_courses(angles: Array, reach: float = REACH) -> Array:
 def _leading_courses_cached(angles: bytes, views: int, reach: float) -> Array:
     """(K, R) of the knots whose angles these are: the same in every diagnosis of a session."""
     knots = np.frombuffer(angles).reshape(views, -1)
-    return _leading_courses(rbf_joints(knots, knots, reach), PROCESS_COLUMNS)
+    return _leading_courses(rbf_joints(knots, knots, reach), limits.PROCESS_COLUMNS)
 
 
 def _knots(views: int) -> Indices:
-    return np.unique(np.linspace(0, views - 1, min(views, PROCESS_KNOTS)).astype(np.int64))
+    return np.unique(np.linspace(0, views - 1, min(views, limits.PROCESS_KNOTS)).astype(np.int64))
 
 
 def _leading_courses(covariance: Array, most: int) -> Array:
@@ -153,7 +144,7 @@ def _leading_courses(covariance: Array, most: int) -> Array:
     last = len(covariance) - 1
     values, vectors = eigh(covariance, subset_by_index=(max(last + 1 - most, 0), last))
     values, vectors = values[::-1], vectors[:, ::-1]
-    keep = values > PROCESS_LEAST_VARIANCE * values[0]
+    keep = values > limits.PROCESS_LEAST_VARIANCE * values[0]
     return np.asarray(vectors[:, keep] / np.sqrt(values[keep]))
 
 
@@ -286,7 +277,7 @@ def joint_law_log_posterior(base: LinearModel) -> float:
 def log_posterior_of_any(log_bayes_factors: Array) -> Array:
     """(…) log posterior that one of the laws is there, from the log Bayes factors (L, …) of each: all kinds of laws of
     all joints share the prior alike, and none of their sizes is known."""
-    return np.asarray(log_mean_exp(log_bayes_factors) + np.log(PRIOR_UNKNOWN) - ANY_SIZE)
+    return np.asarray(log_mean_exp(log_bayes_factors) + np.log(limits.PRIOR_UNKNOWN) - ANY_SIZE)
 
 
 def law_covariances(base: LinearModel) -> list[list[Array]]:
@@ -317,7 +308,7 @@ def laws_of_kinds(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
         for process in range(len(of_one_joint[follows].joints))
     ]
     tried.sort(key=lambda law: -law.log_bayes_factor)
-    tried = [law.fitted() if k < JOINT_LAWS_FITTED else law for k, law in enumerate(tried)]
+    tried = [law.fitted() if k < limits.JOINT_LAWS_FITTED else law for k, law in enumerate(tried)]
     every: dict[tuple[int, str], list[JointLaw]] = {}
     for law in tried:
         every.setdefault((law.joint, law.follows), []).append(law)
@@ -341,7 +332,7 @@ def _law_at_null(base: LinearModel, follows: str, process: int) -> JointLaw:
 def _fit_law(base: LinearModel, mixed: MixedModel) -> VarianceFit:
     """At the maximum, sought from the likeliest of several starts."""
     nulls = [at.null.variances for at in (base, *base.alternative_starts)]
-    starts: list[Array] = [np.append(null, times * SMOOTH_SCALE**2) for null in nulls for times in LAW_VARIANCES]
+    starts: list[Array] = [np.append(null, times * SMOOTH_SCALE**2) for null in nulls for times in limits.LAW_VARIANCES]
     return fit_variances(mixed, start=min(starts, key=lambda start: at_variances(mixed, start).deviance))
 
 
@@ -515,12 +506,12 @@ def _likeliest_law_per_joint(laws: Sequence[JointLaw]) -> tuple[JointLaw, ...]:
     Args:
         laws: of all kinds and joints, likeliest first.
     """
-    if not laws or log_mean_exp([law.log_bayes_factor for law in laws]) <= ODDS:
+    if not laws or log_mean_exp([law.log_bayes_factor for law in laws]) <= limits.ODDS:
         return ()
     of_joint = {k: [law for law in laws if law.joint == k] for k in dict.fromkeys(law.joint for law in laws)}
     factors = {k: [law.log_bayes_factor for law in own] for k, own in of_joint.items()}
     together = {k: float(logsumexp(own) - np.log(len(laws))) for k, own in factors.items()}
-    near = [k for k in together if together[k] > max(together.values()) - ODDS]
+    near = [k for k in together if together[k] > max(together.values()) - limits.ODDS]
     return tuple(_law_with_alternatives(of_joint[k], together[k]) for k in sorted(near, key=lambda k: -together[k]))
 
 
@@ -531,7 +522,7 @@ def _law_with_alternatives(laws: Sequence[JointLaw], together: float) -> JointLa
         laws: of all kinds, likeliest first.
         together: log Bayes factor of them.
     """
-    near = [law for law in laws if law.log_bayes_factor > laws[0].log_bayes_factor - ODDS]
+    near = [law for law in laws if law.log_bayes_factor > laws[0].log_bayes_factor - limits.ODDS]
     return replace(laws[0], log_bayes_factor=together, may_follow=tuple(dict.fromkeys(map(covariates_in_words, near))))
 
 
@@ -572,7 +563,7 @@ def joint_curves(laws: Sequence[JointLaw]) -> tuple[JointCurve, ...]:
         alike = law.errors.kernel_of(law.process)
         whole = float(_law_given_views(law, alike, alike)[0].var())
         found += [_curve_along(law, along, whole) for along in covariates_of_law(law)]
-    return tuple(sorted((c for c in found if c.share > CURVE_LEAST_SHARE), key=lambda c: -c.share))
+    return tuple(sorted((c for c in found if c.share > limits.CURVE_LEAST_SHARE), key=lambda c: -c.share))
 
 
 def _curve_along(law: JointLaw, along: LawCovariate, whole: float) -> JointCurve:

@@ -6,25 +6,10 @@ from functools import partial
 
 import numpy as np
 
+from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis import unnamed_joint_laws
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import Score
-from stitch.diagnosis.thresholds import (
-    COURSE_SIZES,
-    COURSES_FITTED,
-    FASTEST_SWING,
-    FREE_SIZES,
-    FREQUENCY_STEP,
-    LEAST_SWINGS,
-    LONGEST_STRETCH,
-    MOST_FREQUENCIES,
-    ODDS,
-    PAIRED_JOINTS,
-    PRIOR_UNKNOWN,
-    SHORTEST_STRETCH,
-    STRETCH_VIEWS,
-    TIME_LAWS_FITTED,
-)
 from stitch.diagnosis.unnamed_joint_laws import (
     ANY_SIZE,
     JOINT_ANGLES,
@@ -85,8 +70,8 @@ def time_processes(linear: LinearModel) -> list[TimeProcess]:
     """All that are tried, of any size and direction in the flange's frame."""
     time = time_in_steps(linear.measurement)
     span = _span(time)
-    apart = max(FREQUENCY_STEP / span, FASTEST_SWING / MOST_FREQUENCIES)
-    frequencies = np.arange(LEAST_SWINGS / span, FASTEST_SWING, apart)
+    apart = max(limits.FREQUENCY_STEP / span, limits.FASTEST_SWING / limits.MOST_FREQUENCIES)
+    frequencies = np.arange(limits.LEAST_SWINGS / span, limits.FASTEST_SWING, apart)
     at_once = _swings_in_phase(linear, frequencies)
     return _processes(linear, time, [*_swings(linear, frequencies), *at_once, *_stretches(linear, time)])
 
@@ -95,7 +80,7 @@ def processes_near_period(linear: LinearModel, swing: TimeProcess) -> list[TimeP
     """A swing, and others between it and the next ones that are tried."""
     assert swing.frequency is not None
     time = time_in_steps(linear.measurement)
-    reach = FREQUENCY_STEP / _span(time)
+    reach = limits.FREQUENCY_STEP / _span(time)
     return _processes(linear, time, _swings(linear, swing.frequency + np.linspace(-reach, reach, _PERIOD_REFINEMENT)))
 
 
@@ -138,15 +123,15 @@ def _wave(waves: _TimeCourse, phase: float, time: Array) -> Array:
 
 def _stretches(linear: LinearModel, time: Array) -> Iterator[_DescribedCourse]:
     """Bumps that begin and end within the session, in words."""
-    first, last, width = float(time.min()), float(time.max()), SHORTEST_STRETCH
+    first, last, width = float(time.min()), float(time.max()), limits.SHORTEST_STRETCH
     views = linear.measurement.views
-    while width <= LONGEST_STRETCH * (last - first):
+    while width <= limits.LONGEST_STRETCH * (last - first):
         # A grid of this width within the session, where there are views: it may hold breaks of days.
         steps = np.floor((time - first) / width)
         middles = first + width * np.unique([steps, steps + 1])
         for middle in middles[(middles > first) & (middles < last - width / 2)]:
             away = np.abs(time - middle) / width
-            if np.count_nonzero(away < _FULL_WIDTH / 2) >= STRETCH_VIEWS:
+            if np.count_nonzero(away < _FULL_WIDTH / 2) >= limits.STRETCH_VIEWS:
                 name = views.names[views.number[away.argmin()]]
                 words = f"are off for a stretch of {_duration_in_words(linear, _FULL_WIDTH * width)} about view {name}"
                 yield _STRETCH, words, partial(_bump, middle, width), None
@@ -193,7 +178,7 @@ def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
         return None
     sized = [size_process(linear, course.process) for course in courses]
     gains = np.array([own.gain for own in sized])
-    found = {k: fit_process(linear, sized[k], tried=1) for k in np.argsort(-gains)[:TIME_LAWS_FITTED]}
+    found = {k: fit_process(linear, sized[k], tried=1) for k in np.argsort(-gains)[: limits.TIME_LAWS_FITTED]}
     for k, own in found.items():
         gains[k] = max(gains[k], own.log_bayes_factor)
     best = max(found, key=lambda k: gains[k])
@@ -205,7 +190,7 @@ def likeliest_time_law(linear: LinearModel) -> TimeLaw | None:
 def time_law_log_posterior(linear: LinearModel) -> float:
     """Return the log posterior of such a law, none of its sizes known; −∞ where there is none."""
     law = likeliest_time_law(linear)
-    return -np.inf if law is None else law.log_bayes_factor - ANY_SIZE + float(np.log(PRIOR_UNKNOWN))
+    return -np.inf if law is None else law.log_bayes_factor - ANY_SIZE + float(np.log(limits.PRIOR_UNKNOWN))
 
 
 def significant_time_law(linear: LinearModel) -> TimeLaw | None:
@@ -215,7 +200,7 @@ def significant_time_law(linear: LinearModel) -> TimeLaw | None:
     As with a joint's law (`clear_joints.py`) the odds are those of the likeliest sizes.
     """
     law = likeliest_time_law(linear)
-    if law is None or law.log_bayes_factor <= ODDS:
+    if law is None or law.log_bayes_factor <= limits.ODDS:
         law = _law_replacing_wander(linear)
     return law if law is None or law.course.frequency is None else _refine_period(law)
 
@@ -226,7 +211,7 @@ def _law_replacing_wander(linear: LinearModel) -> TimeLaw | None:
     steady = linear.without_drift
     law = likeliest_time_law(steady)
     wandering = 0.5 * (steady.null.deviance - linear.null.deviance)
-    if law is None or law.log_bayes_factor <= max(ODDS, wandering):
+    if law is None or law.log_bayes_factor <= max(limits.ODDS, wandering):
         return None
     return replace(law, log_bayes_factor=law.log_bayes_factor - wandering)
 
@@ -277,7 +262,7 @@ def time_curve(law: TimeLaw) -> TimeCurve:
     places = np.linspace(0, len(time) - 1, _PLACES * (len(time) - 1) + 1)
     steps = np.interp(places, np.arange(len(time)), time)
     shapes, found = law.course.course(steps), law.fitted
-    G, wide = linear.in_blocks(found.columns), np.full(found.columns.shape[1], FREE_SIZES * found.size)
+    G, wide = linear.in_blocks(found.columns), np.full(found.columns.shape[1], limits.FREE_SIZES * found.size)
     fit = at_variances(linear.mixed, found.fit.variances, G, wide)
     # Of every motion of the flange one coefficient for each shape.
     coefficients = fit.mean[-len(wide) :].reshape(6, -1)
@@ -314,9 +299,11 @@ def unnamed_courses(linear: LinearModel) -> tuple[FittedProcess, ...]:
             [size_process(linear, process) for process in own] for own in single_joint_processes(linear, motions)
         ]
         found += [course for own in by_joint for course in own]
-        first = sorted(range(len(by_joint)), key=lambda k: -max(course.gain for course in by_joint[k]))[:PAIRED_JOINTS]
+        first = sorted(range(len(by_joint)), key=lambda k: -max(course.gain for course in by_joint[k]))[
+            : limits.PAIRED_JOINTS
+        ]
         found += [size_process(linear, process) for k in first for process in joint_pair_processes(linear, motions, k)]
-    likeliest = sorted(found, key=lambda course: -course.gain)[:COURSES_FITTED]
+    likeliest = sorted(found, key=lambda course: -course.gain)[: limits.COURSES_FITTED]
     courses = parallel(lambda c: fit_process(linear, c, len(found)), likeliest)
     return tuple(sorted(courses, key=lambda c: -c.log_bayes_factor))
 
@@ -329,7 +316,7 @@ def significant_course(linear: LinearModel) -> FittedProcess | None:
     then not what it was named for on the other's poses.
     """
     courses = unnamed_courses(linear.independent_only)
-    return next((course for course in courses if course.log_bayes_factor > ODDS), None)
+    return next((course for course in courses if course.log_bayes_factor > limits.ODDS), None)
 
 
 def least_log_bayes_factor(linear: LinearModel, scored: Score) -> float:
@@ -344,7 +331,7 @@ def _factor_with_course(linear: LinearModel, course: FittedProcess, scored: Scor
         _deviance_with_columns(
             linear, both, np.append(np.full(course.columns.shape[1], times * course.size), scored.sizes)
         )
-        for times in COURSE_SIZES
+        for times in limits.COURSE_SIZES
     ]
     return 0.5 * (course.fit.deviance - min(tried))
 
@@ -389,7 +376,7 @@ def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
     if linear.pose_errors is None:
         return _course_errors(linear)
     law = _likelier_errors(_joint_law_errors(linear), _time_law_errors(linear))
-    if _log_evidence_gain(linear, linear.independent_only.null.deviance) < ODDS:
+    if _log_evidence_gain(linear, linear.independent_only.null.deviance) < limits.ODDS:
         return () if law is None else (law,)
     names = linear.pose_errors.names
     kinds = {
@@ -402,7 +389,7 @@ def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
         for words, kind in kinds.items()
         if any(name in kind for name in names)
     ]
-    wanted = sorted((u for u in found if u.log_bayes_factor > ODDS), key=lambda u: -u.log_bayes_factor)
+    wanted = sorted((u for u in found if u.log_bayes_factor > limits.ODDS), key=lambda u: -u.log_bayes_factor)
     if law is not None:
         # What one joint does is part of what follows the joints, and as clear.
         alike = [u.log_bayes_factor for u in found if u.joints == law.joints]
@@ -438,7 +425,7 @@ def _time_law_errors(linear: LinearModel) -> RepeatingError | None:
 def _likelier_errors(joint: RepeatingError | None, time: RepeatingError | None) -> RepeatingError | None:
     """Choose between a joint's law and one in time; both where 20 to 1 tells neither."""
     found = sorted((u for u in (joint, time) if u is not None), key=lambda u: -u.log_bayes_factor)
-    if len(found) == 2 and found[0].log_bayes_factor - found[1].log_bayes_factor < ODDS:
+    if len(found) == 2 and found[0].log_bayes_factor - found[1].log_bayes_factor < limits.ODDS:
         return replace(found[0], words=f"{found[0].words}, or {found[1].words}")
     return found[0] if found else None
 

@@ -5,18 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Form
 from stitch.diagnosis.score import Score, score
-from stitch.diagnosis.thresholds import (
-    END_PRIOR_FREEDOM,
-    END_PRIOR_SIZES,
-    FREE_SIZES,
-    HALVES_P_VALUE,
-    LIKELY_TO_HELP,
-    MAX_REMAINING_SHARE,
-    MIN_STEADINESS,
-    NEGLIGIBLE_SIZE,
-)
 from stitch.frames import Array, Indices
 from stitch.observations.linear_model import CoefficientPrior, LinearModel, LinearTrial
 from stitch.observations.surfaces.surface_model import SurfaceObservation
@@ -46,7 +37,7 @@ class Extrapolation:
     @property
     def helps(self) -> bool:
         """True if the ends together are predicted better by more than a standard error, and a further one probably."""
-        return self.share <= 1 - self.sigma and self.likely >= LIKELY_TO_HELP
+        return self.share <= 1 - self.sigma and self.likely >= limits.LIKELY_TO_HELP
 
     @property
     def errs_somewhere(self) -> bool:
@@ -56,7 +47,7 @@ class Extrapolation:
     @property
     def unseen(self) -> bool:
         """True if the ends together are as well predicted with the effect as without."""
-        return MAX_REMAINING_SHARE <= self.share <= 1 / MAX_REMAINING_SHARE
+        return limits.MAX_REMAINING_SHARE <= self.share <= 1 / limits.MAX_REMAINING_SHARE
 
     def rejection_reason(self, name: str) -> str:
         """Say what speaks against an effect that explains much."""
@@ -72,7 +63,7 @@ def untested_ends_reason(names: Sequence[str]) -> str:
     """Say what speaks against effects that the ends cannot judge."""
     return (
         f"{', '.join(names[:-1])} and {names[-1]} help among the measured poses, but not beyond. Ends of "
-        f"joint ranges left out change by less than {1 - MAX_REMAINING_SHARE:.0%} together"
+        f"joint ranges left out change by less than {1 - limits.MAX_REMAINING_SHARE:.0%} together"
     )
 
 
@@ -105,10 +96,10 @@ def _student_prior(linear: LinearModel, X: Array, sizes: Array) -> CoefficientPr
     (Lange, Little & Taylor 1989, J. Am. Stat. Assoc. 84:881).
     """
     middle = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
-    free = 1 / (END_PRIOR_SIZES * sizes) ** 2
+    free = 1 / (limits.END_PRIOR_SIZES * sizes) ** 2
     found = linear.trial(X, None, CoefficientPrior(free, middle)).solve() - middle
     known = np.where(np.isfinite(sizes), found, 0.0)
-    return CoefficientPrior((END_PRIOR_FREEDOM + 1) / (END_PRIOR_FREEDOM * sizes**2 + known**2), middle)
+    return CoefficientPrior((limits.END_PRIOR_FREEDOM + 1) / (limits.END_PRIOR_FREEDOM * sizes**2 + known**2), middle)
 
 
 @dataclass(frozen=True)
@@ -128,7 +119,7 @@ class CrossValidation:
 
     def rejection_reason(self, name: str) -> str | None:
         """Why an effect should not be in a model of many poses, if it should not: these show even what hardly helps."""
-        if self.helps and self.poses <= MAX_REMAINING_SHARE:
+        if self.helps and self.poses <= limits.MAX_REMAINING_SHARE:
             return None
         share = f"{self.poses:.3f} ± {self.poses_sigma:.3f}"
         return f"{name} hardly helps on views left out: it leaves {share} of the mean square error"
@@ -189,7 +180,7 @@ def prior_of_sizes(linear: LinearModel, scored: Score) -> CoefficientPrior:
     left to see does not count for more than that.
     """
     size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
-    size = np.maximum(size, NEGLIGIBLE_SIZE * scored.form.sizes)
+    size = np.maximum(size, limits.NEGLIGIBLE_SIZE * scored.form.sizes)
     precision = np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
     return CoefficientPrior(precision, np.zeros(len(precision)))
 
@@ -254,7 +245,7 @@ class Halves:
         if self.log_bayes_factor <= 0:
             return f"{name}, found in one half of the views, does not help in the other"
         # A clear effect whose form is not quite right differs a little, beyond chance: it is there all the same.
-        if self.p_value < HALVES_P_VALUE and self.share < MIN_STEADINESS:
+        if self.p_value < limits.HALVES_P_VALUE and self.share < limits.MIN_STEADINESS:
             return f"{name} has another size or sign in each half of the views (p = {self.p_value:.1g})"
         return None
 
@@ -326,11 +317,11 @@ def _log_predictive_gain(seen: _HalfEvidence, mean: Array, precision: Array) -> 
 
 def _size_consistency(a: _HalfEvidence, b: _HalfEvidence, sizes: Array) -> float:
     """p-value of a χ² test of the difference, over the combinations that both halves see."""
-    (mean_a, one), (mean_b, other) = (s.fitted(FREE_SIZES * sizes) for s in (a, b))
+    (mean_a, one), (mean_b, other) = (s.fitted(limits.FREE_SIZES * sizes) for s in (a, b))
     d = (mean_a - mean_b) / sizes
     covariance = sum(np.linalg.inv(p * np.outer(sizes, sizes)) for p in (one, other))
     values, vectors = np.linalg.eigh(covariance)
-    told = values < 0.5 * FREE_SIZES**2
+    told = values < 0.5 * limits.FREE_SIZES**2
     return chi2_tail(float(np.sum((vectors.T @ d)[told] ** 2 / values[told])), int(told.sum())) if told.any() else 1.0
 
 

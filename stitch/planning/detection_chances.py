@@ -12,19 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.sensitivity import detectable_sizes
-from stitch.diagnosis.thresholds import (
-    ALPHA_NAME,
-    LAW_VARIANCES,
-    LOG_BAYES_FACTOR,
-    ODDS,
-    PRIOR_PHYSICAL,
-    SEEN_SIGMAS,
-    SEPARATION_LAMBDA,
-)
 from stitch.diagnosis.unnamed_joint_laws import law_covariances, log_posterior_of_any
 from stitch.frames import Array, Mask
 from stitch.measurement.session import Session
@@ -113,7 +105,7 @@ def _form_test(linear: LinearModel, columns: Array, weight: float, tests: int, s
     values, vectors = np.linalg.eigh(information)
     keep = values > _MIN_INFORMATION
     solved = (vectors[:, keep] / np.sqrt(values[keep])).T
-    limit = keep.sum() * f_limit(ALPHA_NAME * weight / tests, max(int(keep.sum()), 1), known)
+    limit = keep.sum() * f_limit(limits.ALPHA_NAME * weight / tests, max(int(keep.sum()), 1), known)
     with_prior = np.eye(len(values)) + information
     return _FormTest(
         weight * share,
@@ -175,7 +167,7 @@ def identifiable_size(base: LinearModel, own: Candidate, rival: Candidate) -> fl
     for form in own.forms:
         pattern = base.residual(form.columns) * form.sizes
         apart = min(separation(pattern, X) for X in imitations)
-        sizes.append(float(np.sqrt(SEPARATION_LAMBDA / apart)) if apart > 0 else float("inf"))
+        sizes.append(float(np.sqrt(limits.SEPARATION_LAMBDA / apart)) if apart > 0 else float("inf"))
     return _median(np.array(sizes), form_weights(own))
 
 
@@ -227,7 +219,7 @@ class ExpectedDiagnosis:
         own = [self._test({c.name}, c).evaluate(numbers) for c in self.candidates]
         factor, significant = np.array([f for f, _ in own]), np.array([s for _, s in own])
         best = self._best(numbers, np.where(significant & (factor > 0), factor, -np.inf))
-        alarm = (significant & (factor > LOG_BAYES_FACTOR)).any(axis=0)
+        alarm = (significant & (factor > limits.LOG_BAYES_FACTOR)).any(axis=0)
         counts = {c.name: float(np.mean(alarm & (best == k))) for k, c in enumerate(self.candidates)}
         named = counts.pop(effect, 0.0)
         other = max(counts, key=lambda name: counts[name], default=None)
@@ -262,7 +254,7 @@ class ExpectedDiagnosis:
         """(D,) whether a candidate is ahead of joints that follow by no law (`joint_laws.py`)."""
         own = self._test({self.candidates[k].name}, self.candidates[k])
         if k not in self._laws:
-            found, sizes = law_covariances(own.linear), np.sqrt(LAW_VARIANCES)
+            found, sizes = law_covariances(own.linear), np.sqrt(limits.LAW_VARIANCES)
             self._laws[k] = [[covariance_tests(own.linear, C, sizes) for C in kind] for kind in found]
         kinds = self._laws[k]
         if not kinds:
@@ -270,12 +262,12 @@ class ExpectedDiagnosis:
         rival = log_posterior_of_any(
             np.array([log_mean_exp(np.array([_best_log_factor(law, numbers) for law in kind])) for kind in kinds])
         )
-        return np.asarray(own.evaluate(numbers)[0] + np.log(PRIOR_PHYSICAL / self.tests) > rival + ODDS)
+        return np.asarray(own.evaluate(numbers)[0] + np.log(limits.PRIOR_PHYSICAL / self.tests) > rival + limits.ODDS)
 
     def _ahead(self, k: int, other: int, numbers: Array) -> Mask:
         pair = [self.candidates[k], self.candidates[other]]
         own, rival = (self._test({c.name for c in pair}, c).evaluate(numbers)[0] for c in pair)
-        return np.asarray(own > rival + ODDS)
+        return np.asarray(own > rival + limits.ODDS)
 
 
 def _best_log_factor(law: Sequence[CandidateTest], numbers: Array) -> Array:
@@ -286,7 +278,7 @@ def _best_log_factor(law: Sequence[CandidateTest], numbers: Array) -> Array:
 def _is_visible(linear: LinearModel, candidate: Candidate) -> bool:
     """True if one parameter at its plausible size is half a sigma at the least, as a diagnosis has it."""
     white = linear.without([candidate.name]).residual(candidate.forms[0].columns) * candidate.forms[0].sizes
-    return bool((np.linalg.norm(white, axis=0) > SEEN_SIGMAS).any())
+    return bool((np.linalg.norm(white, axis=0) > limits.SEEN_SIGMAS).any())
 
 
 def usual_shifts(candidate: Candidate, rng: np.random.Generator, draws: int = DRAWS) -> Array:
