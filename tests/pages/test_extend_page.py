@@ -34,7 +34,7 @@ from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.evidence import select
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.effects import EFFECTS
-from stitch.measurement.capture import capture
+from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.observations.plate import plate_model
@@ -60,7 +60,7 @@ assert np.isfinite(off).all() and np.abs(off).max() < 4, off
 # The observation: an offset of joint 3 that flat points alone show.
 plate = np.array([[60., 10, 30], [-40, 55, 30], [-20, -60, 30], [10, 5, 30], [-70, -10, 30], [50, -50, 30]])
 cell, T_mount, _ = labelled_cell(1, views=30, offset=np.array([0, 0, 1.5e-3, 0, 0, 0]), targets=plate)
-linear = plate_model(measurement_of(cell, capture(cell)), Model(T_mount))
+linear = plate_model(measurement_of(cell, prepare_capture(cell)), Model(T_mount))
 selection = select(linear, candidates_of(linear)[0], ScatterLimit(*IMPLAUSIBLE))
 assert selection.verdict == "missing_effect", selection.verdict
 (best,) = selection.named
