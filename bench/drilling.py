@@ -7,16 +7,14 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from drilling_loop import calibrate_sensors, drive_pose, measure_hole, run_group
 
 from data_synth.drilling_cell import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.drilling_image import render_plate
-from stitch.cells.drilling import calibrate_sensors, run_group
 from stitch.cells.drilling_sensors import (
     HoleObservations,
-    drive_pose,
     fit_homography,
     leave_one_out,
-    measure_hole,
     select_effects,
     to_plane,
 )

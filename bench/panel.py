@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from panel_drift import drift_table
+from panel_loops import run_pose
 from panel_ready import MASTER, POSES, TOLERANCE, pose_error, read, ready, ready_without_panel, shape_run
 
 from data_synth import hexapod, panel_job
@@ -21,7 +22,6 @@ from stitch.cells.panel_model import (
     calibrate_robot,
     errors_along_motion,
     find_leg_offset,
-    run_pose,
     true_flanges,
 )
 from stitch.errors import NoResultError

@@ -6,11 +6,11 @@ Run: python bench/panel_example.py
 from pathlib import Path
 
 import numpy as np
+from panel_loops import measure_pose
 from panel_ready import POSES, ready
 
 from data_synth import panel_job
 from data_synth.panel_cell import NAMES
-from stitch.cells.panel_model import measure_pose
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "panel"
 

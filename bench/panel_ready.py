@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from panel_loops import PanelSetup, ShapeRun, run_pose, run_shape
 
 from data_synth import panel_job
 from data_synth.panel_cell import NAMES, PanelCell
@@ -11,15 +12,11 @@ from stitch.cells.panel_model import (
     ClampLayout,
     ControlPoints,
     LaserTracker,
-    PanelSetup,
     ReflectorReadings,
-    ShapeRun,
     calibrate_robot,
     clamp_contacts,
     preposition,
     rigid_fit,
-    run_pose,
-    run_shape,
 )
 
 LAYOUT = ClampLayout(**panel_job.LAYOUT, columns=3)

@@ -4,7 +4,6 @@ On one plane all three are hidden: a homography takes up a wrong height complete
 seen at many places and heights, which robot and rangers measure, shows them.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -389,11 +388,6 @@ def hole_rotation(direction: Array) -> Array:
     return np.asarray(np.stack([x, np.cross(z, x), z], axis=-1))
 
 
-def drive_pose(position: Array, direction: Array) -> Array:
-    """T_base_tool (..., 4, 4) that puts the tool on a hole."""
-    return frames.make(hole_rotation(direction), position)
-
-
 def euler_zyx(R: Array) -> Array:
     """Angles (..., 3) in rad about z, y', x'' (A, B, C of a KUKA controller): R = Rz(A) Ry(B) Rx(C)."""
     R = np.asarray(R, float)
@@ -469,7 +463,7 @@ def _centroid(image: NDArray[np.uint8], box: tuple[int, int, int, int]) -> Array
     return np.asarray([(weight * u_index).sum() / weight.sum(), (weight * v_index).sum() / weight.sum()], float)
 
 
-# Laser rangers on the flange: where each beam starts and points, and what several beams say about a surface.
+# Laser rangers on the flange: where each beam starts and points.
 
 
 @dataclass(frozen=True)
@@ -479,27 +473,6 @@ class RangerFit:
     origin: Array  # (3,)
     direction: Array  # (3,) unit vector
     rms: float  # of the distances to the planes
-
-
-@dataclass(frozen=True)
-class Rangers:
-    """Beams of all rangers in the flange frame."""
-
-    origins: Array  # (n, 3)
-    directions: Array  # (n, 3)
-
-
-@dataclass(frozen=True)
-class RangedPlane:
-    """The surface under the tool, in the flange frame."""
-
-    normal: Array  # (3,) unit vector into the part, so close to +z
-    height: float  # along the tool axis
-
-    @property
-    def tilt(self) -> float:
-        """Angle (rad) between tool axis and normal."""
-        return float(np.arctan2(np.hypot(self.normal[0], self.normal[1]), self.normal[2]))
 
 
 def fit_ranger(planes: Array, readings: Array) -> RangerFit:
@@ -535,113 +508,9 @@ def fit_ranger(planes: Array, readings: Array) -> RangerFit:
     return RangerFit(x[:3], direction(x), float(np.sqrt(np.mean(distances(x) ** 2))))
 
 
-def fit_ranged_plane(rangers: Rangers, readings: Array) -> RangedPlane:
-    """Plane through the laser points of three or more readings (n,), and its height on the tool axis.
-
-    The source takes the mean z of its four points, which is the same where the axis passes their centre.
-    """
-    points = rangers.origins + np.asarray(readings)[:, None] * rangers.directions
-    centre = points.mean(axis=0)
-    normal = np.linalg.svd(points - centre)[2][2]
-    normal = normal * np.sign(normal[2])
-    return RangedPlane(normal, float(centre @ normal / normal[2]))
-
-
-# Bring the tool onto a reference hole by what rangers and camera see, and read where the hole truly is.
-
-# Moves to a pose T_base_tool and returns the ranges (n,) and the hole's image point (2,).
-Measure = Callable[[Array], tuple[Array, Array]]
-_MOST_STEPS = 30
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """When the tool counts as placed; the source's values, in rad and mm."""
-
-    tilt: float = float(np.radians(0.35))
-    height: float = 0.5
-    offset: float = 0.2
-
-
-@dataclass(frozen=True)
-class FlangeSensors:
-    """The calibrated sensors of the flange."""
-
-    rangers: Rangers
-    H: Array  # (3, 3) work plane to image
-    height: float  # h, of the work plane
-    thresholds: Thresholds = Thresholds()
-
-
-@dataclass(frozen=True)
-class HoleSight:
-    """What the sensors say at one pose: hole against tool, in the flange frame."""
-
-    normal: Array  # (3,)
-    tilt: float
-    offset: Array  # (3,): x', y', h' − h
-
-
-@dataclass(frozen=True)
-class ServoResult:
-    """The end of a servo loop."""
-
-    T_base_tool: Array  # (4, 4)
-    final_sight: HoleSight
-    steps: int
-
-    @property
-    def hole(self) -> Array:
-        """Drive coordinate (3,) of the hole: p + R'·(x', y', h' − h) (source, formula 14)."""
-        return hole_coordinate(self.T_base_tool, self.final_sight.offset)
-
-
 def hole_coordinate(T_base_tool: Array, offset: Array) -> Array:
     """Drive coordinate (3,) of a hole seen at `offset` (3,) from the tool."""
     return np.asarray(T_base_tool[:3, 3] + T_base_tool[:3, :3] @ offset)
-
-
-def measure_hole(sensors: FlangeSensors, ranges: Array, uv: Array) -> HoleSight:
-    """One measurement in the flange frame, from the rangers' readings and an image point (2,)."""
-    seen = fit_ranged_plane(sensors.rangers, ranges)
-    xy = to_plane(sensors.H, np.asarray(uv)[None])[0]
-    return HoleSight(seen.normal, seen.tilt, np.append(xy, seen.height - sensors.height))
-
-
-def align_tool_axis(T_base_tool: Array, normal: Array) -> Array:
-    """The pose turned about the tool's origin so that its axis lies along `normal` (3,), given in the flange frame."""
-    z = np.array([0.0, 0.0, 1.0])
-    axis = np.cross(z, normal)
-    size = np.linalg.norm(axis)
-    turn = axis / size * np.arctan2(size, normal[2]) if size > 0 else axis
-    R = T_base_tool[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
-    return frames.make(R, T_base_tool[:3, 3])
-
-
-def servo_to_hole(measure: Measure, sensors: FlangeSensors, T_base_tool: Array) -> ServoResult:
-    """Tilt, then height, then camera offset, and again until all three are below their thresholds; starts at a pose
-    (4, 4).
-
-    Raises:
-        NoResultError: the loop does not converge.
-    """
-    limits = sensors.thresholds
-    for step in range(_MOST_STEPS):
-        sight = measure_hole(sensors, *measure(T_base_tool))
-        x, y, dh = sight.offset
-        R = T_base_tool[:3, :3]
-        if sight.tilt >= limits.tilt:
-            T_base_tool = align_tool_axis(T_base_tool, sight.normal)
-        elif abs(dh) >= limits.height:
-            T_base_tool = frames.make(R, T_base_tool[:3, 3] + R @ [0.0, 0.0, dh])
-        elif np.hypot(x, y) >= limits.offset:
-            T_base_tool = frames.make(R, T_base_tool[:3, 3] + R @ [x, y, 0.0])
-        else:
-            return ServoResult(T_base_tool, sight, step)
-    raise NoResultError(
-        f"the tool did not converge on the hole in {_MOST_STEPS} steps: tilt {np.degrees(sight.tilt):.2f}°, height "
-        f"{dh:+.2f}, offset {np.hypot(x, y):.2f}; calibrate rangers and camera again"
-    )
 
 
 # The tool's true axis in its own frame, from how the robot reports to stand when the tool is upright on a hole.

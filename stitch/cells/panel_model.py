@@ -6,7 +6,6 @@ that the tracker measures while the robot moves; base and clamp are both unknown
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -548,88 +547,3 @@ def largest_deviations(deviations: Array, control: ControlPoints) -> Array:
     across = np.einsum("ki,ki->k", deviations, control.T_panel_contact[control.clamp][:, :3, 2])
     clamps = range(len(control.T_panel_contact))
     return np.array([np.abs(across[control.clamp == i]).max(initial=0.0) for i in clamps])
-
-
-# The closed loops of a panel cell: any cell that drives and measures will do.
-
-_MOST_CORRECTIONS = 10
-
-
-class PanelMachines(Protocol):
-    """What a loop needs of the machines."""
-
-    def drive(self, T_base_flange: Array, /) -> None:
-        """All robots to poses (N, 4, 4)."""
-
-    def track(self, nominal: Array, /) -> Array:
-        """Readings (K, 3), world frame, of the panel's targets given by their nominal places (K, 3)."""
-
-    def forces(self) -> Array:
-        """(N, 6) change of torques and forces at the clamps since the panel was laid on."""
-
-
-@dataclass(frozen=True)
-class PanelSetup:
-    """Where the panel shall go, and what holds it."""
-
-    models: Sequence[RobotModel]
-    master: int
-    tracker: LaserTracker
-    T_world_target: Array  # (4, 4)
-
-
-@dataclass(frozen=True)
-class ShapeRun:
-    """Deviations and forces, first before any correction."""
-
-    T_base_flange: Array  # (N, 4, 4) at the end
-    deviations: list[Array]  # (N,) mm each
-    forces: list[Array]  # (N, 6) each
-
-
-def measure_pose(cell: PanelMachines, stage: PanelSetup, targets: Array) -> RigidFit:
-    """The panel's pose from its targets (K, 3), panel frame."""
-    seen = cell.track(targets)
-    return rigid_fit(targets, seen, stage.tracker.sigma(seen))
-
-
-def run_pose(cell: PanelMachines, stage: PanelSetup, targets: Array, T_base_flange: Array) -> Array:
-    """One adjustment: measure, move master and slaves; returns where the robots stand then, (N, 4, 4)."""
-    bases = np.array([m.T_world_base for m in stage.models])
-    T_world_panel = measure_pose(cell, stage, targets).T
-    moved = adjust_pose(bases, T_base_flange, stage.master, T_world_panel, stage.T_world_target)
-    cell.drive(moved)
-    return moved
-
-
-def run_shape(
-    cell: PanelMachines,
-    stage: PanelSetup,
-    control: ControlPoints,
-    T_base_flange: Array,
-    *,
-    tolerance: float,
-    axes: Array = SHAPE_AXES,
-) -> ShapeRun:
-    """Correct from poses (N, 4, 4) on until all control points are within the tolerance, mm.
-
-    Raises:
-        NoResultError: they are not after ten corrections.
-    """
-    contact = np.array([m.T_flange_contact for m in stage.models])
-    deviations: list[Array] = []
-    forces: list[Array] = []
-    T_target_world = frames.inverse(stage.T_world_target)
-    for _ in range(_MOST_CORRECTIONS + 1):
-        seen = frames.transform(T_target_world, cell.track(control.nominal))
-        step = shape_step(seen, control, T_base_flange, contact, axes=axes)
-        deviations.append(largest_deviations(step.deviations, control))
-        forces.append(cell.forces())
-        if deviations[-1].max() <= tolerance:
-            return ShapeRun(T_base_flange, deviations, forces)
-        T_base_flange = step.T_base_flange
-        cell.drive(T_base_flange)
-    raise NoResultError(
-        f"shape: still {deviations[-1].max():.2f} mm off after {_MOST_CORRECTIONS} corrections "
-        f"(tolerance {tolerance:g} mm); look at the forces, or check that control points and clamps belong together"
-    )

@@ -7,30 +7,34 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.drilling_loop import (
+    FlangeSensors,
+    Rangers,
+    align_tool_axis,
+    calibrate_sensors,
+    drive_pose,
+    fit_ranged_plane,
+    run_group,
+    servo_to_hole,
+)
 from data_synth.drilling_cell import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.drilling_image import ellipse_centres, render_plate
 from data_synth.drilling_job import write_job
 from stitch import frames
 from stitch.cells import drilling_sensors
-from stitch.cells.drilling import calibrate_sensors, read_drill_job, run_group, solve_drill_job
+from stitch.cells.drilling import read_drill_job, solve_drill_job
 from stitch.cells.drilling_sensors import (
-    FlangeSensors,
     HoleObservations,
-    Rangers,
-    align_tool_axis,
     base_frame,
     compensate_group,
     distort,
-    drive_pose,
     euler_zyx,
     fit_circle,
     fit_homography,
-    fit_ranged_plane,
     fit_ranger,
     hole_rotation,
     leave_one_out,
     select_effects,
-    servo_to_hole,
     to_plane,
     undistort,
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.panel_loops import PanelSetup, run_pose, run_shape
 from data_synth import hexapod, panel_job
 from data_synth.panel_cell import NAMES, PanelCell, Sizes
 from data_synth.shell import Laminate, Shell
@@ -17,7 +18,6 @@ from stitch.cells.panel_model import (
     ControlPoints,
     LaserTracker,
     Legs,
-    PanelSetup,
     ReflectorReadings,
     RobotModel,
     adjust_pose,
@@ -29,8 +29,6 @@ from stitch.cells.panel_model import (
     leg_jacobian,
     preposition,
     rigid_fit,
-    run_pose,
-    run_shape,
     shape_step,
     true_flanges,
 )
