@@ -10,11 +10,15 @@ _FINE = 4  # rays per pixel and direction
 
 def render_plate(cell: DrillingCell, noise: float = 2.0) -> np.ndarray:
     """Image (2050, 2448) of 8 bits: bright plate, uneven light, nine dark holes, a dark bar that is no hole."""
+    return render_holes(cell, NINE, HEIGHT + cell.sizes.plate_height, noise)
+
+
+def render_holes(cell: DrillingCell, centres: np.ndarray, height: float, noise: float = 2.0) -> np.ndarray:
+    """Image of holes at x, y (N, 2) of a plane at one height of the flange frame."""
     v, u = np.mgrid[: IMAGE[1], : IMAGE[0]]
     image = 190 + 20 * (u / IMAGE[0] - 0.5) - 15 * (v / IMAGE[1] - 0.5)
     image[1950:1980, 300:900] = 30
-    height = HEIGHT + cell.sizes.plate_height
-    for centre in NINE:
+    for centre in centres:
         at = cell.image(np.array([[*centre, height]]))[0].round().astype(int)
         rows, columns = (slice(at[axis] - 90, at[axis] + 90) for axis in (1, 0))
         covered = _covered(cell, rows, columns, centre, height)

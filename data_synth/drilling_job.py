@@ -24,6 +24,8 @@ rangers = "rangers.csv"  # per ranger: planes a x + b y + c z + d = 0 in the fla
 joint1 = "joint1.csv"    # a marker's path while joint 1 turns right-handed about the base's z, measuring system
 joint6 = "joint6.csv"    # the same for joint 6 and x
 checks = "checks.csv"    # one hole seen at many places and heights: shows lens distortion and a wrong plate height
+# plate_image = "plate.png"   # a picture of the nine holes: plate.csv then needs no u, v; likewise a column image
+#                            # in placed.csv names a picture of each hole; needs the extra `vision`
 """
 
 

@@ -25,15 +25,16 @@ from stitch.cells.drilling_sensors import (
     find_tool_axis,
     fit_homography,
     fit_ranger,
+    hole_at_tool,
     hole_coordinate,
     hole_rotation,
+    holes_of_plate,
     leave_one_out,
     select_effects,
     to_plane,
 )
 from stitch.cells.job_files import (
     POSE_COLUMNS,
-    CsvColumns,
     JobFile,
     JsonOption,
     RecordingOption,
@@ -53,6 +54,7 @@ from stitch.cells.job_files import (
 )
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
+from stitch.reading.csv_files import read_csv_lines
 from stitch.system.process import console
 from stitch.units import METRES, value_uncertainty_text
 from stitch.writing.session_files import SessionFiles, pose_columns, write_session
@@ -81,7 +83,7 @@ def drill(
 # A drilling job on disk (TOML and CSV) -> `Job`; every check of the input is made here.
 
 DRILL_FORMAT = "stitch-drill/1"
-_FILES = {"plate", "holes", "placed", "rangers", "joint1", "joint6", "checks"}
+_FILES = {"plate", "plate_image", "holes", "placed", "rangers", "joint1", "joint6", "checks"}
 _KEYS = {"format", "length_unit", "height", "image_size", *_FILES}
 # Cosine of the largest angle between tool and hole that a small error explains.
 _ALONG = float(np.cos(np.radians(30)))
@@ -136,20 +138,31 @@ def read_drill_job(file: Path | str) -> DrillJob:
     for key in _NEEDED:
         if key not in paths:
             raise InputError(f"{file}: {key} is missing; name the CSV file")
-    plate = read_columns(paths["plate"], "", "x y z u v")
+    plate_xyz, plate_uv = _read_plate(paths["plate"], paths.get("plate_image"))
     holes = _read_holes(paths["holes"])
     return DrillJob(
         length_unit=choice(file, "length_unit", document.get("length_unit"), tuple(METRES)),
         height=finite(file, "height", document.get("height"), positive=True),
-        plate_xyz=plate.stack("x y z"),
-        plate_uv=plate.stack("u v"),
+        plate_xyz=plate_xyz,
+        plate_uv=plate_uv,
         holes=holes,
-        placed=_read_placed_tools(paths["placed"], holes),
+        placed=_read_placed_tools(paths["placed"], holes, plate_xyz, plate_uv),
         rangers=_read_ranger_tables(paths.get("rangers")),
         marker_paths=_read_marker_paths(file, paths),
-        checks=_read_check_holes(file, document, paths, plate),
+        checks=_read_check_holes(file, document, paths, plate_xyz, plate_uv),
         file=file,
     )
+
+
+def _read_plate(file: Path, picture: Path | None) -> tuple[Array, Array]:
+    """Read the plate's holes, flange frame (N, 3) and pixels (N, 2); with a picture, pixels come from there."""
+    if picture is None:
+        plate = read_columns(file, "", "x y z u v")
+        return plate.stack("x y z"), plate.stack("u v")
+    xyz, uv = read_columns(file, "", "x y z").stack("x y z"), holes_of_plate(picture)
+    if len(xyz) != len(uv):
+        raise InputError(f"{file}: has {len(xyz)} rows; to fix: with plate_image, list the {len(uv)} holes it shows")
+    return xyz, uv
 
 
 def _read_holes(file: Path) -> tuple[Hole, ...]:
@@ -170,8 +183,16 @@ def _read_holes(file: Path) -> tuple[Hole, ...]:
     return tuple(holes)
 
 
-def _read_placed_tools(file: Path, holes: tuple[Hole, ...]) -> dict[str, PlacedTool]:
-    table = read_columns(file, "hole", f"{POSE_COLUMNS} u v height")
+def _read_placed_tools(file: Path, holes: tuple[Hole, ...], plate_xyz: Array, plate_uv: Array) -> dict[str, PlacedTool]:
+    """Read where the tool ended; a column image in place of u and v names a picture of each hole."""
+    header, _ = read_csv_lines(file)
+    if "image" in header and "u" not in header:
+        table = read_columns(file, "hole image", f"{POSE_COLUMNS} height")
+        H = fit_homography(plate_xyz[:, :2], plate_uv)
+        pixels = np.array([hole_at_tool(file.parent / name, H) for name in table.texts["image"]])
+    else:
+        table = read_columns(file, "hole", f"{POSE_COLUMNS} u v height")
+        pixels = table.stack("u v")
     poses, names = poses_from_columns(table), table.texts["hole"]
     require_unique(file, "hole", names)
     for hole in holes:
@@ -182,7 +203,7 @@ def _read_placed_tools(file: Path, holes: tuple[Hole, ...]) -> dict[str, PlacedT
                 f"{file}: on hole {hole.name} the tool's z lies more than 30° off the hole's direction; directions "
                 "point into the part, and a, b, c turn about z, y', x''"
             )
-    seen = zip(names, poses, table.stack("u v"), table.numbers["height"].tolist(), strict=True)
+    seen = zip(names, poses, pixels, table.numbers["height"].tolist(), strict=True)
     return {name: PlacedTool(T_base_tool, uv, height) for name, T_base_tool, uv, height in seen}
 
 
@@ -205,7 +226,7 @@ def _read_marker_paths(file: Path, paths: dict[str, Path]) -> tuple[Array, Array
 
 
 def _read_check_holes(
-    file: Path, document: dict[str, Any], paths: dict[str, Path], plate: CsvColumns
+    file: Path, document: dict[str, Any], paths: dict[str, Path], plate_xyz: Array, plate_uv: Array
 ) -> HoleObservations | None:
     """Holes of the plate and check holes together."""
     if "checks" not in paths:
@@ -213,11 +234,11 @@ def _read_check_holes(
     form = "[width, height] in pixels, which the checks need"
     size = vectors(file, "image_size", document.get("image_size"), (2,), form)
     width, height = (finite(file, "image_size", value, positive=True) for value in size.tolist())
-    tables = plate, read_columns(paths["checks"], "", "x y z u v")
+    checks = read_columns(paths["checks"], "", "x y z u v")
     return HoleObservations(
-        xyz=np.vstack([table.stack("x y z") for table in tables]),
-        uv=np.vstack([table.stack("u v") for table in tables]),
-        on_plate=np.repeat([True, False], [table.rows for table in tables]),
+        xyz=np.vstack([plate_xyz, checks.stack("x y z")]),
+        uv=np.vstack([plate_uv, checks.stack("u v")]),
+        on_plate=np.repeat([True, False], [len(plate_xyz), checks.rows]),
         image_size=(width, height),
     )
 

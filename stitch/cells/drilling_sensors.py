@@ -5,7 +5,7 @@ seen at many places and heights, which robot and rangers measure, shows them.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from stitch import frames
 from stitch.cells.job_files import align_points, on_a_line
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
+from stitch.reading.text_files import import_extra
 
 # The robot's base frame from outside: a marker's path while one joint turns is a circle about that joint's axis.
 
@@ -394,17 +395,43 @@ def euler_zyx(R: Array) -> Array:
     return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_euler("ZYX").reshape(*R.shape[:-2], 3))
 
 
-# Holes in a camera image. Needs OpenCV, which only `stitch[dev]` installs: `pip install opencv-python-headless`.
+# Holes in a camera image, found with OpenCV (the extra `vision`).
 
 
-def _opencv() -> Any:
+def holes_of_plate(picture: Path) -> Array:
+    """Return the centres (9, 2) of the plate's holes in a picture, from the top, each row from the left.
+
+    Raises:
+        InputError: no OpenCV, no picture, or another number of holes.
+    """
     try:
-        import cv2
-    except ImportError:
-        raise InputError(
-            "finding holes in images needs OpenCV; install opencv-python-headless, or give u, v of the holes in a CSV"
-        ) from None
-    return cv2
+        return order_grid(find_holes(_read_picture(picture)))
+    except NoResultError as error:
+        raise InputError(f"{picture}: {error}") from None
+
+
+def hole_at_tool(picture: Path, H: Array) -> Array:
+    """Return the centre (2,) of the hole nearest the tool's axis, by the homography of the work plane.
+
+    Raises:
+        InputError: no OpenCV, no picture, or no hole in it.
+    """
+    centres = find_holes(_read_picture(picture))
+    if not len(centres):
+        raise InputError(f"{picture}: no hole is found; to fix: light the part evenly, or write u, v in the CSV")
+    middle = _apply_homography(H, np.zeros((1, 2)))
+    return np.asarray(centres[np.linalg.norm(centres - middle, axis=1).argmin()])
+
+
+def _read_picture(file: Path) -> NDArray[np.uint8]:
+    """Read one grey channel of 8 bits."""
+    cv2 = import_extra("cv2", file, "vision")
+    if not file.is_file():
+        raise InputError(f"{file}: not found; to fix: correct its name, relative to the file that names it")
+    picture = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise InputError(f"{file}: is no picture that OpenCV reads; to fix: save it as PNG, JPEG or TIFF")
+    return np.asarray(picture, np.uint8)
 
 
 def find_holes(image: NDArray[np.uint8], min_width: float = 20.0) -> Array:
@@ -415,7 +442,7 @@ def find_holes(image: NDArray[np.uint8], min_width: float = 20.0) -> Array:
     Raises:
         InputError: OpenCV is not installed, or the image is not one grey channel.
     """
-    cv2 = _opencv()
+    cv2 = import_extra("cv2", "holes in a picture", "vision")
     if image.ndim != 2 or image.dtype != np.uint8:
         raise InputError(f"the image has shape {image.shape} and type {image.dtype}; give one grey channel of 8 bits")
     _, mask = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)
@@ -441,7 +468,8 @@ def order_grid(centres: Array, rows: int = 3, columns: int = 3) -> Array:
     """
     if len(centres) != rows * columns:
         raise NoResultError(
-            f"{len(centres)} holes found, {rows * columns} expected; light the plate evenly and keep it in the image"
+            f"{len(centres)} holes found, {rows * columns} expected; to fix: light the plate evenly and keep it in the "
+            "picture"
         )
     by_row = centres[np.argsort(centres[:, 1])].reshape(rows, columns, 2)
     return np.concatenate([row[np.argsort(row[:, 0])] for row in by_row])
