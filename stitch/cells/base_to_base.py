@@ -92,13 +92,13 @@ def solve_stand(stand: Stand) -> BaseResult:
         raise NoResultError(
             "rod and joints contradict each other: "
             + "; ".join(comparison_text(c, stand.length_unit) for c in wrong)
-            + ". No transform is given; read these points again"
+            + ". No transform is given; to fix: read these points again"
         )
     solution = fit_stand(stand)
     if solution.p_value < 2 * norm.sf(CONTRADICTION_SIGMAS):
         raise NoResultError(
             f"the readings contradict each other: chi-square {solution.chi_square:.1f} with {solution.redundancy} "
-            f"redundant readings; {_worst(stand, solution)}. Read that point again, or state larger sigmas"
+            f"redundant readings; {_worst(stand, solution)}; to fix: read that point again, or state larger sigmas"
         )
     try:
         return BaseResult(stand.length_unit, solution, project(stand), None, comparisons)
@@ -243,7 +243,7 @@ def _touched_points(
     check_keys(file, name, robot, {"points", "sigma"})
     entries = robot.get("points")
     if not isinstance(entries, list) or len(entries) < 2:
-        raise InputError(f"{file}: [[{name}.points]] needs at least two entries")
+        raise InputError(f"{file}: [[{name}.points]] has fewer than two entries; to fix: add one")
     readings = {"slide"} if name == "main" else {"slide", "angle", "length"}
     sigma = robot.get("sigma", {})
     check_keys(file, f"{name}.sigma", sigma, {"point", *_CYLINDER})
@@ -272,7 +272,9 @@ def _touched_points(
 
 def _entry(file: Path, place: str, entry: dict[str, Any], key: str) -> float:
     if key not in entry:
-        raise InputError(f"{file}: {place}.{key} is missing; give point = [x, y, z] or joint1, radius and height")
+        raise InputError(
+            f"{file}: {place}.{key} is missing; to fix: give point = [x, y, z] or joint1, radius and height"
+        )
     return finite(file, f"{place}.{key}", entry[key], positive=key == "radius")
 
 
@@ -283,7 +285,7 @@ def _column(
     for i, entry in enumerate(entries):
         place = f"{name}.points[{i + 1}].{key}"
         if key not in entry and not optional:
-            raise InputError(f"{file}: {place} is missing; every point of the rod needs slide, angle and length")
+            raise InputError(f"{file}: {place} is missing; to fix: give every point of the rod slide, angle and length")
         values.append(finite(file, place, entry[key], positive) if key in entry else np.nan)
     return np.array(values, float)
 
@@ -297,18 +299,24 @@ def _check_geometry(file: Path, stand: Stand) -> None:
     rail = stand.rail.points
     extent = float(np.linalg.norm(rail - rail.mean(axis=0), axis=1).max())
     if extent < 100 * np.sqrt(np.trace(stand.rail.covariance[0]) / 3):
-        raise InputError(f"{file}: main.points lie within {2 * extent:.3g}; a rail's direction needs points far apart")
+        raise InputError(
+            f"{file}: main.points lie within {2 * extent:.3g}; to fix: measure points farther apart on the rail"
+        )
     if not np.isfinite(stand.rail_slide).any():
-        raise InputError(f"{file}: no main point has a slide reading; write slide = 0 at the one that sets the zero")
+        raise InputError(
+            f"{file}: no main point has a slide reading; to fix: write slide = 0 at the one that sets the zero"
+        )
     x = rail_direction(rail)
     read = stand.rail_slide[np.isfinite(stand.rail_slide)]
     if np.isnan(stand.rail_slide[-1]) or (np.diff(rail @ x) <= 0).any() or (np.diff(read) <= 0).any():
         raise InputError(
             f"{file}: main.points must be listed in the direction in which the slide grows, the last with its slide "
-            "reading; reorder them, or correct a slide reading"
+            "reading; to fix: reorder them, or correct a slide reading"
         )
     if abs(x[2]) > 0.9:
-        raise InputError(f"{file}: the rail stands upright in the main base; it must lie, or the rod has no level")
+        raise InputError(
+            f"{file}: the rail stands upright in the main base; to fix: correct its points, for a rail lies level"
+        )
 
 
 # What `stitch base` does: a stand solved, shown, drawn, and as a session.

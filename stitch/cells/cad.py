@@ -92,7 +92,9 @@ def read_scan_table(file: Path) -> PlacedScans:
     for name in table.texts["file"]:
         points = read_cloud(file.parent / name).points
         if len(points) < _MIN_SCAN_POINTS:
-            raise InputError(f"{file.parent / name}: {len(points)} points are too few; scan again or drop its row")
+            raise InputError(
+                f"{file.parent / name}: {len(points)} points are too few; to fix: scan again or drop its row"
+            )
         clouds.append(points)
     names = [Path(name).stem for name in table.texts["file"]]
     if len(set(names)) < len(names):
@@ -108,11 +110,15 @@ def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
     """
     session = load_session(folder, at_most=None)
     if session.mount != "eye_in_hand":
-        raise InputError(f"{folder / 'session.toml'}: mount is {session.mount!r}; the scanner must ride on the flange")
+        raise InputError(
+            f"{folder / 'session.toml'}: mount is {session.mount!r}; to fix: take scans with the scanner on the flange"
+        )
     clouds = []
     for view in session.views:
         if view.cloud is None or len(view.cloud.points) < _MIN_SCAN_POINTS:
-            raise InputError(f"{folder / 'views.csv'}: view {view.name} has too few points; scan again or drop its row")
+            raise InputError(
+                f"{folder / 'views.csv'}: view {view.name} has too few points; to fix: scan again or drop its row"
+            )
         clouds.append(view.cloud.points)
     poses = np.array([view.T_base_flange for view in session.views])
     T_flange_scanner = read_hand_eye(hand_eye, session.length_unit)
@@ -131,11 +137,17 @@ def read_hand_eye(file: Path, length_unit: str) -> Array:
         T, unit = np.array(document["hand_eye"], float), METRES[document["length_unit"]]
         mount = document.get("mount", "eye_in_hand")
     except FileNotFoundError:
-        raise InputError(f"{file}: not found; `stitch calibrate sphere SESSION -o {file.name}` writes one") from None
+        raise InputError(
+            f"{file}: not found; to fix: write it with `stitch calibrate sphere SESSION -o {file.name}`"
+        ) from None
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"{file}: holds no hand_eye with length_unit; name what stitch calibrate wrote") from None
+        raise InputError(
+            f"{file}: holds no hand_eye with length_unit; to fix: name what stitch calibrate wrote"
+        ) from None
     if not frames.is_rigid(T) or mount != "eye_in_hand":
-        raise InputError(f"{file}: hand_eye must be a rigid motion of a scanner on the flange (eye_in_hand)")
+        raise InputError(
+            f"{file}: hand_eye is no rigid motion of a scanner on the flange; to fix: name an eye_in_hand calibration"
+        )
     T[:3, 3] *= unit / METRES[length_unit]
     return T
 
@@ -177,13 +189,13 @@ def read_cad(file: Path) -> CadSurface:
         InputError: missing, unreadable or without triangles.
     """
     if not file.is_file():
-        raise InputError(f"{file}: not found; name the CAD model as a mesh, STL, PLY or OBJ")
+        raise InputError(f"{file}: not found; to fix: name the CAD model as a mesh, STL, PLY or OBJ")
     try:
         mesh = trimesh.load_mesh(file)
     except Exception as error:
-        raise InputError(f"{file}: cannot be read ({reason_of(error)}); export the mesh again") from None
+        raise InputError(f"{file}: cannot be read ({reason_of(error)}); to fix: export the mesh again") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError(f"{file}: holds no triangles; export the CAD model as a triangle mesh")
+        raise InputError(f"{file}: holds no triangles; to fix: export the CAD model as a triangle mesh")
     return cad_surface(mesh)
 
 

@@ -137,7 +137,7 @@ def read_drill_job(file: Path | str) -> DrillJob:
     paths = {key: resolve_file(file, key, document[key]) for key in _FILES if key in document}
     for key in _NEEDED:
         if key not in paths:
-            raise InputError(f"{file}: {key} is missing; name the CSV file")
+            raise InputError(f"{file}: {key} is missing; to fix: name the CSV file")
     plate_xyz, plate_uv = _read_plate(paths["plate"], paths.get("plate_image"))
     holes = _read_holes(paths["holes"])
     return DrillJob(
@@ -172,14 +172,16 @@ def _read_holes(file: Path) -> tuple[Hole, ...]:
     for row, (name, group, kind) in enumerate(zip(*(table.texts[c] for c in ("hole", "group", "kind")), strict=True)):
         size = np.linalg.norm(directions[row])
         if abs(size - 1) > 0.01:
-            raise InputError(f"{file}: direction of hole {name} has length {size:.4f}; i, j, k must be a unit vector")
+            raise InputError(
+                f"{file}: direction of hole {name} has length {size:.4f}; to fix: write i, j, k as a unit vector"
+            )
         if kind not in ("reference", "drill"):
-            raise InputError(f"{file}: kind of hole {name} is {kind!r}; write reference or drill")
+            raise InputError(f"{file}: kind of hole {name} is {kind!r}; to fix: write reference or drill")
         holes.append(Hole(name, group, kind == "reference", positions[row], directions[row] / size))
     pairs = [(hole.name, hole.group) for hole in holes]
     for pair in pairs:
         if pairs.count(pair) > 1:
-            raise InputError(f"{file}: hole {pair[0]} stands twice in group {pair[1]}; leave one of them out")
+            raise InputError(f"{file}: hole {pair[0]} stands twice in group {pair[1]}; to fix: leave one of them out")
     return tuple(holes)
 
 
@@ -197,10 +199,11 @@ def _read_placed_tools(file: Path, holes: tuple[Hole, ...], plate_xyz: Array, pl
     require_unique(file, "hole", names)
     for hole in holes:
         if hole.reference and hole.name not in names:
-            raise InputError(f"{file}: reference hole {hole.name} is missing; add where the robot ended on it")
+            raise InputError(f"{file}: reference hole {hole.name} is missing; to fix: add where the robot ended on it")
         if hole.reference and poses[names.index(hole.name), :3, 2] @ hole.direction < _ALONG:
             raise InputError(
-                f"{file}: on hole {hole.name} the tool's z lies more than 30° off the hole's direction; directions "
+                f"{file}: on hole {hole.name} the tool's z lies more than 30° off the hole's direction; to fix: "
+                "let directions "
                 "point into the part, and a, b, c turn about z, y', x''"
             )
     seen = zip(names, poses, pixels, table.numbers["height"].tolist(), strict=True)
@@ -213,13 +216,13 @@ def _read_ranger_tables(file: Path | None) -> dict[str, tuple[Array, Array]]:
     table = read_columns(file, "ranger", "a b c d reading")
     planes, readings, names = table.stack("a b c d"), table.numbers["reading"], np.array(table.texts["ranger"])
     if (np.linalg.norm(planes[:, :3], axis=1) == 0).any():
-        raise InputError(f"{file}: a plane has a = b = c = 0; write its normal there")
+        raise InputError(f"{file}: a plane has a = b = c = 0; to fix: write its normal there")
     return {str(name): (planes[names == name], readings[names == name]) for name in dict.fromkeys(names)}
 
 
 def _read_marker_paths(file: Path, paths: dict[str, Path]) -> tuple[Array, Array] | None:
     if ("joint1" in paths) != ("joint6" in paths):
-        raise InputError(f"{file}: joint1 and joint6 belong together; name both marker paths or neither")
+        raise InputError(f"{file}: joint1 and joint6 belong together; to fix: name both marker paths or neither")
     if "joint1" not in paths:
         return None
     return tuple(read_columns(paths[key], "", "x y z").stack("x y z") for key in ("joint6", "joint1"))  # type: ignore[return-value]
@@ -287,7 +290,7 @@ def solve_drill_job(job: DrillJob) -> DrillResult:
     for group in dict.fromkeys(hole.group for hole in job.holes):
         references = [hole for hole in job.holes if hole.group == group and hole.reference]
         if len(references) < 3:
-            raise NoResultError(f"group {group}: {len(references)} reference holes; a group needs three or more")
+            raise NoResultError(f"group {group}: {len(references)} reference holes; to fix: give it three or more")
         actual = np.array([_measured_hole(job, H, effects, hole.name) for hole in references])
         groups[group] = compensate_group(np.array([hole.position for hole in references]), actual)
     tool_axis = _fitted_tool_axis(job, groups)

@@ -46,7 +46,7 @@ def fit_circle(points: Array) -> Circle:
     _, spread, axes = np.linalg.svd(points - middle, full_matrices=False)
     if len(points) < 4 or spread[1] < 1e-6 * spread[0]:
         raise NoResultError(
-            "a circle needs four or more marker positions that do not lie on a line; turn the joint further"
+            "a circle needs four or more marker positions that do not lie on a line; to fix: turn the joint further"
         )
     flat = (points - middle) @ axes[:2].T
     # Algebraic circle |p|² = 2 c·p + k as a start.
@@ -74,7 +74,7 @@ def base_frame(joint6_path: Array, joint1_path: Array, height_joint6: float = 0.
     z = about_z.axis
     y = np.cross(z, about_x.axis)
     if np.linalg.norm(y) < np.sin(_PARALLEL):
-        raise NoResultError("the axes of joint 1 and joint 6 are parallel at this pose; move to the home pose")
+        raise NoResultError("the axes of joint 1 and joint 6 are parallel at this pose; to fix: move to the home pose")
     y /= np.linalg.norm(y)
     x = np.cross(y, z)
     # The foot of the common normal: c1 + a z and c6 + b x6 at their closest.
@@ -98,7 +98,7 @@ def fit_homography(xy: Array, uv: Array) -> Array:
     xy, uv = np.asarray(xy, float), np.asarray(uv, float)
     if len(xy) < 4:
         raise NoResultError(
-            f"a homography needs four or more holes, {len(xy)} are given; find more of them in the image"
+            f"a homography needs four or more holes, {len(xy)} are given; to fix: find more of them in the image"
         )
     to_xy, to_uv = normaliser(xy), normaliser(uv)
     p, q = _apply_homography(to_xy, xy), _apply_homography(to_uv, uv)
@@ -107,7 +107,7 @@ def fit_homography(xy: Array, uv: Array) -> Array:
     matrix = np.vstack([np.hstack([row, zero, -q[:, :1] * row]), np.hstack([zero, row, -q[:, 1:] * row])])
     values, vectors = np.linalg.svd(matrix)[1:]
     if values[7] < 1e-9 * values[0]:
-        raise NoResultError("the holes lie on a line and fix no homography; use holes spread over the plane")
+        raise NoResultError("the holes lie on a line and fix no homography; to fix: use holes spread over the plane")
     h = vectors[8]
     # In normalised coordinates the plane's centre maps near the image's, so the last entry is far from zero.
     start = h[:8] / h[8]
@@ -257,13 +257,13 @@ def _check_enough(observations: HoleObservations, effects: tuple[str, ...]) -> N
     """Refuse holes that leave the camera or an effect open."""
     if len(observations.xyz) < 8 or np.ptp(observations.xyz[:, 2]) < 1e-3 * np.ptp(observations.xyz[:, 0]):
         raise NoResultError(
-            "a camera beyond its work plane needs eight or more holes at different heights; measure some"
+            "a camera beyond its work plane needs eight or more holes at different heights; to fix: measure some"
         )
     if "plate_height" in effects and not (
         observations.on_plate.any() and np.unique(observations.xyz[~observations.on_plate, 2]).size > 1
     ):
         raise NoResultError(
-            "a plate height error shows only against a hole seen at several other heights; measure some"
+            "a plate height error shows only against a hole seen at several other heights; to fix: measure some"
         )
 
 
@@ -368,7 +368,7 @@ def compensate_group(nominal: Array, actual: Array) -> GroupCompensation:
     """
     nominal, actual = np.asarray(nominal, float), np.asarray(actual, float)
     if len(nominal) < 3 or on_a_line(nominal) or on_a_line(actual):
-        raise NoResultError("a group needs three or more reference holes off one line; add a reference hole")
+        raise NoResultError("a group needs three or more reference holes off one line; to fix: add a reference hole")
     T = align_points(nominal, actual)
     return GroupCompensation(T, actual - frames.transform(T, nominal), actual - nominal)
 
@@ -444,7 +444,9 @@ def find_holes(image: NDArray[np.uint8], min_width: float = 20.0) -> Array:
     """
     cv2 = import_extra("cv2", "holes in a picture", "vision")
     if image.ndim != 2 or image.dtype != np.uint8:
-        raise InputError(f"the image has shape {image.shape} and type {image.dtype}; give one grey channel of 8 bits")
+        raise InputError(
+            f"the image has shape {image.shape} and type {image.dtype}; to fix: give one grey channel of 8 bits"
+        )
     _, mask = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY_INV + cv2.THRESH_OTSU)
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     centres = []
@@ -519,7 +521,7 @@ def fit_ranger(planes: Array, readings: Array) -> RangerFit:
     scale = np.linalg.norm(matrix, axis=0)
     if len(planes) < 6 or (scale == 0).any() or np.linalg.cond(matrix / scale) > 1e6:
         raise NoResultError(
-            "six or more plane positions are needed, tilted both ways and at different distances; measure more"
+            "six or more plane positions are needed, tilted both ways and at different distances; to fix: measure more"
         )
     start = np.linalg.lstsq(matrix, -offsets, rcond=None)[0]
     n0 = start[3:] / np.linalg.norm(start[3:])

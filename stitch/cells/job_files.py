@@ -39,7 +39,7 @@ def read_job_file(file: Path, expected_format: str, known: set[str], example: st
     """
     document = read_toml(file, f"see {example} for how it looks")
     if document.get("format") != expected_format:
-        raise InputError(f'{file}: format is {document.get("format")!r}; expected "{expected_format}"')
+        raise InputError(f'{file}: format is {document.get("format")!r}; to fix: write "{expected_format}"')
     check_keys(file, "", document, known)
     return document
 
@@ -52,7 +52,7 @@ def table(file: Path, document: dict[str, Any], name: str) -> dict[str, Any]:
     """
     entry = document.get(name)
     if not isinstance(entry, dict):
-        raise InputError(f"{file}: [{name}] is missing")
+        raise InputError(f"{file}: [{name}] is missing; to fix: add this table")
     return entry
 
 
@@ -63,12 +63,12 @@ def check_keys(file: Path, place: str, entries: Any, known: set[str]) -> None:
         InputError: `entries` is not a table or holds an unknown key.
     """
     if not isinstance(entries, dict):
-        raise InputError(f"{file}: {place} must be a table")
+        raise InputError(f"{file}: {place} is no table; to fix: write [{place}]")
     for key in entries:
         if key not in known:
             close = get_close_matches(key, known, 1)
-            hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(sorted(known))}"
-            raise InputError(f"{file}: unknown key {f'{place}.{key}' if place else key!r}; {hint}")
+            hint = f"write {close[0]!r}" if close else f"write one of {', '.join(sorted(known))}"
+            raise InputError(f"{file}: unknown key {f'{place}.{key}' if place else key!r}; to fix: {hint}")
 
 
 def choice(file: Path, place: str, value: Any, known: tuple[str, ...]) -> str:
@@ -78,7 +78,7 @@ def choice(file: Path, place: str, value: Any, known: tuple[str, ...]) -> str:
         InputError: it is none.
     """
     if not isinstance(value, str) or value not in known:
-        raise InputError(f"{file}: {place} is {value!r}; write one of {', '.join(known)}")
+        raise InputError(f"{file}: {place} is {value!r}; to fix: write one of {', '.join(known)}")
     return value
 
 
@@ -89,11 +89,11 @@ def finite(file: Path, place: str, value: Any, positive: bool = False) -> float:
         InputError: it is none.
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{file}: {place} is {value!r}; write a finite number")
+        raise InputError(f"{file}: {place} is {value!r}; to fix: write a finite number")
     if abs(value) > HIGHEST_VALUE:
-        raise InputError(f"{file}: {place} is {value!r}; nothing in a cell is that large")
+        raise InputError(f"{file}: {place} is {value!r}; to fix: write a number that a cell can have")
     if positive and value < LOWEST_VALUE:
-        raise InputError(f"{file}: {place} is {value!r}; it must be above zero")
+        raise InputError(f"{file}: {place} is {value!r}; to fix: write a number above zero")
     return float(value)
 
 
@@ -116,7 +116,7 @@ def _flat(file: Path, place: str, value: Any, shape: tuple[int, ...], form: str)
     if not shape:
         return [value]
     if not isinstance(value, list) or len(value) != shape[0]:
-        raise InputError(f"{file}: {place} is {reprlib.repr(value)}; write {form}")
+        raise InputError(f"{file}: {place} is {reprlib.repr(value)}; to fix: write {form}")
     return [entry for part in value for entry in _flat(file, place, part, shape[1:], form)]
 
 
@@ -127,7 +127,7 @@ def resolve_file(file: Path, place: str, value: Any) -> Path:
         InputError: no name in quotes.
     """
     if not isinstance(value, str):
-        raise InputError(f"{file}: {place} is {value!r}; name a file in quotes")
+        raise InputError(f"{file}: {place} is {value!r}; to fix: name a file in quotes")
     return file.parent / value
 
 
@@ -160,9 +160,11 @@ def read_columns(file: Path, texts: str, numbers: str) -> CsvColumns:
     header, lines = read_csv_lines(file)
     for name in (*texts.split(), *numbers.split()):
         if name not in header:
-            raise InputError(f"{file}: column {name!r} is missing; the header must name {texts} {numbers}".rstrip())
+            raise InputError(
+                f"{file}: column {name!r} is missing; to fix: name {texts} {numbers} in the header".rstrip()
+            )
     if not lines:
-        raise InputError(f"{file}: no rows below the header; add one per line")
+        raise InputError(f"{file}: no rows below the header; to fix: add one per line")
     rows = [(line, dict(zip(header, cells + [""] * len(header), strict=False))) for line, cells in lines]
     return CsvColumns(
         {name: [_text(file, line, name, row[name]) for line, row in rows] for name in texts.split()},
@@ -182,19 +184,19 @@ def require_unique(file: Path, what: str, names: list[str]) -> None:
     """
     for name in names:
         if names.count(name) > 1:
-            raise InputError(f"{file}: {what} {name} stands twice; leave one of them out, or rename it")
+            raise InputError(f"{file}: {what} {name} stands twice; to fix: leave one of them out, or rename it")
 
 
 def _text(file: Path, line: int, name: str, cell: str) -> str:
     if not cell.strip():
-        raise InputError(f"{file} line {line}: {name} is empty; write a name")
+        raise InputError(f"{file} line {line}: {name} is empty; to fix: write a name")
     return cell.strip()
 
 
 def _number(file: Path, line: int, name: str, cell: str) -> float:
     value = finite_number(file, line, name, cell)
     if abs(value) > HIGHEST_VALUE:
-        raise InputError(f"{file} line {line}: {name} is {cell.strip()!r}; nothing in a cell is that large")
+        raise InputError(f"{file} line {line}: {name} is {cell.strip()!r}; to fix: write a number that a cell can have")
     return value
 
 
@@ -235,9 +237,9 @@ def write_recording_and_page(command: str, recording: Path | None, report: Path 
             continue
         offered = entry_points(group=group, name=command)
         if not offered:
-            raise InputError(f"{path}: no writer for `stitch {command}` is installed; install stitch anew")
+            raise InputError(f"{path}: no writer for `stitch {command}` is installed; to fix: install stitch anew")
         if not path.parent.is_dir():
-            raise InputError(f"{path}: its folder does not exist; make it first")
+            raise InputError(f"{path}: its folder does not exist; to fix: make it first")
         with whole_file(path) as scratch:
             for writer in offered:
                 writer.load()(*results, scratch)

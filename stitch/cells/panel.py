@@ -120,10 +120,12 @@ def read_calibration(
     sides = seen[:, 1:] - seen[:, :1]
     flat = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) < _FLAT * (sides**2).sum(axis=(1, 2))
     if flat.any():
-        raise InputError(f"{file}: data row {np.argmax(flat) + 1}: the reflectors lie on one line; read them again")
+        raise InputError(
+            f"{file}: data row {np.argmax(flat) + 1}: the reflectors lie on one line; to fix: read them again"
+        )
     for name in names:
         if not (robot == name).any():
-            raise InputError(f"{file}: robot {name} has no row; measure its poses, or leave it out of the job")
+            raise InputError(f"{file}: robot {name} has no row; to fix: measure its poses, or leave it out of the job")
     return tuple(
         ReflectorReadings(n, poses[robot == n], seen[robot == n], tracker.sigma(seen[robot == n])) for n in names
     )
@@ -140,7 +142,7 @@ def read_per_robot(file: Path, names: tuple[str, ...], column_names: str) -> Arr
     listed = columns.texts["robot"]
     for name in names:
         if listed.count(name) != 1:
-            raise InputError(f"{file}: robot {name} stands in {listed.count(name)} rows; give each robot one")
+            raise InputError(f"{file}: robot {name} stands in {listed.count(name)} rows; to fix: give each robot one")
     return columns.stack(column_names)[[listed.index(name) for name in names]]
 
 
@@ -157,7 +159,9 @@ def read_panel_points(file: Path, robots: tuple[str, ...] | None, T_world_tracke
         clamp = np.array([robots.index(name) for name in columns.texts["robot"]])
         for i, name in enumerate(robots):
             if not (clamp == i).any():
-                raise InputError(f"{file}: robot {name} has no control point; measure one or more beside its clamp")
+                raise InputError(
+                    f"{file}: robot {name} has no control point; to fix: measure one or more beside its clamp"
+                )
     seen = frames.transform(T_world_tracker, columns.stack("seen_x seen_y seen_z"))
     return PanelPoints(columns.texts["point"], columns.stack("x y z"), seen, clamp)
 
@@ -180,7 +184,7 @@ def read_world(file: Path, tracker: LaserTracker) -> Array:
     if np.linalg.norm(found.residuals[worst]) > 10 * np.sqrt(3) * sigma[worst]:
         size = float(np.linalg.norm(found.residuals[worst]))
         raise InputError(
-            f"{file}: point {columns.texts['point'][worst]} is {size:.3f} mm off the others; measure it anew"
+            f"{file}: point {columns.texts['point'][worst]} is {size:.3f} mm off the others; to fix: measure it anew"
         )
     return frames.inverse(found.T)
 
@@ -193,7 +197,9 @@ def require_known_robots(file: Path, columns: CsvColumns, names: tuple[str, ...]
     """
     for name in columns.texts["robot"]:
         if name not in names:
-            raise InputError(f"{file}: robot {name!r} is not in the job's robots {', '.join(names)}; correct its name")
+            raise InputError(
+                f"{file}: robot {name!r} is not in the job's robots {', '.join(names)}; to fix: correct its name"
+            )
 
 
 # A panel job (TOML) and its CSV files -> `Job`; every check of the input is made here.
@@ -235,9 +241,11 @@ def read_panel_job(file: Path | str) -> PanelJob:
     document = read_job_file(file, PANEL_FORMAT, _KEYS, "examples/panel/job.toml")
     robots = document.get("robots")
     if not isinstance(robots, list) or len(robots) < 2 or not all(isinstance(r, str) for r in robots):
-        raise InputError(f"{file}: robots is {robots!r}; list the robots' names, row by row")
+        raise InputError(f"{file}: robots is {robots!r}; to fix: list the robots' names, row by row")
     if len(set(robots)) != len(robots) or len(robots) % 2:
-        raise InputError(f"{file}: robots must be an even number of different names, half of them in each row")
+        raise InputError(
+            f"{file}: robots has an odd number of names or one twice; to fix: list half of them for each row"
+        )
     names = tuple(robots)
     paths = _file_paths(file, table(file, document, "files"))
     tracker = _read_tracker(file, table(file, document, "tracker"))
@@ -290,7 +298,7 @@ def _read_shape(file: Path, entries: Any) -> tuple[float, Array]:
     check_keys(file, "shape", entries, {"tolerance", "axes"})
     axes = entries.get("axes", ["rx", "ry", "z"])
     if not isinstance(axes, list) or not axes:
-        raise InputError(f"{file}: shape.axes is {axes!r}; list some of {', '.join(_AXES)}")
+        raise InputError(f"{file}: shape.axes is {axes!r}; to fix: list some of {', '.join(_AXES)}")
     for axis in axes:
         choice(file, "shape.axes", axis, _AXES)
     return (
@@ -307,17 +315,21 @@ def _read_legs(file: Path, entries: Any) -> Legs | None:
     legs = Legs(*(vectors(file, f"legs.{key}", entries.get(key), (6, 3), form) for key in ("base", "platform")))
     for name, joints in (("base", legs.base), ("platform", legs.platform)):
         if np.linalg.matrix_rank(joints - joints.mean(axis=0), tol=1e-3) < 2:
-            raise InputError(f"{file}: legs.{name}: the six joints lie on one line; give them in mm, leg by leg")
+            raise InputError(
+                f"{file}: legs.{name}: the six joints lie on one line; to fix: give them in mm, leg by leg"
+            )
     return legs
 
 
 def _file_paths(file: Path, entries: dict[str, Any]) -> dict[str, Path]:
     check_keys(file, "files", entries, _FILES)
     if "calibration" not in entries:
-        raise InputError(f"{file}: files.calibration is missing; without it nothing is known about the robots")
+        raise InputError(f"{file}: files.calibration is missing; to fix: name the table of the robots' calibration")
     for first, second in (("targets", "flanges"), ("control", "flanges")):
         if first in entries and second not in entries:
-            raise InputError(f"{file}: files.{first} needs files.{second}: where the robots stood at that time")
+            raise InputError(
+                f"{file}: files.{first} is without files.{second}; to fix: add where the robots stood then"
+            )
     return {key: resolve_file(file, f"files.{key}", value) for key, value in entries.items()}
 
 

@@ -119,7 +119,9 @@ def initial_guess(readings: ReflectorReadings) -> tuple[Array, Array]:
         NoResultError: too few poses, or motions about one axis only.
     """
     if len(readings.T_base_flange) < _MINIMUM:
-        raise NoResultError(f"robot {readings.name}: {len(readings.T_base_flange)} poses; measure at least {_MINIMUM}")
+        raise NoResultError(
+            f"robot {readings.name}: {len(readings.T_base_flange)} poses; to fix: measure at least {_MINIMUM}"
+        )
     T_world_contact = contact_frame(readings.reflectors)
     A = frames.inverse(readings.T_base_flange[:1]) @ readings.T_base_flange[1:]
     B = frames.inverse(T_world_contact[:1]) @ T_world_contact[1:]
@@ -318,19 +320,23 @@ def clamp_contacts(layout: ClampLayout) -> Contacts:
     half_chords = {"clamp_width": layout.clamp_width / 2, "spacing": layout.spacing / 2}
     for name, half in half_chords.items():
         if half >= layout.radius:
-            raise InputError(f"layout: {name} is {2 * half:g} mm, wider than the cylinder; make it smaller")
+            raise InputError(f"layout: {name} is {2 * half:g} mm, wider than the cylinder; to fix: make it smaller")
     width, free = (2 * np.arcsin(half / layout.radius) for half in half_chords.values())
     rise = layout.radius * (1 - np.cos(width / 2))
     if rise >= layout.clamp_height:
-        raise InputError(f"layout: clamp_height is below the arc's rise of {rise:.3g} mm under it; make it larger")
+        raise InputError(
+            f"layout: clamp_height is below the arc's rise of {rise:.3g} mm under it; to fix: make it larger"
+        )
     tilt = float(np.arcsin(rise / layout.clamp_height))
     outer = layout.length / 2 - layout.edge
     inner = outer - layout.clamp_height * np.cos(tilt)
     if inner <= 0:
-        raise InputError("layout: edge and clamp_height together reach over the panel's middle; make them smaller")
+        raise InputError(
+            "layout: edge and clamp_height together reach over the panel's middle; to fix: make them smaller"
+        )
     angles = (width + free) * (np.arange(layout.columns) - (layout.columns - 1) / 2)
     if np.abs(angles).max() + width / 2 >= np.pi / 2:
-        raise InputError("layout: the clamps reach beyond a quarter turn; take fewer columns or less spacing")
+        raise InputError("layout: the clamps reach beyond a quarter turn; to fix: take fewer columns or less spacing")
     pads = np.array([_pads(layout.radius, a, width, side * outer, side * inner) for side in (-1, 1) for a in angles])
     return Contacts(pads, contact_frame(pads), angles, tilt)
 
@@ -448,7 +454,8 @@ def _twists_per_leg(legs: Legs, T_base_flange: Array) -> Array:
     if len(loose):
         x, y, z = T_base_flange[loose[0], :3, 3]
         raise NoResultError(
-            f"the legs leave the flange loose at {x:.1f} {y:.1f} {z:.1f} mm; correct that pose, or the joints in [legs]"
+            f"the legs leave the flange loose at {x:.1f} {y:.1f} {z:.1f} mm; to fix: correct that pose, or the "
+            "joints in [legs]"
         )
     return np.asarray(np.linalg.inv(lengths))
 
@@ -476,9 +483,11 @@ def rigid_fit(nominal: Array, measured: Array, sigma: Array) -> RigidFit:
     """
     nominal, measured = np.asarray(nominal, float), np.asarray(measured, float)
     if len(nominal) < 3:
-        raise NoResultError(f"{len(nominal)} points fix no pose; measure at least three that are not on a line")
+        raise NoResultError(f"{len(nominal)} points fix no pose; to fix: measure at least three that are not on a line")
     if on_a_line(nominal):
-        raise NoResultError("all points lie on one line: the turn about it is open; measure a point off the line")
+        raise NoResultError(
+            "all points lie on one line: the turn about it is open; to fix: measure a point off the line"
+        )
     T = align_points(nominal, measured)
     arms = nominal - nominal.mean(axis=0)
     design = np.concatenate([-frames.skew(arms), np.tile(np.eye(3), (len(arms), 1, 1))], axis=-1)

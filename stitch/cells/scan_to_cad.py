@@ -92,7 +92,8 @@ def read_allowance(text: str | None) -> AllowancePrior:
         known = float("nan")
     if not np.isfinite(known):
         raise InputError(
-            f"--allowance is {text!r}; write free (to find an even one), varying (one that changes slowly over the "
+            f"--allowance is {text!r}; to fix: write free (to find an even one), varying (one that changes slowly "
+            "over the "
             "part), or the stock in the CAD's unit, as 0.3"
         )
     return AllowancePrior(known=known)
@@ -172,7 +173,7 @@ def separable_share(N: Array) -> float:
         along = " ".join(f"{x:.2f}" for x in shift)
         raise NoResultError(
             f"the allowance cannot be told from a shift of the part along ({along}): all that was scanned looks to "
-            "one side; scan opposite sides too, or state the stock, as --allowance 0.3"
+            "one side; to fix: scan opposite sides too, or state the stock, as --allowance 0.3"
         )
     return share
 
@@ -352,7 +353,9 @@ def _find_correspondences(
     found = nearest_partners(cad, local, frames.rotate(T, scan.normals))
     used = found.accept if regions is None else found.accept & regions.used(local)
     if used.sum() < _MIN_FIT_POINTS:
-        raise NoResultError(f"{used.sum()} points meet the CAD; check the start, the regions and the CAD's unit")
+        raise NoResultError(
+            f"{used.sum()} points meet the CAD; to fix: check the start, the regions and the CAD's unit"
+        )
     stock = allowance_columns(local, cad, prior)
     design = np.hstack([np.cross(local - cad.centre, found.normal), found.normal, -stock])
     return _Correspondences(local, found, used, stock, design)
@@ -366,7 +369,7 @@ def _normal_matrix(design: Array, weight: Array, cad: CadSurface) -> Array:
     if values[0] < _OPEN * values[-1]:
         shift = ", and of a plate the allowance is a shift along its normal" if len(N) > 6 else ""
         raise NoResultError(
-            f"the scanned surface leaves a direction open (plane, cylinder or sphere){shift}; scan an edge too"
+            f"the scanned surface leaves a direction open (plane, cylinder or sphere){shift}; to fix: scan an edge too"
         )
     if len(N) > 6:
         separable_share(N)
@@ -405,7 +408,9 @@ def find_cad_start(scan: JoinedScans, cad: CadSurface) -> CadStart:
         NoResultError: no candidate brings a third of the scan onto the CAD.
     """
     if scan.usable.sum() < _MIN_START_POINTS:
-        raise NoResultError(f"{scan.usable.sum()} usable points in the scan; the rest are edges or seen too flat")
+        raise NoResultError(
+            f"{scan.usable.sum()} usable points in the scan; to fix: scan surfaces head-on, edges do not count"
+        )
     index = _spread_sample(scan)
     points, normals = scan.points[index], scan.normals[index]
     gate, fine = cad.size / 25, cad.size / 250
@@ -421,7 +426,8 @@ def find_cad_start(scan: JoinedScans, cad: CadSurface) -> CadStart:
     ]
     if shares[best] < _LEAST_SHARE:
         raise NoResultError(
-            f"scan and CAD do not meet: {shares[best]:.0%} of the points at best; check the CAD's unit, or cut away "
+            f"scan and CAD do not meet: {shares[best]:.0%} of the points at best; to fix: check the CAD's unit, "
+            "or cut away "
             "what is not the part"
         )
     return CadStart(refined[best], shares[best], max(elsewhere, default=0.0))
@@ -435,7 +441,7 @@ def _spread_sample(scan: JoinedScans) -> Indices:
     kept = usable[np.sort(first)]
     if len(kept) < _MIN_START_POINTS:
         raise NoResultError(
-            f"the scans reach over {70 * size:.3g}, mostly empty; correct a scanner's pose, or cut them"
+            f"the scans reach over {70 * size:.3g}, mostly empty; to fix: correct a scanner's pose, or cut them"
         )
     picked: Indices = kept[even_indices(len(kept), _START_POINTS)]
     return picked
@@ -621,6 +627,6 @@ def split_instances(scan: JoinedScans, cad: CadSurface, count: int) -> list[Join
     big = [heap for heap in heaps if scan.area[heap].sum() > _MIN_INSTANCE_SHARE * cad.mesh.area / 2]
     if len(big) < count:
         raise NoResultError(
-            f"{len(big)} separate parts in the scan, {count} wanted; scan the others, or correct `instances`"
+            f"{len(big)} separate parts in the scan, {count} wanted; to fix: scan the others, or correct `instances`"
         )
     return [scan.take(heap) for heap in sorted(big, key=lambda heap: -scan.area[heap].sum())[:count]]

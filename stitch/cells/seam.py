@@ -43,15 +43,17 @@ def find_edge(points: Array, normals: Array, facing: float) -> SeamEdge:
     up, out = normals[:, 2], facing * normals[:, 0]
     flank = points[(out > 0.75) & (up < 0.6)]
     if len(flank) < _FEWEST:
-        raise NoResultError(f"{len(flank)} points on the flank; scan it leaned by 30 to 45° towards it")
+        raise NoResultError(f"{len(flank)} points on the flank; to fix: scan it leaned by 30 to 45° towards it")
     rim = np.median(flank[:, 0])
     top = points[(up > 0.85) & (np.abs(points[:, 0] - rim) < _REACH)]
     if len(top) < _FEWEST:
-        raise NoResultError(f"{len(top)} points on the outer surface; scan the seam wider")
+        raise NoResultError(f"{len(top)} points on the outer surface; to fix: scan the seam wider")
     # The flank of a bent sheet may bend too further down: only its upper part makes the edge.
     flank = flank[flank[:, 2] > np.median(top[:, 2]) - _REACH / 2]
     if len(flank) < _FEWEST:
-        raise NoResultError(f"{len(flank)} points on the flank's upper part; scan it leaned by 30 to 45° towards it")
+        raise NoResultError(
+            f"{len(flank)} points on the flank's upper part; to fix: scan it leaned by 30 to 45° towards it"
+        )
     a, s, h = top.T
     design = np.column_stack([a**0, a - rim, s, (a - rim) ** 2, s**2, (a - rim) * s])
     surface, surface_spread = _robust(design, h, top)

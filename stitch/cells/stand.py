@@ -208,7 +208,7 @@ def fit_stand(stand: Stand) -> BaseFit:
     U, values, Vt = np.linalg.svd(jacobian, full_matrices=False)
     if len(U) < len(Vt) or values[-1] < 1e-7 * values[0]:
         raise NoResultError(
-            "turning the second base about the line through its points changes no reading; touch a third point "
+            "turning the second base about the line through its points changes no reading; to fix: touch a third point "
             "off that line, or state level.second_base"
         )
     covariance = (Vt.T / values**2) @ Vt * np.outer(_unknown_scales(stand), _unknown_scales(stand))
@@ -322,7 +322,7 @@ def _whiten(residuals: Array, covariance: Array) -> Array:
 _GAP = 0.05
 # R1R2 shorter in a plane than this share of its length gives no angle there.
 _SHORT = 0.05
-_ARRANGEMENT = "rod and joints contradict each other, or the stand is not placed as the source places it"
+_ARRANGEMENT = "check the rod and joint readings, and that the stand is placed as the source places it"
 
 
 @dataclass(frozen=True)
@@ -342,9 +342,7 @@ def project(stand: Stand) -> Projection:
             not close as in the source's arrangement.
     """
     if len(stand.rail.points) != 2 or len(stand.rod.points) != 2 or np.ptp(stand.slide) > 0:
-        raise NoResultError(
-            "the projection takes two points per robot and one slide; the least squares takes any number"
-        )
+        raise NoResultError("the projection takes two points per robot and one slide; to fix: use the least squares")
     R_base1 = frames.transform(level_stand(stand.rail.points, stand.rail_slide), _measured_rod_points(stand))
     gamma, p_xy = _plane_xy(stand)
     turned = stand.rod.points @ _rotation(2, gamma).T
@@ -357,7 +355,7 @@ def project(stand: Stand) -> Projection:
     T = frames.make(rotation, np.array(mean))
     gap = float(np.linalg.norm(frames.transform(T, stand.rod.points) - R_base1, axis=1).max())
     if not gap < _GAP * stand.length.max():
-        raise NoResultError(f"the projection misses the rod's cup by {gap:.3g}; {_ARRANGEMENT}")
+        raise NoResultError(f"the projection misses the rod's cup by {gap:.3g}; to fix: {_ARRANGEMENT}")
     return Projection(T, np.array([gamma, beta, alpha]), offsets)
 
 
@@ -413,7 +411,9 @@ def _angle(a: float, b: float, opposite: float) -> float:
     cosine = (a * a + b * b - opposite * opposite) / (2 * a * b) if a * b > 0 else np.nan
     # A triangle that lies flat may miss ±1 by rounding; one that misses more does not close.
     if not abs(cosine) < 1 + 1e-12:
-        raise NoResultError(f"projection: sides {a:.4f}, {b:.4f} and {opposite:.4f} make no triangle; {_ARRANGEMENT}")
+        raise NoResultError(
+            f"projection: sides {a:.4f}, {b:.4f} and {opposite:.4f} make no triangle; to fix: {_ARRANGEMENT}"
+        )
     return float(np.arccos(np.clip(cosine, -1, 1)))
 
 

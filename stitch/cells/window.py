@@ -160,14 +160,16 @@ def read_fit_job(file: Path | str) -> FitJob:
     document = read_job_file(file, FIT_FORMAT, _FIT_KEYS, "examples/window/fit.toml")
     nominal = pose_from_table(file, "nominal", document["nominal"]) if "nominal" in document else None
     if "path" in document and nominal is None:
-        raise InputError(f"{file}: path needs [nominal]: the part's pose for which the path was programmed")
+        raise InputError(
+            f"{file}: path has no [nominal]; to fix: give the part's pose for which the path was programmed"
+        )
     path = None
     if "path" in document:
         rows = read_columns(resolve_file(file, "path", document["path"]), "name", POSE_COLUMNS)
         path = (rows.texts["name"], poses_from_columns(rows))
     instances = document.get("instances", 1)
     if not isinstance(instances, int) or isinstance(instances, bool) or instances < 1:
-        raise InputError(f"{file}: instances is {instances!r}; write how many parts are in the scan, 1 or more")
+        raise InputError(f"{file}: instances is {instances!r}; to fix: write how many parts are in the scan, 1 or more")
     cad_file = resolve_file(file, "cad", document.get("cad"))
     cad, placed = read_cad(cad_file), _read_scans(file, document)
     unit = placed.length_unit if "session" in document else None  # else neither scans nor CAD name it
@@ -199,7 +201,7 @@ def read_seam_job(file: Path | str) -> SeamJob:
     file = Path(file)
     document = read_job_file(file, SEAM_FORMAT, _SEAM_KEYS, "examples/window/seam.toml")
     if ("part" in document) == ("fit" in document):
-        raise InputError(f"{file}: say where the part lies: either [part] with its pose, or fit = the fit.json of it")
+        raise InputError(f"{file}: no place of the part; to fix: give [part] with its pose, or fit = its fit.json")
     T_base_part = (
         pose_from_table(file, "part", document["part"]) if "part" in document else _fitted_pose(file, document["fit"])
     )
@@ -221,20 +223,24 @@ def read_seam_job(file: Path | str) -> SeamJob:
 def _read_scans(file: Path, document: dict[str, Any]) -> PlacedScans:
     """From a table of scanner poses, or from a session and a hand-eye."""
     if ("scans" in document) == ("session" in document):
-        raise InputError(f"{file}: say where the scans are: scans = a table of them, or session = a session folder")
+        raise InputError(f"{file}: no scans; to fix: give scans = a table of them, or session = a session folder")
     if "scans" in document and "hand_eye" in document:
-        raise InputError(f"{file}: hand_eye goes with session; the poses of a table of scans are the scanner's own")
+        raise InputError(
+            f"{file}: hand_eye goes with session; to fix: leave it out, for a table of scans has the scanner's poses"
+        )
     if "scans" in document:
         return read_scan_table(resolve_file(file, "scans", document["scans"]))
     if "hand_eye" not in document:
-        raise InputError(f"{file}: session needs hand_eye = what `stitch calibrate sphere -o` wrote")
+        raise InputError(
+            f"{file}: session has no hand_eye; to fix: name the file that `stitch calibrate sphere -o` wrote"
+        )
     return read_placed_session(*(resolve_file(file, key, document[key]) for key in ("session", "hand_eye")))
 
 
 def _read_regions(file: Path, entries: Any) -> Regions:
     boxes: dict[str, list[Box]] = {"expected": [], "forbidden": []}
     if not isinstance(entries, list):
-        raise InputError(f"{file}: region must be written as [[region]], one for each box")
+        raise InputError(f"{file}: region is no list; to fix: write [[region]], one for each box")
     for i, entry in enumerate(entries):
         place = f"region[{i + 1}]"
         check_keys(file, place, entry, {"name", "kind", "low", "high"})
@@ -242,7 +248,7 @@ def _read_regions(file: Path, entries: Any) -> Regions:
         form = "[x, y, z] in the part's frame"
         low, high = (vectors(file, f"{place}.{key}", entry.get(key), (3,), form) for key in ("low", "high"))
         if (low >= high).any():
-            raise InputError(f"{file}: {place}.low must lie below its high in x, y and z; the box is empty")
+            raise InputError(f"{file}: the box {place} is empty; to fix: write low below high in x, y and z")
         boxes[kind].append(Box(str(entry.get("name", place)), low, high))
     return Regions(tuple(boxes["expected"]), tuple(boxes["forbidden"]))
 
@@ -253,11 +259,13 @@ def _fitted_pose(job: Path, name: Any) -> Array:
     try:
         T = np.array(json.loads(file.read_text(encoding="utf-8"))["parts"][0]["T_base_part"], float)
     except FileNotFoundError:
-        raise InputError(f"{file}: not found; run stitch fit with -o first, or give [part]") from None
+        raise InputError(f"{file}: not found; to fix: run stitch fit with -o first, or give [part]") from None
     except (ValueError, KeyError, IndexError, TypeError):
-        raise InputError(f"{file}: holds no parts[0].T_base_part; name the fit.json that stitch fit wrote") from None
+        raise InputError(
+            f"{file}: holds no parts[0].T_base_part; to fix: name the fit.json that stitch fit wrote"
+        ) from None
     if not frames.is_rigid(T):
-        raise InputError(f"{file}: parts[0].T_base_part is no rigid motion; run stitch fit again")
+        raise InputError(f"{file}: parts[0].T_base_part is no rigid motion; to fix: run stitch fit again")
     return T
 
 
@@ -269,7 +277,9 @@ def _read_stations(file: Path) -> tuple[Station, ...]:
     require_unique(file, "station", names)
     for i, name in enumerate(names):
         if np.linalg.norm(np.cross(across[i], out[i])) < 0.5 or abs(np.linalg.norm(out[i]) - 1) > 0.05:
-            raise InputError(f"{file}: station {name}: across and out must be unit vectors at right angles")
+            raise InputError(
+                f"{file}: station {name}: across and out are not unit vectors at right angles; to fix: correct them"
+            )
     return tuple(Station(n, m, a, o) for n, m, a, o in zip(names, middle, across, out, strict=True))
 
 
@@ -303,7 +313,8 @@ def _fit_part(job: FitJob, scan: Any) -> FittedPart:
     for name, share in covered.items():
         if share < job.coverage:
             raise NoResultError(
-                f"expected region {name}: only {share:.0%} of it was scanned, {job.coverage:.0%} wanted; scan it, or "
+                f"expected region {name}: only {share:.0%} of it was scanned, {job.coverage:.0%} wanted; to fix: "
+                "scan it, or "
                 "lower `coverage`"
             )
     forbidden = {box.name: int(box.holds(local).sum()) for box in job.regions.forbidden}

@@ -63,7 +63,7 @@ def _targets(file: Path, text: str, at: int, name: str, value: str, joint: bool)
     matches = list(_TARGET.finditer(value))
     line = line_of(text, at)
     if not matches:
-        raise InputError(f"{file} line {line}: {name} is not written as [[…],[…],…]; write its numbers out")
+        raise InputError(f"{file} line {line}: {name} is not written as [[…],[…],…]; to fix: write its numbers out")
     names = [name] if len(matches) == 1 else [f"{name}_{k + 1}" for k in range(len(matches))]
     return [
         (at + m.start(), _point(file, line_of(text, at + m.start()), label, m[1], at + m.start(1), joint=joint))
@@ -94,4 +94,6 @@ def _point(file: Path, line: int, name: str, body: str, begin: int, *, joint: bo
         axes = [f"eax_{letter} {x:g}" for letter, x in zip("abcdef", values[-1], strict=False) if x and x < _NONE]
         moved_by = ", ".join(axes) if len(values) == 4 else ""
         return TaughtPoint(name, line, T_frame_tool, None, pose_at=spans[0] + spans[1], moved_by=moved_by)
-    raise InputError(f"{file} line {line}: {name} is neither [[x,y,z],[q1,q2,q3,q4],…] nor [[j1 … j6],…]")
+    raise InputError(
+        f"{file} line {line}: {name} is no target; to fix: write [[x,y,z],[q1,q2,q3,q4],…] or [[j1 … j6],…]"
+    )

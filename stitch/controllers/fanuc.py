@@ -32,7 +32,7 @@ def read(file: Path, text: str) -> list[TaughtPoint]:
     """
     start = text.find("/POS")
     if start < 0:
-        raise InputError(f"{file}: no /POS section; save the program as an .LS listing with its positions")
+        raise InputError(f"{file}: no /POS section; to fix: save the program as an .LS listing with its positions")
     return [_point(file, text, match) for match in _POINT.finditer(text, start)]
 
 
@@ -41,7 +41,7 @@ def _point(file: Path, text: str, match: re.Match[str]) -> TaughtPoint:
     line, name = line_of(text, match.start()), comment or f"P{index}"
     group = _GROUP.search(body)
     if group is None:
-        raise InputError(f"{file} line {line}: P[{index}] has no GP1; the arm's own group is read")
+        raise InputError(f"{file} line {line}: P[{index}] has no GP1; to fix: teach it in the arm's own group")
     if (cut := _DECIMAL_COMMA.search(group[1])) is not None:
         raise InputError(f"{file} line {line}: P[{index}] has {cut[1]!r}; to fix: write decimals with a point")
     begin = match.start(3) + group.start(1)
@@ -56,5 +56,5 @@ def _point(file: Path, text: str, match: re.Match[str]) -> TaughtPoint:
     frame = f"UF {taught_in[1]}, UT {taught_in[2]}" if taught_in else ""
     point = taught_point(name, line, fields, "XYZWPR", fixed_xyz, joint="J", frame=frame)
     if point is None:
-        raise InputError(f"{file} line {line}: P[{index}] has neither X … R nor J1 … J6; teach it again")
+        raise InputError(f"{file} line {line}: P[{index}] has neither X … R nor J1 … J6; to fix: teach it again")
     return point

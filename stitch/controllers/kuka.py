@@ -72,11 +72,15 @@ def _declared_points(file: Path, text: str) -> dict[str, TaughtPoint]:
 def _motion_target(file: Path, text: str, match: re.Match[str], known: dict[str, TaughtPoint]) -> TaughtPoint:
     line = line_of(text, match.start(1) if match[1] else match.start(2))
     if "_REL" in match[0].upper():
-        raise InputError(f"{file} line {line}: a relative motion has no pose of its own; give the point as E6POS")
+        raise InputError(
+            f"{file} line {line}: a relative motion has no pose of its own; to fix: give the point as E6POS"
+        )
     if match[2]:
         return _point(file, f"line{line}", line, match[2], match.start(2))
     if match[1].upper() not in known:
-        raise InputError(f"{file} line {line}: {match[1]} is declared nowhere; put {file.stem}.dat beside the .src")
+        raise InputError(
+            f"{file} line {line}: {match[1]} is declared nowhere; to fix: put {file.stem}.dat beside the .src"
+        )
     return replace(known[match[1].upper()], is_target=True)
 
 
@@ -96,5 +100,7 @@ def _point(file: Path, name: str, line: int, body: str, begin: int) -> TaughtPoi
     }
     point = taught_point(name, line, fields, "XYZABC", zyx, joint="A")
     if point is None:
-        raise InputError(f"{file} line {line}: {name} has neither X, Y, Z, A, B, C nor A1 … A6; write all of them")
+        raise InputError(
+            f"{file} line {line}: {name} has neither X, Y, Z, A, B, C nor A1 … A6; to fix: write all of them"
+        )
     return point

@@ -111,7 +111,7 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
     """
     reader = PROGRAMS.get(file.suffix.lower())
     if reader is None:
-        raise InputError(f"{file}: unknown kind {file.suffix!r} of program; known are {', '.join(PROGRAMS)}")
+        raise InputError(f"{file}: unknown kind {file.suffix!r} of program; to fix: name one of {', '.join(PROGRAMS)}")
     if not file.is_file():
         raise InputError(f"{file}: no such file; to fix: name a program of the controller")
     text = program_text(file)
@@ -119,7 +119,7 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
     every = [p for p in told if p.is_target]
     points = tuple({(p.file, p.pose_at, p.joints_at): p for p in every}.values())
     if not points:
-        raise NoResultError(f"{file}: no taught points found; export the program with its positions")
+        raise NoResultError(f"{file}: no taught points found; to fix: export the program with its positions")
     # A script of a UR has its poses in the base.
     needed = {"tool": tool} if reader is universal_robots else {"frame": frame, "tool": tool}
     _require_stated(file, require_one_frame(file, points), [f"--{name}" for name in needed if needed[name] is None])
@@ -239,7 +239,7 @@ def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: st
     if not file.is_file():
         raise InputError(f"{file}: no such file; to fix: name an export of the controller")
     if unit not in _MM_IN_UNIT:
-        raise InputError(f"--unit {unit}: use mm or m")
+        raise InputError(f"--unit {unit}: is no unit of a program; to fix: use mm or m")
     reader = _READERS.get(file.suffix.lower())
     if reader is None:
         raise InputError(
@@ -248,12 +248,12 @@ def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: st
         )
     text = file.read_text(encoding="utf-8-sig", errors="replace")
     if not text.strip():
-        raise InputError(f"{file}: empty; export it again")
+        raise InputError(f"{file}: empty; to fix: export it again")
     if reader is universal_robots and file.suffix.lower() == ".csv" and not universal_robots.is_recording(text):
         return _import_tracker(file, text, unit)
     points: Sequence[TaughtPoint] = reader.read(file, text)
     if not points:
-        raise NoResultError(f"{file}: no taught points found; export the program with its positions")
+        raise NoResultError(f"{file}: no taught points found; to fix: export the program with its positions")
     warnings = _check_frames(file, points, frame, tool)
     T_base_frame, T_flange_tool = stated_pose(reader.pose, "frame", frame), stated_pose(reader.pose, "tool", tool)
     rows = view_rows(points, T_base_frame, frames.inverse(T_flange_tool), _MM_IN_UNIT[unit])
@@ -278,7 +278,7 @@ def _import_tracker(file: Path, text: str, unit: str) -> ImportedTable:
     """frames.csv from 6D probes; points.csv from reflectors, a new view whenever a name comes again."""
     measured: list[TrackerPoint] = tracker_csv.read(file, text)
     if not measured:
-        raise NoResultError(f"{file}: no measurements; export them again")
+        raise NoResultError(f"{file}: no measurements; to fix: export them again")
     scale = _MM_IN_UNIT[unit]
     poses = [m.T_sensor_probe for m in measured if m.T_sensor_probe is not None]
     if poses:

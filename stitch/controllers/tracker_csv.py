@@ -50,14 +50,15 @@ def read(file: Path, text: str) -> list[TrackerPoint]:
     """
     header, separator = split_header(text)
     if not all(axis in header for axis in "xyz"):
-        raise InputError(f"{file} line 1: no columns x, y, z; the header has {', '.join(header)}")
+        raise InputError(f"{file} line 1: no columns x, y, z in {', '.join(header)}; to fix: name them in the header")
     first = text.strip().splitlines()[0].lower()
     scale = 1000.0 if re.search(r"x\s*[\[(]\s*m\s*[\])]", first) else 1.0
     quaternion = next((q for q in _QUATERNIONS if all(n in header for n in q)), None)
     angles = quaternion is None and all(n in header for n in _ANGLES)
     if angles and not re.search(r"deg|°", first):
         raise InputError(
-            f"{file} line 1: rx, ry, rz may be degrees or a rotation vector; write Rx (deg) … for a tracker's angles, "
+            f"{file} line 1: rx, ry, rz may be degrees or a rotation vector; to fix: write Rx (deg) … for a "
+            "tracker's angles, "
             "actual_TCP_pose_0 … for a UR's pose"
         )
     out: list[TrackerPoint] = []
@@ -65,7 +66,9 @@ def read(file: Path, text: str) -> list[TrackerPoint]:
     rows = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     for line, cells in rows[1:]:
         if len(cells) < len(header):
-            raise InputError(f"{file} line {line}: {len(cells)} cells, the header has {len(header)}")
+            raise InputError(
+                f"{file} line {line}: {len(cells)} cells, the header has {len(header)}; to fix: correct the line"
+            )
         row = dict(zip(header, cells, strict=False))
         if separator != ",":
             row = {key: cell.replace(",", ".") for key, cell in row.items()}

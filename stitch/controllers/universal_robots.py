@@ -56,7 +56,9 @@ def _read_script(file: Path, text: str) -> list[TaughtPoint]:
         if not all(is_number(cell) for cell in cells):
             if name != f"line{line}":
                 continue  # Computed while the program runs: no taught point.
-            raise InputError(f"{file} line {line}: the target is computed while the program runs; write its numbers")
+            raise InputError(
+                f"{file} line {line}: the target is computed while the program runs; to fix: write its numbers"
+            )
         values = np.array([float(cell) for cell in cells])
         base = re.sub(r"_[pq]$", "", name)
         before = points.get(base, TaughtPoint(base, line, None, None))
@@ -89,7 +91,9 @@ def _read_recording(file: Path, text: str) -> list[TaughtPoint]:
     out = []
     for (line, _), row in zip(lines[1:], rows[1:], strict=True):
         if len(row) < len(header):
-            raise InputError(f"{file} line {line}: {len(row)} cells, the header has {len(header)}")
+            raise InputError(
+                f"{file} line {line}: {len(row)} cells, the header has {len(header)}; to fix: correct the line"
+            )
         cells = dict(zip(header, row, strict=False))
         T = None if pose is None else rotation_vector(_row_values(file, line, cells, pose))
         out.append(

@@ -179,7 +179,7 @@ def test_what_the_option_takes():
 
 @pytest.mark.parametrize("text", ["frei", "nan", "inf", "", "0,3"])
 def test_other_words_are_refused(text):
-    with pytest.raises(InputError, match="--allowance is .*; write free"):
+    with pytest.raises(InputError, match="--allowance is .*; to fix: write free"):
         read_allowance(text)
 
 

@@ -418,13 +418,13 @@ def test_effects_left_out_leave_the_reference_holes_wrong(tmp_path):
 @pytest.mark.parametrize(
     "file, old, new, part",
     [
-        ("job.toml", "height = 186.61", "height = 0", "above zero"),
-        ("job.toml", "height = 186.61", "heigth = 186.61", "did you mean 'height'"),
+        ("job.toml", "height = 186.61", "height = 0", "to fix: write a number above zero"),
+        ("job.toml", "height = 186.61", "heigth = 186.61", "to fix: write 'height'"),
         ("job.toml", 'plate = "plate.csv"', 'plate = "plat.csv"', "plat.csv: not found"),
         ("job.toml", 'plate = "plate.csv"', "", "plate is missing"),
         ("job.toml", 'joint1 = "joint1.csv"', "", "belong together"),
         ("job.toml", "image_size", "# ", "image_size is None"),
-        ("job.toml", "stitch-drill/1", "stitch-drill/9", "expected"),
+        ("job.toml", "stitch-drill/1", "stitch-drill/9", "to fix: write"),
         ("holes.csv", "101,1,reference", "101,1,refrence", "write reference or drill"),
         ("holes.csv", "101,1,reference", "102,1,reference", "stands twice"),
         ("placed.csv", "101,", "109,", "reference hole 101 is missing"),

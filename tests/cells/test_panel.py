@@ -317,7 +317,7 @@ def main_code(arguments):
     [
         ('master = "B"', 'master = "X"', "master is 'X'"),
         ("[tracker]", "[tracker]\nnoise = 1", "unknown key 'tracker.noise'"),
-        ("radius = 2960.0", "radius = -1", "layout.radius is -1; it must be above zero"),
+        ("radius = 2960.0", "radius = -1", "layout.radius is -1; to fix: write a number above zero"),
         ('calibration = "calibration.csv"', "", "files.calibration is missing"),
         ('"flanges.csv"', '"none.csv"', "none.csv: not found"),
     ],

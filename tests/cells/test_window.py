@@ -218,9 +218,9 @@ def main_code(arguments):
     "command, name, old, new, message",
     [
         ("fit", "fit.toml", '"pane.stl"', '"none.stl"', "none.stl: not found"),
-        ("fit", "fit.toml", "tolerance = 0.5", "tolerance = 0", "tolerance is 0; it must be above zero"),
-        ("fit", "fit.toml", "high = [700.0", "high = [10.0", "region[1].low must lie below its high"),
-        ("fit", "fit.toml", "[nominal]", "[nominl]", "unknown key 'nominl'; did you mean 'nominal'?"),
+        ("fit", "fit.toml", "tolerance = 0.5", "tolerance = 0", "tolerance is 0; to fix: write a number above zero"),
+        ("fit", "fit.toml", "high = [700.0", "high = [10.0", "the box region[1] is empty"),
+        ("fit", "fit.toml", "[nominal]", "[nominl]", "unknown key 'nominl'; to fix: write 'nominal'"),
         ("seam", "seam.toml", "[part]", "[other]", "unknown key 'other'"),
         ("seam", "seam.toml", '"stations.csv"', '"seam.csv"', "column 'station' is missing"),
     ],
