@@ -32,7 +32,7 @@ from stitch.effects import EFFECTS
 from stitch.errors import StitchError
 from stitch.observations.linear_model import LinearModel
 from stitch.pipeline import change, diagnose, run, suggest
-from stitch.runs.run import Run, RunState, state_of
+from stitch.runs.run import Run
 from stitch.system.threads import library_threads_off
 
 Row = dict[str, Any]
@@ -69,7 +69,7 @@ def cell_without(scene: str, seed: int, chance: int | None = None) -> EmptyCell:
     """The cell of a scene and a seed, with nothing hidden; `chance` as in `measure`."""
     measured = measure(scene, seed, {}, chance=chance)
     calm = run(session_of(measured))
-    return EmptyCell(measured.plan, linear_model_of(state_of(calm)))
+    return EmptyCell(measured.plan, linear_model_of(calm))
 
 
 def _chance(job: Row) -> int:
@@ -125,7 +125,7 @@ def _effect(job: Row) -> Row:
         return {"verdict": "not shown"}
     measured, first, found, row = _diagnosed(job, hidden)
     if job["multiple"] >= 2 and job["effect"] in found.effects:
-        row["added"] = _added(measured, first, change(state_of(first), [job["effect"]]), job)
+        row["added"] = _added(measured, first, change(first, [job["effect"]]), job)
         if job["multiple"] == 4:
             knowing = run(session_of(measured), effects=[job["effect"]])
             row["added"]["knowing"] = knowing.heldout_rms
@@ -168,7 +168,7 @@ def _outside(job: Row) -> Row:
         name = user_effect(job["effect"])
         try:
             again = diagnose(first)
-            added = change(state_of(first), [name])
+            added = change(first, [name])
         finally:
             del EFFECTS[name]
         floor = run(session_of(measure(job["scene"], job["seed"], {}, chance=_chance(job))))
@@ -185,7 +185,7 @@ def _pair(job: Row) -> Row:
     if hidden is None:
         return {"verdict": "not shown"}
     measured = measure(job["scene"], job["seed"], hidden, chance=_chance(job))
-    state: RunState = state_of(run(session_of(measured)))
+    state: Run = run(session_of(measured))
     result, lines, last = suggest(state, 4)
     return {
         "hidden": dict(measured.hidden), "verdict": last.verdict, "named": list(last.effects),

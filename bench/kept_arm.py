@@ -17,7 +17,7 @@ from stitch.measurement.session import Session
 from stitch.model.model_toml import keep_arm_effects
 from stitch.pipeline import run, run_rig, suggest
 from stitch.reading.session_folder import load_session
-from stitch.runs.run import Run, state_of
+from stitch.runs.run import Run
 from stitch.writing.result_document import model_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,7 +48,7 @@ def main() -> None:
     lines, found = [], {}
     for name, session in series.items():
         began = time.monotonic()
-        result, told, _ = suggest(state_of(run(session)), 5)
+        result, told, _ = suggest(run(session), 5)
         assert result is not None, told
         found[name] = result
         seconds = time.monotonic() - began

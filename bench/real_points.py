@@ -16,7 +16,7 @@ import numpy as np
 from stitch.measurement.session import Session
 from stitch.pipeline import run, suggest
 from stitch.reading.session_folder import load_session
-from stitch.runs.run import Run, state_of
+from stitch.runs.run import Run
 from stitch.writing.result_document import model_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -69,7 +69,7 @@ def judged(session: Session, effects: list[str], way: list[tuple[np.ndarray, np.
 def suggested(session: Session, at_most: int, fit_on: np.ndarray) -> tuple[list[list[str]], list[str]]:
     """The way that the diagnosis takes on some poses alone, and what it says on it."""
     first = run(only(session, fit_on))
-    found, lines, last = suggest(state_of(first), at_most)
+    found, lines, last = suggest(first, at_most)
     return [list(step.effects) for step in (found or first).ledger], [*lines, last.sentence]
 
 

@@ -22,7 +22,6 @@ from data_synth.fixtures.quiet_scenes import Measured
 from stitch.diagnosis.diagnose import diagnose_state
 from stitch.errors import StitchError
 from stitch.pipeline import run
-from stitch.runs.run import state_of
 from stitch.system.threads import library_threads_off
 
 # Of the points (N, 3) of one view, scanner frame, the view's number and the cell.
@@ -92,7 +91,7 @@ def said(m: Measured, law: Law) -> dict[str, Any]:
     """Verdict and names for one cell."""
     clouds = [replace(c, points=law(c.points, v, m)) for v, c in enumerate(m.clouds)]
     try:
-        found = diagnose_state(state_of(run(session_of(replace(m, clouds=clouds)))))
+        found = diagnose_state(run(session_of(replace(m, clouds=clouds))))
     except StitchError as error:
         return {"verdict": "refused", "names": [], "said": str(error)}
     kept = {

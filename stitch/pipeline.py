@@ -25,7 +25,7 @@ from stitch.model.model_toml import ModelFile, arm_model, convert_unit
 from stitch.observations.pose_errors import MANY_VIEWS
 from stitch.planning.next_view import propose_measurements
 from stitch.runs.recorder import Recorder, SilentRecorder
-from stitch.runs.run import Run, RunState, StageResult, state_of
+from stitch.runs.run import Run, StageResult
 from stitch.stages.assemble import FitSummary, assemble_run, pipeline_for
 from stitch.stages.finish import FittedRig, InitialModel, Pipeline
 from stitch.stages.initial_guess import COARSE_GATE, CoarseHandEye
@@ -37,24 +37,22 @@ from stitch.writing.diagnosis_document import plain_finding
 # Change the model of a run: put effects in or take them out, and fit everything again.
 
 
-def add(run: Run | RunState, *effects: str, recorder: Recorder | None = None) -> Run:
+def add(run: Run, *effects: str, recorder: Recorder | None = None) -> Run:
     """Fit a run again with further effects in its model: hand-eye and all effects together.
 
     Raises:
         InputError: an effect that is not known, or that the session cannot have.
         NoResultError: no two views overlap.
     """
-    state = state_of(run) if isinstance(run, Run) else run
-    return change(state, [*state.model.effects, *effects], recorder)
+    return change(run, [*run.model.effects, *effects], recorder)
 
 
-def drop(run: Run | RunState, *effects: str, recorder: Recorder | None = None) -> Run:
+def drop(run: Run, *effects: str, recorder: Recorder | None = None) -> Run:
     """Fit a run again without some of its effects."""
-    state = state_of(run) if isinstance(run, Run) else run
-    return change(state, [name for name in state.model.effects if name not in effects], recorder)
+    return change(run, [name for name in run.model.effects if name not in effects], recorder)
 
 
-def change(state: RunState, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
+def change(state: Run, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
     """Fit a run again with these effects in its model: matches, hand-eye and all effects.
 
     Raises:
@@ -81,7 +79,7 @@ def change(state: RunState, effects: Sequence[str], recorder: Recorder | None = 
             fitted=fitted,
             seconds=clock.lap(),
             effects_file=state.effects_file,
-            register=state.register or DEFAULT,
+            register=state.register_method or DEFAULT,
             ledger=state.ledger,
             left_out=state.left_out,
             links=state.links,
@@ -207,13 +205,13 @@ def _assemble_runs(
     return runs
 
 
-def diagnose(run: Run | RunState) -> Diagnosis:
+def diagnose(run: Run) -> Diagnosis:
     """Find which effect is missing in the model of a run.
 
     Raises:
         NoResultError: no two views overlap.
     """
-    found = diagnose_state(state_of(run) if isinstance(run, Run) else run)
+    found = diagnose_state(run)
     return replace(found, next=propose_measurements(found))
 
 
@@ -222,7 +220,7 @@ def diagnose(run: Run | RunState) -> Diagnosis:
 # Or add a whole group of effects that the views cannot tell apart, where that helps.
 
 
-def suggest(state: RunState, at_most: int) -> tuple[Run | None, list[str], Diagnosis]:
+def suggest(state: Run, at_most: int) -> tuple[Run | None, list[str], Diagnosis]:
     """The run with everything that the diagnosis names, the way in lines, and the last diagnosis.
 
     The run is None where nothing is named.
@@ -249,7 +247,7 @@ def suggest(state: RunState, at_most: int) -> tuple[Run | None, list[str], Diagn
         if not _improves_heldout(state, tried):
             lines.append(f"{found.effects[0]} was tried and did not earn its place: the held-out residual rose.")
             break
-        result, state = tried, state_of(tried)
+        result, state = tried, tried
         lines.append(f"Added {found.effects[0]}. With it:")
         # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
         found = None
@@ -258,11 +256,11 @@ def suggest(state: RunState, at_most: int) -> tuple[Run | None, list[str], Diagn
     if result is not None and not state.session.has_clouds and state.measurement.views.count >= MANY_VIEWS:
         result, dropped = _drop_unneeded(result, given)
         lines += dropped
-        state, found = (state_of(result), None) if dropped else (state, found)
+        state, found = (result, None) if dropped else (state, found)
     return result, lines, diagnose(state) if found is None else found
 
 
-def suggest_group(state: RunState) -> tuple[Run | None, list[str], Diagnosis]:
+def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:
     """The run with all effects of a group that these views cannot tell apart, what to say of it, and the diagnosis.
 
     The run is None where the diagnosis names no such group, or where the group does not help on views left out.
@@ -289,8 +287,8 @@ def suggest_group(state: RunState) -> tuple[Run | None, list[str], Diagnosis]:
         f"{names} are fitted as one group: {judged}, and together they stand for what is missing; these views do not "
         "tell its parts apart, so that none of their values means anything alone"
     )
-    tried = replace(tried, notes=(f"{told}.", *tried.notes))
-    return tried, [*_finding_and_evidence(found), f"{told}."], diagnose(state_of(tried))
+    tried = tried.with_fit(notes=(f"{told}.", *tried.notes))
+    return tried, [*_finding_and_evidence(found), f"{told}."], diagnose(tried)
 
 
 def _finding_and_evidence(found: Diagnosis) -> list[str]:
@@ -301,12 +299,12 @@ def _finding_and_evidence(found: Diagnosis) -> list[str]:
 def _drop_unneeded(result: Run, given: set[str]) -> tuple[Run, list[str]]:
     """The run without added effects that do not hold their place beside the others, and why each went."""
     lines: list[str] = []
-    while (idle := find_effect_to_drop(state_of(result), set(result.effects) - given)) is not None:
+    while (idle := find_effect_to_drop(result, set(result.effects) - given)) is not None:
         name, reason = idle
         lines.append(f"{reason}; it was dropped.")
-        result = change(state_of(result), [other for other in result.effects if other != name])
+        result = change(result, [other for other in result.effects if other != name])
     return result, lines
 
 
-def _improves_heldout(state: RunState, tried: Run) -> bool:
+def _improves_heldout(state: Run, tried: Run) -> bool:
     return not state.ledger or tried.heldout_rms < HELDOUT_RISE * state.ledger[-1].heldout_rms

@@ -12,7 +12,7 @@ from stitch.comparison.residual_tables import ResidualTables
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import fitted_amounts
 from stitch.model.model import uncertainty_scope
-from stitch.runs.run import RunState
+from stitch.runs.run import Run
 from stitch.system.files import whole_file
 from stitch.units import MICROMETRES, length_text
 from stitch.writing.diagnosis_document import (
@@ -37,7 +37,7 @@ from viz.unbroken import unbroken
 _SHOWN = 8
 
 
-def write_diagnosis(found: Diagnosis, state: RunState, folder: Path) -> None:
+def write_diagnosis(found: Diagnosis, state: Run, folder: Path) -> None:
     """Section of report.html, pictures/*.svg and *.png, a tab of the recording."""
     pictures = _pictures(found, state.session.length_unit)
     addresses = _save(folder / "pictures", {name: picture.figure for name, picture in pictures.items()})
@@ -127,7 +127,7 @@ def _rms(found: Diagnosis, candidate: CandidateEffect, which: int, um: float) ->
     return "–" if validation is None else f"{um * found.rms_if_added(validation)[which]:.1f}"
 
 
-def write_comparison(found: ResidualTables, state: RunState, folder: Path) -> None:
+def write_comparison(found: ResidualTables, state: Run, folder: Path) -> None:
     """Section of report.html and pictures/compare.*."""
     figure = comparison(found, state.session.length_unit)
     picture = _save(folder / "pictures", {"compare": figure})["compare"]

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from stitch import pipeline
-from stitch import pipeline as revision
 from stitch.api.run import ReplayRecorder, Run, public_run
 from stitch.api.session import Session, public_session
 from stitch.comparison.residual_tables import ResidualTables, compare_surfaces, compare_targets
@@ -31,9 +30,8 @@ from stitch.planning.expected_model import PlannedCell, cell_of_session, cell_of
 from stitch.planning.plan import Plan, PlanRequest
 from stitch.runs import run as runs
 from stitch.runs.recorder import Recorder
-from stitch.runs.run import RunState, state_of
 from stitch.stages.correct import REUSE_GATE, converged_gate
-from stitch.stored.stored_run import load_state, stored_run
+from stitch.stored import stored_run
 from stitch.system.files import whole_file
 from stitch.system.threads import library_threads_off
 from stitch.writing.diagnosis_document import diagnosis_document
@@ -127,15 +125,15 @@ def load_run(folder: Path | str, effects_file: Path | None = None, trust: bool =
         True
     """
     folder = Path(folder)
-    state = load_state(folder, effects_file, trust=trust)
-    return public_run(stored_run(folder, state), None)
+    run = stored_run.load_run(folder, effects_file, trust=trust)
+    return public_run(replace(run, source=run.fit), None)
 
 
-def diagnose(run: runs.Run | RunState) -> Diagnosis:
+def diagnose(run: runs.Run) -> Diagnosis:
     """Find which effect is missing in the model of a run, as `stitch diagnose` does.
 
     Args:
-        run: a run, or the state of one.
+        run: a run in memory or of a folder.
 
     Returns:
         Verdict, sentence and candidates; sizes in rad and in the session's length_unit, of the flange's poses.
@@ -151,7 +149,7 @@ def diagnose(run: runs.Run | RunState) -> Diagnosis:
     return pipeline.diagnose(_state(run))
 
 
-def add(run: runs.Run | RunState, *effects: str, recorder: Recorder | None = None) -> Run:
+def add(run: runs.Run, *effects: str, recorder: Recorder | None = None) -> Run:
     """Return the run with further effects in its model, hand-eye and all effects fitted anew.
 
     Args:
@@ -178,7 +176,7 @@ def add(run: runs.Run | RunState, *effects: str, recorder: Recorder | None = Non
     return _changed(run, state, [*state.model.effects, *effects], recorder)
 
 
-def drop(run: runs.Run | RunState, *effects: str, recorder: Recorder | None = None) -> Run:
+def drop(run: runs.Run, *effects: str, recorder: Recorder | None = None) -> Run:
     """Return the run without some effects, hand-eye and the rest fitted anew.
 
     Args:
@@ -206,7 +204,7 @@ def drop(run: runs.Run | RunState, *effects: str, recorder: Recorder | None = No
     return _changed(run, state, [name for name in used if name not in effects], recorder)
 
 
-def compare(run: runs.Run | RunState) -> ResidualTables:
+def compare(run: runs.Run) -> ResidualTables:
     """Compute how the residuals of a run depend on everything known of its views, as `stitch compare` does.
 
     Returns:
@@ -224,7 +222,7 @@ def compare(run: runs.Run | RunState) -> ResidualTables:
     return compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
 
 
-def explain(run: runs.Run | RunState) -> Explanation:
+def explain(run: runs.Run) -> Explanation:
     """Find a formula of what the model of a run leaves, as `stitch explain` does.
 
     Returns:
@@ -370,23 +368,20 @@ def _names(effects: Sequence[str]) -> list[str]:
     return [find_effect(name).name for name in effects]
 
 
-def _state(run: runs.Run | RunState) -> RunState:
+def _state(run: runs.Run) -> runs.Run:
     """Return what a command reads of the run's folder: partners are looked for within the gate of the model alone."""
-    if not isinstance(run, runs.Run):
-        return run
-    state = state_of(run)
-    own = corrected_capture(state.measurement, state.model)
+    own = corrected_capture(run.measurement, run.model)
     if not own.scans:
-        return state
+        return run
     with library_threads_off():
-        gate = converged_gate(own, state.model.T_mount, REUSE_GATE * part_size([own]))
-    return replace(state, gate=gate)
+        gate = converged_gate(own, run.T_mount, REUSE_GATE * part_size([own]))
+    return replace(run, gate=gate)
 
 
-def _changed(run: runs.Run | RunState, state: RunState, effects: Sequence[str], recorder: Recorder | None) -> Run:
+def _changed(run: runs.Run, state: runs.Run, effects: Sequence[str], recorder: Recorder | None) -> Run:
     replay = ReplayRecorder(recorder)
     whole_session: Session | None = run.measured if isinstance(run, Run) else None
-    return public_run(revision.change(state, effects, replay), whole_session, replay)
+    return public_run(pipeline.change(state, effects, replay), whole_session, replay)
 
 
 def _cell_of(run: runs.Run) -> PlannedCell:

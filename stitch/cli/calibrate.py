@@ -162,21 +162,20 @@ def calibrate_arm(session: Path, output: Path | None, *, force: bool, at_most: i
     from stitch.cli.diagnose import write_diagnosis
     from stitch.pipeline import run, suggest
     from stitch.reading.session_folder import load_session
-    from stitch.runs.run import state_of
     from stitch.writing import run_folder
     from stitch.writing.json_file import to_json
 
     loaded = load_session(session)
     first = run(loaded)
     calibrated_robot_of_run(first)
-    found, lines, diagnosis = suggest(state_of(first), at_most)
+    found, lines, diagnosis = suggest(first, at_most)
     result = found or first
     target = output or Path("runs") / f"{loaded.name}-robot"
     with run_folder.new_folder(target, [session], force) as scratch:
         run_folder.write_with_page(result, scratch)
         table = link_table(loaded)
         write_robot(table, result, scratch)
-        write_diagnosis(diagnosis, state_of(result), scratch)
+        write_diagnosis(diagnosis, result, scratch)
     document = robot_document(result, table, lines, diagnosis.sentence)
     if as_json:
         emit(to_json(document))

@@ -16,7 +16,7 @@ from stitch.errors import InputError
 if TYPE_CHECKING:
     from stitch.diagnosis.diagnosis import Diagnosis
     from stitch.model.model import Term
-    from stitch.runs.run import Run, RunState
+    from stitch.runs.run import Run
 
 
 # The history of a model as a table, its parameters, and whether the last effect earned its place.
@@ -111,11 +111,11 @@ def add_effects(
         InputError, NoResultError: as `stitch add` ends.
     """
     from stitch.effects.contract import find_effect, require_available
-    from stitch.stored.stored_run import load_state
+    from stitch.stored.stored_run import load_run
     from stitch.writing import run_folder
 
     with run_folder.lock_run_folder(run):
-        state = load_state(run, effects_file, trust=trust)
+        state = load_run(run, effects_file, trust=trust)
         used = state.model.effects
         for name in effects:
             require_available(state.measurement, find_effect(name))
@@ -140,14 +140,14 @@ def add_diagnosed(
         InputError, NoResultError: as `stitch add` ends.
     """
     from stitch.pipeline import suggest, suggest_group
-    from stitch.stored.stored_run import load_state
+    from stitch.stored.stored_run import load_run
     from stitch.system.process import console
     from stitch.writing import run_folder
     from stitch.writing.diagnosis_document import suggested_command
 
     with run_folder.lock_run_folder(run):
         with show_activity("diagnosing"):
-            state = load_state(run, effects_file, trust=trust)
+            state = load_run(run, effects_file, trust=trust)
             run_folder.preload_entry_points("stitch.reports")
             chosen = suggest_group(state) if at_most is None else suggest(state, at_most)
         found = _keep_diagnosed(run, state, chosen, recording, as_json)
@@ -156,12 +156,11 @@ def add_diagnosed(
 
 
 def _keep_diagnosed(
-    run: Path, state: RunState, chosen: tuple[Run | None, list[str], Diagnosis], recording: bool, as_json: bool
+    run: Path, state: Run, chosen: tuple[Run | None, list[str], Diagnosis], recording: bool, as_json: bool
 ) -> Diagnosis:
     """Write and show what a diagnosis chose; what was tried on the way leaves no recording, the end does."""
     from stitch.cli.diagnose import write_diagnosis
     from stitch.pipeline import change
-    from stitch.runs.run import state_of
     from stitch.system.process import console
     from stitch.writing import run_folder
 
@@ -172,16 +171,16 @@ def _keep_diagnosed(
         with show_activity("writing cloud and page"), run_folder.replace_run_files(run) as scratch:
             if recording:
                 # The same fit once more from where it ended, for the recording; it takes the last step's place.
-                before = replace(state_of(result), ledger=result.ledger[:-1])
+                before = replace(result, ledger=result.ledger[:-1])
                 again = change(before, result.effects, recorder_for(scratch, recording))
-                result = replace(again, notes=result.notes)
+                result = again.with_fit(notes=result.notes)
             run_folder.write_with_page(result, scratch)
         _show_changed(result, run, as_json)
     elif as_json:
         emit((run / "result.json").read_text(encoding="utf-8").rstrip())
     else:
         console().print("Nothing was added: the model is as it was.", soft_wrap=True)
-    write_diagnosis(found, state if result is None else state_of(result), run)
+    write_diagnosis(found, result or state, run)
     return found
 
 
@@ -193,11 +192,11 @@ def drop_effects(
     Raises:
         InputError, NoResultError: as `stitch drop` ends.
     """
-    from stitch.stored.stored_run import load_state
+    from stitch.stored.stored_run import load_run
     from stitch.writing import run_folder
 
     with run_folder.lock_run_folder(run):
-        state = load_state(run, effects_file, trust=trust)
+        state = load_run(run, effects_file, trust=trust)
         used = state.model.effects
         for name in effects:
             if name not in used:
@@ -206,7 +205,7 @@ def drop_effects(
         _refit_run(run, state, kept, recording, as_json)
 
 
-def _refit_run(run: Path, state: RunState, effects: list[str], recording: bool, as_json: bool) -> None:
+def _refit_run(run: Path, state: Run, effects: list[str], recording: bool, as_json: bool) -> None:
     """Give the run folder the model with these effects, and show it."""
     from stitch.pipeline import change
     from stitch.system.process import console

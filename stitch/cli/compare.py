@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from stitch.comparison.residual_tables import ResidualTable, ResidualTables
-    from stitch.runs.run import RunState
+    from stitch.runs.run import Run
 
 
 # What `stitch compare` does: the residual against everything known of it, into the run folder and for people.
@@ -30,12 +30,12 @@ def run_compare(run: Path, effects_file: Path | None, *, trust: bool, as_json: b
         InputError, NoResultError: as `stitch compare` ends.
     """
     from stitch.comparison.residual_tables import comparison_document
-    from stitch.stored.stored_run import load_state
+    from stitch.stored.stored_run import load_run
     from stitch.writing.json_file import to_json
     from stitch.writing.run_folder import lock_run_folder
 
     with lock_run_folder(run):
-        state = load_state(run, effects_file, trust=trust)
+        state = load_run(run, effects_file, trust=trust)
         found = write_comparison(state, run)
     if as_json:
         emit(to_json(comparison_document(found)))
@@ -43,7 +43,7 @@ def run_compare(run: Path, effects_file: Path | None, *, trust: bool, as_json: b
         show_comparison(found, state, run)
 
 
-def show_comparison(comparison: ResidualTables, state: RunState, run: Path) -> None:
+def show_comparison(comparison: ResidualTables, state: Run, run: Path) -> None:
     """The clearest tables, for people."""
     from stitch.system.process import console
     from stitch.units import MICROMETRES, length_text
@@ -65,7 +65,7 @@ def show_comparison(comparison: ResidualTables, state: RunState, run: Path) -> N
     terminal.print(_next_command(run), soft_wrap=True)
 
 
-def write_comparison(state: RunState, run: Path) -> ResidualTables:
+def write_comparison(state: Run, run: Path) -> ResidualTables:
     """compare.json and what other packages make of it."""
     from stitch.comparison.residual_tables import compare_surfaces, compare_targets, comparison_document
     from stitch.writing.json_file import write_json
@@ -119,7 +119,7 @@ def _next_command(run: Path) -> str:
     return f"Next: stitch {'review' if (run / 'diagnosis.json').exists() else 'diagnose'} {folder}"
 
 
-def _row_names(table: ResidualTable, state: RunState) -> str:
+def _row_names(table: ResidualTable, state: Run) -> str:
     """What the rows are; of places, in which unit and frame they are written."""
     from stitch.comparison.residual_tables import PLACE
 

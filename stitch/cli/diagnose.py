@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
     from stitch.diagnosis.residual_structure import BudgetLine
-    from stitch.runs.run import RunState
+    from stitch.runs.run import Run
 
 
 # Where the error comes from, as a table of the terminal.
@@ -98,17 +98,17 @@ def _no_next_reason(diagnosis: Diagnosis) -> str:
 
 def _diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, object], str]:
     from stitch.pipeline import diagnose
-    from stitch.stored.stored_run import load_state
+    from stitch.stored.stored_run import load_run
     from stitch.writing.run_folder import lock_run_folder, preload_entry_points
 
     with lock_run_folder(run), show_activity("diagnosing"):
-        state = load_state(run, effects_file, trust=trust)
+        state = load_run(run, effects_file, trust=trust)
         preload_entry_points("stitch.diagnosis_reports")
         found = diagnose(state)
         return found, write_diagnosis(found, state, run), state.session.length_unit
 
 
-def write_diagnosis(diagnosis: Diagnosis, state: RunState, run: Path) -> dict[str, object]:
+def write_diagnosis(diagnosis: Diagnosis, state: Run, run: Path) -> dict[str, object]:
     """diagnosis.json and what other packages make of it."""
     from stitch.writing.diagnosis_document import diagnosis_document
     from stitch.writing.json_file import write_json

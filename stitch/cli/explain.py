@@ -26,17 +26,17 @@ def run_explain(run: Path, output: Path | None, effects_file: Path | None, *, tr
     """
     from stitch.diagnosis.diagnose import linear_model_of
     from stitch.explanation.explain import EFFECT_NAME, explain
-    from stitch.stored.stored_run import load_state
+    from stitch.stored.stored_run import load_run
     from stitch.system.files import whole_file
     from stitch.writing.json_file import to_json
 
-    state = load_state(run, effects_file, trust=trust)
+    state = load_run(run, effects_file, trust=trust)
     if EFFECT_NAME in state.model.effects:
         raise InputError(
             f"{run}: has an effect {EFFECT_NAME!r} in its model; to fix: give it another name in its file, and add that"
         )
     found = explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")
-    heldout = state.heldout_rms * found.heldout_share**0.5 if found.found else None
+    heldout = state.heldout_or_fit_rms * found.heldout_share**0.5 if found.found else None
     if output is not None and found.found:
         with whole_file(output) as file:
             file.write_text(found.source, encoding="utf-8")

@@ -251,13 +251,13 @@ def _planned_cell(folder: Path, stated: StatedCell, *, trust: bool) -> tuple[Ses
 
     from stitch.planning.expected_model import cell_of_run, cell_of_session
     from stitch.reading.session_folder import load_session
-    from stitch.stored.stored_run import load_state
+    from stitch.stored.stored_run import load_run
 
     if (folder / "result.json").is_file():
         odd = next((f"--{name}" for name, value in vars(stated).items() if value is not None), None)
         if odd is not None:
             raise InputError(f"{odd}: {folder} is a run, which knows that; to fix: leave {odd} out")
-        state = load_state(folder, trust=trust)
+        state = load_run(folder, trust=trust)
         return state.session, cell_of_run(state, folder)
     start = None
     if stated.start is not None:

@@ -91,19 +91,18 @@ def write_run_page(
     from stitch.cli.diagnose import write_diagnosis
     from stitch.cli.run import show_light
     from stitch.pipeline import diagnose
-    from stitch.stored.stored_run import load_state, stored_run
+    from stitch.stored.stored_run import load_run
     from stitch.system.process import console
     from stitch.writing import run_folder
 
     page = run / "report.html"
     with run_folder.lock_run_folder(run):
-        state = load_state(run, effects_file, trust=trust)
-        shown = stored_run(run, state)
+        shown = load_run(run, effects_file, trust=trust)
         run_folder.call_entry_points("stitch.reports", shown, page, tolerance)
         show_light(console(), shown, tolerance)
         if with_diagnosis:
-            write_comparison(state, run)
-            write_diagnosis(diagnose(state), state, run)
+            write_comparison(shown, run)
+            write_diagnosis(diagnose(shown), shown, run)
         _print_paths(_print_to_pdf(page, printer))
 
 
@@ -122,11 +121,10 @@ def write_two_run_page(
         InputError, NoResultError: as `stitch report` ends.
     """
     from stitch.comparison.two_runs import compare_runs, comparison_sentence
-    from stitch.stored.stored_run import load_state, stored_run
+    from stitch.stored.stored_run import load_run
     from stitch.system.process import console
 
-    states = [load_state(folder, effects_file, trust=trust) for folder in _require_different_runs(run, other)]
-    runs = [stored_run(folder, state) for folder, state in zip((run, other), states, strict=True)]
+    runs = [load_run(folder, effects_file, trust=trust) for folder in _require_different_runs(run, other)]
     both = compare_runs(runs, _run_names(run, other))
     written = _write_two_run_files(both, other, output, tolerance, printer)
     console().print(comparison_sentence(both), soft_wrap=True, style="bold")

@@ -12,7 +12,7 @@ from stitch.model.forward import corrected_capture
 from stitch.observations.surfaces.matching import Match, sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, RMS_GATE, collect_overlaps
 from stitch.observations.targets.rows import drawing_of, initial_landmarks, target_rows
-from stitch.runs.run import RunState
+from stitch.runs.run import Run
 from stitch.statistics.distributions import f_tail
 from stitch.statistics.least_squares import BlockLeastSquares
 from stitch.system.threads import library_threads_off
@@ -296,7 +296,7 @@ _ENOUGH = 30
 _PLACES = 4  # cells along each axis of the part
 
 
-def compare_surfaces(state: RunState) -> ResidualTables:
+def compare_surfaces(state: Run) -> ResidualTables:
     """Tables of the residual by view, pair, joint, torque, approach, range, incidence, field, time, covariate, place.
 
     Raises:
@@ -325,7 +325,7 @@ def compare_surfaces(state: RunState) -> ResidualTables:
 class _CorrespondenceRows:
     """Both sides of every correspondence inside the robust gate."""
 
-    def __init__(self, state: RunState, poses: Array, matches: Sequence[Match], scale: float) -> None:
+    def __init__(self, state: Run, poses: Array, matches: Sequence[Match], scale: float) -> None:
         self.count = len(poses)
         parts: list[list[Array]] = [[], [], [], [], [], []]
         for m in matches:
@@ -388,7 +388,7 @@ def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTabl
     )
 
 
-def _correspondence_properties(state: RunState, rows: _CorrespondenceRows) -> list[tuple[str, str, Array]]:
+def _correspondence_properties(state: Run, rows: _CorrespondenceRows) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per row."""
     views, unit = state.measurement.views, state.session.length_unit
     x, y, z = rows.points.T
@@ -441,7 +441,7 @@ class _Offsets:
     views: int
 
 
-def compare_targets(state: RunState) -> ResidualTables:
+def compare_targets(state: Run) -> ResidualTables:
     """Tables of the offsets by view, target, joint, move, torque, approach, range, time and covariate."""
     rows = _target_offsets(state)
     s = state.measurement.capture.sightings
@@ -459,7 +459,7 @@ def compare_targets(state: RunState) -> ResidualTables:
     return ResidualTables(tuple(tables), rms, rms, tuple(state.session.names), of_views)
 
 
-def _target_offsets(state: RunState) -> _Offsets:
+def _target_offsets(state: Run) -> _Offsets:
     """Return offsets from where hand-eye and effects put the targets best."""
     own = corrected_capture(state.measurement, state.model)
     s = own.sightings
@@ -498,7 +498,7 @@ def _offset_table(
     return table_of(name, unit, edges, tuple(labels), view_statistics(n, s, q, directions=_DIRECTIONS))
 
 
-def _offset_properties(state: RunState, rows: _Offsets) -> list[tuple[str, str, Array]]:
+def _offset_properties(state: Run, rows: _Offsets) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per row."""
     out = [("range", state.session.length_unit, np.linalg.norm(rows.points, axis=1))]
     return out + [
@@ -508,7 +508,7 @@ def _offset_properties(state: RunState, rows: _Offsets) -> list[tuple[str, str, 
     ]
 
 
-def _offset_view_properties(state: RunState) -> list[tuple[str, str, Array]]:
+def _offset_view_properties(state: Run) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per view."""
     views = state.measurement.views
     moves = np.degrees(views.joints - views.previous)

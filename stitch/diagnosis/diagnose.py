@@ -34,12 +34,12 @@ from stitch.diagnosis.validation import CrossValidation, cross_validate
 from stitch.diagnosis.verdict import Evidence
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.runs.run import RunState
+from stitch.runs.run import Run
 from stitch.stages.assemble import linearise
 from stitch.system.threads import library_threads_off, parallel, return_large_arrays
 
 
-def diagnose_state(state: RunState) -> Diagnosis:
+def diagnose_state(state: Run) -> Diagnosis:
     """Find which effect is missing in the model of a run; what to measure next is planned elsewhere.
 
     Raises:
@@ -51,7 +51,7 @@ def diagnose_state(state: RunState) -> Diagnosis:
         return _diagnose(state)
 
 
-def _diagnose(state: RunState) -> Diagnosis:
+def _diagnose(state: Run) -> Diagnosis:
     linear, limit = linear_model_of(state), scatter_limit(state.session)
     candidates, missing = candidates_of(linear)
     evidence = select(linear, candidates, limit)
@@ -74,7 +74,7 @@ def _diagnose(state: RunState) -> Diagnosis:
         named=evidence.named,
         sentence="",
         residual_rms=state.residual_rms,
-        heldout_rms=state.heldout_rms,
+        heldout_rms=state.heldout_or_fit_rms,
         noise_floor=state.noise_floor,
         rotation=rotation,
         translation=translation,
@@ -132,7 +132,7 @@ def _with_joint_law(linear: LinearModel, reported: Sequence[RepeatingError]) -> 
     return laws[0].model if laws else linear
 
 
-def linear_model_of(state: RunState) -> LinearModel:
+def linear_model_of(state: Run) -> LinearModel:
     """Linearise a session under the model of a run."""
     return linearise(state.session, state.measurement, state.model, state.gate)
 

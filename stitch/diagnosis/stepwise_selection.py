@@ -12,14 +12,14 @@ from stitch.diagnosis.thresholds import CANDIDATES_TRIED, MANY_POSES, MAX_JOINT_
 from stitch.diagnosis.validation import Extrapolation, cross_validate, extrapolate, untested_ends_reason
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
-from stitch.runs.run import RunState
+from stitch.runs.run import Run
 from stitch.stages.assemble import linearise
 from stitch.system.threads import parallel
 
 # Whether the effects of a model still hold their place beside each other.
 
 
-def find_effect_to_drop(state: RunState, names: Collection[str]) -> tuple[str, str] | None:
+def find_effect_to_drop(state: Run, names: Collection[str]) -> tuple[str, str] | None:
     """The weakest effect of labelled points that does not hold its place beside all others, and why; None if all do.
 
     Effects are asked at once, of many poses one after the other. Scans, whose overlaps are found by all cores already,
@@ -38,7 +38,7 @@ def find_effect_to_drop(state: RunState, names: Collection[str]) -> tuple[str, s
     return name, reason
 
 
-def _test_effect(state: RunState, term: Term) -> tuple[float, str | None]:
+def _test_effect(state: Run, term: Term) -> tuple[float, str | None]:
     """Log Bayes factor of an effect beside the others, and why it should go, if it should."""
     name = term.name
     linear = linearise(state.session, state.measurement, state.model.without(name), state.gate)

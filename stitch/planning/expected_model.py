@@ -26,7 +26,7 @@ from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.surfaces.view_poses import SAMPLES, UnconstrainedPoses
 from stitch.reading.clouds import read_cloud
 from stitch.reading.text_files import reason_of, require_file
-from stitch.runs.run import RunState
+from stitch.runs.run import Run
 from stitch.statistics.least_squares import generalised_fit
 from stitch.statistics.reml import NOISE, USUAL_NOISE_FACTOR, at_variances, fit_variances
 from stitch.statistics.variance_posterior import mean_variances
@@ -391,7 +391,7 @@ def cell_of_session(
     return PlannedCell(cell, (*scatter.assumed, *assumed, *words))
 
 
-def cell_of_run(state: RunState, folder: Path) -> PlannedCell:
+def cell_of_run(state: Run, folder: Path) -> PlannedCell:
     """The cell as a run found it: its model, its scatter, its fused cloud, the field that its scans fill.
 
     Raises:
@@ -406,7 +406,7 @@ def cell_of_run(state: RunState, folder: Path) -> PlannedCell:
     return cell_of_state(state, cloud.points, cloud.normals)
 
 
-def cell_of_state(state: RunState, points: Array, normals: Array) -> PlannedCell:
+def cell_of_state(state: Run, points: Array, normals: Array) -> PlannedCell:
     """Return the cell as a run found it.
 
     Args:

@@ -1,7 +1,10 @@
 """What a run computed, as plain frozen data; `writing` puts it on disk."""
 
 import re
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
@@ -102,38 +105,67 @@ class LedgerStep:
 
 
 @dataclass(frozen=True)
-class Run:
-    """Result of one session, as `result.json` and the report show it; lengths in length_unit, angles in rad."""
+class Fit:
+    """What the stages found of one session under its model; lengths in length_unit, angles in rad."""
 
-    session: Session
-    measurement: Measurement  # as it counts: without outliers
-    model: Model
-    T_mount_coarse: Array  # (4, 4)
-    unobservable: tuple[str, ...]  # plain words, one per unobservable direction
     stages: tuple[StageResult, ...]
     poses_model: Array  # (V, 4, 4) T_reference_scanner of the model (robot, hand-eye, effects)
     poses: Array  # (V, 4, 4) T_reference_scanner after register
+    view_rms: Array  # (V,) NaN for a view without partners, or without a target that counts
+    fused: FusedCloud
+    repeatability: Repeatability  # of the flange poses, as the overlaps show it
+    verdict: str  # one plain sentence
+    convergence: dict[str, list[float]]  # stage -> rms per iteration
     corrections: Array  # (V, 6) twists: poses = exp(corrections) @ poses_model, reference frame
-    view_rms: Array  # (V,)
+    overlaps: Overlaps | None = None  # correspondences of the model, before register moves single views
+    registered: Overlaps | None = None  # correspondences found anew after register: what scatters there is noise
+    targets: TargetModelFit | None = None  # what the labelled points say, where there are any
+    outliers: tuple[Outlier, ...] = ()  # labelled points that do not count
+    unobservable: tuple[str, ...] = ()  # plain words, one per unobservable direction
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Run:
+    """One session, its model and its results, as `result.json` and the report show them.
+
+    Of a run that was read from a folder, `fit` is read and matched again when it is first asked for.
+    """
+
+    session: Session  # without the views that were left out
+    measurement: Measurement  # as it counts: without outliers
+    model: Model
+    T_mount_coarse: Array  # (4, 4)
+    gate: float  # largest distance between partners, length_unit; NaN without clouds
     residual_rms: float
     heldout_rms: float
     noise_floor: float
-    fused: FusedCloud
-    repeatability: Repeatability  # of the flange poses, as the overlaps show it
-    overlaps: Overlaps | None  # correspondences of the model, before register moves single views; None without clouds
-    verdict: str  # one plain sentence
-    registered: Overlaps | None = None  # correspondences found anew after register: what scatters there is noise
+    source: Fit | Callable[[Any], Fit]  # what the stages found, or what reads it for this run
+    register_method: str = ""  # by which single views were registered; empty without clouds
     ledger: tuple[LedgerStep, ...] = ()
     effects_file: str | None = None
-    convergence: dict[str, list[float]] = field(default_factory=dict)  # stage -> rms per iteration
-    notes: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences: they stand before the verdict
-    targets: TargetModelFit | None = None  # what the labelled points say, where there are any
-    outliers: tuple[Outlier, ...] = ()  # labelled points that do not count
-    left_out: tuple[
-        ExcludedView, ...
-    ] = ()  # views of the session that are not fused; all other fields are without them
+    left_out: tuple[ExcludedView, ...] = ()  # views of the session that are not fused
     links: ViewLinks = field(default_factory=ViewLinks)
+
+    @cached_property
+    def fit(self) -> Fit:
+        """What the stages found.
+
+        Raises:
+            InputError: a file of the run's folder is damaged, or belongs to another model or session.
+        """
+        return self.source if isinstance(self.source, Fit) else self.source(self)
+
+    def with_fit(self, **changes: Any) -> Self:
+        """Return the run with other values of some fields of `fit`."""
+        return replace(self, source=replace(self.fit, **changes))
+
+    @property
+    def heldout_or_fit_rms(self) -> float:
+        """On views left out, length_unit; that of the fit where the history does not know it."""
+        known = self.ledger[-1].heldout_rms if self.ledger else np.nan
+        return known if np.isfinite(known) else self.residual_rms
 
     @property
     def T_mount(self) -> Array:
@@ -155,10 +187,67 @@ class Run:
         """Names of the effects in use."""
         return self.model.effects
 
+    # Fields of `fit`.
+
     @property
-    def register_method(self) -> str:
-        """By which method single views were registered; empty without clouds."""
-        return next((stage.method for stage in self.stages if stage.method), "")
+    def stages(self) -> tuple[StageResult, ...]:
+        return self.fit.stages
+
+    @property
+    def poses_model(self) -> Array:
+        return self.fit.poses_model
+
+    @property
+    def poses(self) -> Array:
+        return self.fit.poses
+
+    @property
+    def corrections(self) -> Array:
+        return self.fit.corrections
+
+    @property
+    def view_rms(self) -> Array:
+        return self.fit.view_rms
+
+    @property
+    def fused(self) -> FusedCloud:
+        return self.fit.fused
+
+    @property
+    def repeatability(self) -> Repeatability:
+        return self.fit.repeatability
+
+    @property
+    def overlaps(self) -> Overlaps | None:
+        return self.fit.overlaps
+
+    @property
+    def registered(self) -> Overlaps | None:
+        return self.fit.registered
+
+    @property
+    def targets(self) -> TargetModelFit | None:
+        return self.fit.targets
+
+    @property
+    def outliers(self) -> tuple[Outlier, ...]:
+        return self.fit.outliers
+
+    @property
+    def unobservable(self) -> tuple[str, ...]:
+        return self.fit.unobservable
+
+    @property
+    def verdict(self) -> str:
+        return self.fit.verdict
+
+    @property
+    def convergence(self) -> dict[str, list[float]]:
+        return self.fit.convergence
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.fit.notes
 
     def __repr__(self) -> str:
         unit = self.session.length_unit
@@ -166,55 +255,3 @@ class Run:
             f"Run({self.session.name!r}, {len(self.session.views)} views, residual {self.residual_rms:.4g} {unit}, "
             f"held-out {self.heldout_rms:.4g} {unit}, {self.model!r})"
         )
-
-
-# A run as far as the next question needs it: what was measured, the model, and its history.
-
-
-@dataclass(frozen=True)
-class RunState:
-    """What was measured, the model, and its history."""
-
-    session: Session
-    measurement: Measurement
-    model: Model
-    T_mount_coarse: Array  # (4, 4)
-    gate: float  # largest distance between partners, length_unit; NaN without clouds
-    residual_rms: float
-    noise_floor: float
-    ledger: tuple[LedgerStep, ...]
-    effects_file: str | None
-    left_out: tuple[
-        ExcludedView, ...
-    ] = ()  # views of the session that do not count; session and measurement are without
-    links: ViewLinks = field(default_factory=ViewLinks)
-    doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
-    register: str = ""  # method of register; empty: the usual one
-
-    @property
-    def heldout_rms(self) -> float:
-        """On views left out, length_unit; that of the fit where the history does not know it."""
-        known = self.ledger[-1].heldout_rms if self.ledger else np.nan
-        return known if np.isfinite(known) else self.residual_rms
-
-    def __repr__(self) -> str:
-        return f"State({self.session.name!r}, {len(self.session.views)} views, {self.model!r})"
-
-
-def state_of(run: Run) -> RunState:
-    """The state of a run in memory."""
-    return RunState(
-        session=run.session,
-        measurement=run.measurement,
-        model=run.model,
-        T_mount_coarse=run.T_mount_coarse,
-        gate=float("nan") if run.overlaps is None else run.overlaps.gate,
-        residual_rms=run.residual_rms,
-        noise_floor=run.noise_floor,
-        ledger=run.ledger,
-        effects_file=run.effects_file,
-        left_out=run.left_out,
-        links=run.links,
-        doubts=run.doubts,
-        register=run.register_method,
-    )

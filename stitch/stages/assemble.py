@@ -1,7 +1,7 @@
 """Which way a run goes, from clouds or from labelled points, and its result collected at the end."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from stitch.measurement.measurement import Measurement, session_notes
 from stitch.measurement.session import Session
@@ -10,7 +10,7 @@ from stitch.observations.linear_model import LinearModel
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import ExcludedView, LedgerStep, Run, StageResult, ViewLinks
 from stitch.stages import surface_pipeline, target_pipeline
-from stitch.stages.finish import FinishedSession, FittedRig, Pipeline
+from stitch.stages.finish import FittedRig, Pipeline
 from stitch.stages.initial_guess import CoarseHandEye
 from stitch.stages.observability import unobservable
 from stitch.stages.register import DEFAULT
@@ -55,55 +55,39 @@ class FitSummary:
 def assemble_run(session: Session, index: int, end: FitSummary, before: StageResult, recorder: Recorder) -> Run:
     """Register and fuse one session, collect its result with its line in the history, and show it."""
     course, fitted = pipeline_for(session), end.fitted
-    finished = course.finish(session, fitted, index, before, recorder, end.seconds, end.register)
+    found, step = course.finish(session, fitted, index, before, recorder, end.seconds, end.register)
     own, model, begun = fitted.sessions[index], fitted.model_of(index), end.starts[index]
     # Where several sessions share a hand-eye no joint has one place for all.
     shared = fitted.captures if session.has_clouds else [fitted.captures[index]]
     joints = session.joints if len(shared) == 1 else None
-    result = Run(
-        session=session,
-        measurement=own.measurement,
-        model=model,
-        T_mount_coarse=begun.T_mount,
+    found = replace(
+        found,
+        targets=own.targets,
+        outliers=own.outliers,
         unobservable=unobservable(shared, model.T_mount, session.robot, joints),
-        stages=finished.stages,
-        poses_model=finished.poses_model,
-        poses=finished.poses,
-        corrections=finished.corrections,
-        view_rms=finished.view_rms,
-        residual_rms=finished.residual_rms,
-        heldout_rms=finished.heldout_rms,
-        noise_floor=finished.noise_floor,
-        fused=finished.fused,
-        repeatability=finished.repeatability,
-        overlaps=finished.overlaps,
-        registered=finished.registered,
-        verdict=finished.verdict,
-        ledger=(*end.ledger, _ledger_step(model, finished)),
-        effects_file=end.effects_file,
-        convergence=finished.convergence,
         notes=(
             *view_notes(end.left_out, end.kept, end.suspected),
             *course.notes(session, fitted, index, begun),
             *session_notes(session),
             *end.notes,
         ),
+    )
+    result = Run(
+        session=session,
+        measurement=own.measurement,
+        model=model,
+        T_mount_coarse=begun.T_mount,
+        gate=float("nan") if found.overlaps is None else found.overlaps.gate,
+        residual_rms=step.residual_rms,
+        heldout_rms=step.heldout_rms,
+        noise_floor=step.noise_floor,
+        source=found,
+        register_method=next((stage.method for stage in found.stages if stage.method), ""),
+        ledger=(*end.ledger, step),
+        effects_file=end.effects_file,
         doubts=end.doubts,
         left_out=end.left_out,
         links=end.links,
-        targets=own.targets,
-        outliers=own.outliers,
     )
     recorder.finish(result)
     return result
-
-
-def _ledger_step(model: Model, finished: FinishedSession) -> LedgerStep:
-    return LedgerStep(
-        effects=tuple(model.effects),
-        residual_rms=finished.residual_rms,
-        heldout_rms=finished.heldout_rms,
-        noise_floor=finished.noise_floor,
-        T_mount=model.T_mount,
-        values={term.name: {p.name: p.value for p in term.parameters} for term in model.terms},
-    )

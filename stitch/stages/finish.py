@@ -14,12 +14,12 @@ from stitch.measurement.session import Session
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.hand_eye_fit import Repeatability, repeatability_from
+from stitch.observations.surfaces.hand_eye_fit import repeatability_from
 from stitch.observations.surfaces.normal_equations import RMS_GATE, Overlaps
 from stitch.observations.surfaces.view_poses import noise_floor
 from stitch.observations.targets.target_model import TargetModelFit, rms_of
 from stitch.runs.recorder import Recorder
-from stitch.runs.run import FusedCloud, StageResult
+from stitch.runs.run import Fit, FusedCloud, LedgerStep, StageResult
 from stitch.stages.correct import Correction
 from stitch.stages.fuse import RegisteredSession, fuse_every_point
 from stitch.stages.initial_guess import CoarseHandEye
@@ -33,31 +33,6 @@ from stitch.system.threads import Clock, release_mapped
 _RMS_SAMPLES = 2_000_000
 
 
-@dataclass(frozen=True)
-class FinishedSession:
-    """One session under its model, with single views registered and fused."""
-
-    own: Capture  # without the effects in use
-    stages: tuple[StageResult, ...]
-    poses_model: Array  # (V, 4, 4) T_reference_scanner
-    poses: Array  # (V, 4, 4) after register
-    view_rms: Array  # (V,) NaN for a view without partners, or without a target that counts
-    residual_rms: float
-    heldout_rms: float
-    noise_floor: float
-    fused: FusedCloud
-    repeatability: Repeatability
-    verdict: str
-    convergence: dict[str, list[float]]
-    overlaps: Overlaps | None = None
-    registered: Overlaps | None = None  # after register
-
-    @property
-    def corrections(self) -> Array:
-        """(V, 6) twists: poses = exp(corrections) @ poses_model."""
-        return frames.log(self.poses @ frames.inverse(self.poses_model))
-
-
 def finish_surfaces(
     session: Session,
     measurement: Measurement,
@@ -68,7 +43,7 @@ def finish_surfaces(
     recorder: Recorder,
     seconds: float,
     method: Method,
-) -> FinishedSession:
+) -> tuple[Fit, LedgerStep]:
     """Register and fuse session `index` of a rig under the common model, and show it to the recorder.
 
     Raises:
@@ -91,21 +66,36 @@ def finish_surfaces(
     last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap())
     recorder.stage(registered, registration.poses)
     floor = noise_floor(own, registration.overlaps, session.scanner.noise)
-    return FinishedSession(
-        own=own,
+    found = Fit(
         stages=(before, corrected, registered, last),
         poses_model=poses_model,
         poses=registration.poses,
+        corrections=_twists(poses_model, registration.poses),
         view_rms=per_view_rms(registration.overlaps, len(own.scans)),
-        residual_rms=corrected.rms,
-        heldout_rms=corrected.rms * correction.hand_eye.heldout_ratio,
-        noise_floor=floor,
         fused=fused,
         repeatability=scatter,
         verdict=surface_sentence(corrected.rms, registered.rms, floor, scatter, session.length_unit, model.effects),
         convergence={"correct": list(correction.history), "register": list(registration.history)},
         overlaps=overlaps,
         registered=registration.overlaps,
+    )
+    return found, _ledger_step(model, corrected.rms, corrected.rms * correction.hand_eye.heldout_ratio, floor)
+
+
+def _twists(poses_model: Array, poses: Array) -> Array:
+    """Return (V, 6) twists: poses = exp(twists) @ poses_model."""
+    return frames.log(poses @ frames.inverse(poses_model))
+
+
+def _ledger_step(model: Model, residual_rms: float, heldout_rms: float, noise_floor: float) -> LedgerStep:
+    """Return the line of the model's history."""
+    return LedgerStep(
+        effects=tuple(model.effects),
+        residual_rms=residual_rms,
+        heldout_rms=heldout_rms,
+        noise_floor=noise_floor,
+        T_mount=model.T_mount,
+        values={term.name: {p.name: p.value for p in term.parameters} for term in model.terms},
     )
 
 
@@ -115,7 +105,7 @@ def _overlap_stage(name: str, overlaps: Overlaps, iterations: int, seconds: floa
 
 def finish_targets(
     session: Session, found: TargetModelFit, before: StageResult, recorder: Recorder, seconds: float
-) -> FinishedSession:
+) -> tuple[Fit, LedgerStep]:
     """Register single views by their labelled points, and show it to the recorder; there is no cloud to fuse."""
     clock, rows = Clock(), found.rows
     own = rows.capture
@@ -130,20 +120,18 @@ def finish_targets(
     recorder.stage(corrected, poses_model)
     recorder.stage(registered, poses)
     scatter = repeatability_from(found.variances)
-    return FinishedSession(
-        own=own,
+    fit = Fit(
         stages=(before, corrected, registered),
         poses_model=poses_model,
         poses=poses,
+        corrections=_twists(poses_model, poses),
         view_rms=np.sqrt(found.view_squares),
-        residual_rms=found.rms,
-        heldout_rms=found.heldout_rms,
-        noise_floor=found.noise_floor,
         fused=_targets_as_cloud(found),
         repeatability=scatter,
         verdict=target_sentence(found, rms_of(after), scatter, session.length_unit),
         convergence={"correct": list(found.history), "register": [rms_of(after)]},
     )
+    return fit, _ledger_step(found.model, found.rms, found.heldout_rms, found.noise_floor)
 
 
 def _targets_as_cloud(found: TargetModelFit) -> FusedCloud:
@@ -246,7 +234,7 @@ class Pipeline(Protocol):
         recorder: Recorder,
         seconds: float,
         register: str,
-    ) -> FinishedSession:
+    ) -> tuple[Fit, LedgerStep]:
         """Single views registered by a method, and fused."""
         ...
 

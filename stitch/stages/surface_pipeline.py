@@ -19,9 +19,9 @@ from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.runs.recorder import Recorder
-from stitch.runs.run import StageResult
+from stitch.runs.run import Fit, LedgerStep, StageResult
 from stitch.stages.correct import COARSE_SAMPLES, Correction, apply_given_hand_eye, correct
-from stitch.stages.finish import FinishedSession, FittedRig, InitialModel, finish_surfaces
+from stitch.stages.finish import FittedRig, InitialModel, finish_surfaces
 from stitch.stages.initial_guess import REUSED, STATED, CoarseHandEye, find_coarse_hand_eye, use_given_hand_eye
 from stitch.stages.register import METHODS
 from stitch.stages.sentences import coarse_note, mixed_notes, warnings
@@ -128,7 +128,7 @@ def finish(
     recorder: Recorder,
     seconds: float,
     register: str,
-) -> FinishedSession:
+) -> tuple[Fit, LedgerStep]:
     """Register and fuse session `index` under the common model."""
     assert fitted.correction is not None
     return finish_surfaces(

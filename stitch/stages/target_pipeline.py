@@ -17,8 +17,8 @@ from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_ey
 from stitch.observations.targets.rows import drawing_of, initial_landmarks, target_rows
 from stitch.observations.targets.target_model import TargetModelFit, rms_of, target_model
 from stitch.runs.recorder import Recorder
-from stitch.runs.run import StageResult
-from stitch.stages.finish import FinishedSession, FittedRig, InitialModel, finish_targets
+from stitch.runs.run import Fit, LedgerStep, StageResult
+from stitch.stages.finish import FittedRig, InitialModel, finish_targets
 from stitch.stages.initial_guess import REUSED, STATED, CoarseHandEye
 from stitch.stages.sentences import target_notes
 from stitch.stages.target_fit import TargetStart, evaluate_targets, fit_targets, fit_without_outliers
@@ -128,7 +128,7 @@ def finish(
     recorder: Recorder,
     seconds: float,
     register: str,
-) -> FinishedSession:
+) -> tuple[Fit, LedgerStep]:
     """Register single views; `register` names a method of surfaces, which labelled points do not need."""
     found = fitted.sessions[index].targets
     assert found is not None

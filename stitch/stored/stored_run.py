@@ -1,8 +1,9 @@
-"""result.json and ledger.json of a run folder, checked: a person may have edited them, or a disk cut them short."""
+"""Read a run folder again: its documents checked, its model, and the run that wrote it."""
 
 import json
 import shlex
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from stitch.observations.targets.target_model import TargetModelFit
 from stitch.reading.clouds import require_room
 from stitch.reading.session_folder import load_session
 from stitch.reading.text_files import read_text, shortened
-from stitch.runs.run import ExcludedView, FusedCloud, LedgerStep, Note, Run, RunState, StageResult, ViewLinks
+from stitch.runs.run import ExcludedView, Fit, FusedCloud, LedgerStep, Note, Run, StageResult, ViewLinks
 from stitch.stages.correct import REUSE_GATE, converged_gate, converged_overlaps
 from stitch.stages.target_fit import evaluate_targets
 from stitch.system.threads import library_threads_off
@@ -240,11 +241,11 @@ def trusted_model(path: Path, effects_file: Path | None = None, trust: bool = Fa
     return model, model.effects_file
 
 
-# A run as far as the next question needs it: what was measured, and the model.
+# A run folder as the run that wrote it: its numbers as they stand there, its correspondences found again.
 
 
-def load_state(folder: Path, effects_file: Path | None = None, trust: bool = False) -> RunState:
-    """The state of a run folder; its session is read again.
+def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False) -> Run:
+    """Read a run folder; its session is read again and nothing is fitted.
 
     Args:
         trust: run the Python file of effects that the model names.
@@ -268,20 +269,81 @@ def load_state(folder: Path, effects_file: Path | None = None, trust: bool = Fal
         measurement = restore_counted_targets(measurement, session, document)
         own = corrected_capture(measurement, model)
         gate = converged_gate(own, model.T_mount, REUSE_GATE * part_size([own])) if own.scans else float("nan")
-    return RunState(
+    return Run(
         session=session,
         measurement=measurement,
         model=model,
         T_mount_coarse=file.T_mount_coarse,
         gate=gate,
         residual_rms=document["residual_rms"],
+        heldout_rms=_number(document["heldout_rms"]),
         noise_floor=document["noise_floor"],
+        source=partial(_read_fit, folder),
         ledger=steps,
         effects_file=effects,
         left_out=left_out,
         links=links,
         doubts=tuple(document.get("doubts", ())),
-        register=next((stage["method"] for stage in document["stages"] if "method" in stage), ""),
+        register_method=next((stage["method"] for stage in document["stages"] if "method" in stage), ""),
+    )
+
+
+def _read_fit(folder: Path, run: Run) -> Fit:
+    """Read what the stages found; correspondences are found again, nothing is fitted.
+
+    Raises:
+        InputError: a file of the folder is damaged, or belongs to another model or session.
+    """
+    model = read_model(folder)
+    try:
+        document = read_result(folder)
+        _require_one(folder, document, model, run)
+        return _restore_fit(folder, document, run)
+    except (LookupError, TypeError, ValueError, OSError, PlyParseError) as error:
+        reason = shortened(" ".join(str(error).split()))
+        raise InputError(f"{folder}: its files are damaged ({reason}); run `stitch run` again") from None
+
+
+def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, run: Run) -> None:
+    """Refuse a model or a session that is not that of the result any more."""
+    stated = {name: {p: f["value"] for p, f in own.items()} for name, own in document["effects"].items()}
+    values = {name: {p: f.value for p, f in own.items()} for name, own in model.effects.items()}
+    if stated != values or not np.array_equal(document["hand_eye"], model.T_mount):
+        raise InputError(
+            f"{folder}/model.toml: changed after the run; see what it does with `stitch run {run.session.path} "
+            f"--hand-eye {folder} -o ANOTHER`"
+        )
+    gone = {item.view for item in run.left_out}
+    if [v["view"] for v in document["views"] if v["view"] not in gone] != run.session.names:
+        raise InputError(f"{run.session.path}/views.csv: changed after {folder} was made; run `stitch run` again")
+
+
+def _restore_fit(folder: Path, document: dict[str, Any], run: Run) -> Fit:
+    model = run.model
+    gone = {item.view for item in run.left_out}
+    views = [view for view in document["views"] if view["view"] not in gone]
+    with library_threads_off():
+        own = corrected_capture(run.measurement, model)
+        overlaps = converged_overlaps(own, model.T_mount, run.gate) if own.scans else None
+        poses = np.array([view["pose"] for view in views], float)
+        registered = _registered_overlaps(own, poses, document, run.gate) if own.scans else None
+        targets = _target_fit(folder, run) if document.get("targets") and own.sightings is not None else None
+    scatter = document["repeatability"]
+    return Fit(
+        unobservable=tuple(document["unobservable"]),
+        stages=tuple(_stage_result(row) for row in document["stages"]),
+        poses_model=own.poses(model.T_mount),
+        poses=poses,
+        corrections=np.array([view["correction"] for view in views], float),
+        view_rms=np.array([_number(view["rms"]) for view in views]),
+        fused=fused_cloud(folder / "stitched.ply"),
+        repeatability=Repeatability(_number(scatter["rotation"]), _number(scatter["translation"]), float("nan")),
+        overlaps=overlaps,
+        registered=registered,
+        verdict=document["verdict"],
+        convergence={stage: [_number(x) for x in course] for stage, course in document["convergence"].items()},
+        notes=tuple(document["notes"]),
+        targets=targets,
     )
 
 
@@ -301,83 +363,6 @@ def left_out_of(document: dict[str, Any]) -> tuple[tuple[ExcludedView, ...], Vie
     return tuple(left_out), ViewLinks(components, weak)
 
 
-# A run folder as the run that wrote it: its numbers as they stand there, its correspondences found again.
-
-
-def stored_run(folder: Path, state: RunState) -> Run:
-    """The run of a folder as far as its page shows it; nothing is fitted.
-
-    Args:
-        state: of the same folder, with all points.
-
-    Raises:
-        InputError: a file of the folder is damaged, or belongs to another model or session.
-    """
-    model = read_model(folder)
-    try:
-        document = read_result(folder)
-        _require_one(folder, document, model, state)
-        return _restore_run(folder, document, state)
-    except (LookupError, TypeError, ValueError, OSError, PlyParseError) as error:
-        reason = shortened(" ".join(str(error).split()))
-        raise InputError(f"{folder}: its files are damaged ({reason}); run `stitch run` again") from None
-
-
-def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, state: RunState) -> None:
-    """Refuse a model or a session that is not that of the result any more."""
-    stated = {name: {p: f["value"] for p, f in own.items()} for name, own in document["effects"].items()}
-    values = {name: {p: f.value for p, f in own.items()} for name, own in model.effects.items()}
-    if stated != values or not np.array_equal(document["hand_eye"], model.T_mount):
-        raise InputError(
-            f"{folder}/model.toml: changed after the run; see what it does with `stitch run {state.session.path} "
-            f"--hand-eye {folder} -o ANOTHER`"
-        )
-    gone = {item.view for item in state.left_out}
-    if [v["view"] for v in document["views"] if v["view"] not in gone] != state.session.names:
-        raise InputError(f"{state.session.path}/views.csv: changed after {folder} was made; run `stitch run` again")
-
-
-def _restore_run(folder: Path, document: dict[str, Any], state: RunState) -> Run:
-    session, model = state.session, state.model
-    gone = {item.view for item in state.left_out}
-    views = [view for view in document["views"] if view["view"] not in gone]
-    with library_threads_off():
-        own = corrected_capture(state.measurement, model)
-        overlaps = converged_overlaps(own, model.T_mount, state.gate) if own.scans else None
-        poses = np.array([view["pose"] for view in views], float)
-        registered = _registered_overlaps(own, poses, document, state.gate) if own.scans else None
-        targets = _target_fit(folder, state) if document.get("targets") and own.sightings is not None else None
-    scatter = document["repeatability"]
-    return Run(
-        session=session,
-        measurement=state.measurement,
-        model=model,
-        T_mount_coarse=state.T_mount_coarse,
-        unobservable=tuple(document["unobservable"]),
-        stages=tuple(_stage_result(row) for row in document["stages"]),
-        poses_model=own.poses(model.T_mount),
-        poses=poses,
-        corrections=np.array([view["correction"] for view in views], float),
-        view_rms=np.array([_number(view["rms"]) for view in views]),
-        residual_rms=_number(document["residual_rms"]),
-        heldout_rms=_number(document["heldout_rms"]),
-        noise_floor=_number(document["noise_floor"]),
-        fused=fused_cloud(folder / "stitched.ply"),
-        repeatability=Repeatability(_number(scatter["rotation"]), _number(scatter["translation"]), float("nan")),
-        overlaps=overlaps,
-        registered=registered,
-        verdict=document["verdict"],
-        ledger=state.ledger,
-        effects_file=state.effects_file,
-        convergence={stage: [_number(x) for x in course] for stage, course in document["convergence"].items()},
-        notes=tuple(document["notes"]),
-        doubts=state.doubts,
-        targets=targets,
-        left_out=state.left_out,
-        links=state.links,
-    )
-
-
 def _registered_overlaps(own: Capture, poses: Array, document: dict[str, Any], gate: float) -> Overlaps:
     """Correspondences after register, as the run found them last."""
     stated = (document.get("disagreement") or {}).get("gate")
@@ -389,13 +374,13 @@ def _stage_result(row: dict[str, Any]) -> StageResult:
     return StageResult(row["name"], rms, row["correspondences"], row["iterations"], row["seconds"], *words)
 
 
-def _target_fit(folder: Path, state: RunState) -> TargetModelFit:
+def _target_fit(folder: Path, run: Run) -> TargetModelFit:
     """What the labelled points say under the model; the distances of views left out are those of the fit."""
-    found = evaluate_targets(state.measurement, state.model)
+    found = evaluate_targets(run.measurement, run.model)
     used = found.rows.sightings.used
     heldout = np.full(used.shape, np.nan)
     # Beside clouds views are left out with their surfaces, not by their labelled points.
-    if not state.measurement.capture.scans:
+    if not run.measurement.capture.scans:
         heldout[used] = pq.read_table(folder / "residuals.parquet")["heldout"].to_numpy()
     return replace(found, heldout=heldout)
 

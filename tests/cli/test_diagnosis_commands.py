@@ -12,7 +12,7 @@ from data_synth.scene import load_scene
 from data_synth.write import write_session, write_truth
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.stored.stored_run import load_state
+from stitch.stored.stored_run import load_run
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_the_whole_way_by_command_line(session_on_disk, stitch_command):
     assert [s["step"] for s in ledger] == [0, 1]
     assert ledger[1]["residual_rms"] < ledger[0]["residual_rms"]
     assert judge(folder / "r", folder / "s.truth.json")["judgement"] == "complete"
-    assert load_state(folder / "r").model.terms[0].effect.name == "joint_compliance"
+    assert load_run(folder / "r").model.terms[0].effect.name == "joint_compliance"
 
 
 @pytest.mark.slow
@@ -101,4 +101,4 @@ def test_state_of_a_vanished_session_is_refused(tmp_path, session_on_disk):
         (tmp_path / "r" / name).write_text((folder / "r0" / name).read_text())
     (tmp_path / "r" / "result.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match="has gone"):
-        load_state(tmp_path / "r")
+        load_run(tmp_path / "r")

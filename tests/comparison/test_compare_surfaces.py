@@ -7,7 +7,6 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch.comparison.residual_tables import compare_surfaces
 from stitch.pipeline import run
-from stitch.runs.run import state_of
 
 
 def blade_run(seed, hidden, mount="eye_to_hand", views=12):
@@ -17,8 +16,7 @@ def blade_run(seed, hidden, mount="eye_to_hand", views=12):
 
 def test_compare_counts_everything_and_shows_the_view_that_is_off():
     measured, result = blade_run(5, {})
-    state = state_of(result)
-    found = compare_surfaces(state)
+    found = compare_surfaces(result)
     assert found.rms == pytest.approx(result.residual_rms, rel=0.05)
     table = found.table("view")
     assert table.views.sum() == len(measured.clouds)

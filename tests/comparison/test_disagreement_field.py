@@ -15,7 +15,7 @@ from stitch.observations.surfaces.matching import sample_points, signed_distance
 from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.pipeline import add, run
 from stitch.reading.session_folder import load_session
-from stitch.stored.stored_run import load_state, stored_run
+from stitch.stored.stored_run import load_run
 from stitch.writing.result_document import result_document
 from stitch.writing.run_folder import write_run
 
@@ -104,7 +104,7 @@ def test_a_view_that_is_moved_lies_off_by_its_motion():
 
 def test_the_history_is_the_same_when_it_is_read_again(changed, tmp_path):
     write_run(changed, tmp_path)
-    again = model_history(stored_run(tmp_path, load_state(tmp_path)))
+    again = model_history(load_run(tmp_path))
     stated = result_document(changed)["disagreement"]
     assert [s.name for s in again.steps] == [row["step"] for row in stated["steps"]]
     np.testing.assert_allclose(

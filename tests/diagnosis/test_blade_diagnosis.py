@@ -10,7 +10,6 @@ from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.pipeline import add, diagnose, run
-from stitch.runs.run import state_of
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json
 
@@ -100,7 +99,7 @@ def test_turning_the_last_joint_alone_names_nothing():
 @pytest.mark.slow
 def test_prediction_of_the_null_is_the_present_residual():
     _, result = blade_run(6, {})
-    linear = linear_model_of(state_of(result))
+    linear = linear_model_of(result)
     g, present = linear.observation.unconstrained.overlaps.gram, linear.baseline_trial
     assert np.sqrt(present.squares(present.solve()).sum() / g.weight.sum()) == pytest.approx(
         result.residual_rms, rel=0.15

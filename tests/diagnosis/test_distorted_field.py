@@ -11,13 +11,12 @@ from stitch.diagnosis.diagnose import diagnose_state
 from stitch.effects.empirical import FIELD, empirical_effects
 from stitch.measurement.measurement import measurement_of
 from stitch.pipeline import run
-from stitch.runs.run import state_of
 
 
 def said_of(measured, seen=lambda points: points):
     """The diagnosis of a run in which the scanner reports true points (N, 3) so."""
     clouds = [replace(c, points=seen(c.points)) for c in measured.clouds]
-    return diagnose_state(state_of(run(session_of(replace(measured, clouds=clouds)))))
+    return diagnose_state(run(session_of(replace(measured, clouds=clouds))))
 
 
 @pytest.fixture(scope="module")

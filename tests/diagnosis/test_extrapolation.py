@@ -10,13 +10,12 @@ from stitch.diagnosis.stepwise_selection import find_exchange
 from stitch.diagnosis.validation import Extrapolation, extrapolate, untested_ends_reason
 from stitch.effects.contract import EFFECTS
 from stitch.pipeline import run
-from stitch.runs.run import state_of
 from stitch.statistics.folds import JointEnd
 
 
 def stands(session, name):
     """Whether an effect would be named, and what it leaves at left-out ends of joints' ranges."""
-    linear = linear_model_of(state_of(run(session)))
+    linear = linear_model_of(run(session))
     own = rank_one(linear, candidate_of(linear, EFFECTS[name]), tests=1)
     return is_certain(own), extrapolate(linear, own.score)
 
@@ -61,7 +60,7 @@ def test_effects_that_no_end_tells_of_are_refused_in_one_sentence():
 
 def exchanged(session, name, rivals):
     """What takes the place of an effect that was found alone, if anything."""
-    linear = linear_model_of(state_of(run(session)))
+    linear = linear_model_of(run(session))
     every = {n: candidate_of(linear, EFFECTS[n]) for n in (name, *rivals)}
     own = rank_one(linear, every[name], tests=1)
     return find_exchange(linear, list(every.values()), [own], {name: extrapolate(linear, own.score)})

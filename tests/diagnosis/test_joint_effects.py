@@ -6,7 +6,6 @@ import pytest
 from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_cell
 from stitch.diagnosis.stepwise_selection import find_effect_to_drop
 from stitch.pipeline import add, diagnose, run, suggest
-from stitch.runs.run import state_of
 
 
 def test_a_hidden_joint_offset_is_named_and_found():
@@ -27,17 +26,17 @@ def test_offsets_and_gravity_together_are_found_by_their_names(few_effects):
     # Gravity on the flange's mass turns joint 2 by what the flange reaches out: 2 µrad a millimetre.
     offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
     session, *_ = labelled_cell(9, views=100, offset=offset, sag=2e-6, targets=TARGETS[:2])
-    found, lines, _ = suggest(state_of(run(session)), 3)
+    found, lines, _ = suggest(run(session), 3)
     assert set(found.effects) == {"joint_offset", "joint_compliance"}, lines
     assert found.heldout_rms < 0.1
 
 
 def test_an_effect_that_another_made_idle_is_dropped():
     session, *_ = labelled_cell(12, views=100, offset=np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0]), targets=TARGETS[:2])
-    state = state_of(run(session, effects=["gear_eccentricity", "joint_offset"]))
+    state = run(session, effects=["gear_eccentricity", "joint_offset"])
     name, reason = find_effect_to_drop(state, {"gear_eccentricity", "joint_offset"})
     assert name == "gear_eccentricity", reason
-    assert find_effect_to_drop(state_of(run(session, effects=["joint_offset"])), {"joint_offset"}) is None
+    assert find_effect_to_drop(run(session, effects=["joint_offset"]), {"joint_offset"}) is None
 
 
 def test_an_honest_cell_is_adequate():

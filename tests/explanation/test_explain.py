@@ -14,7 +14,6 @@ from stitch.explanation.explain import explain
 from stitch.explanation.search import search_sums
 from stitch.measurement.measurement import views_of
 from stitch.pipeline import run
-from stitch.runs.run import state_of
 
 SIZE = 3e-4  # rad
 
@@ -26,7 +25,7 @@ def coupling(q):
 
 def evidence(seed, gears=None, views=60, **options):
     session, *_ = labelled_cell(seed, views=views, targets=TARGETS[:2], gears=gears, **options)
-    return linear_model_of(state_of(run(session)))
+    return linear_model_of(run(session))
 
 
 def test_a_coupling_of_two_joints_is_found_with_its_size():

@@ -11,7 +11,6 @@ from stitch.explanation.dictionary import Ingredient, Nonlinear, build_dictionar
 from stitch.explanation.explain import explain
 from stitch.explanation.search import HalfModel, refine_parameters, round_parameters
 from stitch.pipeline import run
-from stitch.runs.run import state_of
 from tests.diagnosis.freed_blade import freed_blade
 
 MIDDLE, WIDTH, HEIGHT = 0.31, 0.13, 6e-4  # rad: between the places and beside the widths that are tried
@@ -25,7 +24,7 @@ def tooth(q):
 @pytest.fixture(scope="module")
 def labelled():
     session, *_ = labelled_cell(2, views=80, targets=TARGETS[:2], gears=tooth)
-    return linear_model_of(state_of(run(session)))
+    return linear_model_of(run(session))
 
 
 def halves(linear):

@@ -11,7 +11,6 @@ from stitch.explanation.dictionary import Quantity, build_dictionary, nonlinear_
 from stitch.explanation.explain import explain
 from stitch.measurement.measurement import views_of
 from stitch.pipeline import run
-from stitch.runs.run import state_of
 
 TOOTH, HEIGHT = 0.33, 8e-4  # rad
 
@@ -25,7 +24,7 @@ def belt(q):
 @pytest.mark.parametrize("views", [40, 80])
 def test_a_belt_that_jumps_is_found_with_its_tooth(views):
     session, *_ = labelled_cell(1, views=views, targets=TARGETS[:2], gears=belt)
-    found = explain(linear_model_of(state_of(run(session))))
+    found = explain(linear_model_of(run(session)))
     assert found.found and found.formula.startswith("q*3 = q3")
     (saw,) = re.findall(r"([-+0-9.e]+) rad · saw of q\d, a tooth ([0-9.]+)°", found.formula)
     size, tooth = map(float, saw)
@@ -41,7 +40,7 @@ def test_a_saw_jumps_where_it_says_and_belongs_to_its_own_joint():
     slope = np.diff(saw.values) - np.diff(views.joints[:, 1]) / 0.2
     np.testing.assert_allclose(slope, np.round(slope), atol=1e-9)  # whole teeth are jumped over
     assert {q.joint for q in view_quantities(views) if q.kind == "teeth"} <= set(range(6))
-    linear = linear_model_of(state_of(run(labelled_cell(3, views=12)[0])))
+    linear = linear_model_of(run(labelled_cell(3, views=12)[0]))
     of_teeth = [i for i in build_dictionary(linear, view_quantities(views)).ingredients if i.quantity.kind == "teeth"]
     assert of_teeth and all(i.index == i.quantity.joint for i in of_teeth)
 

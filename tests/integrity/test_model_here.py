@@ -10,7 +10,6 @@ from stitch import frames
 from stitch.comparison.run_verdict import run_light, run_verdict
 from stitch.errors import NoResultError
 from stitch.pipeline import change, diagnose, run
-from stitch.runs.run import state_of
 from stitch.writing.diagnosis_document import plain_finding, suggested_command
 from stitch.writing.result_document import model_of
 
@@ -75,7 +74,7 @@ def test_a_diagnosis_says_first_what_is_doubted(cell):
     )
     assert suggested_command(found, "RUN").startswith("Next: put right what is doubted")
     # Fitted anew, hand-eye and targets are of this session, and nothing is doubted.
-    assert not diagnose(change(state_of(moved), ["joint_offset"])).doubts
+    assert not diagnose(change(moved, ["joint_offset"])).doubts
 
 
 def test_a_tool_that_was_mounted_anew_is_said_by_its_targets(cell):

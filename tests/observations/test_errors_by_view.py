@@ -25,7 +25,6 @@ from stitch.observations.surfaces.scanner_errors import (
     view_error_likelihood,
 )
 from stitch.observations.surfaces.view_poses import displacement_factors
-from stitch.runs.run import state_of
 
 VIEWS = 12
 # What moves the points (N, 3) of view v, scanner frame, mm.
@@ -58,7 +57,7 @@ def linear_of(law: Law | None, seed: int = 5) -> LinearModel:
     if law is not None:
         clouds = [replace(c, points=c.points + law(c.points, v, cell)) for v, c in enumerate(cell.clouds)]
         cell = replace(cell, clouds=clouds)
-    return linear_model_of(state_of(pipeline.run(session_of(cell))))
+    return linear_model_of(pipeline.run(session_of(cell)))
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from data_synth.fixtures.quiet_scenes import clean, simulated
 from stitch import pipeline
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap, field_error, robust_pass_share
-from stitch.runs.run import state_of
 
 # mm along the ray at places (N,) of the field, −1 … 1 both ways.
 Law = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -67,7 +66,7 @@ def found(change: Callable[[np.ndarray], np.ndarray], backwards: bool = False) -
         tool = session.scanner
         tool = replace(tool, T_mount=tool.T_mount @ turn, optical_axis=-tool.optical_axis)
         session = replace(session, views=views, scanner=tool)
-    linear = linear_model_of(state_of(pipeline.run(session)))
+    linear = linear_model_of(pipeline.run(session))
     freed = linear.observation.unconstrained
     return field_error(linear.measurement, linear.model, freed, 0.01), robust_pass_share(freed.overlaps)
 

@@ -12,7 +12,6 @@ from data_synth.scene import load_scene
 from stitch import frames, pipeline
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.observations.surfaces.scanner_errors import field_error, field_scatter
-from stitch.runs.run import state_of
 
 SEEDS = 2
 
@@ -42,7 +41,7 @@ def chi_squares(share: float) -> tuple[list[float], list[float]]:
 def test_what_repeats_is_told_with_its_size(share, unusual, over_noise):
     """A usual scanner, one that errs by nearly its noise, and one by four times that: none too much is said of any."""
     measured = repeated(share, 0)
-    linear = linear_model_of(state_of(pipeline.run(session_of(measured))))
+    linear = linear_model_of(pipeline.run(session_of(measured)))
     found = field_error(linear.measurement, linear.model, linear.observation.unconstrained, 0.01)
     assert (found.unusual, found.over_noise) == (unusual, over_noise)
     assert found.rms < 2 * share * load_scene("drill-plate").scanner.noise
@@ -64,7 +63,7 @@ def test_what_incidence_shows_is_not_laid_on_the_field():
     scene = load_scene("blade-table")
     scanner = replace(scene.scanner, columns=80, rows=80, field_error=0.0)
     measured = simulated(replace(scene, scanner=scanner), {}, 3, views=10)
-    linear = linear_model_of(state_of(pipeline.run(session_of(measured))))
+    linear = linear_model_of(pipeline.run(session_of(measured)))
     shown, unit = (field_scatter(linear.measurement, linear.observation.unconstrained, share) for share in (None, 1.0))
     shares = np.linalg.norm(shown, axis=0) / np.linalg.norm(unit, axis=0)
     assert np.max(shares[:-1]) < 0.2

@@ -9,9 +9,8 @@ from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.pipeline import change, run
 from stitch.reading.session_folder import load_session
-from stitch.runs.run import state_of
 from stitch.stages.register import DEFAULT, METHODS
-from stitch.stored.stored_run import load_state, stored_run
+from stitch.stored.stored_run import load_run
 from stitch.writing.run_folder import write_run
 from viz.run_markdown import run_markdown
 
@@ -25,10 +24,10 @@ def test_the_method_is_written_read_again_and_kept_by_a_change(session, tmp_path
     write_run(asked, tmp_path)
     stages = json.loads((tmp_path / "result.json").read_text())["stages"]
     assert [stage.get("method") for stage in stages] == [None, None, "gicp", None]
-    state = load_state(tmp_path)
-    assert stored_run(tmp_path, state).register_method == "gicp"
+    state = load_run(tmp_path)
+    assert state.register_method == "gicp"
     assert change(state, []).register_method == "gicp"
-    assert state_of(usual).register == DEFAULT
+    assert usual.register_method == DEFAULT
     assert "Registered by plane to plane (GICP)" in run_markdown(asked, None)
     assert "Registered by DPWVM-style weighted fit" in run_markdown(usual, None)
 

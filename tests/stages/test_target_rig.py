@@ -16,7 +16,6 @@ from stitch.model.forward import corrected_capture
 from stitch.model.model import Model, term_of
 from stitch.observations.targets.rows import initial_landmarks
 from stitch.pipeline import run, run_rig
-from stitch.runs.run import state_of
 from stitch.stages.target_fit import TargetStart, _TargetProblem
 
 OFFSET = np.array([0, 1e-3, -0.7e-3, 0, 0.8e-3, 0])
@@ -109,7 +108,7 @@ def test_the_command_writes_a_folder_a_session_and_an_arm_to_keep(days, tmp_path
 def test_a_parameter_that_goes_to_zero_is_made_up_for_in_the_same_step():
     """From a model with an offset that is no longer fitted, the step ends where it ends from a model without it."""
     session, *_ = labelled_cell(5, views=30)
-    found = state_of(run(session))
+    found = run(session)
     ends = []
     for value in (0.0, 1e-5):
         term = term_of(found.measurement, EFFECTS["joint_offset"])

@@ -9,7 +9,7 @@ from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.pipeline import run as stitched
 from stitch.reading.session_folder import load_session
-from stitch.stored.stored_run import load_state, stored_run
+from stitch.stored.stored_run import load_run
 from stitch.writing.result_document import model_of
 from stitch.writing.run_folder import write_run
 from viz.run_page import write_report
@@ -24,7 +24,7 @@ def test_labelled_points_of_a_folder_lie_where_its_run_put_them(tmp_path):
     assert len(found.outliers) == 1
     (tmp_path / "r").mkdir()
     write_run(found, tmp_path / "r")
-    again = stored_run(tmp_path / "r", load_state(tmp_path / "r"))
+    again = load_run(tmp_path / "r")
     for name in ("positions", "orientation"):
         np.testing.assert_array_equal(getattr(again.targets.landmarks, name), getattr(found.targets.landmarks, name))
     np.testing.assert_allclose(again.targets.target_rms, found.targets.target_rms, rtol=1e-9)
@@ -36,7 +36,7 @@ def test_labelled_points_of_a_folder_lie_where_its_run_put_them(tmp_path):
     document = json.loads((tmp_path / "r" / "result.json").read_text())
     document["repeatability"] = {"rotation": None, "translation": None}
     (tmp_path / "r" / "result.json").write_text(json.dumps(document))
-    unknown = stored_run(tmp_path / "r", load_state(tmp_path / "r"))
+    unknown = load_run(tmp_path / "r")
     assert np.isnan(unknown.repeatability.translation) and np.isnan(unknown.repeatability.rotation)
     for told, shown in ((again, True), (unknown, False)):
         write_report(told, tmp_path / "page.html")

@@ -12,7 +12,7 @@ from stitch.errors import InputError
 from stitch.model.model_toml import read_model
 from stitch.pipeline import add, drop, run
 from stitch.reading.session_folder import load_session
-from stitch.stored.stored_run import load_state, trusted_model
+from stitch.stored.stored_run import load_run, trusted_model
 from stitch.writing import run_folder
 
 EFFECT = """
@@ -80,9 +80,9 @@ def test_a_file_is_named_while_an_effect_of_it_is_in_use(tmp_path):
         run_folder.write_run(replace(run(session), effects_file=str(file)), folder)
         assert read_model(folder).effects_file is None
         for change, *names in ((add, "of_my_own"), (add, "joint_offset"), (drop, "of_my_own")):
-            run_folder.write_run(change(load_state(folder, file), *names), folder)
+            run_folder.write_run(change(load_run(folder, file), *names), folder)
             used = change is add
             assert read_model(folder).effects_file == (str(file) if used else None)
     finally:
         EFFECTS.pop("of_my_own", None)
-    assert load_state(folder).model.effects == ["joint_offset"]
+    assert load_run(folder).model.effects == ["joint_offset"]

@@ -142,7 +142,8 @@ def test_the_recording_says_where_a_joint_errs_without_a_name(tmp_path):
 def test_page_needs_nothing_beside_it_and_says_everything(recorded, tmp_path):
     result, _ = recorded
     noted = replace(result.ledger[-1], notes=(Note("2026-03-01T10:00:00+00:00", "Q", "clamp <loose>"),))
-    told = replace(result, unobservable=("translation along the axis of joint 6",), ledger=(*result.ledger[:-1], noted))
+    told = replace(result, ledger=(*result.ledger[:-1], noted))
+    told = told.with_fit(unobservable=("translation along the axis of joint 6",))
     write_report(told, tmp_path / "r.html")
     page = (tmp_path / "r.html").read_text()
     assert not re.search(r"""(src|href)=["'](?!data:)""", page)

@@ -68,7 +68,7 @@ def test_runs_whose_numbers_mean_other_things_are_refused(recorded):
         "mount is eye_to_hand in the one and eye_in_hand": replace(
             run, session=replace(run.session, mount="eye_in_hand")
         ),
-        "surfaces in the one and labelled points alone": replace(run, registered=None),
+        "surfaces in the one and labelled points alone": run.with_fit(registered=None),
     }
     for words, other in others.items():
         with pytest.raises(InputError, match=f"x and y cannot be compared: .*{words}.*to fix"):

@@ -11,15 +11,13 @@ from matplotlib.figure import Figure
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.write import write_session
 from stitch import pipeline
-from stitch.cli import diagnose as diagnose_command
 from stitch.cli.main import main
 from stitch.errors import NoResultError
 from stitch.model.model_toml import read_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
-from stitch.runs.run import LedgerStep, state_of
-from stitch.stored.stored_run import load_state, stored_run
-from stitch.writing import diagnosis_document
+from stitch.runs.run import LedgerStep
+from stitch.stored.stored_run import load_run
 from stitch.writing.run_folder import write_run
 from viz import run_page, sections
 
@@ -63,7 +61,7 @@ def test_a_model_that_is_used_as_it_is_stays_as_it_is(folder):
 
 def test_an_effect_named_twice_counts_once(folder):
     assert json.loads((folder / "r" / "ledger.json").read_text())[0]["effects"] == [EFFECT]
-    ledger = pipeline.change(load_state(folder / "q"), ["range_scale", "range_scale"]).ledger
+    ledger = pipeline.change(load_run(folder / "q"), ["range_scale", "range_scale"]).ledger
     assert ledger[-1].effects == ("range_scale",)
 
 
@@ -84,7 +82,7 @@ def test_a_page_made_anew_is_the_page_of_the_run(folder, name, stitch_command):
 def test_a_page_of_a_rig_shows_the_hand_eye_of_all(folder, tmp_path):
     runs = run_rig([load_session(folder / name) for name in "so"])
     write_run(runs[1], tmp_path)
-    again = stored_run(tmp_path, load_state(tmp_path))
+    again = load_run(tmp_path)
     np.testing.assert_array_equal(again.T_mount, runs[0].T_mount)
     assert again.residual_rms == runs[1].residual_rms and again.heldout_rms == runs[1].heldout_rms
 
@@ -115,7 +113,7 @@ def changing(folder, tmp_path, monkeypatch):
         (run / name).write_bytes(data)
     for name in (*STALE, "pictures/budget.png"):
         (run / name).write_text("of the old model")
-    result = replace(stored_run(run, load_state(run)), ledger=())
+    result = replace(load_run(run), ledger=())
     monkeypatch.setattr(pipeline, "change", lambda state, effects, recorder: result)
     return run, result
 
@@ -152,8 +150,8 @@ def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch
     fitted = replace(result, ledger=(step, step))
     monkeypatch.setattr(pipeline, "change", lambda s, *_: replace(result, ledger=(*s.ledger, last)))
     monkeypatch.setattr(pipeline, "suggest", lambda state, at_most: (fitted, [], None))
-    monkeypatch.setattr(diagnose_command, "write_diagnosis", lambda found, state, run: {})
-    monkeypatch.setattr(diagnosis_document, "suggested_command", lambda found, run: "")
+    monkeypatch.setattr("stitch.cli.diagnose.write_diagnosis", lambda found, state, run: {})
+    monkeypatch.setattr("stitch.writing.diagnosis_document.suggested_command", lambda found, run: "")
     stitch_command("add", run, "--suggested")
     steps = json.loads((run / "ledger.json").read_text())
     assert len(steps) == len(fitted.ledger)
@@ -163,9 +161,9 @@ def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch
 def test_where_nothing_is_to_be_added_the_present_result_is_printed(changing, monkeypatch, stitch_command):
     run, result = changing
     monkeypatch.setattr(pipeline, "suggest", lambda state, at_most: (None, [], None))
-    monkeypatch.setattr(diagnose_command, "write_diagnosis", lambda found, state, run: {})
+    monkeypatch.setattr("stitch.cli.diagnose.write_diagnosis", lambda found, state, run: {})
     assert json.loads(stitch_command("add", run, "--suggested", "--json")) == told(run)
-    assert state_of(result).model.T_mount.tolist() == told(run)["hand_eye"]
+    assert result.model.T_mount.tolist() == told(run)["hand_eye"]
 
 
 def test_a_page_or_picture_that_fails_leaves_the_old_one(changing, monkeypatch):

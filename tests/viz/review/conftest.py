@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from stitch.comparison.residual_tables import compare_surfaces, comparison_document
-from stitch.stored.stored_run import load_state
+from stitch.stored.stored_run import load_run
 from stitch.writing.json_file import write_json
 
 
@@ -93,7 +93,7 @@ def served(run, *options):
 
 def compare_without_picture(run):
     """compare.json as `stitch compare` writes it."""
-    write_json(comparison_document(compare_surfaces(load_state(run))), run / "compare.json")
+    write_json(comparison_document(compare_surfaces(load_run(run))), run / "compare.json")
 
 
 @pytest.fixture(scope="package")
