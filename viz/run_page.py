@@ -37,7 +37,7 @@ def write_report(run: Run, path: Path, tolerance: float | None = None) -> None:
 
 def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> Head:
     light = None if tolerance is None else run_light(run, history, tolerance)
-    gone = [f"View {item.view} does not belong and was left out: {item.why}." for item in run.left_out]
+    gone = [f"View {item.view} does not fit its robot pose and was left out: {item.why}." for item in run.left_out]
     hidden = [f"Not observable from these motions: {direction}." for direction in run.unobservable]
     return Head(
         title=run.session.name,

@@ -97,7 +97,7 @@ def page(told: dict[Case, Entry], others: list[str]) -> str:
 def _row(case: Case, own: Made) -> str:
     hidden = "measured" if case.hidden is None else case.hidden.partition("=")[0] or "nothing"
     named = f": {', '.join(own.effects)}" if own.effects else ""
-    follows = own.plain.partition("what is left follows ")[2].rstrip(".")
+    follows = own.plain.partition("the remaining error follows ")[2].rstrip(".")
     traced = f"; it follows {follows}" if follows else ""
     told = f"{_VERDICTS.get(own.verdict, 'no result')}{named}{traced}"
     exits = ", ".join(f"{name} {code}" for name, code in own.codes.items())

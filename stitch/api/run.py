@@ -174,7 +174,7 @@ class RunView:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Run(runs.Run):
-    """Results of a run of one session; lengths in the session's length_unit, angles in rad.
+    """The results of one session; lengths in the session's length_unit, angles in rad.
 
     `print(run)` writes it as one block; in a notebook the last line of a cell shows the part as report.html does.
 

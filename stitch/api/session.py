@@ -43,7 +43,7 @@ _PLAIN = re.compile(r"[\w+-][\w.+-]*")
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Session(measured.Session):
-    """Measured session: views with a scan each, their poses, the scanner and the robot.
+    """The measured session: views with a scan each, their poses, the scanner and the robot.
 
     Lengths in `length_unit`, angles in rad. Scans lie in the scanner frame; a view's `T_base_flange` (4, 4) maps flange
     to base. `stitch.load_session` makes one of a folder, `stitch.Session.from_arrays` of arrays in memory.

@@ -205,7 +205,7 @@ def drop(run: runs.Run, *effects: str, recorder: Recorder | None = None) -> Run:
 
 
 def compare(run: runs.Run) -> ResidualTables:
-    """Compute how the residuals of a run depend on everything known of its views, as `stitch compare` does.
+    """Compute how the residuals of a run depend on everything that is known of its views, as `stitch compare` does.
 
     Returns:
         Tables by view, pair, joint, place on the part (reference frame), field, time; lengths in length_unit.
@@ -223,7 +223,7 @@ def compare(run: runs.Run) -> ResidualTables:
 
 
 def explain(run: runs.Run) -> Explanation:
-    """Find a formula of what the model of a run leaves, as `stitch explain` does.
+    """Find a formula for what the model of a run leaves, as `stitch explain` does.
 
     Returns:
         `found`, `why` in a sentence, `formula` in rad and length_unit, and `source`, a Python file of effects.
@@ -257,7 +257,7 @@ def plan(
     size: float | None = None,
     field: float | None = None,
 ) -> Plan:
-    """Compute what views would tell before they are taken and which further ones bring most, as `stitch plan` does.
+    """Compute what views would show before they are taken, and which further ones help most, as `stitch plan` does.
 
     Args:
         cell: a run, which knows its cell, or a session whose views are planned.

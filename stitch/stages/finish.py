@@ -113,9 +113,11 @@ def finish_targets(
     distances = rows.distances(rows.residual)
     poses, after = register_targets(rows, found.variances, poses_model)
     total, history = int(np.isfinite(distances).sum()), len(found.history)
-    corrected = StageResult("correct", found.rms, total, history, seconds, "3D distance of targets from their place")
+    corrected = StageResult(
+        "correct", found.rms, total, history, seconds, "3D distances of the targets from their fitted positions"
+    )
     registered = StageResult(
-        "register", rms_of(after), total, 1, clock.lap(), "each view moved by its own most likely error"
+        "register", rms_of(after), total, 1, clock.lap(), "each view moved by its most likely pose error"
     )
     recorder.stage(corrected, poses_model)
     recorder.stage(registered, poses)

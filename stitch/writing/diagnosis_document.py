@@ -17,30 +17,28 @@ from stitch.runs.run import doubt_headline
 from stitch.units import length_text
 from stitch.writing.json_file import rows_of_fields
 
-# The variance budget as people are told it: the largest sources by name, what is small together.
-
-# Sources of less are told together.
+# The variance budget for people: the largest sources by name, those below this share as one line.
 _MIN_SHARE = 0.01
 OTHER_SOURCES = "others"
 
 
 def largest_error_sources(budget: Sequence[BudgetLine]) -> list[BudgetLine]:
-    """Sources of at least 1 % of the variance, largest first, then all others as one line; shares add up to 1.
+    """Return sources of at least 1 % of the variance, largest first, then all others as one line; shares add up to 1.
 
     Empty where there is no budget, or nothing in it.
     """
     there = sorted((line for line in budget if line.variance_share > 0), key=lambda line: -line.variance_share)
     small = [line for line in there if line.variance_share < _MIN_SHARE]
-    told = there[: len(there) - len(small)]
+    lines = there[: len(there) - len(small)]
     if small:
         share = sum(line.variance_share for line in small)
         sigma = float(np.sqrt(sum(line.sigma**2 for line in small)))
-        told.append(BudgetLine(OTHER_SOURCES, share, sigma, small[0].unit))
-    return told
+        lines.append(BudgetLine(OTHER_SOURCES, share, sigma, small[0].unit))
+    return lines
 
 
 def share_text(line: BudgetLine) -> str:
-    """A share of the variance in per cent."""
+    """Return a share of the variance in per cent."""
     return "< 1 %" if line.variance_share < _MIN_SHARE else f"{line.variance_share:.0%}".replace("%", " %")
 
 
@@ -73,12 +71,12 @@ _WORDS = {
 
 
 def effect_description(name: str) -> str:
-    """An effect in a few words; nothing of one of one's own."""
+    """Return an effect in a few words; empty for a user's own."""
     return _WORDS.get(name, "")
 
 
 def effect_in_words(name: str) -> str:
-    """An effect's name with what it is; of an effect of one's own the name alone."""
+    """Return an effect's name with a description; the name alone for a user's own."""
     return f"{name} ({effect_description(name)})" if effect_description(name) else name
 
 
@@ -88,33 +86,31 @@ def effect_in_words(name: str) -> str:
 
 
 def plain_finding(found: Diagnosis, length_unit: str) -> str:
-    """What is doubted of the session as a whole, what is missing, and how far the error should fall with it."""
+    """Return the doubts about the session, what is missing, and how far the error should fall with it."""
     finding = _finding(found, length_unit)
     if not found.doubts:
         return finding
     doubted = " ".join(doubt_headline(doubt) for doubt in found.doubts)
-    return f"{doubted} What is found beside that may be no more than its mark. {finding}"
+    return f"{doubted} The findings below may only be consequences of this problem. {finding}"
 
 
 def _finding(found: Diagnosis, length_unit: str) -> str:
-    """What is missing, and how far the error should fall with it."""
+    """Return what is missing, and how far the error should fall with it."""
     named = " or ".join(effect_in_words(name) for name in found.effects)
-    doubt = (
-        "" if found.certain else f" The odds that it is more than chance are {odds_text(found.log_odds_over_nothing)}."
-    )
+    doubt = "" if found.certain else f" The odds against chance are {odds_text(found.log_odds_over_nothing)}."
     match found.verdict:
         case "adequate":
             return (
-                f"No effect is found missing: {_remaining_error(found.scanner_error, length_unit)} explain what is "
-                "left."
+                f"No missing effect was found: {_remaining_error(found.scanner_error, length_unit)} explain the "
+                "remaining error."
             )
         case "cannot_tell":
             something = "Something is" if found.certain else "Something may be"
-            return f"{something} missing in the model, and these views cannot tell whether it is {named}.{doubt}"
+            return f"{something} missing in the model: {named}. These views cannot tell which.{doubt}"
         case "unknown_effect":
-            return f"Something is missing in the model that no effect of the library explains{_error_location(found)}."
+            return f"Something is missing in the model, and no known effect explains it{_error_location(found)}."
     validation = next(c for c in found.candidates if c.name == found.effects[0]).cross_validation
-    though = "" if found.likelier_than_not else ", though chance is likelier"
+    though = "" if found.likelier_than_not else ", though chance is more likely"
     missing = "Missing in the model" if found.certain else f"Perhaps missing in the model{though}"
     if validation is None:
         return f"{missing}: {named}.{doubt}"
@@ -127,18 +123,18 @@ def _expected_gain(residual_rms: float, validation: CrossValidation, length_unit
     share = validation.inside**0.5
     before, after = (length_text(rms, length_unit) for rms in (residual_rms, share * residual_rms))
     if share < HELDOUT_FALL:
-        return f"Adding it should bring the error from {before} to {after} (rms)."
-    small = f"It is too small for the error to show ({before} now, {after} with it, rms)"
+        return f"Adding it should reduce the error from {before} to {after} (rms)."
+    small = f"The effect is too small to change the error visibly ({before} now, {after} with it, rms)"
     if validation.poses > MAX_REMAINING_SHARE:
         return f"{small}."
     return (
-        f"{small}, but views left out should be predicted about {1 - validation.poses**0.5:.0%} better, in units of "
+        f"{small}. Views left out should be predicted about {1 - validation.poses**0.5:.0%} better, in units of "
         "their scatter."
     )
 
 
 def _remaining_error(smooth: FieldError | None, length_unit: str) -> str:
-    """What explains the rest where no effect is missing."""
+    """Return what explains the remaining error where no effect is missing."""
     if smooth is None:
         return "noise and the arm's scatter"
     size = length_text(smooth.rms_by_view if smooth.by_view else smooth.rms, length_unit, 2)
@@ -149,19 +145,19 @@ def _remaining_error(smooth: FieldError | None, length_unit: str) -> str:
 def _error_location(found: Diagnosis) -> str:
     """The scanner or the joint that errs, or what the rest follows as clearly as in the diagnosis' own sentence."""
     if found.follows_field and found.scanner_error is not None and found.scanner_error.by_view:
-        return ": every scan errs in its own way, as if the part bent or the scanner changed"
+        return ": each scan has its own error, as if the part bent or the scanner changed"
     if found.follows_field:
-        return ": the scanner errs by where in its field a point is seen"
+        return ": the scanner's error depends on the position in its field of view"
     joints = " or ".join(f"joint {k}" for k in sorted({curve.joint for curve in found.curves}))
     if joints:
-        return f": {joints} errs by a law that has no name"
+        return f": the error follows {joints}, but no known formula"
     if found.time_curve is not None:
-        return ": the poses err in the course of time, by a law that has no name"
+        return ": the pose errors change over time, but follow no known formula"
     if found.overlap_misfit:
-        return ": the scanner or the part's shape is off, and not the poses alone"
+        return ": the scanner or the part's shape is wrong, not only the poses"
     follows = [x.covariate for x in found.depends_on if x.p_value < CLEAR_DEPENDENCE]
     if follows:
-        return f": what is left follows {' and '.join(follows[:2])}"
+        return f": the remaining error follows {' and '.join(follows[:2])}"
     # The likeliest name, and why it does not hold.
     return f": {found.notes[0]}" if found.notes else ""
 
@@ -169,20 +165,20 @@ def _error_location(found: Diagnosis) -> str:
 def suggested_command(found: Diagnosis, run: str) -> str:
     """The command that most would type now, with what it is for; `run` as it has to be typed."""
     if found.doubts:
-        return f"Next: put right what is doubted; it stands in full in: stitch review {run}"
+        return f"Next: fix the problem above; for details: stitch review {run}"
     match found.verdict:
         case "missing_effect" if not found.likelier_than_not:
-            return f"Next, what would tell it from chance: stitch next {run}"
+            return f"Next, for views that would separate it from chance: stitch next {run}"
         case "missing_effect":
             return f"Next: stitch add {run} --suggested"
         case "cannot_tell" if not _group_helps(found):
-            return f"Next, what would tell them apart: stitch next {run}"
+            return f"Next, for views that would separate them: stitch next {run}"
         case "cannot_tell":
-            return f"Fitted as one, if that helps: stitch add {run} --group"
+            return f"Next, to fit them as one group: stitch add {run} --group"
         case "unknown_effect" if found.curves or found.time_curve is not None:
-            return f"A formula for it, if there is one: stitch explain {run} -o mine.py"
+            return f"Next, to look for a formula: stitch explain {run} -o mine.py"
         case "unknown_effect":
-            return f"Next, to see where it fails: stitch review {run}"
+            return f"Next, to see where the model fails: stitch review {run}"
     return f"Next: stitch export {run} --to ros"
 
 

@@ -82,7 +82,7 @@ def test_exchanged_scans_are_named_and_left_out_and_stay_out(good):
     found = run(swapped)
     assert {item.view for item in found.left_out} == {"v002", "v006"}
     assert all("exchange the clouds of v002 and v006" in item.why for item in found.left_out)
-    assert found.notes[0].startswith("View v002 does not belong") and len(found.poses) == 8
+    assert found.notes[0].startswith("View v002 does not fit its robot pose") and len(found.poses) == 8
     again = add(found, "range_scale")
     assert again.left_out == found.left_out and len(again.poses) == 8
     kept = run(swapped, keep=True)

@@ -72,7 +72,7 @@ def test_a_diagnosis_says_first_what_is_doubted(cell):
     assert plain_finding(found, "mm").startswith(
         "The hand-eye of the other run does not hold here. What is found beside"
     )
-    assert suggested_command(found, "RUN").startswith("Next: put right what is doubted")
+    assert suggested_command(found, "RUN").startswith("Next: fix the problem above")
     # Fitted anew, hand-eye and targets are of this session, and nothing is doubted.
     assert not diagnose(change(moved, ["joint_offset"])).doubts
 

@@ -43,7 +43,7 @@ def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, caps
     diagnosed = told(capsys, "diagnose", run)
     finding = json.loads((run / "diagnosis.json").read_text())
     named = "Missing in the model: joint_offset (a joint counts its angle from a wrong zero). "
-    assert finding["plain"].startswith(f"{named}Adding it should bring the error from ")
+    assert finding["plain"].startswith(f"{named}Adding it should reduce the error from ")
     state = RunReview(run).state()
     assert diagnosed.startswith(f"{finding['plain']} {finding['sentence']}")
     assert (state["diagnosis"]["plain"], state["diagnosis"]["sentence"]) == (finding["plain"], finding["sentence"])

@@ -105,14 +105,14 @@ def test_a_name_that_may_be_chance_is_no_statement(odds, said):
     found.certain = Diagnosis.certain.fget(found)
     found.likelier_than_not = Diagnosis.likelier_than_not.fget(found)
     told = plain_finding(found, "mm")
-    assert ("though chance is likelier" in told) == (odds < 1)
+    assert ("though chance is more likely" in told) == (odds < 1)
     assert said in told and told.startswith("Perhaps missing") == (odds < 20)
 
 
 @pytest.mark.parametrize(
     ("inside", "poses", "said"),
     [
-        (0.25, 0.64, "bring the error from 40 µm to 20 µm"),
+        (0.25, 0.64, "reduce the error from 40 µm to 20 µm"),
         (1.02, 0.64, "predicted about 20% better"),
         (1.02, 1.1, "with it, rms)."),
     ],
