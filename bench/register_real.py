@@ -27,8 +27,8 @@ from stitch.observations.surfaces.hand_eye_fit import Repeatability
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, collect_overlaps
 from stitch.reading.session_folder import load_session
+from stitch.stages.coarse import find_coarse_hand_eye
 from stitch.stages.correct import correct
-from stitch.stages.initial_guess import find_coarse_hand_eye
 from stitch.stages.register import Method, Registration, normal_equations, register
 
 OBJECTS = ("cone", "gripperopen", "rubik", "sphere", "david")

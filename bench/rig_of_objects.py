@@ -28,8 +28,8 @@ from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD, HandEyeFit,
 from stitch.observations.surfaces.scanner_errors import field_scatter
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.reading.session_folder import load_session
+from stitch.stages.coarse import find_coarse_hand_eye
 from stitch.stages.correct import correct
-from stitch.stages.initial_guess import find_coarse_hand_eye
 
 IN_HAND = ("david", "cone", "sphere", "rubik")
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "method.md"

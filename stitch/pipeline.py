@@ -1,4 +1,7 @@
-"""The run: coarse → correct → register → fuse, for one session or several of one rig; and what is missing."""
+"""Stitch sessions (coarse → correct → fit → register → fuse), change a run's effects, and find what is missing.
+
+The steps stand in `stages`: `surface_steps` for clouds, `target_steps` for labelled points alone.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,66 +29,13 @@ from stitch.observations.pose_errors import MANY_VIEWS
 from stitch.planning.next_view import propose_measurements
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.runs.run import Run, StageResult
-from stitch.stages.assemble import FitSummary, assemble_run, pipeline_for
-from stitch.stages.finish import FittedRig, InitialModel, Pipeline
-from stitch.stages.initial_guess import COARSE_GATE, CoarseHandEye
+from stitch.stages.coarse import COARSE_GATE, CoarseHandEye
 from stitch.stages.register import DEFAULT, method_named
+from stitch.stages.register_and_fuse import FittedRig, InitialModel, Pipeline
+from stitch.stages.results import FitSummary, assemble_run, pipeline_for
 from stitch.stages.rig import require_effects, require_measured_once, require_same_rig
 from stitch.system.threads import Clock, library_threads_off
 from stitch.writing.diagnosis_document import plain_finding
-
-# Change the model of a run: put effects in or take them out, and fit everything again.
-
-
-def add(run: Run, *effects: str, recorder: Recorder | None = None) -> Run:
-    """Fit a run again with further effects in its model: hand-eye and all effects together.
-
-    Raises:
-        InputError: an effect that is not known, or that the session cannot have.
-        NoResultError: no two views overlap.
-    """
-    return change(run, [*run.model.effects, *effects], recorder)
-
-
-def drop(run: Run, *effects: str, recorder: Recorder | None = None) -> Run:
-    """Fit a run again without some of its effects."""
-    return change(run, [name for name in run.model.effects if name not in effects], recorder)
-
-
-def change(state: Run, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
-    """Fit a run again with these effects in its model: matches, hand-eye and all effects.
-
-    Raises:
-        InputError: an effect that is not known, or that the session cannot have.
-        NoResultError: no two views overlap.
-    """
-    recorder = recorder or SilentRecorder()
-    with library_threads_off():
-        clock, course = Clock(), pipeline_for(state.session)
-        session, measurement, effects = state.session, state.measurement, list(dict.fromkeys(effects))
-        recorder.start(session)
-        require_effects([measurement], effects)
-        new = [name for name in effects if name not in state.model.effects]
-        model = start_with_effects(session, new, None, measurement, state.model, state.gate)
-        model = model.with_terms([term for term in model.terms if term.name in effects])
-        gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
-        begun = CoarseHandEye(state.T_mount_coarse, gate, "of the first run", ())
-        before = course.initial_stage(measurement, begun, clock.lap(), recorder)
-        clock.lap()
-        fitted = course.refit([session], [measurement], model, [state.gate], recorder)
-        own = fitted.sessions[0].measurement
-        end = FitSummary(
-            starts=[begun],
-            fitted=fitted,
-            seconds=clock.lap(),
-            effects_file=state.effects_file,
-            register=state.register_method or DEFAULT,
-            ledger=state.ledger,
-            left_out=state.left_out,
-            links=state.links,
-            doubts=session_warnings(session, own, fitted.correction, 0),
-        )
-        return assemble_run(session, 0, end, before, recorder)
 
 
 def run(
@@ -126,7 +76,7 @@ def run_rig(
     require_same_rig(sessions, model)
     recorders = recorders or [SilentRecorder() for _ in sessions]
     with library_threads_off():
-        clock, course = Clock(), pipeline_for(sessions[0])
+        clock, steps = Clock(), pipeline_for(sessions[0])
         for session, recorder in zip(sessions, recorders, strict=True):
             recorder.start(session)
         measurements = [measurement_of(session, prepare_capture(session)) for session in sessions]
@@ -135,39 +85,39 @@ def run_rig(
         arm = convert_unit(arm, sessions[0].length_unit) if arm else None
         require_effects(measurements, [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())])
         require_measured_once(sessions)
-        begun = course.initial_hand_eyes(sessions, measurements, model)
+        begun = steps.initial_hand_eyes(sessions, measurements, model)
         measurements = [with_part_origin(m, own.T_mount) for m, own in zip(measurements, begun, strict=True)]
         seconds = clock.lap()
         before = []
         for session, measurement, own, recorder in zip(sessions, measurements, begun, recorders, strict=True):
             with refuse_explained_mistake(session):
-                before.append(course.initial_stage(measurement, own, seconds, recorder))
+                before.append(steps.initial_stage(measurement, own, seconds, recorder))
         clock.lap()
 
         def with_arm(arm: ModelFile | None) -> InitialModel | None:
             return partial(start_with_effects, sessions[0], effects, arm) if effects or arm else None
 
         if model:
-            fit = partial(course.apply, file=model)
+            fit = partial(steps.apply, file=model)
         else:
-            fit = partial(course.fit, starts=begun, initial_model=with_arm(arm), recorder=recorders[0])
+            fit = partial(steps.fit, starts=begun, initial_model=with_arm(arm), recorder=recorders[0])
         found = fit_screened_views(sessions, measurements, fit, keep)
         end = FitSummary(begun, found.fitted, clock.lap(), model.effects_file if model else None, register)
         if model and not sessions[0].has_clouds:
-            found = check_model_transfer(found, partial(_fit_own_model, course, found, with_arm(arm_model(model))))
+            found = check_model_transfer(found, partial(_fit_own_model, steps, found, with_arm(arm_model(model))))
         if len(sessions) > 1 and effects:
-            alone = partial(_fit_single_session, course, found, begun, with_arm(arm))
+            alone = partial(_fit_single_session, steps, found, begun, with_arm(arm))
             apart = find_disagreeing_sessions([s.name for s in found.sessions], found.fitted, alone)
             end = replace(end, doubts=tuple(own.doubt(sessions[0].length_unit) for own in apart))
         if arm:
-            again = partial(course.fit, found.sessions, found.measurements, begun, recorder=SilentRecorder())
+            again = partial(steps.fit, found.sessions, found.measurements, begun, recorder=SilentRecorder())
             here = check_arm_transfer(lambda other: again(initial_model=with_arm(other)), arm, found.fitted)
             end = _note_arm_transfer(end, here, sessions[0].length_unit)
         return _assemble_runs(sessions, found, end, before, recorders, keep)
 
 
 def _note_arm_transfer(end: FitSummary, here: ArmTransfer, length_unit: str) -> FitSummary:
-    """A note that the arm of another run holds here, or the doubt that it does not."""
+    """Return the fit with a note that the arm of another run holds here, or a doubt that it does not."""
     told = (here.sentence(length_unit),)
     return replace(end, notes=told) if here.holds else replace(end, doubts=(*end.doubts, *told))
 
@@ -175,12 +125,12 @@ def _note_arm_transfer(end: FitSummary, here: ArmTransfer, length_unit: str) -> 
 def _fit_single_session(
     pipeline: Pipeline, found: ScreenedFit, starts: Sequence[CoarseHandEye], initial_model: InitialModel | None, i: int
 ) -> FittedRig:
-    """One session of a rig by itself."""
+    """Fit one session of a rig by itself."""
     return pipeline.fit([found.sessions[i]], [found.measurements[i]], [starts[i]], initial_model, SilentRecorder())
 
 
 def _fit_own_model(pipeline: Pipeline, found: ScreenedFit, initial_model: InitialModel | None) -> FittedRig:
-    """Hand-eye and targets from the sessions themselves."""
+    """Fit hand-eye and targets from the sessions themselves."""
     begun = pipeline.initial_hand_eyes(found.sessions, found.measurements, None)
     return pipeline.fit(found.sessions, found.measurements, begun, initial_model, SilentRecorder())
 
@@ -193,7 +143,7 @@ def _assemble_runs(
     recorders: Sequence[Recorder],
     keep: bool,
 ) -> list[Run]:
-    """One run per session, with what is said of it alone."""
+    """Return one run per session, with its own notes."""
     runs = []
     for i, (session, own) in enumerate(zip(found.sessions, found.screenings, strict=True)):
         if len(session.views) < len(sessions[i].views):
@@ -203,6 +153,57 @@ def _assemble_runs(
         last = replace(last, doubts=(*end.doubts, *own.doubts))
         runs.append(assemble_run(session, i, last, before[i], recorders[i]))
     return runs
+
+
+def add(run: Run, *effects: str, recorder: Recorder | None = None) -> Run:
+    """Fit a run again with further effects in its model: hand-eye and all effects together.
+
+    Raises:
+        InputError: an effect that is not known, or that the session cannot have.
+        NoResultError: no two views overlap.
+    """
+    return change(run, [*run.model.effects, *effects], recorder)
+
+
+def drop(run: Run, *effects: str, recorder: Recorder | None = None) -> Run:
+    """Fit a run again without some of its effects."""
+    return change(run, [name for name in run.model.effects if name not in effects], recorder)
+
+
+def change(state: Run, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
+    """Fit a run again with these effects in its model: matches, hand-eye and all effects.
+
+    Raises:
+        InputError: an effect that is not known, or that the session cannot have.
+        NoResultError: no two views overlap.
+    """
+    recorder = recorder or SilentRecorder()
+    with library_threads_off():
+        clock, steps = Clock(), pipeline_for(state.session)
+        session, measurement, effects = state.session, state.measurement, list(dict.fromkeys(effects))
+        recorder.start(session)
+        require_effects([measurement], effects)
+        new = [name for name in effects if name not in state.model.effects]
+        model = start_with_effects(session, new, None, measurement, state.model, state.gate)
+        model = model.with_terms([term for term in model.terms if term.name in effects])
+        gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
+        begun = CoarseHandEye(state.T_mount_coarse, gate, "of the first run", ())
+        before = steps.initial_stage(measurement, begun, clock.lap(), recorder)
+        clock.lap()
+        fitted = steps.refit([session], [measurement], model, [state.gate], recorder)
+        own = fitted.sessions[0].measurement
+        end = FitSummary(
+            starts=[begun],
+            fitted=fitted,
+            seconds=clock.lap(),
+            effects_file=state.effects_file,
+            register=state.register_method or DEFAULT,
+            ledger=state.ledger,
+            left_out=state.left_out,
+            links=state.links,
+            doubts=session_warnings(session, own, fitted.correction, 0),
+        )
+        return assemble_run(session, 0, end, before, recorder)
 
 
 def diagnose(run: Run) -> Diagnosis:
@@ -215,13 +216,8 @@ def diagnose(run: Run) -> Diagnosis:
     return replace(found, next=propose_measurements(found))
 
 
-# Diagnose, add, and again, until nothing is left to add; then drop what later effects have made idle.
-#
-# Or add a whole group of effects that the views cannot tell apart, where that helps.
-
-
 def suggest(state: Run, at_most: int) -> tuple[Run | None, list[str], Diagnosis]:
-    """The run with everything that the diagnosis names, the way in lines, and the last diagnosis.
+    """Return the run with everything that the diagnosis names, what happened in lines, and the last diagnosis.
 
     The run is None where nothing is named.
 
@@ -241,11 +237,11 @@ def suggest(state: Run, at_most: int) -> tuple[Run | None, list[str], Diagnosis]
             break
         if not found.likelier_than_not:
             name = found.effects[0]
-            lines.append(f"{name} was not added: that it is chance is likelier. All the same: stitch add RUN {name}.")
+            lines.append(f"{name} was not added: chance is more likely. To add it anyway: stitch add RUN {name}.")
             break
         tried = change(state, [*state.model.effects, found.effects[0]])
         if not _improves_heldout(state, tried):
-            lines.append(f"{found.effects[0]} was tried and did not earn its place: the held-out residual rose.")
+            lines.append(f"{found.effects[0]} was tried and not added: the error on views left out rose.")
             break
         result, state = tried, tried
         lines.append(f"Added {found.effects[0]}. With it:")
@@ -261,7 +257,7 @@ def suggest(state: Run, at_most: int) -> tuple[Run | None, list[str], Diagnosis]
 
 
 def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:
-    """The run with all effects of a group that these views cannot tell apart, what to say of it, and the diagnosis.
+    """Return the run with all effects of an undecided group, what to say of it, and the diagnosis.
 
     The run is None where the diagnosis names no such group, or where the group does not help on views left out.
     """
@@ -269,7 +265,7 @@ def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:
     if found.verdict != "cannot_tell":
         return (
             None,
-            [*_finding_and_evidence(found), "There is no group of effects that these views cannot tell apart."],
+            [*_finding_and_evidence(found), "These views leave no group of effects undecided."],
             found,
         )
     names = " + ".join(found.effects)
@@ -292,12 +288,12 @@ def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:
 
 
 def _finding_and_evidence(found: Diagnosis) -> list[str]:
-    """For everybody first, then the evidence, as `stitch diagnose` says it."""
+    """Return the plain finding and the evidence, as `stitch diagnose` prints them."""
     return [plain_finding(found, found.linear.measurement.length_unit), found.sentence]
 
 
 def _drop_unneeded(result: Run, given: set[str]) -> tuple[Run, list[str]]:
-    """The run without added effects that do not hold their place beside the others, and why each went."""
+    """Return the run without added effects that later ones made idle, and why each was dropped."""
     lines: list[str] = []
     while (idle := find_effect_to_drop(result, set(result.effects) - given)) is not None:
         name, reason = idle

@@ -50,4 +50,4 @@ def test_what_is_less_likely_than_chance_is_not_added(first, monkeypatch):
     found = replace(diagnose(first), log_odds_over_nothing=-0.1)
     monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
     result, lines, _ = stepwise.suggest(first, at_most=3)
-    assert result is None and lines[-1].startswith("joint_offset was not added: that it is chance is likelier.")
+    assert result is None and lines[-1].startswith("joint_offset was not added: chance is more likely.")

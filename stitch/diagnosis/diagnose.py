@@ -35,7 +35,7 @@ from stitch.diagnosis.verdict import Evidence
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.run import Run
-from stitch.stages.assemble import linearise
+from stitch.stages.results import linearise
 from stitch.system.threads import library_threads_off, parallel, return_large_arrays
 
 

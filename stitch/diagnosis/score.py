@@ -22,7 +22,7 @@ from stitch.measurement.session import Session
 from stitch.model.model import Model, Term, term_of
 from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.observations.linear_model import LinearModel
-from stitch.stages.assemble import linearise
+from stitch.stages.results import linearise
 from stitch.statistics.distributions import chi2_limit, f_tail
 from stitch.statistics.parameter_selection import log_mixture
 from stitch.statistics.reml import at_variances, fit_variances

@@ -13,7 +13,7 @@ from stitch.diagnosis.validation import Extrapolation, cross_validate, extrapola
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.run import Run
-from stitch.stages.assemble import linearise
+from stitch.stages.results import linearise
 from stitch.system.threads import parallel
 
 # Whether the effects of a model still hold their place beside each other.

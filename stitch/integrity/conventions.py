@@ -17,7 +17,7 @@ from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses
 from stitch.integrity.placement import Placement, place_scan, shows_no_surface, surface_of
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.session import Mount, Session
-from stitch.stages.initial_guess import SCORE_SHARE, icp_from_starts
+from stitch.stages.coarse import SCORE_SHARE, icp_from_starts
 from stitch.system.threads import parallel
 from stitch.units import METRES
 

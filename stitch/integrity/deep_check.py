@@ -35,8 +35,8 @@ from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
 from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.observations.targets.outliers import drop_mislabelled
 from stitch.runs.run import ExcludedView
+from stitch.stages.coarse import find_coarse_hand_eye
 from stitch.stages.correct import Correction, icp_hand_eye
-from stitch.stages.initial_guess import find_coarse_hand_eye
 from stitch.statistics.distributions import chi2_limit, chi2_tail
 from stitch.units import METRES, angle_text, length_text
 

@@ -17,7 +17,7 @@ from stitch.integrity.view_screening import ScreenedFit
 from stitch.measurement.session import Session
 from stitch.model.model_toml import ModelFile
 from stitch.observations.targets.target_model import TargetModelFit
-from stitch.stages.finish import FittedRig, per_view_rms
+from stitch.stages.register_and_fuse import FittedRig, per_view_rms
 from stitch.stages.target_fit import FittedSession
 from stitch.statistics.distributions import chi2_tail, f_tail
 from stitch.statistics.least_squares import significantly_smaller

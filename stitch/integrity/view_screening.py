@@ -35,7 +35,7 @@ from stitch.measurement.session import Session, View
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.runs.run import ExcludedView, ViewLinks
 from stitch.stages.correct import Correction
-from stitch.stages.finish import FittedRig
+from stitch.stages.register_and_fuse import FittedRig
 
 
 @dataclass(frozen=True)

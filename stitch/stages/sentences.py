@@ -9,7 +9,7 @@ from stitch.observations.surfaces.hand_eye_fit import HandEyeFit, Repeatability
 from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.runs.run import ExcludedView
-from stitch.stages.initial_guess import CoarseHandEye
+from stitch.stages.coarse import CoarseHandEye
 from stitch.stages.register import Registration
 from stitch.units import angle_text, length_text
 

@@ -23,7 +23,7 @@ from stitch.frames import Array
 from stitch.model.model_toml import ModelFile, read_model
 from stitch.reading.csv_files import is_number, read_csv_lines
 from stitch.reading.session_tables import covariate_names
-from stitch.stages.initial_guess import REUSED
+from stitch.stages.coarse import REUSED
 from stitch.stored.stored_run import read_result
 from stitch.watch.run_record import Estimate, RunRecord
 

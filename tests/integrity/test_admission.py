@@ -17,7 +17,7 @@ from stitch.measurement.session import Cloud, Sighting
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.pipeline import add, run
-from stitch.stages.finish import FittedRig
+from stitch.stages.register_and_fuse import FittedRig
 from stitch.stages.target_fit import FittedSession
 
 

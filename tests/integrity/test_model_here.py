@@ -69,9 +69,7 @@ def test_a_diagnosis_says_first_what_is_doubted(cell):
     moved = run(seen_by(then, frames.exp(np.array([3e-4, 0, 0, 0, 0.6, 0]))), model=model)
     found = diagnose(moved)
     assert found.doubts == moved.doubts
-    assert plain_finding(found, "mm").startswith(
-        "The hand-eye of the other run does not hold here. What is found beside"
-    )
+    assert plain_finding(found, "mm").startswith("The hand-eye of the other run does not hold here. The findings below")
     assert suggested_command(found, "RUN").startswith("Next: fix the problem above")
     # Fitted anew, hand-eye and targets are of this session, and nothing is doubted.
     assert not diagnose(change(moved, ["joint_offset"])).doubts

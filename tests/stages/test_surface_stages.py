@@ -18,9 +18,9 @@ from stitch.model.model import Model
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps
+from stitch.stages.coarse import find_coarse_hand_eye
 from stitch.stages.correct import correct
 from stitch.stages.fuse import fuse
-from stitch.stages.initial_guess import find_coarse_hand_eye
 from stitch.stages.observability import unobservable
 from stitch.stages.register import register
 

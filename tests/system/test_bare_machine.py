@@ -37,7 +37,7 @@ def test_scan_motions_mesh_and_cad_in_a_stripped_environment():
         from data_synth.fixtures.blade_cells import captured_blade
         from stitch.cells import cad, scan_to_cad
         from stitch.stages.fuse import fuse
-        from stitch.stages.initial_guess import motion_candidates
+        from stitch.stages.coarse import motion_candidates
         from stitch.writing.mesh import mesh_of
         measured, capture = captured_blade(0, views=4, pixels=60)
         assert motion_candidates([capture])

@@ -88,8 +88,8 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
     ("odds", "said"),
     [
         (25.0, "Missing in the model: settling"),
-        (4.0, "more than chance are 4 to 1."),
-        (0.5, "more than chance are 1 to 2."),
+        (4.0, "against chance are 4 to 1."),
+        (0.5, "against chance are 1 to 2."),
     ],
 )
 def test_a_name_that_may_be_chance_is_no_statement(odds, said):
@@ -130,4 +130,4 @@ def test_an_error_that_should_rise_is_no_gain(inside, poses, said):
         residual_rms=0.04,
     )
     told = plain_finding(found, "mm")
-    assert said in told and ("bring the error" in told) == (inside < 1)
+    assert said in told and ("reduce the error" in told) == (inside < 1)

@@ -20,9 +20,9 @@ from stitch.observations.surfaces.view_poses import noise_floor
 from stitch.observations.targets.target_model import TargetModelFit, rms_of
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import Fit, FusedCloud, LedgerStep, StageResult
+from stitch.stages.coarse import CoarseHandEye
 from stitch.stages.correct import Correction
 from stitch.stages.fuse import RegisteredSession, fuse_every_point
-from stitch.stages.initial_guess import CoarseHandEye
 from stitch.stages.register import Method, register, register_targets
 from stitch.stages.sentences import correct_note, register_note, surface_sentence, target_sentence
 from stitch.stages.target_fit import FittedSession

@@ -18,8 +18,8 @@ from stitch.observations.targets.rows import drawing_of, initial_landmarks, targ
 from stitch.observations.targets.target_model import TargetModelFit, rms_of, target_model
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import Fit, LedgerStep, StageResult
-from stitch.stages.finish import FittedRig, InitialModel, finish_targets
-from stitch.stages.initial_guess import REUSED, STATED, CoarseHandEye
+from stitch.stages.coarse import REUSED, STATED, CoarseHandEye
+from stitch.stages.register_and_fuse import FittedRig, InitialModel, finish_targets
 from stitch.stages.sentences import target_notes
 from stitch.stages.target_fit import TargetStart, evaluate_targets, fit_targets, fit_without_outliers
 

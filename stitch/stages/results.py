@@ -9,17 +9,17 @@ from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import ExcludedView, LedgerStep, Run, StageResult, ViewLinks
-from stitch.stages import surface_pipeline, target_pipeline
-from stitch.stages.finish import FittedRig, Pipeline
-from stitch.stages.initial_guess import CoarseHandEye
+from stitch.stages import surface_steps, target_steps
+from stitch.stages.coarse import CoarseHandEye
 from stitch.stages.observability import unobservable
 from stitch.stages.register import DEFAULT
+from stitch.stages.register_and_fuse import FittedRig, Pipeline
 from stitch.stages.sentences import view_notes
 
 
 def pipeline_for(session: Session) -> Pipeline:
     """How a run goes with what was observed."""
-    return surface_pipeline if session.has_clouds else target_pipeline
+    return surface_steps if session.has_clouds else target_steps
 
 
 def linearise(session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:

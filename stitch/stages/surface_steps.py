@@ -20,10 +20,10 @@ from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstr
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import Fit, LedgerStep, StageResult
+from stitch.stages.coarse import REUSED, STATED, CoarseHandEye, find_coarse_hand_eye, use_given_hand_eye
 from stitch.stages.correct import COARSE_SAMPLES, Correction, apply_given_hand_eye, correct
-from stitch.stages.finish import FittedRig, InitialModel, finish_surfaces
-from stitch.stages.initial_guess import REUSED, STATED, CoarseHandEye, find_coarse_hand_eye, use_given_hand_eye
 from stitch.stages.register import METHODS
+from stitch.stages.register_and_fuse import FittedRig, InitialModel, finish_surfaces
 from stitch.stages.sentences import coarse_note, mixed_notes, warnings
 from stitch.stages.surface_fit import fit_surfaces
 from stitch.stages.target_fit import FittedSession, fit_without_outliers, locate_targets
