@@ -108,7 +108,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         InputError: no run folder, one of several sessions, no JSON, or an entry of another kind than stitch writes.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such run folder; `stitch run` writes one")
+        raise InputError(f"{folder}: no such run folder; to fix: name one that `stitch run` wrote")
     if not (folder / "result.json").is_file() and (folder / "model.toml").is_file():
         inner = sorted(p.parent.name for p in folder.glob("*/result.json"))
         if inner:
@@ -196,11 +196,11 @@ def _read_checked(file: Path, schema: dict[str, Any]) -> Any:
     try:
         document = json.loads(told, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{file}: damaged ({shortened(str(error))}); run `stitch run` again") from None
+        raise InputError(f"{file}: damaged ({shortened(str(error))}); to fix: run `stitch run` again") from None
     wrong = best_match(Draft202012Validator(schema).iter_errors(document))
     if wrong is not None:
         place = ".".join(str(step) for step in wrong.absolute_path) or "the document"
-        raise InputError(f"{file}: damaged ({place}: {shortened(wrong.message, 160)}); run `stitch run` again")
+        raise InputError(f"{file}: damaged ({place}: {shortened(wrong.message, 160)}); to fix: run `stitch run` again")
     return document
 
 
@@ -233,7 +233,7 @@ def trusted_model(path: Path, effects_file: Path | None = None, trust: bool = Fa
         return model, str(effects_file.resolve())
     if model.effects_file and not trust:
         raise InputError(
-            f"{file}: names effects in {model.effects_file}, Python that would be run with your rights; look at it, "
+            f"{file}: names effects in {model.effects_file}, Python that runs with your rights; to fix: read it, "
             "then allow it with --trust, or name a file of your own with --effects-file"
         )
     if model.effects_file:
@@ -258,7 +258,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
     file, effects = trusted_model(folder, effects_file, trust)
     path = Path(document["session"])
     if not path.is_dir():
-        raise InputError(f"{folder}/result.json: its session {path} has gone; put it back, or correct the path there")
+        raise InputError(f"{folder}/result.json: its session {path} has gone; to fix: restore it or correct the path")
     session = load_session(path)
     with library_threads_off():
         measurement = with_part_origin(measurement_of(session, prepare_capture(session)), file.T_mount_coarse)
@@ -301,7 +301,7 @@ def _read_fit(folder: Path, run: Run) -> Fit:
         return _restore_fit(folder, document, run)
     except (LookupError, TypeError, ValueError, OSError, PlyParseError) as error:
         reason = shortened(" ".join(str(error).split()))
-        raise InputError(f"{folder}: its files are damaged ({reason}); run `stitch run` again") from None
+        raise InputError(f"{folder}: its files are damaged ({reason}); to fix: run `stitch run` again") from None
 
 
 def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, run: Run) -> None:
@@ -315,7 +315,7 @@ def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, run: 
         )
     gone = {item.view for item in run.left_out}
     if [v["view"] for v in document["views"] if v["view"] not in gone] != run.session.names:
-        raise InputError(f"{run.session.path}/views.csv: changed after {folder} was made; run `stitch run` again")
+        raise InputError(f"{run.session.path}/views.csv: changed after {folder}; to fix: run `stitch run` again")
 
 
 def _restore_fit(folder: Path, document: dict[str, Any], run: Run) -> Fit:

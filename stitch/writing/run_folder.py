@@ -157,7 +157,7 @@ def lock_run_folder(path: Path) -> Iterator[None]:
         return
     with claim_folder(path):
         if (path / "pictures").is_symlink():
-            raise InputError(f"{path}/pictures: is a link, and pictures would be written where it points; remove it")
+            raise InputError(f"{path}/pictures: is a link out of the run folder; to fix: remove it")
         yield
 
 
