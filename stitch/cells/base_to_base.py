@@ -3,19 +3,14 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from rich.table import Table
 from scipy.stats import norm
 
 from stitch import frames
 from stitch.cells.job_files import (
-    JsonOption,
-    RecordingOption,
-    ReportOption,
-    SessionOption,
     check_keys,
     choice,
     finite,
@@ -44,26 +39,6 @@ from stitch.frames import Array
 from stitch.system.process import console
 from stitch.units import METRES
 from stitch.writing.session_files import SessionFiles, pose_columns, write_session
-
-# `stitch base FILE`: where the second robot stands as seen from the first.
-
-
-def base(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Readings of the stand, TOML.")],
-    recording: RecordingOption = None,
-    report: ReportOption = None,
-    session: SessionOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Find the transform between two robot bases from a stand with a measuring rod.
-
-    \b
-    Examples:
-      stitch base stand.toml --report page.html
-    """
-
-    run_base(file, recording, report, session, as_json)
-
 
 # A distance that differs by more than this many sigmas is a wrong reading, not noise (one in two million).
 CONTRADICTION_SIGMAS = 5.0

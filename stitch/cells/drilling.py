@@ -4,10 +4,9 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -35,11 +34,6 @@ from stitch.cells.drilling_sensors import (
 )
 from stitch.cells.job_files import (
     POSE_COLUMNS,
-    JobFile,
-    JsonOption,
-    RecordingOption,
-    ReportOption,
-    SessionOption,
     choice,
     finite,
     points_table,
@@ -58,27 +52,6 @@ from stitch.reading.csv_files import read_csv_lines
 from stitch.system.process import console
 from stitch.units import METRES, value_uncertainty_text
 from stitch.writing.session_files import SessionFiles, pose_columns, write_session
-
-# `stitch drill JOB`: where the robot must be sent so that the holes come where they belong.
-
-
-def drill(
-    file: JobFile,
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="CSV", help="Write the drives.")] = None,
-    recording: RecordingOption = None,
-    report: ReportOption = None,
-    session: SessionOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Correct the drives of holes from reference holes that the robot has seen.
-
-    \b
-    Examples:
-      stitch drill job.toml --report page.html
-    """
-
-    run_drill(file, output, recording, report, session, as_json=as_json)
-
 
 # A drilling job on disk (TOML and CSV) -> `Job`; every check of the input is made here.
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
@@ -204,17 +203,6 @@ def _number(file: Path, line: int, name: str, cell: str) -> float:
 #
 # Recording and page come from whoever offers them under the entry points `stitch.cell_recordings` and
 # `stitch.cell_reports`, by the command's name.
-
-JobFile = Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")]
-RecordingOption = Annotated[
-    Path | None, typer.Option("--recording", metavar="FILE", help="Write a Rerun recording, .rrd.")
-]
-ReportOption = Annotated[Path | None, typer.Option("--report", metavar="FILE", help="Write one page, .html.")]
-SessionOption = Annotated[
-    Path | None,
-    typer.Option("--session", metavar="FOLDER", help="Write the readings as a session for `stitch run` and diagnose."),
-]
 
 
 def write_pictures(command: str, folder: Path, *results: Any) -> list[str]:

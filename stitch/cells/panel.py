@@ -3,10 +3,9 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -14,11 +13,6 @@ from stitch import frames
 from stitch.cells.job_files import (
     POSE_COLUMNS,
     CsvColumns,
-    JobFile,
-    JsonOption,
-    RecordingOption,
-    ReportOption,
-    SessionOption,
     check_keys,
     choice,
     finite,
@@ -66,27 +60,6 @@ from stitch.errors import InputError, NoResultError
 from stitch.frames import Array, Indices
 from stitch.system.process import console
 from stitch.writing.session_files import SessionFiles, pose_columns, write_sessions
-
-# `stitch panel JOB`: model, commands and errors of a cell in which several robots hold one panel.
-
-
-def panel(
-    file: JobFile,
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="For the commands.")] = None,
-    recording: RecordingOption = None,
-    report: ReportOption = None,
-    session: SessionOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Robots and tracker in one model; where to send the robots for the panel's place, pose and shape.
-
-    \b
-    Examples:
-      stitch panel job.toml --report page.html
-    """
-
-    run_panel(file, output, recording, report, session, as_json=as_json)
-
 
 # The CSV files of a panel job, checked.
 

@@ -4,10 +4,9 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -26,11 +25,6 @@ from stitch.cells.cad import (
 )
 from stitch.cells.job_files import (
     POSE_COLUMNS,
-    JobFile,
-    JsonOption,
-    RecordingOption,
-    ReportOption,
-    SessionOption,
     check_keys,
     choice,
     finite,
@@ -68,34 +62,6 @@ from stitch.measurement.session import Cloud
 from stitch.system.process import console
 from stitch.units import uncertainty_text
 from stitch.writing.session_files import SessionFiles, pose_columns, write_session
-
-# `stitch fit JOB`: where the parts lie, how they differ from their CAD, and the robot path that follows them.
-
-
-def fit(
-    file: JobFile,
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="For map and path.")] = None,
-    recording: RecordingOption = None,
-    report: ReportOption = None,
-    session: SessionOption = None,
-    allowance: Annotated[
-        str | None,
-        typer.Option(
-            metavar="free|varying|SIZE", help="Stock on a casting, outside = plus: found evenly, varying, or stated."
-        ),
-    ] = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Fit scans onto a CAD model without a guess: pose, deviation map and corrected robot path.
-
-    \b
-    Examples:
-      stitch fit fit.toml --report page.html
-      stitch fit casting.toml --allowance free
-    """
-
-    run_fit(file, allowance, output, recording, report, session=session, as_json=as_json)
-
 
 # A robot path moved along with the part.
 
@@ -574,24 +540,3 @@ def _print_seams(seams: list[Seam], limits: Limits) -> None:
     terminal = console()
     terminal.print(stations_sentence(limits, seams))
     terminal.print(table)
-
-
-# `stitch seam JOB`: flush and gap around a window.
-
-
-def seam(
-    file: JobFile,
-    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="CSV", help="Write the stations.")] = None,
-    recording: RecordingOption = None,
-    report: ReportOption = None,
-    session: SessionOption = None,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure flush and gap at the stations of a seam, with uncertainty and verdict.
-
-    \b
-    Examples:
-      stitch seam seam.toml --report page.html
-    """
-
-    run_seam(file, output, recording, report, session, as_json=as_json)

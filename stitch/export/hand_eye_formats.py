@@ -230,18 +230,6 @@ def _frame_numbers(T: Array, controller: str, near: Array | None = None) -> Arra
     return np.asarray(NUMBERS[controller](T, near))
 
 
-# What may be asked of `stitch export`: who lists it waits for no library of a format.
-
-HAND_EYE = ("ros", "urdf", "opencv", "zivid", "kuka", "fanuc", "abb", "ur")
-ARM = ("arm-dh", "arm-urdf")
-CLOUD = ("ply", "pcd", "las", "laz", "e57", "glb")
-
-# Largest believable move, mm: an industrial arm that nobody calibrated is off by 1 to 2 mm (IRB 1600: at most 2.2 mm,
-# Nubiola & Bonev 2013, Robotics and Computer-Integrated Manufacturing 29:236); more than twice that is another arm, a
-# wrong frame or a wrong tool.
-LIMIT_MM = 5.0
-
-
 _QUATERNION = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 

@@ -1,0 +1,121 @@
+"""The commands of the other measuring systems: `stitch base`, `drill`, `panel`, `fit`, `seam`.
+
+Each imports its system when it runs, so that its help waits for no mathematics.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+JobFile = Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")]
+RecordingOption = Annotated[
+    Path | None, typer.Option("--recording", metavar="FILE", help="Write a Rerun recording, .rrd.")
+]
+ReportOption = Annotated[Path | None, typer.Option("--report", metavar="FILE", help="Write one page, .html.")]
+SessionOption = Annotated[
+    Path | None,
+    typer.Option("--session", metavar="FOLDER", help="Write the readings as a session for `stitch run` and diagnose."),
+]
+
+
+def base(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Readings of the stand, TOML.")],
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the transform between two robot bases from a stand with a measuring rod.
+
+    \b
+    Examples:
+      stitch base stand.toml --report page.html
+    """
+    from stitch.cells.base_to_base import run_base
+
+    run_base(file, recording, report, session, as_json)
+
+
+def drill(
+    file: JobFile,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="CSV", help="Write the drives.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Correct the drives of holes from reference holes that the robot has seen.
+
+    \b
+    Examples:
+      stitch drill job.toml --report page.html
+    """
+    from stitch.cells.drilling import run_drill
+
+    run_drill(file, output, recording, report, session, as_json=as_json)
+
+
+def panel(
+    file: JobFile,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="For the commands.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Robots and tracker in one model; where to send the robots for the panel's place, pose and shape.
+
+    \b
+    Examples:
+      stitch panel job.toml --report page.html
+    """
+    from stitch.cells.panel import run_panel
+
+    run_panel(file, output, recording, report, session, as_json=as_json)
+
+
+def fit(
+    file: JobFile,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="FOLDER", help="For map and path.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    allowance: Annotated[
+        str | None,
+        typer.Option(
+            metavar="free|varying|SIZE", help="Stock on a casting, outside = plus: found evenly, varying, or stated."
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit scans onto a CAD model without a guess: pose, deviation map and corrected robot path.
+
+    \b
+    Examples:
+      stitch fit fit.toml --report page.html
+      stitch fit casting.toml --allowance free
+    """
+    from stitch.cells.window import run_fit
+
+    run_fit(file, allowance, output, recording, report, session=session, as_json=as_json)
+
+
+def seam(
+    file: JobFile,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="CSV", help="Write the stations.")] = None,
+    recording: RecordingOption = None,
+    report: ReportOption = None,
+    session: SessionOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure flush and gap at the stations of a seam, with uncertainty and verdict.
+
+    \b
+    Examples:
+      stitch seam seam.toml --report page.html
+    """
+    from stitch.cells.window import run_seam
+
+    run_seam(file, output, recording, report, session, as_json=as_json)
