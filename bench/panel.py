@@ -25,7 +25,7 @@ from stitch.cells.panel_model import (
     true_flanges,
 )
 from stitch.errors import NoResultError
-from viz.cells.panel_error_figures import errors_figure, shape_figure
+from viz.cells.panel import errors_figure, shape_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, PICTURES = ROOT / "docs" / "panel.md", ROOT / "docs" / "pictures"

@@ -19,7 +19,7 @@ from stitch.cells.cad import Box, Regions, cad_surface, join_scans
 from stitch.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations
 from stitch.cells.seam import Limits, Station, measure_seam
 from stitch.measurement.scan import prepare_scan
-from viz.cells.window_fit_figures import deviation_map
+from viz.cells.window_fit import deviation_map
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, PICTURES = ROOT / "docs" / "window.md", ROOT / "docs" / "pictures"

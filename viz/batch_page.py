@@ -7,7 +7,7 @@ from pathlib import Path
 from stitch.batch.run_batch import SessionRow, batch_sentence
 from stitch.system.files import whole_file
 from stitch.units import length_text
-from viz.filled_templates import render
+from viz.page_parts import render
 
 
 def write_page(rows: Sequence[SessionRow], path: Path) -> None:

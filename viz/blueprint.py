@@ -2,18 +2,64 @@
 
 import os
 
-os.environ.setdefault("RERUN_ANALYTICS", "off")
 import numpy as np
+import rerun as rr
 import rerun.blueprint as rrb
+from matplotlib import colormaps
 
 from stitch.comparison.disagreement_field import effect_changes
 from stitch.frames import Array
 from stitch.runs.run import Run
-from viz.colour_bar import HIGH, WIDE
-from viz.model_scene import ModelScene, shown_steps
-from viz.model_timeline import FRAMES
-from viz.part_camera import Camera
-from viz.whole_picture import eye_for
+from viz.colours import UNSEEN
+from viz.model_timeline import FRAMES, ModelScene, shown_steps
+from viz.part_surface import Camera
+
+# A colour bar as a native picture of a recording.
+
+_LENGTH, _HEIGHT = 256, 14
+# All of it with its words, which are as large in any window.
+WIDE, HIGH = (-28.0, _LENGTH + 44.0), (-4.0, _HEIGHT + 54.0)
+
+
+def log_colour_bar(recording: rr.RecordingStream, path: str, name: str, ticks: list[str], grey: str) -> None:
+    """The colours of a map from left to right, with labels at equal distances below, and what grey means below them."""
+    row = np.asarray(colormaps[name](np.linspace(0, 1, _LENGTH))[:, :3] * 255, np.uint8)
+    recording.log(f"{path}/colours", rr.Image(np.tile(row, (_HEIGHT, 1, 1))), static=True)
+    places = np.column_stack([np.linspace(0, _LENGTH, len(ticks)), np.full(len(ticks), _HEIGHT + 6.0)])
+    marks = rr.Points2D(places, labels=ticks, radii=0.4, colors=[(128, 128, 128)], show_labels=True)
+    recording.log(f"{path}/ticks", marks, static=True)
+    below = [(_LENGTH / 2, _HEIGHT + 27.0)]
+    unseen = rr.Points2D(below, labels=[f"grey: {grey}"], radii=0.4, colors=[UNSEEN], show_labels=True)
+    recording.log(f"{path}/grey", unseen, static=True)
+
+
+# An eye of the viewer from which everything is in the picture, and in its middle.
+
+os.environ.setdefault("RERUN_ANALYTICS", "off")
+
+# Tangent of half the viewer's field, 55 degrees high, with a margin.
+_HIGH = 0.47
+
+
+def eye_for(points: Array, axes: Array, up: Array, aspect: float) -> rrb.EyeControls3D:
+    """The nearest eye that sees all points (N, 3).
+
+    Args:
+        axes: (3, 3) rows right, up, and from the points to the eye: unit vectors.
+        up: (3,) about which the picture is turned.
+        aspect: width of the window over its height.
+    """
+    middle, half = (points.min(axis=0) + points.max(axis=0)) / 2, np.array([aspect * _HIGH, _HIGH])
+    for _ in range(4):
+        x, y, z = axes @ (points - middle).T
+        away = float(np.max(z + np.maximum(np.abs(x) / half[0], np.abs(y) / half[1])))
+        seen = np.array([x, y]) / (away - z)
+        middle = middle + 0.5 * away * (seen.min(axis=1) + seen.max(axis=1)) @ axes[:2]
+    return rrb.EyeControls3D(position=middle + away * axes[2], look_target=middle, eye_up=up)
+
+
+os.environ.setdefault("RERUN_ANALYTICS", "off")
+
 
 # Width over height, in an ordinary window, of a picture of the part and of that of the cell.
 _OF_PART, _OF_CELL = 0.68, 1.5
@@ -135,7 +181,7 @@ def _errors(run: Run, stages: tuple[str, ...]) -> rrb.Vertical:
     closed = [_bars(f"iterations/{s}", f"Rms of every iteration of the last fit (µm): {s}") for s in stages]
     last = rrb.Horizontal(*closed, _moved())
     rows = [rrb.Horizontal(*fell), last] if len(run.ledger) > 1 else [last]
-    return rrb.Vertical(*rows, row_shares=[2, 1][: len(rows)], name="How the error fell")
+    return rrb.Vertical(*rows, row_shares=[2, 1][: len(rows)], name="The error, step by step")
 
 
 def _moved() -> rrb.BarChartView:

@@ -2,23 +2,74 @@
 
 import os
 import subprocess
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import rerun as rr
 
+from stitch.comparison.disagreement_field import DisagreementField, Patches, patches_of
 from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
+from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.system.files import whole_file
 from stitch.units import MICROMETRES
 from stitch.writing.diagnosis_document import effect_description, effect_in_words, plain_finding, suggested_command
-from viz.candidate_fields import CandidateFields
 from viz.colours import COLOURS_OF_FEW
-from viz.recorded_words import words
-from viz.rerun_program import rerun_program
-from viz.rrd_file import RecordingFile, id_of
+from viz.part_data import packed_floats, packed_values
+from viz.rrd_file import RecordingFile, id_of, words
+from viz.viewer import rerun_program
+
+# What each candidate effect would leave of the field of disagreement, for the page.
+
+# Best candidate effects whose field a page holds.
+_BEST = 3
+
+
+@dataclass(frozen=True)
+class CandidateFields:
+    """The field as it is, and as it would be with each of the best candidate effects."""
+
+    patches: Patches
+    present: DisagreementField
+    if_added: dict[str, DisagreementField]
+
+
+def candidate_fields(found: Diagnosis) -> CandidateFields | None:
+    """None without clouds."""
+    linear = found.linear
+    present = predicted_distances(linear)
+    if present is None or not isinstance(linear.observation, SurfaceObservation):
+        return None
+    overlaps = linear.observation.unconstrained.overlaps
+    patches = patches_of(overlaps.matches, linear.measurement.views.count, overlaps.gram.scale, model_distances=present)
+    worth = [c for c in found.candidates if c.ranked.score.observable and c.ranked.score.fitted][:_BEST]
+    added = {}
+    for candidate in worth:
+        distances = predicted_distances(linear, candidate.ranked.score)
+        assert distances is not None
+        added[candidate.name] = patches.field(distances)
+    return CandidateFields(patches, patches.field(present), added)
+
+
+def packed_candidates(fields: CandidateFields, length_unit: str) -> dict[str, Any]:
+    """Plain data for the viewer of the page; µm."""
+    um = MICROMETRES[length_unit]
+    return {
+        "patches": packed_floats(fields.patches.points),
+        "mean": fields.present.mean_abs * um,
+        "noise": fields.present.noise * um,
+        "values": packed_values(fields.present.overall * um),
+        "candidates": [
+            {"name": name, "mean": field.mean_abs * um, "values": packed_values(field.overall * um)}
+            for name, field in fields.if_added.items()
+        ],
+    }
+
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
-import rerun as rr
 
 _SHOWN = 8
 NOT_YET = "Not asked yet: `stitch diagnose RUN` says which effect is missing."

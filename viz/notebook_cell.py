@@ -8,11 +8,10 @@ from stitch.comparison.disagreement_field import full_colour_distance, model_his
 from stitch.comparison.run_verdict import run_headline
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES
-from viz import target_figures
-from viz.filled_templates import render
-from viz.part_camera import camera_for
+from viz import run_figures
+from viz.page_parts import render
 from viz.part_picture import DISAGREE, part_picture, step_shown
-from viz.part_surface import part_surface
+from viz.part_surface import camera_for, part_surface
 from viz.run_page import shown_part
 
 # Steps of the model side by side, the last ones.
@@ -38,7 +37,7 @@ def plot(run: Run) -> Figure:
     alone, the targets as every view puts them."""
     history, um = model_history(run), MICROMETRES[run.session.length_unit]
     if history is None:
-        return target_figures.sticks(run)
+        return run_figures.sticks(run)
     surface = part_surface(run.fused, history.patches)
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
     # Coarse is so far off that all would be red.

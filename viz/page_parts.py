@@ -1,9 +1,28 @@
-"""Figures of a page as data addresses, which need nothing beside it."""
+"""What stands on top of every page: a sentence, lights, notes, and what the page is about."""
 
 import base64
 import io
+import json
+import platform
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
 
+from jinja2 import Environment, PackageLoader, select_autoescape
+from markupsafe import Markup
 from matplotlib.figure import Figure
+
+from stitch.comparison.run_verdict import ToleranceVerdict
+from stitch.measurement.session import Session
+from stitch.reading.session_folder import session_hash
+from stitch.runs.run import Run
+from stitch.system.files import whole_file
+from stitch.writing.diagnosis_document import effect_in_words
+
+# Figures of a page as data addresses, which need nothing beside it.
 
 
 def svg(figure: Figure) -> str:
@@ -37,3 +56,110 @@ def png_bytes(figure: Figure, dpi: int) -> bytes:
 
 def _address(kind: str, data: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+# Numbers and their units stay on one line.
+
+_SPACE = "\u00a0"
+_UNIT = r"(?:[kµm]?m|[µm]?rad|N|kg|°C?|deg|ppm|h|min|m?s|[kM]B|[%σ])(?![\w%])"
+_VALUE = r"[−\-]?\d"
+_BETWEEN = re.compile(
+    rf"(?<=\d) (?={_UNIT}|± \d)|(?<=\d ±) (?=\d)|(?<=\bN) (?=m\b)|(?<=\w) (?== {_VALUE})|(?<=\w =) (?={_VALUE})"
+)
+
+
+def unbroken(text: str) -> str:
+    """The text with no-break spaces before units, about ± and =: a line of a page ends elsewhere."""
+    return _BETWEEN.sub(_SPACE, text)
+
+
+# Templates of pages filled in, without the libraries that draw.
+
+
+def render(template: str, **content: object) -> str:
+    """A template of `viz/templates` filled in; text is escaped, and numbers stay with their units."""
+    environment = Environment(
+        loader=PackageLoader("viz"), autoescape=select_autoescape(default=True), trim_blocks=True, finalize=_on_one_line
+    )
+    return environment.get_template(template).render(**content)
+
+
+def _on_one_line(value: object) -> object:
+    """Text as a page has it; what is markup already was text before."""
+    return unbroken(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
+def script_json(data: object) -> str:
+    """Plain data as JSON that may stand inside a script element."""
+    return json.dumps(data).replace("<", "\\u003c")
+
+
+# What a page is about: object, time, arm, scanner, versions, and a hash that tells one session from another.
+
+Row = tuple[str, str]
+
+
+def identity(run: Run) -> list[Row]:
+    """Rows of label and text; nothing that the session does not state."""
+    session = run.session
+    scanner = "fixed in the cell, part on the flange" if session.mount == "eye_to_hand" else "on the flange, part fixed"
+    noise = session.scanner.noise
+    stated = "" if noise is None else f", noise {noise:g} {session.length_unit} as stated"
+    joints = "" if session.robot is None else f", {session.robot.n_joints} joints"
+    of = f" of {len(session.views) + len(run.left_out)}" if run.left_out else ""
+    return [
+        ("Session", session.name),
+        ("Views", f"{len(session.views)}{of}, {_points(session)}"),
+        page_written(),
+        ("Arm", ("not stated" if session.robot is None else session.robot.name or "without a name") + joints),
+        ("Scanner", scanner + stated),
+        ("Model", ", ".join(["hand-eye", *map(effect_in_words, run.effects)])),
+        versions(),
+        ("SHA-256 of the session", session_hash(session)),
+    ]
+
+
+def page_written() -> Row:
+    """The day, UTC."""
+    return "Page written", datetime.now(UTC).strftime("%Y-%m-%d")
+
+
+def versions() -> Row:
+    """What computed it."""
+    return "stitch", f"{version('stitch')}, Python {platform.python_version()}, numpy {version('numpy')}"
+
+
+def _points(session: Session) -> str:
+    clouds = sum(view.cloud.count for view in session.views if view.cloud is not None)
+    labelled = sum(len(view.sighting.targets) for view in session.views if view.sighting is not None)
+    told = [f"{n:,} {word}" for n, word in ((clouds, "points"), (labelled, "labelled points")) if n]
+    return " and ".join(told) or "no points"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One of the things that a page is about."""
+
+    identity: Sequence[tuple[str, str]]  # label and text
+    name: str = ""  # where they are several
+    found: Sequence[str] = ()  # sentences
+
+
+@dataclass(frozen=True)
+class Head:
+    """In the order in which it is read."""
+
+    title: str
+    verdict: str
+    subjects: Sequence[Subject]
+    lights: Sequence[ToleranceVerdict] = ()  # against what is allowed, where somebody said what is
+    evidence: str = ""
+    notes: Sequence[str] = ()
+    doubts: Sequence[str] = ()  # in full, of which the verdict has the beginnings
+
+
+def write_page(path: Path, template: str, head: Head, **content: object) -> None:
+    """Fill in a template that extends `page.html.j2`, whole or not at all; it needs nothing beside it."""
+    page = render(template, head=head, **content)
+    with whole_file(path) as file:
+        file.write_text(page, encoding="utf-8")

@@ -1,17 +1,39 @@
 """What the viewer of the page needs, packed: the surface once, the field of every step of the model's history."""
 
+import base64
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
+from numpy.typing import NDArray
 
 from stitch.comparison.disagreement_field import ModelHistory, full_colour_distance
 from stitch.frames import Array
 from stitch.units import MICROMETRES
 from viz.colours import FIELD, SIGNED
-from viz.packed_numbers import packed, packed_floats, packed_values
-from viz.part_camera import Camera
-from viz.part_surface import PartSurface
+from viz.part_surface import Camera, PartSurface
+
+# Arrays as text for a browser, small.
+
+_UNKNOWN = -32768
+
+
+def packed_values(values: Array) -> dict[str, Any]:
+    """16 bits a value and the size of one count; what nobody knows is the smallest number."""
+    known = np.isfinite(values)
+    count = float(np.abs(values[known]).max(initial=0.0)) / 32000 or 1.0
+    return {"count": count, "data": packed(np.where(known, np.nan_to_num(values) / count, _UNKNOWN).astype("<i2"))}
+
+
+def packed_floats(numbers: Array) -> str:
+    """32 bits a number."""
+    return packed(numbers.astype("<f4"))
+
+
+def packed(numbers: NDArray[Any]) -> str:
+    """The bytes of an array, base64."""
+    return base64.b64encode(np.ascontiguousarray(numbers).tobytes()).decode()
+
 
 # Views whose own field a page holds.
 _VIEWS = 24

@@ -12,8 +12,7 @@ from stitch.comparison.disagreement_field import ModelStep
 from stitch.frames import Array, Indices
 from stitch.units import length_text
 from viz.colours import FIELD, unsigned_colours
-from viz.part_camera import Camera
-from viz.part_surface import PartSurface
+from viz.part_surface import Camera, PartSurface
 
 # Light that comes from the eye, a little from above and from the left.
 _LIGHT = np.array([-0.25, 0.45, 0.86])

@@ -4,29 +4,46 @@ import os
 from pathlib import Path
 
 import numpy as np
+import rerun as rr
 
-from stitch.comparison.disagreement_field import model_history
+from stitch.comparison.disagreement_field import ModelHistory, model_history
+from stitch.comparison.run_verdict import run_headline
 from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.runs.run import Run, StageResult
-from stitch.units import MICROMETRES
-from viz.blueprint import model_blueprint, target_blueprint
-from viz.colour_bar import log_colour_bar
+from stitch.units import MICROMETRES, length_text
+from stitch.writing.diagnosis_document import effect_in_words
+from viz.blueprint import log_colour_bar, model_blueprint, target_blueprint
 from viz.colours import COLOURS_OF_FEW, FIELD, GREY, robust_limit, unsigned_colours
 from viz.diagnosis_recording import NOT_YET
-from viz.model_scene import model_scene
-from viz.model_timeline import log_model
-from viz.part_camera import camera_for
-from viz.part_surface import part_surface
-from viz.recorded_words import words
+from viz.model_timeline import log_model, model_scene
+from viz.part_surface import camera_for, part_surface
 from viz.robot_scene import log_robot
-from viz.rrd_file import RecordingFile, id_of
-from viz.run_figures import view_shifts
-from viz.run_markdown import run_markdown
-from viz.target_figures import residual_vectors
+from viz.rrd_file import RecordingFile, id_of, words
+from viz.run_figures import residual_vectors, view_shifts
+
+# What a run found, as Markdown for the recording.
+
+
+def run_markdown(run: Run, history: ModelHistory | None) -> str:
+    """Verdict, how the error fell, what could not be seen."""
+    lines = [f"# {run.session.name}", "", f"**{run_headline(run, history)}**", ""]
+    for doubt in run.doubts:
+        lines += [doubt, ""]
+    if run.effects:
+        lines += [f"In the model: {', '.join(map(effect_in_words, run.effects))}.", ""]
+    lines += [run.verdict, ""]
+    if history is not None:
+        lines += ["| step of the model | views disagree by |", "|---|---:|"]
+        lines += [f"| {s.name} | {length_text(s.field.mean_abs, run.session.length_unit)} |" for s in history.steps]
+        lines += [""]
+    lines += [f"- Registered by {stage.remark}." for stage in run.stages if stage.method]
+    lines += [f"- Not observable from these motions: {direction}" for direction in run.unobservable]
+    lines += [f"- {note}" for note in run.notes]
+    return "\n".join(lines)
+
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
-import rerun as rr
 
 # A stage whose rms did not fall to this share of its first has no course that is worth a picture.
 _FELL = 0.95

@@ -3,11 +3,23 @@
 Rerun's own file sink writes from a thread of its own: on a full disk it reports nothing and waits without end.
 """
 
+import os
 import uuid
 from pathlib import Path
 
 import rerun as rr
 import rerun.blueprint as rrb
+
+from viz.page_parts import unbroken
+
+# Text beside the pictures of a recording.
+
+os.environ.setdefault("RERUN_ANALYTICS", "off")
+
+
+def words(markdown: str) -> rr.TextDocument:
+    """A text with numbers that stay with their units."""
+    return rr.TextDocument(unbroken(markdown), media_type=rr.MediaType.MARKDOWN)
 
 
 def id_of(session: str) -> str:

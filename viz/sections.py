@@ -23,15 +23,9 @@ from stitch.writing.diagnosis_document import (
 )
 from viz import captions
 from viz import diagnosis_figures as draw
-from viz.budget_figure import budget
-from viz.candidate_fields import CandidateFields, candidate_fields, packed_candidates
-from viz.comparison_figures import comparison
-from viz.course_figures import joint_courses, time_course
-from viz.diagnosis_recording import add_diagnosis
-from viz.field_map_figure import scanner_field
-from viz.filled_templates import render, script_json
-from viz.page_parts import svg_address, svg_text
-from viz.unbroken import unbroken
+from viz.diagnosis_figures import budget, comparison, joint_courses, scanner_field, time_course
+from viz.diagnosis_recording import CandidateFields, add_diagnosis, candidate_fields, packed_candidates
+from viz.page_parts import render, script_json, svg_address, svg_text, unbroken
 
 # Candidate effects in the table of the page.
 _SHOWN = 8

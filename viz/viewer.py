@@ -1,14 +1,22 @@
 """`stitch view RUN`: open a recording in the Rerun viewer."""
 
 import os
+import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from stitch.errors import InputError, NoResultError
-from viz.rerun_program import rerun_program
+
+# Where the program of the rerun library lies.
+
+
+def rerun_program() -> str:
+    """The program that came with the library."""
+    return shutil.which("rerun", path=str(Path(sys.executable).parent)) or "rerun"
 
 
 def view(run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")]) -> None:

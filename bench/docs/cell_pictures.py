@@ -15,7 +15,9 @@ from stitch.cells.drilling import solve_drill_job as solve_drilling
 from stitch.cells.panel import read_panel_job as read_panel
 from stitch.cells.panel import solve_panel_job as solve_panel
 from stitch.cells.window import read_seam_job, solve_seam
-from viz.cells import base_to_base_figures, drilling_figures, panel_figures, window_seam
+from viz.cells import base_to_base, window_seam
+from viz.cells.drilling import holes
+from viz.cells.panel import shape
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES, PICTURES = ROOT / "examples", ROOT / "docs" / "pictures"
@@ -26,9 +28,9 @@ def figures() -> dict[str, Figure]:
     stand, drilling = read_stand(EXAMPLES / "base_to_base.toml"), read_drilling(EXAMPLES / "drilling" / "job.toml")
     panel, seam = read_panel(EXAMPLES / "panel" / "job.toml"), read_seam_job(EXAMPLES / "window" / "seam.toml")
     return {
-        "base-to-base": base_to_base_figures.plan(stand, solve_stand(stand)),
-        "drilling": drilling_figures.holes(drilling, solve_drilling(drilling)),
-        "panel-clamps": panel_figures.shape(panel, solve_panel(panel)),
+        "base-to-base": base_to_base.plan(stand, solve_stand(stand)),
+        "drilling": holes(drilling, solve_drilling(drilling)),
+        "panel-clamps": shape(panel, solve_panel(panel)),
         "window-seam": window_seam.cuts(seam, solve_seam(seam)),
     }
 

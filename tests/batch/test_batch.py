@@ -10,7 +10,7 @@ import pytest
 from stitch.batch import cluster, run_batch
 from stitch.batch.run_batch import BatchJob, SessionRow, run_jobs, run_session
 from viz.batch_page import write_page
-from viz.unbroken import unbroken
+from viz.page_parts import unbroken
 
 pytestmark = pytest.mark.usefixtures("no_drawing")
 

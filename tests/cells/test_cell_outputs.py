@@ -19,7 +19,6 @@ from scipy.stats import chi2
 import viz.cells.base_to_base
 import viz.cells.drilling
 import viz.cells.panel
-import viz.cells.panel_figures
 import viz.cells.window_fit
 import viz.cells.window_seam
 from data_synth.drilling_cell import DrillingCell, Sizes
@@ -29,8 +28,8 @@ from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.reading.session_folder import load_session
 from tests.in_browser import WAYS, require_for_everybody
-from viz.cells.job_identity import job_identity
-from viz.unbroken import unbroken
+from viz.cells.page import job_identity
+from viz.page_parts import unbroken
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 JOBS = {
@@ -238,7 +237,7 @@ def test_expected_shape_is_what_the_commanded_clamps_do():
 
     job = read_panel_job(JOBS["panel"])
     result = solve_panel_job(job)
-    remaining = viz.cells.panel_figures.expected_after(job, result)
+    remaining = viz.cells.panel.expected_after(job, result)
     assert np.abs(remaining).max() < 0.05
     assert result.shape_largest.max() > 3.0
 

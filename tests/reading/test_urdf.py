@@ -8,7 +8,7 @@ from rerun.chunk import RrdReader
 from stitch.errors import InputError
 from stitch.measurement.robot import forward, link_frames
 from stitch.reading.robot_description import robot_from_urdf
-from viz.arm_meshes import log_meshes
+from viz.robot_scene import log_meshes
 from viz.rrd_file import RecordingFile
 
 GRAVITY = np.array([0.5, -0.2, -9.81])

@@ -12,7 +12,7 @@ from stitch.reading.session_folder import load_session
 from stitch.stages.register import DEFAULT, METHODS
 from stitch.stored.stored_run import load_run
 from stitch.writing.run_folder import write_run
-from viz.run_markdown import run_markdown
+from viz.recording import run_markdown
 
 
 def test_the_method_is_written_read_again_and_kept_by_a_change(session, tmp_path):

@@ -18,10 +18,8 @@ from stitch.pipeline import diagnose, run
 from stitch.writing.json_file import is_run_file
 from tests.diagnosis.freed_blade import freed_blade
 from viz import captions
-from viz.budget_figure import budget
 from viz.colours import BLUE, DARK, ORANGE
-from viz.diagnosis_figures import added_variable
-from viz.field_map_figure import scanner_field
+from viz.diagnosis_figures import added_variable, budget, scanner_field
 from viz.sections import _pictures
 
 LINES = (

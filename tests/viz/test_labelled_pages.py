@@ -12,9 +12,9 @@ import pytest
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
+from viz.page_parts import unbroken
 from viz.review.chosen_field import Choice
 from viz.review.run_review import RunReview
-from viz.unbroken import unbroken
 
 
 def told(capsys, *words):

@@ -23,10 +23,10 @@ from stitch.writing.result_document import result_document
 from viz.colours import UNSEEN, signed_colours
 from viz.diagnosis_recording import log_diagnosis
 from viz.model_timeline import one_above_the_other
+from viz.page_parts import unbroken
 from viz.recording import RerunRecorder
 from viz.rrd_file import RecordingFile
 from viz.run_page import write_report
-from viz.unbroken import unbroken
 
 
 def rerun(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -13,9 +13,8 @@ from stitch.comparison.disagreement_field import model_history
 from stitch.comparison.run_verdict import check_tolerance, plain_verdict, run_headline
 from stitch.writing.result_document import result_document
 from tests.in_browser import require_for_everybody
-from viz.filled_templates import render
+from viz.page_parts import render, unbroken
 from viz.run_page import write_report
-from viz.unbroken import unbroken
 
 LARGEST = 8_000_000  # bytes that can be mailed
 

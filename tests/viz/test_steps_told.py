@@ -9,7 +9,7 @@ from rerun.chunk import RrdReader
 from stitch.units import length_text
 from stitch.writing.result_document import result_document
 from viz.model_timeline import FRAMES
-from viz.unbroken import unbroken
+from viz.page_parts import unbroken
 
 
 def told_at(recording):

@@ -5,8 +5,7 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import PROBE_TURN, TABLE, TARGETS, flange, labelled_cell
 from stitch.pipeline import run
-from viz.target_bodies import bodies
-from viz.target_marks import ANY, NOTHING, mark_values, marks_of
+from viz.target_scene import ANY, NOTHING, bodies, mark_values, marks_of
 
 
 def test_a_mark_counts_what_it_stands_for():

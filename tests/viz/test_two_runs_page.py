@@ -14,8 +14,7 @@ from stitch.comparison.disagreement_field import model_history
 from stitch.comparison.two_runs import compare_runs, comparison_sentence, hand_eye_change
 from stitch.errors import InputError
 from tests.in_browser import WAYS, require_for_everybody, shown
-from viz.two_runs_page import write_two_runs
-from viz.two_runs_tables import facts, view_change_rows
+from viz.two_runs_page import facts, view_change_rows, write_two_runs
 
 # A turn of 2 mrad and a shift of 0.3 mm, in the scanner frame of A.
 MOVED = np.array([0.002, 0.0, 0.0, 0.0, 0.3, 0.0])

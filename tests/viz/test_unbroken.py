@@ -2,8 +2,7 @@
 
 import pytest
 
-from viz.filled_templates import render
-from viz.unbroken import unbroken
+from viz.page_parts import render, unbroken
 
 
 @pytest.mark.parametrize(

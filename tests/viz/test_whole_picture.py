@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stitch import frames
-from viz.whole_picture import eye_for
+from viz.blueprint import eye_for
 
 HALF_FIELD = np.tan(np.radians(55.0) / 2)  # of the viewer's field, upwards
 

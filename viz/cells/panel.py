@@ -1,19 +1,181 @@
 """Page and recording of a panel held by several robots: contact points, shape before and after, forces, residuals."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from stitch import frames
 from stitch.cells.panel import PanelJob, PanelResult, leg_sentence, shape_sentence
+from stitch.cells.panel_model import MotionErrors
 from stitch.comparison.run_verdict import ToleranceVerdict
-from stitch.frames import Array
+from stitch.frames import Array, Indices
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
-from viz.cells.panel_error_figures import errors_figure
-from viz.cells.panel_figures import deviation_before, expected_after, forces, misfit, shape
-from viz.colours import signed_colours
-from viz.identity import Row
+from viz.colours import BLUE, DARK, GREEN, ORANGE, SIGNED, YELLOW, above, signed_colours
+from viz.page_parts import Row
+
+
+def expected_after(job: PanelJob, result: PanelResult) -> Array:
+    """(K,) deviation across the surface, mm, that the commanded twists of the clamps leave at the control points."""
+    assert result.shape is not None and job.control is not None
+    after = np.zeros(len(job.control.clamp))
+    for i, T in enumerate(result.contacts.T_panel_contact):
+        beside = job.control.clamp == i
+        local = frames.transform(frames.inverse(T), job.control.nominal[beside])
+        twist = result.shape.twists[i]
+        moved = twist[3:] + np.cross(twist[:3], local)
+        after[beside] = -(result.shape.deviations[beside] @ T[:3, 2]) - moved[:, 2]
+    return after
+
+
+def deviation_before(job: PanelJob, result: PanelResult) -> Array:
+    """(K,) deviation across the surface, mm, outwards positive: a clamp's z looks into the panel."""
+    assert result.shape is not None and job.control is not None
+    inward = result.contacts.T_panel_contact[job.control.clamp][:, :3, 2]
+    return np.asarray(-np.einsum("ki,ki->k", result.shape.deviations, inward))
+
+
+def shape(job: PanelJob, result: PanelResult) -> Figure:
+    """Control points on the unrolled panel, coloured by their deviation, before and after."""
+    assert job.control is not None
+    figure = Figure(figsize=(10.5, 3.5), layout="constrained")
+    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    before = deviation_before(job, result)
+    limit = max(float(np.abs(before).max()), job.tolerance)
+    shown = (("measured", before), ("expected after the correction", expected_after(job, result)))
+    for ax, (title, values) in zip(axes, shown, strict=True):
+        _draw_panel(ax, job, result)
+        at = _unrolled(job, job.control.nominal)
+        drawn = ax.scatter(*at.T, c=values, s=70, cmap=SIGNED, vmin=-limit, vmax=limit, edgecolor="0.3", zorder=3)
+        _write_values(ax, at, values, job.control.clamp)
+        ax.set(title=f"{title}: {np.abs(values).max():.2f} mm at most", xlabel="along the panel's axis (mm)")
+    axes[0].set_ylabel("around it (mm)")
+    figure.colorbar(drawn, ax=axes, label="outside (+) or inside (−) its target (mm)", shrink=0.9)
+    return figure
+
+
+def _write_values(ax: Axes, at: Array, values: Array, clamp: Indices) -> None:
+    """Each value on the side of its point that looks away from its clamp."""
+    for place, value, i in zip(at, values, clamp, strict=True):
+        away = np.sign(place - at[clamp == i].mean(axis=0))
+        align = {"ha": "left" if away[0] > 0 else "right", "va": "center"}
+        ax.annotate(_signed(value), place, xytext=7 * away * [1, 0], textcoords="offset points", fontsize=7, **align)
+
+
+def _signed(value: float) -> str:
+    """With its sign, which nothing has not."""
+    text = f"{value:+.2f}".replace("-", "−")
+    return text[1:] if text[1:] == "0.00" else text
+
+
+def _draw_panel(ax: Axes, job: PanelJob, result: PanelResult) -> None:
+    for name, pads in zip(job.robots, result.contacts.pads, strict=True):
+        at = _unrolled(job, pads)
+        ax.fill(*at.T, facecolor="0.93", edgecolor="0.6")
+        aside = at.mean(axis=0) * [0.22, 1.0]
+        ax.annotate(name, aside, ha="center", va="center", fontsize=13, color="0.45", weight="bold")
+    half = job.layout.length / 2
+    ax.set(aspect="equal", xlim=(-half - 330, half + 330))
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def _unrolled(job: PanelJob, points: Array) -> Array:
+    """(N, 2) along the axis and around it, mm, of points (N, 3) of the panel frame."""
+    R = job.layout.radius
+    return np.column_stack([points[:, 0], R * np.arctan2(points[:, 1], points[:, 2] + R)])
+
+
+def forces(job: PanelJob) -> Figure:
+    """Size along z and across it at every clamp."""
+    assert job.forces is not None
+    figure = Figure(figsize=(7, 2.6), layout="constrained")
+    ax, place = figure.subplots(), np.arange(len(job.robots))
+    ax.bar(place - 0.2, job.forces[:, 5], 0.38, color=BLUE, label="along z, into the panel")
+    ax.bar(place + 0.2, np.linalg.norm(job.forces[:, 3:5], axis=1), 0.38, color=ORANGE, label="in its plane")
+    ax.set_xticks(place, job.robots)
+    ax.set(ylabel="force (N)", xlabel="clamp")
+    ax.axhline(0, color="k", lw=0.6)
+    ax.legend(frameon=False)
+    ax.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def misfit(job: PanelJob, result: PanelResult) -> Figure:
+    """Root mean square of the weighted residuals of each robot."""
+    figure = Figure(figsize=(7, 2.4), layout="constrained")
+    ax = figure.subplots()
+    sizes = [np.sqrt(m.chi_square / m.redundancy) for m in result.models]
+    ax.bar(job.robots, sizes, color=GREEN)
+    ax.axhline(1.0, color="0.4", ls="--", lw=1, label="tracker's sigma")
+    ax.set(ylabel="rms (sigmas)", xlabel="robot")
+    above(ax)
+    ax.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+# Lines that lie upon one another still tell by their marks; nobody has to tell red from green.
+_STYLES: list[dict[str, Any]] = [
+    {"color": colour, "marker": marker, "ms": 5, "mfc": "none"}
+    for colour, marker in zip((BLUE, ORANGE, GREEN, YELLOW, DARK, "black"), "osD^vx", strict=True)
+]
+
+
+def write_pictures(job: PanelJob, result: PanelResult, folder: Path) -> list[str]:
+    """Write the errors to expect along a motion as PNG and SVG; returns the files' names."""
+    names = ["errors.png", "errors.svg"]
+    figure = errors_figure(job.robots, job.master, result.errors.shift, result.errors.turn)
+    for name in names:
+        figure.savefig(folder / name, dpi=110)
+    return names
+
+
+def errors_figure(names: Sequence[str], master: int, shift: MotionErrors, turn: MotionErrors) -> Figure:
+    """Error against distance and angle, one line per slave: the worst of the three axes."""
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    axes = figure.subplots(2, 2, sharex="row", squeeze=False)
+    rows = ((shift, shift.steps, "distance moved (mm)"), (turn, np.degrees(turn.steps), "angle turned (°)"))
+    for row, (errors, steps, label) in enumerate(rows):
+        microns, millidegrees = errors.position * 1e3, np.degrees(errors.angle) * 1e3
+        columns = ((microns, "position error (µm)"), (millidegrees, "angle error (0.001°)"))
+        for ax, (sizes, size_label) in zip(axes[row], columns, strict=True):
+            _draw_slaves(ax, steps, sizes, names, master=master)
+            ax.set(xlabel=label, ylabel=size_label)
+    axes[0, 0].legend(title=f"slaves of {names[master]}", fontsize="small")
+    figure.suptitle("Slave against master, rms expected from the global model's covariance, worst axis")
+    return figure
+
+
+def _draw_slaves(ax: Axes, steps: Array, sizes: Array, names: Sequence[str], *, master: int) -> None:
+    """Errors (3, D, N) over D steps, the worst axis of each slave."""
+    for i, name in enumerate(names):
+        if i != master:
+            ax.plot(steps, sizes[:, :, i].max(axis=0), label=name, **_STYLES[i % len(_STYLES)])
+    # An error of zero shall look like zero, not like magnified rounding.
+    ax.set_ylim(0, max(0.05, 1.05 * sizes.max()))
+    if np.allclose(sizes, 0.0, atol=1e-6):
+        ax.text(0.5, 0.5, "none: what is only moved does not turn", transform=ax.transAxes, ha="center", color=DARK)
+    ax.grid(alpha=0.3)
+
+
+def shape_figure(names: Sequence[str], steps: Sequence[Array], tolerance: float, forces: Array) -> Figure:
+    """Largest deviation at each clamp, step by step (each (N,) mm), and the largest force (steps,) N."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    deviations, bars = figure.subplots(1, 2)
+    table = np.array(steps)
+    for i, name in enumerate(names):
+        deviations.plot(range(len(table)), table[:, i], label=name, **_STYLES[i % len(_STYLES)])
+    deviations.axhline(tolerance, color="0.4", linestyle="--", label="tolerance")
+    deviations.set(xlabel="corrections made", ylabel="largest deviation at the clamp (mm)", xticks=range(len(table)))
+    deviations.set_ylim(0, None)
+    deviations.legend(fontsize="small", ncols=2)
+    bars.bar(range(len(forces)), forces, color=BLUE)
+    bars.set(xlabel="corrections made", ylabel="largest change of force (N)", xticks=range(len(forces)))
+    return figure
+
 
 # mm of arrow for a newton, and for a millimetre out of shape, beside a panel of three metres.
 _PER_NEWTON, _PER_MM = 4.0, 60.0

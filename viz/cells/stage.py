@@ -14,8 +14,7 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 import rerun as rr
 import rerun.blueprint as rrb
 
-from viz.recorded_words import words
-from viz.rrd_file import RecordingFile
+from viz.rrd_file import RecordingFile, words
 
 Colours = NDArray[np.uint8] | Sequence[tuple[int, int, int]]
 Recording = rr.RecordingStream

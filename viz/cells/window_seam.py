@@ -14,7 +14,7 @@ from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, DARK, GREEN, ORANGE, YELLOW
-from viz.identity import Row
+from viz.page_parts import Row
 
 _COLOURS = dict(zip(VERDICTS, (GREEN, ORANGE, YELLOW, DARK), strict=True))
 # Half width of a cut along the seam and half its extent across and down, mm.

@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from stitch.errors import NoResultError
-from viz.rerun_program import rerun_program
+from viz.viewer import rerun_program
 
 NAMES = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
 _HERE = "127.0.0.1"

@@ -22,7 +22,7 @@ def review(
       stitch review runs/blade-17
       stitch review runs/blade-17 --port 8080 --no-browser
     """
-    # Loaded by who reviews something: whoever asks for help has it at once.
-    from viz.review.served_review import served_review
+    # Imported here so that --help stays fast.
+    from viz.review.web_app import served_review
 
     served_review(run, port, browser=browser, effects_file=effects_file, trust=trust)

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,9 +14,118 @@ from stitch.reading.text_files import shortened
 from stitch.runs.run import LedgerStep
 from stitch.stored.stored_run import read_documents
 from stitch.units import MICROMETRES, format_amount
-from stitch.writing.diagnosis_document import effect_in_words
-from viz.review.told_candidates import told_diagnosis
-from viz.review.undo_history import undo_history
+from stitch.writing.diagnosis_document import effect_description, effect_in_words
+
+# Undo and redo, read from the ledger alone: it only grows, and a return to an earlier model is one of its steps.
+
+Effects = Sequence[str]
+
+
+def undo_history(steps: Sequence[Effects]) -> dict[str, Any]:
+    """What undo and redo would do: {"undo": {"command", "effects", "to"}, "redo": …}, None where there is nothing.
+
+    Args:
+        steps: effects of the model at every step of the ledger, the present one last.
+    """
+    visited, at = _visited(steps)
+    return {
+        "undo": _change(visited[at], visited[at - 1]) if at > 0 else None,
+        "redo": _change(visited[at], visited[at + 1]) if at + 1 < len(visited) else None,
+    }
+
+
+def _visited(steps: Sequence[Effects]) -> tuple[list[Effects], int]:
+    """Models as a browser keeps pages, and which of them is shown: a step to a neighbour goes there."""
+    visited: list[Effects] = [steps[0]] if steps else [()]
+    at = 0
+    for effects in steps[1:]:
+        if set(effects) == set(visited[at]):
+            continue
+        if at > 0 and set(effects) == set(visited[at - 1]):
+            at -= 1
+        elif at + 1 < len(visited) and set(effects) == set(visited[at + 1]):
+            at += 1
+        else:
+            visited = [*visited[: at + 1], effects]
+            at += 1
+    return visited, at
+
+
+def _change(present: Effects, target: Effects) -> dict[str, Any] | None:
+    """The one command that leads there; None where it takes two."""
+    new = [effect for effect in target if effect not in present]
+    gone = [effect for effect in present if effect not in target]
+    if bool(new) == bool(gone):
+        return None
+    return {"command": "add" if new else "drop", "effects": new or gone, "to": list(target)}
+
+
+# A diagnosis as rows for people: candidate effects with what they should leave if added.
+
+# The clearest parameters of an effect that are told.
+_TOLD = 3
+
+
+def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
+    """diagnosis.json for the browser.
+
+    Args:
+        um: micrometres in one length_unit.
+
+    An older diagnosis has one sentence for everything: it stands once.
+    """
+    plain = document.get("plain")
+    candidates = document.get("candidates", [])
+    follows = [row for row in document.get("depends_on", []) if row["p_value"] is not None and row["p_value"] < 0.05]
+    return {
+        "verdict": document["verdict"],
+        "named": document["effects"],
+        "plain": plain or document["sentence"],
+        "sentence": document["sentence"] if plain else "",
+        "candidates": [_candidate(row, um) for row in candidates if row["observable"]],
+        "unseen": [row["effect"] for row in candidates if not row["observable"] and not row.get("needs")],
+        "untested": [{"effect": row["effect"], "needs": row["needs"]} for row in candidates if row.get("needs")],
+        "follows": [{"covariate": row["covariate"], "p": f"{row['p_value']:.1g}"} for row in follows],
+        "next": [{"do": row["do"], "separates": row["separates"]} for row in document.get("next", [])],
+        "budget": [
+            {"source": row["source"], "share": row["variance_share"]}
+            for row in document.get("budget", [])
+            if row["variance_share"] and row["variance_share"] > 0.005
+        ],
+    }
+
+
+def _candidate(row: dict[str, Any], um: float) -> dict[str, Any]:
+    def in_um(value: float | None) -> float | None:
+        return None if value is None else value * um
+
+    return {
+        "effect": row["effect"],
+        "is": effect_description(row["effect"]),
+        "p": "–" if row["p_value"] is None else f"{row['p_value']:.1g}",
+        "posterior": row["posterior"],
+        "rms_if_added": in_um(row["rms_if_added"]),
+        "heldout_if_added": in_um(row["heldout_rms_if_added"]),
+        "amounts": _amounts(row["parameters"]),
+        "aliases": [f"{alias['effect']} {alias['correlation']:.2f}" for alias in row["aliases"][:2]],
+        "own": row.get("tier") == "user",
+    }
+
+
+def _amounts(parameters: dict[str, dict[str, Any]]) -> str:
+    """The clearest parameters: c2 = 0.44 ± 0.04 µrad/(N m)."""
+    tried = [
+        f"{name} = {p.get('view') or format_amount(p['value'], None, p['unit'])}"
+        for name, p in parameters.items()
+        if p["sigma"] is None
+    ]
+    fitted = {name: p for name, p in parameters.items() if p["sigma"]}
+    clearest = sorted(fitted, key=lambda name: -abs(fitted[name]["value"]) / fitted[name]["sigma"])[:_TOLD]
+    told = [
+        f"{name} = {format_amount(p['value'], p['sigma'], p['unit'])}" for name, p in fitted.items() if name in clearest
+    ]
+    return ", ".join(tried + told)
+
 
 # What the page shows comes from these; a change of one is a change of the run.
 _FILES = ("result.json", "ledger.json", "compare.json", "diagnosis.json", "report.html", "residuals.parquet")

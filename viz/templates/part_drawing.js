@@ -15,7 +15,8 @@ function partDrawing(canvas, { vertices, normals, triangles, count }, colours) {
       facing = turn * normal;
       known = min(before, after) < -1e8 ? 0.0 : 1.0;
       float value = mix(before, after, blend);
-      share = isSigned > 0.5 ? 0.5 + value / (2.0 * full) : value / full;
+      // An unknown value weighs nothing, so that it does not darken the triangles between it and known ones.
+      share = known * (isSigned > 0.5 ? 0.5 + value / (2.0 * full) : value / full);
       gl_Position = vec4(p.xy * scale + shift, -p.z * 0.5, 1.0);
       gl_PointSize = dot;
     }`;
@@ -27,7 +28,8 @@ function partDrawing(canvas, { vertices, normals, triangles, count }, colours) {
     void main() {
       vec3 n = normalize(facing);
       float light = 0.55 + 0.45 * abs(dot(n, normalize(vec3(-0.25, 0.45, 0.86))));
-      vec3 base = known > 0.5 ? texture(map, vec2(0.03 + 0.94 * clamp(share, 0.0, 1.0), row)).rgb : vec3(0.62);
+      float place = clamp(share / max(known, 0.5), 0.0, 1.0);
+      vec3 base = known > 0.5 ? texture(map, vec2(0.03 + 0.94 * place, row)).rgb : vec3(0.62);
       colour = vec4(base * light, 1.0);
     }`;
   const compiled = (kind, code) => {

@@ -1,6 +1,8 @@
 """The page of a cell over days: one sentence, until when the calibration holds, every parameter over time."""
 
+from collections.abc import Sequence
 from importlib.metadata import version
+from os.path import relpath
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +21,8 @@ from stitch.watch.report import (
     table_unit,
 )
 from viz import captions
-from viz.drawing import covariate
-from viz.filled_templates import render
+from viz.colours import covariate
+from viz.page_parts import render
 from viz.watch.small_multiples import channel_drawing, drawings
 
 # Parameters that are drawn before the others are folded.
@@ -122,3 +124,48 @@ def _past(report: CellReport) -> list[dict[str, str]]:
         }
         for p, c in own
     ]
+
+
+# The page of a plant: a row a cell, those first that need somebody.
+
+_ORDER = ("bad", "check", "good")
+
+
+def write_plant_page(cells: Sequence[tuple[CellReport, Path]], path: Path) -> None:
+    """Write the page of some cells with links to theirs.
+
+    Args:
+        cells: what each has to say, and where its page lies.
+    """
+    rows = [
+        {
+            "name": report.name,
+            "href": Path(relpath(page, path.parent)).as_posix(),
+            "light": light(report)[0],
+            "words": "; ".join(event_sentences(report)) or "nothing moves",
+            "sessions": f"{report.sessions:,}",
+            "last": day_text(report.last),
+            "until": _until(report),
+        }
+        for report, page in cells
+    ]
+    rows.sort(key=lambda row: (_ORDER.index(row["light"]), row["name"]))
+    counts = {colour: sum(row["light"] == colour for row in rows) for colour in _ORDER}
+    with whole_file(path) as file:
+        file.write_text(render("plant.html.j2", rows=rows, sentence=_sentence(counts)), encoding="utf-8")
+
+
+def _until(report: CellReport) -> str:
+    end = report.recalibrate_before
+    if end is None:
+        return "holds"
+    return "over" if end <= report.last else day_text(end)
+
+
+def _sentence(counts: dict[str, int]) -> str:
+    total, told = sum(counts.values()), []
+    if counts["bad"]:
+        told.append(f"{counts['bad']} to recalibrate now")
+    if counts["check"]:
+        told.append(f"{counts['check']} in which something moves")
+    return f"{total} cells: {', '.join(told)}." if told else f"{total} cells: nothing moves."

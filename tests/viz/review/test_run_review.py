@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 
 from stitch.errors import InputError
+from viz.page_parts import unbroken
 from viz.review import run_snapshot
 from viz.review.residual_rows import read_rows
 from viz.review.run_review import RunReview
-from viz.review.run_snapshot import read_snapshot
-from viz.review.undo_history import undo_history
-from viz.unbroken import unbroken
+from viz.review.run_snapshot import read_snapshot, undo_history
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-// How the error fell: a step for every change of the model, its remarks, undo and redo.
+// The error, step by step: a step for every change of the model, its remarks, undo and redo.
 import { bars, legend } from "./candidates.js";
 import { at, element, signed, um } from "./elements.js";
 

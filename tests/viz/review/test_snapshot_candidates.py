@@ -2,7 +2,7 @@
 
 import pytest
 
-from viz.review.told_candidates import told_diagnosis
+from viz.review.run_snapshot import told_diagnosis
 
 EVIDENCE = "backlash is missing (b5 = 0.0004 rad)."
 
