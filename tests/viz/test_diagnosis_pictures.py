@@ -45,7 +45,7 @@ def field() -> FieldMap:
 
 
 def test_the_budget_has_a_bar_for_each_source(found: Diagnosis):
-    (axes,) = budget(replace(found, budget=LINES, effects=("backlash",)), "mm").axes
+    (axes,) = budget(replace(found, budget=LINES, named=(SimpleNamespace(name="backlash"),)), "mm").axes
     names = [label.get_text() for label in axes.get_yticklabels()]
     assert names == ["backlash", "sensor noise", "smooth, unnamed", "others"]
     assert [bar.get_width() for bar in axes.patches] == pytest.approx([60, 30, 9.5, 0.5])
