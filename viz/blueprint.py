@@ -1,4 +1,4 @@
-"""What the viewer opens on: before and after side by side, the model's history and the cell on further tabs."""
+"""Lay out the viewer: before and after side by side, the model's history and the cell on further tabs."""
 
 import os
 
@@ -68,7 +68,7 @@ _COS, _SIN = np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
 
 
 def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[str, ...]) -> rrb.Blueprint:
-    """Before and after | the model step by step | what is missing | the cell | how the error fell."""
+    """Before and after | the model step by step | what is missing | the cell | the error, step by step."""
     before, after = shown_steps(scene.history)
     unit = "" if len(scene.history.models) > 1 else " (single views moved)"
     compare = rrb.Horizontal(
@@ -108,7 +108,7 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
 
 
 def target_blueprint(cell: Array, run: Run) -> rrb.Blueprint:
-    """Targets and what was found | what is missing | the cell, by some of its points (N, 3) | how the error fell."""
+    """Targets and what was found | what is missing | the cell (points, (N, 3)) | the error, step by step."""
     result = rrb.Horizontal(
         rrb.Spatial3DView(
             origin="targets", name="Targets by the rms of their views; sticks magnified", line_grid=False

@@ -24,7 +24,7 @@ _HOURS_FROM = 7200.0  # s that are better told in hours than in minutes
 
 
 def joint_courses(found: Diagnosis, at_most: int = 3) -> Figure:
-    """How far joints are off by no known law along what they follow, with two sigmas."""
+    """Draw the errors of joints that match no effect along what they follow, with two sigmas."""
     shown = found.curves[:at_most]
     figure = Figure(figsize=(7, 2.6), layout="constrained")
     axes = figure.subplots(1, max(len(shown), 1), sharey=True, squeeze=False)[0]
@@ -50,7 +50,7 @@ def _along(c: JointCurve) -> tuple[str, Array, Array]:
 
 
 def time_course(found: Diagnosis, curve: TimeCurve, length_unit: str) -> Figure:
-    """How far the flange turns and moves in time along its own axes, with two sigmas."""
+    """Draw rotation and displacement of the flange in time along its own axes, with two sigmas."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.subplots(2, 1, sharex=True)
     unit, of_step = _times(curve)
@@ -66,7 +66,7 @@ def time_course(found: Diagnosis, curve: TimeCurve, length_unit: str) -> Figure:
 
 
 def _times(curve: TimeCurve) -> tuple[str, float]:
-    """What the time axis counts, and how much of it a step is."""
+    """Return the label of the time axis and its units per step."""
     if not curve.seconds:
         return "view", 1.0
     unit, of_second = _unit_of(curve.seconds * float(np.ptp(curve.steps)))
@@ -74,7 +74,7 @@ def _times(curve: TimeCurve) -> tuple[str, float]:
 
 
 def _unit_of(whole: float) -> tuple[str, float]:
-    """What the time of a session of so many seconds is told in, and how much of it a second is."""
+    """Return the unit of time for a session of so many seconds, and its units per second."""
     return ("hours", 1 / 3600) if whole > _HOURS_FROM else ("minutes", 1 / 60)
 
 
@@ -163,7 +163,7 @@ def budget(found: Diagnosis, length_unit: str) -> Figure:
 
 
 def _kind(found: Diagnosis, line: BudgetLine) -> tuple[str, str]:
-    """What a source is called in the legend, and its colour."""
+    """Return name and colour of a source in the legend."""
     if line.source in found.effects:
         return _MISSING
     if line.source in {term.name for term in found.linear.model.terms}:
@@ -237,7 +237,7 @@ def candidates(found: Diagnosis) -> Figure:
 
 
 def added_variable(found: Diagnosis, at_most: int = 3) -> Figure | None:
-    """What the views show against what each candidate effect predicts, hand-eye and model taken out of both.
+    """Draw observed against predicted numbers of each candidate effect, hand-eye and model taken out of both.
 
     Points are numbers of the pose channel in units of their scatter; a straight line through zero of slope 1
     is an effect that is there as fitted. None where no candidate effect explains anything.
@@ -269,7 +269,7 @@ def _added(ax: Axes, found: Diagnosis, candidate: CandidateEffect) -> None:
 
 
 def alias_picture(found: Diagnosis, at_most: int = 12) -> Figure:
-    """How much of each candidate effect's pattern the others can imitate."""
+    """Draw the share of each candidate effect's pattern that the others can imitate."""
     keep = [k for k, s in enumerate(found.candidates) if s.ranked.score.observable][:at_most]
     names = [found.candidates[k].name for k in keep]
     figure = Figure(figsize=(7, 5.6), layout="constrained")
@@ -303,7 +303,7 @@ def shape(found: Diagnosis, length_unit: str, at_most: int = 3) -> Figure:
 
 
 def view_arrows(found: Diagnosis, length_unit: str) -> Figure:
-    """How far every view sits from where the model puts it."""
+    """Draw the distance of every view from its place under the model."""
     um = MICROMETRES[length_unit]
     moved = found.linear.view_displacements() * um
     figure = Figure(figsize=(7, 2.6), layout="constrained")

@@ -48,7 +48,7 @@ class ModelScene:
 
 
 def model_scene(run: Run, history: ModelHistory, surface: PartSurface, cell: Array) -> ModelScene:
-    """Where every step puts the views, and by how much that has to be magnified to be seen."""
+    """Return the poses of the views at every step, and the magnification that makes them visible."""
     centre = surface.vertices.mean(axis=0)
     to_centre = frames.make(np.eye(3), -centre)
     at_rest = frames.inverse(to_centre @ history.steps[-1].poses)
@@ -170,7 +170,7 @@ def _log_frame(recording: rr.RecordingStream, scene: ModelScene, at: float, plac
 
 
 def _told(scene: ModelScene, k: int, share: float) -> str:
-    """What is seen at a step, or on the way from step k to the next."""
+    """Describe the picture at a step, or on the way from step k to the next."""
     steps = scene.history.steps
     if 0 < share < 1:
         told = "Nothing is fitted in between: colours, places and bars are drawn in proportion."

@@ -1,4 +1,4 @@
-"""What stands on top of every page: a sentence, lights, notes, and what the page is about."""
+"""Parts of every page: head with verdict and identity, templates, pictures, numbers that stay on one line."""
 
 import base64
 import io
@@ -125,7 +125,7 @@ def page_written() -> Row:
 
 
 def versions() -> Row:
-    """What computed it."""
+    """Return the versions of the programs that computed it."""
     return "stitch", f"{version('stitch')}, Python {platform.python_version()}, numpy {version('numpy')}"
 
 

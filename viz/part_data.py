@@ -1,4 +1,4 @@
-"""What the viewer of the page needs, packed: the surface once, the field of every step of the model's history."""
+"""Pack the data of the part's viewer: the surface once, the field of every step of the model's history."""
 
 import base64
 from typing import Any, NamedTuple
@@ -41,7 +41,7 @@ _STOPS = 17
 
 
 class Extent(NamedTuple):
-    """What a viewer shows at first, in the camera's axes."""
+    """Hold centre and sides of what a viewer shows at first, in the camera's axes."""
 
     centre: Array  # (3,)
     sides: Array  # (3,)
@@ -53,7 +53,7 @@ class Extent(NamedTuple):
 
 
 def extent_of(points: Array, camera: Camera) -> Extent:
-    """Of points (N, 3) in the reference frame."""
+    """Return the extent of points (N, 3) in the reference frame."""
     flat = points @ camera.axes.T
     return Extent((flat.max(axis=0) + flat.min(axis=0)) / 2, np.ptp(flat, axis=0))
 

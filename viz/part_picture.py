@@ -23,7 +23,7 @@ _INCHES = 4.4
 
 
 class Seen(NamedTuple):
-    """What the pixels of a picture show."""
+    """Hold the place of the surface that each pixel shows."""
 
     shape: tuple[int, int]
     pixel: Indices  # (P,) numbers of the pixels that show the part
@@ -58,7 +58,7 @@ def part_picture(
 
 
 def visible(surface: PartSurface, camera: Camera) -> Seen:
-    """Which place of the surface each pixel shows: of dense samples the one nearest to the eye."""
+    """Find the place of the surface that each pixel shows: of dense samples the one nearest to the eye."""
     flat = surface.vertices @ camera.axes.T
     low, size = flat.min(axis=0)[:2], np.ptp(flat, axis=0)[:2]
     scale = (_PIXELS - 1) / float(size.max())

@@ -26,7 +26,7 @@ from viz.run_figures import residual_vectors, view_shifts
 
 
 def run_markdown(run: Run, history: ModelHistory | None) -> str:
-    """Verdict, how the error fell, what could not be seen."""
+    """Verdict, the error of each step, what could not be seen."""
     lines = [f"# {run.session.name}", "", f"**{run_headline(run, history)}**", ""]
     for doubt in run.doubts:
         lines += [doubt, ""]

@@ -102,7 +102,7 @@ def log_robot(recording: rr.RecordingStream, run: Run) -> Array:
 
 
 def _log_names(recording: rr.RecordingStream, places: dict[str, Array]) -> None:
-    """What stands where, in words."""
+    """Log the names of the bodies at their places."""
     named = rr.Points3D(
         np.array(list(places.values())),
         labels=list(places),

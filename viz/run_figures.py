@@ -20,7 +20,7 @@ _PLANES = ((0, 1), (0, 2), (1, 2))
 
 
 def sticks(run: Run) -> Figure:
-    """Where every view puts each target, as magnified sticks from the target's place, in three planes."""
+    """Draw each target as seen by every view: magnified sticks from the target's place, in three planes."""
     assert run.targets is not None
     target, residual = residual_vectors(run)
     place, unit = run.targets.landmarks.positions, run.session.length_unit
@@ -81,7 +81,7 @@ def convergence(run: Run) -> Figure:
 
 
 def per_view(run: Run) -> Figure:
-    """What register moved each view by, and the rms that remains."""
+    """Draw the displacement of each view by register, and the rms that remains."""
     figure = Figure(figsize=(7, 2.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     um = MICROMETRES[run.session.length_unit]

@@ -12,7 +12,6 @@ from stitch.model.model import expanded_uncertainty, uncertainty_scope
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES, value_uncertainty_text
 from viz import captions, run_figures
-from viz import run_figures as target_figures
 from viz.history_figures import waterfall
 from viz.page_parts import Head, Subject, identity, png, script_json, svg, write_page
 from viz.part_data import part_data
@@ -82,7 +81,7 @@ def effect_rows(run: Run) -> list[dict[str, str]]:
 
 
 def note_rows(run: Run) -> list[dict[str, str]]:
-    """What reviewers remarked on the steps of the ledger."""
+    """Return the remarks of reviewers on the steps of the ledger."""
     return [
         {
             "step": effect_changes(run.ledger, i),
@@ -203,12 +202,12 @@ def _targets(run: Run) -> dict[str, Any] | None:
 
 
 def _pictures(run: Run) -> list[tuple[str, str, str]]:
-    """What the views have in common decides what can be drawn: overlaps or targets."""
+    """Return the pictures of a run: those of overlaps or those of targets."""
     out = []
     if run.targets is not None:
         out += [
-            ("Targets, as every view puts them", png(target_figures.sticks(run), 130), captions.STICKS),
-            ("Distance of the targets", svg(target_figures.errors(run)), captions.TARGETS),
+            ("Targets, as every view puts them", png(run_figures.sticks(run), 130), captions.STICKS),
+            ("Distance of the targets", svg(run_figures.errors(run)), captions.TARGETS),
         ]
     if run.overlaps is not None:
         out += [

@@ -1,4 +1,4 @@
-"""What comparison and diagnosis add to a run folder: sections of the page, pictures, a tab of the recording."""
+"""Add comparison and diagnosis to a run folder: sections of the page, pictures, a tab of the recording."""
 
 import re
 from collections.abc import Mapping
@@ -81,7 +81,7 @@ def _pictures(found: Diagnosis, unit: str) -> dict[str, _Picture]:
 
 
 def _field_map(found: Diagnosis, unit: str) -> _Picture:
-    """Where the scanner itself errs, where that is found."""
+    """Draw the errors of the scanner over its field, if any were found."""
     title, shown = (
         "How the scanner errs over its field",
         None if found.scanner_error is None else found.scanner_error.map,

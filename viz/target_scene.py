@@ -47,7 +47,7 @@ class Marks:
 
 
 def marks_of(run: Run) -> Marks:
-    """What a stranger wants to see of a cell: who moves stands wherever it stood.
+    """Return the marks of a cell: a moving body stands wherever it stood.
 
     A carried scanner: the targets, and the scanner of every view. Carried targets: each wherever a view saw it.
     """
@@ -139,7 +139,7 @@ def scanner() -> "trimesh.Trimesh":
 
 
 def pedestal() -> "trimesh.Trimesh":
-    """What a robot stands on: a disc of radius 1 below the origin, and a stub of height 1 upon it."""
+    """Return a robot's base: a disc of radius 1 below the origin, and a stub of height 1 upon it."""
     import trimesh
 
     disc = trimesh.creation.cylinder(radius=1.0, height=0.3, sections=24)
@@ -207,7 +207,7 @@ def camera_of(marks: Marks) -> Camera:
 
 
 def _radius(marks: Marks) -> float:
-    """Of a ball, length_unit: large enough to be seen, small enough to stand beside the others."""
+    """Return the radius of a ball, length_unit: large enough to be seen, smaller than the gaps between balls."""
     places = marks.valued
     size = float(np.ptp(places, axis=0).max()) or 1.0
     return float(size * np.clip(0.05 * len(places) ** -0.25, 0.004, 0.03))
@@ -246,7 +246,7 @@ def step_values(run: Run, marks: Marks, step: TargetStep) -> Array:
 
 
 def _told(run: Run, steps: tuple[TargetStep, ...], values: list[Array], limit: float) -> dict[str, Any]:
-    """What the viewer says and shows of every step; µm."""
+    """Return values and titles of every step for the viewer; µm."""
     assert run.targets is not None
     um = MICROMETRES[run.session.length_unit]
     floor = run.targets.noise_floor * um

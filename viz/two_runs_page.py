@@ -20,7 +20,7 @@ from viz.part_surface import Camera, PartSurface, camera_for, part_surface
 
 
 class Fact(NamedTuple):
-    """What is known of both runs."""
+    """Hold one property of both runs."""
 
     name: str
     a: str
@@ -32,7 +32,7 @@ class Fact(NamedTuple):
 
 
 def facts(both: TwoRuns) -> list[Fact]:
-    """What was measured and asked for; those that differ first."""
+    """Return properties of data and settings; those that differ first."""
     told = [_facts(side) for side in (both.a, both.b)]
     rows = [Fact(name, told[0][name], told[1][name]) for name in told[0]]
     return sorted(rows, key=lambda row: not row.differs)

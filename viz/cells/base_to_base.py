@@ -174,7 +174,7 @@ _PLAN = (
 
 
 def sentence(stand: Stand, result: BaseResult) -> str:
-    """Where base 2 stands, and how well that is known."""
+    """Return a sentence on the place of base 2 and its uncertainty."""
     T, sigma, mm = result.fit.T_base1_base2, result.fit.sigma, MICROMETRES[stand.length_unit] / 1e3
     x, y, z = T[:3, 3]
     turn = np.degrees(np.linalg.norm(frames.log(T)[:3]))

@@ -43,7 +43,7 @@ def holes(job: DrillJob, result: DrillResult) -> Figure:
 
 
 def magnified(job: DrillJob, result: DrillResult) -> float:
-    """How many times larger than the panel errors are drawn: a round number."""
+    """Return the magnification of errors in the drawing: a round number."""
     places = np.array([hole.position for hole in job.holes])
     largest = max(float(np.linalg.norm(c.errors, axis=1).max()) for c in result.groups.values())
     wanted = _LONGEST * float(np.linalg.norm(np.ptp(places, axis=0))) / max(largest, 1e-12)

@@ -105,7 +105,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Page:
-    """What a cell has to say."""
+    """Hold the content of a cell's page."""
 
     system: str
     verdict: str

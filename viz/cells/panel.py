@@ -206,7 +206,7 @@ def write_page(job: PanelJob, result: PanelResult, path: Path) -> None:
 
 
 def _light(job: PanelJob, result: PanelResult) -> ToleranceVerdict | None:
-    """Of the shape, against the job's tolerance."""
+    """Return the verdict on the shape against the job's tolerance."""
     if result.shape_largest is None:
         return None
     worst, beyond = float(result.shape_largest.max()), int((result.shape_largest > job.tolerance).sum())

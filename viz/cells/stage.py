@@ -1,4 +1,4 @@
-"""What the recordings of all cells share: frames, arrows, labelled points and words, all static."""
+"""Log parts of the cells' recordings: frames, arrows, labelled points and words, all static."""
 
 import os
 from collections.abc import Iterator, Sequence

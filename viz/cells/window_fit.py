@@ -110,7 +110,7 @@ def _about(job: FitJob) -> list[Row]:
 
 
 def sentence(job: FitJob, parts: list[FittedPart]) -> str:
-    """What was found and how it compares."""
+    """Return how well every part fits, in sentences."""
     sentences = []
     for i, part in enumerate(parts):
         sentences.append(agreement_sentence(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))

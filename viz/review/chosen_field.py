@@ -24,7 +24,7 @@ _ENOUGH = 8.0
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen; everything where nothing is stated."""
+    """Hold the choice of views and covariates; everything where nothing is stated."""
 
     views: frozenset[str] = frozenset()
     targets: frozenset[str] = frozenset()
@@ -35,7 +35,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class PatchWeights:
-    """How every side counts for the patches of the part; K patches, weights (N, k), 0 where none is near."""
+    """Weigh every side on the patches of the part; K patches, weights (N, k), 0 where none is near."""
 
     patch: Indices  # (N, k)
     weight: Array  # (N, k)

@@ -91,7 +91,7 @@ def _end(served: subprocess.Popen[bytes]) -> None:
 
 
 def _asked(address: str) -> bytes:
-    """What the address answers, once somebody listens there; no proxy between."""
+    """Fetch the answer of an address once a server listens there; no proxy between."""
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     end = time.monotonic() + _SECONDS
     while True:

@@ -38,7 +38,7 @@ class ResidualRows:
 
     @cached_property
     def properties(self) -> dict[str, Array]:
-        """What depends on the point, as `stitch compare` names it."""
+        """Return the covariates of a point, as `stitch compare` names them."""
         away, seen = np.empty_like(self.place), np.empty(len(self.view))
         for v, T in enumerate(self.poses):  # view by view: all at once would take several times the memory
             own = np.flatnonzero(self.view == v)

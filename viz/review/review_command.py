@@ -23,6 +23,6 @@ def review(
       stitch review runs/blade-17 --port 8080 --no-browser
     """
     # Imported here so that --help stays fast.
-    from viz.review.web_app import served_review
+    from viz.review.web_app import serve_review
 
-    served_review(run, port, browser=browser, effects_file=effects_file, trust=trust)
+    serve_review(run, port, browser=browser, effects_file=effects_file, trust=trust)

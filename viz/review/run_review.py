@@ -1,4 +1,4 @@
-"""What one `stitch review` knows: the run folder as it stands, what was trusted, which commands it may run."""
+"""State of one `stitch review`: the run folder, the trusted files, the commands it may run."""
 
 import re
 import threading

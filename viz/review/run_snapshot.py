@@ -1,4 +1,4 @@
-"""What a run folder says at one moment, as the browser shows it: its documents, and the data of the part's viewer."""
+"""A run folder at one moment, as the browser shows it: documents, undo history, candidates, the part's viewer."""
 
 import json
 import re
@@ -22,7 +22,7 @@ Effects = Sequence[str]
 
 
 def undo_history(steps: Sequence[Effects]) -> dict[str, Any]:
-    """What undo and redo would do: {"undo": {"command", "effects", "to"}, "redo": …}, None where there is nothing.
+    """Return the effects of undo and redo: {"undo": {"command", "effects", "to"}, "redo": …}, or None.
 
     Args:
         steps: effects of the model at every step of the ledger, the present one last.
@@ -259,7 +259,7 @@ def _tables(comparison: dict[str, Any], um: float) -> list[dict[str, Any]]:
 
 
 def _told(path: Path, tell: Callable[[dict[str, Any]], _Told]) -> _Told | None:
-    """What a document tells; None where there is none.
+    """Read a document; None where there is none.
 
     Raises:
         InputError: it is damaged.

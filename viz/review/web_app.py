@@ -34,7 +34,7 @@ from viz.review.run_review import RunReview
 # Answers as JSON, and requests that bring it.
 
 
-async def asked_object(request: Request) -> dict[str, Any] | None:
+async def json_object(request: Request) -> dict[str, Any] | None:
     """The JSON object of a request; None where it brings something else."""
     try:
         found = await request.json()
@@ -43,26 +43,26 @@ async def asked_object(request: Request) -> dict[str, Any] | None:
     return found if isinstance(found, dict) else None
 
 
-def told(value: Any) -> Response:
+def json_response(value: Any) -> Response:
     """Plain data; what is not known is null."""
     return JSONResponse(_finite(value))
 
 
-def wrong(text: str, status: int = 400) -> Response:
+def error_response(text: str, status: int = 400) -> Response:
     """One line for the page."""
     return JSONResponse({"problem": text}, status_code=status)
 
 
-def refused(error: Exception) -> Response:
-    """What stitch says of an input."""
-    return wrong(str(error), 422)
+def refusal_response(error: Exception) -> Response:
+    """Return the message of a refused input."""
+    return error_response(str(error), 422)
 
 
 async def fault(_: Request, error: Exception) -> Response:
     """A fault of the program: one line for the page and the terminal."""
     text = f"unexpected {type(error).__name__}: {error}; a fault of stitch"
     print(f"stitch: {text}", file=sys.stderr, flush=True)
-    return wrong(text, 500)
+    return error_response(text, 500)
 
 
 def _finite(value: Any) -> Any:
@@ -147,7 +147,7 @@ _CHANGES = ("add", "drop", "undo", "redo")
 _FULL = "too many commands wait already"
 
 
-class Asked:
+class ReviewActions:
     """Requests that start, allow or end something."""
 
     def __init__(self, review: RunReview, jobs: Jobs, news: News) -> None:
@@ -161,51 +161,51 @@ class Asked:
 
     async def command(self, request: Request) -> Response:
         """{"kind": "add", "model": …, …}: a command for the queue; what changes the model names the present one."""
-        asked = await asked_object(request)
+        asked = await json_object(request)
         if asked is None:
-            return wrong("a command is {kind, model, …}")
+            return error_response("a command is {kind, model, …}")
         kind, model = str(asked.get("kind")), asked.get("model")
         changes = kind in _CHANGES
         if kind == "own":
-            return wrong("own effects need consent", 403)
+            return error_response("own effects need consent", 403)
         if changes and model != self.review.model:
-            return wrong("the run has changed since this page read it; look at it again", 409)
+            return error_response("the run has changed since this page read it; look at it again", 409)
         try:
             arguments = await asyncio.to_thread(self.review.arguments, kind, asked)
-            return told(self._submitted(kind, arguments, model if changes else None))
+            return json_response(self._submitted(kind, arguments, model if changes else None))
         except StitchError as error:
-            return refused(error)
+            return refusal_response(error)
         except Busy:
-            return wrong(_FULL, 429)
+            return error_response(_FULL, 429)
 
     async def own(self, request: Request) -> Response:
         """{"text": …, "trust": true, "diagnose": true}: own effects, checked or tried."""
-        asked = await asked_object(request)
+        asked = await json_object(request)
         text = None if asked is None else asked.get("text")
         if asked is None or not isinstance(text, str) or not text.strip():
-            return wrong("own effects are {text, trust}")
+            return error_response("own effects are {text, trust}")
         if asked.get("trust") is not True:
-            return wrong("this Python is run with your rights; it needs your consent", 403)
+            return error_response("this Python is run with your rights; it needs your consent", 403)
         try:
             await asyncio.to_thread(self.review.keep_own_effects, text)
             words = self.review.arguments("own", asked)
-            return told(self._submitted(words[0], words, done=self.review.use_own_effects))
+            return json_response(self._submitted(words[0], words, done=self.review.use_own_effects))
         except (StitchError, OSError) as error:
-            return refused(error)
+            return refusal_response(error)
         except Busy:
-            return wrong(_FULL, 429)
+            return error_response(_FULL, 429)
 
     async def trust(self, request: Request) -> Response:
         """{"trust": true}: the file of effects that the model names may be run."""
-        asked = await asked_object(request)
+        asked = await json_object(request)
         self.review.trust = asked is not None and asked.get("trust") is True
         self.news.tell({"type": "trusted"})
-        return told({"trust": self.review.trust})
+        return json_response({"trust": self.review.trust})
 
     async def stop(self, request: Request) -> Response:
-        """What runs ends, what waits is forgotten."""
+        """End the running job and drop the waiting ones."""
         self.jobs.stop()
-        return told({})
+        return json_response({})
 
     def _submitted(
         self, kind: str, arguments: list[str], model: str | None = None, done: Callable[[], None] | None = None
@@ -226,7 +226,7 @@ _SHARED = ("part_numbers.js", "part_drawing.js", "part_eye.js", "part_viewer.js"
 _RECORDING = "recording.rrd"
 
 
-class Shown:
+class ReviewPages:
     """Answers that change nothing; those that read files run beside the event loop."""
 
     def __init__(self, review: RunReview, jobs: Jobs, news: News, nonce: str) -> None:
@@ -253,14 +253,14 @@ class Shown:
 
     def state(self, request: Request) -> Response:
         """The run as it stands, or why it cannot be read."""
-        return told(self.review.state())
+        return json_response(self.review.state())
 
     def part(self, request: Request) -> Response:
         """As report.html holds it: {"model", "part", "predicted"}."""
         try:
             found = self.review.snapshot()
         except StitchError as error:
-            return refused(error)
+            return refusal_response(error)
         held = {"part": found.part or "null", "predicted": found.predicted or "null"}  # JSON already
         text = f'{{"model": {json.dumps(found.model)}, "part": {held["part"]}, "predicted": {held["predicted"]}}}'
         warm = BackgroundTask(self.review.warm)
@@ -268,15 +268,15 @@ class Shown:
 
     async def chosen(self, request: Request) -> Response:
         """{"views", "targets", "bins", "place", "within"}: field and numbers of a choice."""
-        asked = await asked_object(request)
+        asked = await json_object(request)
         try:
             choice = _choice(asked or {})
         except (ValueError, TypeError, LookupError, AttributeError):
-            return wrong("a choice is {views, targets, bins, place, within}")
+            return error_response("a choice is {views, targets, bins, place, within}")
         try:
-            return told(await asyncio.to_thread(self.review.chosen, choice))
+            return json_response(await asyncio.to_thread(self.review.chosen, choice))
         except StitchError as error:
-            return refused(error)
+            return refusal_response(error)
 
     async def events(self, request: Request) -> Response:
         """Everything that happens from now on, after the commands so far."""
@@ -290,11 +290,11 @@ class Shown:
         if name == _RECORDING and (self.review.run / name).is_file():
             return FileResponse(self.review.run / name)
         if name not in NAMES:
-            return wrong("not found", 404)
+            return error_response("not found", 404)
         try:
             return FileResponse(self.viewer.file(name))
         except StitchError as error:
-            return refused(error)
+            return refusal_response(error)
 
 
 def _file(path: Path, request: Request) -> Response:
@@ -320,8 +320,8 @@ def review_app(review: RunReview, token: str, nonce: str) -> ASGIApp:
     """The application, which answers below /TOKEN/ alone."""
     news = News()
     jobs = Jobs(news.tell, lambda: review.model)
-    shown = Shown(review, jobs, news, nonce)
-    routes = [*shown.routes, *Asked(review, jobs, news).routes]
+    pages = ReviewPages(review, jobs, news, nonce)
+    routes = [*pages.routes, *ReviewActions(review, jobs, news).routes]
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
@@ -334,7 +334,7 @@ def review_app(review: RunReview, token: str, nonce: str) -> ASGIApp:
             for task in tasks:
                 with suppress(asyncio.CancelledError):
                     await task
-            shown.viewer.close()
+            pages.viewer.close()
 
     return Guard(Starlette(routes=routes, lifespan=lifespan, exception_handlers={Exception: fault}), token, nonce)
 
@@ -354,7 +354,7 @@ _HERE = "127.0.0.1"
 _GRACE = 1
 
 
-def served_review(run: Path, port: int, *, browser: bool, effects_file: Path | None, trust: bool) -> None:
+def serve_review(run: Path, port: int, *, browser: bool, effects_file: Path | None, trust: bool) -> None:
     """Serve until Ctrl-C.
 
     Raises:
