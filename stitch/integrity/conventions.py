@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.frames import Array, Mask
-from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses
+from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses, known_unit_ratio, scale_text
 from stitch.integrity.placement import Placement, place_scan, shows_no_surface, surface_of
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.session import Mount, Session
@@ -406,7 +406,7 @@ def hypotheses_by_table_part(
         for side in (own for own, share in zip(sides, agree, strict=True) if share == max(agree)):
             rows = tuple(int(row) for row in np.flatnonzero(side))
             T = np.where(side[:, None, None], h.T_base_flange, tried[0].T_base_flange)
-            fix = f"from {names[rows[0]]} to {names[rows[-1]]} alone {h.fix}"
+            fix = f"only from {names[rows[0]]} to {names[rows[-1]]}: {h.fix}"
             yield replace(h, T_base_flange=T, fix=fix, rows=rows)
 
 
@@ -447,7 +447,7 @@ def restore_stuck_columns(stated: MotionFit, motions: RelativeScans, length: flo
         if np.median(np.abs(column - np.median(column))) > length:
             fix = (
                 f"{'xyz'[axis]} of the positions is {position[0, axis]:.6g} in all rows, and the scans show that it "
-                "changes: export the poses again, with this column"
+                "changes; to fix: export the poses again, with this column"
             )
             yield Hypothesis("scale", frames.make(T[:, :3, :3], moved), h.mount, fix)
 
@@ -533,8 +533,6 @@ _CLEARER, _CLEAR_OPEN = 0.6, 0.02
 _MANY_CLOSED, _FEW_CLOSED, _AS_MANY = 0.4, 0.2, 0.75
 # Poses whose motions nearly all close need no other convention.
 _ALL = 0.95
-# A factor is one between units if it is this near.
-_UNIT_NEAR = 0.05
 
 
 def rank_hypotheses(session: Session, motions: RelativeScans) -> list[MotionFit]:
@@ -611,12 +609,11 @@ def _other_length_unit(found: MotionFit) -> MotionFit:
     h = found.hypothesis
     if s <= 0:
         return replace(found, open=1.0, closed=0.0)
-    factor = min(UNITS, key=lambda u: abs(np.log(s / u)))
-    if abs(s / factor - 1) < _UNIT_NEAR:
+    factor = known_unit_ratio(s)
+    if factor is not None:
         fix = (
-            f"the clouds are {factor:.6g} times as large as the poses say ({UNITS[factor]}): "
-            "check cloud_unit and length_unit"
+            f"the clouds are {factor:.6g} times as large as the poses say ({UNITS[factor]}); to fix: correct "
+            "cloud_unit or length_unit"
         )
         return replace(found, hypothesis=replace(h, kind="unit", fix=fix))
-    fix = f"the clouds are {s:.5g} times as large as the robot's motions say: check their scale"
-    return replace(found, hypothesis=replace(h, kind="scale", fix=fix))
+    return replace(found, hypothesis=replace(h, kind="scale", fix=scale_text(s)))

@@ -21,7 +21,7 @@ from stitch.integrity.hypotheses import Hypothesis
 from stitch.integrity.pairing import explain_misplaced
 from stitch.integrity.placement import names_of_views
 from stitch.integrity.pose_tests import length_problem
-from stitch.integrity.problems import SessionProblem, displacement_text, list_views
+from stitch.integrity.problems import SessionProblem, displacement_text, likeliest_text, list_views
 from stitch.integrity.scan_faults import find_occluder, find_static_background
 from stitch.integrity.snooping import MisplacedView, Snooping, snoop_views
 from stitch.integrity.target_checks import check_targets, target_problems
@@ -77,7 +77,7 @@ def beyond_any_arm(session: Session, rotation: float, translation: float) -> boo
 def displacement_in_words(session: Session, found: MisplacedView) -> str:
     """How far a suspected view stands off, in words."""
     amount = displacement_text(found.at_least, found.at_least, session.length_unit)
-    return f"stands off by at least {amount}" if amount else "stands out, by how much its surface does not tell"
+    return f"is off by at least {amount}" if amount else "is off by an amount that its surface does not show"
 
 
 def contradiction_in_words(session: Session, found: Snooping) -> str:
@@ -113,8 +113,7 @@ def background_problems(session: Session, own: Capture, T_mount: Array, found: S
 # Three views, which show no more than two motions: whether their poses agree as poses of arms do.
 #
 # A scan that is off gives another hand-eye there, and a scatter that effects of an arm may cause too: three views do
-# not
-# tell whose fault it is, but that something is wrong.
+# not tell whose fault it is, but that something is wrong.
 
 _VIEWS = 3
 # That poses which repeat as those of arms do are said to disagree.
@@ -130,8 +129,8 @@ def check_three_views(session: Session, found: Snooping) -> str | None:
     by = f"{length_text(found.translation, unit, 2)} and {angle_text(found.rotation, 2)}"
     usual = f"{length_text(translation, unit, 2)} and {angle_text(rotation, 2)}"
     return (
-        f"Three poses contradict their scans by {by}, where arms repeat to about {usual}: a scan or a row is off, or "
-        "the arm errs, and three views do not tell which. Add views before you believe hand-eye or stitched cloud."
+        f"Three poses contradict their scans by {by}, where arms repeat to about {usual}: a scan, a row or the arm is "
+        "off; to fix: add views, since three do not show which."
     )
 
 
@@ -169,9 +168,8 @@ def snooping_warnings(session: Session, own: Capture, found: Snooping, T_mount: 
     worst = [v for v in np.argsort(-moved) if v not in found.left_out][:_LISTED]
     farthest = ", ".join(f"{names[v]} ({moved[v]:.3g} {session.length_unit})" for v in worst)
     return (
-        f"No arm scatters by {contradiction_in_words(session, found)}: several rows or scans are wrong, and the "
-        "views hold "
-        f"together by their surfaces alone; hand-eye and pose errors mean little. Look first at {farthest}.",
+        f"No arm scatters by {contradiction_in_words(session, found)}: several rows or scans are wrong, and hand-eye "
+        f"and pose errors are not reliable; to fix: check first {farthest}.",
         *said,
     )
 
@@ -291,30 +289,24 @@ def _convention_problem(session: Session, named: tuple[MotionFit, ...]) -> Sessi
 
 def _hypothesis_problem(session: Session, best: Hypothesis, fixes: Sequence[str]) -> SessionProblem:
     """The problem of a hypothesis, with what is as likely."""
-    fixes = list(dict.fromkeys(fixes))
-    fix = fixes[0] + (f"; as likely: {'; '.join(fixes[1:3])}" if len(fixes) > 1 else "")
-    return SessionProblem(best.kind, tuple(names_of_views(best.rows, session.names)), fix)
+    return SessionProblem(best.kind, tuple(names_of_views(best.rows, session.names)), likeliest_text(fixes))
 
 
 def _suspected_problem(session: Session, found: MisplacedView) -> SessionProblem:
     fix = (
-        f"{displacement_in_words(session, found)}, as effects of an arm may do too: run and diagnose, and look at "
-        "this scan"
+        f"{displacement_in_words(session, found)}, which an effect of the arm may cause too; to fix: run and diagnose, "
+        "and look at this scan"
     )
     return SessionProblem("displaced", (session.views[found.view].name,), fix, certain=False)
 
 
 def _unexplained_problem(session: Session, found: Snooping) -> SessionProblem:
-    off = contradiction_in_words(session, found)
-    fix = (
-        f"poses contradict the scans by {off}, more than any arm; no usual mistake explains it: check that rows and "
-        "clouds belong together and how the poses were converted"
-    )
-    return SessionProblem("displaced", tuple(session.names), fix)
+    return SessionProblem("displaced", tuple(session.names), _unexplained_text(session, found))
 
 
 # Sessions that no run may use: poses that contradict the scans, another mount's model, too few views that belong.
 
+_CHECK_ROWS = "check that rows and clouds belong together and how the poses were converted"
 # A hand-eye that differs by chance alone is refused once in a million.
 _OWN_MODEL_CHANCE = 1e-6
 # Views that show two motions, the fewest that a hand-eye follows from.
@@ -382,8 +374,7 @@ def require_majority(session: Session, left_out: Sequence[ExcludedView]) -> None
         names = list_views([name for name in session.names if name in gone], session.names)
         raise NoResultError(
             f"{session.path}: {len(left_out)} of {len(session.views)} views ({names}) do not belong to the others, and "
-            "which half is right nobody can say; to fix: check that rows and clouds belong together and how the poses "
-            "were converted"
+            f"the scans do not show which half is right; to fix: {_CHECK_ROWS}"
         )
 
 
@@ -403,7 +394,7 @@ def require_own_model(session: Session, correction: Correction, index: int) -> N
     if clear and beyond_any_arm(session, turn, shift):
         raise NoResultError(
             f"{session.path}: the model's hand-eye is {shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad off "
-            "what these scans say: it belongs to another mount, scanner or unit; to fix: run without --hand-eye"
+            "what these scans show: it belongs to another mount, scanner or unit; to fix: run without --hand-eye"
         )
 
 
@@ -415,16 +406,20 @@ def require_two_motions(session: Session) -> None:
     """
     if len(session.views) < _MOTIONS:
         raise NoResultError(
-            f"{session.path}: two views show one motion, and no hand-eye was found from it that brings them together; "
+            f"{session.path}: two views show one motion, and no hand-eye brings them together; "
             "to fix: add views turned about another axis, or take the hand-eye of another run (--hand-eye RUN)"
         )
 
 
 def unexplained_error(session: Session, found: Snooping) -> NoResultError:
-    off = contradiction_in_words(session, found)
-    return NoResultError(
-        f"{session.path}: the poses contradict the scans by {off}, more than any arm, and no usual mistake explains "
-        "it; to fix: check that rows and clouds belong together and how the poses were converted"
+    """Return the refusal of poses that contradict the scans beyond any arm, where no usual mistake explains it."""
+    return NoResultError(f"{session.path}: {_unexplained_text(session, found)}")
+
+
+def _unexplained_text(session: Session, found: Snooping) -> str:
+    return (
+        f"the poses contradict the scans by {contradiction_in_words(session, found)}, more than any arm, and no usual "
+        f"mistake explains it; to fix: {_CHECK_ROWS}"
     )
 
 

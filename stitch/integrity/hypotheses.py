@@ -19,6 +19,7 @@ from stitch.measurement.session import Mount, Session
 # Positions whose columns were read in another way than they were written, undone.
 
 _AXES = "xyz"
+_CORRECT_TABLE = "to fix: correct the table of poses"
 
 
 def other_columns(position: Array) -> Iterator[tuple[str, Array]]:
@@ -29,12 +30,12 @@ def other_columns(position: Array) -> Iterator[tuple[str, Array]]:
     for order in permutations(range(3)):
         if order != (0, 1, 2):
             named = ", ".join(_AXES[i] for i in np.argsort(order))
-            yield f"the columns of the positions are {named}, not x, y, z", position[:, order]
+            yield f"the columns of the positions are {named}, not x, y, z; {_CORRECT_TABLE}", position[:, order]
     for signs in product((1.0, -1.0), repeat=3):
         wrong = [axis for axis, sign in zip(_AXES, signs, strict=True) if sign < 0]
         if len(wrong) in (1, 2):
             have = "has" if len(wrong) == 1 else "have"
-            yield f"{' and '.join(wrong)} of the positions {have} the wrong sign", position * signs
+            yield f"{' and '.join(wrong)} of the positions {have} the wrong sign; {_CORRECT_TABLE}", position * signs
 
 
 def other_units(position: Array, units: Mapping[float, str]) -> Iterator[tuple[str, Array]]:
@@ -47,7 +48,7 @@ def other_units(position: Array, units: Mapping[float, str]) -> Iterator[tuple[s
         for factor, words in units.items():
             right = np.array(position)
             right[:, column] /= factor
-            yield f"{axis} of the positions alone is in {words}: convert this column", right
+            yield f"{axis} of the positions alone is in {words}; to fix: convert this column", right
 
 
 # Rotations that were read in another way than they were written, undone.
@@ -59,8 +60,8 @@ ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "XYX", "XZX", "YXY", "YZY", 
 
 def other_quaternions(q: Array) -> Iterator[tuple[str, Rotation]]:
     """Readings (V, 4) x, y, z, w taken for another order."""
-    yield "w, x, y, z, not x, y, z, w", Rotation.from_quat(q[:, [1, 2, 3, 0]])
-    yield "x, y, z, w but were reordered as if w came first", Rotation.from_quat(q[:, [3, 0, 1, 2]])
+    yield "w, x, y, z, not x, y, z, w; to fix: rename them", Rotation.from_quat(q[:, [1, 2, 3, 0]])
+    yield "x, y, z, w but were reordered as if w came first; to fix: undo that", Rotation.from_quat(q[:, [3, 0, 1, 2]])
 
 
 def other_angles(R: Rotation) -> Iterator[tuple[str, Rotation]]:
@@ -75,16 +76,20 @@ def other_angles(R: Rotation) -> Iterator[tuple[str, Rotation]]:
                 if right != order:
                     named = np.column_stack([angles[:, order.upper().index(axis)] for axis in right])
                     yield _order_fix(order, right), Rotation.from_euler(right, named)
-        yield "the angles are a rotation vector, not Euler angles", Rotation.from_rotvec(_shortest(angles))
+        yield (
+            "the angles are a rotation vector, not Euler angles; to fix: convert them as such",
+            Rotation.from_rotvec(_shortest(angles)),
+        )
     for right in (*ORDERS, *(o.lower() for o in ORDERS)):
         yield (
-            f"the rotation vectors are Euler angles in the order {_order_name(right)}",
+            f"the rotation vectors are Euler angles in the order {_order_name(right)}; to fix: convert them as such",
             Rotation.from_euler(right, R.as_rotvec()),
         )
 
 
 def _order_fix(order: str, right: str) -> str:
-    return f"the Euler angles were turned in the order {_order_name(order)} and belong into {_order_name(right)}"
+    name = _order_name(right)
+    return f"the Euler angles are {name}, not {_order_name(order)}; to fix: convert them as {name}"
 
 
 def _order_name(order: str) -> str:
@@ -94,10 +99,10 @@ def _order_name(order: str) -> str:
 
 def degrees_for_radians(R: Rotation) -> Iterator[tuple[str, Rotation]]:
     """Angles in radians that were taken for degrees."""
-    words = "the angles are radians, and were read as degrees"
-    yield words, Rotation.from_rotvec(R.as_rotvec() * 180 / np.pi)
+    words, fix = "the angles are radians, and were read as degrees", "to fix: convert them to degrees"
+    yield f"{words}; {fix}", Rotation.from_rotvec(R.as_rotvec() * 180 / np.pi)
     for order in ORDERS:
-        yield f"{words} ({_order_name(order)})", Rotation.from_euler(order, _angles(R, order) * 180 / np.pi)
+        yield f"{words} ({_order_name(order)}); {fix}", Rotation.from_euler(order, _angles(R, order) * 180 / np.pi)
 
 
 def _angles(R: Rotation, order: str) -> Array:
@@ -124,9 +129,35 @@ UNITS = {
     10.0: "mm where cm are stated",
     0.1: "cm where mm are stated",
 }
+# A fitted factor is one between units if it is this near; beyond the other one it is no factor of lengths.
+_UNIT_NEAR, _LARGEST_SCALE = 0.05, 1000.0
+
+
+def known_unit_ratio(scale: float) -> float | None:
+    """Return the factor of `UNITS` that a fitted scale is, None where it is none."""
+    if scale <= 0:
+        return None
+    factor = min(UNITS, key=lambda u: abs(np.log(scale / u)))
+    return factor if abs(scale / factor - 1) < _UNIT_NEAR else None
+
+
+def scale_text(scale: float) -> str:
+    """Return what a fitted factor between clouds and robot says, without the factor where lengths cannot differ so."""
+    possible = scale > 0 and 1 / _LARGEST_SCALE <= scale <= _LARGEST_SCALE
+    if possible or known_unit_ratio(scale) is not None:
+        return f"the clouds are {scale:.5g} times as large as the robot's motions; to fix: check the scale of both"
+    return (
+        "The robot's positions do not explain how the scanner moved; its rotations do; to fix: is an axis missing "
+        "(column E1), or a column mixed up?"
+    )
+
+
 _OTHER_MOUNT: dict[Mount, Mount] = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
-_HANDED = "the scans, or the frames of the poses, are left-handed: two columns are exchanged, or one has the wrong sign"
-_TEXT_ORDER = "the {} are in the order of numbers as text (1, 10, 11, 2, …), the {} in that of numbers: pair by number"
+_HANDED = (
+    "the scans, or the frames of the poses, are left-handed; to fix: look for two exchanged columns, or one with the "
+    "wrong sign"
+)
+_TEXT_ORDER = "the {} are sorted as text (1, 10, 11, 2, …), the {} by number; to fix: pair them by number"
 # Rows that a list may be shifted by.
 _SHIFTS = (1, -1, 2, -2, 3, -3)
 
@@ -163,20 +194,20 @@ def _session_mistakes(session: Session, T: Array) -> Iterator[Hypothesis]:
     mount, joints = session.mount, [view.joints for view in session.views]
     robot = session.robot
     known = robot is not None and all(q is not None for q in joints)
-    other = f'set mount = "{_OTHER_MOUNT[mount]}" in session.toml'
+    other = f'the scanner is not mounted as stated; to fix: set mount = "{_OTHER_MOUNT[mount]}" in session.toml'
     if known:
         yield Hypothesis("mount", T, _OTHER_MOUNT[mount], other)
         q = np.array(joints)
         assert robot is not None
         for factor, words in ((180 / np.pi, "radians, not degrees"), (np.pi / 180, "degrees turned twice")):
             yield Hypothesis(
-                "degrees", forward(robot, q * factor), mount, f"the joint angles are {words}: convert them"
+                "degrees", forward(robot, q * factor), mount, f"the joint angles are {words}; to fix: convert them"
             )
     else:
         yield Hypothesis("inverse", frames.inverse(T), mount, _mount_or_inverse(mount))
     position, R = T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3])
     transposed = frames.make(R.inv().as_matrix(), position)
-    yield Hypothesis("quaternion", transposed, mount, "the quaternions turn the other way: negate qx, qy, qz")
+    yield Hypothesis("quaternion", transposed, mount, "the quaternions turn the other way; to fix: negate qx, qy, qz")
     for name, q in other_quaternions(R.as_quat()):
         yield Hypothesis(
             "quaternion", frames.make(q.as_matrix(), position), mount, f"the quaternion columns are {name}"
@@ -188,7 +219,7 @@ def _session_mistakes(session: Session, T: Array) -> Iterator[Hypothesis]:
     flip = np.diag([-1.0, 1, 1])
     yield Hypothesis("mirrored", frames.make(flip @ T[:, :3, :3] @ flip, position @ flip), mount, _HANDED)
     for name, moved in other_columns(position):
-        yield Hypothesis("mirrored", frames.make(T[:, :3, :3], moved), mount, f"{name}: correct the table of poses")
+        yield Hypothesis("mirrored", frames.make(T[:, :3, :3], moved), mount, name)
     for name, moved in other_units(position, UNITS):
         yield Hypothesis("unit", frames.make(T[:, :3, :3], moved), mount, name)
     still = np.broadcast_to(np.eye(4), T.shape)
@@ -196,16 +227,15 @@ def _session_mistakes(session: Session, T: Array) -> Iterator[Hypothesis]:
         "mount",
         still,
         mount,
-        "the clouds stand in one common frame already: export them as the scanner sees them; or most of them shows "
-        "what stands still before the scanner, a wall or a table: cut it away (within, under [scanner])",
+        "the clouds stand in one common frame already, or show mostly a wall or a table before the scanner; to fix: "
+        "export them in the scanner's frame, or cut the background away (within, under [scanner])",
     )
 
 
 def _mount_or_inverse(mount: Mount) -> str:
     return (
-        f'the poses are T_flange_base: invert them; if they are not, set mount = "{_OTHER_MOUNT[mount]}" in '
-        "session.toml "
-        "(these scans cannot tell the two apart, the size of the hand-eye can)"
+        "the poses are T_flange_base, or the mount is not as stated (the size of the hand-eye shows which); to fix: "
+        f'invert the poses, or set mount = "{_OTHER_MOUNT[mount]}" in session.toml'
     )
 
 
@@ -213,7 +243,7 @@ def _row_mistakes(T: Array, mount: Mount) -> Iterator[Hypothesis]:
     """Poses that belong to other rows."""
     V = len(T)
     index = np.arange(V)
-    yield Hypothesis("reversed", T[::-1], mount, "the poses are in reverse order: turn the list around")
+    yield Hypothesis("reversed", T[::-1], mount, "the poses are in reverse order; to fix: turn the list around")
     for first in (0, 1):
         as_text = np.argsort([str(v + first) for v in range(V)])
         yield Hypothesis("shifted", T[as_text], mount, _TEXT_ORDER.format("clouds", "poses"))
@@ -225,12 +255,20 @@ def _row_mistakes(T: Array, mount: Mount) -> Iterator[Hypothesis]:
     for a, b in combinations(range(V), 2):
         order = index.copy()
         order[[a, b]] = [b, a]
-        yield Hypothesis("exchanged", T[order], mount, "exchange the clouds of these rows", (a, b))
+        yield Hypothesis(
+            "exchanged",
+            T[order],
+            mount,
+            "the clouds of two rows are exchanged; to fix: exchange the clouds of these rows",
+            (a, b),
+        )
 
 
 def _shifted(T: Array, mount: Mount, by: int, kept: Indices) -> Hypothesis:
     where = "below" if by > 0 else "above"
-    fix = f"every cloud belongs to the pose {abs(by)} row{'s' * (abs(by) > 1)} {where} it: shift the column back"
+    fix = (
+        f"every cloud belongs to the pose {abs(by)} row{'s' * (abs(by) > 1)} {where} it; to fix: shift the column back"
+    )
     return Hypothesis("shifted", np.roll(T, -by, axis=0), mount, fix, (), tuple(int(v) for v in kept))
 
 

@@ -26,8 +26,7 @@ from stitch.units import length_text
 # Whether an arm that another session showed holds in this one: what it leaves beside what the nominal arm leaves.
 #
 # What imitates among the poses of one session may err at those of another; base, tool and targets are fitted with
-# either
-# arm, so that nothing but the arm makes the difference.
+# either arm, so that nothing but the arm makes the difference.
 
 # That an arm which is right is doubted.
 _ARM_CHANCE = 0.01
@@ -102,8 +101,7 @@ def view_mean_squares(fitted: FittedRig) -> Array:
 # Whether sessions of a rig share the effects that were fitted to all of them: each against a fit of its own.
 #
 # Two arms of one make have the same table and other errors. In one fit with both, what the one does wrong is left in
-# the
-# other, and looks like an effect that is missing.
+# the other, and looks like an effect that is missing.
 
 # That one session of sound rigs is doubted.
 _SESSION_CHANCE = 0.001

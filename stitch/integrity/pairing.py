@@ -179,14 +179,14 @@ def _pose_distances(capture: Capture, view: int, T: Array, poses: Array) -> Arra
 
 
 _TORN = (
-    "a part of this scan contradicts the other scans wherever it is put: the part or the scanner moved meanwhile, or "
-    "two scans are in one file; scan again or leave the view out"
+    "a part of this scan contradicts the other scans wherever it is put: something moved during the scan, or two scans "
+    "are in one file; to fix: scan again or leave the view out"
 )
 _EXCHANGED = (
-    "the scan of {0} fits the pose of {1}, whose own scan belongs elsewhere and shows too little of the others to tell "
-    "where: exchange the clouds of {0} and {1} in views.csv, or leave both out"
+    "the scan of {0} fits the pose of {1}, whose own scan shows too little of the others to be placed; to fix: "
+    "exchange the clouds of {0} and {1} in views.csv, or leave both out"
 )
-_COPY = "this scan is a copy of that of {}: put the right file in its row"
+_COPY = "this scan is a copy of that of {}; to fix: put the right file in its row"
 
 
 def explain_misplaced(session: Session, capture: Capture, T_mount: Array, found: Snooping) -> list[SessionProblem]:
@@ -238,7 +238,7 @@ def explain_misplaced(session: Session, capture: Capture, T_mount: Array, found:
     if len(found.disconnected) > 1:
         shown = " | ".join(list_views(names_of_views(group, names), names) for group in found.disconnected)
         views = tuple(n for group in found.disconnected[1:] for n in names_of_views(group, names))
-        out.append(SessionProblem("disconnected", views, f"no surface links {shown}: add views between them"))
+        out.append(SessionProblem("disconnected", views, f"no surface links {shown}; to fix: add views between them"))
     return out
 
 
@@ -249,9 +249,10 @@ def _worse_of_copies(found: Snooping, v: int, w: int) -> int:
 
 def _exchange_problem(cycle: Sequence[int], rows: dict[int, int | None], names: Sequence[str]) -> str:
     if len(cycle) == 2:
-        return f"exchange the clouds of {names[cycle[0]]} and {names[cycle[1]]} in views.csv"
+        pair = f"{names[cycle[0]]} and {names[cycle[1]]}"
+        return f"the scans of {pair} fit each other's poses; to fix: exchange the clouds of {pair} in views.csv"
     moves = ", ".join(f"the cloud of {names[v]} to row {names[int(rows[v] or 0)]}" for v in cycle)
-    return f"the clouds of {len(cycle)} rows are mixed up: move {moves}"
+    return f"the clouds of {len(cycle)} rows are mixed up; to fix: move {moves}"
 
 
 def _single_view_problem(
@@ -271,24 +272,28 @@ def _single_view_problem(
         return SessionProblem("displaced", own, _TORN)
     if m.T is None:
         return SessionProblem(
-            "foreign", own, "this scan fits nowhere on the part: it shows another part or too little; leave it out"
+            "foreign",
+            own,
+            "this scan fits nowhere on the part: it shows another part or too little; to fix: leave it out",
         )
     amount = displacement_text((m.rotation, m.distance), m.at_least, session.length_unit)
-    off = f"off by {amount}" if amount else "off, by how much its surface does not tell"
+    off = f"off by {amount}" if amount else "off by an amount that its surface does not show"
     partner = next((v if w == m.view else w for v, w in same if m.view in (v, w)), None)
     if partner is not None:
         joint = session.views[m.view].joints is not None and abs(partner - m.view) == 1
         kind = "joint_row" if joint else "duplicate_pose"
         what = "joint angles" if joint else "pose"
-        fix = f"{own[0]} has the {what} of {names[partner]}, and is {off}: put in its own"
+        fix = f"{own[0]} has the {what} of {names[partner]}, and is {off}; to fix: put in its own"
         return SessionProblem(kind, (*own, names[partner]), fix)
     digit = find_wrong_joint(session, capture, T_mount, m)
     if digit is not None:
         joint_name, stated, fits, neighbour = digit
         kind = "joint_row" if neighbour else "displaced"
         reads = f"{joint_name} of {own[0]} reads {stated:.4f}, {fits:.4f} would fit (it is {off})"
-        return SessionProblem(kind, own, f"{reads}: correct it or leave the view out")
-    return SessionProblem("displaced", own, f"its pose is {off}: correct the row, scan again or leave the view out")
+        return SessionProblem(kind, own, f"{reads}; to fix: correct it or leave the view out")
+    return SessionProblem(
+        "displaced", own, f"its pose is {off}; to fix: correct the row, scan again or leave the view out"
+    )
 
 
 def _scan_problem(capture: Capture, found: Snooping, m: MisplacedView) -> ScanFault | None:
@@ -308,5 +313,5 @@ def _reclamped_problem(views: range, moved: str, names: Sequence[str]) -> Sessio
     what = {"part": "the part was clamped anew", "scanner": "the scanner moved on its mount"}.get(
         moved, "the part or the scanner moved"
     )
-    fix = f"{what} between {names[start - 1]} and {names[start]}: make two sessions of it"
+    fix = f"{what} between {names[start - 1]} and {names[start]}; to fix: make two sessions of it"
     return SessionProblem("reclamped", tuple(names_of_views(views, names)), fix)

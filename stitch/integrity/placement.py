@@ -72,8 +72,7 @@ def nearest_partners(scan: Scan, points: Array, normals: Array, reach: float) ->
 #
 # Partners beyond the gate are no partners, so that such a scan keeps its few that fit and seems to fit well, and the
 # stitched cloud gets a second surface beside the first. What is torn in itself, because the part moved during the scan
-# or
-# two scans are in one file, fits with one half and contradicts with the other.
+# or two scans are in one file, fits with one half and contradicts with the other.
 
 # Points of a scan that are asked, in so many other scans each (with more they take turns), and how far from their
 # surface, as a share of the part's size.

@@ -8,6 +8,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array
+from stitch.integrity.hypotheses import scale_text
 from stitch.integrity.problems import DisplacementSize, SessionProblem, displacement_text
 from stitch.integrity.view_model import (
     Projector,
@@ -45,13 +46,13 @@ class PoseStep:
         """What happened and what to do, in words."""
         before, after = names[self.start - 1], names[self.start]
         off = displacement_text(self.size, self.at_least, length_unit)
-        by = f"{off} off at the part" if off else "by how much these surfaces do not tell"
+        by = f"{off} off at the part" if off else "by an amount that these surfaces do not show"
         other = "scanner" if self.moved == "part" else "part"
-        unsure = "" if self.distinguishable else f" (or the {other}: these views do not tell which)"
+        unsure = "" if self.distinguishable else f" (or the {other}: these views do not show which)"
         further = ", or add the effect part_slip" if self.moved == "part" and self.distinguishable else ""
         return (
-            f"From view {after} on the {self.moved} sits elsewhere{unsure}, {by}: no hand-eye holds "
-            f"before and after. Make two sessions of it, one up to {before} and one from {after} on{further}."
+            f"From view {after} on the {self.moved} sits elsewhere{unsure}, {by}; to fix: make two sessions, one up to "
+            f"{before} and one from {after} on{further}."
         )
 
     def columns(self, model: ViewModel) -> Array:
@@ -97,10 +98,9 @@ def _median_size(moved: Array, lever: float) -> DisplacementSize:
 # Blunders among the poses of the views: how many, which, and whether all from one on moved together.
 #
 # Single views: generalised extreme Studentised deviate (Rosner 1983, Technometrics 25:165). The most deviant view is
-# let
-# go, the scatter estimated anew, and so on; the number of blunders is the largest count whose last one is significant,
-# so that several cannot hide in the scatter which they inflate. What all views from one on have in common is a step
-# (`steps.py`); beside it single ones are sought anew.
+# let go, the scatter estimated anew, and so on; the number of blunders is the largest count whose last one is
+# significant, so that several cannot hide in the scatter which they inflate. What all views from one on have in common
+# is a step (`steps.py`); beside it single ones are sought anew.
 
 # Chance that a session without blunders loses a view.
 FAMILY_WISE = 0.01
@@ -468,5 +468,4 @@ def length_problem(model: ViewModel, T_reference_mount: Array, further: Array | 
     share = float(found.estimate[0])
     if abs(share) < _SCALE or found.p_value > _LENGTH_CHANCE:
         return None
-    fix = f"the clouds are {1 + share:.4f} times as large as the robot's motions say: check their scale"
-    return SessionProblem("scale", (), fix)
+    return SessionProblem("scale", (), scale_text(1 + share))

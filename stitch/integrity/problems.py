@@ -68,6 +68,11 @@ def list_views(names: Sequence[str], order: Sequence[str]) -> str:
     return shown + (f" … and {rest} more" if rest else "")
 
 
+def likeliest_text(fixes: Sequence[str]) -> str:
+    """Return the likeliest explanation, followed by up to two others that are as likely."""
+    return "; or, as likely: ".join([*dict.fromkeys(fixes)][:3])
+
+
 @dataclass(frozen=True)
 class SessionProblem:
     """What is wrong, where, and how to put it right; `views` is empty where it concerns the whole session."""

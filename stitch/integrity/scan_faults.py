@@ -20,8 +20,7 @@ from stitch.statistics.distributions import tukey
 # What one scan shows where others look through and see nothing: a cable, an arm, a box that stood there for a while.
 #
 # It belongs neither to the part nor to the scanner, stands elsewhere in every view, and is in the stitched cloud at
-# every
-# place where it was seen.
+# every place where it was seen.
 
 # Points of a scan that are asked, and other scans, evenly over the session, that are asked for each.
 _OCCLUDER_PROBES, _OCCLUDER_VIEWS_COMPARED = 400, 20
@@ -45,10 +44,14 @@ class Occluder:
         """In words, and what to do."""
         where, verb = list_views([names[v] for v in self.views], names), "shows" if len(self.views) == 1 else "show"
         return (
-            f"At least {self.share:.0%} of what {where} {verb} stands where other scans look through and see none of "
-            "it: something was in the way, a cable, an arm or a clamp, or these are stray points. It is in the "
-            "stitched cloud: cut it out of the scan, or scan again."
+            f"At least {self.share:.0%} of what {where} {verb} stands where other scans see through: a cable, an "
+            "arm, a clamp or stray points, which the stitched cloud contains; to fix: cut it out, or scan again."
         )
+
+
+def ray_tree(scan: Scan) -> KDTree:
+    """Return the search tree over the directions in which a scan sees its points."""
+    return KDTree(scan.rays(scan.points))
 
 
 def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder | None:
@@ -59,7 +62,7 @@ def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder 
         size: of the part, length_unit.
     """
     views = [v for v, scan in enumerate(scans) if len(scan.points)]
-    looks = {v: KDTree(scans[v].rays(scans[v].points)) for v in views}
+    looks = {v: ray_tree(scans[v]) for v in views}
     shares = {}
     for v in views:
         others = [w for w in views if w != v]
@@ -112,9 +115,8 @@ def _surrounded(rays: Array, looks: Array) -> Mask:
 #
 # Where scanner or part are carried around, what belongs to the part changes its place before the scanner with every
 # view. What does not belongs to the scanner, and every view puts it elsewhere in the stitched cloud. A panel that
-# slides
-# along itself, or a disc that turns about its axis, looks as if it stood still too; but under the model others show it
-# where it is, and nobody looks through it.
+# slides along itself, or a disc that turns about its axis, looks as if it stood still too; but under the model others
+# show it where it is, and nobody looks through it.
 
 # Points of a scan that are asked, other scans in which they are sought, and how many of these must move them, by what
 # share of the part's size.
@@ -140,13 +142,13 @@ class StaticBackground:
     def describe(self, length_unit: str) -> str:
         """In words, and what to do."""
         sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *self.box, strict=True))
-        mend = f"Cut {', '.join(sides)} {length_unit} out of the scans"
+        fix = f"cut {', '.join(sides)} {length_unit} out of the scans"
         if self.within is not None:
             low, high = (", ".join(f"{side:.4g}" for side in corner) for corner in self.within)
-            mend = f"State within = [[{low}], [{high}]] under [scanner] in session.toml"
+            fix = f"state within = [[{low}], [{high}]] under [scanner] in session.toml"
         return (
-            f"{self.share:.0%} of what the scans show stands still before the scanner whatever the arm did: a wall, a "
-            f"table or a bracket, which is in the stitched cloud at {len(self.views)} places. {mend}, and run again."
+            f"{self.share:.0%} of what the scans show stands still before the scanner: a wall, a table or a bracket, "
+            f"at {len(self.views)} places of the stitched cloud; to fix: {fix}, and run again."
         )
 
 
@@ -167,7 +169,7 @@ def find_static_background(
     still = np.concatenate(stays)
     if still.mean() < _BACKGROUND_MIN_SHARE:
         return None
-    looks = [KDTree(scan.rays(scan.points)) for scan in scans]
+    looks = [ray_tree(scan) for scan in scans]
     judged = [_under_model(scans, looks, poses, (v, own), tolerance) for v, own in enumerate(probes)]
     on_part, through = (np.concatenate([found[i] for found in judged]) for i in range(2))
     if np.sum(still & through & ~on_part) < max(_THROUGH, _ODDS * np.sum(still & on_part)):
@@ -287,11 +289,11 @@ def scan_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float
     near = _STAYS * size
     mirrored = [w for w, flip in _FLIPS.items() if closes(scan.points @ flip, scan.eye @ flip, near) > needed]
     if len(mirrored) == 1:
-        return ScanFault("mirrored", f"{mirrored[0]} in this cloud: export it again")
+        return ScanFault("mirrored", f"{mirrored[0]} in this cloud; to fix: export it again")
     for factor, words in UNITS.items():
         if closes(scan.points / factor, scan.eye / factor, np.inf) > needed:
             return ScanFault(
-                "unit", f"this cloud is {factor:.6g} times too large ({words}): export it in the right unit"
+                "unit", f"this cloud is {factor:.6g} times too large ({words}); to fix: export it in the right unit"
             )
     return scale_fault(scan, T_pose, surface, size, needed)
 
@@ -311,7 +313,8 @@ def scale_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: floa
         moved = np.linalg.norm(frames.transform(found.T, middle) - frames.transform(T_pose, middle))
         if found.closure < needed or moved > _RANGE_LEFT * abs(scale - 1) * np.linalg.norm(middle):
             return None
-    return ScanFault("scale", f"this cloud is {1 / scale:.4g} times as large as the part: multiply it by {scale:.5g}")
+    size_text = f"this cloud is {1 / scale:.4g} times as large as the part"
+    return ScanFault("scale", f"{size_text}; to fix: multiply it by {scale:.5g}")
 
 
 def _similarity(scan: Scan, T: Array, surface: ReferenceSurface, size: float) -> float:

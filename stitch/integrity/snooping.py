@@ -43,10 +43,9 @@ from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstr
 #
 # A step pulls the hand-eye, and the side of it that has fewer views stands farther from the others than what two scans
 # share reaches. Tried wide, such a view would close somewhere on a part that looks alike from several sides, and would
-# be
-# called displaced. One step explains more than that: the views are tried from where it puts them first. The likeliest
-# step is tried whether it stands out among the few views that are linked or not: that it links more of them is the
-# proof.
+# be called displaced. One step explains more than that: the views are tried from where it puts them first. The
+# likeliest step is tried whether it stands out among the few views that are linked or not: that it links more of them
+# is the proof.
 
 # Chance at which a step is tried.
 _ANY_CHANCE = 1.0

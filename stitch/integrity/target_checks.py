@@ -15,7 +15,7 @@ from stitch.frames import Array, Indices
 from stitch.integrity.conventions import RelativeScans, rank_hypotheses
 from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses
 from stitch.integrity.placement import names_of_views
-from stitch.integrity.problems import SessionProblem
+from stitch.integrity.problems import SessionProblem, likeliest_text
 from stitch.measurement.capture import Capture, Sightings, build_capture, sightings_of
 from stitch.measurement.session import Session
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
@@ -60,11 +60,11 @@ class MovedTarget:
         if self.drifts:
             return (
                 f"{self.target} creeps among the targets over the session: its distances to the others change by up to "
-                f"{length}. Leave it out of points.csv, and fix it before you measure again."
+                f"{length}; to fix: leave it out of points.csv, and fasten it before you measure again."
             )
         return (
             f"{self.target} sits elsewhere among the targets from view {view} on: its distances to the others change "
-            f"by up to {length}. Give it another name from there on in points.csv, or leave it out."
+            f"by up to {length}; to fix: give it another name from there on in points.csv, or leave it out."
         )
 
 
@@ -241,13 +241,12 @@ def check_targets(session: Session) -> list[SessionProblem]:
             return []
         fix = (
             f"the targets scatter by {stated.spread:.3g} {session.length_unit} under the best hand-eye, and no usual "
-            "mistake explains it: check names of targets, rows and how the poses were converted"
+            "mistake explains it; to fix: check names of targets, rows and how the poses were converted"
         )
         return [SessionProblem("displaced", tuple(names), fix)]
     h = best.hypothesis
     others = [f.hypothesis.fix for f in fits if f.spread < 2 * best.spread and f.hypothesis.fix != h.fix]
-    fix = h.fix + (f"; as likely: {'; '.join(dict.fromkeys(others[:2]))}" if others else "")
-    return [SessionProblem(h.kind, tuple(names_of_views(h.rows, names)), fix)]
+    return [SessionProblem(h.kind, tuple(names_of_views(h.rows, names)), likeliest_text([h.fix, *others[:2]]))]
 
 
 def _hypotheses_to_try(session: Session, capture: Capture, length: float) -> Iterator[Hypothesis]:
@@ -264,7 +263,7 @@ def _hypotheses_to_try(session: Session, capture: Capture, length: float) -> Ite
     for factor, words in UNITS.items():
         T = np.array(stated.T_base_flange)
         T[:, :3, 3] *= factor
-        fix = f"the sightings are {factor:.6g} times as large as the poses say ({words}): check length_unit"
+        fix = f"the sightings are {factor:.6g} times as large as the poses say ({words}); to fix: correct length_unit"
         yield replace(stated, kind="unit", T_base_flange=T, fix=fix)
 
 

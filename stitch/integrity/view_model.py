@@ -148,11 +148,9 @@ def projector(model: ViewModel, fit: VarianceFit, further: Array | None = None) 
 # Tests of one view's own displacement, or of a block's, under the scatter of the other poses.
 #
 # The per-view evidence of overlaps is linear: z = X ξ + Σ L_v δ_v + ε, with ξ the hand-eye, δ_v a displacement of view
-# v
-# (left twist in the reference frame) and cov(ε) of pose scatter and sensor noise. With P = C⁻¹ − C⁻¹X(XᵀC⁻¹X)⁻¹XᵀC⁻¹,
-# the
-# statistic of an alternative with columns G is T = uᵀN⁻¹u, u = GᵀPz, N = GᵀPG: χ² with rank(N) degrees of freedom, with
-# non-centrality δᵀNδ where a blunder δ is present (Baarda 1968; Teunissen, Testing Theory, 2000).
+# v (left twist in the reference frame) and cov(ε) of pose scatter and sensor noise. With P = C⁻¹ − C⁻¹X(XᵀC⁻¹X)⁻¹XᵀC⁻¹,
+# the statistic of an alternative with columns G is T = uᵀN⁻¹u, u = GᵀPz, N = GᵀPG: χ² with rank(N) degrees of freedom,
+# with non-centrality δᵀNδ where a blunder δ is present (Baarda 1968; Teunissen, Testing Theory, 2000).
 
 
 @dataclass(frozen=True)
@@ -214,9 +212,8 @@ def leave_one_out_test(model: ViewModel, columns: Array | None, view: int) -> tu
 # The smallest displacement that evidence admits: what only a weak direction seems to show is no size.
 #
 # A scan that slides along the part, or that few holes keep from turning, comes to rest millimetres from where it
-# belongs,
-# and where all scans slid together each stands off from its pose by that. The estimate of the test knows both: what the
-# views have in common, and how well each direction is held.
+# belongs, and where all scans slid together each stands off from its pose by that. The estimate of the test knows both:
+# what the views have in common, and how well each direction is held.
 
 # Chance that the evidence tells it from the right one.
 _CHANCE = 0.01

@@ -154,6 +154,9 @@ def _suspected_view(session: Session, own: Capture, found: MisplacedView, T_moun
     )
 
 
+_NO_SURFACE = "it shares no surface with the others; to fix: add views that overlap with it"
+
+
 def _excluded_views(
     session: Session, own: Capture, found: Snooping, T_mount: Array, problems: Sequence[SessionProblem]
 ) -> tuple[ExcludedView, ...]:
@@ -161,7 +164,7 @@ def _excluded_views(
     out = []
     for v in found.left_out:
         name = session.views[v].name
-        why = next((p.line(session.names) for p in problems if name in p.views), "it shares no surface with the others")
+        why = next((p.line(session.names) for p in problems if name in p.views), _NO_SURFACE)
         out.append(ExcludedView(name, why, poses[v], _point_count(session.views[v])))
     return tuple(out)
 
@@ -225,7 +228,7 @@ def fit_screened_views(
         short = next((i for i, s in enumerate(own) if len(s.views) < 2), None)
         if short is not None:
             gone = taken[short].line(sessions[short].names)
-            raise NoResultError(f"{own[short].path}: fewer than two views are left that belong together: {gone}")
+            raise NoResultError(f"{own[short].path}: fewer than two views belong together ({gone}); to fix: add views")
     else:
         # The last round has left views out too: what is returned is the fit of those that are left.
         fitted = fit(own, measured)

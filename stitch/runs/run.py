@@ -19,11 +19,11 @@ from stitch.observations.targets.target_model import TargetModelFit
 
 # A doubt of a session as a whole in one clause: what it means and what to do stands elsewhere.
 
-_CLAUSE_END = re.compile(r"[:.] ")
+_CLAUSE_END = re.compile(r"[:.] |; to fix: ")
 
 
 def doubt_headline(doubt: str) -> str:
-    """A doubt up to its first colon or full stop outside brackets."""
+    """A doubt up to what to do, or to its first colon or full stop outside brackets."""
     ends = (found.start() for found in _CLAUSE_END.finditer(doubt) if _brackets_closed(doubt[: found.start()]))
     return f"{doubt[: next(ends, len(doubt.rstrip('.')))]}."
 

@@ -51,15 +51,15 @@ def test_check_deep_says_of_a_wall_what_a_run_says(measured):
     session, _ = before_wall(session_of(measured), 40.0, 25.0)
     (found,) = deep_check(session)
     assert found.kind == "foreign" and len(found.views) == 12
-    assert "stands still before the scanner" in found.fix and "State within = [[" in found.fix
+    assert "stands still before the scanner" in found.fix and "state within = [[" in found.fix
 
 
 def test_a_wall_behind_the_part_is_said_first_with_the_box_that_leaves_it_out(measured):
     session, depth = before_wall(session_of(measured), 40.0, 25.0)
     found = run(session)
     said = run_verdict(found, model_history(found))
-    assert "of what the scans show stands still before the scanner whatever the arm did" in said
-    assert "in the stitched cloud at 12 places. State within = [[" in said
+    assert "of what the scans show stands still before the scanner: a wall" in said
+    assert "at 12 places of the stitched cloud; to fix: state within = [[" in said
     scans, poses = prepare_capture(session), found.model.T_mount
     still = find_static_background(scans.scans, scans.poses(poses), TOLERANCE, part_size([scans]))
     shown = np.mean(np.abs(np.concatenate([view.cloud.points for view in session.views])[:, 2] - depth) < 0.2)
