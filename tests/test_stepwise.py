@@ -1,6 +1,7 @@
 """A group of effects that cannot be told apart: added as one where it helps on views left out, and only there."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ def first():
 
 def answered(monkeypatch, verdict, effects):
     """Diagnoses that say what a session with such effects would lead to."""
-    monkeypatch.setattr(stepwise, "diagnose", lambda state: replace(diagnose(state), verdict=verdict, effects=effects))
+    named = tuple(SimpleNamespace(name=name) for name in effects)
+    monkeypatch.setattr(stepwise, "diagnose", lambda state: replace(diagnose(state), verdict=verdict, named=named))
 
 
 def test_a_group_that_helps_is_added_as_one(first, monkeypatch):

@@ -109,7 +109,7 @@ class Session(measured.Session):
             ...     stitch.Session.from_arrays(clouds, inverted, mount="eye_in_hand")
             ... except stitch.InputError as error:
             ...     print(str(error)[:92])
-            <session>: the poses contradict what was measured: inverse: the poses are T_flange_base: inv
+            <session>: the poses contradict what was measured: inverse: the poses are T_flange_base, ...
         """
         toml = Path(f"<{require_folder_name('name', name, 'name')}>") / "session.toml"
         with _in_arguments(toml.parent.name):

@@ -50,7 +50,7 @@ class Diagnosis:
     Example:
         >>> found = stitch.diagnose(run)
         >>> print(found.sentence)
-        The model is adequate: ...
+        The model is adequate. The residual is ...
         >>> found.candidates[0].name in found.missing
         False
     """

@@ -189,4 +189,4 @@ def test_the_course_under_load_of_a_spring_that_stiffens_is_the_true_one_within_
     true = 1e-3 * yields(course.at) - off[:, 1].mean()
     assert np.all(np.abs(course.error - true) < 4 * course.sigma)
     assert np.corrcoef(course.error, true)[0, 1] > 0.9
-    assert re.search(r" under -?\d+ N m, and by .* under -?\d+ N m, beside", joint_curve_sentence(course))
+    assert re.search(r" under -?\d+ N m, and by .* under -?\d+ N m\. That is", joint_curve_sentence(course))

@@ -72,5 +72,5 @@ def test_what_stands_beside_all_looks_is_looked_through_by_none(edge, in_the_way
 def test_a_run_and_a_deep_check_say_it_alike(measured):
     session = with_squares(measured, (4,))
     (said,) = run(session).doubts
-    assert "of what v004 shows stands where other scans look through" in said
+    assert "of what v004 shows stands where other scans see through" in said
     assert [(p.kind, p.views) for p in deep_check(session)] == [("foreign", ("v004",))]

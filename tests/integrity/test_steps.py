@@ -53,7 +53,7 @@ def test_a_common_displacement_is_found_where_it_begins_with_its_size(start):
 
 def test_part_and_scanner_that_look_alike_are_not_told_apart():
     (found,) = steps(stepped(direct(5), 9))
-    assert not found.distinguishable and "these views do not tell which" in found.describe(
+    assert not found.distinguishable and "these views do not show which" in found.describe(
         [f"v{k}" for k in range(VIEWS)], "mm"
     )
 

@@ -27,4 +27,4 @@ def test_one_of_three_views_that_is_off_is_doubted_and_none_accused(good):
     )
     assert found.left_out == () and len(found.doubts) == 1
     assert found.doubts[0].startswith("Three poses contradict their scans by")
-    assert "three views do not tell which" in found.doubts[0]
+    assert "three do not show which" in found.doubts[0]
