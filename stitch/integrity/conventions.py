@@ -1,4 +1,4 @@
-"""Which convention of the poses explains how the scanner moved: A·X = X·B under every hypothesis.
+"""Find the convention of the poses that explains how the scanner moved: A·X = X·B under every hypothesis.
 
 The motions B come from the scans alone (`relative_scans.py`), A from the poses with one mistake undone. A hypothesis
 is judged by the motions that close under its best hand-eye (`motion_fit.py`).
@@ -536,7 +536,7 @@ _ALL = 0.95
 
 
 def rank_hypotheses(session: Session, motions: RelativeScans) -> list[MotionFit]:
-    """All hypotheses about the poses of a session, best first; empty if the scans show too little motion."""
+    """Return all hypotheses about the poses of a session, best first; empty if the scans show too little motion."""
     if len(motions.pairs) < FEWEST:
         return []
     length = TRANSLATION_M / METRES[session.length_unit]
@@ -556,7 +556,7 @@ def rank_hypotheses(session: Session, motions: RelativeScans) -> list[MotionFit]
 def fit_hypotheses(
     tried: Sequence[Hypothesis], motions: RelativeScans, length_unit: str, *, scaled: bool = False
 ) -> list[MotionFit]:
-    """What could close of some hypotheses, the first always, in their order; those that move alike are one.
+    """Fit hypotheses that could close, the first always, in their order; those that move alike are one.
 
     Args:
         scaled: fit the scale of the robot's lengths too.

@@ -1,4 +1,4 @@
-"""`stitch check --deep`: everything that people do wrong with a session, tried out; no run is made."""
+"""Find what is wrong with a session without a run (`stitch check --deep`), and refuse or warn of it in a run."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -40,8 +40,6 @@ from stitch.stages.correct import Correction, icp_hand_eye
 from stitch.statistics.distributions import chi2_limit, chi2_tail
 from stitch.units import METRES, angle_text, length_text
 
-# What no arm does: scatter, and displacements of single views, beyond which poses and scans contradict each other.
-
 # No arm scatters by more.
 _ROTATION, _TRANSLATION_M = 0.010, 0.005
 # No effect of an arm is believed to displace a single view by more than half of that.
@@ -49,7 +47,7 @@ _VIEW_ROTATION, _VIEW_M = 0.005, 0.0025
 
 
 def apply_displacement_limits(session: Session, found: Snooping) -> Snooping:
-    """Suspected views that are surely off by more than what effects of an arm are believed to do are misplaced."""
+    """Return the findings with those suspected views misplaced that are surely off by more than effects of an arm."""
 
     def too_far(m: MisplacedView) -> bool:
         rotation, distance = m.at_least
@@ -75,21 +73,18 @@ def beyond_any_arm(session: Session, rotation: float, translation: float) -> boo
 
 
 def displacement_in_words(session: Session, found: MisplacedView) -> str:
-    """How far a suspected view stands off, in words."""
+    """Return how far a suspected view is off, in words."""
     amount = displacement_text(found.at_least, found.at_least, session.length_unit)
     return f"is off by at least {amount}" if amount else "is off by an amount that its surface does not show"
 
 
 def contradiction_in_words(session: Session, found: Snooping) -> str:
-    """By how much the poses contradict the scans, in words."""
+    """Return the scatter by which the poses contradict the scans, in words."""
     return f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
 
 
-# What the scans show beside the part: what stands still before the scanner, and what only one of them shows.
-
-
 def background_problems(session: Session, own: Capture, T_mount: Array, found: Snooping) -> list[SessionProblem]:
-    """One problem for each, with the views that show it.
+    """Return the problems of what the scans show beside the part: static background, or what only one scan shows.
 
     Args:
         T_mount: (4, 4) hand-eye under which `found` was made.
@@ -110,18 +105,16 @@ def background_problems(session: Session, own: Capture, T_mount: Array, found: S
     return out
 
 
-# Three views, which show no more than two motions: whether their poses agree as poses of arms do.
-#
-# A scan that is off gives another hand-eye there, and a scatter that effects of an arm may cause too: three views do
-# not tell whose fault it is, but that something is wrong.
-
 _VIEWS = 3
-# That poses which repeat as those of arms do are said to disagree.
+# Chance that poses which repeat as those of arms do are said to disagree.
 _THREE_VIEWS_CHANCE = 1e-4
 
 
 def check_three_views(session: Session, found: Snooping) -> str | None:
-    """What to say of three views whose poses disagree by more than arms repeat; None where they do not."""
+    """Return a warning of three views whose poses disagree by more than arms repeat; None where they do not.
+
+    Three views show two motions: that something is wrong, but not which scan, row or effect.
+    """
     rotation, translation = usual_twist(session.length_unit)[[0, 3]]
     if len(session.views) != _VIEWS or _global_model_test(found, np.array([rotation**2, translation**2, 1.0])):
         return None
@@ -135,7 +128,7 @@ def check_three_views(session: Session, found: Snooping) -> str | None:
 
 
 def _global_model_test(found: Snooping, variances: Array) -> bool:
-    """The test of the model as a whole (Baarda 1968): the scatter is known and not taken from the same data."""
+    """Test the model as a whole (Baarda 1968): the scatter is known and not taken from the same data."""
     mixed = found.model.mixed()
     C, A, z = mixed.covariance(variances)[0], mixed.A[0], mixed.z[0]
     CA, Cz = np.linalg.solve(C, A), np.linalg.solve(C, z)
@@ -143,23 +136,21 @@ def _global_model_test(found: Snooping, variances: Array) -> bool:
     return chi2_tail(float(statistic), len(z) - A.shape[1]) > _THREE_VIEWS_CHANCE
 
 
-# What is said of a session as a whole before its verdict, though it runs.
-
 _LISTED = 3
 
 
 def snooping_warnings(session: Session, own: Capture, found: Snooping, T_mount: Array) -> tuple[str, ...]:
-    """What is no part, steps, and poses that contradict the scans as no arm of use does.
+    """Return session-level warnings: background in the scans, steps between views, implausible pose errors.
 
     Args:
         T_mount: (4, 4) hand-eye under which `found` was made.
     """
     names = session.names
-    beside = (problem.fix for problem in background_problems(session, own, T_mount, found))
-    said = (*beside, *(step.describe(names, session.length_unit) for step in found.steps))
+    background = (problem.fix for problem in background_problems(session, own, T_mount, found))
+    warnings = (*background, *(step.describe(names, session.length_unit) for step in found.steps))
     if not scatter_is_doubtful(session, found):
         few = check_three_views(session, found)
-        return said if few is None else (few, *said)
+        return warnings if few is None else (few, *warnings)
     twists = frames.log(found.unconstrained.poses @ frames.inverse(own.poses(T_mount)))
     middles = np.array([points.mean(axis=0) for points in own.visible_points])
     moved = np.linalg.norm(
@@ -170,7 +161,7 @@ def snooping_warnings(session: Session, own: Capture, found: Snooping, T_mount: 
     return (
         f"No arm scatters by {contradiction_in_words(session, found)}: several rows or scans are wrong, and hand-eye "
         f"and pose errors are not reliable; to fix: check first {farthest}.",
-        *said,
+        *warnings,
     )
 
 
@@ -182,7 +173,7 @@ _CLOSES = 0.5
 
 
 def deep_check(session: Session) -> list[SessionProblem]:
-    """What is wrong with a session; empty if nothing is found.
+    """Return what is wrong with a session; empty if nothing is found.
 
     Raises:
         NoResultError: the views do not overlap under any hand-eye, and no mistake explains it.
@@ -217,7 +208,7 @@ def _check_clouds(session: Session) -> list[SessionProblem]:
 
 
 def _check_views(session: Session, capture: Capture, found: Sequence[MotionFit]) -> tuple[list[SessionProblem], bool]:
-    """What is wrong with single views under the poses as stated, and whether these contradict the scans altogether."""
+    """Return problems of single views under the stated poses, and True if these contradict the scans altogether."""
     T_mount, snooped = snoop_from_start(session, capture, _starting_hand_eye(session, capture, found))
     size = length_problem(snooped.model, capture.T_reference_mount, snooped.blunder_search.mean_columns)
     if size is not None:
@@ -225,7 +216,7 @@ def _check_views(session: Session, capture: Capture, found: Sequence[MotionFit])
     problems = explain_misplaced(session, capture, T_mount, snooped)
     contradicted = poses_contradict_scans(session, snooped) and not any(p.kind == "disconnected" for p in problems)
     if contradicted:
-        problems.append(_unexplained_problem(session, snooped))
+        problems.append(SessionProblem("displaced", tuple(session.names), _unexplained_text(session, snooped)))
     problems += [_suspected_problem(session, m) for m in snooped.suspected]
     return problems + background_problems(session, capture, T_mount, snooped), contradicted
 
@@ -237,27 +228,29 @@ def _stated_poses_rivalled(found: Sequence[MotionFit]) -> bool:
 
 
 def _starting_hand_eye(session: Session, capture: Capture, found: Sequence[MotionFit]) -> tuple[Array, float]:
-    """A hand-eye that these poses allow, and the distance between partners to begin with."""
+    """Return a hand-eye that these poses allow, and the distance between partners to begin with."""
     stated = next((e for e in found if e.hypothesis.kind == "stated" and e.scale == 1.0), None)
     size = part_size([capture])
     if stated is not None and stated.closed >= _CLOSES:
         return stated.T_mount, _GATE * size
     if session.scanner.T_mount is not None:
         return session.scanner.T_mount, _STATED_GATE * size
-    begun = find_coarse_hand_eye([capture])
-    return begun.T_mount, begun.gate
+    coarse = find_coarse_hand_eye([capture])
+    return coarse.T_mount, coarse.gate
 
 
 def snoop_from_start(session: Session, capture: Capture, start: tuple[Array, float]) -> tuple[Array, Snooping]:
-    """The hand-eye closed in on from a start (hand-eye, gate), and what snooping says under it."""
+    """Return the hand-eye refined from a start (hand-eye, gate), and what snooping finds under it."""
     T_mount, overlaps, _ = icp_hand_eye([capture], start[0], [start[1]])
-    freed = unconstrained_poses(capture, capture.poses(T_mount), overlaps[0].gate)
+    unconstrained = unconstrained_poses(capture, capture.poses(T_mount), overlaps[0].gate)
     usual = UsualEffects(measurement_of(session, capture), Model(T_mount))
-    return T_mount, apply_displacement_limits(session, snoop_views(capture, T_mount, overlaps[0].gate, freed, usual))
+    return T_mount, apply_displacement_limits(
+        session, snoop_views(capture, T_mount, overlaps[0].gate, unconstrained, usual)
+    )
 
 
 def _mistake_from_surfaces(session: Session, capture: Capture, found: Sequence[MotionFit]) -> SessionProblem | None:
-    """The mistake without which the surfaces fall together and nothing contradicts any more; None if there is none."""
+    """Return the mistake that, undone, lets the surfaces agree without contradiction; None if there is none."""
     fallen = hypotheses_by_surface(capture, found)
     if not fallen:
         return None
@@ -277,18 +270,18 @@ def _mistake_from_surfaces(session: Session, capture: Capture, found: Sequence[M
 
 
 def _mistake_from_motions(session: Session, found: Sequence[MotionFit]) -> SessionProblem | None:
-    """The mistake that the motions show short of proof; None if there is none."""
+    """Return the mistake that the motions show short of proof; None if there is none."""
     likely = likeliest_hypotheses(found)
     return _convention_problem(session, likely) if likely else None
 
 
 def _convention_problem(session: Session, named: tuple[MotionFit, ...]) -> SessionProblem:
-    """One problem from hypotheses that explain the motions equally well."""
+    """Return one problem from hypotheses that explain the motions equally well."""
     return _hypothesis_problem(session, named[0].hypothesis, [e.hypothesis.fix for e in named])
 
 
 def _hypothesis_problem(session: Session, best: Hypothesis, fixes: Sequence[str]) -> SessionProblem:
-    """The problem of a hypothesis, with what is as likely."""
+    """Return the problem of a hypothesis, with what is as likely."""
     return SessionProblem(best.kind, tuple(names_of_views(best.rows, session.names)), likeliest_text(fixes))
 
 
@@ -299,12 +292,6 @@ def _suspected_problem(session: Session, found: MisplacedView) -> SessionProblem
     )
     return SessionProblem("displaced", (session.views[found.view].name,), fix, certain=False)
 
-
-def _unexplained_problem(session: Session, found: Snooping) -> SessionProblem:
-    return SessionProblem("displaced", tuple(session.names), _unexplained_text(session, found))
-
-
-# Sessions that no run may use: poses that contradict the scans, another mount's model, too few views that belong.
 
 _CHECK_ROWS = "check that rows and clouds belong together and how the poses were converted"
 # A hand-eye that differs by chance alone is refused once in a million.
@@ -319,7 +306,7 @@ _KINDS_LEAVING_A_REST = ("reclamped", "exchanged")
 
 
 def refuse(session: Session, problems: Sequence[SessionProblem]) -> None:
-    """Raise what a deep check found; nothing where it found nothing certain."""
+    """Raise what a deep check found; do nothing where it found nothing certain."""
     for problem in (p for p in problems if p.certain):
         kind = NoResultError if problem.kind in ("displaced", "disconnected") else InputError
         raise kind(f"{session.path}: the poses contradict what was measured: {problem.line(session.names)}")
@@ -385,9 +372,9 @@ def require_own_model(session: Session, correction: Correction, index: int) -> N
     turn, shift = _hand_eye_difference(own, T_mount, fitted.T_mount)
     if not beyond_any_arm(session, turn, shift):
         return
-    # Views freed from far off are only on their way, and what they lack would count as scatter: once more from there.
-    freed = unconstrained_poses(own, own.poses(fitted.T_mount), correction.overlaps[index].gate)
-    fitted = fit_hand_eye([own], [freed], fitted.T_mount)
+    # Unconstrained views that start far off have not converged, which would count as scatter: once more from there.
+    unconstrained = unconstrained_poses(own, own.poses(fitted.T_mount), correction.overlaps[index].gate)
+    fitted = fit_hand_eye([own], [unconstrained], fitted.T_mount)
     turn, shift = _hand_eye_difference(own, T_mount, fitted.T_mount)
     xi = frames.log(frames.inverse(T_mount) @ fitted.T_mount)
     clear = xi @ np.linalg.solve(fitted.covariance + correction.model.covariance, xi) > chi2_limit(_OWN_MODEL_CHANCE, 6)
@@ -424,7 +411,7 @@ def _unexplained_text(session: Session, found: Snooping) -> str:
 
 
 def _hand_eye_difference(own: Capture, T_mount: Array, other: Array) -> tuple[float, float]:
-    """Angle (rad) between two hand-eyes, and how far they put the part from each other."""
+    """Return the angle (rad) between two hand-eyes, and how far they put the part from each other."""
     xi = frames.log(frames.inverse(T_mount) @ other)
     middle = np.mean([scan.points.mean(axis=0) for scan in own.scans], axis=0)
     return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle)))

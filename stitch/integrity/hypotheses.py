@@ -1,4 +1,4 @@
-"""What people do wrong with the poses of a session, written out: each mistake undone gives other poses.
+"""Mistakes that people make with the poses of a session: each mistake undone gives other poses.
 
 Poses that are right after one of these changes, and only then, say which mistake was made.
 """
@@ -16,14 +16,12 @@ from stitch.frames import Array, Indices
 from stitch.measurement.robot import forward
 from stitch.measurement.session import Mount, Session
 
-# Positions whose columns were read in another way than they were written, undone.
-
 _AXES = "xyz"
 _CORRECT_TABLE = "to fix: correct the table of poses"
 
 
 def other_columns(position: Array) -> Iterator[tuple[str, Array]]:
-    """Positions (V, 3) with their columns in other places, then one or two with the other sign, and what that undoes.
+    """Yield positions (V, 3) with permuted columns, then with one or two signs changed, and the mistake undone.
 
     All three with the other sign are a left-handed frame, of poses or of scans.
     """
@@ -39,7 +37,7 @@ def other_columns(position: Array) -> Iterator[tuple[str, Array]]:
 
 
 def other_units(position: Array, units: Mapping[float, str]) -> Iterator[tuple[str, Array]]:
-    """Positions (V, 3) of which one column is in another unit than the rest, and what that undoes.
+    """Yield positions (V, 3) of which one column is in another unit than the rest, and what that undoes.
 
     Args:
         units: factors by which lengths may be too large, and how that comes about.
@@ -59,13 +57,13 @@ ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "XYX", "XZX", "YXY", "YZY", 
 
 
 def other_quaternions(q: Array) -> Iterator[tuple[str, Rotation]]:
-    """Readings (V, 4) x, y, z, w taken for another order."""
+    """Yield readings (V, 4) x, y, z, w taken for another order."""
     yield "w, x, y, z, not x, y, z, w; to fix: rename them", Rotation.from_quat(q[:, [1, 2, 3, 0]])
     yield "x, y, z, w but were reordered as if w came first; to fix: undo that", Rotation.from_quat(q[:, [3, 0, 1, 2]])
 
 
 def other_angles(R: Rotation) -> Iterator[tuple[str, Rotation]]:
-    """Angles that were composed in one order and belong into another; columns by place, and by the axis they name."""
+    """Yield angles that were composed in one order and belong into another, columns by place or by axis."""
     for order in (*ORDERS, *(o.lower() for o in ORDERS)):
         angles = _angles(R, order)
         for right in (*ORDERS, *(o.lower() for o in ORDERS)):
@@ -98,7 +96,7 @@ def _order_name(order: str) -> str:
 
 
 def degrees_for_radians(R: Rotation) -> Iterator[tuple[str, Rotation]]:
-    """Angles in radians that were taken for degrees."""
+    """Yield angles in radians that were taken for degrees."""
     words, fix = "the angles are radians, and were read as degrees", "to fix: convert them to degrees"
     yield f"{words}; {fix}", Rotation.from_rotvec(R.as_rotvec() * 180 / np.pi)
     for order in ORDERS:
@@ -113,7 +111,7 @@ def _angles(R: Rotation, order: str) -> Array:
 
 
 def _shortest(angles: Array) -> Array:
-    """Of the two triples of angles about three axes that make one rotation, the shorter: vectors are at most π long."""
+    """Return the shorter of the two triples of angles that make one rotation: vectors are at most π long."""
     other = np.stack([angles[:, 0] - np.pi, np.pi - angles[:, 1], angles[:, 2] - np.pi], axis=1)
     other = (other + np.pi) % (2 * np.pi) - np.pi
     shorter = np.linalg.norm(other, axis=1) < np.linalg.norm(angles, axis=1)
@@ -180,7 +178,7 @@ class Hypothesis:
 
 
 def hypotheses(session: Session) -> list[Hypothesis]:
-    """The poses as stated, first, and with every mistake undone that can be undone."""
+    """Return the poses as stated, first, and with every mistake undone that can be undone."""
     T = np.array([view.T_base_flange for view in session.views])
     mount = session.mount
     out = [Hypothesis("stated", T, mount, "")]
@@ -190,7 +188,7 @@ def hypotheses(session: Session) -> list[Hypothesis]:
 
 
 def _session_mistakes(session: Session, T: Array) -> Iterator[Hypothesis]:
-    """Mistakes that change all poses alike."""
+    """Yield mistakes that change all poses in the same way."""
     mount, joints = session.mount, [view.joints for view in session.views]
     robot = session.robot
     known = robot is not None and all(q is not None for q in joints)
@@ -240,7 +238,7 @@ def _mount_or_inverse(mount: Mount) -> str:
 
 
 def _row_mistakes(T: Array, mount: Mount) -> Iterator[Hypothesis]:
-    """Poses that belong to other rows."""
+    """Yield poses that belong to other rows."""
     V = len(T)
     index = np.arange(V)
     yield Hypothesis("reversed", T[::-1], mount, "the poses are in reverse order; to fix: turn the list around")
@@ -273,7 +271,7 @@ def _shifted(T: Array, mount: Mount, by: int, kept: Indices) -> Hypothesis:
 
 
 def distinct(found: Sequence[Hypothesis], angle: float, length: float) -> list[Hypothesis]:
-    """Hypotheses whose relative motions differ, the first of each kind kept."""
+    """Return hypotheses whose relative motions differ, the first of each kind kept."""
     kept: list[Hypothesis] = []
     signs: list[Array] = []
     for h in found:

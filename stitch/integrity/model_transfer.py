@@ -1,4 +1,4 @@
-"""Whether the hand-eye and the targets of another run hold in a session of labelled points that fits none of them.
+"""Test if the hand-eye and the targets of another run hold in a session of labelled points that fits none of them.
 
 Another day the tracker may stand elsewhere, the tool be mounted anew, a ball of the same name sit in another nest: then
 what is left is no error of the arm. Hand-eye and targets fitted here say so, within what both are known to.
@@ -51,7 +51,7 @@ class ArmTransfer:
         return not self.worse and self.better_without is None
 
     def sentence(self, unit: str) -> str:
-        """What the arm does here; where it does not hold, a doubt."""
+        """Return what the arm does here; a doubt where it does not hold."""
         here, nominal, without = (length_text(x, unit) for x in (self.rms, self.nominal_rms, self.without_rms))
         if self.holds:
             return f"The arm of the other run leaves {here} where the nominal arm leaves {nominal}."
@@ -119,7 +119,7 @@ class SessionDisagreement:
     p_value: float  # that effects of its own explain so much by chance
 
     def doubt(self, unit: str) -> str:
-        """As a sentence."""
+        """Return a warning."""
         here, own = length_text(self.shared_rms, unit), length_text(self.separate_rms, unit)
         return (
             f"{self.name} does not share the effects of this rig: they leave {here}, fitted to it alone {own}; another "
@@ -147,7 +147,7 @@ def find_disagreeing_sessions(
 
 
 def _count_fitted_parameters(fitted: FittedRig) -> int:
-    """Of the effects that were fitted."""
+    """Return the number of parameters of the effects that were fitted."""
     return sum(int(np.count_nonzero(term.values)) for term in fitted.model.terms)
 
 
@@ -169,7 +169,7 @@ _LISTED = 4
 
 @dataclass(frozen=True)
 class ModelTransfer:
-    """What of another run does not hold; lengths in length_unit, angles in rad."""
+    """Parts of another run that do not hold; lengths in length_unit, angles in rad."""
 
     turned: float  # of the hand-eye from there to here
     moved: float
@@ -180,7 +180,7 @@ class ModelTransfer:
     own_rms: float  # with hand-eye and targets of this session
 
     def sentence(self, unit: str) -> str:
-        """What lies elsewhere, and what to do."""
+        """Return what lies elsewhere, and what to do."""
         told, off, own = [], length_text(self.rms, unit), length_text(self.own_rms, unit)
         if self.hand_eye:
             away = f"{length_text(self.moved, unit)} and {1e3 * self.turned:.3g} mrad"
@@ -216,7 +216,7 @@ def check_model_transfer(found: ScreenedFit, fit: Callable[[], FittedRig]) -> Sc
 
 
 def _transfer_warnings(session: Session, applied: FittedSession, own: FittedSession | None) -> tuple[str, ...]:
-    """What to doubt; nothing where the other run holds."""
+    """Return warnings; none where the other run holds."""
     there = applied.targets
     assert there is not None
     beyond = beyond_any_arm(session, *np.sqrt(there.variances[:2]))
@@ -257,7 +257,7 @@ def _compare_with_own(applied: FittedSession, own: FittedSession) -> ModelTransf
 
 
 def _displaced_targets(there: TargetModelFit, here: TargetModelFit) -> tuple[float, tuple[str, ...]]:
-    """How far the farthest lies from where the other run has it, and the names of those that lie elsewhere."""
+    """Return how far the farthest lies from where the other run has it, and the names of those that lie elsewhere."""
     sigmas, found = here.landmark_sigmas, dict[str, float]()
     known = {name: k for k, name in enumerate(here.rows.sightings.targets) if name in there.model.targets}
     for name, k in known.items():

@@ -49,17 +49,17 @@ def find_common_displacement(
 
 
 def _count_sharing_displacement(capture: Capture, poses: Array, placed: Mapping[int, Array], what: str) -> int:
-    """How many views at most share one displacement: a left twist if the part moved, a right one if the scanner did."""
+    """Count the views that share one displacement, at most: a left twist of the part or a right one of the scanner."""
     best = 0
     for v, T in placed.items():
         back = frames.inverse(poses[v])
-        alike = 0
+        sharing = 0
         for w, there in placed.items():
             expected = T @ back @ poses[w] if what == "part" else poses[w] @ back @ T
             points = capture.scans[w].points[::50]
             stated, fitted, shared = (frames.transform(pose, points) for pose in (poses[w], there, expected))
-            alike += bool(np.linalg.norm(shared - fitted) < _AGREES * np.linalg.norm(fitted - stated))
-        best = max(best, alike)
+            sharing += bool(np.linalg.norm(shared - fitted) < _AGREES * np.linalg.norm(fitted - stated))
+        best = max(best, sharing)
     return best if best >= _FEWEST else 0
 
 
@@ -110,7 +110,7 @@ _CLOSER_SHARE = 0.2
 
 
 def find_fitting_rows(capture: Capture, found: Snooping, misplaced: Sequence[MisplacedView]) -> dict[int, int | None]:
-    """Of every misplaced scan that fits the part the row to whose pose it belongs, None for no other row's."""
+    """Return for every misplaced scan that fits the part the row to whose pose it belongs; None for no other row."""
     some = [m for m in misplaced if m.T is not None]
     rows = {m.view: _nearest_row(capture, found.expected, m.view, m.T) for m in some if m.T is not None}
     open_ones = [view for view, row in rows.items() if row is None]
@@ -159,7 +159,7 @@ def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | N
 def _row_where_it_fits(
     capture: Capture, found: Snooping, surface: ReferenceSurface, view: int, rows: Sequence[int]
 ) -> int | None:
-    """Of some rows that in which a scan, moved least, fits the others, if not in its own."""
+    """Return the row in which a scan, moved least, fits the others; None for its own."""
     near, moved = CLOSE_SHARE * part_size([capture]), dict[int, float]()
     for row in rows:
         T = found.expected[row]
@@ -190,7 +190,7 @@ _COPY = "this scan is a copy of that of {}; to fix: put the right file in its ro
 
 
 def explain_misplaced(session: Session, capture: Capture, T_mount: Array, found: Snooping) -> list[SessionProblem]:
-    """One problem for everything that snooping found, with the rows and what to do.
+    """Return one problem for everything that snooping found, with the rows and what to do.
 
     Args:
         session, capture: with the same views.
@@ -198,39 +198,39 @@ def explain_misplaced(session: Session, capture: Capture, T_mount: Array, found:
     """
     names = session.names
     poses = found.expected
-    out, told = [], set[int]()
+    out, explained = [], set[int]()
     for v, w in find_copies(capture):
-        bad = _worse_of_copies(found, v, w)
-        told.add(bad)
+        bad = v if v in found.left_out and w not in found.left_out else w
+        explained.add(bad)
         good = v if bad == w else w
         out.append(SessionProblem("duplicate_scan", (names[v], names[w]), _COPY.format(names[good])))
-    misplaced = [m for m in found.misplaced if m.view not in told]
+    misplaced = [m for m in found.misplaced if m.view not in explained]
     rows = find_fitting_rows(capture, found, misplaced)
     cycles = exchange_cycles(rows)
     for cycle in cycles:
-        told |= set(cycle)
+        explained |= set(cycle)
         out.append(
             SessionProblem("exchanged", tuple(names_of_views(cycle, names)), _exchange_problem(cycle, rows, names))
         )
-    left = {v: row for v, row in rows.items() if v not in told}
-    for v, row in exchanged_pairs(left, [m for m in misplaced if m.view not in told]):
-        told |= {v, row}
+    left = {v: row for v, row in rows.items() if v not in explained}
+    for v, row in exchanged_pairs(left, [m for m in misplaced if m.view not in explained]):
+        explained |= {v, row}
         out.append(
             SessionProblem(
                 "exchanged", tuple(names_of_views(sorted((v, row)), names)), _EXCHANGED.format(names[v], names[row])
             )
         )
     step = (
-        find_common_displacement(capture, poses, [m for m in misplaced if m.view not in told])
+        find_common_displacement(capture, poses, [m for m in misplaced if m.view not in explained])
         if not found.steps
         else None
     )
     if step is not None:
-        told |= set(step[0])
+        explained |= set(step[0])
         out.append(_reclamped_problem(step[0], step[1], names))
     same = find_same_poses(capture)
     for m in misplaced:
-        if m.view not in told:
+        if m.view not in explained:
             out.append(_single_view_problem(session, capture, T_mount, found, m, same))
     for s in found.steps:
         side = range(s.start) if s.start <= found.largest_segment.start else range(s.start, len(names))
@@ -240,11 +240,6 @@ def explain_misplaced(session: Session, capture: Capture, T_mount: Array, found:
         views = tuple(n for group in found.disconnected[1:] for n in names_of_views(group, names))
         out.append(SessionProblem("disconnected", views, f"no surface links {shown}; to fix: add views between them"))
     return out
-
-
-def _worse_of_copies(found: Snooping, v: int, w: int) -> int:
-    """Of two views with the same scan, the one that does not belong."""
-    return v if v in found.left_out and w not in found.left_out else w
 
 
 def _exchange_problem(cycle: Sequence[int], rows: dict[int, int | None], names: Sequence[str]) -> str:
@@ -297,7 +292,7 @@ def _single_view_problem(
 
 
 def _scan_problem(capture: Capture, found: Snooping, m: MisplacedView) -> ScanFault | None:
-    """What is wrong with the cloud of a view, rather than with its pose."""
+    """Return what is wrong with the cloud of a view, rather than with its pose; None if nothing is."""
     scan, T_pose = capture.scans[m.view], found.expected[m.view]
     if shows_no_surface(scan):
         return None

@@ -1,4 +1,4 @@
-"""Where a scan belongs among the others, tried wide: from many starts, by the surface alone.
+"""Find where a scan belongs among the others, tried wide: from many starts, by the surface alone.
 
 Point-to-plane ICP (Chen & Medioni 1992) of one scan against the surface of other views, all starts at once, with a
 gate that shrinks. A placement is judged by its closure: of the points that come to lie near the other surface, the
@@ -115,7 +115,7 @@ def find_contradicting_views(
 
 
 def _contradicted_share(own: dict[int, PointVisibility], without: Sequence[int], least: float) -> float:
-    """Of the points that other views show too, the share that all of these show elsewhere; 0 up to the least one."""
+    """Return the share of points shown by other views that all of these show elsewhere; 0 up to the least one."""
     others = [shown for w, shown in own.items() if w not in without]
     if not others:
         return 0.0
@@ -149,7 +149,7 @@ def _point_visibility(
 #
 # Two views are linked if most of their correspondences close within the robust gate. A pair that only lies near,
 # with surfaces that cross, has correspondences too, but they do not close: it links nothing, and the robust weights
-# of the fit ignore it without a word. That is how a displaced view used to end at an rms of zero.
+# of the fit ignore it without a word.
 
 # Share of a pair's correspondences within four robust sigmas. Pairs of good sessions have 0.7 to 1, simulated and
 # real; pairs with a view displaced by more than the gate 0 to 0.3.
@@ -160,7 +160,7 @@ HOLDING = 20
 
 @dataclass(frozen=True)
 class Link:
-    """How two views meet."""
+    """The overlap of two views."""
 
     v: int
     w: int
@@ -318,14 +318,14 @@ def lies_in_a_line(scan: Scan) -> bool:
 
 
 def evaluate_placement(scan: Scan, T: Array, surface: ReferenceSurface) -> Placement:
-    """How well a scan lies on a surface under a pose (4, 4)."""
+    """Return how well a scan lies on a surface under a pose (4, 4)."""
     return evaluate_placements(scan, T[None], surface)[0]
 
 
 def evaluate_placements(
     scan: Scan, poses: Array, surface: ReferenceSurface, probes: int = _FINAL_PROBES
 ) -> list[Placement]:
-    """The same for several poses (S, 4, 4)."""
+    """Return how well a scan lies on a surface under each pose (S, 4, 4)."""
     index = sample_points(scan, probes)
     if not len(index):
         return [Placement(T, 0.0, 0.0) for T in poses]
@@ -416,7 +416,7 @@ FEW_SHARED = 0.1
 
 
 def place_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple[float, float]) -> dict[int, Placement]:
-    """Where the views of groups outside the core belong, each group moved as a whole; the core grows with them.
+    """Find where the views of groups outside the core belong, each group moved as a whole; the core grows with them.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner at which the views of each group fit together.
@@ -465,7 +465,7 @@ def _group_closes(scan: Scan, T: Array, surface: ReferenceSurface, needed: float
 
 
 def _rms_displacement(scan: Scan, T: Array) -> float:
-    """How far a motion (4, 4) carries the points of a scan, rms."""
+    """Return how far a motion (4, 4) carries the points of a scan, rms."""
     return float(np.sqrt(np.mean(np.sum((frames.transform(T, scan.points) - scan.points) ** 2, axis=1))))
 
 
@@ -493,7 +493,7 @@ def place_unlinked_views(
     linked: Linkage,
     limits: tuple[float, float],
 ) -> tuple[dict[int, Placement], list[int]]:
-    """Where the views outside the core belong, and those that belong nowhere; the core grows as they are placed.
+    """Find where the views outside the core belong, and those that belong nowhere; the core grows as they are placed.
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner by the robot.
@@ -547,7 +547,7 @@ def _placement_is_unsure(capture: Capture, linked: Linkage, model_poses: Array, 
 def _likeliest_placement(
     scan: Scan, found: Sequence[Placement], model_poses: Array, limits: tuple[float, float]
 ) -> Placement | None:
-    """Of the placements that close the one nearest to any row's pose: a part may look alike from several sides."""
+    """Return the closing placement nearest to any row's pose: a part may look the same from several sides."""
     needed, size = limits
     away = _distances_from_rows(scan, found, model_poses)
     limit = [needed * (_CLOSURE_AT_ROW if a < CLOSE_SHARE * size else 1.0) for a in away]
@@ -556,7 +556,7 @@ def _likeliest_placement(
 
 
 def _distances_from_rows(scan: Scan, found: Sequence[Placement], model_poses: Array) -> list[float]:
-    """How far each placement is from the nearest row's pose, rms of the points."""
+    """Return how far each placement is from the nearest row's pose, rms of the points."""
     points = scan.points[::50]
     rows = frames.transform(model_poses, points)
     return [float(np.sqrt(((rows - frames.transform(p.T, points)) ** 2).sum(axis=2).mean(axis=1)).min()) for p in found]

@@ -1,4 +1,4 @@
-"""A displacement that all views from one on share: what moved, by how much, and what to say of it."""
+"""Tests of the poses of views: steps that all views from one on share, single blunders, a factor on lengths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -43,7 +43,7 @@ class PoseStep:
     p_value: float  # all change points counted
 
     def describe(self, names: Sequence[str], length_unit: str) -> str:
-        """What happened and what to do, in words."""
+        """Return a warning with what to do."""
         before, after = names[self.start - 1], names[self.start]
         off = displacement_text(self.size, self.at_least, length_unit)
         by = f"{off} off at the part" if off else "by an amount that these surfaces do not show"
@@ -90,7 +90,7 @@ def likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody,
 
 
 def _median_size(moved: Array, lever: float) -> DisplacementSize:
-    """Of twists (S, 6), rotations in 1/lever, the usual one."""
+    """Return the median size of twists (S, 6), rotations in 1/lever."""
     turn, shift = (float(np.median(np.linalg.norm(half, axis=1))) for half in (moved[:, :3], moved[:, 3:]))
     return turn / lever, shift
 
@@ -143,7 +143,7 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
 def find_unlinked_blunders(
     model: ViewModel, excluded: Sequence[int], unlinked: Sequence[int], steps: Sequence[PoseStep] = ()
 ) -> list[Blunder]:
-    """Of views that no surface links where they should stand, those that the scatter of all others does not explain."""
+    """Return the unlinked views that the scatter of all others does not explain."""
     out = []
     for v in unlinked:
         p = leave_one_out_test(
@@ -233,7 +233,7 @@ def find_steps(
 
 @dataclass(frozen=True)
 class _Pick:
-    """What explains most beside what was picked before: a step, or a single view that is off."""
+    """Return what explains most beside what was picked before: a step, or a single view that is off."""
 
     columns: Array  # (n, 6)
     p_value: float

@@ -1,4 +1,4 @@
-"""What can be wrong with one scan so that it closes nowhere: mirrored, scaled, another unit; or a copy of another."""
+"""Find faults of single scans: occluders, static background, mirrored or scaled clouds, copies of other scans."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,13 +35,13 @@ _OCCLUDER_MIN_SHARE, _FEWEST = 0.01, 5
 
 @dataclass(frozen=True)
 class Occluder:
-    """What stands where others look through."""
+    """Points of some scans that stand where others see through: a cable, an arm, a box that stood there for a while."""
 
     views: tuple[int, ...]
     share: float  # of the points of these views, at least: where no other scan looks, nobody can say
 
     def describe(self, names: Sequence[str]) -> str:
-        """In words, and what to do."""
+        """Return a warning with what to do."""
         where, verb = list_views([names[v] for v in self.views], names), "shows" if len(self.views) == 1 else "show"
         return (
             f"At least {self.share:.0%} of what {where} {verb} stands where other scans see through: a cable, an "
@@ -55,7 +55,7 @@ def ray_tree(scan: Scan) -> KDTree:
 
 
 def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder | None:
-    """What single scans show where others look through, if that is worth a word.
+    """Return what single scans show where others see through; None if it is too little.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner where surfaces put the views.
@@ -82,8 +82,8 @@ def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder 
             there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
             through |= _looks_through(scans[w], looks[w], there, apart[w])
         shares[v] = through.sum() / count if through.sum() >= _FEWEST else 0.0
-    told = tuple(v for v, share in shares.items() if share > _OCCLUDER_MIN_SHARE)
-    return Occluder(told, float(np.mean([shares[v] for v in told]))) if told else None
+    found = tuple(v for v, share in shares.items() if share > _OCCLUDER_MIN_SHARE)
+    return Occluder(found, float(np.mean([shares[v] for v in found]))) if found else None
 
 
 def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Mask:
@@ -132,7 +132,7 @@ _BEHIND = 4.0
 
 @dataclass(frozen=True)
 class StaticBackground:
-    """What stands still before the scanner."""
+    """Points at one place before the scanner in all views: a wall, a table, a bracket."""
 
     share: float  # of the points of all scans
     views: tuple[int, ...]  # that show it
@@ -140,7 +140,7 @@ class StaticBackground:
     within: Array | None  # (2, 3) corners of a box with the part and without it, where one side of a box parts them
 
     def describe(self, length_unit: str) -> str:
-        """In words, and what to do."""
+        """Return a warning with what to do."""
         sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *self.box, strict=True))
         fix = f"cut {', '.join(sides)} {length_unit} out of the scans"
         if self.within is not None:
@@ -155,7 +155,7 @@ class StaticBackground:
 def find_static_background(
     scans: Sequence[Scan], poses: Array, tolerance: float, size: float
 ) -> StaticBackground | None:
-    """What stands still before the scanner, if that is worth a word.
+    """Return what stands still before the scanner; None if it is too little.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner under the model.
@@ -267,7 +267,7 @@ class ScanFault:
 
 
 def scan_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float, needed: float) -> ScanFault | None:
-    """What makes a scan close on the surface of the others, at its pose or near it; None if nothing does.
+    """Return what makes a scan close on the surface of the others, at its pose or near it; None if nothing does.
 
     Args:
         T_pose: (4, 4) T_reference_scanner from the robot.
@@ -299,7 +299,7 @@ def scan_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float
 
 
 def scale_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float, needed: float) -> ScanFault | None:
-    """A factor on the cloud under which it closes at its own pose; None if there is none."""
+    """Return a factor on the cloud under which it closes at its own pose; None if there is none."""
     begin = place_scan(scan, surface, np.concatenate([T_pose[None], starts_about(T_pose, scan, size)]), size)[0]
     scale = _similarity(scan, begin.T, surface, size)
     if not (_LEAST_SCALE < scale < 1 / _LEAST_SCALE) or abs(scale - 1) < _NEAR_ONE:

@@ -56,7 +56,7 @@ class MovedTarget:
     drifts: bool = False
 
     def describe(self, view: str, length: str) -> str:
-        """What happened and what to do, with the name of the view and that distance in words."""
+        """Return a warning with what to do; with the name of the view and that distance in words."""
         if self.drifts:
             return (
                 f"{self.target} creeps among the targets over the session: its distances to the others change by up to "
@@ -132,7 +132,7 @@ def _steps_of_means(off: Array) -> Array:
 
 
 def _target_step(places: Array, k: int, start: int, sigma: float) -> tuple[float, MovedTarget]:
-    """How many times what is usual the distances from target k step before a view, and the move that this would be."""
+    """Return by how many times the usual step the distances from target k change before a view, and that move."""
     held = _partners(places, k)
     among = target_distances(places[:, held])[:, *np.triu_indices(len(held), 1)]
     mine, rest = (
@@ -185,11 +185,8 @@ def _median_steps(distances: Array, start: int, scatter: float) -> tuple[Array, 
     return steps, steps / (_MEDIAN * scatter * np.sqrt(1 / before + 1 / after))
 
 
-# What is wrong with labelled points whatever the poses are: names that are mixed up, targets that moved.
-
-
 def target_problems(session: Session, sightings: Sightings | None) -> list[SessionProblem]:
-    """Views with names mixed up, then targets that moved, with the views from there on; nothing without targets."""
+    """Return views with names mixed up, then targets that moved, with the views from there on."""
     if sightings is None:
         return []
     names, every = session.names, sightings.with_outliers
@@ -203,7 +200,7 @@ def target_problems(session: Session, sightings: Sightings | None) -> list[Sessi
 
 
 def target_warnings(session: Session, sightings: Sightings | None) -> tuple[str, ...]:
-    """The same in words, each a sentence or two."""
+    """Return the same problems as sentences."""
     return tuple(problem.fix for problem in target_problems(session, sightings))
 
 
@@ -223,7 +220,7 @@ class ConventionFit:
 
 
 def check_targets(session: Session) -> list[SessionProblem]:
-    """What is wrong with the poses of a session of labelled points; empty if nothing is found."""
+    """Return what is wrong with the poses of a session of labelled points; empty if nothing is found."""
     T = np.array([view.T_base_flange for view in session.views])
     capture = build_capture(session.name, (), T, session.mount, sightings_of(session))
     limit = _LIMIT_M / METRES[session.length_unit]
@@ -250,7 +247,7 @@ def check_targets(session: Session) -> list[SessionProblem]:
 
 
 def _hypotheses_to_try(session: Session, capture: Capture, length: float) -> Iterator[Hypothesis]:
-    """What to try: where targets show how the sensor moved, the hypotheses that explain its motions best."""
+    """Yield hypotheses to try: where targets show how the sensor moved, those that explain its motions best."""
     motions = _sensor_motions(capture)
     ranked = rank_hypotheses(session, motions)
     if ranked:

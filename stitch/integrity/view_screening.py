@@ -49,17 +49,17 @@ class ViewScreening:
 
     @property
     def names(self) -> set[str]:
-        """Of the views that are left out."""
+        """Names of the views that are left out."""
         return {item.view for item in self.left_out}
 
     def line(self, order: Sequence[str]) -> str:
-        """What was left out and why; with the names of all views as they follow each other."""
+        """Return what was left out and why; `order` has the names of all views."""
         why = dict.fromkeys(item.why for item in self.left_out)
-        alike = {w: [item.view for item in self.left_out if item.why == w] for w in why}
-        return "; ".join(f"{list_views(views, order)}: {w}" for w, views in alike.items())
+        groups = {w: [item.view for item in self.left_out if item.why == w] for w in why}
+        return "; ".join(f"{list_views(views, order)}: {w}" for w, views in groups.items())
 
     def indices(self, session: Session) -> list[int]:
-        """Numbers of the views that are left out."""
+        """Return the indices of the views that are left out."""
         return [v for v, view in enumerate(session.views) if view.name in self.names]
 
 
@@ -90,7 +90,7 @@ def screen_views(session: Session, measurement: Measurement, correction: Correct
     if scatter_is_doubtful(session, found):
         # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
         refuse_whole(session)
-    told = (*target_warnings(session, own.sightings), *snooping_warnings(session, own, found, T_mount))
+    warnings = (*target_warnings(session, own.sightings), *snooping_warnings(session, own, found, T_mount))
     if not any(beyond_any_arm(session, *step.at_least) for step in found.steps):
         # A slip of the part, or a knock of the mount, within what a model can hold: said, and left to the diagnosis.
         found = replace(found, steps=())
@@ -103,14 +103,14 @@ def screen_views(session: Session, measurement: Measurement, correction: Correct
         left_out=out,
         suspected=tuple(_suspected_view(session, own, m, T_mount) for m in found.suspected),
         links=_view_links(session, found),
-        doubts=told,
+        doubts=warnings,
     )
 
 
 def session_warnings(
     session: Session, measurement: Measurement, correction: Correction | None, index: int
 ) -> tuple[str, ...]:
-    """What to say of a session as a whole under a model, whose views were admitted before.
+    """Return the warnings of a session as a whole under a model, whose views were screened before.
 
     Args:
         correction: of surfaces; None where there are none.
