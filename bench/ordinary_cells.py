@@ -19,7 +19,7 @@ from stitch.measurement.measurement import Measurement, measurement_of, with_par
 from stitch.observations.surfaces.hand_eye_fit import capture_repeatability
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps, next_gate
-from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses, visible_directions
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.stages.correct import COARSE_SAMPLES
 
 SCATTER = np.repeat([20e-6, 0.02], 3)  # of the flange, rad and mm
@@ -102,7 +102,9 @@ def seen(cell: Cell, T_base_flange: Array, rng: np.random.Generator) -> Unconstr
     to_centre = frames.make(np.eye(3), -g.centre)
     model = cell.measurement.capture.poses(cell.T_mount)
     twists = frames.log(to_centre @ left @ cell.T_mount @ frames.inverse(to_centre @ model))
-    values, vectors, scale = visible_directions(g)
-    noise = np.sqrt(cell.noise_factor * g.variance / values) * rng.standard_normal(len(values))
+    visible = g.visible
+    noise = np.sqrt(cell.noise_factor * g.variance / visible.values) * rng.standard_normal(len(visible.values))
     # The common motion is what no overlap shows.
-    return replace(cell.freed, twists=twists - twists.mean(axis=0) + (scale * (vectors @ noise)).reshape(-1, 6))
+    return replace(
+        cell.freed, twists=twists - twists.mean(axis=0) + (visible.scale * (visible.vectors @ noise)).reshape(-1, 6)
+    )

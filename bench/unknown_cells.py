@@ -18,7 +18,7 @@ from stitch.frames import Array
 from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import SurfaceObservation, surface_model
-from stitch.observations.surfaces.view_poses import UnconstrainedPoses, visible_directions
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.statistics.reml import fit_variances
 
 
@@ -65,9 +65,9 @@ def seen(asked: Asked, world: World, rng: np.random.Generator) -> LinearModel:
     to_centre = frames.make(np.eye(3), -g.centre)
     model = cell.measurement.capture.poses(cell.T_mount)
     twists = frames.log(to_centre @ true_poses(asked, world, rng) @ frames.inverse(to_centre @ model))
-    values, vectors, scale = visible_directions(g)
-    noise = np.sqrt(cell.noise_factor * g.variance / values) * rng.standard_normal(len(values))
-    twists = twists - twists.mean(axis=0) + (scale * (vectors @ noise)).reshape(-1, 6)
+    visible = g.visible
+    noise = np.sqrt(cell.noise_factor * g.variance / visible.values) * rng.standard_normal(len(visible.values))
+    twists = twists - twists.mean(axis=0) + (visible.scale * (visible.vectors @ noise)).reshape(-1, 6)
     freed = with_moved_points(replace(freed, twists=twists), cell.measurement, asked.scene, world.laws, asked.moments)
     return _with_freed(asked.linear, freed)
 

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import f
 
 from stitch import frames
-from stitch.cells.job_files import align_points, on_a_line
+from stitch.cells.job_files import on_a_line
+from stitch.closed_form.feature_matching import align_points
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.reading.text_files import import_extra

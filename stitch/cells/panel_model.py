@@ -12,7 +12,8 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from stitch import frames
-from stitch.cells.job_files import align_points, on_a_line
+from stitch.cells.job_files import on_a_line
+from stitch.closed_form.feature_matching import align_points
 from stitch.closed_form.hand_eye import park_martin
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array, Indices

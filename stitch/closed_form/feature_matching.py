@@ -1,9 +1,9 @@
-"""The rigid motion between two surfaces from their shape alone, without a first guess: FPFH, RANSAC, ICP.
+"""The rigid motion between two sets of points: of partners in closed form; of surfaces from their shape alone.
 
-Fast point feature histograms (Rusu, Blodow & Beetz 2009) say how the surface bends around each point, whatever the
-frame. Points whose histograms are each other's nearest are tentative partners; triples of partners propose motions,
-and the one that the partners agree with best wins. Draws are seeded and each sum has one order, so the same surfaces
-give the same motion, bit for bit.
+Surfaces need no first guess: fast point feature histograms (FPFH; Rusu, Blodow & Beetz 2009) say how the surface bends
+around each point, whatever the frame. Points whose histograms are each other's nearest are tentative partners; triples
+of partners propose motions, the one that the partners agree with best wins (RANSAC), and ICP refines it. Draws are
+seeded and each sum has one order, so the same surfaces give the same motion, bit for bit.
 """
 
 from dataclasses import dataclass
@@ -24,6 +24,22 @@ _EDGE_RATIO = 0.9
 _ICP_STEPS = 30
 # Motions judged at once: bounds the memory.
 _BLOCK = 200
+
+
+def align_points(points: Array, targets: Array, weights: Array | None = None) -> Array:
+    """(..., 4, 4) the rigid motions that bring points (..., N, 3) closest to their targets (..., N, 3).
+
+    Least squares, by singular values (Arun, Huang & Blostein 1987).
+
+    Args:
+        weights: (N,) on the squares of each; all count alike unless stated.
+    """
+    share = np.full(points.shape[-2], 1.0) if weights is None else weights
+    share = (share / share.sum())[:, None]
+    middle, there = ((share * x).sum(axis=-2) for x in (points, targets))
+    across = np.swapaxes(share * (targets - there[..., None, :]), -1, -2) @ (points - middle[..., None, :])
+    R = frames.nearest_rotation(across)
+    return frames.make(R, there - (R @ middle[..., None])[..., 0])
 
 
 @dataclass(frozen=True)
@@ -76,7 +92,7 @@ def register_ransac(source: FeaturedSurface, target: FeaturedSurface, reach: flo
     a, b = source.points[own], target.points[other]
     triples = np.random.default_rng(seed).integers(len(a), size=(draws, _MIN_SAMPLE))
     triples = triples[_same_shape(a[triples], b[triples])]
-    T = _least_squares_motions(a[triples], b[triples])
+    T = align_points(a[triples], b[triples])
     moved = a[triples] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
     T = T[np.linalg.norm(moved - b[triples], axis=2).max(axis=1, initial=0.0) < reach]
     return np.asarray(T[np.argmin(_msac_costs(T, a, b, reach))]) if len(T) else np.eye(4)
@@ -148,17 +164,6 @@ def _same_shape(a: Array, b: Array) -> NDArray[np.bool_]:
     """Whether the edges of triples a and b (K, 3, 3) have the same length."""
     edges = [np.linalg.norm(triples - np.roll(triples, 1, axis=1), axis=2) for triples in (a, b)]
     return np.asarray((np.minimum(*edges) > _EDGE_RATIO * np.maximum(*edges)).all(axis=1))
-
-
-def _least_squares_motions(a: Array, b: Array) -> Array:
-    """(K, 4, 4) that bring points a (K, n, 3) onto b in least squares (Arun, Huang & Blostein 1987)."""
-    from_a, from_b = (points - points.mean(axis=1, keepdims=True) for points in (a, b))
-    u, _, vt = np.linalg.svd(np.swapaxes(from_a, 1, 2) @ from_b)
-    vt[:, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
-    T = np.tile(np.eye(4), (len(a), 1, 1))
-    T[:, :3, :3] = np.swapaxes(u @ vt, 1, 2)
-    T[:, :3, 3] = b.mean(axis=1) - np.einsum("kij,kj->ki", T[:, :3, :3], a.mean(axis=1))
-    return T
 
 
 def _msac_costs(T: Array, a: Array, b: Array, reach: float) -> Array:

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from stitch import frames
+from stitch.closed_form.feature_matching import align_points
 from stitch.errors import InputError
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.scan import prepare_scan
@@ -252,12 +253,10 @@ def _largest_matchings(arrangement: _Arrangement, view: ViewBalls, kinds: Indice
 def _matching_motion(
     arrangement: _Arrangement, view: ViewBalls, matching: Sequence[tuple[int, int]]
 ) -> tuple[Array, float]:
-    """T_arrangement_scanner (4, 4) of a way and the rms distance that it leaves (Arun, Huang & Blostein 1987)."""
+    """T_arrangement_scanner (4, 4) of a way and the rms distance that it leaves."""
     own, other = view.centres[[b for b, _ in matching]], arrangement.places[[k for _, k in matching]]
-    a, b = own - own.mean(axis=0), other - other.mean(axis=0)
-    R = frames.nearest_rotation(b.T @ a)
-    left = float(np.sqrt(np.mean(np.sum((b - a @ R.T) ** 2, axis=1))))
-    return frames.make(R, other.mean(axis=0) - R @ own.mean(axis=0)), left
+    T = align_points(own, other)
+    return T, float(np.sqrt(np.mean(np.sum((other - frames.transform(T, own)) ** 2, axis=1))))
 
 
 def _rotation_agrees(arrangement: _Arrangement, views: Sequence[ViewBalls], v: int, T: Array) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stitch import frames
+from stitch.closed_form.feature_matching import align_points
 from stitch.errors import InputError
 from stitch.frames import Array, Mask
 from stitch.measurement.session import RangeImage, Sighting
@@ -412,11 +413,9 @@ def _consistent_corners(placed: PlacedBoard) -> PlacedBoard:
 
 
 def _drawing_deviation(placed: PlacedBoard) -> Array:
-    """(K,) distance from the drawing in sigmas under the rigid motion that fits best (Arun et al. 1987)."""
-    weight = (placed.sigma**-2)[:, None]
-    a, b = (x - (weight * x).sum(axis=0) / weight.sum() for x in (placed.drawing, placed.points))
-    R = frames.nearest_rotation(b.T @ (weight * a))
-    return np.asarray(np.linalg.norm(b - a @ R.T, axis=1) / placed.sigma)
+    """(K,) distance from the drawing in sigmas under the rigid motion that fits best."""
+    drawn = frames.transform(align_points(placed.drawing, placed.points, placed.sigma**-2), placed.drawing)
+    return np.asarray(np.linalg.norm(placed.points - drawn, axis=1) / placed.sigma)
 
 
 def _sum_of_squares(placed: PlacedBoard) -> tuple[float, int]:

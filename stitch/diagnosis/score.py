@@ -24,7 +24,7 @@ from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.observations.linear_model import LinearModel
 from stitch.stages.results import linearise
 from stitch.statistics.distributions import chi2_limit, f_tail
-from stitch.statistics.parameter_selection import log_mixture
+from stitch.statistics.parameter_selection import log_evidence, log_mixture
 from stitch.statistics.reml import at_variances, fit_variances
 from stitch.statistics.variance_posterior import satterthwaite
 from stitch.system.threads import parallel
@@ -115,9 +115,7 @@ def gain_at_null(linear: LinearModel, form: Form, white: Array) -> Gain:
     told, b = white.T @ white, white.T @ linear.white_residual
     shares = regime_of(linear).scales
     scales = np.array(list(shares))
-    information = np.eye(len(b)) + scales[:, None, None] ** 2 * told
-    squares = scales**2 * (np.linalg.solve(information, np.tile(b[:, None], (len(scales), 1, 1)))[..., 0] @ b)
-    found = 0.5 * (squares - np.linalg.slogdet(information)[1])
+    found = log_evidence(scales[:, None, None] ** 2 * told, scales[:, None] * b)
     return Gain(log_mixture(found, shares), float(scales[(found + np.log(list(shares.values()))).argmax()]))
 
 

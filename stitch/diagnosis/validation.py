@@ -14,6 +14,7 @@ from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.statistics.distributions import chi2_tail, normal_tail
 from stitch.statistics.folds import JointEnd, halves_of
 from stitch.statistics.least_squares import column_space, mean_square_share
+from stitch.statistics.parameter_selection import log_evidence
 
 # Whether a candidate helps where nothing was measured: at ends of joints' ranges that were left out.
 #
@@ -262,6 +263,10 @@ class _HalfEvidence:
         precision = self.information + np.diag(prior**-2)
         return np.asarray(np.linalg.solve(precision, self.vector), float), precision
 
+    def log_evidence(self, precision: Array, mean: Array | None = None) -> float:
+        """Log of the likelihood over that of no effect, averaged over a normal prior."""
+        return float(log_evidence(self.information, self.vector, precision, mean))
+
 
 def validate_in_halves(scored: Score) -> Halves | None:
     """The best form of a candidate, and all its forms, in halves of the views; None where pose errors have no prior."""
@@ -300,19 +305,9 @@ def _predictive_factor(scored: Score, base: LinearModel, chosen_in: Array, teste
         [_half_evidence(base, chosen_in, form) for form in forms],
         [scored.scale * form.sizes for form in forms],
     )
-    best = max(range(len(forms)), key=lambda i: _log_predictive_gain(seen[i], 0 * priors[i], np.diag(priors[i] ** -2)))
+    best = max(range(len(forms)), key=lambda i: seen[i].log_evidence(np.diag(priors[i] ** -2)))
     mean, precision = seen[best].fitted(priors[best])
-    return _log_predictive_gain(_half_evidence(base, tested_in, forms[best]), mean, precision)
-
-
-def _log_predictive_gain(seen: _HalfEvidence, mean: Array, precision: Array) -> float:
-    """Log of the likelihood over that of no effect, averaged over a normal prior."""
-    scale = 1 / np.sqrt(np.diag(precision))
-    units = np.outer(scale, scale)
-    P, told, v, m = precision * units, seen.information * units, seen.vector * scale, mean / scale
-    pull = v + P @ m
-    square = pull @ np.linalg.solve(told + P, pull) - m @ P @ m
-    return float(0.5 * square - 0.5 * (np.linalg.slogdet(told + P)[1] - np.linalg.slogdet(P)[1]))
+    return _half_evidence(base, tested_in, forms[best]).log_evidence(precision, mean)
 
 
 def _size_consistency(a: _HalfEvidence, b: _HalfEvidence, sizes: Array) -> float:

@@ -29,6 +29,7 @@ from stitch.observations.pose_errors import DRIFT_MEMORY
 from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.statistics.distributions import chi2_tail, f_tail
 from stitch.statistics.least_squares import column_space
+from stitch.statistics.parameter_selection import log_evidence
 from stitch.statistics.reml import NOISE, at_variances
 
 # Some of the views, as one who knows nothing of the others sees them.
@@ -201,11 +202,7 @@ def _log_predictive_ratio(A: Array, y: Array, B: Array, w: Array) -> float:
     """Log likelihood ratio of w = B·x for what y = A·x tells of x, over none."""
     mean = np.asarray(np.linalg.lstsq(A, y, rcond=None)[0], float)
     precision = A.T @ A + np.diag((_PRIOR_WIDTH * np.abs(mean) + _MIN_PRIOR_SIGMA) ** -2.0)
-    information, vector = B.T @ B, B.T @ w
-    both = precision + information
-    pull = vector + precision @ mean
-    square = pull @ np.linalg.solve(both, pull) - mean @ precision @ mean
-    return float(0.5 * square - 0.5 * (np.linalg.slogdet(both)[1] - np.linalg.slogdet(precision)[1]))
+    return float(log_evidence(B.T @ B, B.T @ w, precision, mean))
 
 
 # Orthogonal matching pursuit over addends of one or several columns (Pati, Rezaiifar & Krishnaprasad 1993, ACSSC;

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch import frames
+from stitch.closed_form.feature_matching import align_points
 from stitch.detection.balls import ball_sightings
 from stitch.detection.boards import Board, PlacedBoard, board_sightings, boards_in
 from stitch.errors import InputError, NoResultError
@@ -48,12 +48,8 @@ def _relative_motion(first: Sighting, second: Sighting) -> Array | None:
     if len(common) < _FEWEST:
         return None
     a, b = (s.points[[s.targets.index(name) for name in common]] for s in (first, second))
-    from_a, from_b = a - a.mean(axis=0), b - b.mean(axis=0)
-    extent = np.linalg.svd(from_a, compute_uv=False)
-    if extent[1] < _LINE * extent[0]:
-        return None
-    R = frames.nearest_rotation(from_a.T @ from_b)
-    return frames.make(R, a.mean(axis=0) - R @ b.mean(axis=0))
+    extent = np.linalg.svd(a - a.mean(axis=0), compute_uv=False)
+    return None if extent[1] < _LINE * extent[0] else align_points(b, a)
 
 
 _METRES_PER_MM = 1e-3

@@ -20,7 +20,7 @@ from stitch.observations.targets.target_model import TargetModelFit
 from stitch.stages.register_and_fuse import FittedRig, per_view_rms
 from stitch.stages.target_fit import FittedSession
 from stitch.statistics.distributions import chi2_tail, f_tail
-from stitch.statistics.least_squares import significantly_smaller
+from stitch.statistics.least_squares import equilibrated, significantly_smaller
 from stitch.units import length_text
 
 # Whether an arm that another session showed holds in this one: what it leaves beside what the nominal arm leaves.
@@ -270,6 +270,5 @@ def _displaced_targets(there: TargetModelFit, here: TargetModelFit) -> tuple[flo
 
 def _mahalanobis_square(apart: Array, covariance: Array) -> float:
     """dᵀ C⁻¹ d; a direction that is known exactly counts nothing."""
-    unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    inverse = np.linalg.pinv(covariance / np.outer(unit, unit), rcond=1e-9, hermitian=True)
-    return float((apart / unit) @ inverse @ (apart / unit))
+    scaled, unit = equilibrated(covariance)
+    return float((apart * unit) @ np.linalg.pinv(scaled, rcond=1e-9, hermitian=True) @ (apart * unit))

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch import frames
+from stitch.closed_form.feature_matching import align_points
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.integrity.conventions import RelativeScans, rank_hypotheses
@@ -23,7 +24,6 @@ from stitch.observations.targets.outliers import LIMIT_TARGET, drop_mislabelled,
 from stitch.observations.targets.rows import (
     COMPARED_TARGETS,
     distance_sigma,
-    fit_rigid_motion,
     target_distances,
     target_positions,
 )
@@ -265,7 +265,7 @@ def _hypotheses_to_try(session: Session, capture: Capture, length: float) -> Ite
 
 
 def _sensor_motions(capture: Capture) -> RelativeScans:
-    """Motions of the sensor between views that share three targets or more, by least squares (Kabsch 1976)."""
+    """Motions of the sensor between views that share three targets or more, by least squares."""
     s = capture.sightings
     assert s is not None
     views, pairs, T = len(s.points), [], []
@@ -277,7 +277,7 @@ def _sensor_motions(capture: Capture) -> RelativeScans:
         spread = np.linalg.svd(a - a.mean(axis=0), compute_uv=False)
         if spread[1] > _LINE * spread[0]:
             pairs.append((v, w))
-            T.append(fit_rigid_motion(b, a))
+            T.append(align_points(b, a))
     return RelativeScans(tuple(pairs), np.array(T).reshape(-1, 4, 4))
 
 

@@ -15,10 +15,10 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model, term_of
 from stitch.observations.pose_errors import DRIFT_MEMORY, PoseErrors, drift_kernel, prior_pose_errors, usual_twist
 from stitch.observations.surfaces.effect_columns import view_responses
-from stitch.observations.surfaces.view_poses import UnconstrainedPoses, visible_directions
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.statistics.distributions import f_limit, f_tail
 from stitch.statistics.kernels import process_covariance
-from stitch.statistics.least_squares import column_space, summed_squares
+from stitch.statistics.least_squares import column_space, equilibrated, summed_squares
 from stitch.statistics.reml import MixedModel, VarianceFit, fit_variances
 
 # Combinations of parameters weaker than this share of the strongest are not seen.
@@ -105,8 +105,7 @@ def view_model(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPos
         T_mount: (4, 4) hand-eye of the model poses from which `freed.twists` are counted.
     """
     g = unconstrained.overlaps.gram
-    values, vectors, scale = visible_directions(g)
-    left = (vectors.T / scale[None, :]).reshape(len(values), g.views, 6).transpose(1, 0, 2)
+    left = (g.visible.vectors.T / g.visible.scale).reshape(-1, g.views, 6).transpose(1, 0, 2)
     to_centre = frames.make(np.eye(3), -g.centre)
     J = frames.adjoint(to_centre @ capture.hand_eye_frames(T_mount))
     carried = frames.adjoint(to_centre @ capture.T_reference_flange)
@@ -119,7 +118,7 @@ def view_model(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPos
         carried=np.linalg.inv(unit) @ carried,
         mounts=left @ J,
         mount_twists=np.linalg.inv(unit) @ J,
-        noise=np.diag(g.variance / values),
+        noise=np.diag(g.variance / g.visible.values),
         centre=g.centre,
         lever=lever,
     )
@@ -185,10 +184,10 @@ def test_alternative(under: Projector, columns: Array) -> AlternativeTest:
 
 def _pseudo_inverse(N: Array) -> tuple[Array, int]:
     """Pseudo-inverse and rank of a symmetric matrix whose units may differ."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(N), 1e-300))
-    values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
+    same_units, unit = equilibrated(N)
+    values, vectors = np.linalg.eigh(same_units)
     keep = values > SEEN * max(values[-1], 1e-300)
-    scaled = vectors[:, keep] * scale[:, None]
+    scaled = vectors[:, keep] * unit[:, None]
     return np.asarray((scaled / values[keep]) @ scaled.T), int(keep.sum())
 
 

@@ -27,7 +27,7 @@ from stitch.observations.surfaces.view_poses import SAMPLES, UnconstrainedPoses
 from stitch.reading.clouds import read_cloud
 from stitch.reading.text_files import reason_of, require_file
 from stitch.runs.run import Run
-from stitch.statistics.least_squares import generalised_fit
+from stitch.statistics.least_squares import equilibrated, generalised_fit
 from stitch.statistics.reml import NOISE, USUAL_NOISE_FACTOR, at_variances, fit_variances
 from stitch.statistics.variance_posterior import mean_variances
 from stitch.units import METRES, angle_text, length_text
@@ -504,9 +504,9 @@ def _shares_of(sources: dict[str, Array], covariance: Array) -> dict[str, float]
 
     The hand-eye is what the first six rows of all these covariances are of.
     """
-    scale = np.sqrt(np.diag(covariance)[:6])
-    unit = np.linalg.inv(covariance[:6, :6] / scale / scale[:, None])
-    return {name: float(np.sum(unit * (own[:6, :6] / scale / scale[:, None]))) / 6 for name, own in sources.items()}
+    scaled, unit = equilibrated(covariance[:6, :6])
+    weight = np.linalg.inv(scaled) * np.outer(unit, unit)
+    return {name: float(np.sum(weight * own[:6, :6])) / 6 for name, own in sources.items()}
 
 
 # How large errors of planned views would be found: what they would see is drawn, and fitted as a run fits it.

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from stitch.frames import Array
+from stitch.statistics.least_squares import equilibrated
 
 # Precision of ten plausible sizes: a rival may take each of its parameters that large.
 RIDGE = 0.01
@@ -88,9 +89,9 @@ def separations(normal: Array, own: slice, rival: slice) -> Array:
     ridge = np.where((rest >= rival.start) & (rest < rival.stop), RIDGE, 0.0)
     free = normal[..., rest[:, None], rest] + np.diag(ridge)
     across = normal[..., rest[:, None], np.arange(own.start, own.stop)]
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(free, axis1=-2, axis2=-1), 1e-300))
-    inverse = np.linalg.pinv(free * scale[..., :, None] * scale[..., None, :], rcond=1e-12, hermitian=True)
-    scaled = across * scale[..., :, None]
+    same_units, unit = equilibrated(free)
+    inverse = np.linalg.pinv(same_units, rcond=1e-12, hermitian=True)
+    scaled = across * unit[..., :, None]
     imitated = np.einsum("...ap,...ab,...bp->...p", scaled, inverse, scaled)
     left = np.diagonal(normal[..., own, own], axis1=-2, axis2=-1) - imitated
     return np.asarray(np.maximum(left, 0.0))

@@ -29,6 +29,7 @@ from stitch.planning.expected_model import (
     thinned_surface,
 )
 from stitch.planning.information import TwistChannel, noise_of, separations
+from stitch.statistics.least_squares import equilibrated
 from stitch.system.threads import library_threads_off
 
 # All views that a plan may hold, with what they would say of the hand-eye and of rival effects.
@@ -133,10 +134,9 @@ class HalvedHandEye:
 
     def U(self, normal: Array) -> Array:
         """(...) of normal matrices (..., q, q)."""
-        scale = 1 / np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), 1e-300))
-        scaled = normal * scale[..., :, None] * scale[..., None, :]
+        scaled, unit = equilibrated(normal)
         inverse = np.linalg.inv(scaled + _OPEN * np.eye(normal.shape[-1]))
-        covariance = (inverse * scale[..., :, None] * scale[..., None, :])[..., :6, :6]
+        covariance = (inverse * unit[..., :, None] * unit[..., None, :])[..., :6, :6]
         flat = covariance.reshape(-1, 6, 6)
         return np.array([displacement(C, self.middle) for C in flat]).reshape(covariance.shape[:-2])
 

@@ -33,6 +33,13 @@ def anderson_step(step: Array, last_step: Array, last_taken: Array) -> Array:
     return np.asarray(step + share * (last_taken + change))
 
 
+def equilibrated(matrix: Array) -> tuple[Array, Array]:
+    """Symmetric matrices (..., k, k) of unit diagonal, and the units (..., k) that make them: rows and columns times
+    these; unknowns count in rad, mm and per hour."""
+    unit = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
+    return matrix * unit[..., :, None] * unit[..., None, :], unit
+
+
 # How much more leaving out samples moves estimates than their covariance says (Efron & Stein 1981).
 
 # Fewer estimates say nothing about their spread.
@@ -49,9 +56,9 @@ def grouped_inflation(left_out: Array, covariance: Array) -> float:
     count = len(left_out)
     if count < _FEWEST:
         return 1.0
-    unit = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    centred = (left_out - left_out.mean(axis=0)) / unit
-    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    scaled, unit = equilibrated(covariance)
+    centred = (left_out - left_out.mean(axis=0)) * unit
+    values, vectors = np.linalg.eigh(scaled)
     keep = values > 1e-9
     squares = (count - 1) / count * ((centred @ vectors[:, keep]) ** 2).sum(axis=0) / values[keep]
     return float(max(1.0, squares.mean()))
@@ -74,11 +81,6 @@ class BlockLeastSquares:
     covariance: Array  # (B, m, m)
     precision: Array  # (k,) of the prior
     prior_vector: Array  # (k,) precision times the prior's middle
-
-    @cached_property
-    def scale(self) -> Array:
-        """(k,) equilibrates: parameters count in rad, mm and per hour."""
-        return np.asarray(1 / np.sqrt(np.maximum(np.diag(self.information) + self.precision, 1e-300)))
 
     @cached_property
     def weighted(self) -> Array:
@@ -106,19 +108,25 @@ class BlockLeastSquares:
             out = np.asarray(left_out, np.int64)
             M = M - _product(self.weighted[out], self.X[out])
             b = b - _product(self.weighted[out], self.z[out][..., None])[:, 0]
-        inverse = _inverse(M + np.diag(self.precision), self.scale)
-        return np.asarray(inverse @ (b + self.prior_vector))
+        return np.asarray(self._inverse(M) @ (b + self.prior_vector))
 
     def estimates_covariance(self) -> Array:
         """(k, k) of the estimates under the blocks' full covariance."""
         spread = np.einsum("bmk,bmn,bnl->kl", self.weighted, self.covariance, self.weighted, optimize=True)
-        inverse = _inverse(self.information + np.diag(self.precision), self.scale)
+        inverse = self._inverse(self.information)
         return np.asarray(inverse @ (spread + np.diag(self.precision)) @ inverse)
 
     def shift_by_errors(self, errors: Array) -> Array:
         """(k, q) how far errors (B, m, q) of the blocks, which nobody models, move the estimates."""
         pulls = np.einsum("bmk,bmq->kq", self.weighted, errors)
-        return np.asarray(_inverse(self.information + np.diag(self.precision), self.scale) @ pulls)
+        return np.asarray(self._inverse(self.information) @ pulls)
+
+    def _inverse(self, information: Array) -> Array:
+        """(k, k) of the information with the prior's; what nothing shows is zero in it."""
+        unit = equilibrated(self.information + np.diag(self.precision))[1]
+        units = np.outer(unit, unit)
+        scaled = (information + np.diag(self.precision)) * units
+        return np.asarray(np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) * units)
 
     def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
         """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""
@@ -128,10 +136,6 @@ class BlockLeastSquares:
 def _product(X: Array, Y: Array) -> Array:
     """(k, l) Σ_b XᵀY of (B, m, k) and (B, m, l)."""
     return np.asarray(X.reshape(-1, X.shape[2]).T @ Y.reshape(-1, Y.shape[2]))
-
-
-def _inverse(M: Array, scale: Array) -> Array:
-    return np.asarray(np.linalg.pinv(M * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale))
 
 
 @dataclass(frozen=True)
@@ -149,9 +153,8 @@ class GeneralisedFit:
 def generalised_fit(noise: Array, columns: Array, precision: Array) -> GeneralisedFit:
     """Columns (n, a) under noise of covariance (n, n), with a prior of a precision (a, a); units may be mixed."""
     weighted = cho_solve(cho_factor(noise, lower=True), columns)
-    M = columns.T @ weighted + precision
-    scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
-    covariance = np.linalg.inv(M * np.outer(scale, scale)) * np.outer(scale, scale)
+    scaled, unit = equilibrated(columns.T @ weighted + precision)
+    covariance = np.linalg.inv(scaled) * np.outer(unit, unit)
     return GeneralisedFit(np.asarray(covariance @ weighted.T), np.asarray(covariance))
 
 
@@ -170,11 +173,11 @@ def fit_columns(columns: Array, values: Array) -> Array:
 
 def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Array:
     """Minimum-norm solution of the symmetric system matrix·x = −vector, in scaled unknowns."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix * scale[:, None] * scale[None, :])
+    scaled, unit = equilibrated(matrix)
+    values, vectors = np.linalg.eigh(scaled)
     keep = values > relative * values[-1]
-    projected = vectors[:, keep].T @ (-vector * scale) / values[keep]
-    return np.asarray(scale * (vectors[:, keep] @ projected))
+    projected = vectors[:, keep].T @ (-vector * unit) / values[keep]
+    return np.asarray(unit * (vectors[:, keep] @ projected))
 
 
 def summed_squares(blocks: Array) -> Array:

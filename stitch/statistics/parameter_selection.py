@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import expit, logit, logsumexp
 
 from stitch.frames import Array, Indices, Mask
-from stitch.statistics.least_squares import project_out
+from stitch.statistics.least_squares import equilibrated, project_out
 
 # How large an amplitude may be over its plausible size: scales of a normal prior, and the share of belief in each.
 #
@@ -26,6 +26,24 @@ GROSS, _GROSS_SHARE = 30.0, 0.01
 PLAUSIBLE = {1.0: 1 - _GROSS_SHARE, GROSS: _GROSS_SHARE}
 # Of any size: what plausible sizes are is a guess.
 ANY_SIZE = dict.fromkeys((1.0, 3.0, 0.3, 0.1), (1 - _GROSS_SHARE) / 4) | {GROSS: _GROSS_SHARE}
+
+
+def log_evidence(information: Array, vector: Array, precision: Array | None = None, mean: Array | None = None) -> Array:
+    """(...) log of the likelihood, vᵀθ − ½ θᵀIθ, integrated over a normal prior of the amplitudes θ (..., k).
+
+    Args:
+        information: (..., k, k) I.
+        vector: (..., k) v.
+        precision: (k, k) of the prior; one unless stated.
+        mean: (k,) of the prior; zero unless stated.
+    """
+    # In units of the prior: amplitudes may differ by powers of ten.
+    P, unit = equilibrated(np.eye(vector.shape[-1]) if precision is None else precision)
+    m = np.zeros(len(unit)) if mean is None else mean / unit
+    both = information * np.outer(unit, unit) + P
+    pull = vector * unit + P @ m
+    square = np.sum(pull * np.linalg.solve(both, pull[..., None])[..., 0], axis=-1) - m @ P @ m
+    return np.asarray(0.5 * (square - np.linalg.slogdet(both)[1] + np.linalg.slogdet(P)[1]))
 
 
 def log_mixture(logs: Array, scales: dict[float, float]) -> float:
@@ -76,7 +94,7 @@ def select_supported(
     def gain(chosen: Sequence[int]) -> float:
         index = sorted({i for k in chosen for i in groups[k]})
         told, b = M[np.ix_(index, index)], v[index]
-        return log_mixture(np.array([_evidence(scale**2 * told, scale * b) for scale in PLAUSIBLE]), PLAUSIBLE)
+        return log_mixture(np.array([log_evidence(scale**2 * told, scale * b) for scale in PLAUSIBLE]), PLAUSIBLE)
 
     every = list(range(len(groups)))
     # Two joints may explain together what neither does alone: adding one by one never meets them, leaving out does.
@@ -90,12 +108,6 @@ def select_supported(
     out = np.zeros(len(sizes), bool)
     out[[i for k in chosen for i in groups[k]]] = True
     return out
-
-
-def _evidence(gram: Array, b: Array) -> float:
-    """Log likelihood ratio integrated over standard normal amplitudes, from MᵀM and Mᵀy."""
-    information = np.eye(len(b)) + gram
-    return float(0.5 * b @ np.linalg.solve(information, b) - 0.5 * np.linalg.slogdet(information)[1])
 
 
 def omitted_rms(whitened: WhitenedData, sizes: Array, fitted: Mask, effects: Indices) -> Array:

@@ -18,6 +18,7 @@ from scipy.optimize import minimize
 from scipy.special import betainc, betaln, expit
 
 from stitch.frames import Array, Mask
+from stitch.statistics.least_squares import equilibrated
 
 # A covariance in blocks: its inverse, its factor and its determinant.
 
@@ -251,15 +252,14 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
     white = flatten_blocks(inverse.half @ problem.X)
     white_z = np.matmul(inverse.half, mixed.z[..., None]).ravel()
     M = white.T @ white + np.diag(problem.precision)
-    # Equilibrate: columns count in rad, mm and per hour.
-    scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
-    own, of_information = _root_of_inverse(M * scale[:, None] * scale[None, :])
-    half = scale[:, None] * own
+    scaled, unit = equilibrated(M)
+    own, of_information = _root_of_inverse(scaled)
+    half = unit[:, None] * own
     mean = half @ (half.T @ (white.T @ white_z))
     rest = white_z - white @ mean
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
     square = float(rest @ rest) + float(mean @ (problem.precision * mean))
-    logdet = inverse.logdet + float(of_information - 2 * np.log(scale).sum()) + problem.offset
+    logdet = inverse.logdet + float(of_information - 2 * np.log(unit).sum()) + problem.offset
     value = logdet + square + log_prior(log_variances, mixed.further)[0]
     return Likelihood(problem, log_variances, value, mean, half, inverse, white=white, rest=rest)
 

@@ -24,7 +24,6 @@ from stitch.observations.surfaces.scanner_errors import (
     sum_smooth_errors,
     view_error_likelihood,
 )
-from stitch.observations.surfaces.view_poses import displacement_factors
 
 VIEWS = 12
 # What moves the points (N, 3) of view v, scanner frame, mm.
@@ -146,7 +145,7 @@ def test_where_the_iteration_ended_makes_no_error_of_the_scanner(sound: LinearMo
     poses follow most of what a scale does, so that a small step they still owe looks like hundreds of nats."""
     freed, rng = sound.observation.unconstrained, np.random.default_rng(0)
     g = freed.overlaps.gram
-    twists = short * rng.standard_normal((g.views, 6)) / displacement_factors(g)
+    twists = short * rng.standard_normal((g.views, 6)) / g.displacement_factors
 
     def moved(m: Match) -> Match:
         B = np.concatenate([np.cross(m.middle - g.centre, m.normal), m.normal], axis=1)

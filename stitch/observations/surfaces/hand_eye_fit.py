@@ -19,7 +19,7 @@ from stitch.measurement.capture import Capture
 from stitch.observations.linear_model import WHITE_COMPONENTS
 from stitch.observations.pose_errors import PoseErrors, white_scatter_only
 from stitch.observations.surfaces.normal_equations import Gram, pair_squares
-from stitch.observations.surfaces.view_poses import UnconstrainedPoses, visible_directions
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.statistics.folds import grouped_folds
 from stitch.statistics.least_squares import GeneralisedFit, column_space, generalised_fit, summed_squares
 from stitch.statistics.parameter_selection import WhitenedData
@@ -74,14 +74,14 @@ def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_fla
         T_reference_flange: (V, 4, 4) carries a twist of the flange into the reference frame: identity
             for eye_to_hand, T_base_flange for eye_in_hand.
     """
-    values, vectors, scale = visible_directions(g)
-    left = vectors.T / scale[None, :]
+    seen = g.visible
+    left = seen.vectors.T / seen.scale
     to_centre = frames.make(np.eye(3), -g.centre)
     response = left @ hand_eye_jacobian(hand_eye_frames, g.centre)
     carried = frames.adjoint(to_centre @ T_reference_flange)
     rotation, translation = (_unit_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6)))
-    expansion = scale[:, None] * vectors
-    z, noise = left @ twists.reshape(-1), np.diag(g.variance / values)
+    expansion = seen.scale[:, None] * seen.vectors
+    z, noise = left @ twists.reshape(-1), np.diag(g.variance / seen.values)
     return ReducedPoses(left, expansion, z, response, rotation, translation, noise)
 
 

@@ -13,7 +13,7 @@ from stitch import frames
 from stitch.frames import Array, Mask
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.matching import sample_points
-from stitch.observations.surfaces.normal_equations import Gram, Overlaps, assemble, collect_overlaps, next_gate
+from stitch.observations.surfaces.normal_equations import Gram, Overlaps, collect_overlaps, next_gate
 from stitch.statistics.least_squares import anderson_step
 
 # Views moved by one step of an iteration after another.
@@ -22,14 +22,9 @@ from stitch.statistics.least_squares import anderson_step
 LastStep = tuple[Array, Array] | None
 
 
-def displacement_factors(g: Gram) -> Array:
-    """(6,) factors that make a twist about the centre displacements: rotations count at the correspondences' lever."""
-    return np.array([max(g.lever, 1e-300)] * 3 + [1.0] * 3)
-
-
 def take_step(poses: Array, g: Gram, step: Array, last: LastStep) -> tuple[Array, LastStep]:
     """T_reference_scanner (V, 4, 4) after a step (V, 6) about the centre, which makes up for what the last one left."""
-    unit = displacement_factors(g)
+    unit = g.displacement_factors
     asked = (step * unit).ravel()
     taken = asked if last is None else anderson_step(asked, *last)
     to_centre = frames.make(np.eye(3), -g.centre)
@@ -68,12 +63,6 @@ def noise_floor(capture: Capture, overlaps: Overlaps, stated: float | None = Non
 SAMPLES = 1500
 _MAXIMUM_ITERATIONS = 12
 _CONVERGED = 5e-3
-# Directions of H weaker than this share of the strongest (as displacements) carry no evidence: what
-# little they have comes from the noise of the normals. Gap seen on real parts: 3e-4 (noise on a
-# sphere and a cone) against 5e-3 (their weakest true directions). Labelled points have no such bias: what they
-# see is known by their sigma, as long as the lever is not noise itself: a three-hundredth of the part's.
-_NEAR_NULL = 1e-3
-_NULL = 1e-5
 
 
 @dataclass(frozen=True)
@@ -114,33 +103,6 @@ def unconstrained_poses(capture: Capture, model_poses: Array, gate: float) -> Un
     return UnconstrainedPoses(poses, np.zeros((len(poses), 6)), overlaps).relative_to(model_poses)
 
 
-def visible_directions(g: Gram) -> tuple[Array, Array, Array]:
-    """Eigenvalues (n,), eigenvectors (6V, n) of the scaled H, and the scale (6V,).
-
-    Twists are scale · U · z: rotations count as displacements at the correspondences' lever.
-    """
-    scale = np.tile(1 / displacement_factors(g), g.views)
-    values, vectors = _dominant_eigenpairs(_scaled_hessian(g, ~g.labelled, scale), _NEAR_NULL)
-    if g.labelled.any():
-        targets = _scaled_hessian(g, g.labelled, scale)
-        basis = np.hstack([vectors, _target_only_directions(targets, vectors)])
-        values, within = np.linalg.eigh(basis.T @ ((vectors * values) @ vectors.T + targets) @ basis)
-        vectors = basis @ within
-    return values, vectors, scale
-
-
-def _target_only_directions(H: Array, vectors: Array) -> Array:
-    """(6V, k) orthonormal: what targets see of the directions in which surfaces, `vectors` (6V, n), see nothing.
-
-    A ball's centre sees its own surface turn no more than the two centres lie apart, which is noise.
-    """
-    unseen = np.linalg.svd(vectors, full_matrices=True)[0][:, vectors.shape[1] :]
-    if not unseen.shape[1]:
-        return unseen
-    values, within = np.linalg.eigh(unseen.T @ H @ unseen)
-    return np.asarray(unseen @ within[:, values > _NULL * np.linalg.eigvalsh(H)[-1]])
-
-
 def visible_step(g: Gram) -> Array:
     """(V, 6) Gauss–Newton step of all views in the directions that overlaps and targets see."""
     return -solve_views(g, g.vector[..., None]).reshape(-1, 6)
@@ -161,22 +123,10 @@ def solve_views(g: Gram, pair_vectors: Array) -> Array:
 
 def solve_view_sums(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:
     """(6V, K) the same where pulls on the views are given: (6V, K) of surfaces, and of labelled points."""
-    values, vectors, scale = visible_directions(g)
-    b, named = scale[:, None] * by_surfaces, scale[:, None] * by_targets
+    seen = g.visible
+    scale, vectors, by_normals = seen.scale[:, None], seen.vectors, seen.of_surfaces
+    b = scale * by_surfaces
     if g.labelled.any():
         # Where surfaces see nothing, their pull is noise of normals: there the targets' own counts alone.
-        seen = _dominant_eigenpairs(_scaled_hessian(g, ~g.labelled, scale), _NEAR_NULL)[1]
-        b = named + seen @ (seen.T @ b)
-    return np.asarray(scale[:, None] * (vectors @ ((vectors.T @ b) / values[:, None])))
-
-
-def _scaled_hessian(g: Gram, keep: Mask, scale: Array) -> Array:
-    """(6V, 6V) H of some pairs in scaled twists."""
-    return np.asarray(assemble(g, keep)[0] * scale[:, None] * scale[None, :])
-
-
-def _dominant_eigenpairs(H: Array, share: float) -> tuple[Array, Array]:
-    """Eigenvalues above a share of the largest, with their eigenvectors."""
-    values, vectors = np.linalg.eigh(H)
-    keep = values > share * values[-1]
-    return values[keep], vectors[:, keep]
+        b = scale * by_targets + by_normals @ (by_normals.T @ b)
+    return np.asarray(scale * (vectors @ ((vectors.T @ b) / seen.values[:, None])))

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
+from stitch.closed_form.feature_matching import align_points
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture, Sightings
 from stitch.measurement.measurement import Measurement
@@ -118,16 +119,11 @@ def initial_landmarks(own: Capture, T_mount: Array, drawing: Drawing | None = No
         # The middle of the turns against a first guess: medians of matrices lean.
         off = Rotation.from_matrix(turned @ first.T).as_rotvec()
         orientation = Rotation.from_rotvec(np.median(off, axis=0)).as_matrix() @ first
-    T = None if drawing is None else fit_rigid_motion(drawing.points, positions[drawing.target])
+    if drawing is None:
+        return Landmarks(positions, orientation)
+    seen = np.isfinite(positions[drawing.target]).all(axis=1)
+    T = align_points(drawing.points[seen], positions[drawing.target[seen]])
     return Landmarks(positions, orientation, drawing, T)
-
-
-def fit_rigid_motion(points: Array, targets: Array) -> Array:
-    """(4, 4) the rigid motion that brings points (N, 3) closest to targets (N, 3), least squares (Kabsch 1976)."""
-    known = np.isfinite(targets).all(axis=1)
-    a, b = points[known], targets[known]
-    R = frames.nearest_rotation((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
-    return frames.make(R, b.mean(axis=0) - R @ a.mean(axis=0))
 
 
 @dataclass(frozen=True)

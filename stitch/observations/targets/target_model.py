@@ -23,7 +23,7 @@ from stitch.observations.targets.rows import (
     target_rows,
 )
 from stitch.statistics.folds import JointEnd, grouped_folds, joint_ends
-from stitch.statistics.least_squares import BlockLeastSquares, independent
+from stitch.statistics.least_squares import BlockLeastSquares, equilibrated, independent
 from stitch.statistics.parameter_selection import UNSEEN
 from stitch.statistics.reml import fit_variances, whitener
 
@@ -139,8 +139,8 @@ class TargetTrial:
     def influential_views(self, coefficients: Array) -> Indices:
         """(n,) the views without which the coefficients would move most, to first order."""
         b = self.blocks
-        inverse = np.linalg.pinv(b.information * np.outer(b.scale, b.scale), rcond=1e-14, hermitian=True)
-        moves = b.residual_vectors(coefficients) * b.scale @ inverse
+        scaled, unit = equilibrated(b.information)
+        moves = b.residual_vectors(coefficients) * unit @ np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
         sizes = np.linalg.norm(moves[: len(self.rows.lever)], axis=1)
         return np.asarray(np.argsort(-sizes, kind="stable")[:_CARRIERS], np.int64)
 
