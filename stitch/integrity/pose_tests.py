@@ -66,7 +66,7 @@ def step_columns(model: ViewModel, start: int, moved: str) -> Array:
 
 
 def likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody, int], tests: int) -> PoseStep:
-    """The likelier one of a step of the part and one of the scanner, with its size.
+    """Return the likelier one of a step of the part and one of the scanner, with its size.
 
     Args:
         columns: (n, K) of what else there is.
@@ -83,24 +83,17 @@ def likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody,
     under = projector(model, model.fit(own[likelier]), columns)
     tested = test_alternative(under, displaced)
     carried = model.mount_twists[start:] if likelier == "scanner" else np.eye(6)[None]
-    least = [rotation_shift_lower_bounds(tested, under.degrees, own) for own in carried]
-    turn, shift = np.median(least, axis=0)
-    at_least = (float(turn) / model.lever, float(shift))
-    return PoseStep(start, likelier, told, _median_size(carried @ tested.estimate, model.lever), at_least, p)
+    moved = (carried @ tested.estimate).reshape(-1, 2, 3)
+    sizes = np.linalg.norm(moved, axis=2), [rotation_shift_lower_bounds(tested, under.degrees, own) for own in carried]
+    (turn, shift), (least_turn, least_shift) = (np.median(size, axis=0).tolist() for size in sizes)
+    size, at_least = (turn / model.lever, shift), (least_turn / model.lever, least_shift)
+    return PoseStep(start, likelier, told, size, at_least, p)
 
 
-def _median_size(moved: Array, lever: float) -> DisplacementSize:
-    """Return the median size of twists (S, 6), rotations in 1/lever."""
-    turn, shift = (float(np.median(np.linalg.norm(half, axis=1))) for half in (moved[:, :3], moved[:, 3:]))
-    return turn / lever, shift
-
-
-# Blunders among the poses of the views: how many, which, and whether all from one on moved together.
-#
-# Single views: generalised extreme Studentised deviate (Rosner 1983, Technometrics 25:165). The most deviant view is
+# Single blunders: generalised extreme Studentised deviate (Rosner 1983, Technometrics 25:165). The most deviant view is
 # let go, the scatter estimated anew, and so on; the number of blunders is the largest count whose last one is
-# significant, so that several cannot hide in the scatter which they inflate. What all views from one on have in common
-# is a step (`steps.py`); beside it single ones are sought anew.
+# significant, so that several cannot hide in the scatter which they inflate. Beside a step, which all views from one on
+# have in common, single ones are sought anew.
 
 # Chance that a session without blunders loses a view.
 FAMILY_WISE = 0.01
@@ -131,42 +124,14 @@ class BlunderSearch:
 
 
 def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequence[PoseStep] = ()) -> BlunderSearch:
-    """Blunders among the views of a model.
+    """Find blunders among the views of a model.
 
     Args:
         excluded: views that are known to be off: they stay free and are not counted.
         steps: what all views from one on have in common.
     """
-    return _rosner(model, free_view_columns(model, excluded, steps), excluded)
-
-
-def find_unlinked_blunders(
-    model: ViewModel, excluded: Sequence[int], unlinked: Sequence[int], steps: Sequence[PoseStep] = ()
-) -> list[Blunder]:
-    """Return the unlinked views that the scatter of all others does not explain."""
-    out = []
-    for v in unlinked:
-        p = leave_one_out_test(
-            model, free_view_columns(model, [*excluded, *(w for w in unlinked if w != v)], steps), v
-        )[1]
-        p = min(1.0, model.count * p)
-        if p < FAMILY_WISE:
-            out.append(Blunder(v, p))
-    return out
-
-
-def free_view_columns(model: ViewModel, excluded: Sequence[int], steps: Sequence[PoseStep]) -> Array | None:
-    """(n, K) of views that stay free, and of steps."""
-    columns = model.columns(excluded)
-    for step in steps:
-        columns = hstack_columns(columns, step.columns(model))
-    return columns
-
-
-def _rosner(model: ViewModel, first: Array | None, excluded: Sequence[int]) -> BlunderSearch:
-    """Single blunders on top of columns that are in the mean already."""
     freed: list[Blunder] = []
-    columns, states = first, list[tuple[VarianceFit, Array | None, Projector]]()
+    columns, states = free_view_columns(model, excluded, steps), list[tuple[VarianceFit, Array | None, Projector]]()
     most = max(int(_MAX_BLUNDER_SHARE * model.count) - len(excluded), 0)
     significant = 0
     while True:
@@ -177,7 +142,7 @@ def _rosner(model: ViewModel, first: Array | None, excluded: Sequence[int]) -> B
         if len(freed) >= most or len(freed) >= significant + _MASKING_DEPTH or under.degrees < 12:
             break
         tests = {v: test_alternative(under, model.views[v]) for v in rest}
-        likely = sorted(rest, key=lambda v: (tests[v].p_value, -tests[v].statistic))[:_LEAVE_ONE_OUT_COUNT]
+        likely = sorted(rest, key=lambda v: tests[v].rank)[:_LEAVE_ONE_OUT_COUNT]
         # Either test alone holds its level; together they were seen to stay below it (docs/integrity.md).
         chance = {v: min(tests[v].p_value, leave_one_out_test(model, columns, v)[1]) for v in likely}
         worst = min(likely, key=lambda v: chance[v])
@@ -190,13 +155,29 @@ def _rosner(model: ViewModel, first: Array | None, excluded: Sequence[int]) -> B
     return BlunderSearch(tuple(freed[:significant]), fit, columns, under)
 
 
-# From which view on the part or the scanner sits elsewhere: clamped anew, knocked, its mount re-seated.
-#
-# Under one hand-eye for all views every change point in the order of time is tested, for the part and for the scanner,
-# as a displacement that all views from there on share: Baarda's test as for single views, an F since the scatter comes
-# from the same data, times the number of tests (Bonferroni). What drifts, warms up, remembers or follows
-# the pose is no step, so the scatter holds all by which poses of a good session may err, in sizes that these views
-# show.
+def find_unlinked_blunders(
+    model: ViewModel, excluded: Sequence[int], unlinked: Sequence[int], steps: Sequence[PoseStep] = ()
+) -> list[Blunder]:
+    """Return the unlinked views that the scatter of all others does not explain."""
+    out = []
+    for v in unlinked:
+        others = [*excluded, *(w for w in unlinked if w != v)]
+        p = model.count * leave_one_out_test(model, free_view_columns(model, others, steps), v)[1]
+        if p < FAMILY_WISE:
+            out.append(Blunder(v, p))
+    return out
+
+
+def free_view_columns(model: ViewModel, excluded: Sequence[int], steps: Sequence[PoseStep]) -> Array | None:
+    """(n, K) of views that stay free, and of steps."""
+    own = [model.columns(excluded), *(step.columns(model) for step in steps)]
+    return hstack_columns(*own) if len(excluded) or steps else None
+
+
+# Steps: under one hand-eye for all views every change point in the order of time is tested, for the part and for the
+# scanner, as a displacement that all views from there on share: Baarda's test as for single views, an F since the
+# scatter comes from the same data, times the number of tests (Bonferroni). What drifts, warms up, remembers or follows
+# the pose is no step, so the scatter holds all by which poses of a good session may err, in sizes that they show.
 
 # That a session without a step shows one. What an arm does wrong where its poses change their kind is a step to a list
 # without joint angles: at nine equal poses three of four measured objects show the same one, at p of 0.006 to 0.06.
@@ -233,7 +214,7 @@ def find_steps(
 
 @dataclass(frozen=True)
 class _Pick:
-    """Return what explains most beside what was picked before: a step, or a single view that is off."""
+    """What explains most beside what was picked before: a step, or a single view that is off."""
 
     columns: Array  # (n, 6)
     p_value: float
@@ -242,101 +223,71 @@ class _Pick:
 
 
 def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple[list[PoseStep], Array | None]:
-    """Steps on top of columns that are in the mean already, and all columns with them and with single views.
+    """Find steps on top of columns that are in the mean already; return all columns with them and with single views.
 
     As with single views (Rosner 1983) the search goes on beside what does not stand out yet: what is moved there and
     back are two steps, and each hides in the scatter that the other makes, as a step does beside one view far off.
     """
+
+    def beside(some: Sequence[_Pick]) -> Array | None:
+        return hstack_columns(first, *(pick.columns for pick in some)) if some else first
+
     picked, significant = list[_Pick](), 0
-    while (
-        model.count >= _MIN_VIEWS_FOR_STEP
-        and len(picked) < significant + _MAX_STEPS
-        and len(_step_starts(picked)) < _MAX_STEPS
-    ):
-        pick = _next_pick(model, _with_picked_columns(first, picked), _step_starts(picked))
+    while model.count >= _MIN_VIEWS_FOR_STEP and len(picked) < significant + _MAX_STEPS:
+        taken = [pick.starts for pick in picked if pick.starts is not None]
+        pick = _next_pick(model, beside(picked), taken) if len(taken) < _MAX_STEPS else None
         if pick is None:
             break
+        p = pick.p_value
+        if len(picked) > significant:
+            # Each of the last two may hide in the scatter that the other makes, and then neither stands out alone.
+            columns, last = beside(picked[:-1]), picked[-1]
+            under = projector(model, model.fit(columns), columns)
+            both = test_alternative(under, hstack_columns(last.columns, pick.columns))
+            p = min(p, both.p_value * last.tests * pick.tests)
         picked.append(pick)
-        p = min(pick.p_value, _joint_p_value(model, first, picked)) if len(picked) > significant + 1 else pick.p_value
         significant = len(picked) if p < chance else significant
     picked = picked[:significant]
-    steps = []
-    for pick in picked:
-        if pick.starts is not None:
-            others = _with_picked_columns(first, [other for other in picked if other is not pick])
-            steps.append(likelier_step(model, others, pick.starts, _count_step_tests(model)))
+    steps = [
+        likelier_step(model, beside([other for other in picked if other is not pick]), pick.starts, pick.tests)
+        for pick in picked
+        if pick.starts is not None
+    ]
     # What was picked early may stand out no more beside the rest.
-    return [step for step in steps if step.p_value < chance], _with_picked_columns(first, picked)
-
-
-def _joint_p_value(model: ViewModel, first: Array | None, picked: Sequence[_Pick]) -> float:
-    """Chance of the last two: each may hide in the scatter that the other makes, and then neither stands out alone."""
-    *rest, one, other = picked
-    columns = _with_picked_columns(first, rest)
-    both = test_alternative(
-        projector(model, model.fit(columns), columns), np.column_stack([one.columns, other.columns])
-    )
-    return both.p_value * one.tests * other.tests
-
-
-def _step_starts(picked: Sequence[_Pick]) -> list[dict[MovedBody, int]]:
-    return [pick.starts for pick in picked if pick.starts is not None]
-
-
-def _with_picked_columns(first: Array | None, picked: Sequence[_Pick]) -> Array | None:
-    for pick in picked:
-        first = hstack_columns(first, pick.columns)
-    return first
+    return [step for step in steps if step.p_value < chance], beside(picked)
 
 
 def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[MovedBody, int]]) -> _Pick | None:
-    """The likeliest step, or the single view that is off, beside some columns; None where these leave no view."""
-    under = projector(model, model.fit(columns), columns)
-    starts = [
-        k
-        for k in range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
-        if k not in [k for own in taken for k in own.values()]
+    """Return the likeliest step, or single view that is off, beside some columns; None where these leave no view."""
+    under, mean = projector(model, model.fit(columns), columns), model.mixed(columns).A[0]
+    # What the orthonormal columns of the mean hold of a view says nothing more.
+    free = [
+        v
+        for v, own in enumerate(model.views)
+        if np.linalg.norm(own - mean @ (mean.T @ own)) >= _NEW_COLUMN_SHARE * np.linalg.norm(own)
     ]
+    if not free:
+        return None
+    every = range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
+    starts = [k for k in every if k not in [k for own in taken for k in own.values()]]
     tests = {
         (moved, k): test_alternative(under, step_columns(model, k, moved)) for moved in MOVED_BODIES for k in starts
     }
-    mean = model.mixed(columns).A[0]
-    alone = {v: test_alternative(under, own) for v, own in enumerate(model.views) if not _held_by_mean(own, mean)}
-    if not alone:
-        return None
-    view = min(alone, key=lambda v: (alone[v].p_value, -alone[v].statistic))
-    likelier = min(tests, key=lambda at: (tests[at].p_value, -tests[at].statistic))
-    if (alone[view].p_value, -alone[view].statistic) < (tests[likelier].p_value, -tests[likelier].statistic):
+    alone = {v: test_alternative(under, model.views[v]) for v in free}
+    view, likelier = min(alone, key=lambda v: alone[v].rank), min(tests, key=lambda at: tests[at].rank)
+    if alone[view].rank < tests[likelier].rank:
         return _Pick(model.views[view], alone[view].p_value * model.count, model.count)
     best = {moved: max(starts, key=lambda k: tests[moved, k].statistic) for moved in MOVED_BODIES}
     moved, start = likelier
-    return _Pick(
-        step_columns(model, start, moved),
-        tests[likelier].p_value * _count_step_tests(model),
-        _count_step_tests(model),
-        best,
-    )
-
-
-def _held_by_mean(columns: Array, mean: Array) -> bool:
-    """True if columns (n, 6) say nothing that a mean of orthonormal columns (n, K) does not hold."""
-    left = columns - mean @ (mean.T @ columns)
-    return bool(np.linalg.norm(left) < _NEW_COLUMN_SHARE * np.linalg.norm(columns))
-
-
-def _count_step_tests(model: ViewModel) -> int:
-    """How many steps are tested."""
-    return len(MOVED_BODIES) * (model.count - 2 * _MIN_VIEWS_AT_END + 1) * _MAX_STEPS
+    count = len(MOVED_BODIES) * len(every) * _MAX_STEPS
+    return _Pick(step_columns(model, start, moved), tests[likelier].p_value * count, count, best)
 
 
 def _akaike_criterion(model: ViewModel, columns: Array | None) -> float:
-    """Akaike's for few numbers (Hurvich and Tsai 1989): half of the views, let go, would leave no scatter."""
+    """Return Akaike's for few numbers (Hurvich and Tsai 1989): half of the views, let go, would leave no scatter."""
     count = len(model.z)
     taken = model.hand_eye.shape[1] + (0 if columns is None else columns.shape[1])
     return model.deviance(columns) + 2 * taken * count / (count - taken - 1) if count > taken + 1 else np.inf
-
-
-# Tests of the poses of all views: which one is off under the scatter of the others, and from where on all are.
 
 
 @dataclass(frozen=True)
@@ -347,14 +298,18 @@ class PoseTests:
     displaced: list[Blunder]  # stand off whatever the others scatter
     blunder_search: BlunderSearch  # the rest of them, under the scatter of the others
     steps: tuple[PoseStep, ...]
-    sure: set[int] = field(
-        default_factory=set
-    )  # of `off`, what effects of the arm do not explain in sizes that the others show
+    # Displaced views that effects of the arm do not explain in sizes that the others show.
+    sure: set[int] = field(default_factory=set)
 
     @property
     def excluded(self) -> list[int]:
         """Views that take no part in the tests of the others."""
         return [*self.unplaced, *(b.view for b in self.displaced)]
+
+    @property
+    def standing_off(self) -> list[int]:
+        """These, and single blunders under the scatter of the others."""
+        return [*self.excluded, *(b.view for b in self.blunder_search.blunders)]
 
 
 def pose_tests(
@@ -364,37 +319,31 @@ def pose_tests(
     usual: UsualEffects | None,
     chance: float = STEP_CHANCE,
 ) -> PoseTests:
-    """Single views off and steps; where there is a step, single views once more beside it.
+    """Find single views that are off and steps; where there is a step, single views once more beside it.
 
     Args:
         unlinked: views that nothing holds, and those that were placed by their surfaces.
-        usual: what may happen to views beside white scatter; of many views it takes minutes to hold it against a step.
+        usual: what may happen to views beside white scatter; in many views it takes minutes to test a step against it.
         chance: that a session without a step shows one.
     """
-    homeless, placed = unlinked
-    off = find_unlinked_blunders(model, homeless, placed)
-    found = find_blunders(model, [*homeless, *(b.view for b in off)])
-    erring = (
-        model
-        if usual is None or model.count >= MAX_VIEWS_WITH_EFFECTS
-        else model.with_errors(usual.errors(unconstrained))
-    )
-    steps = find_steps(erring, model.columns(homeless), (found.mean_columns, len(off) + len(found.blunders)), chance)
+    unplaced, placed = unlinked
+    off = find_unlinked_blunders(model, unplaced, placed)
+    found = find_blunders(model, [*unplaced, *(b.view for b in off)])
+    few = usual is not None and model.count < MAX_VIEWS_WITH_EFFECTS
+    erring = model.with_errors(usual.errors(unconstrained)) if usual is not None and few else model
+    steps = find_steps(erring, model.columns(unplaced), (found.mean_columns, len(off) + len(found.blunders)), chance)
     if steps:
         # A view at the step may stand for one of its sides.
-        off = find_unlinked_blunders(model, homeless, placed, steps)
-        found = find_blunders(model, [*homeless, *(b.view for b in off)], steps)
-    sure = find_unlinked_blunders(erring, homeless, [b.view for b in off], steps)
-    return PoseTests(homeless, off, found, steps, {b.view for b in sure})
-
-
-# Where views are expected beside steps: what a single one is off by does not hold what all from one on share.
-#
-# Across a step the hand-eye is a compromise, and every view stands off from it by its share of the step.
+        off = find_unlinked_blunders(model, unplaced, placed, steps)
+        found = find_blunders(model, [*unplaced, *(b.view for b in off)], steps)
+    sure = find_unlinked_blunders(erring, unplaced, [b.view for b in off], steps)
+    return PoseTests(unplaced, off, found, steps, {b.view for b in sure})
 
 
 def expected_poses(model: ViewModel, model_poses: Array, unconstrained: UnconstrainedPoses, tests: PoseTests) -> Array:
-    """Hand-eye and steps estimated together, without the views that stand off.
+    """Return where views are expected: hand-eye and steps estimated together, without the views that stand off.
+
+    Across a step the hand-eye alone is a compromise, and every view stands off from it by its share of the step.
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner from which the evidence is counted.
@@ -403,11 +352,10 @@ def expected_poses(model: ViewModel, model_poses: Array, unconstrained: Unconstr
     Returns:
         (V, 4, 4) T_reference_scanner.
     """
-    alone = [*tests.excluded, *(b.view for b in tests.blunder_search.blunders)]
+    alone = tests.standing_off
     moved = [_step_displacement(model, tests, alone, k) for k in range(len(tests.steps))]
     z = model.z - sum(step.columns(model) @ by for step, by in zip(tests.steps, moved, strict=True))
-    singles = model.columns(alone)
-    X = model.hand_eye if singles is None else np.column_stack([model.hand_eye, singles])
+    X = hstack_columns(model.hand_eye, model.columns(alone))
     CX = np.linalg.solve(model.mixed().covariance(tests.blunder_search.fit.variances)[0], X)
     twists = model.mount_twists @ least_squares(X.T @ CX, -CX.T @ z)[:6]
     for step, by in zip(tests.steps, moved, strict=True):
@@ -427,13 +375,10 @@ def _step_displacement(model: ViewModel, tests: PoseTests, excluded: list[int], 
     return displacement_lower_bound(test_alternative(under, tests.steps[k].columns(model)), under.degrees)
 
 
-# The smallest rotation of a view and the smallest shift of what it shows that its evidence admits.
-
-
 def least_displacement(
     model: ViewModel, found: BlunderSearch, others: list[int], steps: tuple[PoseStep, ...], view: int, middle: Array
-) -> tuple[float, float]:
-    """The smallest rotation (rad) and the smallest shift of a view's middle (length_unit) that may be its displacement.
+) -> DisplacementSize:
+    """Return the smallest displacement of a view's middle that its evidence admits.
 
     Args:
         found: the scatter of the poses.
@@ -443,13 +388,10 @@ def least_displacement(
     under = projector(model, found.fit, free_view_columns(model, others, steps))
     carried = np.eye(6)
     carried[3:, :3] = -frames.skew(middle - model.centre) / model.lever
-    turn, shift = rotation_shift_lower_bounds(
-        test_alternative(under, model.held_responses[view]), under.degrees, carried
-    )
+    tested = test_alternative(under, model.held_responses[view])
+    turn, shift = rotation_shift_lower_bounds(tested, under.degrees, carried)
     return turn / model.lever, shift
 
-
-# Do scanner and robot count lengths alike? The part would come out whole but of the wrong size, and fit itself.
 
 # No scanner in use is off by this share of its lengths, and no arm.
 _SCALE = 0.01
@@ -457,7 +399,9 @@ _LENGTH_CHANCE = 1e-4
 
 
 def length_problem(model: ViewModel, T_reference_mount: Array, further: Array | None = None) -> SessionProblem | None:
-    """The robot's lengths, tested as one factor on all its translations; None if they agree with the scans'.
+    """Test the robot's lengths as one factor on all its translations; None if they agree with the scans'.
+
+    Under a wrong one the part would come out whole but of the wrong size, and fit itself.
 
     Args:
         further: (n, K) columns of what was found beside: a factor must not explain what single views do.

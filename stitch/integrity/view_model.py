@@ -8,17 +8,24 @@ import numpy as np
 from scipy.optimize import brentq
 
 from stitch import frames
-from stitch.effects.contract import EFFECTS, EVERY_VIEW, Effect, missing_need
+from stitch.effects.contract import EFFECTS, EVERY_VIEW, missing_need
 from stitch.frames import Array
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model, term_of
+from stitch.observations.linear_model import with_pose_errors
 from stitch.observations.pose_errors import DRIFT_MEMORY, PoseErrors, drift_kernel, prior_pose_errors, usual_twist
 from stitch.observations.surfaces.effect_columns import view_responses
+from stitch.observations.surfaces.hand_eye_fit import (
+    ReducedPoses,
+    hand_eye_jacobian,
+    hand_eye_mixed_model,
+    reduce_poses,
+)
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.statistics.distributions import f_limit, f_tail
 from stitch.statistics.kernels import process_covariance
-from stitch.statistics.least_squares import column_space, equilibrated, summed_squares
+from stitch.statistics.least_squares import column_space, equilibrated
 from stitch.statistics.reml import MixedModel, VarianceFit, fit_variances
 
 # Combinations of parameters weaker than this share of the strongest are not seen.
@@ -30,45 +37,63 @@ _HELD_SHARE = 0.1
 
 @dataclass(frozen=True)
 class ViewModel:
-    """Linear evidence about the poses of V views: n visible directions."""
+    """What overlaps and targets say about the poses of V views: the n visible directions that diagnosis reads too."""
 
-    z: Array  # (n,)
-    hand_eye: Array  # (n, 6) response to a common correction of the hand-eye
-    views: Array  # (V, n, 6) response to a left twist of one view about `centre`, rotations in 1/lever
-    carried: Array  # (V, 6, 6) from a twist of the flange to that twist, rotations in 1/lever
-    mounts: Array  # (V, n, 6) response of one view to a correction of its own hand-eye
-    mount_twists: Array  # (V, 6, 6) the twist of a view that such a correction makes, rotations in 1/lever
-    noise: Array  # (n, n) covariance of the sensor noise within overlaps
+    reduced: ReducedPoses
+    mount_jacobians: Array  # (V, 6, 6) left twist of a view about `centre` that a correction of its hand-eye makes
     centre: Array  # (3,) reference frame
     lever: float  # length_unit: rotations about `centre` count as displacements at this distance
     usual: Array | None = None  # (n, n) covariance of what effects of the library may do
     errors: PoseErrors | None = None  # of the n numbers, beside white scatter, in sizes that the views show
 
     def with_usual(self, twists: Array) -> "ViewModel":
-        """The model of an arm that may have effects: twists (6V, P) of the views about the centre, rad and length."""
-        unit = np.array([self.lever] * 3 + [1.0] * 3)
-        columns = np.einsum("vni,vip->np", self.views, twists.reshape(self.count, 6, -1) * unit[:, None])
+        """Return the model of an arm that may have effects: twists (6V, P) of the views, rad and length_unit."""
+        columns = self.reduced.reduction @ twists
         return replace(self, usual=columns @ columns.T)
 
     def with_errors(self, errors: PoseErrors) -> "ViewModel":
-        """The model of poses that may err beside white scatter by twists about the centre, in rad and length."""
-        unit = np.array([self.lever] * 3 + [1.0] * 3)
-        return replace(self, errors=errors.project((self.views * unit).transpose(1, 0, 2).reshape(len(self.z), -1)))
+        """Return the model of poses that may err beside white scatter, by twists of the views."""
+        return replace(self, errors=errors.project(self.reduced.reduction))
+
+    @property
+    def z(self) -> Array:
+        """(n,) what was seen."""
+        return self.reduced.z
+
+    @property
+    def hand_eye(self) -> Array:
+        """(n, 6) response to a common correction of the hand-eye."""
+        return self.reduced.hand_eye
 
     @property
     def count(self) -> int:
         """Number of views."""
-        return len(self.views)
+        return len(self.mount_jacobians)
 
-    def mixed(self, further: Array | None = None) -> MixedModel:
-        """The model with further columns (n, K) in its mean, ready for restricted maximum likelihood."""
-        mean = self.hand_eye if further is None else np.column_stack([self.hand_eye, further])
-        usual = None if self.usual is None else self.usual[None]
-        A, components = column_space(mean, SEEN)[None], self._components
-        if self.errors is None:
-            return MixedModel(self.z[None], A, components, usual)
-        every = np.concatenate([components, self.errors.components[:, None]])
-        return MixedModel(self.z[None], A, every, usual, further=self.errors.prior)
+    @cached_property
+    def _blocks(self) -> Array:
+        """(V, n, 6) response to a left twist of one view, rad and length_unit."""
+        return self.reduced.reduction.reshape(-1, self.count, 6).transpose(1, 0, 2)
+
+    @property
+    def _unit(self) -> Array:
+        """(6,) by which twists with rotations in 1/lever become such."""
+        return np.array([1 / self.lever] * 3 + [1.0] * 3)
+
+    @cached_property
+    def views(self) -> Array:
+        """(V, n, 6) the same, rotations in 1/lever."""
+        return self._blocks * self._unit
+
+    @cached_property
+    def mounts(self) -> Array:
+        """(V, n, 6) response of one view to a correction of its own hand-eye."""
+        return np.asarray(self._blocks @ self.mount_jacobians)
+
+    @cached_property
+    def mount_twists(self) -> Array:
+        """(V, 6, 6) the twist of a view that such a correction makes, rotations in 1/lever."""
+        return self.mount_jacobians / self._unit[:, None]
 
     @cached_property
     def held_responses(self) -> Array:
@@ -77,18 +102,22 @@ class ViewModel:
         held = vectors * (values**2 > _HELD_SHARE)[:, :, None]
         return np.asarray(self.views @ held.transpose(0, 2, 1) @ vectors)
 
+    def mixed(self, further: Array | None = None) -> MixedModel:
+        """Return the model with further columns (n, K) in its mean, ready for restricted maximum likelihood."""
+        mean, usual = hstack_columns(self.hand_eye, further), None if self.usual is None else self.usual[None]
+        own = replace(self._alone, A=column_space(mean, SEEN)[None], fixed=usual)
+        return own if self.errors is None else with_pose_errors(own, self.errors)
+
     @cached_property
-    def _components(self) -> Array:
-        """(3, 1, n, n) covariances of unit scatter of the flange, rotation and translation, and of the noise."""
-        blocks = self.views @ self.carried
-        return np.array([*(summed_squares(b) for b in (blocks[:, :, :3], blocks[:, :, 3:])), self.noise])[:, None]
+    def _alone(self) -> MixedModel:
+        return hand_eye_mixed_model(self.reduced)
 
     def fit(self, further: Array | None = None) -> VarianceFit:
-        """Scatter of the poses (rotation², translation², noise factor) with further columns in the mean."""
+        """Fit the scatter of the poses (rotation², translation², noise factor) with further columns in the mean."""
         return fit_variances(self.mixed(further), both_starts=self.errors is not None)
 
     def deviance(self, further: Array | None = None) -> float:
-        """−2 log of the full likelihood of z with further columns in the mean, comparable between means."""
+        """Return −2 log of the full likelihood of z with further columns in the mean, comparable between means."""
         fit = self.fit(further)
         C = self.mixed(further).covariance(fit.variances)[0]
         return float(np.linalg.slogdet(C)[1] + self.z @ projector(self, fit, further).projected)
@@ -99,28 +128,17 @@ class ViewModel:
 
 
 def view_model(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses) -> ViewModel:
-    """The evidence of overlaps and targets about the poses of a capture.
+    """Reduce freed views to the evidence about their poses.
 
     Args:
-        T_mount: (4, 4) hand-eye of the model poses from which `freed.twists` are counted.
+        T_mount: (4, 4) hand-eye of the model poses from which the twists of the freed views are counted.
     """
-    g = unconstrained.overlaps.gram
-    left = (g.visible.vectors.T / g.visible.scale).reshape(-1, g.views, 6).transpose(1, 0, 2)
-    to_centre = frames.make(np.eye(3), -g.centre)
-    J = frames.adjoint(to_centre @ capture.hand_eye_frames(T_mount))
-    carried = frames.adjoint(to_centre @ capture.T_reference_flange)
-    lever = max(g.lever, 1e-300)
-    unit = np.diag([1 / lever] * 3 + [1.0] * 3)
+    g, mounts = unconstrained.overlaps.gram, capture.hand_eye_frames(T_mount)
     return ViewModel(
-        z=np.einsum("vni,vi->n", left, unconstrained.twists),
-        hand_eye=np.einsum("vni,vij->nj", left, J),
-        views=left @ unit,
-        carried=np.linalg.inv(unit) @ carried,
-        mounts=left @ J,
-        mount_twists=np.linalg.inv(unit) @ J,
-        noise=np.diag(g.variance / g.visible.values),
+        reduced=reduce_poses(g, unconstrained.twists, mounts, capture.T_reference_flange),
+        mount_jacobians=hand_eye_jacobian(mounts, g.centre).reshape(-1, 6, 6),
         centre=g.centre,
-        lever=lever,
+        lever=max(g.lever, 1e-300),
     )
 
 
@@ -136,20 +154,18 @@ class Projector:
 def projector(model: ViewModel, fit: VarianceFit, further: Array | None = None) -> Projector:
     """P for variances that were fitted, with further columns (n, K) in the mean."""
     mixed = model.mixed(further)
-    A = mixed.A[0]
-    C = mixed.covariance(fit.variances)[0]
+    A, C = mixed.A[0], mixed.covariance(fit.variances)[0]
     both = np.linalg.solve(C, np.column_stack([A, np.eye(len(C))]))
     CA, inverse = both[:, : A.shape[1]], both[:, A.shape[1] :]
     P = inverse - CA @ np.linalg.solve(A.T @ CA, CA.T)
     return Projector(P, P @ model.z, len(C) - A.shape[1])
 
 
-# Tests of one view's own displacement, or of a block's, under the scatter of the other poses.
-#
-# The per-view evidence of overlaps is linear: z = X ξ + Σ L_v δ_v + ε, with ξ the hand-eye, δ_v a displacement of view
-# v (left twist in the reference frame) and cov(ε) of pose scatter and sensor noise. With P = C⁻¹ − C⁻¹X(XᵀC⁻¹X)⁻¹XᵀC⁻¹,
-# the statistic of an alternative with columns G is T = uᵀN⁻¹u, u = GᵀPz, N = GᵀPG: χ² with rank(N) degrees of freedom,
-# with non-centrality δᵀNδ where a blunder δ is present (Baarda 1968; Teunissen, Testing Theory, 2000).
+# One view's own displacement, or a block's, is tested under the scatter of the other poses. The evidence is linear:
+# z = X ξ + Σ L_v δ_v + ε, with ξ the hand-eye, δ_v a displacement of view v (left twist in the reference frame) and
+# cov(ε) of pose scatter and sensor noise. With P = C⁻¹ − C⁻¹X(XᵀC⁻¹X)⁻¹XᵀC⁻¹, the statistic of an alternative with
+# columns G is T = uᵀN⁻¹u, u = GᵀPz, N = GᵀPG: χ² with rank(N) degrees of freedom, with non-centrality δᵀNδ where a
+# blunder δ is present (Baarda 1968; Teunissen, Testing Theory, 2000).
 
 
 @dataclass(frozen=True)
@@ -162,10 +178,15 @@ class AlternativeTest:
     estimate: Array  # (6,) displacement, rotations in 1/lever
     normal: Array  # (6, 6) N: non-centrality of a displacement δ is δᵀNδ
 
+    @property
+    def rank(self) -> tuple[float, float]:
+        """The less, the likelier it is: by chance, and where that is too small to be told, by the statistic."""
+        return self.p_value, -self.statistic
 
-def hstack_columns(columns: Array | None, more: Array) -> Array:
-    """(n, ·) columns with more of them, where there are any."""
-    return more if columns is None else np.column_stack([columns, more])
+
+def hstack_columns(*columns: Array | None) -> Array:
+    """(n, ·) those columns that there are, side by side."""
+    return np.hstack([own for own in columns if own is not None])
 
 
 def test_alternative(under: Projector, columns: Array) -> AlternativeTest:
@@ -191,9 +212,6 @@ def _pseudo_inverse(N: Array) -> tuple[Array, int]:
     return np.asarray((scaled / values[keep]) @ scaled.T), int(keep.sum())
 
 
-# One view tested under the scatter that the others have without it: it cannot hide in what it inflates itself.
-
-
 def leave_one_out_test(model: ViewModel, columns: Array | None, view: int) -> tuple[AlternativeTest, float]:
     """One view tested under the scatter that all others have without it, and the chance of that.
 
@@ -208,11 +226,10 @@ def leave_one_out_test(model: ViewModel, columns: Array | None, view: int) -> tu
     return tested, f_tail(tested.statistic / max(tested.degrees, 1), max(tested.degrees, 1), free)
 
 
-# The smallest displacement that evidence admits: what only a weak direction seems to show is no size.
-#
-# A scan that slides along the part, or that few holes keep from turning, comes to rest millimetres from where it
-# belongs, and where all scans slid together each stands off from its pose by that. The estimate of the test knows both:
-# what the views have in common, and how well each direction is held.
+# What only a weak direction seems to show is no size of a displacement: a scan that slides along the part, or that few
+# holes keep from turning, comes to rest millimetres from where it belongs, and where all scans slid together each
+# stands off from its pose by that. The estimate of the test knows both: what the views have in common, and how well
+# each direction is held.
 
 # Chance that the evidence tells it from the right one.
 _CHANCE = 0.01
@@ -260,8 +277,6 @@ def _shortest_within_limit(normal: Array, estimate: Array, limit: float) -> Arra
     return np.asarray(axes @ (held / (held + pull) * seen))
 
 
-# What effects of the library may do to the views of a session before anybody knows of one.
-#
 # A view that stands out from white scatter may do so by a blunder, or because the arm bends as arms do. The second is a
 # random effect (Searle, Casella and McCulloch 1992): every parameter of every effect is zero give or take its size, and
 # the views scatter accordingly, together and not one by one.
@@ -306,7 +321,12 @@ class UsualEffects:
 
     def _by_place(self, unconstrained: UnconstrainedPoses) -> dict[str, Array]:
         """(6V, P) twists by the effects of each place of the chain, one column a parameter, of usual size."""
-        physical = [e for e in EFFECTS.values() if e.tier == "physical" and not _is_event(e)]
+        # Steps between two views are tested as blocks of views.
+        physical = [
+            e
+            for e in EFFECTS.values()
+            if e.tier == "physical" and all(spec.grid != EVERY_VIEW for spec in e.specs.values())
+        ]
         terms = [term_of(self.measurement, e) for e in physical if not missing_need(self.measurement, e)]
         columns = [
             response.columns[:, ~term.gridded] * term.typical[~term.gridded]
@@ -337,8 +357,3 @@ def _thin_correspondences(unconstrained: UnconstrainedPoses) -> UnconstrainedPos
         for m in unconstrained.overlaps.matches
     ]
     return replace(unconstrained, overlaps=replace(unconstrained.overlaps, matches=thinned))
-
-
-def _is_event(effect: Effect) -> bool:
-    """True for a step between two views: blocks of views are tested as such."""
-    return any(spec.grid == EVERY_VIEW for spec in effect.specs.values())

@@ -11,21 +11,19 @@ from data_synth.fixtures.quiet_scenes import simulated, with_part
 from data_synth.scene import load_scene
 from stitch import frames
 from stitch.integrity.pose_tests import find_blunders, least_displacement
-from stitch.integrity.view_model import ViewModel
 from stitch.pipeline import run
 from stitch.statistics.reml import at_variances
+from tests.integrity.direct_views import direct_views
 
 VIEWS, SIGMA, OFF = 20, 0.02, 7
 
 
 def direct(shown, blunder, seed=0):
     """All poses observed directly, the mean of all the unknown hand-eye; of one view each direction is shown by a share."""
-    rng, blocks = np.random.default_rng(seed), np.zeros((VIEWS, 6 * VIEWS, 6))
-    for v in range(VIEWS):
-        blocks[v, 6 * v : 6 * v + 6] = np.diag(np.sqrt(shown)) if v == OFF else np.eye(6)
-    eye = np.tile(np.eye(6), (VIEWS, 1, 1))
-    z = SIGMA * rng.standard_normal(6 * VIEWS) + blocks[OFF] @ blunder
-    return ViewModel(z, blocks.sum(axis=0), blocks, eye, blocks, eye, 1e-8 * np.eye(6 * VIEWS), np.zeros(3), 1.0)
+    reduction = np.eye(6 * VIEWS)
+    reduction[6 * OFF : 6 * OFF + 6, 6 * OFF : 6 * OFF + 6] = np.diag(np.sqrt(shown))
+    moved = reduction[:, 6 * OFF : 6 * OFF + 6] @ blunder
+    return direct_views(SIGMA * np.random.default_rng(seed).standard_normal(6 * VIEWS) + moved, reduction)
 
 
 def least(model):

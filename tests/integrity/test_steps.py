@@ -12,11 +12,11 @@ from stitch import frames
 from stitch.comparison.disagreement_field import model_history
 from stitch.comparison.run_verdict import run_verdict
 from stitch.integrity.pose_tests import PoseTests, expected_poses, find_blunders, find_steps
-from stitch.integrity.view_model import ViewModel
 from stitch.measurement.session import Cloud
 from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.pipeline import run
+from tests.integrity.direct_views import direct_views, with_z
 
 VIEWS, SIGMA, MEMORY = 18, 0.02, 20.0
 STEP = SIGMA * np.array([0.5, -1, 0.3, 1, 0.2, -0.7])
@@ -24,14 +24,10 @@ STEP = SIGMA * np.array([0.5, -1, 0.3, 1, 0.2, -0.7])
 
 def direct(seed, wanders=0.0):
     """Every pose is observed directly, about one common one; beside white scatter it may wander."""
-    rng = np.random.default_rng(seed)
-    blocks = np.eye(6 * VIEWS).reshape(6 * VIEWS, VIEWS, 6).transpose(1, 0, 2)
-    eye, time = np.tile(np.eye(6), (VIEWS, 1, 1)), np.arange(VIEWS)
+    rng, time = np.random.default_rng(seed), np.arange(VIEWS)
     alike = np.kron(np.exp(-np.abs(time[:, None] - time) / MEMORY), np.eye(6))
     z = SIGMA * rng.standard_normal(6 * VIEWS) + wanders * np.linalg.cholesky(alike) @ rng.standard_normal(6 * VIEWS)
-    errors = PoseErrors(("wandering",), SIGMA**2 * alike[None], np.ones(1))
-    noise = 1e-8 * np.eye(6 * VIEWS)
-    return ViewModel(z, blocks.sum(axis=0), blocks, eye, blocks, eye, noise, np.zeros(3), 1.0, errors=errors)
+    return direct_views(z, errors=PoseErrors(("wandering",), SIGMA**2 * alike[None], np.ones(1)))
 
 
 def steps(model):
@@ -40,7 +36,7 @@ def steps(model):
 
 def stepped(model, *starts, times=30.0):
     moved = sum(times * (-1) ** i * np.outer(np.arange(VIEWS) >= k, STEP) for i, k in enumerate(starts))
-    return replace(model, z=model.z + moved.ravel())
+    return with_z(model, model.z + moved.ravel())
 
 
 @pytest.mark.parametrize("start", [2, 9, 16])
@@ -65,7 +61,7 @@ def test_what_is_moved_there_and_back_is_two_steps():
 def test_what_drifts_is_no_step():
     model = direct(7)
     drift = np.linspace(0, 30, VIEWS)[:, None] * STEP
-    assert steps(replace(model, z=model.z + drift.ravel())) == ()
+    assert steps(with_z(model, model.z + drift.ravel())) == ()
 
 
 def test_one_view_at_the_end_that_is_off_is_a_blunder_and_no_step():
@@ -76,7 +72,7 @@ def test_one_view_at_the_end_that_is_off_is_a_blunder_and_no_step():
 
 
 def off(model, view, times=100.0):
-    return replace(model, z=model.z + times * np.kron(np.arange(VIEWS) == view, STEP))
+    return with_z(model, model.z + times * np.kron(np.arange(VIEWS) == view, STEP))
 
 
 def test_one_view_in_the_middle_that_is_off_is_no_two_steps():

@@ -1,29 +1,20 @@
 """Tests of single views against closed forms, published numbers and a generator of chance."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import stats
 
 from stitch.integrity.pose_tests import find_blunders
-from stitch.integrity.view_model import ViewModel, projector, test_alternative
+from stitch.integrity.view_model import projector, test_alternative
 from stitch.statistics.reml import at_variances
+from tests.integrity.direct_views import direct_views, with_z
 
 test_alternative.__test__ = False  # a function of the library, not a case
 VIEWS, SIGMA = 20, 0.02
 
 
 def direct(seed=0, views=VIEWS):
-    """Every pose is observed directly; the mean of all is the unknown hand-eye: everything has a closed form."""
-    rng = np.random.default_rng(seed)
-    blocks = np.zeros((views, 6 * views, 6))
-    for v in range(views):
-        blocks[v, 6 * v : 6 * v + 6] = np.eye(6)
-    eye = np.tile(np.eye(6), (views, 1, 1))
-    noise = 1e-8 * np.eye(6 * views)
-    z = SIGMA * rng.standard_normal(6 * views)
-    return ViewModel(z, blocks.sum(axis=0), blocks, eye, blocks, eye, noise, np.zeros(3), 1.0)
+    return direct_views(SIGMA * np.random.default_rng(seed).standard_normal(6 * views))
 
 
 def known(model):
@@ -50,7 +41,7 @@ def test_good_views_stay_and_several_blunders_do_not_hide_each_other():
     z = np.array(model.z)
     for v in (2, 7, 11):
         z[6 * v + 3] += 40 * SIGMA
-    found = find_blunders(replace(model, z=z))
+    found = find_blunders(with_z(model, z))
     assert {b.view for b in found.blunders} == {2, 7, 11}
     assert np.sqrt(found.fit.variances[1]) < 1.5 * SIGMA
 
@@ -61,7 +52,7 @@ def test_one_of_six_views_does_not_hide_in_a_scatter_that_it_inflates():
     for seed in range(10):
         model = direct(seed, views=6)
         z = model.z * quiet + model.views[2] @ np.array([0, 0, 0, 10 * SIGMA, 0, 0])
-        assert [b.view for b in find_blunders(replace(model, z=z)).blunders] == [2]
+        assert [b.view for b in find_blunders(with_z(model, z)).blunders] == [2]
 
 
 @pytest.mark.slow
@@ -70,5 +61,5 @@ def test_few_views_without_blunders_are_left_alone():
     quiet, alarms = np.tile([1e-3, 1e-3, 1e-3, 1, 1, 1], 6), 0
     for seed in range(200):
         model = direct(1000 + seed, views=6)
-        alarms += bool(find_blunders(replace(model, z=model.z * (quiet if seed % 2 else 1))).blunders)
+        alarms += bool(find_blunders(with_z(model, model.z * (quiet if seed % 2 else 1))).blunders)
     assert alarms <= stats.binom.isf(1e-3, 200, 0.01)
