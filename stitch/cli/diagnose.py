@@ -128,11 +128,11 @@ def show_diagnosis(diagnosis: Diagnosis, length_unit: str) -> None:
     from stitch.effects.contract import describe_need
     from stitch.model.model import uncertainty_scope
     from stitch.system.process import console
-    from stitch.writing.diagnosis_document import plain_finding
+    from stitch.writing.diagnosis_document import open_doubts, plain_finding
 
     terminal = console()
     terminal.print(plain_finding(diagnosis, length_unit), soft_wrap=True, style="bold")
-    for line in (*diagnosis.doubts, diagnosis.sentence):
+    for line in (*open_doubts(diagnosis), diagnosis.sentence):
         terminal.print(line, soft_wrap=True)
     if diagnosis.verdict != "adequate":
         terminal.print(uncertainty_scope(diagnosis.verdict), soft_wrap=True)

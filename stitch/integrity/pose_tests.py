@@ -22,6 +22,7 @@ from stitch.integrity.view_model import (
     test_alternative,
 )
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
+from stitch.runs.run import effect_cure
 from stitch.statistics.least_squares import least_squares
 from stitch.statistics.reml import VarianceFit
 
@@ -49,7 +50,7 @@ class PoseStep:
         by = f"{off} off at the part" if off else "by an amount that these surfaces do not show"
         other = "scanner" if self.moved == "part" else "part"
         unsure = "" if self.distinguishable else f" (or the {other}: these views do not show which)"
-        further = ", or add the effect part_slip" if self.moved == "part" and self.distinguishable else ""
+        further = f", or {effect_cure('part_slip')}" if self.moved == "part" and self.distinguishable else ""
         return (
             f"From view {after} on the {self.moved} sits elsewhere{unsure}, {by}; to fix: make two sessions, one up to "
             f"{before} and one from {after} on{further}."

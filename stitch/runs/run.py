@@ -28,6 +28,11 @@ def doubt_headline(doubt: str) -> str:
     return f"{doubt[: next(ends, len(doubt.rstrip('.')))]}."
 
 
+def effect_cure(effect: str) -> str:
+    """Return what a doubt says of an effect that would hold what is doubted."""
+    return f"add the effect {effect}"
+
+
 def _brackets_closed(text: str) -> bool:
     return text.count("(") == text.count(")")
 

@@ -13,7 +13,7 @@ from stitch.diagnosis.unnamed_joint_laws import JointCurve
 from stitch.diagnosis.unnamed_time_laws import TimeCurve
 from stitch.diagnosis.validation import CrossValidation, group_helps, group_share
 from stitch.observations.surfaces.scanner_errors import FieldError
-from stitch.runs.run import doubt_headline
+from stitch.runs.run import doubt_headline, effect_cure
 from stitch.units import length_text
 from stitch.writing.json_file import rows_of_fields
 
@@ -88,10 +88,24 @@ def effect_in_words(name: str) -> str:
 def plain_finding(found: Diagnosis, length_unit: str) -> str:
     """Return the doubts about the session, what is missing, and how far the error should fall with it."""
     finding = _finding(found, length_unit)
-    if not found.doubts:
+    left = open_doubts(found)
+    if not left:
         return finding
-    doubted = " ".join(doubt_headline(doubt) for doubt in found.doubts)
+    doubted = " ".join(doubt_headline(doubt) for doubt in left)
     return f"{doubted} The findings below may only be consequences of this problem. {finding}"
+
+
+def open_doubts(found: Diagnosis) -> tuple[str, ...]:
+    """Return the doubts about the session that are something else than the effect which is missing."""
+    return tuple(doubt for doubt in found.doubts if doubt != _same_as_finding(found))
+
+
+def _same_as_finding(found: Diagnosis) -> str | None:
+    """Return the doubt that the effect which is missing would hold; None where there is none, or several."""
+    if not found.doubts or found.verdict != "missing_effect" or not found.likelier_than_not:
+        return None
+    same = [doubt for doubt in found.doubts if effect_cure(found.effects[0]) in doubt]
+    return same[0] if len(same) == 1 else None
 
 
 def _finding(found: Diagnosis, length_unit: str) -> str:
@@ -112,6 +126,9 @@ def _finding(found: Diagnosis, length_unit: str) -> str:
     validation = next(c for c in found.candidates if c.name == found.effects[0]).cross_validation
     though = "" if found.likelier_than_not else ", though chance is more likely"
     missing = "Missing in the model" if found.certain else f"Perhaps missing in the model{though}"
+    if (same := _same_as_finding(found)) is not None:
+        seen = doubt_headline(same).removesuffix(".")
+        named = f"{found.effects[0]} ({seen[0].lower()}{seen[1:]})"
     if validation is None:
         return f"{missing}: {named}.{doubt}"
     return f"{missing}: {named}.{doubt} {_expected_gain(found.residual_rms, validation, length_unit)}"
@@ -164,7 +181,7 @@ def _error_location(found: Diagnosis) -> str:
 
 def suggested_command(found: Diagnosis, run: str) -> str:
     """The command that most would type now, with what it is for; `run` as it has to be typed."""
-    if found.doubts:
+    if open_doubts(found):
         return f"Next: fix the problem above; for details: stitch review {run}"
     match found.verdict:
         case "missing_effect" if not found.likelier_than_not:

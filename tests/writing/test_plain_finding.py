@@ -11,6 +11,7 @@ from bench.docs.page_blocks import refused
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
+from stitch.integrity.pose_tests import PoseStep
 from stitch.observations.surfaces.scanner_errors import FieldError
 from stitch.writing.diagnosis_document import effect_in_words, plain_finding, suggested_command
 
@@ -68,9 +69,38 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
 
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
 def test_no_model_is_built_on_a_doubtful_session(verdict):
-    found = SimpleNamespace(verdict=verdict, curves=("of joint 3",), time_curve=None, doubts=("knocked",))
+    found = SimpleNamespace(
+        verdict=verdict,
+        effects=("backlash",),
+        curves=("of joint 3",),
+        time_curve=None,
+        doubts=("knocked",),
+        likelier_than_not=True,
+    )
     command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
     assert command == "stitch review RUN" and refused(command) is None
+
+
+@pytest.mark.parametrize("moved", ["part", "scanner"])
+@pytest.mark.parametrize("distinguishable", [True, False])
+@pytest.mark.parametrize("further", [(), ("knocked",)])
+def test_a_slip_that_is_named_is_no_doubt_beside_it(moved, distinguishable, further):
+    """The step and the effect are one sentence; a scanner that was knocked is no slip of the part."""
+    step = PoseStep(2, moved, distinguishable, (7e-4, 0.12), (7e-4, 0.12), 1e-30)
+    found = SimpleNamespace(
+        verdict="missing_effect",
+        effects=("part_slip",),
+        candidates=(SimpleNamespace(name="part_slip", cross_validation=None),),
+        doubts=(step.describe(["a", "b", "c", "d"], "mm"), *further),
+        certain=True,
+        likelier_than_not=True,
+    )
+    same = moved == "part" and distinguishable
+    told, command = plain_finding(found, "mm"), suggested_command(found, "RUN").rsplit(": ", 1)[1]
+    assert ("part_slip (from view c on the part sits elsewhere, " in told) == same
+    assert told.count("sits elsewhere") == 1
+    assert ("may only be consequences" in told) == (not same or bool(further))
+    assert command == ("stitch add RUN --suggested" if same and not further else "stitch review RUN")
 
 
 def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
