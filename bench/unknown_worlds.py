@@ -148,7 +148,7 @@ def _least(a: Asked, world: World) -> float:
     plain = a.linear.scatter_only
     seen = plain.residual(plain.reduce(true_column(a, world)[:, None]))
     scatter = plain.satterthwaite.degrees_of_freedom(plain.in_blocks(seen))
-    return float(np.sqrt(least_noncentrality(seen, 1.0, len(EFFECTS), scatter)) / np.linalg.norm(seen))
+    return float(np.sqrt(least_noncentrality(seen, 1.0, len(EFFECTS), scatter, {1.0: 1.0})) / np.linalg.norm(seen))
 
 
 def _possible(a: Asked, rng: np.random.Generator, k: int) -> str:

@@ -1,6 +1,6 @@
 """The field of disagreement: per place of the part, how far each view puts the surface from where the others put it.
 
-The distance of two matched points carries the noise of both. Averaged over a patch (`patches.py`) the noise goes and
+The distance of two matched points carries the noise of both. Averaged over a patch (`Patches`) the noise goes and
 what repeats stays: the error of the model as it shows on the part.
 """
 

@@ -129,11 +129,15 @@ class ResidualTable:
         return [int(i) for i in np.argsort(-np.nan_to_num(self.rms), kind="stable") if fair[i]][:at_most]
 
 
-def table_of(
-    name: str, unit: str, edges: tuple[Array, Array], label: tuple[str, ...], statistics: BinStatistics
-) -> ResidualTable:
-    """The table of bins with their statistics; `edges` are (B,) lower and (B,) upper ones."""
-    return ResidualTable(name, unit, *edges, label, **vars(statistics))
+def _labelled_table(name: str, labels: Sequence[str], statistics: BinStatistics) -> ResidualTable:
+    """Return the table of rows with names and their statistics."""
+    number = np.arange(len(labels), dtype=float)
+    return ResidualTable(name, "", number, number, tuple(labels), **vars(statistics))
+
+
+def binned_table(name: str, unit: str, edges: Array, statistics: BinStatistics) -> ResidualTable:
+    """Return the table of bins between edges (B + 1,) and their statistics."""
+    return ResidualTable(name, unit, edges[:-1], edges[1:], (), **vars(statistics))
 
 
 # Properties whose bins hold the same rows: they say one thing under several names.
@@ -148,9 +152,8 @@ def group_same_bins(tables: Sequence[ResidualTable]) -> tuple[tuple[ResidualTabl
     for table in tables:
         group = next((g for g in groups if _same_rows(g[0], table)), None)
         if group is None:
-            groups.append([table])
-        else:
-            group.append(table)
+            groups.append(group := [])
+        group.append(table)
     return tuple(tuple(g) for g in groups)
 
 
@@ -164,6 +167,8 @@ def _same_rows(a: ResidualTable, b: ResidualTable) -> bool:
     pairs = ((a.mean, b.mean), (a.rms, b.rms))
     return all(np.allclose(x[first], y[second], rtol=0, atol=small, equal_nan=True) for x, y in pairs)
 
+
+# All tables of a run, and what they say together.
 
 PLACE = "place on the part"
 APPROACH = "approach of j"
@@ -238,11 +243,6 @@ def _unit_of(covariate: str) -> str:
     return next((unit for ending, unit in _ENDINGS.items() if covariate.endswith(ending)), "")
 
 
-def values_of_views(views: Views) -> dict[str, Array]:
-    """Property -> (V,) value of each view; as `view_properties`."""
-    return {name: values for name, _, values in view_properties(views)}
-
-
 def property_varies(name: str, values: Array) -> bool:
     """True if a property (V,) has two values; that no view came before the first is no approach."""
     told = values[values != 0] if name.startswith(APPROACH) else values
@@ -309,16 +309,16 @@ def compare_surfaces(state: Run) -> ResidualTables:
     rows = _CorrespondenceRows(state, poses, overlaps.matches, overlaps.gram.scale)
     names = state.session.names
     tables = [_view_table(rows, names), _pair_table(rows, names)]
-    tables += [
-        _property_table(rows, name, unit, values) for name, unit, values in _correspondence_properties(state, rows)
-    ]
+    for name, unit, values in _correspondence_properties(state, rows):
+        edges, bins = equal_count_bins(values)
+        tables.append(binned_table(name, unit, edges, rows.statistics(bins, len(edges) - 1)))
     tables.append(_regions(rows))
     return ResidualTables(
         tables=tuple(t for t in tables if len(t.count) > (0 if t.label else 1)),
         rms=overlaps.gram.rms,
         scale=overlaps.gram.scale,
         views=tuple(names),
-        of_views=values_of_views(state.measurement.views),
+        of_views={name: values for name, _, values in view_properties(state.measurement.views)},
     )
 
 
@@ -349,20 +349,15 @@ class _CorrespondenceRows:
             np.bincount(key, w, length).reshape(shape) for w in (None, self.residual, self.residual**2)
         )
 
-
-def _bin_statistics(rows: _CorrespondenceRows, bins: Indices, size: int) -> BinStatistics:
-    n, s, q = (x.sum(axis=2) for x in rows.sums(bins, size))  # (B, V)
-    return view_statistics(n, s, q, _ENOUGH)
-
-
-def _labelled_table(rows: _CorrespondenceRows, name: str, bins: Indices, labels: Sequence[str]) -> ResidualTable:
-    number = np.arange(len(labels), dtype=float)
-    return table_of(name, "", (number, number), tuple(labels), _bin_statistics(rows, bins, len(labels)))
+    def statistics(self, bins: Indices, size: int) -> BinStatistics:
+        """What the views say of the means of so many bins."""
+        n, s, q = (x.sum(axis=2) for x in self.sums(bins, size))
+        return view_statistics(n, s, q, _ENOUGH)
 
 
 def _view_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
     """One sample each: how well its own mean is known nothing says."""
-    table = _labelled_table(rows, "view", rows.view, names)
+    table = _labelled_table("view", names, rows.statistics(rows.view, len(names)))
     nothing = np.full(len(names), np.nan)
     return replace(table, mean_sigma=nothing, rms_sigma=nothing, p_value=nothing)
 
@@ -371,21 +366,9 @@ def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTabl
     n, s, q = (x[0] for x in rows.sums(np.zeros(len(rows.view), np.int64), 1))
     v, w = np.nonzero(np.triu(n, 1))
     count, mean, square = n[v, w], s[v, w], q[v, w]
-    nothing, number = np.full(len(v), np.nan), np.arange(len(v), dtype=float)
-    return ResidualTable(
-        name="pair",
-        unit="",
-        low=number,
-        high=number,
-        label=tuple(f"{names[int(a)]}–{names[int(b)]}" for a, b in zip(v, w, strict=True)),
-        mean=mean / count,
-        mean_sigma=nothing,
-        rms=np.sqrt(square / count),
-        rms_sigma=nothing,
-        count=count,
-        views=np.full(len(v), 2),
-        p_value=nothing,
-    )
+    nothing, two = np.full(len(v), np.nan), np.full(len(v), 2)
+    told = BinStatistics(mean / count, nothing, np.sqrt(square / count), nothing, count, two, nothing)
+    return _labelled_table("pair", [f"{names[int(a)]}–{names[int(b)]}" for a, b in zip(v, w, strict=True)], told)
 
 
 def _correspondence_properties(state: Run, rows: _CorrespondenceRows) -> list[tuple[str, str, Array]]:
@@ -404,11 +387,6 @@ def _correspondence_properties(state: Run, rows: _CorrespondenceRows) -> list[tu
     ]
 
 
-def _property_table(rows: _CorrespondenceRows, name: str, unit: str, values: Array) -> ResidualTable:
-    edges, bins = equal_count_bins(values)
-    return table_of(name, unit, (edges[:-1], edges[1:]), (), _bin_statistics(rows, bins, len(edges) - 1))
-
-
 def _regions(rows: _CorrespondenceRows) -> ResidualTable:
     """Cells of the part along the axes of the reference frame."""
     low, high = np.quantile(rows.place, [0.005, 0.995], axis=0)
@@ -417,7 +395,7 @@ def _regions(rows: _CorrespondenceRows) -> ResidualTable:
     used, bins = np.unique(bins, return_inverse=True)
     centre = [low + (np.array(np.unravel_index(b, (_PLACES,) * 3)) + 0.5) / _PLACES * (high - low) for b in used]
     labels = [f"({c[0]:.4g}, {c[1]:.4g}, {c[2]:.4g})" for c in centre]
-    return _labelled_table(rows, PLACE, bins.astype(np.int64), labels)
+    return _labelled_table(PLACE, labels, rows.statistics(bins.astype(np.int64), len(labels)))
 
 
 # Where model and labelled points part: offsets of the targets against everything that is known of the views.
@@ -440,22 +418,37 @@ class _Offsets:
     points: Array  # (N, 3) sensor frame
     views: int
 
+    def statistics(self, bins: Indices, size: int) -> BinStatistics:
+        """What the views say of the means of so many bins, along the direction in which these differ most."""
+        count = np.asarray(np.bincount(bins, minlength=size), float)
+        sums = np.stack([np.bincount(bins, self.offset[:, i], size) for i in range(3)], axis=1)
+        mean = sums / np.maximum(count, 1)[:, None]
+        direction = np.linalg.svd(mean - mean.mean(axis=0), full_matrices=False)[2][0] if size > 1 else np.eye(3)[0]
+        along = self.offset @ direction
+        key, shape = bins * self.views + self.view, (size, self.views)
+        weights = np.ones(len(along)), along, np.sum(self.offset**2, axis=1)
+        n, s, q = (np.asarray(np.bincount(key, w, size * self.views), float).reshape(shape) for w in weights)
+        return view_statistics(n, s, q, directions=_DIRECTIONS)
+
 
 def compare_targets(state: Run) -> ResidualTables:
     """Tables of the offsets by view, target, joint, move, torque, approach, range, time and covariate."""
     rows = _target_offsets(state)
     s = state.measurement.capture.sightings
     assert s is not None
-    labels = {"view": (rows.view, state.session.names), "target": (rows.target, list(s.targets))}
     tables = [
-        _offset_table(rows, name, "", bins, _numbered_labels(names), names) for name, (bins, names) in labels.items()
+        _labelled_table(name, names, rows.statistics(bins, len(names)))
+        for name, bins, names in (("view", rows.view, state.session.names), ("target", rows.target, list(s.targets)))
     ]
-    for name, unit, values in _offset_properties(state, rows):
+    known = _offset_view_properties(state.measurement.views)
+    every = [("range", state.session.length_unit, np.linalg.norm(rows.points, axis=1))]
+    every += [(name, unit, values[rows.view]) for name, unit, values in known if property_varies(name, values)]
+    for name, unit, values in every:
         edges, bins = equal_count_bins(values)
         if len(edges) > 2:
-            tables.append(_offset_table(rows, name, unit, bins, (edges[:-1], edges[1:]), ()))
+            tables.append(binned_table(name, unit, edges, rows.statistics(bins, len(edges) - 1)))
     rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
-    of_views = {name: values for name, _, values in _offset_view_properties(state)}
+    of_views = {name: values for name, _, values in known}
     return ResidualTables(tuple(tables), rms, rms, tuple(state.session.names), of_views)
 
 
@@ -466,51 +459,17 @@ def _target_offsets(state: Run) -> _Offsets:
     assert s is not None
     T_mount = state.model.T_mount
     rows = target_rows(own, T_mount, initial_landmarks(own, T_mount, drawing_of(state.session.nominal, s)))
-    diagonal = np.zeros((*rows.residual.shape, rows.residual.shape[1]))
-    diagonal[:, np.arange(rows.residual.shape[1]), np.arange(rows.residual.shape[1])] = rows.noise + rows.fixed
-    k = rows.landmarks.shape[2]
-    left = (
-        rows.residual
-        + rows.landmarks @ BlockLeastSquares(-rows.residual, rows.landmarks, diagonal, np.zeros(k), np.zeros(k)).solve()
-    )
+    covariance = (rows.noise + rows.fixed)[:, :, None] * np.eye(rows.residual.shape[1])
+    nothing = np.zeros(rows.landmarks.shape[2])
+    placed = BlockLeastSquares(-rows.residual, rows.landmarks, covariance, nothing, nothing).solve()
+    left = rows.residual + rows.landmarks @ placed
     v, slot = np.nonzero(s.used)
     offset = left[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)[v, slot]
     return _Offsets(v, s.target[v, slot], offset, s.points[v, slot], len(s.used))
 
 
-def _numbered_labels(names: Sequence[str]) -> tuple[Array, Array]:
-    number = np.arange(len(names), dtype=float)
-    return number, number
-
-
-def _offset_table(
-    rows: _Offsets, name: str, unit: str, bins: Indices, edges: tuple[Array, Array], labels: Sequence[str]
-) -> ResidualTable:
-    size = len(edges[0])
-    count = np.asarray(np.bincount(bins, minlength=size), float)
-    sums_3d = np.stack([np.bincount(bins, rows.offset[:, i], size) for i in range(3)], axis=1)
-    mean = sums_3d / np.maximum(count, 1)[:, None]
-    direction = np.linalg.svd(mean - mean.mean(axis=0), full_matrices=False)[2][0] if size > 1 else np.eye(3)[0]
-    along = rows.offset @ direction
-    key, shape = bins * rows.views + rows.view, (size, rows.views)
-    weights = np.ones(len(along)), along, np.sum(rows.offset**2, axis=1)
-    n, s, q = (np.asarray(np.bincount(key, w, size * rows.views), float).reshape(shape) for w in weights)
-    return table_of(name, unit, edges, tuple(labels), view_statistics(n, s, q, directions=_DIRECTIONS))
-
-
-def _offset_properties(state: Run, rows: _Offsets) -> list[tuple[str, str, Array]]:
-    """Name, unit and value of every property, per row."""
-    out = [("range", state.session.length_unit, np.linalg.norm(rows.points, axis=1))]
-    return out + [
-        (name, unit, values[rows.view])
-        for name, unit, values in _offset_view_properties(state)
-        if property_varies(name, values)
-    ]
-
-
-def _offset_view_properties(state: Run) -> list[tuple[str, str, Array]]:
+def _offset_view_properties(views: Views) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per view."""
-    views = state.measurement.views
     moves = np.degrees(views.joints - views.previous)
     of_view = [(f"last move of j{i + 1}", "deg", moves[:, i]) for i in range(moves.shape[1])]
     return [*of_view, *view_properties(views), ("order", "view", np.arange(views.count, dtype=float))]

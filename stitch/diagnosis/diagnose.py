@@ -1,20 +1,13 @@
 """The whole diagnosis: linear model, candidates, evidence, verdict, plain sentences."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.evidence import (
-    challenge,
-    cross_validate_named,
-    find_scanner_error,
-    overlap_misfit_beyond_noise,
-    score_pair,
-    select,
-)
+from stitch.diagnosis.evidence import find_scanner_error, gather_evidence, overlap_misfit_beyond_noise, score_pair
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.residual_structure import BudgetLine, dependences, follows_field, variance_budget
@@ -30,7 +23,7 @@ from stitch.diagnosis.sentences import diagnosis_sentence
 from stitch.diagnosis.thresholds import CROSS_VALIDATED_CANDIDATES, MANY_POSES
 from stitch.diagnosis.unnamed_joint_laws import joint_curves
 from stitch.diagnosis.unnamed_time_laws import RepeatingError, find_repeating_errors, reportable
-from stitch.diagnosis.validation import CrossValidation, cross_validate
+from stitch.diagnosis.validation import cross_validate
 from stitch.diagnosis.verdict import Evidence
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
@@ -54,13 +47,10 @@ def diagnose_state(state: Run) -> Diagnosis:
 def _diagnose(state: Run) -> Diagnosis:
     linear, limit = linear_model_of(state), scatter_limit(state.session)
     candidates, missing = candidates_of(linear)
-    evidence = select(linear, candidates, limit)
-    left_out = cross_validate_named(linear, evidence)
-    evidence = challenge(linear, candidates, evidence, left_out)
     within = overlap_misfit_beyond_noise(linear, state.session.scanner.noise)
-    evidence = replace(evidence, overlap_misfit=within)
+    evidence = replace(gather_evidence(linear, candidates, limit), overlap_misfit=within)
     matrix = alias_matrix(linear, [r.score for r in evidence.ranked])
-    examined = _examine_candidates(linear, evidence, matrix, sum(not c.empirical for c in candidates), left_out)
+    examined = _examine_candidates(linear, evidence, matrix, sum(not c.empirical for c in candidates))
     unknown = evidence.verdict == "unknown_effect"
     unnamed = evidence.repeating_errors or ()
     if unknown and evidence.repeating_errors is None:
@@ -137,13 +127,10 @@ def linear_model_of(state: Run) -> LinearModel:
     return linearise(state.session, state.measurement, state.model, state.gate)
 
 
-def _examine_candidates(
-    linear: LinearModel, evidence: Evidence, matrix: Array, tests: int, left_out: Mapping[str, CrossValidation]
-) -> list[CandidateEffect]:
+def _examine_candidates(linear: LinearModel, evidence: Evidence, matrix: Array, tests: int) -> list[CandidateEffect]:
     """Every candidate with what it would leave on views left out, what looks like it, and its detectable sizes.
 
-    Args:
-        left_out: of those that may be named, beside all that they were named beside; the others are asked alone.
+    Those that are not among what may be named are asked alone.
     """
     scores, push = [r.score for r in evidence.ranked], hand_eye_response(linear)
 
@@ -154,7 +141,8 @@ def _examine_candidates(
         return CandidateEffect(
             ranked=ranked,
             aliases=tuple(aliases_of(k, matrix, scores)),
-            cross_validation=left_out.get(ranked.name) or (cross_validate(linear, scores[k]) if asked else None),
+            cross_validation=evidence.left_out.get(ranked.name)
+            or (cross_validate(linear, scores[k]) if asked else None),
             detectable=detectable,
             hand_eye=omitted_effect_bias(linear, push, candidate, detectable),
         )

@@ -35,7 +35,7 @@ class CandidateEffect:
     aliases: tuple[Alias, ...]
     cross_validation: CrossValidation | None
     detectable: dict[str, float]  # smallest detectable size per parameter, alone
-    hand_eye: float | None  # how far it would push the hand-eye unseen, length_unit (`omitted_effect_bias.py`)
+    hand_eye: float | None  # how far it would push the hand-eye unseen, length_unit (`omitted_effect_bias`)
 
     @property
     def name(self) -> str:
@@ -58,7 +58,7 @@ class Diagnosis:
     verdict: str
     named: tuple[Ranked, ...]  # the effect that is missing, or the group that these views cannot tell apart
     sentence: str
-    residual_rms: float
+    residual_rms: float  # length_unit
     heldout_rms: float  # the same on views left out
     noise_floor: float
     rotation: float  # repeatability under the present model, rad
@@ -80,9 +80,8 @@ class Diagnosis:
     overlap_misfit: float = 0.0
     follows_field: bool = False  # nothing is named, and what is left follows the place in the scanner's field
     scanner_error: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer
-    doubts: tuple[
-        str, ...
-    ] = ()  # of the session as a whole, as sentences: what is found may be no more than their mark
+    # Of the session as a whole, as sentences: what is found may be no more than their mark.
+    doubts: tuple[str, ...] = ()
 
     @property
     def effects(self) -> tuple[str, ...]:

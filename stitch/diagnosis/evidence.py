@@ -44,7 +44,7 @@ def overlap_misfit_beyond_noise(linear: LinearModel, stated: float | None = None
     """Rms (length_unit) of it beside the noise that the scans show, where it is more than that; else 0, and where no
     overlap of surfaces was observed.
 
-    The noise is the scatter about the surface within each scan (`noise_floor.py`), whatever a data sheet says.
+    The noise is the scatter about the surface within each scan (`noise_floor`), whatever a data sheet says.
 
     Args:
         stated: noise of the scanner, for scans too small to show their own.
@@ -118,7 +118,7 @@ def score_pair(linear: LinearModel, first: Ranked, second: Ranked, tests: int) -
 
 # Which effects the data want beside everything else that an arm may do wrong.
 #
-# A candidate is scored without its own share of the pose errors (`score.py`), while every other joint and link may err
+# A candidate is scored without its own share of the pose errors (`score`), while every other joint and link may err
 # by as much as the views show. What two effects can both do no single one is wanted for, since the errors that remain
 # do the other's part: then the smallest set is sought without which the views cannot do.
 
@@ -187,13 +187,17 @@ def gather_evidence(linear: LinearModel, candidates: Sequence[Candidate], limit:
     What remains between the overlaps is not asked here (`overlap_misfit_beyond_noise`).
     """
     evidence = select(linear, candidates, limit)
-    return challenge(linear, candidates, evidence, cross_validate_named(linear, evidence))
+    return challenge(linear, candidates, replace(evidence, left_out=cross_validate_named(linear, evidence)))
 
 
 def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:
     """Find the effects that would explain the views, and what explains them as well; nothing is left out yet."""
     ranked, empirical = rank_all(linear, candidates)
-    shape = _certain_shape(empirical)
+    shape = next(iter(empirical), None)
+    if shape is not None and not (
+        shape.adjusted < limits.ALPHA_UNKNOWN and shape.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
+    ):
+        shape = None
     found = Evidence(ranked, empirical, implausible_scatter=implausible(linear, limit))
     if shape is None and not any(is_certain(r) for r in ranked):
         # No effect is certain by itself: several of which some are required, errors without a name, or nothing.
@@ -256,14 +260,6 @@ def _select_jointly(
     return effects, found.refused | idle, False
 
 
-def _certain_shape(empirical: Sequence[Ranked]) -> Ranked | None:
-    """The best shape without a cause, where it is certain."""
-    for r in empirical[:1]:
-        if r.adjusted < limits.ALPHA_UNKNOWN and r.score.log_bayes_factor > limits.LOG_BAYES_FACTOR:
-            return r
-    return None
-
-
 def _beaten_by_unnamed(
     best: Ranked, empirical: Ranked | None, law: float, second: Ranked | None = None, tests: int = 1
 ) -> bool:
@@ -273,7 +269,7 @@ def _beaten_by_unnamed(
     20 to 1 less likely, as all others that might have the name.
 
     Args:
-        law: log posterior of that (`rivals.py`).
+        law: log posterior of that (`unnamed_law_log_posterior`).
         tests: effects among which the second was chosen.
     """
     known = best.log_posterior
@@ -301,23 +297,15 @@ def _gear_order_ambiguous(base: LinearModel, best: Ranked, empirical: Sequence[R
 # A name, held against views left out, halves of the views and what the scanner itself may do wrong.
 
 
-def challenge(
-    linear: LinearModel,
-    candidates: Sequence[Candidate],
-    evidence: Evidence,
-    left_out: Mapping[str, CrossValidation],
-) -> Evidence:
+def challenge(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Evidence:
     """Add what speaks against the name: views left out, halves of the views, smooth errors of the scans.
 
     Where a name does not stand, a second effect that is missing too may be why: what it does made the first another in
     each half of the views, or looked like a smooth error of the scanner.
-
-    Args:
-        left_out: of `cross_validate_named`.
     """
     if evidence.verdict != "missing_effect":
         return with_scanner_error(linear, evidence)
-    found = with_scanner_error(linear, _validated(linear, evidence, left_out))
+    found = with_scanner_error(linear, _validated(linear, evidence))
     if found.named or regime_of(linear).many_views:
         return found
     two = find_missing_pair(linear, candidates, evidence.named[0])
@@ -348,13 +336,13 @@ def with_scanner_error(linear: LinearModel, evidence: Evidence) -> Evidence:
     return replace(out, scanner_error=None)
 
 
-def _validated(linear: LinearModel, evidence: Evidence, left_out: Mapping[str, CrossValidation]) -> Evidence:
+def _validated(linear: LinearModel, evidence: Evidence) -> Evidence:
     """Keep what holds on views left out and in halves.
 
     A second effect that is named without the first is asked alone, and is refuted where alone it is not certain.
     """
     halves = {r.name: validate_in_halves(r.score) for r in _named_effects(evidence)}
-    held = with_validation(evidence, left_out, halves)
+    held = with_validation(evidence, evidence.left_out, halves)
     if held.refuted or held.named[0] is evidence.named[0]:
         return held
     alone = next(r for r in evidence.ranked if r.name == held.named[0].name)

@@ -85,7 +85,7 @@ def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Arr
 
 
 def _along_normals(matches: Sequence[Match], centre: Array, twists: Array) -> Array:
-    """(M,) B(δ_v − δ_w) of `gram.py`: what twists (V, 6) about `centre` do to the distances.
+    """(M,) B(δ_v − δ_w) of the normal equations: what twists (V, 6) about `centre` do to the distances.
 
     Not by moving the views: where hand-eye and links can stand in for one another, both move far and their common
     motion alone counts.

@@ -1,6 +1,6 @@
 """How well each candidate explains the views: evidence, p-value, amplitude.
 
-Every form of a candidate is fitted with the variances estimated anew (`variance_components.py`). The p-value is that of
+Every form of a candidate is fitted with the variances estimated anew (`reml`). The p-value is that of
 the Wald F test under the form's own REML; forms are counted (Bonferroni). The evidence is the likelihood
 integrated over amplitudes of plausible size, so that more parameters cost what they could have explained.
 """
@@ -194,6 +194,9 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
         values, covariance = nothing, np.diag(nothing + np.nan)
     else:
         p, total, values, covariance = p if seen else 1.0, total if seen else 0.0, best.values, best.covariance
+    beside = None
+    if regime_of(base).prior and best.variances is not None:
+        beside = replace(base, null=at_variances(base.mixed, best.variances))
     return Score(
         candidate,
         seen,
@@ -203,14 +206,8 @@ def score(linear: LinearModel, candidate: Candidate) -> Score:
         values=values,
         covariance=covariance,
         scale=best.scale,
-        base_model=_base_with_candidate(base, best),
+        base_model=beside,
     )
-
-
-def _base_with_candidate(base: LinearModel, best: FormTrial) -> LinearModel | None:
-    if base.pose_errors is None or best.variances is None:
-        return None
-    return replace(base, null=at_variances(base.mixed, best.variances))
 
 
 def _gains_at_null(base: LinearModel, at: LinearModel, candidate: Candidate) -> tuple[list[Gain], bool]:

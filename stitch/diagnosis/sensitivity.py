@@ -7,7 +7,7 @@ p-value alone this is |θ| = (z_{1−α/2K} + z_{power})/√I.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
@@ -108,16 +108,12 @@ def omitted_effect_bias(
     return max(found, default=None)
 
 
-# Of plausible size and nothing else.
-SINGLE_SCALE = {1.0: 1.0}
-
-
 def least_noncentrality(
     white: Array,
     weight: float,
     tests: int,
     degrees_of_freedom: float,
-    scales: Mapping[float, float] = SINGLE_SCALE,
+    scales: Mapping[float, float],
 ) -> float:
     """θᵀIθ that a form needs to be detected.
 
@@ -126,7 +122,7 @@ def least_noncentrality(
         weight: share of the candidate's prior that the form has.
         tests: number of candidates.
         degrees_of_freedom: degrees of freedom of the scatter along the columns.
-        scales: of the plausible sizes, with their shares (`amplitude_scales.py`).
+        scales: of the plausible sizes, with their shares.
     """
     information = np.linalg.eigvalsh(white.T @ white)
     rank = int((information > 1e-2).sum())
@@ -160,40 +156,17 @@ def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -
     return degrees_of_freedom * float(np.expm1(min(2 * charged / degrees_of_freedom, 500.0)))
 
 
-@dataclass(frozen=True)
-class FormInformation:
-    """What the views show of one form of a candidate."""
-
-    names: tuple[str, ...]  # of its free parameters (p,)
-    white: Array  # (n, p) whitened columns per unit
-    sizes: Array  # (p,) plausible ones
-    weight: float  # share of the candidate's prior
-    degrees_of_freedom: float  # of the scatter along the columns
-    scales: Mapping[float, float] = field(
-        default_factory=lambda: SINGLE_SCALE
-    )  # of the plausible sizes, with their shares
-
-
 def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
-    """Smallest detectable size of every free parameter of a candidate among so many."""
+    """Smallest detectable size of every free parameter of a candidate among so many, where it alone is not zero, by the
+    form that shows it best."""
     linear = linear.without([candidate.name])
-    shown = []
-    for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
-        white = linear.residual(form.columns)
-        known = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
-        names = tuple(p.name for p in form.free)
-        shown.append(FormInformation(names, white, form.sizes, float(weight), known, regime_of(linear).scales))
-    return detectable_sizes_by_form(shown, tests)
-
-
-def detectable_sizes_by_form(forms: Sequence[FormInformation], tests: int) -> dict[str, float]:
-    """Per parameter the size that is detectable when it alone is not zero, by the form that shows it best."""
     found: dict[str, dict[tuple[str, ...], list[float]]] = {}
-    for form in forms:
-        white, known = form.white * form.sizes, form.degrees_of_freedom
-        least = least_noncentrality(white, form.weight, tests, known, form.scales)
-        for name, length in zip(form.names, np.linalg.norm(form.white, axis=0), strict=True):
+    for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
+        white, names = linear.residual(form.columns), tuple(p.name for p in form.free)
+        known = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
+        least = least_noncentrality(white * form.sizes, float(weight), tests, known, regime_of(linear).scales)
+        for name, length in zip(names, np.linalg.norm(white, axis=0), strict=True):
             size = float(np.sqrt(least) / length) if length > 0 else float("inf")
-            found.setdefault(name, {}).setdefault(form.names, []).append(size)
+            found.setdefault(name, {}).setdefault(names, []).append(size)
     # Forms of the same parameters differ in when something happened: any of them could be true.
     return {name: min(float(np.median(own)) for own in by_form.values()) for name, by_form in found.items()}

@@ -106,11 +106,6 @@ def joint_pair_processes(linear: LinearModel, motions: Array, k: int) -> Iterato
             yield SmoothProcess(k + 1, motions[k], _smooth_courses(joints[:, [k, other]]))
 
 
-def process_with_covariance(joint: int, motions: Array, kernel: Array) -> SmoothProcess:
-    """A joint, counted from 1, that follows a process of covariance (V, V); motions (V, 6, 1) as above."""
-    return SmoothProcess(joint, motions, kernel @ _leading_courses(kernel, len(kernel)))
-
-
 def wandering_flange(linear: LinearModel) -> SmoothProcess:
     """A flange that wanders."""
     measurement, time = linear.measurement, time_in_steps(linear.measurement)
@@ -220,7 +215,7 @@ def fit_process(linear: LinearModel, sized: SizedProcess, tried: int) -> FittedP
     return FittedProcess(linear, sized.process, columns, size, fit, gained)
 
 
-# What not knowing its size costs a law, nats: as much as an effect (`form_trial.py`), so that neither has an advantage.
+# What not knowing its size costs a law, nats: as much as an effect (`try_form`), so that neither has an advantage.
 ANY_SIZE = -float(np.log(parameter_selection.ANY_SIZE[1.0]))
 
 
@@ -239,8 +234,7 @@ class JointLaw:
     @property
     def errors(self) -> SmoothErrors:
         """Return the errors of its kind, of all joints."""
-        assert self.base.pose_errors is not None
-        return self.base.pose_errors.joint_processes[self.follows]
+        return _joint_processes(self.base)[self.follows]
 
     @cached_property
     def model(self) -> LinearModel:
@@ -264,7 +258,7 @@ def joint_laws(base: LinearModel) -> tuple[JointLaw, ...]:
 
     Its size is fitted with all others; `some_law` charges it for that.
     """
-    return tuple(sorted(laws_of_kinds(base, _kinds(base)), key=lambda law: -law.log_bayes_factor))
+    return tuple(sorted(laws_of_kinds(base, tuple(_joint_processes(base))), key=lambda law: -law.log_bayes_factor))
 
 
 def joint_law_log_posterior(base: LinearModel) -> float:
@@ -282,17 +276,16 @@ def log_posterior_of_any(log_bayes_factors: Array) -> Array:
 
 def law_covariances(base: LinearModel) -> list[list[Array]]:
     """(n, n) in the channel of the laws of usual size, those of one kind of one joint together."""
-    of_one_joint = {} if base.pose_errors is None else base.pose_errors.joint_processes
     return [
         [SMOOTH_SCALE**2 * base.reduce(base.reduce(smooth.twist_covariance(p)).T) for p in smooth.of_joint(joint)]
-        for smooth in of_one_joint.values()
+        for smooth in _joint_processes(base).values()
         for joint in dict.fromkeys(smooth.joints)
     ]
 
 
-def _kinds(base: LinearModel) -> Sequence[str]:
-    """All that the views tell of."""
-    return () if base.pose_errors is None else tuple(base.pose_errors.joint_processes)
+def _joint_processes(base: LinearModel) -> dict[str, SmoothErrors]:
+    """What each joint alone may do without a name, by kind; empty where pose errors have no prior."""
+    return {} if base.pose_errors is None else base.pose_errors.joint_processes
 
 
 def laws_of_kinds(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
@@ -300,32 +293,33 @@ def laws_of_kinds(base: LinearModel, kinds: Sequence[str]) -> list[JointLaw]:
 
     All variances are sought anew for the likeliest few; for the others their likelihood at the null's is a bound.
     """
-    of_one_joint = {} if base.pose_errors is None else base.pose_errors.joint_processes
+    processes = _joint_processes(base)
     tried = [
         _law_at_null(base, follows, process)
         for follows in kinds
-        if follows in of_one_joint
-        for process in range(len(of_one_joint[follows].joints))
+        if follows in processes
+        for process in range(len(processes[follows].joints))
     ]
     tried.sort(key=lambda law: -law.log_bayes_factor)
     tried = [law.fitted() if k < limits.JOINT_LAWS_FITTED else law for k, law in enumerate(tried)]
     every: dict[tuple[int, str], list[JointLaw]] = {}
     for law in tried:
         every.setdefault((law.joint, law.follows), []).append(law)
-    return [_average_laws(laws) for laws in every.values()]
-
-
-def _average_laws(laws: Sequence[JointLaw]) -> JointLaw:
-    """The likeliest of a joint's laws of a kind; which of them it is, nobody knows."""
-    likeliest = max(laws, key=lambda law: law.log_bayes_factor)
-    return replace(likeliest, log_bayes_factor=float(log_mean_exp([law.log_bayes_factor for law in laws])))
+    # Which of a joint's laws of a kind it is, nobody knows: the likeliest has the mean Bayes factor of all.
+    return [
+        replace(
+            max(laws, key=lambda law: law.log_bayes_factor),
+            log_bayes_factor=float(log_mean_exp([law.log_bayes_factor for law in laws])),
+        )
+        for laws in every.values()
+    ]
 
 
 def _law_at_null(base: LinearModel, follows: str, process: int) -> JointLaw:
-    assert base.pose_errors is not None
-    smooth = base.pose_errors.joint_processes[follows]
+    smooth = _joint_processes(base)[follows]
     joint, motions = smooth.joints[process] + 1, smooth.columns[:, process].reshape(-1, 6, 1)
-    sized = size_process(base, process_with_covariance(joint, motions, smooth.kernel_of(process)))
+    kernel = smooth.kernel_of(process)
+    sized = size_process(base, SmoothProcess(joint, motions, kernel @ _leading_courses(kernel, len(kernel))))
     return JointLaw(joint, follows, process, sized.gain, base)
 
 
@@ -351,16 +345,6 @@ class LawCovariate:
     kernel: Callable[[Array, Array], Array]  # (S, O) between places (S,) and (O,)
     remaining_kernel: Array | float = 1.0  # (V, V) between views, by all that the law follows beside it
     unit: float = 1.0  # of the covariate per unit of `stood`
-
-
-def covariates_of_law(law: JointLaw) -> list[LawCovariate]:
-    """All of them, by the kind of the law."""
-    return _COVARIATES_OF_KIND[law.follows][1](law)
-
-
-def covariates_in_words(law: JointLaw) -> str:
-    """Return what a law follows in words: the joint angles, the way it came, time, its load."""
-    return _COVARIATES_OF_KIND[law.follows][0]
 
 
 def _angle(joint: int, stood: Array, of_it: Callable[[Array, Array], Array], rest: Array | float = 1.0) -> LawCovariate:
@@ -406,25 +390,13 @@ def _approach(law: JointLaw) -> list[LawCovariate]:
     ]
 
 
-def _angles_and_time(law: JointLaw) -> list[LawCovariate]:
-    return [_along_time(law, (1 + rbf_joints(law.base.measurement.views.joints)) / 2)]
-
-
-def _time_only(law: JointLaw) -> list[LawCovariate]:
-    return [_along_time(law, 1.0)]
-
-
-def _along_time(law: JointLaw, rest: Array | float) -> LawCovariate:
+def _time(law: JointLaw) -> list[LawCovariate]:
     measurement = law.base.measurement
     seconds = usual_time_step(measurement)
     name, unit = ("time_s", seconds) if seconds else ("view", 1.0)
-    return LawCovariate(
-        name,
-        time_in_steps(measurement),
-        partial(exponential_kernel, reach=DRIFT_MEMORY["slowly wandering"]),
-        rest,
-        unit,
-    )
+    of_it = partial(exponential_kernel, reach=DRIFT_MEMORY["slowly wandering"])
+    rest = (1 + rbf_joints(measurement.views.joints)) / 2 if law.follows == WITH_TIME else 1.0
+    return [LawCovariate(name, time_in_steps(measurement), of_it, rest, unit)]
 
 
 def _joint_load(law: JointLaw) -> list[LawCovariate]:
@@ -434,13 +406,10 @@ def _joint_load(law: JointLaw) -> list[LawCovariate]:
     for t in own:
         stood = torques.values[:, t]
         of_it = partial(exponential_kernel, reach=len(own) * float(np.ptp(stood)))
-        found.append(LawCovariate(_load_name(torques.names[t]), stood, of_it, whole / of_it(stood, stood)))
+        # Of what is known to weigh something, or of 1 kg at a link.
+        name = f"j{torques.names[t]}_torque_nm" + ("_per_kg" if "_" in torques.names[t] else "")
+        found.append(LawCovariate(name, stood, of_it, whole / of_it(stood, stood)))
     return found
-
-
-def _load_name(torque: str) -> str:
-    """Name a torque: of what is known to weigh something, or of 1 kg at a link."""
-    return f"j{torque}_torque_nm" + ("_per_kg" if "_" in torque else "")
 
 
 # By kind of law what it follows, in words and along what its course is told.
@@ -450,8 +419,8 @@ _COVARIATES_OF_KIND: dict[str, tuple[str, Callable[[JointLaw], list[LawCovariate
     OWN_ANGLE: (JOINT_ANGLES, _own_angle),
     WAVES: (JOINT_ANGLES, _periodic_angle),
     TRAVEL: ("the way it came", _approach),
-    WITH_TIME: ("time", _angles_and_time),
-    TIME_ONLY: ("time", _time_only),
+    WITH_TIME: ("time", _time),
+    TIME_ONLY: ("time", _time),
     JOINT_LOAD: ("its load", _joint_load),
 }
 
@@ -489,7 +458,7 @@ def significant_laws(linear: LinearModel) -> tuple[JointLaw, ...]:
 def _laws_without_arm_errors(linear: LinearModel) -> tuple[JointLaw, ...]:
     """Return laws of which one, where joints and links err by it alone, is 20 to 1 over none and explains no less
     than all of them together."""
-    if linear.pose_errors is None or not linear.pose_errors.joint_processes:
+    if not _joint_processes(linear):
         return ()
     right = linear.without_arm
     tried = joint_laws(right)
@@ -523,7 +492,8 @@ def _law_with_alternatives(laws: Sequence[JointLaw], together: float) -> JointLa
         together: log Bayes factor of them.
     """
     near = [law for law in laws if law.log_bayes_factor > laws[0].log_bayes_factor - limits.ODDS]
-    return replace(laws[0], log_bayes_factor=together, may_follow=tuple(dict.fromkeys(map(covariates_in_words, near))))
+    in_words = dict.fromkeys(_COVARIATES_OF_KIND[law.follows][0] for law in near)
+    return replace(laws[0], log_bayes_factor=together, may_follow=tuple(in_words))
 
 
 # Where in the range a joint errs that follows a law without a name, or when, or under which load: its course, with
@@ -562,7 +532,7 @@ def joint_curves(laws: Sequence[JointLaw]) -> tuple[JointCurve, ...]:
     for law in laws:
         alike = law.errors.kernel_of(law.process)
         whole = float(_law_given_views(law, alike, alike)[0].var())
-        found += [_curve_along(law, along, whole) for along in covariates_of_law(law)]
+        found += [_curve_along(law, along, whole) for along in _COVARIATES_OF_KIND[law.follows][1](law)]
     return tuple(sorted((c for c in found if c.share > limits.CURVE_LEAST_SHARE), key=lambda c: -c.share))
 
 

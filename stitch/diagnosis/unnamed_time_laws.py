@@ -41,8 +41,6 @@ from stitch.units import duration_text
 
 # Of a Gaussian its full width at half maximum.
 _FULL_WIDTH = 2.355
-
-
 # Periods between those that are tried, where one of them is clear.
 _PERIOD_REFINEMENT = 17
 # Of a swing in which all that moves does so at once: one of these is within a sixteenth of a period of any phase.
@@ -107,7 +105,7 @@ def _swings_in_phase(linear: LinearModel, frequencies: Array) -> Iterator[_Descr
     """Yield swings with one phase for all motions, as where one temperature moves them: half as many numbers."""
     for _, words, waves, f in _swings(linear, frequencies):
         for phase in np.arange(_PHASES) * np.pi / _PHASES:
-            yield _SWING_IN_PHASE, words, partial(_wave, waves, phase), f
+            yield _SWING_IN_PHASE, words, partial(_at_phase, waves, phase), f
 
 
 def _waves(frequency: float, time: Array) -> Array:
@@ -116,7 +114,7 @@ def _waves(frequency: float, time: Array) -> Array:
     return np.stack([np.cos(phase), np.sin(phase)], axis=1)
 
 
-def _wave(waves: _TimeCourse, phase: float, time: Array) -> Array:
+def _at_phase(waves: _TimeCourse, phase: float, time: Array) -> Array:
     """(T, 1) the one of them with a phase."""
     return np.asarray(waves(time) @ np.array([[np.cos(phase)], [np.sin(phase)]]))
 
@@ -197,7 +195,7 @@ def significant_time_law(linear: LinearModel) -> TimeLaw | None:
     """The likeliest, where it is 20 to 1 likelier than none, beside all else that poses may do or in place of what
     wanders; a swing with the likeliest of all periods near its own.
 
-    As with a joint's law (`clear_joints.py`) the odds are those of the likeliest sizes.
+    As with a joint's law (`significant_laws`) the odds are those of the likeliest sizes.
     """
     law = likeliest_time_law(linear)
     if law is None or law.log_bayes_factor <= limits.ODDS:
@@ -327,17 +325,9 @@ def least_log_bayes_factor(linear: LinearModel, scored: Score) -> float:
 
 def _factor_with_course(linear: LinearModel, course: FittedProcess, scored: Score) -> float:
     both = linear.in_blocks(np.hstack([course.columns, scored.form.columns]))
-    tried = [
-        _deviance_with_columns(
-            linear, both, np.append(np.full(course.columns.shape[1], times * course.size), scored.sizes)
-        )
-        for times in limits.COURSE_SIZES
-    ]
-    return 0.5 * (course.fit.deviance - min(tried))
-
-
-def _deviance_with_columns(linear: LinearModel, G: Array, prior: Array) -> float:
-    return fit_variances(linear.mixed, G, prior, start=linear.null.variances).deviance
+    own, start = np.full(course.columns.shape[1], course.size), linear.null.variances
+    priors = [np.append(times * own, scored.sizes) for times in limits.COURSE_SIZES]
+    return 0.5 * (course.fit.deviance - min(fit_variances(linear.mixed, both, p, start).deviance for p in priors))
 
 
 # What the poses do wrong again without a name: which processes of the prior the views want, and how large they are.
@@ -367,11 +357,11 @@ def reportable(unnamed: tuple[RepeatingError, ...], implausible: bool) -> tuple[
 def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
     """Kinds of errors without which the views cannot do, clearest first; () where white scatter explains them.
 
-    Without a prior of pose errors the likeliest alone (`unnamed_courses.py`).
+    Without a prior of pose errors the likeliest alone (`unnamed_courses`).
 
     Each is left out of the prior in turn, all other sizes fitted anew. A size that is not wanted goes to where its
     prior piles up and costs nothing; one that is wanted pays for its prior's tail alone and not for its width, about
-    three nats (`variance_prior.py`), which the odds of 20 to 1 stand for.
+    three nats (`reml`), which the odds of 20 to 1 stand for.
     """
     if linear.pose_errors is None:
         return _course_errors(linear)

@@ -1,6 +1,7 @@
 """The verdict of a diagnosis, decided in one place from evidence that was gathered before."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -9,6 +10,7 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.unnamed_time_laws import RepeatingError
+from stitch.diagnosis.validation import CrossValidation
 from stitch.observations.surfaces.scanner_errors import FieldError
 
 Verdict = Literal["adequate", "missing_effect", "cannot_tell", "unknown_effect"]
@@ -31,6 +33,8 @@ class Evidence:
     scanner_error: FieldError | None = None
     repeating_errors: tuple[RepeatingError, ...] | None = None  # pose errors without a name; None: not asked
     implausible_scatter: bool = False  # the poses scatter by more than is stated, or than any sound arm does
+    # of effects that may be named, beside all that each was named beside
+    left_out: Mapping[str, CrossValidation] = field(default_factory=dict)
     overlap_misfit: float = 0.0  # rms that no motion of the views removes, where it exceeds the noise; length_unit
     notes: tuple[str, ...] = ()  # effects that explain much and are not named, and why
 

@@ -1,7 +1,7 @@
 """Chances, before measuring: that an effect would be detected, named, or taken for another.
 
 What planned views would see is drawn: an effect of a given size, beside everything that poses err by otherwise. Every
-candidate effect is then judged as a diagnosis judges it (`diagnosis/selection`), at the expected variances: family-wise
+candidate effect is then judged as a diagnosis judges it (`diagnosis.evidence`), at the expected variances: family-wise
 p, Bayes factor, and odds over every rival in the model in which neither of the two is among the errors that remain, and
 over joints that follow by no law; not over a flange that errs in time by no law.
 What a diagnosis asks of views left out is not drawn.
@@ -26,7 +26,6 @@ from stitch.planning.expected_model import (
     CellModel,
     ExpectedHandEye,
     FittedScatter,
-    Scatter,
     expected_hand_eye,
     expected_model,
     expected_scatter,
@@ -82,18 +81,19 @@ def test_of_candidate(linear: LinearModel, candidate: Candidate, tests: int) -> 
     Args:
         linear: the candidate is none of its pose errors.
     """
-    forms, scales = zip(candidate.forms, form_weights(candidate), strict=True), regime_of(linear).scales
     found = [
         _form_test(linear, scale * form.columns * form.sizes, float(weight), tests, share)
-        for form, weight in forms
-        for scale, share in scales.items()
+        for form, weight in zip(candidate.forms, form_weights(candidate), strict=True)
+        for scale, share in regime_of(linear).scales.items()
     ]
     return CandidateTest(linear, tuple(found))
 
 
 def covariance_tests(linear: LinearModel, covariance: Array, sigmas: Array) -> tuple[CandidateTest, ...]:
     """Build tests of errors with a covariance (n, n) in the channel, times the square of each sigma (s,)."""
-    half = _factor(covariance)
+    values, vectors = np.linalg.eigh(covariance)
+    keep = values > 1e-12 * values[-1]
+    half = vectors[:, keep] * np.sqrt(values[keep])
     return tuple(CandidateTest(linear, (_form_test(linear, sigma * half, 1.0, 1),)) for sigma in sigmas)
 
 
@@ -115,13 +115,6 @@ def _form_test(linear: LinearModel, columns: Array, weight: float, tests: int, s
         solved=solved,
         limit=float(limit) if keep.any() else np.inf,
     )
-
-
-def _factor(covariance: Array) -> Array:
-    """(n, r) columns whose products make a covariance (n, n)."""
-    values, vectors = np.linalg.eigh(covariance)
-    keep = values > 1e-12 * values[-1]
-    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
 
 
 # From which size on planned views would tell one effect from another, pair by pair.
@@ -183,6 +176,8 @@ def _median(values: Array, weights: Array) -> float:
     return float(values[order][np.searchsorted(share, 0.5)])
 
 
+# What a diagnosis would say of one effect, over draws of what planned views may see.
+
 DRAWS = 100
 
 
@@ -209,13 +204,9 @@ class ExpectedDiagnosis:
         # By candidate the tests of all laws beside it, of each kind of each joint together, at several sizes.
         self._laws: dict[int, list[list[tuple[CandidateTest, ...]]]] = {}
 
-    def simulate_numbers(self, shift: Array, rng: np.random.Generator) -> Array:
-        """(n, D) numbers of the channel: shifts (n, D) under all other errors."""
-        return np.asarray(self._half @ rng.standard_normal(shift.shape) + shift)
-
     def chance(self, effect: str, shift: Array, rng: np.random.Generator) -> Chance:
-        """Return what would be said of an effect that shifts the channel by (n, D)."""
-        numbers = self.simulate_numbers(shift, rng)
+        """Return what would be said of an effect that shifts the channel by (n, D), under all other errors."""
+        numbers = np.asarray(self._half @ rng.standard_normal(shift.shape) + shift)
         own = [self._test({c.name}, c).evaluate(numbers) for c in self.candidates]
         factor, significant = np.array([f for f, _ in own]), np.array([s for _, s in own])
         best = self._best(numbers, np.where(significant & (factor > 0), factor, -np.inf))
@@ -251,7 +242,7 @@ class ExpectedDiagnosis:
         return out
 
     def _ahead_of_laws(self, k: int, numbers: Array) -> Mask:
-        """(D,) whether a candidate is ahead of joints that follow by no law (`joint_laws.py`)."""
+        """(D,) whether a candidate is ahead of joints that follow by no law (`law_covariances`)."""
         own = self._test({self.candidates[k].name}, self.candidates[k])
         if k not in self._laws:
             found, sizes = law_covariances(own.linear), np.sqrt(limits.LAW_VARIANCES)
@@ -259,20 +250,15 @@ class ExpectedDiagnosis:
         kinds = self._laws[k]
         if not kinds:
             return np.ones(numbers.shape[1], bool)
-        rival = log_posterior_of_any(
-            np.array([log_mean_exp(np.array([_best_log_factor(law, numbers) for law in kind])) for kind in kinds])
-        )
+        # Of each law the log Bayes factor at the likeliest of its sizes.
+        factors = [[np.max([size.evaluate(numbers)[0] for size in law], axis=0) for law in kind] for kind in kinds]
+        rival = log_posterior_of_any(np.array([log_mean_exp(np.array(kind)) for kind in factors]))
         return np.asarray(own.evaluate(numbers)[0] + np.log(limits.PRIOR_PHYSICAL / self.tests) > rival + limits.ODDS)
 
     def _ahead(self, k: int, other: int, numbers: Array) -> Mask:
         pair = [self.candidates[k], self.candidates[other]]
         own, rival = (self._test({c.name for c in pair}, c).evaluate(numbers)[0] for c in pair)
         return np.asarray(own > rival + limits.ODDS)
-
-
-def _best_log_factor(law: Sequence[CandidateTest], numbers: Array) -> Array:
-    """(D,) log Bayes factor at the likeliest of its sizes."""
-    return np.asarray(np.max([size.evaluate(numbers)[0] for size in law], axis=0))
 
 
 def _is_visible(linear: LinearModel, candidate: Candidate) -> bool:
@@ -347,28 +333,19 @@ def view_outlook(
     diagnosed = with_scatter(linear, fitted_scatter.fitted)
     candidates, missing = candidates_of(linear, empirical=False)
     expected = ExpectedDiagnosis(diagnosed, candidates)
-    at = None if feature is None else feature_in_scanner(found.unconstrained.poses, feature)
-    ordinary = _ordinary_scatter(fitted_scatter.believed)
+    # Errors of a usual arm, where they are not larger anyway.
+    believed = fitted_scatter.believed
+    usual = {name: max(size, believed.errors.get(name, 0.0)) for name, size in usual_sizes().items()}
+    ordinary = replace(believed, errors=believed.errors | usual)
     return Outlook(
         views=len(session.views),
-        hand_eye=expected_hand_eye(with_scatter(linear, fitted_scatter.believed), found, at),
-        ordinary=expected_hand_eye(with_scatter(linear, ordinary), found, at),
+        hand_eye=expected_hand_eye(with_scatter(linear, believed), found, feature),
+        ordinary=expected_hand_eye(with_scatter(linear, ordinary), found, feature),
         effects=_effect_outlooks(diagnosed, candidates, expected, chances),
         pairs=tuple(effect_pairs(diagnosed, expected.candidates)),
         untestable={name: needs for name, needs in missing.items() if name not in linear.model.effects},
         fitted_scatter=fitted_scatter,
     )
-
-
-def _ordinary_scatter(scatter: Scatter) -> Scatter:
-    """Raise errors to those of a usual arm, where they are not larger anyway."""
-    usual = usual_sizes()
-    return replace(scatter, errors=scatter.errors | {k: max(v, scatter.errors.get(k, 0.0)) for k, v in usual.items()})
-
-
-def feature_in_scanner(poses: Array, feature: Array) -> Array:
-    """(3,) mean place of a point of the reference frame in the scanner's frame."""
-    return np.asarray(np.einsum("vji,vj->vi", poses[:, :3, :3], feature - poses[:, :3, 3]).mean(axis=0))
 
 
 def _effect_outlooks(

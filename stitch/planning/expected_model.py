@@ -14,7 +14,7 @@ from stitch.errors import InputError, NoResultError
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture, build_capture
 from stitch.measurement.measurement import Measurement, measurement_of, with_part_origin
-from stitch.measurement.scan import GRAZING_COSINE, Scan, even_indices, prepare_scan
+from stitch.measurement.scan import GRAZING_COSINE, even_indices, prepare_scan
 from stitch.measurement.session import Session
 from stitch.model.model import COVERAGE_FACTOR, Model
 from stitch.observations.linear_model import WHITE_COMPONENTS, LinearModel
@@ -221,10 +221,7 @@ def mean_scatter(linear: LinearModel, noise: float, variances: Sequence[tuple[Ar
     return FittedScatter(*both)
 
 
-def scatter_of_run(linear: LinearModel, noise: float) -> FittedScatter:
-    """Return the scatter that the views of a run show."""
-    return mean_scatter(linear, noise, [(linear.null.variances, mean_variances(linear.mixed, linear.null))])
-
+# What planned views would see, as a measurement and as a linear model.
 
 _SPACINGS, _SIGMAS = 1.5, 6.0  # of the gate
 # Fewer points of a view say nothing of six directions.
@@ -248,9 +245,8 @@ class ExpectedModel(LinearModel):
     def refit(self) -> Self:
         """The variances that the remaining errors had in the model this was taken from."""
         source = self.full_model or self
-        assert source.pose_errors is not None and self.pose_errors is not None
-        own = dict(zip(source.pose_errors.names, source.null.variances[NOISE + 1 :], strict=True))
-        kept = [own[name] for name in self.pose_errors.names]
+        own = dict(zip(source.component_names, source.null.variances[NOISE + 1 :], strict=True))
+        kept = [own[name] for name in self.component_names]
         return self.at(np.append(source.null.variances[: NOISE + 1], kept))
 
     def at(self, variances: Array) -> Self:
@@ -264,6 +260,13 @@ class SimulatedViews:
 
     measurement: Measurement
     unconstrained: UnconstrainedPoses
+
+    def field_middle(self, feature: Array | None = None) -> Array:
+        """(3,) scanner frame: mean place of a feature (3,) of the reference frame; None: of all that the views see."""
+        if feature is None:
+            return np.asarray(np.mean([p.mean(axis=0) for p in self.measurement.capture.point_sets], axis=0))
+        poses = self.unconstrained.poses
+        return np.asarray(np.einsum("vji,vj->vi", poses[:, :3, :3], feature - poses[:, :3, 3]).mean(axis=0))
 
 
 def expected_scans(cell: CellModel, T_reference_scanner: Array) -> list[Indices]:
@@ -281,7 +284,11 @@ def simulate_views(session: Session, cell: CellModel, samples: int = SAMPLES, fe
     Raises:
         NoResultError: no two views would overlap.
     """
-    session = _without_scans(session, cell.field.standoff)
+    session = replace(
+        session,
+        views=tuple(replace(view, cloud=None, sighting=None) for view in session.views),
+        scanner=replace(session.scanner, standoff=cell.field.standoff),
+    )
     T_base_flange = np.array([view.T_base_flange for view in session.views])
     bare = build_capture(session.name, (), T_base_flange, session.mount)
     poses = bare.poses(cell.model.T_mount)
@@ -292,21 +299,11 @@ def simulate_views(session: Session, cell: CellModel, samples: int = SAMPLES, fe
             f"view {blind} would see next to nothing of the part; to fix: check scanner.pose, scanner.standoff and the "
             "part, or leave the view out"
         )
-    scans = tuple(_simulated_scan(cell, T, index) for T, index in zip(poses, shown, strict=True))
+    seen = [frames.transform(frames.inverse(T), cell.part.points[i]) for T, i in zip(poses, shown, strict=True)]
+    scans = tuple(replace(prepare_scan("planned", points), noise=cell.scatter.noise) for points in seen)
     capture = replace(bare, scans=scans)
     measurement = with_part_origin(measurement_of(session, capture), cell.model.T_mount)
     return SimulatedViews(measurement, _unconstrained_poses(capture, poses, cell, samples))
-
-
-def _without_scans(session: Session, standoff: float) -> Session:
-    """The session without what it has seen."""
-    views = tuple(replace(view, cloud=None, sighting=None) for view in session.views)
-    return replace(session, views=views, scanner=replace(session.scanner, standoff=standoff))
-
-
-def _simulated_scan(cell: CellModel, T_reference_scanner: Array, index: Indices) -> Scan:
-    points = frames.transform(frames.inverse(T_reference_scanner), cell.part.points[index])
-    return replace(prepare_scan("planned", points), noise=cell.scatter.noise)
 
 
 def _unconstrained_poses(capture: Capture, poses: Array, cell: CellModel, samples: int) -> UnconstrainedPoses:
@@ -381,7 +378,8 @@ def cell_of_session(
     field = FieldOfView(np.array([half, half]), near, far, standoff=scanner.standoff, axis=scanner.optical_axis)
     surface, words = _part_of_session(session, part, size_mm)
     cell = CellModel(Model(scanner.T_mount), surface, field, scatter)
-    poses = _scanner_poses(session, scanner.T_mount)
+    T_base_flange = np.array([view.T_base_flange for view in session.views])
+    poses = build_capture(session.name, (), T_base_flange, session.mount).poses(scanner.T_mount)
     counts = np.array([len(index) for index in expected_scans(cell, poses)])
     if words or np.mean(counts >= FEWEST) < 0.5:
         # Where nobody says where the part is, it is where the views look.
@@ -425,7 +423,8 @@ def cell_of_state(state: Run, points: Array, normals: Array) -> PlannedCell:
         axis=state.session.scanner.optical_axis,
     )
     noise = float(np.nanmedian([scan.noise for scan in scans]))
-    told = scatter_of_run(linear_model_of(state), noise)
+    linear = linear_model_of(state)
+    told = mean_scatter(linear, noise, [(linear.null.variances, mean_variances(linear.mixed, linear.null))])
     return PlannedCell(CellModel(state.model, thinned_surface(points, normals), field, told.believed), (), told)
 
 
@@ -442,11 +441,6 @@ def _part_of_session(session: Session, part: Path | None, size_mm: float | None)
     raise InputError(
         f"{session.path}: the scanned part is not stated; to fix: --part MESH, or --size MM of its longest side"
     )
-
-
-def _scanner_poses(session: Session, T_mount: Array) -> Array:
-    T_base_flange = np.array([view.T_base_flange for view in session.views])
-    return build_capture(session.name, (), T_base_flange, session.mount).poses(T_mount)
 
 
 # The uncertainty that planned views would give the hand-eye, and where it would come from.
@@ -472,16 +466,17 @@ def displacement(covariance: Array, middle: Array) -> float:
     return float(COVERAGE_FACTOR * np.sqrt(np.trace(lever @ covariance @ lever.T)))
 
 
-def expected_hand_eye(linear: ExpectedModel, simulated: SimulatedViews, middle: Array | None = None) -> ExpectedHandEye:
+def expected_hand_eye(
+    linear: ExpectedModel, simulated: SimulatedViews, feature: Array | None = None
+) -> ExpectedHandEye:
     """Predict the fit of `fit_hand_eye`: least squares under the scatter alone, the covariance under all errors.
 
     Args:
-        middle: (3,) scanner frame, whose displacement U counts; None: the middle of what the views see.
+        feature: (3,) reference frame: the place whose displacement U counts; None: the middle of what the views see.
     """
     capture, T_mount = simulated.measurement.capture, linear.model.T_mount
     sizes, components = linear.null.variances, linear.mixed.components[:, 0]
-    errors = () if linear.pose_errors is None else linear.pose_errors.names
-    names = (*WHITE_COMPONENTS, *errors)
+    names = (*WHITE_COMPONENTS, *linear.component_names)
     columns = linear.reduce(linear.design)
     prior = weak_prior([capture], [simulated.unconstrained], T_mount, linear.sizes[6:])
     scatter = np.einsum("c,cij->ij", sizes[: NOISE + 1], components[: NOISE + 1])
@@ -494,9 +489,7 @@ def expected_hand_eye(linear: ExpectedModel, simulated: SimulatedViews, middle: 
         sources["scanner field"] = weighed.gain @ field @ weighed.gain.T
     sources["unseen"] = weighed.covariance @ prior @ weighed.covariance
     covariance = np.sum(list(sources.values()), axis=0)
-    if middle is None:
-        middle = np.mean([points.mean(axis=0) for points in capture.point_sets], axis=0)
-    return ExpectedHandEye(covariance[:6, :6], _shares_of(sources, covariance), middle)
+    return ExpectedHandEye(covariance[:6, :6], _shares_of(sources, covariance), simulated.field_middle(feature))
 
 
 def _shares_of(sources: dict[str, Array], covariance: Array) -> dict[str, float]:
@@ -537,5 +530,4 @@ def expected_scatter(linear: ExpectedModel, noise: float) -> FittedScatter:
 
 def with_scatter(linear: ExpectedModel, scatter: Scatter) -> ExpectedModel:
     """Return the same views under another scatter."""
-    names = () if linear.pose_errors is None else linear.pose_errors.names
-    return linear.at(scatter.variances(names))
+    return linear.at(scatter.variances(linear.component_names))

@@ -18,7 +18,7 @@ from stitch.observations.surfaces.effect_columns import view_columns, view_respo
 from stitch.observations.surfaces.hand_eye_fit import hand_eye_jacobian
 from stitch.observations.surfaces.scanner_errors import field_scatter
 from stitch.planning.candidate_views import candidate_joints, with_views
-from stitch.planning.detection_chances import Outlook, feature_in_scanner, view_outlook
+from stitch.planning.detection_chances import Outlook, view_outlook
 from stitch.planning.expected_model import (
     CellModel,
     PlannedCell,
@@ -54,11 +54,11 @@ class PossibleViews:
     session: Session
     cell: CellModel
     simulated: SimulatedViews
-    scatter: Scatter
+    scatter: Scatter  # with the errors of the arm that the views are expected to leave open
 
     def channel(self, foreign_effects: Sequence[str] = (), columns: Sequence[Array] = ()) -> TwistChannel:
-        """Hand-eye, a common motion, effects in use, further columns; `foreign_effects`: effects that no arm "
-        "has of itself."""
+        """Hand-eye, a common motion, effects in use, further columns; `foreign_effects` are such as no arm has of
+        itself."""
         m, freed, model = self.simulated.measurement, self.simulated.unconstrained, self.cell.model
         g = freed.overlaps.gram
         errors = prior_pose_errors([m], model, [g.centre]).without(set(foreign_effects))
@@ -66,7 +66,11 @@ class PossibleViews:
         covariance = np.einsum("c,cij->ij", sizes[3:], errors.components) + self._white()
         field = field_scatter(m, freed)
         covariance += field @ field.T
-        covariance += noise_of(self._information(), sizes[2] * g.variance, max(g.lever, 1e-9))
+        # Of every view against all others.
+        information = np.zeros((g.views, 6, 6))
+        for side in (0, 1):
+            np.add.at(information, g.pairs[:, side].astype(np.int64), g.matrix)
+        covariance += noise_of(information, sizes[2] * g.variance, max(g.lever, 1e-9))
         used = view_columns(m, model, freed) * sizes_of(model.terms)
         common = np.tile(np.eye(6), (g.views, 1))
         own = hand_eye_jacobian(m.capture.hand_eye_frames(model.T_mount), g.centre)
@@ -95,24 +99,6 @@ class PossibleViews:
         each = np.arange(len(carried))
         out[each, :, each] = (carried * size) @ carried.transpose(0, 2, 1)
         return out.reshape(6 * len(carried), -1)
-
-    def _information(self) -> Array:
-        """(N, 6, 6) of every view against all others."""
-        g = self.simulated.unconstrained.overlaps.gram
-        out = np.zeros((g.views, 6, 6))
-        for side in (0, 1):
-            np.add.at(out, g.pairs[:, side].astype(np.int64), g.matrix)
-        return out
-
-
-def possible_views(session: Session, cell: CellModel, scatter: Scatter) -> PossibleViews:
-    """A session with all views that could be added.
-
-    Args:
-        scatter: with the errors of the arm that the views are expected to leave open.
-    """
-    coarse = replace(cell, part=thinned_surface(cell.part.points, cell.part.normals, _POINTS))
-    return PossibleViews(session, coarse, simulate_views(session, coarse, _SAMPLES, _MIN_VIEW_SAMPLES), scatter)
 
 
 # What further views are for: a hand-eye known twice as well, two effects told apart; how far some views get.
@@ -253,6 +239,8 @@ def travel_order(joints: Array, last: int, chosen: Sequence[int]) -> list[int]:
     return out
 
 
+# What a plan rests on: how many views are tried and proposed, and for which pairs of effects.
+
 # Fewer views give no hand-eye: two motions about different axes are the least (Tsai & Lenz 1989).
 _MIN_PRESENT_VIEWS = 3
 # Views that are tried; and proposed, beside present ones or where there are none, unless a number is asked for.
@@ -318,14 +306,13 @@ def plan_further_views(session: Session, planned: PlannedCell, request: PlanRequ
         if not len(possible):
             return empty
         told = planned.fitted_scatter if now is None else now.fitted_scatter
-        bed = possible_views(
-            with_views(session, list(possible), in_turn=False), cell, told.believed if told else cell.scatter
-        )
-        goals = _plan_goals(bed, now, request)
-        joints = np.array([view.joints for view in bed.session.views])
-        chosen = (
-            choose_views(goals, joints, present, request.views or (_ALL if now is None else _MORE)) if goals else []
-        )
+        every = with_views(session, list(possible), in_turn=False)
+        coarse = replace(cell, part=thinned_surface(cell.part.points, cell.part.normals, _POINTS))
+        simulated = simulate_views(every, coarse, _SAMPLES, _MIN_VIEW_SAMPLES)
+        views = PossibleViews(every, coarse, simulated, told.believed if told else cell.scatter)
+        goals, joints = _plan_goals(views, now, request), np.array([view.joints for view in every.views])
+        most = request.views or (_ALL if now is None else _MORE)
+        chosen = choose_views(goals, joints, present, most) if goals else []
         if not chosen:
             return empty
         further = with_views(session, [joints[k] for k in chosen])
@@ -339,8 +326,7 @@ def plan_further_views(session: Session, planned: PlannedCell, request: PlanRequ
 def _plan_goals(views: PossibleViews, now: Outlook | None, request: PlanRequest) -> list[Goal]:
     goals = list[Goal]()
     if request.halve or now is None:
-        channel = views.channel()
-        middle = _uncertainty_point(views, request.feature)
+        channel, middle = views.channel(), views.simulated.field_middle(request.feature)
         goal = HalvedHandEye(channel, middle, float("nan"))
         present = float(goal.U(channel.normal(range(now.views)))) if now else float("nan")
         goals.append(replace(goal, now=present))
@@ -349,14 +335,6 @@ def _plan_goals(views: PossibleViews, now: Outlook | None, request: PlanRequest)
     elif request.split_any and now is not None:
         goals += _hardest_pair_goal(views, now)
     return goals
-
-
-def _uncertainty_point(views: PossibleViews, feature: Array | None) -> Array:
-    if feature is not None:
-        return feature_in_scanner(views.simulated.unconstrained.poses, feature)
-    return np.asarray(
-        np.mean([points.mean(axis=0) for points in views.simulated.measurement.capture.point_sets], axis=0)
-    )
 
 
 def _split_goal(views: PossibleViews, names: tuple[str, str]) -> SplitPair:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stitch.comparison.residual_tables import ResidualTables, equal_count_bins, table_of, view_statistics
+from stitch.comparison.residual_tables import ResidualTables, binned_table, equal_count_bins, view_statistics
 
 
 def compared(errors, properties, rms=1.0):
@@ -12,5 +12,5 @@ def compared(errors, properties, rms=1.0):
         edges, bins = equal_count_bins(values)
         n = (bins == np.arange(len(edges) - 1)[:, None]) * 1000.0
         statistics = view_statistics(n, n * errors, n * errors**2)
-        tables.append(table_of(name, "deg", (edges[:-1], edges[1:]), (), statistics))
+        tables.append(binned_table(name, "deg", edges, statistics))
     return ResidualTables(tuple(tables), rms, rms)

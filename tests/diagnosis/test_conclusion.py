@@ -37,14 +37,14 @@ def upheld(monkeypatch, evidence, *, together, refused):
     """With what the views say of two effects together, and evidences that the scanner's own error outweighs."""
 
     def with_scanner_error(linear, e):
-        return replace(e, scanner_error=SMOOTH) if e in refused else e
+        return replace(e, scanner_error=SMOOTH) if replace(e, left_out={}) in refused else e
 
     pair = together and (together.explanation[0], together.further)
     monkeypatch.setattr(gathering, "regime_of", lambda linear: SimpleNamespace(many_views=False))
     monkeypatch.setattr(gathering, "find_missing_pair", lambda *asked: pair)
     monkeypatch.setattr(gathering, "pair_is_validated", lambda *asked: True)
     monkeypatch.setattr(gathering, "with_scanner_error", with_scanner_error)
-    return gathering.challenge(None, (), evidence, gathering.cross_validate_named(None, evidence))
+    return gathering.challenge(None, (), replace(evidence, left_out=gathering.cross_validate_named(None, evidence)))
 
 
 def test_what_looks_like_an_error_of_the_scanner_may_be_a_second_effect(monkeypatch):

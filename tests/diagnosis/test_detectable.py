@@ -14,14 +14,14 @@ from stitch.statistics.variance_posterior import satterthwaite
 def test_known_scatter_and_one_parameter_need_what_two_quantiles_say():
     """With so many tests that the p-value decides: |θ| √I = z(1 − α/2K) + z(0.8)."""
     tests = 1_000_000
-    least = least_noncentrality(np.array([[1.0]]), 1.0, tests, 1e7)
+    least = least_noncentrality(np.array([[1.0]]), 1.0, tests, 1e7, {1.0: 1.0})
     assert np.sqrt(least) == pytest.approx(norm.isf(ALPHA_NAME / 2 / tests) + norm.ppf(0.8), rel=5e-3)
 
 
 def test_far_beyond_what_is_needed_nothing_is_asked_of_the_distribution():
     """There its series ends in NaN: scipy's for 898 degrees of freedom, an F of 266 and a shift of 2,496."""
     white = np.full((1760, 1), 30.0)
-    least = least_noncentrality(white, 1e-112, 8, 897.9767842812669)
+    least = least_noncentrality(white, 1e-112, 8, 897.9767842812669, {1.0: 1.0})
     assert np.isfinite(least) and least > 500
 
 
@@ -37,7 +37,7 @@ def test_the_smallest_size_shows_in_eight_of_ten():
     plausible = MixedModel(np.zeros((1, n)), A[None], components[:, None])
     unit = VarianceFit(np.array([1.0, 1e-9, 1.0]), 0.0, np.zeros(1), np.eye(1))
     degrees_of_freedom = satterthwaite(plausible, unit).degrees_of_freedom(free[None])
-    least = least_noncentrality(free * 2.0, 1.0, tests, degrees_of_freedom)
+    least = least_noncentrality(free * 2.0, 1.0, tests, degrees_of_freedom, {1.0: 1.0})
     theta = np.ones(p) * np.sqrt(least) / np.linalg.norm(free.sum(axis=1))
     shown = 0
     for _ in range(draws):
