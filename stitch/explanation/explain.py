@@ -57,11 +57,6 @@ def _body_text(addend: Sequence[tuple[Ingredient, float]]) -> str:
     return f"{first.place} {axes} = {', '.join(sizes)} · {first.quantity.text}"
 
 
-def _letter_names(count: int) -> list[str]:
-    """Return names of the sizes: a, b, … or a1, a2, … where there are more than four."""
-    return list("abcd"[:count]) if count <= 4 else [f"a{k + 1}" for k in range(count)]
-
-
 def effect_source(name: str, ingredients: Sequence[Ingredient], coefficients: Sequence[float], origin: str) -> str:
     """The file; all ingredients stand at one place.
 
@@ -70,26 +65,24 @@ def effect_source(name: str, ingredients: Sequence[Ingredient], coefficients: Se
         origin: where the formula comes from, for the first line of the file.
     """
     place = ingredients[0].place
-    letters = _letter_names(len(ingredients))
+    count = len(ingredients)
+    letters = list("abcd"[:count]) if count <= 4 else [f"a{k + 1}" for k in range(count)]
     specs = "".join(
         f'    {a}=number("{i.unit}", typical={size:.2g}, limit={FORMULA_LIMIT_SIZES * size:.2g}),\n'
         for a, i, size in zip(letters, ingredients, np.abs(coefficients), strict=True)
     )
+    # What the code reads of the views, as the tuple that the library asks for.
+    names = ["joints"] if place == "robot" else []
+    names = list(dict.fromkeys([*names, *(need for i in ingredients for need in i.quantity.needs)]))
+    quoted = ", ".join(f'"{need}"' for need in names)
+    needs = f"({quoted},)" if len(names) == 1 else f"({quoted})"
     head = (
         f'"""{origin}"""\n\nimport numpy as np\n\nfrom stitch.effects import effect, number\n\n\n'
-        f'@effect(\n    "{place}",\n    needs={_needed_views(ingredients)},\n{specs})\n'
+        f'@effect(\n    "{place}",\n    needs={needs},\n{specs})\n'
     )
     body = _joint_code(ingredients, letters) if place == "robot" else _twist_code(ingredients, letters)
     first = "joints, views" if place == "robot" else "views"
     return head + "\n".join([f"def {name}({first}, {', '.join(letters)}):", *(f"    {line}" for line in body), ""])
-
-
-def _needed_views(ingredients: Sequence[Ingredient]) -> str:
-    """Return what the file's code reads of the views, as the tuple that the library asks for."""
-    own = ["joints"] if ingredients[0].place == "robot" else []
-    names = dict.fromkeys([*own, *(need for i in ingredients for need in i.quantity.needs)])
-    quoted = [f'"{name}"' for name in names]
-    return f"({quoted[0]},)" if len(quoted) == 1 else f"({', '.join(quoted)})"
 
 
 def _joint_code(ingredients: Sequence[Ingredient], letters: Sequence[str]) -> list[str]:
@@ -108,6 +101,8 @@ def _twist_code(ingredients: Sequence[Ingredient], letters: Sequence[str]) -> li
         lines += [f"course = {own[0][0].quantity.code}", f"twist[:, {axes}] += np.outer(course, [{sizes}])"]
     return [f'"""{told}"""', "twist = np.zeros((views.count, 6))", *lines, "return twist"]
 
+
+# Sums that may hold, tried as an effect among all views.
 
 EFFECT_NAME = "explained"
 _TINY = 1e-12
@@ -172,7 +167,10 @@ def _try_sum(linear: LinearModel, terms: Dictionary, chosen: TestedSum, origin: 
         return Explanation(False, f"{text} explains the views, but not those left out with their neighbours.")
     if beyond is not None and not beyond.helps:
         return Explanation(False, f"{beyond.rejection_reason(text)}.")
-    tested = _tested_formula(linear, terms, chosen, text)
+    tested, other = text, chosen.instead_of
+    if other and not _are_same_sum(other, own):
+        # The formula that stood the test is another, in whose place all views want this one.
+        tested = formula_text(other, _coefficients(linear, other, fitted_sizes(linear, terms, other)))
     why = f"{text}: {_test_sentence(chosen.p_value, text, tested)}."
     return Explanation(
         True, why, text, own[0].place, tested, heldout_share=share, p_value=chosen.p_value, source=source
@@ -185,21 +183,15 @@ def _coefficients(linear: LinearModel, ingredients: Sequence[Ingredient], scaled
     return [coefficient(i, float(x), unit) for i, x in zip(ingredients, scaled, strict=True)]
 
 
-def _tested_formula(linear: LinearModel, terms: Dictionary, chosen: TestedSum, text: str) -> str:
-    """The formula that stood the test: the one that is told, or another in whose place all views want it."""
-    other = chosen.instead_of
-    if not other or _are_same_sum(other, chosen.ingredients):
-        return text
-    return formula_text(other, _coefficients(linear, other, fitted_sizes(linear, terms, other)))
-
-
 def _test_sentence(p_value: float, text: str, tested: str) -> str:
     """Say how the reported formula stood the test, or which one did."""
+    # As far as anybody can vouch for the tails of a distribution.
+    p = f"p = {p_value:.1g}" if p_value > _TINY else f"p < {_TINY:g}"
     if tested == text:
-        return f"found in one half of the views, it holds in the other ({_p_value_text(p_value)})"
+        return f"found in one half of the views, it holds in the other ({p})"
     return (
         f"likeliest in all views, but not the one tested. Found in one half and holding in the other: {tested} "
-        f"({_p_value_text(p_value)}, for this one alone)"
+        f"({p}, for this one alone)"
     )
 
 
@@ -210,11 +202,6 @@ def _are_same_sum(some: Sequence[Ingredient], others: Sequence[Ingredient]) -> b
         return (i.place, i.index) == (k.place, k.index) and i.quantity.nearly(k.quantity)
 
     return len(some) == len(others) and all(any(same(i, k) for k in others) for i in some)
-
-
-def _p_value_text(p_value: float) -> str:
-    """A p-value, as far as anybody can vouch for the tails of a distribution."""
-    return f"p = {p_value:.1g}" if p_value > _TINY else f"p < {_TINY:g}"
 
 
 def _score_effect(linear: LinearModel, source: str) -> Score:

@@ -44,30 +44,26 @@ class HalfModel:
     def __init__(self, linear: LinearModel, terms: Dictionary, keep: Indices) -> None:
         """Restrict a linear model to the views to keep; all others move freely."""
         self._linear, self._terms, self._keep = linear, terms, keep
-        self._out = np.setdiff1d(np.arange(linear.measurement.views.count), keep)
+        # Where each view is a block of its own, the blocks and the numbers of those kept; of surfaces views share all.
+        self._blocks = None if isinstance(linear.observation, SurfaceObservation) else keep
+        size = linear.mixed.z.shape[1]
+        rows = (keep[:, None] * size + np.arange(size)).ravel()
+        self._rows: slice | Indices = slice(None) if self._blocks is None else rows
         self._of_view = dict[tuple[str, int], Array]()
 
     @cached_property
     def _explained(self) -> Array:
         """(n, r) orthonormal."""
-        linear = self._linear
-        if isinstance(linear.observation, SurfaceObservation):
-            if not len(self._out):
-                return column_space(linear.white_design)
-            return explained_basis(linear, linear.observation, self._out)
+        linear, seen = self._linear, self._linear.observation
+        out = np.setdiff1d(np.arange(linear.measurement.views.count), self._keep)
+        if isinstance(seen, SurfaceObservation) and len(out):
+            return explained_basis(linear, seen, out)
         return column_space(linear.white_design[self._rows])
-
-    @cached_property
-    def _rows(self) -> Indices:
-        """Return the numbers of the kept views, where each view is a block of its own."""
-        rows = self._linear.mixed.z.shape[1]
-        return np.asarray((self._keep[:, None] * rows + np.arange(rows)).ravel())
 
     @cached_property
     def z(self) -> Array:
         """(n,) what was seen."""
-        surfaces = isinstance(self._linear.observation, SurfaceObservation)
-        white = self._linear.white_z if surfaces else self._linear.white_z[self._rows]
+        white = self._linear.white_z[self._rows]
         return np.asarray(white - self._explained @ (self._explained.T @ white))
 
     @property
@@ -86,8 +82,7 @@ class HalfModel:
 
     def residual_columns(self, response: Array) -> Array:
         """(n, k) whitened columns of a response (·, k), without what the model explains."""
-        surfaces = isinstance(self._linear.observation, SurfaceObservation)
-        white = self._linear.whiten(self._linear.reduce(response), None if surfaces else self._keep)
+        white = self._linear.whiten(self._linear.reduce(response), self._blocks)
         return np.asarray(white - self._explained @ (self._explained.T @ white))
 
     def columns(self, ingredients: Sequence[Ingredient]) -> Array:
@@ -136,11 +131,6 @@ class TestedSum:
     def holds(self) -> bool:
         """True if the half that took no part wants it."""
         return self.p_value < CONFIRMED_FORMULA and self.log_bayes_factor > ODDS
-
-
-def test_current_scatter(ingredients: tuple[Ingredient, ...], chosen: HalfModel, other: HalfModel) -> TestedSum:
-    """The test under the present scatter."""
-    return _test_sum(ingredients, *((half.columns(ingredients), half.z) for half in (chosen, other)))
 
 
 def test_refitted_scatter(
@@ -192,8 +182,8 @@ def _with_test_scatter(linear: LinearModel, own: Array, sizes: Array, slow: bool
     if slow and linear.pose_errors is None:
         return linear
     variances = linear.conditioned_on(own, sizes).null.variances.copy()
-    if slow and linear.pose_errors is not None:
-        wanders = NOISE + 1 + np.flatnonzero(np.isin(linear.pose_errors.names, list(DRIFT_MEMORY)))
+    if slow:
+        wanders = NOISE + 1 + np.flatnonzero(np.isin(linear.component_names, list(DRIFT_MEMORY)))
         variances[wanders] = np.maximum(variances, linear.null.variances)[wanders]
     return replace(linear, null=at_variances(linear.mixed, variances))
 
@@ -238,7 +228,10 @@ def pursue_sums(
     strength = np.linalg.norm(design, axis=0)
     usable = strength > _MIN_COLUMN_NORM * strength.max(initial=0.0)
     unit = np.where(usable, design / np.maximum(strength, 1e-300), 0.0)
-    asked = _PursuitProblem(unit, z, free, addends, _group_by_size(addends))
+    sizes = np.array([len(own) for own in addends])
+    alike = [np.flatnonzero(sizes == size) for size in np.unique(sizes)]
+    groups = [_AddendGroup(which, np.array([addends[int(k)] for k in which], np.int64)) for which in alike]
+    asked = _PursuitProblem(unit, z, free, addends, groups)
     worth, _, ranks, _ = asked.score_addends(np.zeros((len(z), 0)))
     first = np.argsort(-worth)[:starts]
     every = [asked.sums_from(int(k), refined_columns or (lambda own: design[:, own])) for k in first[ranks[first] > 0]]
@@ -251,12 +244,6 @@ class _AddendGroup:
 
     which: Indices  # (g,)
     columns: Indices  # (g, k)
-
-
-def _group_by_size(addends: Sequence[tuple[int, ...]]) -> list[_AddendGroup]:
-    sizes = np.array([len(own) for own in addends])
-    every = [np.flatnonzero(sizes == size) for size in np.unique(sizes)]
-    return [_AddendGroup(which, np.array([addends[int(k)] for k in which], np.int64)) for which in every]
 
 
 @dataclass(frozen=True)
@@ -391,6 +378,8 @@ def sum_residual(ingredients: Sequence[Ingredient], half: HalfModel) -> Array:
     return np.asarray(half.z - columns @ np.linalg.lstsq(columns, half.z, rcond=1e-9)[0])
 
 
+# Which sums some of the views suggest, and which of them the others want.
+
 _FIRST, _TESTED = 8, 3  # addends with which a sum is begun; sums of some views, or of all, that are tested further
 _REPORTED_SUMS = 6  # sums, the likeliest
 _ENOUGH = 300  # views of a half
@@ -400,15 +389,17 @@ _BLOCKS = 16  # of neighbours in time, for views that share a wandering error wh
 def search_sums(linear: LinearModel, terms: Dictionary) -> list[TestedSum]:
     """Sums of ingredients at one place: those that hold first, the likeliest of them before the others; with places,
     widths and periods as all views want them, and sums that all views suggest where one of theirs holds."""
-    found, ways, groups = list[TestedSum](), 0, _ingredient_groups(terms)
-    for (_, slow), some in groups.items():
+    found, ways, groups = list[TestedSum](), 0, defaultdict[tuple[str, bool], list[Ingredient]](list)
+    for i in terms.ingredients:
+        groups[_ingredient_group(i)].append(i)
+    for (_, slow), some in sorted(groups.items(), key=lambda own: own[0]):
         for chosen, other in _half_models(linear, terms, slow):
             found += _search_split(linear, terms, some, chosen, other)
             ways += 1
     found = [replace(c, p_value=min(1.0, ways * c.p_value)) for c in found]
     # Each was chosen in some views: what they and the others say of it counts.
     found.sort(key=lambda c: (not c.holds, -c.both))
-    every = _thinned_views(np.arange(_view_count(linear)), 2)
+    every = _thinned_views(np.arange(linear.measurement.views.count), 2)
     whole = HalfModel(linear.scatter_only, terms, every)
     told = [
         replace(c, ingredients=round_parameters(refine_parameters(c.ingredients, whole)))
@@ -428,15 +419,8 @@ def enough_views(linear: LinearModel, terms: Dictionary) -> bool:
 
 
 def _ingredient_group(ingredient: Ingredient) -> tuple[str, bool]:
+    """What ingredients that may stand in one sum have in common."""
     return ingredient.place, ingredient.quantity.slow
-
-
-def _ingredient_groups(terms: Dictionary) -> dict[tuple[str, bool], list[Ingredient]]:
-    """Ingredients that may stand in one sum."""
-    found = defaultdict[tuple[str, bool], list[Ingredient]](list)
-    for i in terms.ingredients:
-        found[_ingredient_group(i)].append(i)
-    return {own: found[own] for own in sorted(found)}
 
 
 def _half_models(linear: LinearModel, terms: Dictionary, slow: bool) -> Iterator[tuple[HalfModel, HalfModel]]:
@@ -449,8 +433,12 @@ def _half_models(linear: LinearModel, terms: Dictionary, slow: bool) -> Iterator
 
 def _view_splits(linear: LinearModel, slow: bool) -> list[tuple[Indices, Indices]]:
     """Views in which a sum is chosen, and those in which it is tested."""
-    parts = [_alternating_parts(linear, parts) for parts in (2, 3)]
-    parts += [np.array_split(np.arange(_view_count(linear)), 2)] if slow else []
+    # Over the same region of poses: view by view, or in blocks of time.
+    count = linear.measurement.views.count
+    blocks = count if isinstance(linear.observation, SurfaceObservation) else min(_BLOCKS, count)
+    block = np.arange(count) * blocks // count
+    parts = [[np.flatnonzero(block % n == k) for k in range(n)] for n in (2, 3)]
+    parts += [np.array_split(np.arange(count), 2)] if slow else []
     return [
         (_thinned_views(np.sort(np.concatenate([*own[:k], *own[k + 1 :]]))), _thinned_views(own[k]))
         for own in parts
@@ -479,19 +467,6 @@ def _criterion(ingredients: tuple[Ingredient, ...], half: HalfModel) -> float:
     return float(half.free * np.log(left @ left) + np.log(half.free) * numbers)
 
 
-def _view_count(linear: LinearModel) -> int:
-    return linear.measurement.views.count
-
-
-def _alternating_parts(linear: LinearModel, parts: int) -> list[Indices]:
-    """Parts over the same region of poses: view by view, or in blocks of time."""
-    blocks = (
-        _view_count(linear) if isinstance(linear.observation, SurfaceObservation) else min(_BLOCKS, _view_count(linear))
-    )
-    block = np.arange(_view_count(linear)) * blocks // _view_count(linear)
-    return [np.flatnonzero(block % parts == k) for k in range(parts)]
-
-
 def _thinned_views(views: Indices, halves: int = 1) -> Indices:
     """Evenly over them: more of thousands would tell nothing new, and their columns fill the memory."""
     enough = halves * _ENOUGH
@@ -508,7 +483,8 @@ def _search_split(
         if chosen.has_room(len(sum_)) and other.has_room(len(sum_))
     ]
     # What is worth nothing under the present scatter is not worth a search for the scatter beside it.
-    worth = [test_current_scatter(sum_, chosen, other).log_bayes_factor for sum_ in suggested]
+    both = (chosen, other)
+    worth = [_test_sum(own, *((half.columns(own), half.z) for half in both)).log_bayes_factor for own in suggested]
     likely = [suggested[k] for k in np.argsort(-np.array(worth), kind="stable")[:_TESTED]]
     slow = ingredients[0].quantity.slow
     tested = [test_refitted_scatter(linear, terms, sum_, slow, (chosen.views, other.views)) for sum_ in likely]
@@ -519,13 +495,12 @@ def _suggested_sums(half: HalfModel, ingredients: Sequence[Ingredient]) -> list[
     """Sums that explain some views, as these want their places, widths and periods."""
     found = dict[tuple[int, ...], tuple[Ingredient, ...]]()
 
-    def sum_of(numbers: tuple[int, ...]) -> tuple[Ingredient, ...]:
+    def columns(numbers: tuple[int, ...]) -> Array:
         if numbers not in found:
             found[numbers] = refine_parameters([ingredients[k] for k in numbers], half)
-        return found[numbers]
-
-    def columns(numbers: tuple[int, ...]) -> Array:
-        return half.columns(sum_of(numbers))
+        return half.columns(found[numbers])
 
     sums = pursue_sums(half.columns(ingredients), half.z, half.free, group_addends(ingredients), _FIRST, columns)
-    return [sum_of(numbers) for numbers in sorted(sums)]
+    for numbers in sums - found.keys():
+        columns(numbers)
+    return [found[numbers] for numbers in sorted(sums)]

@@ -84,6 +84,8 @@ def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:
     return torques_of(robot, joints, None if carried is None else np.full(len(joints), carried[-1]))
 
 
+# Further views of a session that is planned.
+
 # A view must show this share of what the others show.
 _SHARE = 0.4
 # So many times as many poses are tried as are asked for.
@@ -98,7 +100,8 @@ def with_views(session: Session, joints: Sequence[Array], in_turn: bool = True) 
     """
     assert session.robot is not None
     last, views = session.views[-1], list(session.views)
-    pause = _pause(session)
+    times = [view.time_s for view in views if view.time_s is not None]
+    pause = float(np.median(np.diff(times))) if len(times) > 1 else 60.0
     for k, q in enumerate(joints):
         before = views[-1] if in_turn else last
         assert before.joints is not None
@@ -116,11 +119,6 @@ def with_views(session: Session, joints: Sequence[Array], in_turn: bool = True) 
             )
         )
     return replace(session, views=tuple(views))
-
-
-def _pause(session: Session) -> float:
-    times = [view.time_s for view in session.views if view.time_s is not None]
-    return float(np.median(np.diff(times))) if len(times) > 1 else 60.0
 
 
 def candidate_joints(session: Session, cell: CellModel, count: int) -> Array:

@@ -59,21 +59,18 @@ ARTEFACTS = {
 def propose_measurements(found: Diagnosis) -> tuple[Proposal, ...]:
     """Return what would tell the named group apart; without a group, the clearest candidate from what resembles it."""
     with library_threads_off():
-        return tuple(_propose(found.linear, _effects_to_separate(found)))
-
-
-def _propose(linear: LinearModel, group: Sequence[Score]) -> list[Proposal]:
-    names = tuple(score.name for score in group)
-    artefacts = [Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS]
-    can_move = linear.measurement.robot is not None and linear.measurement.views.joints.shape[1] > 0
-    found = _best_pose(linear, group) if can_move else None
-    if found is None:
-        return artefacts
-    joints, count, separated = found
-    told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(joints))
-    times = "a view" if count == 1 else f"{count} views"
-    pose = Proposal(f"take {times} near {told}", separated, [round(float(x), 2) for x in joints], count)
-    return [pose, *artefacts]
+        linear, group = found.linear, _effects_to_separate(found)
+        names = tuple(score.name for score in group)
+        artefacts = tuple(Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS)
+        can_move = linear.measurement.robot is not None and linear.measurement.views.joints.shape[1] > 0
+        best = _best_pose(linear, group) if can_move else None
+        if best is None:
+            return artefacts
+        joints, count, separated = best
+        told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(joints))
+        times = "a view" if count == 1 else f"{count} views"
+        pose = Proposal(f"take {times} near {told}", separated, [round(float(x), 2) for x in joints], count)
+        return (pose, *artefacts)
 
 
 def _effects_to_separate(found: Diagnosis) -> list[Score]:
