@@ -401,8 +401,7 @@ def _regions(rows: _CorrespondenceRows) -> ResidualTable:
 # Where model and labelled points part: offsets of the targets against everything that is known of the views.
 #
 # A mean is that of the offset along the direction in which the bins of a property differ most, and its p-value knows
-# that the direction was chosen; rms is that of the 3D distance. Intervals count views: targets of one view share its
-# error.
+# that the direction was chosen; rms is that of the 3D distance. Targets of one view share its error.
 
 # A direction is chosen for every table among so many dimensions.
 _DIRECTIONS = 3

@@ -496,8 +496,7 @@ def _law_with_alternatives(laws: Sequence[JointLaw], together: float) -> JointLa
     return replace(laws[0], log_bayes_factor=together, may_follow=tuple(in_words))
 
 
-# Where in the range a joint errs that follows a law without a name, or when, or under which load: its course, with
-# bands.
+# Courses of laws without a name, with bands: where in its range a joint errs, when, or under which load.
 
 _PLACES = 25  # over the range of a joint
 

@@ -229,8 +229,7 @@ def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, flo
 # The views are halved in the order of time, by the region of their poses, and alternately. In each half the form of the
 # effect is chosen anew and its sizes are fitted; the other half says how much likelier its numbers are with that effect
 # than without (partial Bayes factor; Berger & Pericchi 1996, J. Am. Stat. Assoc. 91:109). What imitates something else
-# among all the views has another size or sign in each half. All of it beside the pose errors that remain with the
-# effect.
+# has another size or sign in each half. The pose errors that remain with the effect stand beside it.
 
 
 @dataclass(frozen=True)
