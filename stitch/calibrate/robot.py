@@ -173,10 +173,9 @@ def poses_to_add(run: Run) -> Array:
 # An arm as a table of links: fitted for what such a table can hold, and proved by reading it back.
 #
 # Offsets and links of a model are right beside its compliance and its gears, which no table holds; without these they
-# may
-# leave more than the nominal arm does. So the table is fitted alone. The proof: fitted without a part of the views, it
-# is
-# written and read back, and that part is run with it and with the nominal arm, base and tool fitted anew for either.
+# may leave more than the nominal arm does. So the table is fitted alone. The proof: fitted without a part of the views,
+# it is written and read back, and that part is run with it and with the nominal arm, base and tool fitted anew for
+# either.
 
 # What a table can hold, alone and together.
 _CHOICES = (("joint_offset",), ("link_geometry",), ("joint_offset", "link_geometry"))

@@ -135,12 +135,10 @@ def allowance_sentence(allowance: Allowance, length_unit: str | None) -> str:
 # The allowance beside the pose: scale, shrinkage, what can be told, and the result.
 #
 # From mean(d²) = Var(d) + mean(d)² a cost Var(d) + λ·mean(d)² can be chosen; the ordinary fit has λ = 1. With an
-# unknown
-# allowance λ = 0: only the variance of the distances is made small (variance-minimisation matching), and their mean is
-# the allowance. A column of ones beside the six of the pose does the same and gives its sigma. Distances above and
-# below
-# the allowance are two classes, plus and minus, each with its own scale, and the cleaner one counts for both: gates,
-# risers and flash all stand on one side.
+# unknown allowance λ = 0: only the variance of the distances is made small (variance-minimisation matching), and their
+# mean is the allowance. A column of ones beside the six of the pose does the same and gives its sigma. Distances above
+# and below the allowance are two classes, plus and minus, each with its own scale, and the cleaner one counts for
+# both: gates, risers and flash all stand on one side.
 
 # Share of an even allowance that no motion of the part imitates. Below, an error of the part's form would enter the
 # allowance more than thirtyfold.

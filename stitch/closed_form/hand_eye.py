@@ -143,9 +143,7 @@ def _misfit(A: Array, B: Array, R: Array) -> float:
     return float((rotation**2).sum() + (shift**2).sum() / unit**2)
 
 
-# Hand-eye calibration A·X = X·B with rotation and translation in one linear system: Andreff, Daniilidis.
-#
-# Arguments as in `axxb.py`.
+# A·X = X·B with rotation and translation in one linear system: Andreff, Daniilidis.
 
 
 def andreff(A: Array, B: Array, weights: Array | None = None) -> Array:

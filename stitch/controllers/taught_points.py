@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.frames import Array
 
-# A pose as the numbers of each controller: the way back from `taught.py`. Among numbers that mean the same pose, those
-# nearest to the ones before, so that a target that hardly moves hardly changes.
+# A pose as the numbers of each controller, the inverse of the readers below. Among numbers that mean the same pose,
+# those nearest to the ones before, so that a target that hardly moves hardly changes.
 
 # cos B below which A and C turn about the same axis, and one of them is free (rad).
 _LOCKED = 1e-6

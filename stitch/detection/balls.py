@@ -123,8 +123,7 @@ def _neighbours(points: Array, size: float, count: int, rng: np.random.Generator
 # Balls of one radius are told apart by the distances between their centres, which no pose changes: the views grow one
 # arrangement, largest first, and each is laid on it in the way in which most distances agree. Where two ways do as well
 # as each other, as in an arrangement with symmetry, the angle decides by which the arm has turned between views: a
-# rigid
-# motion turns scanner and flange by the same angle (Shiu & Ahmad 1989). Where that does not decide either, the
+# rigid motion turns scanner and flange by the same angle (Shiu & Ahmad 1989). Where that does not decide either, the
 # view's balls stay without names.
 
 # Distances agree within this share, and within so many sigmas.

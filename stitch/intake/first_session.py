@@ -1,6 +1,6 @@
 """From a folder of scans and poses to the first session: read, paired, judged by the scans, with reasons.
 
-What a person states is taken; what the files tell is read; the rest is decided by the scans (`doctor.py`).
+What a person states is taken; what the files tell is read; the rest is decided by the scans (`choose_convention`).
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -423,7 +423,7 @@ def session_guesses(
     own_units: Sequence[str],
     stated: StatedFolder,
 ) -> tuple[Guess, ...]:
-    """What was found and how it is read; of the mount speaks `mounting.py`."""
+    """What was found and how it is read; of the mount speaks `choose_mounting`."""
     return (
         _files_guess(files, raw),
         _pairing_guess(decided),

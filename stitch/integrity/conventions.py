@@ -1,7 +1,7 @@
 """Find the convention of the poses that explains how the scanner moved: A·X = X·B under every hypothesis.
 
-The motions B come from the scans alone (`relative_scans.py`), A from the poses with one mistake undone. A hypothesis
-is judged by the motions that close under its best hand-eye (`motion_fit.py`).
+The motions B come from the scans alone (`register_scan_pairs`), A from the poses with one mistake undone. A hypothesis
+is judged by the motions that close under its best hand-eye (`fit_motions`).
 """
 
 from collections.abc import Collection, Iterator, Sequence

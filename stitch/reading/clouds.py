@@ -1,4 +1,4 @@
-"""Point clouds from PLY, PCD, XYZ and CSV files, every scalar kept; other formats in `more_clouds.py`."""
+"""Point clouds from PLY, PCD, XYZ and CSV files, every scalar kept; meshes, arrays and other formats after them."""
 
 import io
 import struct

@@ -1,8 +1,8 @@
 """Find a coarse hand-eye from nothing, or take the given one.
 
 Candidates come from two independent ideas: (1) the centroids of the clouds as crude labelled points
-of one fixed target, minimised from many starting rotations (`centroids.py`); (2) relative scan motions
-against the robot's (AX = XB, five solvers; `relative_motion.py`). Every candidate is then closed in on the scans
+of one fixed target, minimised from many starting rotations (`centroid_hand_eyes`); (2) relative scan motions
+against the robot's (AX = XB, five solvers; `motion_candidates`). Every candidate is then closed in on the scans
 at low resolution, and the consistency of the whole set decides: the truncated mean square distance
 between all views that ought to meet. Objects without features (sphere, cone, plane) pass the same way.
 """

@@ -2,7 +2,7 @@
 
 All overlapping pairs, nearest neighbours in both directions, one ξ for every view of every session
 of the rig, T ← T·exp(ξ) (source A, step 3). Matching tightens from the data's own scale; a last
-generalised least-squares step weighs the views by the robot's own scatter (`hand_eye.py`).
+generalised least-squares step weighs the views by the robot's own scatter (`hand_eye_fit.py`).
 """
 
 from collections.abc import Callable, Sequence

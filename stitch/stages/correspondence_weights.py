@@ -27,8 +27,7 @@ from stitch.statistics.distributions import MAD_TO_SIGMA, mad_sigma, tukey
 # What each correspondence counts in `register`: plane to plane (GICP) inside Tukey's biweight.
 #
 # Of the families compared in docs/register.md the best. Both factors are 1 where two views agree, and neither depends
-# on
-# the order of the views.
+# on the order of the views.
 
 # Variance along the normal over that across it (Segal, Haehnel & Thrun 2009).
 _EPSILON = 1e-3

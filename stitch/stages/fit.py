@@ -1,7 +1,7 @@
 """The one fit of hand-eye, effects and whatever else is unknown: linearise, choose what is fitted, solve, repeat.
 
-What was observed says how: overlapping surfaces of all sessions of a rig (`fit_surfaces.py`), or labelled points
-(`fit_targets.py`).
+What was observed says how: overlapping surfaces of all sessions of a rig (`surface_fit.py`), or labelled points
+(`target_fit.py`).
 """
 
 from collections.abc import Callable, Sequence

@@ -1,7 +1,7 @@
 """Register what the hand-eye cannot explain: all views at once, each held by the robot's pose.
 
-Two methods weigh the correspondences (`METHODS`): `dpwvm`, the weighted variance of the distances (`dpwvm.py`), and
-`gicp`, plane to plane inside Tukey's biweight (`correspondence_weights.py`). The cost is the weighted mean of Var(d) +
+Two methods weigh the correspondences (`METHODS`): `dpwvm`, the weighted variance of the distances (`dpwvm_weights`),
+and `gicp`, plane to plane inside Tukey's biweight (`plane_weights`). The cost is the weighted mean of Var(d) +
 λ·mean(d)² with λ = 1: an offset common to all points of a pair is the very step that stitching has to close. Under
 `dpwvm` λ is 0 for a view that shows an offset of its own, as stock on a casting.
 

@@ -17,8 +17,7 @@ from stitch.statistics.least_squares import equilibrated, project_out
 # How large an amplitude may be over its plausible size: scales of a normal prior, and the share of belief in each.
 #
 # A mixture of normal distributions has tails that one of them has not (West 1987, Biometrika 74:646): a table of
-# lengths
-# in which a digit is wrong, or a joint mounted a tooth off, is no reason to believe in nothing at all.
+# lengths in which a digit is wrong, or a joint mounted a tooth off, is no reason to believe in nothing at all.
 
 # What is grossly wrong: one effect of a hundred.
 GROSS, _GROSS_SHARE = 30.0, 0.01

@@ -393,8 +393,6 @@ def _scoring_step(curvature: Array, slope: Array, weak: Array) -> Array:
 
 
 # Variance components by restricted maximum likelihood, with or without a prior on some columns of the mean.
-#
-# What is maximised stands in `restricted_likelihood.py`.
 
 _SPAN = (32.0, 14.0)  # the search, in log variance below and above the start
 _ABSENT = 1e-300  # in place of a variance of zero, which has no logarithm

@@ -33,7 +33,7 @@ from stitch.statistics.reml import (
 
 # How well the scatter is known in a direction: Satterthwaite's degrees of freedom.
 #
-# The variance s of a combination of what was seen is Σ λ_i s_i over the components of `variance_components.py`, whose
+# The variance s of a combination of what was seen is Σ λ_i s_i over the components of `reml.py`, whose
 # REML estimates have the information ½ tr(P C_i P C_j). An estimate of s of relative variance 2/ν is worth a
 # χ² of ν degrees of freedom (Satterthwaite 1946; Kenward & Roger 1997, Biometrics 53:983).
 

@@ -393,8 +393,7 @@ def _channels(history: History, runs: list[int]) -> dict[str, Array]:
 # K-fields: K0100 number of characteristics, K1001 and K1002 the part, K2001 number and K2002 name of a characteristic,
 # K2101 nominal (the calibration in use), K2110 and K2111 limits, K2142 unit, K2022 digits. In a row of values,
 # characteristics are parted by the character SI, and within one value, attribute (0 valid, 256 not measured) and time
-# by
-# DC4.
+# by DC4.
 
 _VALUE, _FIELD = "\x0f", "\x14"
 _VALID, _MISSING = 0, 256

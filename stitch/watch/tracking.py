@@ -249,8 +249,7 @@ def updated_bank(bank: Bank, values: Array, sigmas: Array, covariates: Array) ->
 #
 # The CUSUM of reference value 2 waits for a step (two sessions of 3.6 sigmas), that of 0.25 and the EWMA of weight 0.05
 # for what moves slowly (Page 1954, Biometrika 41:100; Roberts 1959, Technometrics 1:239; the three together as in Lucas
-# &
-# Saccucci 1990, Technometrics 32:1). Innovations count as four sigmas at most: one wild session is no alarm, two may
+# & Saccucci 1990, Technometrics 32:1). Innovations count as four sigmas at most: one wild session is no alarm, two may
 # be.
 
 CUSUM_REFERENCES = (0.25, 2.0)
@@ -425,10 +424,8 @@ def _without_base(base: Array, columns: Array) -> Array:
 # Session after session: the bank goes on, the charts watch its innovations, and what alarms is followed anew.
 #
 # An alarm names an onset in the past. From there on level and slope of the parameter are open again and its charts
-# begin
-# at zero, so that a second event after a first is seen as well. To go back costs the sessions since the onset; states
-# are
-# kept at intervals for that.
+# begin at zero, so that a second event after a first is seen as well. To go back costs the sessions since the onset;
+# states are kept at intervals for that.
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from stitch.statistics.variance_posterior import mean_variances
 # How far the robot's poses scatter: restricted maximum likelihood on per-view pose estimates.
 #
 # The points of one view share that view's pose error, so evidence counts in views. The per-view
-# twists δ̂ (`free_poses.py`) are reduced to the directions the overlaps can see, z, with covariance
+# twists δ̂ (`view_poses.py`) are reduced to the directions the overlaps can see, z, with covariance
 # σ_r² T_r + σ_t² T_t + c σ² H⁺ (rotation and translation scatter of the flange, and a factor on the
 # noise within overlaps, whose errors are correlated). Patterson & Thompson (1971), Harville (1977).
 

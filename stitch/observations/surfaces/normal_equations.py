@@ -61,7 +61,7 @@ class Gram:
     raw_square: Array  # (P,) Σ e² inside the robust gate
     scale: float  # robust sigma of e
     centre: Array  # (3,)
-    labelled: Mask  # (P,) pairs of labelled points (`target_pairs.py`), in the surfaces' unit of variance
+    labelled: Mask  # (P,) pairs of labelled points (`target_pairs`), in the surfaces' unit of variance
 
     @property
     def rms(self) -> float:

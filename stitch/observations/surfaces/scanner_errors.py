@@ -224,8 +224,7 @@ class SmoothErrorLikelihood:
 # Smooth errors that every view has for itself: what the overlaps show of them, beside those that all views share.
 #
 # A part that bends, a scanner that warms up or is read line by line while the arm still moves: each scan is sound, and
-# no
-# motion of the views makes them meet.
+# no motion of the views makes them meet.
 
 # Normals are off by up to a tenth of a radian: what moves points less than that along them, squared, is their noise.
 _NORMAL_NOISE = 0.01
@@ -350,11 +349,9 @@ def rig_field_scatters(measurements: Sequence[Measurement], unconstrained: Seque
 # A map of the smooth error that a scanner makes in every view alike: what the overlaps tell of it, place by place.
 #
 # Overlaps show differences between views alone. On a part that is nearly flat, moving the views does what a constant or
-# a
-# slope over the field does, and what a bowl does: seen from two places, its two images differ by a slope, however the
+# a slope over the field does, and what a bowl does: seen from two places, its two images differ by a slope, however the
 # scanner is rolled. The map has none of them. Errors across the ray, or along the range, are no map over the field:
-# where
-# they are most of what is shown, there is none.
+# where they are most of what is shown, there is none.
 
 # Places along either way across the field.
 _GRID_PLACES = 25

@@ -96,8 +96,7 @@ def mask_outliers(used: Mask, found: Sequence[Outlier], targets: tuple[str, ...]
 # Views whose targets bear each other's names: the distances between them tell it, wherever the arm stood.
 #
 # One wrong name shows as an outlier. Where all names of a view are mixed up, what is left of it agrees with nothing,
-# and
-# beside clouds it holds the scan in a wrong place, so that the scan is blamed.
+# and beside clouds it holds the scan in a wrong place, so that the scan is blamed.
 
 # Targets of a view whose distances tell names apart, and views that say how far two targets lie apart.
 _MIN_TARGETS, _MIN_VIEWS = 3, 3
