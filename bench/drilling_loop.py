@@ -15,7 +15,6 @@ from stitch.cells.drilling_sensors import (
     compensate_group,
     fit_homography,
     fit_ranger,
-    hole_coordinate,
     hole_rotation,
     to_plane,
 )
@@ -105,7 +104,7 @@ class ServoResult:
     @property
     def hole(self) -> Array:
         """Drive coordinate (3,) of the hole: p + R'·(x', y', h' − h) (source, formula 14)."""
-        return hole_coordinate(self.T_base_tool, self.final_sight.offset)
+        return self.T_base_tool[:3, 3] + self.T_base_tool[:3, :3] @ self.final_sight.offset
 
 
 def measure_hole(sensors: FlangeSensors, ranges: Array, uv: Array) -> HoleSight:

@@ -11,13 +11,12 @@ from scipy.stats import norm
 
 from stitch import frames
 from stitch.cells.job_files import (
-    check_keys,
-    choice,
-    finite,
+    JobTable,
+    Wanted,
+    checked_table,
+    fixed_digits,
     points_table,
     read_job_file,
-    table,
-    vectors,
     write_recording_and_page,
 )
 from stitch.cells.stand import (
@@ -71,9 +70,12 @@ def solve_stand(stand: Stand) -> BaseResult:
         )
     solution = fit_stand(stand)
     if solution.p_value < 2 * norm.sf(CONTRADICTION_SIGMAS):
+        sizes = np.linalg.norm(np.vstack([solution.rail_residuals, solution.rod_residuals]), axis=1)
+        worst = int(np.argmax(sizes))
         raise NoResultError(
             f"the readings contradict each other: chi-square {solution.chi_square:.1f} with {solution.redundancy} "
-            f"redundant readings; {_worst(stand, solution)}; to fix: read that point again, or state larger sigmas"
+            f"redundant readings; the largest misfit is {sizes[worst]:.4g} {stand.length_unit} at "
+            f"{(stand.rail.names + stand.rod.names)[worst]}; to fix: read that point again, or state larger sigmas"
         )
     try:
         return BaseResult(stand.length_unit, solution, project(stand), None, comparisons)
@@ -93,6 +95,11 @@ def comparison_text(c: DistanceComparison, unit: str) -> str:
 def base_document(result: BaseResult) -> dict[str, Any]:
     """Plain numbers for JSON: lengths in length_unit, angles in rad."""
     solution, projection = result.fit, result.projection
+    planes = projection and {
+        "T_base1_base2": projection.T_base1_base2.tolist(),
+        "gamma_beta_alpha": [None if np.isnan(a) else float(a) for a in projection.gamma_beta_alpha],
+        "offsets": projection.offsets.tolist(),
+    }
     return {
         "length_unit": result.length_unit,
         "T_base1_base2": solution.T_base1_base2.tolist(),
@@ -104,28 +111,13 @@ def base_document(result: BaseResult) -> dict[str, Any]:
         "chi_square": solution.chi_square,
         "redundancy": solution.redundancy,
         "p_value": solution.p_value,
-        "projection": None if projection is None else _projection_document(projection),
+        "projection": planes,
         "no_projection": result.no_projection,
         "distances": [
             {"pair": c.pair, "by_stand": c.by_stand, "by_robot": c.by_robot, "sigma": c.sigma, "sigmas": c.sigmas}
             for c in result.comparisons
         ],
     }
-
-
-def _projection_document(projection: Projection) -> dict[str, Any]:
-    return {
-        "T_base1_base2": projection.T_base1_base2.tolist(),
-        "gamma_beta_alpha": [None if np.isnan(a) else float(a) for a in projection.gamma_beta_alpha],
-        "offsets": projection.offsets.tolist(),
-    }
-
-
-def _worst(stand: Stand, solution: BaseFit) -> str:
-    names = stand.rail.names + stand.rod.names
-    sizes = np.linalg.norm(np.vstack([solution.rail_residuals, solution.rod_residuals]), axis=1)
-    worst = int(np.argmax(sizes))
-    return f"the largest misfit is {sizes[worst]:.4g} {stand.length_unit} at {names[worst]}"
 
 
 # The rod's readings as a points session: the stand measures a cup, the second robot says where its tip touches it.
@@ -174,103 +166,85 @@ def read_stand(file: Path | str) -> Stand:
     """
     file = Path(file)
     document = read_job_file(file, STAND_FORMAT, _KEYS, "examples/base_to_base.toml")
-    unit, to_rad = _units(file, document)
-    main, second = table(file, document, "main"), table(file, document, "second")
-    rail, rail_entries = _touched_points(file, "main", main, unit, to_rad)
-    rod, rod_entries = _touched_points(file, "second", second, unit, to_rad)
-    settings = table(file, document, "rod")
-    check_keys(file, "rod", settings, {"turn", "sigma_slide", "sigma_angle", "sigma_length"})
-    turn = choice(file, "rod.turn", settings.get("turn", "clockwise"), tuple(_TURN))
-    level = document.get("level", {})
-    check_keys(file, "level", level, {"stand", "second_base"})
-    base = finite(file, "level.second_base", level["second_base"], positive=True) if "second_base" in level else None
+    unit = METRES[document.choice("length_unit", METRES)]
+    to_rad = 1.0 if document.choice("angle_unit", ("rad", "deg")) == "rad" else float(np.pi / 180)
+    rail, rail_entries = _touched_points(document, "main", {"slide"}, unit, to_rad)
+    rod, rod_entries = _touched_points(document, "second", {"slide", "angle", "length"}, unit, to_rad)
+    settings = document.table("rod", {"turn", "sigma_slide", "sigma_angle", "sigma_length"}, required=True)
+    level = document.table("level", {"stand", "second_base"})
     stand = Stand(
-        length_unit=str(document["length_unit"]),
+        length_unit=str(document.entries["length_unit"]),
         rail=rail,
-        rail_slide=_column(file, "main", rail_entries, "slide", optional=True),
+        rail_slide=np.array([e.number("slide") if "slide" in e else np.nan for e in rail_entries]),
         rod=rod,
-        slide=_column(file, "second", rod_entries, "slide"),
-        angle=_column(file, "second", rod_entries, "angle") * to_rad,
-        length=_column(file, "second", rod_entries, "length", positive=True),
-        turn=_TURN[turn],
-        sigma_slide=_sigma(file, "rod", settings, "sigma_slide", _SLIDE / unit),
-        sigma_angle=_sigma(file, "rod", settings, "sigma_angle", _ANGLE / to_rad) * to_rad,
-        sigma_length=_sigma(file, "rod", settings, "sigma_length", _LENGTH / unit),
-        sigma_level_stand=_sigma(file, "level", level, "stand", _LEVEL / to_rad) * to_rad,
-        sigma_level_base=None if base is None else base * to_rad,
+        slide=_column(rod_entries, "slide"),
+        angle=_column(rod_entries, "angle") * to_rad,
+        length=_column(rod_entries, "length", positive=True),
+        turn=_TURN[settings.choice("turn", _TURN, "clockwise")],
+        sigma_slide=settings.number("sigma_slide", _SLIDE / unit, positive=True),
+        sigma_angle=settings.number("sigma_angle", _ANGLE / to_rad, positive=True) * to_rad,
+        sigma_length=settings.number("sigma_length", _LENGTH / unit, positive=True),
+        sigma_level_stand=level.number("stand", _LEVEL / to_rad, positive=True) * to_rad,
+        sigma_level_base=level.number("second_base", positive=True) * to_rad if "second_base" in level else None,
         file=file,
     )
     _check_geometry(file, stand)
     return stand
 
 
-def _units(file: Path, document: dict[str, Any]) -> tuple[float, float]:
-    """Metres per length unit and rad per angle unit."""
-    length = choice(file, "length_unit", document.get("length_unit"), tuple(METRES))
-    angle = choice(file, "angle_unit", document.get("angle_unit"), ("rad", "deg"))
-    return METRES[length], 1.0 if angle == "rad" else float(np.pi / 180)
-
-
 def _touched_points(
-    file: Path, name: str, robot: dict[str, Any], unit: float, to_rad: float
-) -> tuple[TouchedPoints, list[dict[str, Any]]]:
-    """The points of one robot, from coordinates or from joint 1, radius and height."""
-    check_keys(file, name, robot, {"points", "sigma"})
-    entries = robot.get("points")
-    if not isinstance(entries, list) or len(entries) < 2:
-        raise InputError(f"{file}: [[{name}.points]] has fewer than two entries; to fix: add one")
-    readings = {"slide"} if name == "main" else {"slide", "angle", "length"}
-    sigma = robot.get("sigma", {})
-    check_keys(file, f"{name}.sigma", sigma, {"point", *_CYLINDER})
+    document: JobTable, name: str, readings: set[str], unit: float, to_rad: float
+) -> tuple[TouchedPoints, list[JobTable]]:
+    """The points of one robot, from coordinates or from joint 1, radius and height.
+
+    Args:
+        unit, to_rad: metres per length unit and rad per angle unit.
+    """
+    robot = document.table(name, {"points", "sigma"}, required=True)
+    listed = robot.entries.get("points")
+    if not isinstance(listed, list) or len(listed) < 2:
+        raise InputError(f"{document.file}: [[{name}.points]] has fewer than two entries; to fix: add one")
+    sigma = robot.table("sigma", {"point", *_CYLINDER})
+    known = {"name", "point", *_CYLINDER, *readings}
+    entries = [checked_table(document.file, f"{name}.points[{i + 1}]", entry, known) for i, entry in enumerate(listed)]
     points: list[Array] = []
     covariances: list[Array] = []
-    for i, entry in enumerate(entries):
-        place = f"{name}.points[{i + 1}]"
-        check_keys(file, place, entry, {"name", "point", *_CYLINDER, *readings})
+    for entry in entries:
         if "point" in entry:
-            form = "three numbers [x, y, z] in the robot's base frame"
-            points.append(vectors(file, f"{place}.point", entry["point"], (3,), form))
-            covariances.append(np.eye(3) * _sigma(file, f"{name}.sigma", sigma, "point", _POINT / unit) ** 2)
+            points.append(entry.vectors("point", (3,), "three numbers [x, y, z] in the robot's base frame"))
+            covariances.append(np.eye(3) * sigma.number("point", _POINT / unit, positive=True) ** 2)
             continue
-        joint1, radius, height = (_entry(file, place, entry, key) for key in _CYLINDER)
+        for key in _CYLINDER:
+            if key not in entry:
+                raise InputError(
+                    f"{document.file}: {entry.place}.{key} is missing; to fix: give point = [x, y, z] or joint1, "
+                    "radius and height"
+                )
+        joint1, radius, height = (entry.number(key, positive=key == "radius") for key in _CYLINDER)
         points.append(cylinder_points(np.array(joint1 * to_rad), np.array(radius), np.array(height)))
-        default = sigma.get("point", _POINT / unit)
+        default = sigma.entries.get("point", _POINT / unit)
         spread = (
-            _sigma(file, f"{name}.sigma", sigma, "joint1", default / radius / to_rad) * to_rad,
-            _sigma(file, f"{name}.sigma", sigma, "radius", default),
-            _sigma(file, f"{name}.sigma", sigma, "height", default),
+            sigma.number("joint1", default / radius / to_rad, positive=True) * to_rad,
+            sigma.number("radius", default, positive=True),
+            sigma.number("height", default, positive=True),
         )
         covariances.append(cylinder_covariance(np.array(joint1 * to_rad), np.array(radius), spread))
-    names = tuple(str(entry.get("name", f"{name} {i + 1}")) for i, entry in enumerate(entries))
+    names = tuple(str(entry.entries.get("name", f"{name} {i + 1}")) for i, entry in enumerate(entries))
     return TouchedPoints(names, np.array(points, float), np.array(covariances, float)), entries
 
 
-def _entry(file: Path, place: str, entry: dict[str, Any], key: str) -> float:
-    if key not in entry:
-        raise InputError(
-            f"{file}: {place}.{key} is missing; to fix: give point = [x, y, z] or joint1, radius and height"
-        )
-    return finite(file, f"{place}.{key}", entry[key], positive=key == "radius")
-
-
-def _column(
-    file: Path, name: str, entries: list[dict[str, Any]], key: str, optional: bool = False, positive: bool = False
-) -> Array:
-    values = []
-    for i, entry in enumerate(entries):
-        place = f"{name}.points[{i + 1}].{key}"
-        if key not in entry and not optional:
-            raise InputError(f"{file}: {place} is missing; to fix: give every point of the rod slide, angle and length")
-        values.append(finite(file, place, entry[key], positive) if key in entry else np.nan)
-    return np.array(values, float)
-
-
-def _sigma(file: Path, place: str, entries: dict[str, Any], key: str, default: float) -> float:
-    return finite(file, f"{place}.{key}", entries.get(key, default), positive=True)
+def _column(entries: list[JobTable], key: str, positive: bool = False) -> Array:
+    for entry in entries:
+        if key not in entry:
+            raise InputError(
+                f"{entry.file}: {entry.place}.{key} is missing; to fix: give every point of the rod slide, angle and "
+                "length"
+            )
+    return np.array([entry.number(key, positive=positive) for entry in entries])
 
 
 def _check_geometry(file: Path, stand: Stand) -> None:
-    """Points that leave the rail without a line, a zero or a level."""
+    """Refuse points that leave the rail without a line, a zero or a level."""
     rail = stand.rail.points
     extent = float(np.linalg.norm(rail - rail.mean(axis=0), axis=1).max())
     if extent < 100 * np.sqrt(np.trace(stand.rail.covariance[0]) / 3):
@@ -297,23 +271,19 @@ def _check_geometry(file: Path, stand: Stand) -> None:
 # What `stitch base` does: a stand solved, shown, drawn, and as a session.
 
 
-def run_base(file: Path, recording: Path | None, report: Path | None, session: Path | None, as_json: bool) -> None:
-    """Solve a stand and hand out what was asked for.
-
-    Raises:
-        InputError, NoResultError: as `stitch base` ends.
-    """
+def run_base(file: Path, wanted: Wanted) -> None:
+    """Solve a stand and hand out what was asked for; `InputError` and `NoResultError` end it."""
     stand = read_stand(file)
     try:
         result = solve_stand(stand)
     except NoResultError:
         # The page shows which readings contradict each other.
-        write_recording_and_page("base", None, report, stand, None)
+        write_recording_and_page("base", None, wanted.report, stand, None)
         raise
-    if session is not None:
-        write_session(session, rod_session(stand, result))
-    write_recording_and_page("base", recording, report, stand, result)
-    if as_json:
+    if wanted.session is not None:
+        write_session(wanted.session, rod_session(stand, result))
+    write_recording_and_page("base", wanted.recording, wanted.report, stand, result)
+    if wanted.as_json:
         print(json.dumps(base_document(result), indent=1))
     else:
         _print_solution(result)
@@ -325,10 +295,13 @@ def _print_solution(result: BaseResult) -> None:
     table = Table(title="T_base1_base2, translation and turn about the axes of base 1", title_justify="left")
     for heading in ("solution", f"x y z / {unit}", "rotation vector / rad"):
         table.add_column(heading)
-    table.add_row("least squares", *_pose_cells(solution.T_base1_base2))
-    table.add_row("  1 σ", _number_text(solution.sigma[3:], 5), _number_text(solution.sigma[:3], 6))
+    poses = {"least squares": solution.T_base1_base2}
     if result.projection is not None:
-        table.add_row("projection", *_pose_cells(result.projection.T_base1_base2))
+        poses["projection"] = result.projection.T_base1_base2
+    for name, T in poses.items():
+        table.add_row(name, fixed_digits(T[:3, 3], 5), fixed_digits(frames.log(T)[:3], 6))
+        if name == "least squares":
+            table.add_row("  1 σ", fixed_digits(solution.sigma[3:], 5), fixed_digits(solution.sigma[:3], 6))
     terminal.print(table)
     terminal.print(
         f"chi-square {solution.chi_square:.2f} with {solution.redundancy} redundant readings, p = "
@@ -340,11 +313,3 @@ def _print_solution(result: BaseResult) -> None:
         terminal.print(f"No projection: {result.no_projection}.")
     for row in solution.T_base1_base2:
         print(" ".join(f"{value:.9g}" for value in row))
-
-
-def _pose_cells(T: np.ndarray) -> tuple[str, str]:
-    return _number_text(T[:3, 3], 5), _number_text(frames.log(T)[:3], 6)
-
-
-def _number_text(values: np.ndarray, digits: int) -> str:
-    return "  ".join(f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0)

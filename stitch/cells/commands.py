@@ -34,8 +34,9 @@ def base(
       stitch base stand.toml --report page.html
     """
     from stitch.cells.base_to_base import run_base
+    from stitch.cells.job_files import Wanted
 
-    run_base(file, recording, report, session, as_json)
+    run_base(file, Wanted(None, recording, report, session, as_json))
 
 
 def drill(
@@ -53,8 +54,9 @@ def drill(
       stitch drill job.toml --report page.html
     """
     from stitch.cells.drilling import run_drill
+    from stitch.cells.job_files import Wanted
 
-    run_drill(file, output, recording, report, session, as_json=as_json)
+    run_drill(file, Wanted(output, recording, report, session, as_json))
 
 
 def panel(
@@ -71,9 +73,10 @@ def panel(
     Examples:
       stitch panel job.toml --report page.html
     """
+    from stitch.cells.job_files import Wanted
     from stitch.cells.panel import run_panel
 
-    run_panel(file, output, recording, report, session, as_json=as_json)
+    run_panel(file, Wanted(output, recording, report, session, as_json))
 
 
 def fit(
@@ -97,9 +100,10 @@ def fit(
       stitch fit fit.toml --report page.html
       stitch fit casting.toml --allowance free
     """
+    from stitch.cells.job_files import Wanted
     from stitch.cells.window import run_fit
 
-    run_fit(file, allowance, output, recording, report, session=session, as_json=as_json)
+    run_fit(file, allowance, Wanted(output, recording, report, session, as_json))
 
 
 def seam(
@@ -116,6 +120,7 @@ def seam(
     Examples:
       stitch seam seam.toml --report page.html
     """
+    from stitch.cells.job_files import Wanted
     from stitch.cells.window import run_seam
 
-    run_seam(file, output, recording, report, session, as_json=as_json)
+    run_seam(file, Wanted(output, recording, report, session, as_json))

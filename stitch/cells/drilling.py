@@ -3,11 +3,11 @@
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from stitch import frames
@@ -25,7 +25,6 @@ from stitch.cells.drilling_sensors import (
     fit_homography,
     fit_ranger,
     hole_at_tool,
-    hole_coordinate,
     hole_rotation,
     holes_of_plate,
     leave_one_out,
@@ -34,15 +33,14 @@ from stitch.cells.drilling_sensors import (
 )
 from stitch.cells.job_files import (
     POSE_COLUMNS,
-    choice,
-    finite,
+    JobTable,
+    Wanted,
+    fixed_digits,
     points_table,
     poses_from_columns,
     read_columns,
     read_job_file,
     require_unique,
-    resolve_file,
-    vectors,
     write_columns,
     write_recording_and_page,
 )
@@ -107,22 +105,22 @@ def read_drill_job(file: Path | str) -> DrillJob:
     """
     file = Path(file)
     document = read_job_file(file, DRILL_FORMAT, _KEYS, "examples/drilling/job.toml")
-    paths = {key: resolve_file(file, key, document[key]) for key in _FILES if key in document}
+    paths = {key: document.path(key) for key in _FILES if key in document}
     for key in _NEEDED:
         if key not in paths:
             raise InputError(f"{file}: {key} is missing; to fix: name the CSV file")
     plate_xyz, plate_uv = _read_plate(paths["plate"], paths.get("plate_image"))
     holes = _read_holes(paths["holes"])
     return DrillJob(
-        length_unit=choice(file, "length_unit", document.get("length_unit"), tuple(METRES)),
-        height=finite(file, "height", document.get("height"), positive=True),
+        length_unit=document.choice("length_unit", METRES),
+        height=document.number("height", positive=True),
         plate_xyz=plate_xyz,
         plate_uv=plate_uv,
         holes=holes,
         placed=_read_placed_tools(paths["placed"], holes, plate_xyz, plate_uv),
-        rangers=_read_ranger_tables(paths.get("rangers")),
+        rangers=_read_ranger_tables(paths["rangers"]) if "rangers" in paths else {},
         marker_paths=_read_marker_paths(file, paths),
-        checks=_read_check_holes(file, document, paths, plate_xyz, plate_uv),
+        checks=_read_check_holes(document, paths["checks"], plate_xyz, plate_uv) if "checks" in paths else None,
         file=file,
     )
 
@@ -175,17 +173,14 @@ def _read_placed_tools(file: Path, holes: tuple[Hole, ...], plate_xyz: Array, pl
             raise InputError(f"{file}: reference hole {hole.name} is missing; to fix: add where the robot ended on it")
         if hole.reference and poses[names.index(hole.name), :3, 2] @ hole.direction < _ALONG:
             raise InputError(
-                f"{file}: on hole {hole.name} the tool's z lies more than 30° off the hole's direction; to fix: "
-                "let directions "
-                "point into the part, and a, b, c turn about z, y', x''"
+                f"{file}: on hole {hole.name} the tool's z lies more than 30° off the hole's direction; to fix: let "
+                "directions point into the part, and a, b, c turn about z, y', x''"
             )
     seen = zip(names, poses, pixels, table.numbers["height"].tolist(), strict=True)
     return {name: PlacedTool(T_base_tool, uv, height) for name, T_base_tool, uv, height in seen}
 
 
-def _read_ranger_tables(file: Path | None) -> dict[str, tuple[Array, Array]]:
-    if file is None:
-        return {}
+def _read_ranger_tables(file: Path) -> dict[str, tuple[Array, Array]]:
     table = read_columns(file, "ranger", "a b c d reading")
     planes, readings, names = table.stack("a b c d"), table.numbers["reading"], np.array(table.texts["ranger"])
     if (np.linalg.norm(planes[:, :3], axis=1) == 0).any():
@@ -198,19 +193,16 @@ def _read_marker_paths(file: Path, paths: dict[str, Path]) -> tuple[Array, Array
         raise InputError(f"{file}: joint1 and joint6 belong together; to fix: name both marker paths or neither")
     if "joint1" not in paths:
         return None
-    return tuple(read_columns(paths[key], "", "x y z").stack("x y z") for key in ("joint6", "joint1"))  # type: ignore[return-value]
+    joint6, joint1 = (read_columns(paths[key], "", "x y z").stack("x y z") for key in ("joint6", "joint1"))
+    return joint6, joint1
 
 
-def _read_check_holes(
-    file: Path, document: dict[str, Any], paths: dict[str, Path], plate_xyz: Array, plate_uv: Array
-) -> HoleObservations | None:
-    """Holes of the plate and check holes together."""
-    if "checks" not in paths:
-        return None
-    form = "[width, height] in pixels, which the checks need"
-    size = vectors(file, "image_size", document.get("image_size"), (2,), form)
-    width, height = (finite(file, "image_size", value, positive=True) for value in size.tolist())
-    checks = read_columns(paths["checks"], "", "x y z u v")
+def _read_check_holes(document: JobTable, file: Path, plate_xyz: Array, plate_uv: Array) -> HoleObservations:
+    """Read holes of the plate and check holes together."""
+    width, height = document.vectors("image_size", (2,), "[width, height] in pixels, which the checks need").tolist()
+    if min(width, height) <= 0:
+        raise document.refusal("image_size", "write numbers above zero")
+    checks = read_columns(file, "", "x y z u v")
     return HoleObservations(
         xyz=np.vstack([plate_xyz, checks.stack("x y z")]),
         uv=np.vstack([plate_uv, checks.stack("u v")]),
@@ -266,7 +258,12 @@ def solve_drill_job(job: DrillJob) -> DrillResult:
             raise NoResultError(f"group {group}: {len(references)} reference holes; to fix: give it three or more")
         actual = np.array([_measured_hole(job, H, effects, hole.name) for hole in references])
         groups[group] = compensate_group(np.array([hole.position for hole in references]), actual)
-    tool_axis = _fitted_tool_axis(job, groups)
+    # The tool's axis from each reference hole once, whatever number of groups it serves.
+    once = {hole.name: hole for hole in job.holes if hole.reference}
+    tool_axis = find_tool_axis(
+        np.array([job.placed[name].T_base_tool[:3, :3] for name in once]),
+        np.array([groups[h.group].T_actual_nominal[:3, :3] @ h.direction for h in once.values()]),
+    )
     return DrillResult(
         H,
         leave_one_out_errors=leave_one_out(xy, job.plate_uv) if len(xy) > 4 else np.empty((0, 2)),
@@ -279,13 +276,6 @@ def solve_drill_job(job: DrillJob) -> DrillResult:
     )
 
 
-def _fitted_tool_axis(job: DrillJob, groups: dict[str, GroupCompensation]) -> ToolAxis | None:
-    """From each reference hole once, whatever number of groups it serves."""
-    references = {hole.name: hole for hole in job.holes if hole.reference}
-    directions = [groups[h.group].T_actual_nominal[:3, :3] @ h.direction for h in references.values()]
-    return find_tool_axis(np.array([job.placed[name].T_base_tool[:3, :3] for name in references]), np.array(directions))
-
-
 def _corrected_drive(hole: Hole, group: GroupCompensation, tool_axis: ToolAxis | None) -> Drive:
     position, direction = (found[0] for found in group.apply(hole.position[None], hole.direction[None]))
     R = hole_rotation(direction)
@@ -296,7 +286,7 @@ def _measured_hole(job: DrillJob, H: Array, effects: EffectSelection | None, nam
     """Drive coordinate (3,) of a reference hole from where the robot ended and what it saw there."""
     placed = job.placed[name]
     offset = np.append(hole_in_plane(job, H, effects, name), placed.height - job.height)
-    return hole_coordinate(placed.T_base_tool, offset)
+    return np.asarray(placed.T_base_tool[:3, 3] + placed.T_base_tool[:3, :3] @ offset)
 
 
 def hole_in_plane(job: DrillJob, H: Array, effects: EffectSelection | None, name: str) -> Array:
@@ -328,47 +318,42 @@ def write_drives(result: DrillResult, file: Path) -> None:
 
 def drill_document(result: DrillResult) -> dict[str, Any]:
     """Plain numbers for JSON: lengths in length_unit, angles in degrees."""
-    measuring, tool_axis = result.T_measuring_base, result.tool_axis
+    measuring, tool = result.T_measuring_base, result.tool_axis
     return {
         "homography": result.H.tolist(),
         "leave_one_out": np.linalg.norm(result.leave_one_out_errors, axis=1).tolist(),
-        "groups": {name: _group_document(c) for name, c in result.groups.items()},
-        "drives": [_drive_document(d) for d in result.drives],
+        "groups": {
+            name: {
+                "T_actual_nominal": c.T_actual_nominal.tolist(),
+                "drive_errors": np.linalg.norm(c.errors, axis=1).tolist(),
+                "residuals": np.linalg.norm(c.residuals, axis=1).tolist(),
+            }
+            for name, c in result.groups.items()
+        },
+        "drives": [
+            {
+                "hole": d.hole.name,
+                "group": d.hole.group,
+                "position": d.position.tolist(),
+                "direction": d.direction.tolist(),
+                "angles_deg": np.degrees(d.angles).tolist(),
+            }
+            for d in result.drives
+        ],
         "rangers": {
             name: {"origin": r.origin.tolist(), "direction": r.direction.tolist(), "rms": r.rms}
             for name, r in result.rangers.items()
         },
         "T_measuring_base": None if measuring is None else measuring.tolist(),
-        "tool_axis": None if tool_axis is None else _tool_axis_document(tool_axis),
-        "camera_effects": None if result.effects is None else [vars(trial) for trial in result.effects.trials],
-    }
-
-
-def _group_document(c: GroupCompensation) -> dict[str, Any]:
-    return {
-        "T_actual_nominal": c.T_actual_nominal.tolist(),
-        "drive_errors": np.linalg.norm(c.errors, axis=1).tolist(),
-        "residuals": np.linalg.norm(c.residuals, axis=1).tolist(),
-    }
-
-
-def _drive_document(d: Drive) -> dict[str, Any]:
-    return {
-        "hole": d.hole.name,
-        "group": d.hole.group,
-        "position": d.position.tolist(),
-        "direction": d.direction.tolist(),
-        "angles_deg": np.degrees(d.angles).tolist(),
-    }
-
-
-def _tool_axis_document(tool: ToolAxis) -> dict[str, Any]:
-    return {
-        "axis": tool.axis.tolist(),
-        "tilt_deg": float(np.degrees(tool.tilt)),
-        "sigma_deg": float(np.degrees(tool.sigma)),
-        "p_value": tool.p_value,
-        "accepted": tool.accepted,
+        "tool_axis": tool
+        and {
+            "axis": tool.axis.tolist(),
+            "tilt_deg": float(np.degrees(tool.tilt)),
+            "sigma_deg": float(np.degrees(tool.sigma)),
+            "p_value": tool.p_value,
+            "accepted": tool.accepted,
+        },
+        "camera_effects": result.effects and [vars(trial) for trial in result.effects.trials],
     }
 
 
@@ -463,40 +448,29 @@ def hole_session(job: DrillJob, result: DrillResult) -> SessionFiles:
 # What `stitch drill` does: a job solved, shown, drawn, as a table of drives and as a session.
 
 
-def run_drill(
-    file: Path, output: Path | None, recording: Path | None, report: Path | None, session: Path | None, *, as_json: bool
-) -> None:
-    """Solve a job and hand out what was asked for.
-
-    Raises:
-        InputError, NoResultError: as `stitch drill` ends.
-    """
+def run_drill(file: Path, wanted: Wanted) -> None:
+    """Solve a job and hand out what was asked for; `InputError` and `NoResultError` end it."""
     job = read_drill_job(file)
     result = solve_drill_job(job)
-    if output is not None:
-        write_drives(result, output)
-    if session is not None:
-        write_session(session, hole_session(job, result))
-    write_recording_and_page("drill", recording, report, job, result)
-    if as_json:
+    if wanted.output is not None:
+        write_drives(result, wanted.output)
+    if wanted.session is not None:
+        write_session(wanted.session, hole_session(job, result))
+    write_recording_and_page("drill", wanted.recording, wanted.report, job, result)
+    if wanted.as_json:
         print(json.dumps(drill_document(result), indent=1))
-    else:
-        _print_result(console(), result, job.length_unit)
-        if output is not None:
-            print(output)
-
-
-def _print_result(terminal: Console, result: DrillResult, unit: str) -> None:
+        return
+    terminal, unit = console(), job.length_unit
     terminal.print(correction_sentence(result, unit))
-    for line in (
-        *hand_eye_sentences(result, unit),
-        *significant_effect_sentences(result, unit),
-        *absent_effect_sentences(result),
+    for line in chain(
+        hand_eye_sentences(result, unit), significant_effect_sentences(result, unit), absent_effect_sentences(result)
     ):
         terminal.print(line)
     if result.rangers:
         terminal.print(_ranger_table(result, unit))
     terminal.print(_drive_table(result, unit))
+    if wanted.output is not None:
+        print(wanted.output)
 
 
 def _ranger_table(result: DrillResult, unit: str) -> Table:
@@ -504,7 +478,7 @@ def _ranger_table(result: DrillResult, unit: str) -> Table:
     for heading in ("sensor", f"origin x y z / {unit}", "direction", f"rms / {unit}"):
         table.add_column(heading)
     for name, beam in result.rangers.items():
-        table.add_row(name, _number_text(beam.origin, 3), _number_text(beam.direction, 4), f"{beam.rms:.3f}")
+        table.add_row(name, fixed_digits(beam.origin, 3), fixed_digits(beam.direction, 4), f"{beam.rms:.3f}")
     return table
 
 
@@ -515,10 +489,6 @@ def _drive_table(result: DrillResult, unit: str) -> Table:
         table.add_column(heading)
     for drive in result.drives:
         shift = float(np.linalg.norm(drive.position - drive.hole.position))
-        place, angles = _number_text(drive.position, 3), _number_text(np.degrees(drive.angles), 3)
+        place, angles = fixed_digits(drive.position, 3), fixed_digits(np.degrees(drive.angles), 3)
         table.add_row(drive.hole.name, drive.hole.group, place, angles, f"{shift:.3f}")
     return table
-
-
-def _number_text(values: np.ndarray, digits: int) -> str:
-    return " ".join(f"{value:.{digits}f}" for value in values)

@@ -1,8 +1,4 @@
-"""The camera beyond one plane: a 3x4 projection near the work plane, with radial distortion and a plate height error.
-
-On one plane all three are hidden: a homography takes up a wrong height completely, and distortion partly. A hole
-seen at many places and heights, which robot and rangers measure, shows them.
-"""
+"""What drilling needs of its sensors: base frame, camera, range sensors, the tool's axis, and groups of holes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,29 +97,23 @@ def fit_homography(xy: Array, uv: Array) -> Array:
         raise NoResultError(
             f"a homography needs four or more holes, {len(xy)} are given; to fix: find more of them in the image"
         )
-    to_xy, to_uv = normaliser(xy), normaliser(uv)
-    p, q = _apply_homography(to_xy, xy), _apply_homography(to_uv, uv)
-    one, zero = np.ones(len(p)), np.zeros((len(p), 3))
-    row = np.column_stack([p, one])
-    matrix = np.vstack([np.hstack([row, zero, -q[:, :1] * row]), np.hstack([zero, row, -q[:, 1:] * row])])
-    values, vectors = np.linalg.svd(matrix)[1:]
+    to_xy, to_uv = _normaliser(xy), _normaliser(uv)
+    start, values = _direct_linear_transform(xy, uv, to_xy, to_uv)
     if values[7] < 1e-9 * values[0]:
         raise NoResultError("the holes lie on a line and fix no homography; to fix: use holes spread over the plane")
-    h = vectors[8]
-    # In normalised coordinates the plane's centre maps near the image's, so the last entry is far from zero.
-    start = h[:8] / h[8]
+    p, q = _project(to_xy, xy), _project(to_uv, uv)
 
     def matrix_of(x: Array) -> Array:
         return np.asarray(np.append(x, 1.0).reshape(3, 3))
 
-    refined = least_squares(lambda x: (_apply_homography(matrix_of(x), p) - q).ravel(), start, method="lm").x
+    refined = least_squares(lambda x: (_project(matrix_of(x), p) - q).ravel(), start, method="lm").x
     H = np.linalg.inv(to_uv) @ matrix_of(refined) @ to_xy
     return np.asarray(H / H[2, 2])
 
 
 def to_plane(H: Array, uv: Array) -> Array:
     """Work-plane points (..., N, 2) of image points in pixels; source, formula 13."""
-    return _apply_homography(np.asarray(np.linalg.inv(H), float), np.asarray(uv, float))
+    return _project(np.asarray(np.linalg.inv(H), float), np.asarray(uv, float))
 
 
 def leave_one_out(xy: Array, uv: Array) -> Array:
@@ -136,7 +126,7 @@ def leave_one_out(xy: Array, uv: Array) -> Array:
     return errors
 
 
-def normaliser(points: Array) -> Array:
+def _normaliser(points: Array) -> Array:
     """Similarity (d+1, d+1) that brings points (N, d) to mean 0 and mean distance √d (Hartley 1997)."""
     mean, size = points.mean(axis=0), points.shape[1]
     scale = np.sqrt(size) / max(float(np.linalg.norm(points - mean, axis=1).mean()), np.finfo(float).tiny)
@@ -145,10 +135,29 @@ def normaliser(points: Array) -> Array:
     return matrix
 
 
-def _apply_homography(H: Array, points: Array) -> Array:
-    mapped = points @ H[:, :2].T + H[:, 2]
-    return np.asarray(mapped[..., :2] / mapped[..., 2:])
+def _direct_linear_transform(points: Array, uv: Array, to_points: Array, to_uv: Array) -> tuple[Array, Array]:
+    """Normalised projection of points (N, d) onto image points, its last entry one and left out; singular values.
 
+    In normalised coordinates the points' centre maps near the image's, so the last entry is far from zero.
+    """
+    p = np.column_stack([_project(to_points, points), np.ones(len(points))])
+    q, zero = _project(to_uv, uv), np.zeros_like(p)
+    matrix = np.vstack([np.hstack([p, zero, -q[:, :1] * p]), np.hstack([zero, p, -q[:, 1:] * p])])
+    values, vectors = np.linalg.svd(matrix)[1:]
+    h = vectors[-1]
+    return np.asarray(h[:-1] / h[-1]), values
+
+
+def _project(P: Array, points: Array) -> Array:
+    """Points (..., N, d) through a projective map (k+1, d+1)."""
+    mapped = points @ P[:, :-1].T + P[:, -1]
+    return np.asarray(mapped[..., :-1] / mapped[..., -1:])
+
+
+# The camera beyond one plane: a 3x4 projection near the work plane, with radial distortion and a plate height error.
+#
+# On one plane all three are hidden: a homography takes up a wrong height completely, and distortion partly. A hole
+# seen at many places and heights, which robot and rangers measure, shows them.
 
 # Effects by the names that a report uses.
 CAMERA_EFFECTS = ("k1", "plate_height")
@@ -226,8 +235,8 @@ def fit_camera(observations: HoleObservations, effects: tuple[str, ...] = ()) ->
     centre = np.array(observations.image_size) / 2 - 0.5
     corner = float(np.linalg.norm(observations.image_size) / 2)
     # Normalised as the DLT wants it, for the refinement's conditioning too.
-    to_uv, to_xyz = normaliser(observations.uv), normaliser(observations.xyz)
-    start = _dlt(observations.xyz, observations.uv, to_xyz, to_uv)
+    to_uv, to_xyz = _normaliser(observations.uv), _normaliser(observations.xyz)
+    start, _ = _direct_linear_transform(observations.xyz, observations.uv, to_xyz, to_uv)
 
     def camera(x: Array) -> tuple[Array, dict[str, float]]:
         P = np.linalg.inv(to_uv) @ np.append(x[:11], 1.0).reshape(3, 4) @ to_xyz
@@ -266,21 +275,6 @@ def _check_enough(observations: HoleObservations, effects: tuple[str, ...]) -> N
         raise NoResultError(
             "a plate height error shows only against a hole seen at several other heights; to fix: measure some"
         )
-
-
-def _dlt(xyz: Array, uv: Array, to_xyz: Array, to_uv: Array) -> Array:
-    """First eleven entries of the normalised projection, the twelfth being one."""
-    p = np.column_stack([xyz, np.ones(len(xyz))]) @ to_xyz.T
-    q = uv @ to_uv[:2, :2].T + to_uv[:2, 2]
-    zero = np.zeros_like(p)
-    matrix = np.vstack([np.hstack([p, zero, -q[:, :1] * p]), np.hstack([zero, p, -q[:, 1:] * p])])
-    h = np.linalg.svd(matrix)[2][-1]
-    return np.asarray(h[:11] / h[11])
-
-
-def _project(P: Array, xyz: Array) -> Array:
-    mapped = xyz @ P[:, :3].T + P[:, 3]
-    return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
 # What the homography hides: effects of the camera by forward selection with F-test and BIC.
@@ -420,7 +414,7 @@ def hole_at_tool(picture: Path, H: Array) -> Array:
     centres = find_holes(_read_picture(picture))
     if not len(centres):
         raise InputError(f"{picture}: no hole is found; to fix: light the part evenly, or write u, v in the CSV")
-    middle = _apply_homography(H, np.zeros((1, 2)))
+    middle = _project(H, np.zeros((1, 2)))
     return np.asarray(centres[np.linalg.norm(centres - middle, axis=1).argmin()])
 
 
@@ -537,11 +531,6 @@ def fit_ranger(planes: Array, readings: Array) -> RangerFit:
 
     x = least_squares(distances, np.append(start[:3], [0.0, 0.0]), method="lm", x_scale=[100, 100, 100, 1, 1]).x
     return RangerFit(x[:3], direction(x), float(np.sqrt(np.mean(distances(x) ** 2))))
-
-
-def hole_coordinate(T_base_tool: Array, offset: Array) -> Array:
-    """Drive coordinate (3,) of a hole seen at `offset` (3,) from the tool."""
-    return np.asarray(T_base_tool[:3, 3] + T_base_tool[:3, :3] @ offset)
 
 
 # The tool's true axis in its own frame, from how the robot reports to stand when the tool is upright on a hole.

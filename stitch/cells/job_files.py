@@ -3,7 +3,7 @@
 import csv
 import math
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.metadata import entry_points
@@ -25,12 +25,85 @@ from stitch.writing.session_files import TableColumns
 LOWEST_VALUE, HIGHEST_VALUE = 1e-12, 1e9
 
 
-def read_job_file(file: Path, expected_format: str, known: set[str], example: str) -> dict[str, Any]:
-    """The document of a job file.
+@dataclass(frozen=True)
+class JobTable:
+    """A table of a job file, read key by key. All methods raise `InputError` that names file, place and remedy."""
+
+    file: Path
+    entries: dict[str, Any]
+    place: str = ""  # of the table in the file
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.entries
+
+    def refusal(self, key: str, remedy: str) -> InputError:
+        """Return the error that refuses the value of a key."""
+        return InputError(f"{self.file}: {self._at(key)} is {reprlib.repr(self.entries.get(key))}; to fix: {remedy}")
+
+    def table(self, key: str, known: Collection[str], required: bool = False) -> "JobTable":
+        """Return a table within this one, empty where it may be missing; unknown keys are refused."""
+        if required and not isinstance(self.entries.get(key), dict):
+            raise InputError(f"{self.file}: [{self._at(key)}] is missing; to fix: add this table")
+        return checked_table(self.file, self._at(key), self.entries.get(key, {}), known)
+
+    def choice(self, key: str, known: Collection[str], default: str | None = None) -> str:
+        """Return one of some words."""
+        value = self.entries.get(key, default)
+        if not isinstance(value, str) or value not in known:
+            raise self.refusal(key, f"write one of {', '.join(known)}")
+        return value
+
+    def number(self, key: str, default: float | None = None, positive: bool = False) -> float:
+        """Return a finite number, above zero if `positive`."""
+        return self._finite(key, self.entries.get(key, default), positive)
+
+    def vectors(self, key: str, shape: tuple[int, ...], form: str) -> Array:
+        """Return finite numbers of a shape, such as (3,) for [x, y, z]; `form` says how to write them."""
+
+        def flat(value: Any, shape: tuple[int, ...]) -> list[Any]:
+            if not shape:
+                return [value]
+            if not isinstance(value, list) or len(value) != shape[0]:
+                raise InputError(f"{self.file}: {self._at(key)} is {reprlib.repr(value)}; to fix: write {form}")
+            return [entry for part in value for entry in flat(part, shape[1:])]
+
+        return np.array([self._finite(key, number, False) for number in flat(self.entries.get(key), shape)]).reshape(
+            shape
+        )
+
+    def pose(self, key: str) -> Array:
+        """Return the pose (4, 4) of a table with the keys x, y, z, a_deg, b_deg, c_deg."""
+        names = POSE_COLUMNS.split()
+        numbers = self.table(key, names, required=True)
+        return poses_from_rows(np.array([numbers.number(name) for name in names]))
+
+    def path(self, key: str) -> Path:
+        """Return a file that is named relative to the job file."""
+        value = self.entries.get(key)
+        if not isinstance(value, str):
+            raise self.refusal(key, "name a file in quotes")
+        return self.file.parent / value
+
+    def _at(self, key: str) -> str:
+        return f"{self.place}.{key}" if self.place else key
+
+    def _finite(self, key: str, value: Any, positive: bool) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            wanted = "a finite number"
+        elif abs(value) > HIGHEST_VALUE:
+            wanted = "a number that a cell can have"
+        elif positive and value < LOWEST_VALUE:
+            wanted = "a number above zero"
+        else:
+            return float(value)
+        raise InputError(f"{self.file}: {self._at(key)} is {value!r}; to fix: write {wanted}")
+
+
+def read_job_file(file: Path, expected_format: str, known: Collection[str], example: str) -> JobTable:
+    """Read a job file; unknown keys of its top level are refused.
 
     Args:
         expected_format: the format it must state, such as "stitch-drill/1".
-        known: the keys of its top level.
         example: where a job of that format lies.
 
     Raises:
@@ -39,24 +112,11 @@ def read_job_file(file: Path, expected_format: str, known: set[str], example: st
     document = read_toml(file, f"see {example} for how it looks")
     if document.get("format") != expected_format:
         raise InputError(f'{file}: format is {document.get("format")!r}; to fix: write "{expected_format}"')
-    check_keys(file, "", document, known)
-    return document
+    return checked_table(file, "", document, known)
 
 
-def table(file: Path, document: dict[str, Any], name: str) -> dict[str, Any]:
-    """A required table of a document.
-
-    Raises:
-        InputError: it is missing or not a table.
-    """
-    entry = document.get(name)
-    if not isinstance(entry, dict):
-        raise InputError(f"{file}: [{name}] is missing; to fix: add this table")
-    return entry
-
-
-def check_keys(file: Path, place: str, entries: Any, known: set[str]) -> None:
-    """Refuse a key that nobody reads: most are misspelt.
+def checked_table(file: Path, place: str, entries: Any, known: Collection[str]) -> JobTable:
+    """Return entries as a table; refuse a key that nobody reads, since most are misspelt.
 
     Raises:
         InputError: `entries` is not a table or holds an unknown key.
@@ -68,66 +128,7 @@ def check_keys(file: Path, place: str, entries: Any, known: set[str]) -> None:
             close = get_close_matches(key, known, 1)
             hint = f"write {close[0]!r}" if close else f"write one of {', '.join(sorted(known))}"
             raise InputError(f"{file}: unknown key {f'{place}.{key}' if place else key!r}; to fix: {hint}")
-
-
-def choice(file: Path, place: str, value: Any, known: tuple[str, ...]) -> str:
-    """One of some words.
-
-    Raises:
-        InputError: it is none.
-    """
-    if not isinstance(value, str) or value not in known:
-        raise InputError(f"{file}: {place} is {value!r}; to fix: write one of {', '.join(known)}")
-    return value
-
-
-def finite(file: Path, place: str, value: Any, positive: bool = False) -> float:
-    """A finite number, above zero if `positive`.
-
-    Raises:
-        InputError: it is none.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{file}: {place} is {value!r}; to fix: write a finite number")
-    if abs(value) > HIGHEST_VALUE:
-        raise InputError(f"{file}: {place} is {value!r}; to fix: write a number that a cell can have")
-    if positive and value < LOWEST_VALUE:
-        raise InputError(f"{file}: {place} is {value!r}; to fix: write a number above zero")
-    return float(value)
-
-
-def vectors(file: Path, place: str, value: Any, shape: tuple[int, ...], form: str) -> Array:
-    """Finite numbers of a shape, such as (3,) for [x, y, z].
-
-    Args:
-        form: how to write them, for the message.
-
-    Raises:
-        InputError: another shape, or something that is no finite number.
-    """
-    for number in _flat(file, place, value, shape, form):
-        finite(file, place, number)
-    return np.array(value, float)
-
-
-def _flat(file: Path, place: str, value: Any, shape: tuple[int, ...], form: str) -> list[Any]:
-    """The entries of nested lists of a shape, row by row."""
-    if not shape:
-        return [value]
-    if not isinstance(value, list) or len(value) != shape[0]:
-        raise InputError(f"{file}: {place} is {reprlib.repr(value)}; to fix: write {form}")
-    return [entry for part in value for entry in _flat(file, place, part, shape[1:], form)]
-
-
-def resolve_file(file: Path, place: str, value: Any) -> Path:
-    """A file that a job names relative to itself.
-
-    Raises:
-        InputError: no name in quotes.
-    """
-    if not isinstance(value, str):
-        raise InputError(f"{file}: {place} is {value!r}; to fix: name a file in quotes")
-    return file.parent / value
+    return JobTable(file, entries, place)
 
 
 # CSV tables with named columns, as a person edits them.
@@ -165,31 +166,22 @@ def read_columns(file: Path, texts: str, numbers: str) -> CsvColumns:
     if not lines:
         raise InputError(f"{file}: no rows below the header; to fix: add one per line")
     rows = [(line, dict(zip(header, cells + [""] * len(header), strict=False))) for line, cells in lines]
+    for line, row in rows:
+        for name in texts.split():
+            if not row[name].strip():
+                raise InputError(f"{file} line {line}: {name} is empty; to fix: write a name")
     return CsvColumns(
-        {name: [_text(file, line, name, row[name]) for line, row in rows] for name in texts.split()},
+        {name: [row[name].strip() for _, row in rows] for name in texts.split()},
         {name: np.array([_number(file, line, name, row[name]) for line, row in rows]) for name in numbers.split()},
         len(rows),
     )
 
 
 def require_unique(file: Path, what: str, names: list[str]) -> None:
-    """Refuse a name that stands in two rows.
-
-    Args:
-        what: the thing that has the name, such as "hole".
-
-    Raises:
-        InputError: names the first that does.
-    """
+    """Raise `InputError` where the name of a thing (`what`, such as "hole") stands in two rows."""
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"{file}: {what} {name} stands twice; to fix: leave one of them out, or rename it")
-
-
-def _text(file: Path, line: int, name: str, cell: str) -> str:
-    if not cell.strip():
-        raise InputError(f"{file} line {line}: {name} is empty; to fix: write a name")
-    return cell.strip()
 
 
 def _number(file: Path, line: int, name: str, cell: str) -> float:
@@ -199,17 +191,25 @@ def _number(file: Path, line: int, name: str, cell: str) -> float:
     return value
 
 
-# What every cell's command reads and can hand out beside its result: a Rerun recording, a page, a session folder.
+# What every cell's command hands out beside its result: a Rerun recording, a page, a session folder.
 #
-# Recording and page come from whoever offers them under the entry points `stitch.cell_recordings` and
-# `stitch.cell_reports`, by the command's name.
+# Recording, page and pictures come from whoever offers them under the entry points `stitch.cell_recordings`,
+# `stitch.cell_reports` and `stitch.cell_pictures`, by the command's name.
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a person asks a cell's command for."""
+
+    output: Path | None = None  # table or folder
+    recording: Path | None = None
+    report: Path | None = None
+    session: Path | None = None
+    as_json: bool = False
 
 
 def write_pictures(command: str, folder: Path, *results: Any) -> list[str]:
-    """Write the pictures of a command's job and result (`results`) into its folder; returns the files' names.
-
-    They come from whoever offers them under the entry point `stitch.cell_pictures`, by the command's name.
-    """
+    """Write the pictures of a command's job and result (`results`) into its folder; returns the files' names."""
     offered = entry_points(group="stitch.cell_pictures", name=command)
     return [name for writer in offered for name in writer.load()(*results, folder)]
 
@@ -264,16 +264,6 @@ def rows_from_poses(poses: Array) -> Array:
 def poses_from_columns(table: CsvColumns) -> Array:
     """Poses (N, 4, 4) of a table that holds the six columns."""
     return poses_from_rows(table.stack(POSE_COLUMNS))
-
-
-def pose_from_table(file: Path, place: str, entries: Any) -> Array:
-    """The pose (4, 4) that a table of a job file holds, by the keys of COLUMNS.
-
-    Raises:
-        InputError: no table, an unknown key, or something that is no finite number.
-    """
-    check_keys(file, place, entries, set(POSE_COLUMNS.split()))
-    return poses_from_rows(np.array([finite(file, f"{place}.{key}", entries.get(key)) for key in POSE_COLUMNS.split()]))
 
 
 def write_poses(file: Path, key: str, names: Sequence[str], poses: Array) -> None:

@@ -13,19 +13,14 @@ from stitch import frames
 from stitch.cells.job_files import (
     POSE_COLUMNS,
     CsvColumns,
-    check_keys,
-    choice,
-    finite,
+    JobTable,
+    Wanted,
     points_table,
-    pose_from_table,
     poses_from_columns,
     poses_from_rows,
     read_columns,
     read_job_file,
-    resolve_file,
     rows_from_poses,
-    table,
-    vectors,
     write_columns,
     write_pictures,
     write_poses,
@@ -80,16 +75,15 @@ class PanelPoints:
 def read_calibration(
     file: Path, names: tuple[str, ...], tracker: LaserTracker, T_world_tracker: Array
 ) -> tuple[ReflectorReadings, ...]:
-    """Each robot's poses and reflectors; the tracker's readings brought into the world.
+    """Read each robot's poses and reflectors; the tracker's readings are brought into the world.
 
     Raises:
         InputError: a column or robot is missing, or reflectors lie on one line.
     """
-    columns = read_columns(file, "robot", f"{POSE_COLUMNS} x1 y1 z1 x2 y2 z2 x3 y3 z3")
+    columns = _read_robots(file, names, "robot", f"{POSE_COLUMNS} x1 y1 z1 x2 y2 z2 x3 y3 z3")
     poses, seen = poses_from_columns(columns), columns.stack("x1 y1 z1 x2 y2 z2 x3 y3 z3").reshape(-1, 3, 3)
     seen = frames.transform(T_world_tracker, seen)
     robot = np.array(columns.texts["robot"])
-    require_known_robots(file, columns, names)
     sides = seen[:, 1:] - seen[:, :1]
     flat = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) < _FLAT * (sides**2).sum(axis=(1, 2))
     if flat.any():
@@ -105,13 +99,12 @@ def read_calibration(
 
 
 def read_per_robot(file: Path, names: tuple[str, ...], column_names: str) -> Array:
-    """(N, k) one row of numbers for each robot, in the order of `names`.
+    """Read (N, k), one row of numbers for each robot, in the order of `names`.
 
     Raises:
         InputError: a column is missing, or a robot is missing, unknown or there twice.
     """
-    columns = read_columns(file, "robot", column_names)
-    require_known_robots(file, columns, names)
+    columns = _read_robots(file, names, "robot", column_names)
     listed = columns.texts["robot"]
     for name in names:
         if listed.count(name) != 1:
@@ -120,27 +113,23 @@ def read_per_robot(file: Path, names: tuple[str, ...], column_names: str) -> Arr
 
 
 def read_panel_points(file: Path, robots: tuple[str, ...] | None, T_world_tracker: Array) -> PanelPoints:
-    """Targets (robots None) or control points, which name the robot whose clamp they lie beside.
+    """Read targets (robots None) or control points, which name the robot whose clamp they lie beside.
 
     Raises:
         InputError: a column is missing, a robot unknown or without a point.
     """
-    columns = read_columns(file, "point robot" if robots else "point", "x y z seen_x seen_y seen_z")
-    clamp = np.full(columns.rows, -1)
-    if robots:
-        require_known_robots(file, columns, robots)
-        clamp = np.array([robots.index(name) for name in columns.texts["robot"]])
-        for i, name in enumerate(robots):
-            if not (clamp == i).any():
-                raise InputError(
-                    f"{file}: robot {name} has no control point; to fix: measure one or more beside its clamp"
-                )
+    numbers = "x y z seen_x seen_y seen_z"
+    columns = _read_robots(file, robots, "point robot", numbers) if robots else read_columns(file, "point", numbers)
+    clamp = np.array([robots.index(name) for name in columns.texts["robot"]] if robots else [-1] * columns.rows)
+    for i, name in enumerate(robots or ()):
+        if not (clamp == i).any():
+            raise InputError(f"{file}: robot {name} has no control point; to fix: measure one or more beside its clamp")
     seen = frames.transform(T_world_tracker, columns.stack("seen_x seen_y seen_z"))
     return PanelPoints(columns.texts["point"], columns.stack("x y z"), seen, clamp)
 
 
 def read_world(file: Path, tracker: LaserTracker) -> Array:
-    """T_world_tracker (4, 4) from reference points; the tracker sits at its own frame's origin.
+    """Return T_world_tracker (4, 4) from reference points; the tracker sits at its own frame's origin.
 
     Raises:
         InputError: a column is missing, the points fix no frame, or one contradicts the others.
@@ -152,27 +141,23 @@ def read_world(file: Path, tracker: LaserTracker) -> Array:
         found = rigid_fit(columns.stack("x y z"), seen, sigma)
     except NoResultError as error:
         raise InputError(f"{file}: {error}") from None
-    worst = int(np.argmax(np.linalg.norm(found.residuals, axis=1)))
+    sizes = np.linalg.norm(found.residuals, axis=1)
+    worst = int(np.argmax(sizes))
     # With few points much of an error hides in the fit; ten sigmas beyond it are no noise.
-    if np.linalg.norm(found.residuals[worst]) > 10 * np.sqrt(3) * sigma[worst]:
-        size = float(np.linalg.norm(found.residuals[worst]))
-        raise InputError(
-            f"{file}: point {columns.texts['point'][worst]} is {size:.3f} mm off the others; to fix: measure it anew"
-        )
+    if sizes[worst] > 10 * np.sqrt(3) * sigma[worst]:
+        name = columns.texts["point"][worst]
+        raise InputError(f"{file}: point {name} is {sizes[worst]:.3f} mm off the others; to fix: measure it anew")
     return frames.inverse(found.T)
 
 
-def require_known_robots(file: Path, columns: CsvColumns, names: tuple[str, ...]) -> None:
-    """Refuse robots that the job does not name.
-
-    Raises:
-        InputError: an unknown name.
-    """
+def _read_robots(file: Path, names: tuple[str, ...], texts: str, numbers: str) -> CsvColumns:
+    columns = read_columns(file, texts, numbers)
     for name in columns.texts["robot"]:
         if name not in names:
             raise InputError(
                 f"{file}: robot {name!r} is not in the job's robots {', '.join(names)}; to fix: correct its name"
             )
+    return columns
 
 
 # A panel job (TOML) and its CSV files -> `Job`; every check of the input is made here.
@@ -212,31 +197,31 @@ def read_panel_job(file: Path | str) -> PanelJob:
     """
     file = Path(file)
     document = read_job_file(file, PANEL_FORMAT, _KEYS, "examples/panel/job.toml")
-    robots = document.get("robots")
+    robots = document.entries.get("robots")
     if not isinstance(robots, list) or len(robots) < 2 or not all(isinstance(r, str) for r in robots):
-        raise InputError(f"{file}: robots is {robots!r}; to fix: list the robots' names, row by row")
+        raise document.refusal("robots", "list the robots' names, row by row")
     if len(set(robots)) != len(robots) or len(robots) % 2:
         raise InputError(
             f"{file}: robots has an odd number of names or one twice; to fix: list half of them for each row"
         )
     names = tuple(robots)
-    paths = _file_paths(file, table(file, document, "files"))
-    tracker = _read_tracker(file, table(file, document, "tracker"))
+    paths = _file_paths(document.table("files", _FILES, required=True))
+    tracker = _read_tracker(document.table("tracker", {"position", "constant", "per_length"}, required=True))
     T_world_tracker = np.eye(4)
     if "world" in paths:
         T_world_tracker = read_world(paths["world"], tracker)
         tracker = replace(tracker, position=T_world_tracker[:3, 3])
-    tolerance, axes = _read_shape(file, document.get("shape", {}))
+    tolerance, axes = _read_shape(document.table("shape", {"tolerance", "axes"}))
     flanges = read_per_robot(paths["flanges"], names, POSE_COLUMNS) if "flanges" in paths else None
     return PanelJob(
         robots=names,
-        master=names.index(choice(file, "master", document.get("master"), names)),
-        T_world_target=pose_from_table(file, "target", table(file, document, "target")),
-        layout=_read_layout(file, document, len(names) // 2),
+        master=names.index(document.choice("master", names)),
+        T_world_target=document.pose("target"),
+        layout=_read_layout(document.table("layout", _LAYOUT, required=True), len(names) // 2),
         tracker=tracker,
         tolerance=tolerance,
         axes=axes,
-        legs=_read_legs(file, document.get("legs")),
+        legs=_read_legs(document.table("legs", {"base", "platform"})) if "legs" in document else None,
         calibration=read_calibration(paths["calibration"], names, tracker, T_world_tracker),
         flanges=None if flanges is None else poses_from_rows(flanges),
         targets=read_panel_points(paths["targets"], None, T_world_tracker) if "targets" in paths else None,
@@ -246,64 +231,55 @@ def read_panel_job(file: Path | str) -> PanelJob:
     )
 
 
-def _read_layout(file: Path, document: dict[str, Any], columns: int) -> ClampLayout:
-    entries = table(file, document, "layout")
-    check_keys(file, "layout", entries, set(_LAYOUT))
-    sizes = {key: finite(file, f"layout.{key}", entries.get(key), positive=True) for key in _LAYOUT}
-    layout = ClampLayout(columns=columns, **sizes)
+def _read_layout(entries: JobTable, columns: int) -> ClampLayout:
+    layout = ClampLayout(columns=columns, **{key: entries.number(key, positive=True) for key in _LAYOUT})
     try:
         clamp_contacts(layout)
     except InputError as error:
-        raise InputError(f"{file}: {error}") from None
+        raise InputError(f"{entries.file}: {error}") from None
     return layout
 
 
-def _read_tracker(file: Path, entries: dict[str, Any]) -> LaserTracker:
-    check_keys(file, "tracker", entries, {"position", "constant", "per_length"})
+def _read_tracker(entries: JobTable) -> LaserTracker:
     return LaserTracker(
-        vectors(file, "tracker.position", entries.get("position"), (3,), "[x, y, z] in mm"),
-        constant=finite(file, "tracker.constant", entries.get("constant", 0.010), positive=True),
-        per_length=finite(file, "tracker.per_length", entries.get("per_length", 5e-6), positive=True),
+        entries.vectors("position", (3,), "[x, y, z] in mm"),
+        constant=entries.number("constant", 0.010, positive=True),
+        per_length=entries.number("per_length", 5e-6, positive=True),
     )
 
 
-def _read_shape(file: Path, entries: Any) -> tuple[float, Array]:
-    check_keys(file, "shape", entries, {"tolerance", "axes"})
-    axes = entries.get("axes", ["rx", "ry", "z"])
+def _read_shape(entries: JobTable) -> tuple[float, Array]:
+    """Tolerance, and which of the six axes are driven."""
+    axes = entries.entries.get("axes", ["rx", "ry", "z"])
     if not isinstance(axes, list) or not axes:
-        raise InputError(f"{file}: shape.axes is {axes!r}; to fix: list some of {', '.join(_AXES)}")
+        raise entries.refusal("axes", f"list some of {', '.join(_AXES)}")
     for axis in axes:
-        choice(file, "shape.axes", axis, _AXES)
-    return (
-        finite(file, "shape.tolerance", entries.get("tolerance", 0.6), positive=True),
-        np.array([axis in axes for axis in _AXES]),
-    )
+        if axis not in _AXES:
+            raise InputError(f"{entries.file}: shape.axes is {axis!r}; to fix: write one of {', '.join(_AXES)}")
+    return entries.number("tolerance", 0.6, positive=True), np.array([axis in axes for axis in _AXES])
 
 
-def _read_legs(file: Path, entries: Any) -> Legs | None:
-    if entries is None:
-        return None
-    check_keys(file, "legs", entries, {"base", "platform"})
-    form = "6 points [x, y, z] in mm"
-    legs = Legs(*(vectors(file, f"legs.{key}", entries.get(key), (6, 3), form) for key in ("base", "platform")))
-    for name, joints in (("base", legs.base), ("platform", legs.platform)):
+def _read_legs(entries: JobTable) -> Legs:
+    legs = {key: entries.vectors(key, (6, 3), "6 points [x, y, z] in mm") for key in ("base", "platform")}
+    for name, joints in legs.items():
         if np.linalg.matrix_rank(joints - joints.mean(axis=0), tol=1e-3) < 2:
             raise InputError(
-                f"{file}: legs.{name}: the six joints lie on one line; to fix: give them in mm, leg by leg"
+                f"{entries.file}: legs.{name}: the six joints lie on one line; to fix: give them in mm, leg by leg"
             )
-    return legs
+    return Legs(**legs)
 
 
-def _file_paths(file: Path, entries: dict[str, Any]) -> dict[str, Path]:
-    check_keys(file, "files", entries, _FILES)
+def _file_paths(entries: JobTable) -> dict[str, Path]:
     if "calibration" not in entries:
-        raise InputError(f"{file}: files.calibration is missing; to fix: name the table of the robots' calibration")
-    for first, second in (("targets", "flanges"), ("control", "flanges")):
-        if first in entries and second not in entries:
+        raise InputError(
+            f"{entries.file}: files.calibration is missing; to fix: name the table of the robots' calibration"
+        )
+    for name in ("targets", "control"):
+        if name in entries and "flanges" not in entries:
             raise InputError(
-                f"{file}: files.{first} is without files.{second}; to fix: add where the robots stood then"
+                f"{entries.file}: files.{name} is without files.flanges; to fix: add where the robots stood then"
             )
-    return {key: resolve_file(file, f"files.{key}", value) for key, value in entries.items()}
+    return {key: entries.path(key) for key in entries.entries}
 
 
 # The source moves 100 mm and turns 2°.
@@ -367,7 +343,9 @@ def solve_panel_job(job: PanelJob) -> PanelResult:
     layout = clamp_contacts(job.layout)
     before = preposition(bases, job.T_world_target, layout.T_panel_contact, clamps)
     stand = before if job.flanges is None else _flanges_with_offsets(job, offsets, job.flanges)
-    errors = _expected_errors(job, models, stand)
+    shift = errors_along_motion(models, stand, job.master, _DISTANCES, turn=False)
+    turn = errors_along_motion(models, stand, job.master, _ANGLES, turn=True)
+    by_master = errors_by_master(models, stand, float(_DISTANCES[-1]), float(_ANGLES[-1]))
     pose = pose_error = pose_commands = shape = shape_largest = shape_commands = None
     T_world_panel = job.T_world_target
     if job.targets is not None:
@@ -387,7 +365,7 @@ def solve_panel_job(job: PanelJob) -> PanelResult:
         models=models,
         legs=offsets,
         preposition=_commands_for(job, offsets, before),
-        errors=errors,
+        errors=ExpectedErrors(shift, turn, by_master),
         pose=pose,
         pose_error=pose_error,
         pose_commands=pose_commands,
@@ -395,12 +373,6 @@ def solve_panel_job(job: PanelJob) -> PanelResult:
         shape_largest=shape_largest,
         shape_commands=shape_commands,
     )
-
-
-def _expected_errors(job: PanelJob, models: tuple[RobotModel, ...], stand: Array) -> ExpectedErrors:
-    shift = errors_along_motion(models, stand, job.master, _DISTANCES, turn=False)
-    turn = errors_along_motion(models, stand, job.master, _ANGLES, turn=True)
-    return ExpectedErrors(shift, turn, errors_by_master(models, stand, float(_DISTANCES[-1]), float(_ANGLES[-1])))
 
 
 def _flanges_with_offsets(job: PanelJob, offsets: tuple[LegOffset, ...], believed: Array, sign: float = 1.0) -> Array:
@@ -424,7 +396,18 @@ def panel_document(job: PanelJob, result: PanelResult) -> dict[str, Any]:
     """Plain data for JSON. mm, degrees, N."""
     out: dict[str, Any] = {
         "robots": {m.name: _robot_document(m) for m in result.models},
-        "leg_offsets": {o.robot: _leg_document(o) for o in result.legs},
+        "leg_offsets": {
+            o.robot: {
+                "found": o.detected,
+                "leg": o.leg,
+                "offset": o.offset,
+                "sigma": o.sigma,
+                "gain": o.chi_square_drop,
+                "runner_up": o.runner_up,
+                "runner_up_gain": o.runner_up_drop,
+            }
+            for o in result.legs
+        },
         "errors": {
             "after_100_mm": result.errors.shift.position[:, -1].max(axis=0).tolist(),
             "after_2_deg": result.errors.turn.position[:, -1].max(axis=0).tolist(),
@@ -444,20 +427,11 @@ def panel_document(job: PanelJob, result: PanelResult) -> dict[str, Any]:
         ok = bool(result.shape_largest.max() <= job.tolerance)
         out["shape"] = {"largest_deviation": deviation, "tolerance": job.tolerance, "within_tolerance": ok}
     if job.forces is not None:
-        out["forces"] = {name: _force_document(row) for name, row in zip(job.robots, job.forces, strict=True)}
+        out["forces"] = {
+            name: {"force_N": float(np.linalg.norm(row[3:])), "torque_Nm": float(np.linalg.norm(row[:3]) / 1000)}
+            for name, row in zip(job.robots, job.forces, strict=True)
+        }
     return out
-
-
-def _leg_document(o: LegOffset) -> dict[str, Any]:
-    return {
-        "found": o.detected,
-        "leg": o.leg,
-        "offset": o.offset,
-        "sigma": o.sigma,
-        "gain": o.chi_square_drop,
-        "runner_up": o.runner_up,
-        "runner_up_gain": o.runner_up_drop,
-    }
 
 
 def _robot_document(model: RobotModel) -> dict[str, Any]:
@@ -473,10 +447,6 @@ def _robot_document(model: RobotModel) -> dict[str, Any]:
         "redundancy": model.redundancy,
         "p_value": model.p_value,
     }
-
-
-def _force_document(row: np.ndarray) -> dict[str, float]:
-    return {"force_N": float(np.linalg.norm(row[3:])), "torque_Nm": float(np.linalg.norm(row[:3]) / 1000)}
 
 
 def write_folder(job: PanelJob, result: PanelResult, folder: Path) -> list[str]:
@@ -547,8 +517,10 @@ def robot_sessions(job: PanelJob, result: PanelResult) -> list[SessionFiles]:
     The poses are the controller's own, a leg offset that was found is still in them. A parallel robot has no chain of
     joints that a session could name; the lengths of its legs go along as covariates.
     """
-    pairs = zip(job.calibration, result.models, strict=True)
-    return [_robot_session(readings, model, job.legs) for readings, model in pairs]
+    return [
+        _robot_session(readings, model, job.legs)
+        for readings, model in zip(job.calibration, result.models, strict=True)
+    ]
 
 
 def _robot_session(readings: ReflectorReadings, model: RobotModel, legs: Legs | None) -> SessionFiles:
@@ -560,49 +532,42 @@ def _robot_session(readings: ReflectorReadings, model: RobotModel, legs: Legs | 
         readings.reflectors.reshape(-1, 3),
         readings.sigma.ravel(),
     )
-    lengths = {} if legs is None else _leg_columns(legs, readings.T_base_flange)
+    lengths = () if legs is None else leg_lengths(legs, readings.T_base_flange).T
     return SessionFiles(
         name=readings.name,
         length_unit="mm",
         mount="eye_to_hand",
         tables={"scanner": {"pose": frames.inverse(model.T_world_base).tolist()}},
-        views={"view": views, **pose_columns(readings.T_base_flange), **lengths},
+        views={
+            "view": views,
+            **pose_columns(readings.T_base_flange),
+            **{f"leg{i + 1}_mm": length for i, length in enumerate(lengths)},
+        },
         points=points,
     )
-
-
-def _leg_columns(legs: Legs, T_base_flange: Array) -> dict[str, Array]:
-    return {f"leg{i + 1}_mm": lengths for i, lengths in enumerate(leg_lengths(legs, T_base_flange).T)}
 
 
 # What `stitch panel` does: a job solved, shown, drawn, as a folder of commands and as sessions.
 
 
-def run_panel(
-    file: Path, output: Path | None, recording: Path | None, report: Path | None, session: Path | None, *, as_json: bool
-) -> None:
-    """Solve a job and hand out what was asked for.
-
-    Raises:
-        InputError, NoResultError: as `stitch panel` ends.
-    """
+def run_panel(file: Path, wanted: Wanted) -> None:
+    """Solve a job and hand out what was asked for; `InputError` and `NoResultError` end it."""
     job = read_panel_job(file)
     result = solve_panel_job(job)
     written = []
-    if output is not None:
-        written = write_folder(job, result, output) + write_pictures("panel", output, job, result)
-    if session is not None:
-        write_sessions(session, robot_sessions(job, result))
-    write_recording_and_page("panel", recording, report, job, result)
-    if as_json:
+    if wanted.output is not None:
+        written = write_folder(job, result, wanted.output) + write_pictures("panel", wanted.output, job, result)
+    if wanted.session is not None:
+        write_sessions(wanted.session, robot_sessions(job, result))
+    write_recording_and_page("panel", wanted.recording, wanted.report, job, result)
+    if wanted.as_json:
         print(json.dumps(panel_document(job, result), indent=1))
         return
     terminal = console()
     _print_model(terminal, result)
-    _print_legs(terminal, result)
     _print_moves(terminal, job, result)
     for name in written:
-        print(f"{output}/{name}")
+        print(f"{wanted.output}/{name}")
 
 
 def _print_model(terminal: Console, result: PanelResult) -> None:
@@ -615,9 +580,6 @@ def _print_model(terminal: Console, result: PanelResult) -> None:
         cells = (f"{sigma[1]:.3f}", f"{degrees[0]:.4f}", f"{sigma[3]:.3f}", f"{degrees[2]:.4f}", f"{model.p_value:.3g}")
         table.add_row(model.name, *cells)
     terminal.print(table)
-
-
-def _print_legs(terminal: Console, result: PanelResult) -> None:
     found = [offset for offset in result.legs if offset.detected]
     for o in found:
         terminal.print(leg_sentence(o))

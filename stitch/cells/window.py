@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from stitch import frames
@@ -25,23 +24,19 @@ from stitch.cells.cad import (
 )
 from stitch.cells.job_files import (
     POSE_COLUMNS,
-    check_keys,
-    choice,
-    finite,
-    pose_from_table,
+    JobTable,
+    Wanted,
+    checked_table,
     poses_from_columns,
     read_columns,
     read_job_file,
     require_unique,
-    resolve_file,
     rows_from_poses,
-    vectors,
     write_columns,
     write_poses,
     write_recording_and_page,
 )
 from stitch.cells.scan_to_cad import (
-    Allowance,
     AllowancePrior,
     CadFit,
     CadStart,
@@ -124,33 +119,33 @@ def read_fit_job(file: Path | str) -> FitJob:
     """
     file = Path(file)
     document = read_job_file(file, FIT_FORMAT, _FIT_KEYS, "examples/window/fit.toml")
-    nominal = pose_from_table(file, "nominal", document["nominal"]) if "nominal" in document else None
-    if "path" in document and nominal is None:
-        raise InputError(
-            f"{file}: path has no [nominal]; to fix: give the part's pose for which the path was programmed"
-        )
+    nominal = document.pose("nominal") if "nominal" in document else None
     path = None
     if "path" in document:
-        rows = read_columns(resolve_file(file, "path", document["path"]), "name", POSE_COLUMNS)
+        if nominal is None:
+            raise InputError(
+                f"{file}: path has no [nominal]; to fix: give the part's pose for which the path was programmed"
+            )
+        rows = read_columns(document.path("path"), "name", POSE_COLUMNS)
         path = (rows.texts["name"], poses_from_columns(rows))
-    instances = document.get("instances", 1)
+    instances = document.entries.get("instances", 1)
     if not isinstance(instances, int) or isinstance(instances, bool) or instances < 1:
-        raise InputError(f"{file}: instances is {instances!r}; to fix: write how many parts are in the scan, 1 or more")
-    cad_file = resolve_file(file, "cad", document.get("cad"))
-    cad, placed = read_cad(cad_file), _read_scans(file, document)
+        raise document.refusal("instances", "write how many parts are in the scan, 1 or more")
+    cad_file = document.path("cad")
+    cad, placed = read_cad(cad_file), _read_scans(document)
     unit = placed.length_unit if "session" in document else None  # else neither scans nor CAD name it
     if "length_unit" in document:
-        unit = choice(file, "length_unit", document["length_unit"], (unit,) if unit else ("mm", "m"))
+        unit = document.choice("length_unit", (unit,) if unit else ("mm", "m"))
     return FitJob(
         placed=placed,
         scan=assemble_scans(placed),
         cad=cad,
         cad_file=cad_file,
         instances=instances,
-        tolerance=finite(file, "tolerance", document.get("tolerance", 0.5), positive=True),
-        cell=finite(file, "cell", document.get("cell", cad.size / 60), positive=True),
-        regions=_read_regions(file, document.get("region", [])),
-        coverage=finite(file, "coverage", document.get("coverage", 0.5)),
+        tolerance=document.number("tolerance", 0.5, positive=True),
+        cell=document.number("cell", cad.size / 60, positive=True),
+        regions=_read_regions(document),
+        coverage=document.number("coverage", 0.5),
         T_base_part_nominal=nominal,
         path=path,
         file=file,
@@ -168,26 +163,23 @@ def read_seam_job(file: Path | str) -> SeamJob:
     document = read_job_file(file, SEAM_FORMAT, _SEAM_KEYS, "examples/window/seam.toml")
     if ("part" in document) == ("fit" in document):
         raise InputError(f"{file}: no place of the part; to fix: give [part] with its pose, or fit = its fit.json")
-    T_base_part = (
-        pose_from_table(file, "part", document["part"]) if "part" in document else _fitted_pose(file, document["fit"])
-    )
-    limits = document.get("limits", {})
-    check_keys(file, "limits", limits, set(Limits.__dataclass_fields__))
-    values = {key: finite(file, f"limits.{key}", value, positive="tolerance" in key) for key, value in limits.items()}
-    placed = _read_scans(file, document)
+    T_base_part = document.pose("part") if "part" in document else _fitted_pose(document.path("fit"))
+    limits = document.table("limits", Limits.__dataclass_fields__)
+    placed = _read_scans(document)
     return SeamJob(
         placed=placed,
         scan=assemble_scans(placed),
         T_base_part=T_base_part,
-        stations=_read_stations(resolve_file(file, "stations", document.get("stations"))),
-        limits=Limits(**values),
-        pose_sigma=abs(finite(file, "pose_sigma", document.get("pose_sigma", 0.0))),
+        stations=_read_stations(document.path("stations")),
+        limits=Limits(**{key: limits.number(key, positive="tolerance" in key) for key in limits.entries}),
+        pose_sigma=abs(document.number("pose_sigma", 0.0)),
         file=file,
     )
 
 
-def _read_scans(file: Path, document: dict[str, Any]) -> PlacedScans:
+def _read_scans(document: JobTable) -> PlacedScans:
     """From a table of scanner poses, or from a session and a hand-eye."""
+    file = document.file
     if ("scans" in document) == ("session" in document):
         raise InputError(f"{file}: no scans; to fix: give scans = a table of them, or session = a session folder")
     if "scans" in document and "hand_eye" in document:
@@ -195,33 +187,33 @@ def _read_scans(file: Path, document: dict[str, Any]) -> PlacedScans:
             f"{file}: hand_eye goes with session; to fix: leave it out, for a table of scans has the scanner's poses"
         )
     if "scans" in document:
-        return read_scan_table(resolve_file(file, "scans", document["scans"]))
+        return read_scan_table(document.path("scans"))
     if "hand_eye" not in document:
         raise InputError(
             f"{file}: session has no hand_eye; to fix: name the file that `stitch calibrate sphere -o` wrote"
         )
-    return read_placed_session(*(resolve_file(file, key, document[key]) for key in ("session", "hand_eye")))
+    return read_placed_session(document.path("session"), document.path("hand_eye"))
 
 
-def _read_regions(file: Path, entries: Any) -> Regions:
+def _read_regions(document: JobTable) -> Regions:
     boxes: dict[str, list[Box]] = {"expected": [], "forbidden": []}
+    entries = document.entries.get("region", [])
     if not isinstance(entries, list):
-        raise InputError(f"{file}: region is no list; to fix: write [[region]], one for each box")
+        raise InputError(f"{document.file}: region is no list; to fix: write [[region]], one for each box")
     for i, entry in enumerate(entries):
-        place = f"region[{i + 1}]"
-        check_keys(file, place, entry, {"name", "kind", "low", "high"})
-        kind = choice(file, f"{place}.kind", entry.get("kind"), tuple(boxes))
-        form = "[x, y, z] in the part's frame"
-        low, high = (vectors(file, f"{place}.{key}", entry.get(key), (3,), form) for key in ("low", "high"))
+        region = checked_table(document.file, f"region[{i + 1}]", entry, {"name", "kind", "low", "high"})
+        kind = region.choice("kind", boxes)
+        low, high = (region.vectors(key, (3,), "[x, y, z] in the part's frame") for key in ("low", "high"))
         if (low >= high).any():
-            raise InputError(f"{file}: the box {place} is empty; to fix: write low below high in x, y and z")
-        boxes[kind].append(Box(str(entry.get("name", place)), low, high))
+            raise InputError(
+                f"{document.file}: the box {region.place} is empty; to fix: write low below high in x, y and z"
+            )
+        boxes[kind].append(Box(str(entry.get("name", region.place)), low, high))
     return Regions(tuple(boxes["expected"]), tuple(boxes["forbidden"]))
 
 
-def _fitted_pose(job: Path, name: Any) -> Array:
+def _fitted_pose(file: Path) -> Array:
     """T_base_part (4, 4) of the first part of a fit.json."""
-    file = resolve_file(job, "fit", name)
     try:
         T = np.array(json.loads(file.read_text(encoding="utf-8"))["parts"][0]["T_base_part"], float)
     except FileNotFoundError:
@@ -270,7 +262,7 @@ def fit_parts(job: FitJob) -> list[FittedPart]:
     return [_fit_part(job, scan) for scan in split_instances(job.scan, job.cad, job.instances)]
 
 
-def _fit_part(job: FitJob, scan: Any) -> FittedPart:
+def _fit_part(job: FitJob, scan: JoinedScans) -> FittedPart:
     start = find_cad_start(scan, job.cad)
     found = fit_cad(scan, job.cad, start.T_base_part, job.regions, job.allowance_prior)
     T = frames.inverse(found.T_base_part)
@@ -280,8 +272,7 @@ def _fit_part(job: FitJob, scan: Any) -> FittedPart:
         if share < job.coverage:
             raise NoResultError(
                 f"expected region {name}: only {share:.0%} of it was scanned, {job.coverage:.0%} wanted; to fix: "
-                "scan it, or "
-                "lower `coverage`"
+                "scan it, or lower `coverage`"
             )
     forbidden = {box.name: int(box.holds(local).sum()) for box in job.regions.forbidden}
     path = None
@@ -302,7 +293,7 @@ def _part_document(part: FittedPart) -> dict[str, Any]:
     cells = part.deviations.cells
     worst = int(np.argmax(np.abs(cells.mean))) if len(cells.mean) else None
     pose = rows_from_poses(part.fit.T_base_part[None])[0].tolist()
-    return {
+    document = {
         "T_base_part": part.fit.T_base_part.tolist(),
         "pose": dict(zip(POSE_COLUMNS.split(), pose, strict=True)),
         "sigma": part.fit.sigma[3:].tolist(),
@@ -318,20 +309,18 @@ def _part_document(part: FittedPart) -> dict[str, Any]:
         "worst": None if worst is None else {"at": cells.middle[worst].tolist(), "deviation": float(cells.mean[worst])},
         "coverage": part.coverage,
         "points_in_forbidden": part.forbidden,
-        **({} if part.fit.allowance is None else {"allowance": _allowance_document(part.fit.allowance)}),
     }
-
-
-def _allowance_document(allowance: Allowance) -> dict[str, Any]:
-    return {
-        "value": allowance.value,
-        "sigma": allowance.sigma,
-        "kind": "varying" if allowance.prior.varying else "free" if allowance.prior.free else "stated",
-        "lowest": allowance.lowest,
-        "highest": allowance.highest,
-        "sigma_field": allowance.sigma_field,
-        "told_apart": allowance.separable_share,
-    }
+    if (allowance := part.fit.allowance) is not None:
+        document["allowance"] = {
+            "value": allowance.value,
+            "sigma": allowance.sigma,
+            "kind": "varying" if allowance.prior.varying else "free" if allowance.prior.free else "stated",
+            "lowest": allowance.lowest,
+            "highest": allowance.highest,
+            "sigma_field": allowance.sigma_field,
+            "told_apart": allowance.separable_share,
+        }
+    return document
 
 
 def write_fit(job: FitJob, parts: list[FittedPart], folder: Path) -> list[str]:
@@ -392,7 +381,13 @@ def agreement_sentence(job: FitJob, part: FittedPart, name: str) -> str:
 
 def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
     """Pose with its sigma, stock, doubt, the worst cell and what did not count."""
-    yield _pose_sentence(job, part)
+    x, y, z, a, b, c = rows_from_poses(part.fit.T_base_part[None])[0]
+    shift, turn = part.fit.sigma[3:].max(), np.degrees(part.fit.sigma[:3]).max()
+    place = with_unit(job, f"x {x:.3f}, y {y:.3f}, z {z:.3f}")
+    yield (
+        f"T_base_part: {place}, ± {uncertainty_text(shift)} at most; a {a:.4f}, b {b:.4f}, c {c:.4f}° about z, y', "
+        f"x'', ± {uncertainty_text(turn)}° at most (1 σ)."
+    )
     if part.fit.allowance is not None:
         yield allowance_sentence(part.fit.allowance, job.length_unit)
     if part.start.runner_up > 0.9 * part.start.share:
@@ -411,16 +406,6 @@ def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
     for name, count in part.forbidden.items():
         if count:
             yield f"{count} points in forbidden region {name} did not count."
-
-
-def _pose_sentence(job: FitJob, part: FittedPart) -> str:
-    x, y, z, a, b, c = rows_from_poses(part.fit.T_base_part[None])[0]
-    shift, turn = part.fit.sigma[3:].max(), np.degrees(part.fit.sigma[:3]).max()
-    place = with_unit(job, f"x {x:.3f}, y {y:.3f}, z {z:.3f}")
-    return (
-        f"T_base_part: {place}, ± {uncertainty_text(shift)} at most; a {a:.4f}, b {b:.4f}, c {c:.4f}° about z, y', "
-        f"x'', ± {uncertainty_text(turn)}° at most (1 σ)."
-    )
 
 
 # The scans of a part or a seam as a cloud session, with the hand-eye that placed them and their CAD.
@@ -446,43 +431,27 @@ def scan_session(name: str, placed: PlacedScans, cad: Path | None = None) -> Ses
 # What `stitch fit` does: parts fitted, shown, drawn, as map and path and as a session.
 
 
-def run_fit(
-    file: Path,
-    allowance: str | None,
-    output: Path | None,
-    recording: Path | None,
-    report: Path | None,
-    *,
-    session: Path | None,
-    as_json: bool,
-) -> None:
-    """Fit the parts of a job and hand out what was asked for.
-
-    Raises:
-        InputError, NoResultError: as `stitch fit` ends.
-    """
-    wanted = read_allowance(allowance)
-    job = replace(read_fit_job(file), allowance_prior=wanted)
+def run_fit(file: Path, allowance: str | None, wanted: Wanted) -> None:
+    """Fit the parts of a job and hand out what was asked for; `InputError` and `NoResultError` end it."""
+    prior = read_allowance(allowance)
+    job = replace(read_fit_job(file), allowance_prior=prior)
     parts = fit_parts(job)
-    written = write_fit(job, parts, output) if output is not None else []
-    if session is not None:
-        write_session(session, scan_session(file.stem, job.placed, job.cad_file))
-    write_recording_and_page("fit", recording, report, job, parts)
-    if as_json:
+    written = write_fit(job, parts, wanted.output) if wanted.output is not None else []
+    if wanted.session is not None:
+        write_session(wanted.session, scan_session(file.stem, job.placed, job.cad_file))
+    write_recording_and_page("fit", wanted.recording, wanted.report, job, parts)
+    if wanted.as_json:
         print(json.dumps(fit_document(job, parts), indent=1))
         return
-    _print_parts(console(), job, parts)
-    for name in written:
-        print(f"{output}/{name}")
-
-
-def _print_parts(terminal: Console, job: FitJob, parts: list[FittedPart]) -> None:
+    terminal = console()
     for i, part in enumerate(parts):
         terminal.print(agreement_sentence(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))
         for line in detail_sentences(job, part):
             terminal.print(f"  {line}")
     if job.length_unit is None:
         terminal.print(NO_UNIT)
+    for name in written:
+        print(f"{wanted.output}/{name}")
 
 
 # What a seam's stations say, in sentences: the same on the terminal, on the page and in the recording.
@@ -504,39 +473,30 @@ def stations_sentence(limits: Limits, seams: list[Seam]) -> str:
 # What `stitch seam` does: stations measured, shown, drawn, as a table and as a session.
 
 
-def run_seam(
-    file: Path, output: Path | None, recording: Path | None, report: Path | None, session: Path | None, *, as_json: bool
-) -> None:
-    """Measure the stations of a seam and hand out what was asked for.
-
-    Raises:
-        InputError, NoResultError: as `stitch seam` ends.
-    """
+def run_seam(file: Path, wanted: Wanted) -> None:
+    """Measure the stations of a seam and hand out what was asked for; `InputError` and `NoResultError` end it."""
     job = read_seam_job(file)
     seams = solve_seam(job)
-    if output is not None:
-        write_seam(seams, output)
-    if session is not None:
-        write_session(session, scan_session(file.stem, job.placed))
-    write_recording_and_page("seam", recording, report, job, seams)
-    if as_json:
+    if wanted.output is not None:
+        write_seam(seams, wanted.output)
+    if wanted.session is not None:
+        write_session(wanted.session, scan_session(file.stem, job.placed))
+    write_recording_and_page("seam", wanted.recording, wanted.report, job, seams)
+    if wanted.as_json:
         rows = [{k: None if isinstance(v, float) and np.isnan(v) else v for k, v in asdict(s).items()} for s in seams]
         print(json.dumps(rows, indent=1))
         return
-    _print_seams(seams, job.limits)
-    if output is not None:
-        print(output)
-
-
-def _print_seams(seams: list[Seam], limits: Limits) -> None:
     table = Table(title="Stations, ± 1 σ", title_justify="left")
     for heading in ("station", "flush / mm", "gap / mm", "verdict"):
         table.add_column(heading)
     for s in seams:
-        values = (f"{s.flush:+.3f} ± {s.sigma_flush:.3f}", f"{s.gap:.3f} ± {s.sigma_gap:.3f}")
-        table.add_row(
-            s.station, *(("", "") if s.reason else values), f"{s.verdict}{': ' if s.reason else ''}{s.reason}"
-        )
+        if s.reason:
+            table.add_row(s.station, "", "", f"{s.verdict}: {s.reason}")
+        else:
+            flush, gap = f"{s.flush:+.3f} ± {s.sigma_flush:.3f}", f"{s.gap:.3f} ± {s.sigma_gap:.3f}"
+            table.add_row(s.station, flush, gap, s.verdict)
     terminal = console()
-    terminal.print(stations_sentence(limits, seams))
+    terminal.print(stations_sentence(job.limits, seams))
     terminal.print(table)
+    if wanted.output is not None:
+        print(wanted.output)
