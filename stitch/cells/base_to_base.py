@@ -31,7 +31,6 @@ from stitch.cells.stand import (
     fit_stand,
     project,
     rail_direction,
-    rod_points,
 )
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
@@ -129,11 +128,10 @@ def rod_session(stand: Stand, result: BaseResult) -> SessionFiles:
     The readings tell where the tip was, not how it was turned: its frame is taken parallel to the base, which changes
     nothing, because the target lies in its origin.
     """
-    cups = rod_points(stand.slide, stand.angle, stand.length, stand.turn)
     across = stand.length * stand.sigma_angle
     sigma = np.sqrt((stand.sigma_length**2 + across**2 + stand.sigma_slide**2) / 3)
     T_base2_stand = frames.inverse(result.fit.T_base1_base2) @ result.fit.T_base1_stand
-    T_base2_tip = frames.make(np.tile(np.eye(3), (len(cups), 1, 1)), stand.rod.points)
+    T_base2_tip = frames.make(np.tile(np.eye(3), (len(stand.cups), 1, 1)), stand.rod.points)
     names = stand.rod.names
     return SessionFiles(
         name="rod",
@@ -141,7 +139,7 @@ def rod_session(stand: Stand, result: BaseResult) -> SessionFiles:
         mount="eye_to_hand",
         tables={"scanner": {"pose": T_base2_stand.tolist()}},
         views={"view": names, **pose_columns(T_base2_tip)},
-        points=points_table(names, ["tip"] * len(names), cups, sigma),
+        points=points_table(names, ["tip"] * len(names), stand.cups, sigma),
         targets={"tip": np.zeros(3)},
     )
 

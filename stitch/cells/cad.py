@@ -367,18 +367,15 @@ def sample_normal_space(scan: JoinedScans, T_base_part: Array) -> Indices:
     usable = np.flatnonzero(scan.usable)
     directions = np.round(frames.rotate(frames.inverse(T_base_part), scan.normals[usable]) * _DIRECTIONS)
     _, bucket, counts = np.unique(directions.astype(int), axis=0, return_inverse=True, return_counts=True)
-    quota, bucket = _quota(counts), bucket.ravel()
+    bucket = bucket.ravel()
+    # The largest share per direction that keeps the sum within the points to draw.
+    low, quota = 1, _SAMPLED_POINTS
+    while low < quota:
+        middle = (low + quota + 1) // 2
+        fits = np.minimum(counts, middle).sum() <= _SAMPLED_POINTS
+        low, quota = (middle, quota) if fits else (low, middle - 1)
     order = np.argsort(bucket, kind="stable")
     first = np.cumsum(counts) - counts
     picked = [order[f + np.linspace(0, c - 1, min(quota, c)).astype(int)] for f, c in zip(first, counts, strict=True)]
     chosen: Indices = usable[np.sort(np.concatenate(picked))] if picked else usable
     return chosen
-
-
-def _quota(counts: Indices) -> int:
-    """The largest share per direction that keeps the sum within _POINTS."""
-    low, high = 1, _SAMPLED_POINTS
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if np.minimum(counts, middle).sum() <= _SAMPLED_POINTS else (low, middle - 1)
-    return low

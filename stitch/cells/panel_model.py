@@ -76,6 +76,8 @@ def adjust_pose(
     return follow(T_world_base, T_base_flange, master, T_master)
 
 
+# Where each robot stands and how its clamp sits, from poses of the robot and three reflectors on its flange.
+
 _MINIMUM = 4  # poses: 12 reflectors, 36 readings for 15 unknowns
 
 
@@ -210,8 +212,12 @@ def errors_along_motion(
         T_base_flange: (N, 4, 4) where the robots stand.
         steps: (D,) distances in mm, or angles in rad if `turn`; a turn is about the master's flange.
     """
-    T_world_base = _stacked_models(models)[0]
-    true_base, true_contact = _draw_models(models, draws)
+    rng = np.random.default_rng(0)
+    xi = np.stack([rng.multivariate_normal(np.zeros(12), m.covariance, draws, "ignore") for m in models], axis=1)
+    T_world_base, T_flange_contact = (
+        np.array([getattr(m, n) for m in models]) for n in ("T_world_base", "T_flange_contact")
+    )
+    true_base, true_contact = T_world_base @ frames.exp(xi[..., :6]), T_flange_contact @ frames.exp(xi[..., 6:])
 
     def relative(flanges: Array) -> Array:
         contact = true_base @ flanges @ true_contact
@@ -221,7 +227,9 @@ def errors_along_motion(
     out = np.zeros((2, 3, len(steps), len(models)))
     for axis in range(3):
         for k, step in enumerate(steps):
-            T_master = _moved_flanges(T_base_flange[master], axis, step, turn)
+            motion = frames.exp(step * np.eye(6)[axis if turn else 3 + axis])
+            T_master = T_base_flange[master].copy()
+            T_master[:3, :3], T_master[:3, 3] = motion[:3, :3] @ T_master[:3, :3], T_master[:3, 3] + motion[:3, 3]
             change = frames.log(before @ relative(follow(T_world_base, T_base_flange, master, T_master)))
             for part, columns in enumerate((change[..., 3:], change[..., :3])):
                 out[part, axis, k] = np.sqrt((columns**2).sum(axis=-1).mean(axis=0))
@@ -230,38 +238,13 @@ def errors_along_motion(
 
 def errors_by_master(models: Sequence[RobotModel], T_base_flange: Array, distance: float, angle: float) -> Array:
     """(N, 2) worst rms position error (mm) of any slave after a distance (mm) and an angle (rad), per master."""
-    rows = []
-    for master in range(len(models)):
-        args = models, T_base_flange, master
-        shift, turn = (
-            errors_along_motion(*args, np.array([distance]), turn=False),
-            errors_along_motion(*args, np.array([angle]), turn=True),
-        )
-        rows.append([shift.position.max(), turn.position.max()])
-    return np.array(rows)
-
-
-def _stacked_models(models: Sequence[RobotModel]) -> tuple[Array, Array]:
-    return np.array([m.T_world_base for m in models]), np.array([m.T_flange_contact for m in models])
-
-
-def _draw_models(models: Sequence[RobotModel], draws: int) -> tuple[Array, Array]:
-    """True bases and clamps (draws, N, 4, 4) that the covariances allow."""
-    rng = np.random.default_rng(0)
-    xi = np.stack([rng.multivariate_normal(np.zeros(12), m.covariance, draws, "ignore") for m in models], axis=1)
-    bases, clamps = _stacked_models(models)
-    return bases @ frames.exp(xi[..., :6]), clamps @ frames.exp(xi[..., 6:])
-
-
-def _moved_flanges(T_base_flange: Array, axis: int, step: float, turn: bool) -> Array:
-    """The flange moved along, or turned about its own origin with, an axis of its base."""
-    motion = np.zeros(6)
-    motion[axis if turn else 3 + axis] = step
-    T = frames.exp(motion)
-    moved = T_base_flange.copy()
-    moved[:3, :3] = T[:3, :3] @ moved[:3, :3]
-    moved[:3, 3] += T[:3, 3]
-    return moved
+    motions = ((np.array([distance]), False), (np.array([angle]), True))
+    return np.array(
+        [
+            [errors_along_motion(models, T_base_flange, m, steps, turn=turn).position.max() for steps, turn in motions]
+            for m in range(len(models))
+        ]
+    )
 
 
 # What a laser tracker's points are worth.
@@ -414,7 +397,7 @@ def find_leg_offset(readings: ReflectorReadings, model: RobotModel, legs: Legs, 
     """
     twists = _twists_per_leg(legs, readings.T_base_flange)
     R = model.T_world_base[:3, :3] @ readings.T_base_flange[:, :3, :3]
-    local = np.concatenate([-frames.skew(model.reflectors), np.tile(np.eye(3), (3, 1, 1))], axis=-1)
+    local = _motion_of_points(model.reflectors)
     moved = np.einsum("mij,kjc,mcl->mkil", R, local, twists) / readings.sigma[..., None, None]
     columns = moved.reshape(-1, 6)
     Q = np.linalg.qr(model.jacobian)[0]
@@ -433,6 +416,11 @@ def find_leg_offset(readings: ReflectorReadings, model: RobotModel, legs: Legs, 
         runner_up_drop=float(drops[second]),
         detected=bool(chi2.sf(drops[best], 1) * tests < _FALSE_ALARM),
     )
+
+
+def _motion_of_points(points: Array) -> Array:
+    """(N, 3, 6): motion of points (N, 3) per unit of a twist, rotation first."""
+    return np.concatenate([-frames.skew(points), np.tile(np.eye(3), (len(points), 1, 1))], axis=-1)
 
 
 def true_flanges(legs: Legs, T_base_flange: Array, offsets: Sequence[tuple[int, float]]) -> Array:
@@ -491,8 +479,7 @@ def rigid_fit(nominal: Array, measured: Array, sigma: Array) -> RigidFit:
         )
     T = align_points(nominal, measured)
     arms = nominal - nominal.mean(axis=0)
-    design = np.concatenate([-frames.skew(arms), np.tile(np.eye(3), (len(arms), 1, 1))], axis=-1)
-    gain = np.linalg.pinv(design.reshape(-1, 6)) * np.repeat(np.asarray(sigma, float), 3)
+    gain = np.linalg.pinv(_motion_of_points(arms).reshape(-1, 6)) * np.repeat(np.asarray(sigma, float), 3)
     return RigidFit(T, gain @ gain.T, measured - frames.transform(T, nominal))
 
 
@@ -543,11 +530,12 @@ def shape_step(
         local = frames.transform(frames.inverse(T), measured[beside])
         wanted = -frames.rotate(frames.inverse(T), deviations[beside])
         driven = axes if beside.sum() >= 3 else axes & np.array([False] * 5 + [True])
-        design = np.concatenate([-frames.skew(local), np.tile(np.eye(3), (len(local), 1, 1))], axis=-1)
-        # Deviations within the panel's plane are left out where no driven axis can correct them.
-        rows = design[:, 2][:, driven] if not axes[[2, 3, 4]].any() else design.reshape(-1, 6)[:, driven]
-        right = wanted[:, 2] if not axes[[2, 3, 4]].any() else wanted.ravel()
-        twists[i, driven] = np.linalg.lstsq(rows, right, rcond=None)[0]
+        design = _motion_of_points(local)
+        if not axes[[2, 3, 4]].any():
+            # Deviations within the panel's plane are left out where no driven axis can correct them.
+            design, wanted = design[:, 2:], wanted[:, 2:]
+        rows = design.reshape(-1, 6)[:, driven]
+        twists[i, driven] = np.linalg.lstsq(rows, wanted.ravel(), rcond=None)[0]
     T_contact = T_base_flange @ T_flange_contact @ frames.exp(twists)
     return ShapeStep(T_contact @ frames.inverse(T_flange_contact), twists, deviations)
 

@@ -93,8 +93,7 @@ def read_allowance(text: str | None) -> AllowancePrior:
     if not np.isfinite(known):
         raise InputError(
             f"--allowance is {text!r}; to fix: write free (to find an even one), varying (one that changes slowly "
-            "over the "
-            "part), or the stock in the CAD's unit, as 0.3"
+            "over the part), or the stock in the CAD's unit, as 0.3"
         )
     return AllowancePrior(known=known)
 
@@ -261,8 +260,8 @@ def fit_cad(
 
     The scale follows from the distances' median each round, never below the scan's own noise; what a deformation moved
     beyond 4.7 scales has no say. The rim of a dent leaves less, yet all to one side: so once the fit stands, whole
-    cells of the surface are weighted by their means too (`cell_weights`). The points are drawn
-    evenly over the directions they look to (`all_ways`).
+    cells of the surface are weighted by their means too (`cell_weights`). The points are drawn evenly over the
+    directions they look to (`sample_normal_space`).
 
     Raises:
         NoResultError: too few points meet the CAD, or the surface leaves a direction or the allowance open.
@@ -273,11 +272,14 @@ def fit_cad(
     numbers, size = np.zeros(prior.columns), cad.size / 100
     for _ in range(_ROUNDS):
         seen = _find_correspondences(scan, cad, T_base_part, regions, prior)
-        rest = seen.distance - prior.known - seen.stock @ numbers
+        rest = seen.partners.distance - prior.known - seen.stock @ numbers
         # The gate closes by half a round at most, so that a bad start can still be pulled in.
         spread = robust_spread(rest[seen.used], prior)
         scale = max(spread, 0.5 * scale, noise)
-        weight = _weights(seen, rest, scale, cad.size / _CELLS if by_cell else None)
+        weight = np.asarray(seen.used * biweight(rest / (TUKEY * scale)))
+        if by_cell:
+            left = replace(seen.partners, distance=rest)
+            weight = weight * cell_weights(seen.local, left, seen.used, cad.size / _CELLS, scale)
         N = _normal_matrix(seen.design, weight, cad)
         shrink, size = varying_ridge(N, numbers, scale, size)
         pull = np.concatenate([np.zeros(6), numbers]) * shrink
@@ -288,14 +290,14 @@ def fit_cad(
                 break
             by_cell = True
     covariance = _sandwich(seen.design, rest, weight, scale, shrink)
-    left = rest[seen.used]
+    used = rest[seen.used]
     return CadFit(
         T_base_part,
         covariance=covariance[:6, :6],
         scale=scale,
-        rms=float(np.sqrt((left**2).mean())),
-        inliers=float(np.mean(np.abs(left) < 0.54 * TUKEY * scale)),
-        points=len(left),
+        rms=float(np.sqrt((used**2).mean())),
+        inliers=float(np.mean(np.abs(used) < 0.54 * TUKEY * scale)),
+        points=len(used),
         allowance=summarise_allowance(seen.local[seen.used], cad, prior, numbers, covariance, N),
     )
 
@@ -304,16 +306,6 @@ def moved_about(T_base_part: Array, step: Array, centre: Array) -> Array:
     """The pose (4, 4) after a Gauss-Newton step, a twist (6,) about a centre (3,) of the part."""
     shift = frames.make(np.eye(3), centre)
     return np.asarray(T_base_part @ frames.inverse(shift @ frames.exp(step) @ frames.inverse(shift)))
-
-
-def _weights(correspondences: "_Correspondences", rest: Array, scale: float, cell: float | None) -> Array:
-    """(N,) by what is left of each point's distance, and of its whole cell's where cells have a size."""
-    by_point = np.asarray(correspondences.used * biweight(rest / (TUKEY * scale)))
-    if cell is None:
-        return by_point
-    return by_point * cell_weights(
-        correspondences.local, replace(correspondences.partners, distance=rest), correspondences.used, cell, scale
-    )
 
 
 def _sandwich(design: Array, rest: Array, weight: Array, scale: float, shrink: Array) -> Array:
@@ -337,10 +329,6 @@ class _Correspondences:
     used: NDArray[np.bool_]  # (N,)
     stock: Array  # (N, K) columns of the allowance
     design: Array  # (N, 6 + K) of the twist about the CAD's centre and the allowance
-
-    @property
-    def distance(self) -> Array:
-        return self.partners.distance
 
 
 def _find_correspondences(
@@ -419,14 +407,14 @@ def find_cad_start(scan: JoinedScans, cad: CadSurface) -> CadStart:
         refined += [_refine(T, points, normals, cad, gate) for T in _feature_candidates(points, normals, cad)]
         shares = [_inlier_share(T, points, normals, cad, fine) for T in refined]
     best = int(np.argmax(shares))
-    elsewhere = [
-        s for T, s in zip(refined, shares, strict=True) if _pose_distance(T, refined[best], cad) > cad.size / 50
-    ]
+    corners = cad.samples[:: max(1, len(cad.samples) // 200)]
+    placed = [frames.transform(T, corners) for T in refined]
+    apart = [np.linalg.norm(p - placed[best], axis=1).max() for p in placed]
+    elsewhere = [s for s, d in zip(shares, apart, strict=True) if d > cad.size / 50]
     if shares[best] < _LEAST_SHARE:
         raise NoResultError(
             f"scan and CAD do not meet: {shares[best]:.0%} of the points at best; to fix: check the CAD's unit, "
-            "or cut away "
-            "what is not the part"
+            "or cut away what is not the part"
         )
     return CadStart(refined[best], shares[best], max(elsewhere, default=0.0))
 
@@ -502,11 +490,6 @@ def _refine(T_base_part: Array, points: Array, normals: Array, cad: CadSurface, 
         step[:3] /= cad.size
         T_base_part = moved_about(T_base_part, step, cad.centre)
     return T_base_part
-
-
-def _pose_distance(T_a: Array, T_b: Array, cad: CadSurface) -> float:
-    corners = cad.samples[:: max(1, len(cad.samples) // 200)]
-    return float(np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1).max())
 
 
 # The deviation map: signed distances of scanned points from the CAD with its stock, and cells out of tolerance.

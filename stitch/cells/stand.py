@@ -50,6 +50,11 @@ class Stand:
     sigma_level_base: float | None  # how well the two bases are parallel in tilt; None: not known
     file: Path | None = None  # that was read
 
+    @property
+    def cups(self) -> Array:
+        """(M, 3) rod cup in the stand frame, as it was read."""
+        return rod_points(self.slide, self.angle, self.length, self.turn)
+
 
 def cylinder_points(joint1: Array, radius: Array, height: Array) -> Array:
     """Points (N, 3) of a robot that reaches `radius` and `height` at the joint-1 angle, right-handed about z."""
@@ -127,14 +132,15 @@ def compare_distances(stand: Stand) -> tuple[DistanceComparison, ...]:
     """Every pair of rod settings, and every pair of rail points whose slide was read; largest contradiction first."""
     found = [_compare_rod_pair(stand, i, j) for i, j in combinations(range(len(stand.slide)), 2)]
     known = np.flatnonzero(np.isfinite(stand.rail_slide)).tolist()
-    found += [_compare_rail_pair(stand, i, j) for i, j in combinations(known, 2)]
+    for i, j in combinations(known, 2):
+        distance = abs(float(stand.rail_slide[j] - stand.rail_slide[i]))
+        found.append(_distance_comparison(stand.rail, i, j, distance, 2 * stand.sigma_slide**2))
     return tuple(sorted(found, key=lambda c: -c.sigmas))
 
 
 def _compare_rod_pair(stand: Stand, i: int, j: int) -> DistanceComparison:
     """Both slides count as one reading where they are equal: the pivot was not moved."""
-    cups = rod_points(stand.slide, stand.angle, stand.length, stand.turn)
-    apart = cups[j] - cups[i]
+    apart = stand.cups[j] - stand.cups[i]
     distance = float(np.linalg.norm(apart))
     unit = apart / max(distance, np.finfo(float).tiny)
     variance = 0.0 if stand.slide[i] == stand.slide[j] else 2 * (unit[0] * stand.sigma_slide) ** 2
@@ -144,11 +150,6 @@ def _compare_rod_pair(stand: Stand, i: int, j: int) -> DistanceComparison:
         variance += (unit @ along * stand.sigma_length) ** 2
         variance += (unit @ across * stand.length[k] * stand.sigma_angle) ** 2
     return _distance_comparison(stand.rod, i, j, distance, variance)
-
-
-def _compare_rail_pair(stand: Stand, i: int, j: int) -> DistanceComparison:
-    distance = abs(float(stand.rail_slide[j] - stand.rail_slide[i]))
-    return _distance_comparison(stand.rail, i, j, distance, 2 * stand.sigma_slide**2)
 
 
 def _distance_comparison(
@@ -195,23 +196,30 @@ def fit_stand(stand: Stand) -> BaseFit:
     Raises:
         NoResultError: the readings leave a direction of the second base open.
     """
-    start = _initial_poses(stand)
+    start, scales = _initial_poses(stand), _unknown_scales(stand)
+    steps = np.diag(1e-2 * scales)
+
+    def jacobian_at(x: Array) -> Array:
+        """Central differences, all columns in one evaluation; a step is a hundredth of a typical error."""
+        ahead, back = _residuals(stand, start, x + np.stack([steps, -steps]))
+        return np.asarray((ahead - back).T / (2e-2 * scales))
+
     solution = least_squares(
         lambda x: _residuals(stand, start, x),
-        np.zeros(_unknown_count(stand)),
-        jac=lambda x: _jacobian(stand, start, x),
-        x_scale=_unknown_scales(stand),
+        np.zeros(len(scales)),
+        jac=jacobian_at,
+        x_scale=scales,
         method="trf",
         **_TOLERANCES,
     )
-    jacobian = solution.jac * _unknown_scales(stand)
+    jacobian = solution.jac * scales
     U, values, Vt = np.linalg.svd(jacobian, full_matrices=False)
     if len(U) < len(Vt) or values[-1] < 1e-7 * values[0]:
         raise NoResultError(
             "turning the second base about the line through its points changes no reading; to fix: touch a third point "
             "off that line, or state level.second_base"
         )
-    covariance = (Vt.T / values**2) @ Vt * np.outer(_unknown_scales(stand), _unknown_scales(stand))
+    covariance = (Vt.T / values**2) @ Vt * np.outer(scales, scales)
     T_stand, T_base, *_ = _unpack(stand, start, solution.x)
     rail, rod = _point_misfits(stand, start, solution.x)
     return BaseFit(
@@ -228,7 +236,7 @@ def fit_stand(stand: Stand) -> BaseFit:
 def _initial_poses(stand: Stand) -> tuple[Array, Array]:
     """Level stand, and the second base from its points; bases upright where the points leave that open."""
     T_stand = level_stand(stand.rail.points, stand.rail_slide)
-    here = frames.transform(T_stand, _corrected_rod_points(stand.slide, stand))
+    here = frames.transform(T_stand, stand.cups)
     there = stand.rod.points
     # The upright pair only decides what two points leave open: a thousandth of the points' spread.
     up = 1e-3 * np.linalg.norm(there - there.mean(axis=0)) * np.array([[0.0, 0.0, 1.0]])
@@ -237,14 +245,6 @@ def _initial_poses(stand: Stand) -> tuple[Array, Array]:
     )[0]
     R = turn.as_matrix()
     return T_stand, frames.make(R, here.mean(axis=0) - R @ there.mean(axis=0))
-
-
-def _corrected_rod_points(slide: Array, stand: Stand) -> Array:
-    return rod_points(slide, stand.angle, stand.length, stand.turn)
-
-
-def _unknown_count(stand: Stand) -> int:
-    return 12 + len(stand.rail.points) + 3 * len(stand.slide)
 
 
 def _unknown_scales(stand: Stand) -> Array:
@@ -295,13 +295,6 @@ def _residuals(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
     return np.concatenate(rows, axis=-1)
 
 
-def _jacobian(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
-    """Central differences, all columns in one evaluation; a step is a hundredth of a typical error."""
-    steps = np.diag(1e-2 * _unknown_scales(stand))
-    both = _residuals(stand, start, x + np.stack([steps, -steps]))
-    return np.asarray((both[0] - both[1]).T / (2e-2 * _unknown_scales(stand)))
-
-
 def _whiten(residuals: Array, covariance: Array) -> Array:
     white = np.linalg.solve(np.linalg.cholesky(covariance), residuals[..., None])
     return np.asarray(white.reshape(*residuals.shape[:-2], -1))
@@ -343,13 +336,13 @@ def project(stand: Stand) -> Projection:
     """
     if len(stand.rail.points) != 2 or len(stand.rod.points) != 2 or np.ptp(stand.slide) > 0:
         raise NoResultError("the projection takes two points per robot and one slide; to fix: use the least squares")
-    R_base1 = frames.transform(level_stand(stand.rail.points, stand.rail_slide), _measured_rod_points(stand))
+    R_base1 = frames.transform(level_stand(stand.rail.points, stand.rail_slide), stand.cups)
     gamma, p_xy = _plane_xy(stand)
     turned = stand.rod.points @ _rotation(2, gamma).T
     beta, p_xz = _plane(R_base1, turned, (2, 0), 1)
-    turned = stand.rod.points @ (_rotation(2, gamma) @ _rotation(1, _level(beta))).T
+    turned = stand.rod.points @ (_rotation(2, gamma) @ _rotation(1, beta)).T
     alpha, p_zy = _plane(R_base1, turned, (1, 2), 0)
-    rotation = _rotation(2, gamma) @ _rotation(1, _level(beta)) @ _rotation(0, _level(alpha))
+    rotation = _rotation(2, gamma) @ _rotation(1, beta) @ _rotation(0, alpha)
     offsets = np.array([p_xy, p_xz[::-1], p_zy])
     mean = [(p_xy[0] + p_xz[1]) / 2, (p_xy[1] + p_zy[0]) / 2, (p_xz[0] + p_zy[1]) / 2]
     T = frames.make(rotation, np.array(mean))
@@ -366,8 +359,11 @@ def _plane_xy(stand: Stand) -> tuple[float, Array]:
     """
     mirror = np.array([1.0, stand.turn, 1.0])
     P, R = stand.rail.points * mirror, stand.rod.points * mirror
-    rod, theta = _projected_rod(P, stand.angle, stand.length)
-    P2e = (stand.slide[0] - stand.rail_slide[1]) * np.cos(_slope(P))
+    # Angle of P1P2 against the X-Y plane (formula 7), and the rod's length and angle in that plane (formulas 5 to 10).
+    slope = np.arctan2(P[0, 2] - P[1, 2], np.hypot(P[0, 0] - P[1, 0], P[0, 1] - P[1, 1]))
+    RS, DE = stand.length * np.sin(stand.angle), stand.length * np.cos(stand.angle) * np.cos(slope)
+    rod, theta = np.hypot(RS, DE), np.arctan2(RS, DE)
+    P2e = (stand.slide[0] - stand.rail_slide[1]) * np.cos(slope)
     Pr, Rr = np.arctan2(P[:, 1], P[:, 0]), -np.arctan2(R[:, 1], R[:, 0])
     O1P, O2R = np.hypot(P[:, 0], P[:, 1]), np.hypot(R[:, 0], R[:, 1])
     P1P2, R1R2 = _third_side(O1P[0], O1P[1], abs(Pr[0] - Pr[1])), _third_side(O2R[0], O2R[1], abs(Rr[0] - Rr[1]))
@@ -388,18 +384,6 @@ def _plane_xy(stand: Stand) -> tuple[float, Array]:
     bearing = side * (abs(er) - C11)
     gamma = float(np.arctan2(np.sin(-gamma_z), np.cos(-gamma_z))) * stand.turn
     return gamma, O1O2 * np.array([np.cos(bearing), stand.turn * np.sin(bearing)])
-
-
-def _projected_rod(P: Array, angle: Array, length: Array) -> tuple[Array, Array]:
-    """Length and angle of the rod in the X-Y plane, formulas 5 to 10."""
-    RS, ES = length * np.sin(angle), length * np.cos(angle)
-    DE = ES * np.cos(_slope(P))
-    return np.hypot(RS, DE), np.arctan2(RS, DE)
-
-
-def _slope(P: Array) -> float:
-    """Angle of P1P2 against the X-Y plane, formula 7."""
-    return float(np.arctan2(P[0, 2] - P[1, 2], np.hypot(P[0, 0] - P[1, 0], P[0, 1] - P[1, 1])))
 
 
 def _third_side(a: float, b: float, between: float) -> float:
@@ -423,17 +407,11 @@ def _plane(R_base1: Array, R_turned: Array, axes: tuple[int, int], normal: int) 
     d1, d2 = here[1] - here[0], there[1] - there[0]
     seen = np.linalg.norm(d2) > _SHORT * np.linalg.norm(R_turned[1] - R_turned[0])
     angle = float(np.arctan2(d2[0] * d1[1] - d2[1] * d1[0], d2 @ d1)) if seen else float("nan")
-    turned = R_turned @ _rotation(normal, _level(angle)).T
+    turned = R_turned @ _rotation(normal, angle).T
     return angle, np.asarray((R_base1 - turned).mean(axis=0)[list(axes)])
 
 
-def _level(angle: float) -> float:
-    return 0.0 if np.isnan(angle) else angle
-
-
 def _rotation(axis: int, angle: float) -> Array:
+    """(3, 3); of an angle that a plane does not show, no turn."""
+    angle = 0.0 if np.isnan(angle) else angle
     return np.asarray(frames.exp(np.concatenate([angle * np.eye(3)[axis], np.zeros(3)]))[:3, :3])
-
-
-def _measured_rod_points(stand: Stand) -> Array:
-    return rod_points(stand.slide, stand.angle, stand.length, stand.turn)
