@@ -18,8 +18,8 @@ _LABELS = {
 
 
 def synth(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="A scene's name, or a TOML file.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Session folder to write.")],
+    scene: Annotated[str, typer.Argument(metavar="SCENE", help="A scene's or a cell's name, or a TOML file.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write.")],
     hide: Annotated[
         list[str] | None, typer.Option("--hide", metavar="EFFECT[=AMPLITUDE]", help="May be given again.")
     ] = None,
@@ -29,22 +29,31 @@ def synth(
 ) -> None:
     """Write a session made by a cell that behaves like a real one, and its truth beside it.
 
+    A scene is a session of scans. A cell is a folder for `base`, `drill`, `panel`, `fit` or `seam`, or of two sessions.
+
     \b
     Examples:
       stitch synth blade cells/blade --hide backlash=2 --views 8 --seed 3
+      stitch synth drilling cells/drilling
     """
     if out.exists():
-        raise InputError(f"{out}: exists already; name another folder")
+        raise InputError(f"{out}: exists already; to fix: name another folder")
     if views is not None and views < 2:
-        raise InputError(f"--views {views}: stitching needs at least 2")
+        raise InputError(f"--views {views}: stitching needs at least 2; to fix: ask for more")
     if seed < 0:
-        raise InputError(f"--seed {seed}: use 0 or more")
+        raise InputError(f"--seed {seed}: is below 0; to fix: use 0 or more")
     if truth is not None and truth.suffix != ".json":
         # The part's mesh lies beside it under the same name.
-        raise InputError(f"--truth {truth}: name a file that ends in .json")
-    # Loaded by who makes something: whoever asks for help has it at once.
+        raise InputError(f"--truth {truth}: is no JSON file; to fix: name one that ends in .json")
+    # Imported here so that --help stays fast.
+    from data_synth.made_cell import CELLS, make_cell
     from data_synth.made_session import made_session
 
+    if scene in CELLS:
+        if hide or views is not None:
+            raise InputError(f"{scene}: a cell has its own views and errors; to fix: leave out --hide and --views")
+        make_cell(scene, out, seed, truth)
+        return
     made_session(scene, out, hide or [], seed, views, truth)
 
 

@@ -11,7 +11,7 @@ from data_synth.drilling_cell import GROUPS, HEIGHT, IMAGE, DrillingCell
 from stitch import frames
 
 _JOB = f"""# A drilling job: where must the robot be sent so that the holes come where they belong?
-#   .venv/bin/stitch drill {{folder}}/job.toml -o drives.csv
+#   stitch drill job.toml -o drives.csv
 format = "stitch-drill/1"
 length_unit = "mm"
 height = {HEIGHT}          # of the work plane along the flange's z
@@ -32,7 +32,7 @@ checks = "checks.csv"    # one hole seen at many places and heights: shows lens 
 def write_job(folder: Path, cell: DrillingCell) -> np.ndarray:
     """Write all tables of a job; returns the true T_measuring_base (4, 4)."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "job.toml").write_text(_JOB.format(folder=folder), encoding="utf-8")
+    (folder / "job.toml").write_text(_JOB, encoding="utf-8")
     xyz, uv = cell.plate()
     _table(folder / "plate.csv", "x y z u v", np.hstack([xyz, uv]))
     _table(folder / "checks.csv", "x y z u v", np.hstack(cell.check_holes()))

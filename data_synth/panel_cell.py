@@ -56,7 +56,7 @@ class PanelCell:
         triangle = np.array([[-120.0, -180.0, 160.0], [-120.0, 180.0, 160.0], [240.0, 0.0, 160.0]])
         clamps = frames.exp(self._scatter(*self.sizes.clamp, 6))
         self.reflectors = frames.transform(clamps, triangle)  # (6, 3, 3) flange frame
-        upright = np.array([self.target @ self._place(*at) for at in self._plan()])
+        upright = np.array([self.target @ self.place(*at) for at in self.plan()])
         home = frames.make(np.eye(3), [0.0, 0.0, -160.0 - hexapod.HOME_HEIGHT])
         self.T_world_base = upright @ home @ frames.exp(self._scatter(*self.sizes.base, 6))
         self.T_base_flange = np.tile(frames.make(np.eye(3), [0.0, 0.0, hexapod.HOME_HEIGHT]), (6, 1, 1))
@@ -66,11 +66,12 @@ class PanelCell:
         return self.rng.normal(size=(count, 6)) * np.repeat([np.radians(deg), mm], 3)
 
     @staticmethod
-    def _plan() -> list[tuple[float, float]]:
+    def plan() -> list[tuple[float, float]]:
+        """Where the clamps sit along the panel, mm, and about its axis, rad."""
         return [(x, angle) for x in (-1130.0, 1130.0) for angle in (-0.22, 0.0, 0.22)]
 
     @staticmethod
-    def _place(x: float, angle: float) -> Array:
+    def place(x: float, angle: float) -> Array:
         """Roughly a clamp's frame in the panel's: z inwards, x towards the panel's middle."""
         z = np.array([0.0, -np.sin(angle), -np.cos(angle)])
         ahead = np.array([-np.sign(x), 0.0, 0.0])

@@ -72,6 +72,30 @@ def calibration(cell: PanelCell, commands: Array) -> Array:
     return np.array(seen)
 
 
+def stand_at_target(cell: PanelCell) -> Array:
+    """(6, 4, 4) where the robots stand when their clamps wait for a panel at its target, as they truly are."""
+    places = np.array([cell.place(*at) for at in cell.plan()])
+    T_flange_clamp = frames.inverse(cell.T_world_base @ cell.T_base_flange) @ cell.clamps()
+    return np.asarray(frames.inverse(cell.T_world_base) @ cell.target @ places @ frames.inverse(T_flange_clamp))
+
+
+def write_cell(folder: Path, cell: PanelCell, poses: int = 40) -> None:
+    """Calibrate the robots, lay the panel on, measure it, and write the job with all its tables."""
+    files = {key: f"{key}.csv" for key in ("calibration", "flanges", "targets", "control", "forces")}
+    stand, commands = stand_at_target(cell), calibration_poses(poses, cell.seed)
+    write_calibration(folder / files["calibration"], commands, calibration(cell, commands))
+    cell.drive(stand)
+    cell.lay()
+    write_flanges(folder / files["flanges"], stand)
+    targets, (control, clamp) = pose_targets(), control_points()
+    names = [f"T{i + 1}" for i in range(len(targets))]
+    write_points(folder / files["targets"], names, targets, cell.track(targets))
+    names = [f"SC{c + 1}.{i % 3 + 1}" for i, c in enumerate(clamp)]
+    write_points(folder / files["control"], names, control, cell.track(control), [NAMES[c] for c in clamp])
+    write_forces(folder / files["forces"], cell.forces())
+    write_job(folder / "job.toml", cell, files)
+
+
 def write_calibration(file: Path, commands: Array, seen: Array) -> None:
     """One row per robot and pose."""
     rows = [

@@ -99,7 +99,9 @@ def load_scene(name: str | Path) -> Scene:
     """
     path = Path(name) if str(name).endswith(".toml") else SCENES / f"{name}.toml"
     if not path.is_file():
-        raise InputError(f"{name}: no such scene; there are {', '.join(names())}, or name a TOML file")
+        raise InputError(
+            f"{name}: no such scene; to fix: name one of {', '.join(names())}, a TOML file, or a cell of docs/synth.md"
+        )
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

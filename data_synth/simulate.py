@@ -54,25 +54,29 @@ def simulate(
     seed: int,
     views: int | None = None,
     planned: tuple[Plan, Array] | None = None,
+    day: int = 0,
 ) -> Measured:
     """Run one session. Independent streams of chance for plan, cell, nature and every view.
 
     Args:
         planned: joint angles and the rail's positions (V,), instead of those planned for scene and seed.
+        day: another one has other views, climate and scatter in the same cell: arm, hand-eye and scanner.
 
     Raises ValueError for an unknown law, NoResultError for a plan that cannot be driven.
     """
     mesh = part_mesh(scene)
-    plan, rail = planned or plan_views(scene, mesh, views or scene.plan.views, np.random.default_rng([seed, 1]))
+    plan, rail = planned or plan_views(scene, mesh, views or scene.plan.views, _stream(seed, 1, day))
     laws, hidden_parameters = nature.draw(hidden, scene.small, plan, np.random.default_rng([seed, 2]))
     cell = np.random.default_rng([seed, 3])
     times, covariates = _climate(scene, len(plan.joints), cell)
+    if day:
+        times, covariates = _climate(scene, len(plan.joints), _stream(seed, 3, day))
     field_weights = field_map(scene.scanner, cell)
     T_mount = scene.T_mount @ frames.exp(cell.standard_normal(6) * np.repeat(scene.mount_spread, 3))
     moments = moments_of(scene, plan, times, covariates)
     targets = targets_of(scene)
     true_cell = Cell(scene, mesh, laws, T_mount=T_mount, field_weights=field_weights, targets=targets)
-    taken = _take_all(true_cell, moments, rail, seed)
+    taken = _take_all(true_cell, moments, rail, _stream_key(seed, 4, day))
     return Measured(
         scene=scene,
         mesh=mesh,
@@ -92,11 +96,20 @@ def simulate(
     )
 
 
-def _take_all(cell: Cell, moments: list[Moment], rail: Array, seed: int) -> list[Taken]:
+def _stream_key(seed: int, of: int, day: int) -> list[int]:
+    """Name of a stream of chance."""
+    return [seed, of, *([] if day == 0 else [1000 + day])]
+
+
+def _stream(seed: int, of: int, day: int) -> np.random.Generator:
+    return np.random.default_rng(_stream_key(seed, of, day))
+
+
+def _take_all(cell: Cell, moments: list[Moment], rail: Array, stream: list[int]) -> list[Taken]:
     """All views, each from its own stream of chance."""
 
     def take(moment: Moment) -> Taken:
-        return take_view(cell, moment, rail[moment.index], np.random.default_rng([seed, 4, moment.index]))
+        return take_view(cell, moment, rail[moment.index], np.random.default_rng([*stream, moment.index]))
 
     return list(parallel(take, moments, "taking views"))
 

@@ -46,9 +46,15 @@ def cloud_file(cloud: scanner.Cloud) -> Cloud:
 
 def write_truth(path: Path, measured: Measured, seed: int) -> None:
     """What was hidden, and every true number that a judge needs; the mesh beside it."""
-    truth = {
-        "scene": measured.scene.name,
-        "seed": seed,
+    path.parent.mkdir(parents=True, exist_ok=True)
+    document = {"scene": measured.scene.name, "seed": seed, **truth_of(measured)}
+    path.write_text(json.dumps(document, indent=1) + "\n")
+    write_mesh(measured.mesh, path.with_suffix(".ply"))
+
+
+def truth_of(measured: Measured) -> dict[str, Any]:
+    """Plain data of what was true."""
+    return {
         "mount": measured.scene.mount,
         "length_unit": "mm",
         "hidden": measured.hidden,
@@ -60,9 +66,6 @@ def write_truth(path: Path, measured: Measured, seed: int) -> None:
         "poses": measured.T_reference_scanner.tolist(),
         "targets": {name: p.tolist() for name, p in measured.targets.items()},
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(truth, indent=1) + "\n")
-    write_mesh(measured.mesh, path.with_suffix(".ply"))
 
 
 def _tables(measured: Measured) -> dict[str, dict[str, Any]]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import trimesh
 
-from data_synth.shapes import blade, car_door, drill_plate, panel, spheres
+from data_synth.shapes import blade, body_side, car_door, drill_plate, panel, spheres
 
 
 class Shape(NamedTuple):
@@ -22,6 +22,7 @@ class Shape(NamedTuple):
 SHAPES: dict[str, Shape] = {
     "blade": Shape(blade.Blade, blade.build),
     "car_door": Shape(car_door.CarDoor, car_door.build),
+    "body_side": Shape(body_side.BodySide, body_side.build),
     "window_pane": Shape(car_door.Pane, car_door.build_pane),
     "sphere": Shape(spheres.Sphere, spheres.build),
     "sphere_plate": Shape(spheres.SpherePlate, spheres.build_plate),

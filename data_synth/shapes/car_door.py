@@ -52,14 +52,29 @@ _SHOULDER, _SILL = 0.435, 0.16  # heights of the two creases, in shares of the h
 
 def build(door: CarDoor = CarDoor()) -> trimesh.Trimesh:
     """One closed mesh of the sheet: a tray cut hollow, with a lip left along its edges."""
-    outline = door_outline(door) - window_outline(door)
+    return to_mesh(solid(door))
+
+
+def solid(door: CarDoor) -> Manifold:
+    """The door with its window cut out, drilled, and with a handle."""
+    drills = union(extrude(circle(size / 2, (x, z)), -400.0, 100.0, "y") for x, z, size in holes(door))
+    return tray(door, door_outline(door) - window_outline(door)) - drills + _handle(door)
+
+
+def tray(door: CarDoor, outline: CrossSection, margin: float = 5.0) -> Manifold:
+    """The sheet within an outline, its edges turned inwards and back behind it.
+
+    Args:
+        margin: how far the outline may reach beyond the door's length and height, mm.
+    """
     inside = outline.offset(-door.sheet, circular_segments=96)
     behind = outline.offset(-door.hem, circular_segments=96)
     floor = door.flange - door.sheet
-    tray = _layer(door, outline, 0.0, door.flange)
-    hollow = [_layer(door, inside, door.sheet, floor), _layer(door, behind, floor - 1.0, door.flange + 1.0)]
-    drills = union(extrude(circle(size / 2, (x, z)), -400.0, 100.0, "y") for x, z, size in holes(door))
-    return to_mesh(tray - union(hollow) - drills + _handle(door))
+    hollow = [
+        _layer(door, inside, door.sheet, floor, margin),
+        _layer(door, behind, floor - 1.0, door.flange + 1.0, margin),
+    ]
+    return _layer(door, outline, 0.0, door.flange, margin) - union(hollow)
 
 
 def build_pane(pane: Pane = Pane()) -> trimesh.Trimesh:
@@ -108,9 +123,9 @@ def holes(door: CarDoor) -> list[tuple[float, float, float]]:
     return [lock, *((x * door.length, z * door.height, d) for x, z, d in mirror + clips)]
 
 
-def _layer(door: CarDoor, outline: CrossSection, upper: float, lower: float) -> Manifold:
+def _layer(door: CarDoor, outline: CrossSection, upper: float, lower: float, margin: float = 5.0) -> Manifold:
     """The part of the outline between two depths behind the outer surface."""
-    x, z = np.meshgrid(*_lines(door), indexing="ij")
+    x, z = np.meshgrid(*_lines(door, margin), indexing="ij")
     y = outer_surface(door, x, z)
     # Depth is meant at right angles to the surface; along y it is longer by the slope.
     along, up = np.gradient(y, x[:, 0], z[0])
@@ -120,17 +135,17 @@ def _layer(door: CarDoor, outline: CrossSection, upper: float, lower: float) -> 
     return slab(*levels) ^ extrude(outline, -600.0, 200.0, "y")
 
 
-def _lines(door: CarDoor) -> tuple[Array, Array]:
+def _lines(door: CarDoor, margin: float) -> tuple[Array, Array]:
     """Grid lines in x and z: as close as the surface is curved."""
     x, z = HANDLE * (door.length, door.height)
-    across = _axis_lines(door.length, x, _RECESS[0], wide=15.0, fine=3.0)
-    return across, _axis_lines(door.height, z, _RECESS[1], wide=2.6, fine=1.5)
+    across = _axis_lines((-margin, door.length + margin), x, _RECESS[0], wide=15.0, fine=3.0)
+    return across, _axis_lines((-margin, door.height + margin), z, _RECESS[1], wide=2.6, fine=1.5)
 
 
-def _axis_lines(size: float, centre: float, half: float, wide: float, fine: float) -> Array:
-    """Positions in mm from −5 to size + 5: `fine` apart within `half` of the centre, else `wide`."""
+def _axis_lines(ends: tuple[float, float], centre: float, half: float, wide: float, fine: float) -> Array:
+    """Positions in mm between two ends: `fine` apart within `half` of the centre, else `wide`."""
     low, high = centre - half, centre + half
-    parts = [(-5.0, low, wide), (low, high, fine), (high, size + 5.0, wide)]
+    parts = [(ends[0], low, wide), (low, high, fine), (high, ends[1], wide)]
     lines = [np.linspace(start, stop, int((stop - start) / step) + 2) for start, stop, step in parts]
     return np.unique(np.concatenate(lines))
 

@@ -74,7 +74,7 @@ def test_mistakes_in_a_scene_are_named(small, old, new, says):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["synth", "nowhere", "OUT"], "nowhere: no such scene; there are blade"),
+        (["synth", "nowhere", "OUT"], "nowhere: no such scene; to fix: name one of blade"),
         (["synth", "blade", "OUT", "--hide", "warp"], "--hide warp: nature knows range_scale"),
         (["synth", "blade", "OUT", "--seed", "-1"], "--seed -1"),
         (["reveal", "OUT", "truth.json"], "truth.json: not found"),

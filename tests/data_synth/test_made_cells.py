@@ -1,0 +1,85 @@
+"""`stitch synth CELL`: the folder is what the cell's command reads, and the command finds what was hidden."""
+
+import json
+
+import numpy as np
+import pytest
+
+from data_synth.base_stand import TwoBases
+from data_synth.made_cell import CELLS
+from data_synth.scene import load_scene
+from data_synth.simulate import simulate
+from stitch import frames
+from stitch.cells.base_to_base import read_stand, solve_stand
+from stitch.cli.main import main
+
+
+def run(*arguments):
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in arguments])
+    return stop.value.code or 0
+
+
+def made(tmp_path, cell, capsys, *command):
+    """Truth of a cell, and what its command prints as JSON."""
+    assert run("synth", cell, tmp_path / "cell", "--seed", 3) == 0
+    assert "Next: stitch" in capsys.readouterr().err
+    assert run(*(str(part).replace("FOLDER", str(tmp_path / "cell")) for part in command)) == 0
+    truth = json.loads((tmp_path / "cell.truth.json").read_text())
+    return truth, json.loads(capsys.readouterr().out)
+
+
+def test_panel_names_the_hidden_leg(tmp_path, capsys):
+    truth, found = made(tmp_path, "panel-robots", capsys, "panel", "FOLDER/job.toml", "--json")
+    hidden = truth["hidden"]
+    named = {name for name, leg in found["leg_offsets"].items() if leg["found"]}
+    leg = found["leg_offsets"][hidden["robot"]]
+    assert named == {hidden["robot"]} and leg["leg"] == hidden["leg"]
+    assert abs(leg["offset"] - hidden["offset"]) < 4 * leg["sigma"]
+
+
+def test_drilling_finds_distortion_and_plate(tmp_path, capsys):
+    truth, found = made(tmp_path, "drilling", capsys, "drill", "FOLDER/job.toml", "--json")
+    for effect in found["camera_effects"]:
+        assert effect["accepted"]
+        assert abs(effect["value"] - truth["hidden"][effect["effect"]]) < 4 * effect["sigma"]
+    true = np.array([truth["holes"][d["hole"]]["position"] for d in found["drives"]])
+    assert np.linalg.norm([d["position"] for d in found["drives"]] - true, axis=1).max() < 0.5
+
+
+def test_two_bases_within_their_sigma(tmp_path):
+    """Mean χ² of the pose's six errors over 30 stands: 6 ± 4 standard errors."""
+    squares = []
+    for seed in range(30):
+        cell = TwoBases(seed)
+        cell.write(tmp_path / "stand.toml")
+        fit = solve_stand(read_stand(tmp_path / "stand.toml")).fit
+        R = cell.T_base1_base2[:3, :3] @ fit.T_base1_base2[:3, :3].T
+        turn = frames.log(frames.make(R, np.zeros(3)))[:3]
+        error = np.append(turn, cell.T_base1_base2[:3, 3] - fit.T_base1_base2[:3, 3])
+        squares.append(error @ np.linalg.solve(fit.covariance, error))
+    assert abs(np.mean(squares) - 6) < 4 * np.sqrt(12 / 30)
+
+
+def test_another_day_shares_arm_and_hand_eye(small):
+    first, second = (simulate(load_scene(small), {}, 5, day=day) for day in (0, 1))
+    assert (first.T_mount == second.T_mount).all()
+    assert not np.allclose(first.T_base_flange, second.T_base_flange)
+    assert not np.allclose(first.covariates["humidity_percent"], second.covariates["humidity_percent"])
+
+
+def test_cells_are_whole_or_not_there(tmp_path, monkeypatch, capsys):
+    def fails(folder, seed):
+        (folder / "half.csv").write_text("x")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setitem(CELLS, "drilling", CELLS["drilling"]._replace(write=fails))
+    with pytest.raises((OSError, SystemExit)):
+        main(["synth", "drilling", str(tmp_path / "cell")])
+    assert not list(tmp_path.iterdir())
+
+
+def test_cells_have_their_own_errors(tmp_path, capsys):
+    assert run("synth", "two-bases", tmp_path / "cell", "--hide", "backlash") == 2
+    assert "leave out --hide" in capsys.readouterr().err
+    assert not (tmp_path / "cell").exists()
