@@ -192,6 +192,9 @@ class Dependence:
     mean: Array  # (B,) displacement at the part, length_unit
     sigma: Array  # (B,)
     shape: str  # the empirical form that fits best, in words
+    at: Array  # (V,) the covariate of every view
+    moved: Array  # (V,) displacement of every view along that direction, length_unit
+    fitted: Array  # (V,) what the empirical form says of it
 
 
 def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Dependence]:
@@ -237,9 +240,11 @@ def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependenc
     # The direction in which the displacements follow the fitted shape most.
     fitted = linear.observation.part_displacements(scored.form.columns @ scored.values)
     direction = np.linalg.svd(fitted, full_matrices=False)[2][0]
+    # Towards where the views lie off most: one step points the same way along everything that it follows.
+    main = np.linalg.svd(displacement, full_matrices=False)[2][0]
+    main *= 1.0 if (displacement @ main)[len(displacement) // 2 :].sum() >= 0 else -1.0
+    direction *= 1.0 if direction @ main >= 0 else -1.0
     y = displacement @ direction
-    if np.dot(y, fitted @ direction) < 0:
-        y = -y
     centres, mean, sigma = bin_means(course, y)
     effect = scored.candidate.effect
     return Dependence(
@@ -250,6 +255,9 @@ def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependenc
         mean=mean,
         sigma=sigma,
         shape=effect.formula,
+        at=course,
+        moved=y,
+        fitted=fitted @ direction,
     )
 
 

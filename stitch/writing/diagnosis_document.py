@@ -15,6 +15,7 @@ from stitch.diagnosis.validation import CrossValidation, group_helps, group_shar
 from stitch.observations.surfaces.scanner_errors import FieldError
 from stitch.runs.run import doubt_headline, effect_cure
 from stitch.units import length_text
+from stitch.writing.finding_screen import finding_screen
 from stitch.writing.json_file import rows_of_fields
 
 # The variance budget for people: the largest sources by name, those below this share as one line.
@@ -235,6 +236,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         "field_map": _field_map(d.scanner_error),
         "views": d.linear.measurement.views.count,
         "evidence": d.linear.mixed.size,
+        "screen": finding_screen(d, _WORDS),
     }
 
 

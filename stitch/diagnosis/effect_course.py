@@ -1,0 +1,319 @@
+"""How far every view lies off along what an effect does, over what the effect lives on: the law, to the eye.
+
+A view's value is its displacement at the part along its unit motion: that of one joint where an effect is in a joint,
+that of the mount or the part along the fitted twist, else the direction in which the effect displaces the views most.
+The line is what the effect predicts; a dot is the line and what the whole model with the effect leaves, so that dots
+off the line are what the effect does not explain. Effects of points are read along the rays, in bins of points.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from stitch import frames
+from stitch.diagnosis.candidates import Form, candidate_as_fitted
+from stitch.diagnosis.residual_structure import Dependence, predicted_distances
+from stitch.diagnosis.score import Score, score
+from stitch.effects.contract import EFFECTS, Effect, parameters_in, twist
+from stitch.frames import Array, Indices
+from stitch.measurement.measurement import ScanView, Views
+from stitch.model.forward import moves_points, point_correction, scan_points
+from stitch.model.model import Term
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.surface_model import SurfaceObservation
+
+# Dots along one course: more cannot be told apart.
+_MOST = 300
+# Bins of the points of effects of the scanner and of the part's shape.
+_BINS = 16
+# Correspondences that are asked for one course.
+_ASKED = 60_000
+
+
+@dataclass(frozen=True)
+class EffectCourse:
+    """The course of one effect over what it lives on; lengths in length_unit, angles in rad."""
+
+    follows: str  # what it lives on: view order, time_s, angle of joint 2, …
+    unit: str  # of `at`: "", s, °, N m, °C, length_unit
+    of: str  # what is off: the part, the mount, joint 2, …
+    value_unit: str  # of measured, sigma and predicted: rad, or length_unit
+    at: Array  # (D,)
+    views: Indices  # (D,) number of the view of each dot; empty where dots are bins of points
+    measured: Array  # (D,)
+    sigma: Array  # (D,) standard deviation of a dot, by the scatter about the line
+    predicted: Array  # (D,)
+
+
+def course_of_candidate(linear: LinearModel, scored: Score) -> EffectCourse | None:
+    """The course of a candidate's best form; None where nothing of it was fitted."""
+    if not scored.fitted:
+        return None
+    fitted = linear.scatter_only
+    # As the field of the part predicts it: beside scatter alone, hand-eye and effects in use fitted anew.
+    own = scored if fitted is linear else score(fitted, scored.candidate)
+    if not own.fitted:
+        return None
+    X = np.hstack([fitted.design, own.form.response])
+    sums = own.candidate.points
+    found = fitted.trial(X, None if sums is None else sums.select(own.form.keep)).solve()
+    term = own.form.at(found[len(found) - own.form.response.shape[1] :])
+    if moves_points([term]):
+        return _course_of_points(fitted, own, term)
+    return _course_of_views(fitted, term, own.form, found[len(found) - len(own.values) :], X @ found)
+
+
+def course_in_model(linear: LinearModel, term: Term) -> EffectCourse | None:
+    """The course of an effect that is in the model, as it was fitted; None for one that changes points."""
+    if moves_points([term]) or not (~term.gridded & (term.values != 0)).any():
+        return None
+    fitted = linear.scatter_only
+    form = candidate_as_fitted(fitted, term).forms[0]
+    return _course_of_views(fitted, term, form, term.values[form.keep], fitted.design @ fitted.baseline_trial.solve())
+
+
+def course_of_dependence(linear: LinearModel, found: Dependence) -> EffectCourse:
+    """Where the views lie off along what their displacement follows without a name, and the shape that fits best."""
+    shown = _some(len(found.at))
+    fitted = found.fitted - found.fitted.mean() + found.moved.mean()
+    sigma = float(np.std(found.moved - fitted, ddof=1)) if len(fitted) > 1 else 0.0
+    dots = {"measured": found.moved, "sigma": np.full(len(fitted), sigma), "predicted": fitted}
+    return EffectCourse(
+        follows=found.covariate,
+        unit="",
+        of="the views",
+        value_unit=linear.measurement.length_unit,
+        at=found.at[shown],
+        views=shown,
+        **{name: x[shown] for name, x in dots.items()},
+    )
+
+
+def _some(views: int) -> Indices:
+    """Return the numbers of the views that are shown."""
+    return np.unique(np.linspace(0, views - 1, min(views, _MOST)).astype(np.int64))
+
+
+# Effects that move views.
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """What is off, and how a unit of that displaces each view."""
+
+    of: str
+    unit: str
+    columns: Array  # (V, k) displacements
+    response: Array  # (V, k) displacements by the effect
+    joint: int | None = None
+
+
+def _course_of_views(
+    linear: LinearModel, term: Term, form: Form, values: Array, explained: Array
+) -> EffectCourse | None:
+    """The course of an effect of views.
+
+    Args:
+        values: (p,) of the form's free parameters.
+        explained: response of the whole model with the effect.
+    """
+    motion = _motion(linear, term, form, values)
+    square = np.sum(motion.columns**2, axis=1)
+    if not (square > 0).any():
+        return None
+    # Where a unit moves a view by next to nothing, the view says nothing of it.
+    square = np.maximum(square, 1e-2 * np.median(square))
+    left = linear.mixed.z.ravel() - linear.reduce(explained[:, None])[:, 0]
+    line = np.sum(motion.columns * motion.response, axis=1) / square
+    off = np.sum(motion.columns * _displacements(linear, linear.observation.expand(left[:, None]))[..., 0], axis=1)
+    scatter = float(np.sqrt(np.mean(off**2 / square) * len(line) / max(len(line) - len(values), 1)))
+    follows, unit, at = _lives_on(linear.measurement.views, term, motion.joint)
+    if term.effect.place == "part":
+        # Where the part sat at first is nobody's error.
+        line = line - line[np.argmin(at)]
+    sign = 1.0 if motion.joint is not None or line[np.argmax(np.abs(line))] >= 0 else -1.0
+    shown = _some(len(line))
+    values_of = {"measured": sign * (line + off / square), "sigma": scatter / np.sqrt(square), "predicted": sign * line}
+    return EffectCourse(
+        follows, unit, motion.of, motion.unit, at[shown], shown, **{name: x[shown] for name, x in values_of.items()}
+    )
+
+
+def _motion(linear: LinearModel, term: Term, form: Form, values: Array) -> _Motion:
+    """What an effect moves, by its place in the chain of frames."""
+    response = _displacements(linear, form.response @ values[:, None])[..., 0]
+    unit, fitted = linear.measurement.length_unit, form.at(values)
+    if term.effect.place == "robot":
+        of_joints = Term(EFFECTS["joint_offset"], parameters_in(linear.measurement, EFFECTS["joint_offset"]))
+        turned = linear.responses([of_joints])[0].columns
+        law = _joint_laws(linear.measurement.views, fitted)
+        per_view = len(turned) // len(law)
+        seen = linear.reduce(turned * np.repeat(law, per_view, axis=0)) if len(turned) == per_view * len(law) else law
+        joint = int(np.argmax(np.sum(seen**2, axis=0)))
+        columns = _displacements(linear, turned[:, joint : joint + 1])[..., 0]
+        return _Motion(f"joint {joint + 1}", "rad", columns, law[:, joint : joint + 1] * columns, joint)
+    if term.effect.place == "mount":
+        constant = Effect("constant", "mount", {"xi": twist("", 1e-3, 1.0)}, _constant, (), (), "empirical")
+        own = Term(constant, parameters_in(linear.measurement, constant))
+        along = fitted.values[: len(own.parameters)]
+        columns = _displacements(linear, linear.responses([own])[0].columns @ along[:, None])[..., 0]
+        return _Motion("the scanner's mount", unit, _unit_rows(columns), response)
+    direction = np.linalg.svd(response - response.mean(axis=0), full_matrices=False)[2][0]
+    of = "the part" if term.effect.place == "part" else "the arm"
+    return _Motion(of, unit, np.tile(direction, (len(response), 1)), response)
+
+
+def _constant(views: Views, xi: Array) -> Array:
+    """M·exp(ξ)"""
+    return np.tile(xi, (views.count, 1))
+
+
+def _joint_laws(views: Views, fitted: Term) -> Array:
+    """(V, n) rad by which an effect turns the joints."""
+    return np.asarray(fitted.effect.function(views.joints, views, **fitted.arguments)) - views.joints
+
+
+def _unit_rows(columns: Array) -> Array:
+    """Rows of a mean length of one."""
+    return columns / max(float(np.mean(np.linalg.norm(columns, axis=1))), 1e-300)
+
+
+def _displacements(linear: LinearModel, response: Array) -> Array:
+    """(V, k, P) displacements at the part of responses (·, P); of surfaces a turn counts by what it does at the rim."""
+    observation = linear.observation
+    if not isinstance(observation, SurfaceObservation):
+        return np.stack([observation.part_displacements(own) for own in observation.reduce(response).T], axis=2)
+    out = response.reshape(linear.measurement.views.count, 6, -1).copy()
+    out[:, :3] *= observation.unconstrained.overlaps.gram.lever
+    return np.asarray(out)
+
+
+def _lives_on(views: Views, term: Term, joint: int | None) -> tuple[str, str, Array]:
+    """What an effect lives on, its unit, and where the views stand along it."""
+    name = term.name
+    covariate = next((n for n in (*term.effect.prefers, *term.effect.needs) if n in views.covariates), None)
+    if joint is not None:
+        number = joint + 1
+        if "torque" in term.effect.needs:
+            own = [k for k, bent in enumerate(views.torques.joint) if bent == joint]
+            if own:
+                size = max(own, key=lambda k: abs(term.values[k]) * float(np.ptp(views.torques.values[:, k])))
+                return f"torque on joint {number}", "N m", views.torques.values[:, size]
+        if name == "backlash":
+            return f"last move of joint {number}: −1 down, +1 up", "", views.approach[:, joint]
+        if name == "settling":
+            moved = np.degrees(views.joints - views.previous)
+            return f"last move of joint {number}", "°", moved[:, joint]
+        if "velocity" in term.effect.needs and views.velocity is not None:
+            return f"speed of joint {number}", "°/s", np.degrees(views.velocity[:, joint])
+        return f"angle of joint {number}", "°", np.degrees(views.joints[:, joint])
+    if covariate is not None:
+        return covariate, "", views.covariates[covariate]
+    if any(p.discrete for p in term.parameters) or not views.has("time"):
+        return "view order", "", np.arange(views.count, dtype=float)
+    if "time" in (*term.effect.needs, *term.effect.prefers) or term.effect.prefers:
+        return "time", "s", views.time
+    return "view order", "", np.arange(views.count, dtype=float)
+
+
+# Effects that change points: along the rays of the scanner, or as the part's shape moves.
+
+
+def _course_of_points(linear: LinearModel, scored: Score, term: Term) -> EffectCourse | None:
+    """Means over bins of points, each the effect and what the model with it leaves along its motion."""
+    observation, left = linear.observation, predicted_distances(linear, scored)
+    if left is None or not isinstance(observation, SurfaceObservation):
+        return None
+    poses = observation.capture.poses(linear.model.T_mount)
+    matches, rows = observation.unconstrained.overlaps.matches, list[tuple[Array, Array, Array, Array, Array]]()
+    total = sum(len(m.residual) for m in matches)
+    start = 0
+    for m in matches:
+        some = np.arange(0, len(m.residual), max(total // _ASKED, 1))
+        own, start = left[start + some], start + len(m.residual)
+        for v, index, sign in ((m.v, m.index_v[some], 1.0), (m.w, m.index_w[some], -1.0)):
+            points, view = scan_points(linear.measurement, v, index)
+            size, direction = _sizes(term, points, view, poses[v])
+            facing = np.einsum("ni,ni->n", frames.rotate(poses[v], direction), m.normal[some])
+            at = _place_of(term.name, points, view, poses[v])
+            rows.append((at, size, sign * facing, own, np.full(len(some), v)))
+    at, size, cosine, rest, view_of = (np.concatenate(x) for x in zip(*rows, strict=True))
+    return _binned(linear, term, at, size, cosine, rest, view_of)
+
+
+def _sizes(term: Term, points: Array, view: ScanView, pose: Array) -> tuple[Array, Array]:
+    """(N,) how far an effect moves points, and (N, 3) where to, scanner frame: along the rays where it does so."""
+    moved = -point_correction([term], points, view, pose)
+    rays = view.along(points)
+    along = np.einsum("ni,ni->n", moved, rays)
+    length = np.linalg.norm(moved, axis=1)
+    if np.sum(along**2) > 0.9 * np.sum(length**2):
+        return along, rays
+    return length, moved / np.maximum(length, 1e-300)[:, None]
+
+
+def _place_of(name: str, points: Array, view: ScanView, pose: Array) -> Array:
+    """(N,) where points stand along what an effect of points lives on."""
+    match name:
+        case "range_scale" | "range_nonlinearity":
+            return np.asarray(np.linalg.norm(view.away(points), axis=1))
+        case "incidence_bias":
+            return np.degrees(np.arccos(np.clip(view.cosine, 0, 1)))
+        case "intensity_bias":
+            assert view.intensity is not None
+            return view.intensity
+        case "part_sag":
+            return frames.transform(pose, points)[:, 2]
+        case "part_growth" | "scanner_thermal_scale":
+            at = view.views.covariates.get(_TEMPERATURES[name], view.views.time)
+            return np.full(len(points), float(at[view.index]))
+    return np.degrees(np.arctan(np.sqrt(view.rho2(points))))
+
+
+_TEMPERATURES = {"part_growth": "part_temperature_c", "scanner_thermal_scale": "scanner_temperature_c"}
+# What effects of points live on, with its unit, None for the session's; all others the angle in the field.
+_POINT_AXES = {
+    "range_scale": ("distance from the scanner", None),
+    "range_nonlinearity": ("distance from the scanner", None),
+    "incidence_bias": ("angle of incidence", "°"),
+    "intensity_bias": ("intensity, in standard deviations", ""),
+    "part_sag": ("height above the clamp", None),
+}
+
+
+def _point_axis(name: str, views: Views) -> tuple[str, str | None]:
+    """What an effect of points lives on, and its unit."""
+    temperature = _TEMPERATURES.get(name)
+    if temperature is not None:
+        return (temperature, "°C") if temperature in views.covariates else ("time", "s")
+    return _POINT_AXES.get(name, ("angle from the middle of the field", "°"))
+
+
+def _binned(
+    linear: LinearModel, term: Term, at: Array, size: Array, cosine: Array, rest: Array, view_of: Indices
+) -> EffectCourse | None:
+    """A dot for each of equal counts of points; its sigma is the scatter of the views' own means about it."""
+    edges = np.unique(np.quantile(at, np.linspace(0, 1, _BINS + 1)))
+    if len(edges) < 3:
+        return None
+    dots = []
+    for low, high in pairwise(edges):
+        here = (at >= low) & (at <= high)
+        weight = np.sum(cosine[here] ** 2)
+        if weight <= 0:
+            continue
+        off = float(np.sum(cosine[here] * rest[here]) / weight)
+        views = view_of[here]
+        top, below = (np.bincount(views, x[here]) for x in (cosine * rest, cosine**2))
+        known = below > 0
+        spread = np.sqrt(np.sum((top[known] - off * below[known]) ** 2)) / weight
+        law = float(size[here].mean())
+        dots.append((float(at[here].mean()), law + off, float(spread), law))
+    place, measured, sigma, predicted = np.array(dots).T
+    length = linear.measurement.length_unit
+    follows, unit = _point_axis(term.name, linear.measurement.views)
+    of = "the part" if term.effect.place == "shape" else "the scanner"
+    return EffectCourse(
+        follows, length if unit is None else unit, of, length, place, np.zeros(0, np.int64), measured, sigma, predicted
+    )

@@ -1,0 +1,228 @@
+"""What one screen shows of a diagnosis: the cause in words, its proof, what each candidate would leave, and why.
+
+The page of a run, its review and the first tab of its recording draw from this part of diagnosis.json alone.
+"""
+
+import weakref
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from stitch.comparison.disagreement_field import DisagreementField, Patches, patches_of
+from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.diagnosis.effect_course import (
+    EffectCourse,
+    course_in_model,
+    course_of_candidate,
+    course_of_dependence,
+)
+from stitch.diagnosis.residual_structure import predicted_distances
+from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
+from stitch.frames import Array
+from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.units import angle_text, length_text
+
+# What each of the best candidate effects would leave of the field of disagreement.
+
+# Candidate effects that a screen compares.
+_BEST = 3
+# Digits of a field in length_unit: thousandths of its largest value are finer than any colour.
+_FINE = 1e-3
+
+
+@dataclass(frozen=True)
+class CandidateFields:
+    """The field as it is, and as it would be with each of the best candidate effects."""
+
+    patches: Patches
+    present: DisagreementField
+    if_added: dict[str, DisagreementField]
+
+
+_last_fields: tuple[weakref.ref[Diagnosis], CandidateFields | None] | None = None
+
+
+def candidate_fields(found: Diagnosis) -> CandidateFields | None:
+    """Return the fields of the diagnosis that was asked for last; None without clouds."""
+    global _last_fields
+    if _last_fields is None or _last_fields[0]() is not found:
+        _last_fields = weakref.ref(found), _fields(found)
+    return _last_fields[1]
+
+
+def _fields(found: Diagnosis) -> CandidateFields | None:
+    linear = found.linear
+    present = predicted_distances(linear)
+    if present is None or not isinstance(linear.observation, SurfaceObservation):
+        return None
+    overlaps = linear.observation.unconstrained.overlaps
+    patches = patches_of(overlaps.matches, linear.measurement.views.count, overlaps.gram.scale, model_distances=present)
+    added = {}
+    for candidate in compared(found):
+        distances = predicted_distances(linear, candidate.ranked.score)
+        assert distances is not None
+        added[candidate.name] = patches.field(distances)
+    return CandidateFields(patches, patches.field(present), added)
+
+
+def compared(found: Diagnosis) -> list[CandidateEffect]:
+    """Return the candidate effects that a screen compares: those that are named first."""
+    worth = [c for c in found.candidates if c.ranked.score.observable and c.ranked.score.fitted]
+    return sorted(worth, key=lambda c: c.name not in found.effects)[:_BEST]
+
+
+# The screen as a dictionary.
+
+
+def finding_screen(found: Diagnosis, descriptions: dict[str, str]) -> dict[str, Any]:
+    """Return the screen of a diagnosis; lengths in length_unit, angles in rad.
+
+    Args:
+        descriptions: effects in a few words.
+    """
+    fields = candidate_fields(found)
+    courses = {c.name: course_of_candidate(found.linear, c.ranked.score) for c in compared(found)}
+    why = _why(found, courses)
+    return {
+        "headline": _headline(found, why, descriptions),
+        "proof": _proof(found, why),
+        # A doubt whose cure is to add what was found is the finding itself.
+        "doubts": [x for x in found.doubts if not any(f"effect {name}" in x for name in found.effects)],
+        "now": {"heldout": found.heldout_rms} | _on_part(None if fields is None else fields.present),
+        "noise": found.noise_floor,
+        "why": None if why is None else _course(why),
+        "candidates": [
+            _candidate(found, c, None if fields is None else fields.if_added[c.name], courses[c.name], descriptions)
+            for c in compared(found)
+        ],
+        "places": None if fields is None else np.round(fields.patches.points, 2).tolist(),
+    }
+
+
+def _candidate(
+    found: Diagnosis,
+    candidate: CandidateEffect,
+    field: DisagreementField | None,
+    course: EffectCourse | None,
+    descriptions: dict[str, str],
+) -> dict[str, Any]:
+    left_out = candidate.cross_validation
+    return {
+        "effect": candidate.name,
+        "words": _cause(candidate, course, descriptions),
+        "heldout": None if left_out is None else found.rms_if_added(left_out)[1],
+        **_on_part(field),
+        "why": None if course is None else _course(course),
+    }
+
+
+def _on_part(field: DisagreementField | None) -> dict[str, Any]:
+    """Mean and worst disagreement on the part, and the value of every place; null where nothing compares."""
+    if field is None:
+        return {"mean": None, "worst": None, "field": None}
+    seen = field.overall[np.isfinite(field.overall)]
+    digits = max(0, int(np.ceil(-np.log10(_FINE * max(float(seen.max(initial=0.0)), 1e-12)))))
+    values = [round(x, digits) if np.isfinite(x) else None for x in field.overall.tolist()]
+    return {"mean": field.mean_abs, "worst": float(seen.max(initial=0.0)), "field": values}
+
+
+def _course(course: EffectCourse) -> dict[str, Any]:
+    return {
+        "follows": course.follows,
+        "unit": course.unit,
+        "of": course.of,
+        "value_unit": course.value_unit,
+        "views": course.views.tolist(),
+        "at": _rounded(course.at),
+        "measured": _rounded(course.measured),
+        "sigma": _rounded(course.sigma),
+        "predicted": _rounded(course.predicted),
+    }
+
+
+def _rounded(values: Array) -> list[float]:
+    return [float(f"{x:.4g}") for x in values]
+
+
+def _why(found: Diagnosis, courses: dict[str, EffectCourse | None]) -> EffectCourse | None:
+    """Return the course of what is named, of the last effect in a model that lacks nothing, or of what has no name."""
+    if found.verdict in ("missing_effect", "cannot_tell"):
+        return courses.get(found.effects[0])
+    terms = found.linear.model.terms
+    if found.verdict == "adequate":
+        return course_in_model(found.linear, terms[-1]) if terms else None
+    return course_of_dependence(found.linear, found.depends_on[0]) if found.depends_on else None
+
+
+# The cause and its proof in words.
+
+_OF_A_JOINT = {
+    "joint_offset": "counts its angle from a wrong zero",
+    "joint_compliance": "gives way under load",
+    "gear_eccentricity": "has a gear that runs out of true once a turn",
+    "gear_harmonic": "has a gear that runs out of true twice a turn",
+    "backlash": "has play",
+    "settling": "is measured before it has come to rest",
+}
+
+
+def _cause(candidate: CandidateEffect, course: EffectCourse | None, descriptions: dict[str, str]) -> str:
+    """Return the cause as a sentence without its full stop."""
+    term = candidate.ranked.score.form.at(candidate.ranked.score.values)
+    view = next((p.view for p in term.parameters if p.discrete), "")
+    if view:
+        return (
+            f"The part slipped before view {view}" if candidate.name == "part_slip" else f"{candidate.name} at {view}"
+        )
+    if course is not None and candidate.name in _OF_A_JOINT and course.of.startswith("joint"):
+        return f"{course.of.capitalize()} {_OF_A_JOINT[candidate.name]}"
+    words = descriptions.get(candidate.name, candidate.name)
+    return words[:1].upper() + words[1:]
+
+
+def _headline(found: Diagnosis, why: EffectCourse | None, descriptions: dict[str, str]) -> str:
+    """Return what is missing, in one sentence."""
+    match found.verdict:
+        case "adequate":
+            named = " and ".join(found.linear.model.effects)
+            return f"With {named} in the model, nothing more is missing." if named else "Nothing is missing."
+        case "unknown_effect":
+            follows = "" if why is None or not _follows_clearly(found) else f": the error follows {why.follows}"
+            return f"Something is missing that no known effect explains{follows}."
+    causes = [_cause(c, why, descriptions) for c in compared(found) if c.name in found.effects]
+    if len(causes) > 1:
+        told = " or ".join([causes[0], *(cause[:1].lower() + cause[1:] for cause in causes[1:])])
+        return f"{told}: these views cannot tell which."
+    return f"{'' if found.certain else 'Perhaps: '}{causes[0]}."
+
+
+def _follows_clearly(found: Diagnosis) -> bool:
+    return bool(found.depends_on) and found.depends_on[0].p_value < CLEAR_DEPENDENCE
+
+
+def _proof(found: Diagnosis, why: EffectCourse | None) -> str:
+    """Return how large it is, and what it does to the error on views left out."""
+    unit = found.linear.measurement.length_unit
+    now, noise = length_text(found.heldout_rms, unit, 2), length_text(found.noise_floor, unit, 2)
+    if found.verdict not in ("missing_effect", "cannot_tell"):
+        return f"On views left out the error is {now}; the scanner's noise alone would leave {noise}."
+    named = next(c for c in found.candidates if c.name == found.effects[0])
+    size = "" if why is None else f"{_size(why, unit)} "
+    if named.cross_validation is None:
+        return f"{size}On views left out the error is {now}; the scanner's noise alone would leave {noise}."
+    then = length_text(found.rms_if_added(named.cross_validation)[1], unit, 2)
+    return (
+        f"{size}Adding it should take the error on views left out from {now} to {then}; the scanner's noise alone "
+        f"would leave {noise}."
+    )
+
+
+def _size(why: EffectCourse, unit: str) -> str:
+    """Return how far off an effect puts things, as a sentence."""
+    largest = float(np.abs(why.predicted).max())
+    size = angle_text(largest, 2) if why.value_unit == "rad" else length_text(largest, unit, 2)
+    if why.follows == "view order" and len(why.views):
+        away = int(np.sum(np.abs(why.predicted) > largest / 2))
+        return f"{away} of {len(why.views)} views sit {size} away from the others."
+    return f"{why.of.capitalize()} is off by up to {size}."

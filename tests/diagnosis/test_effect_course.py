@@ -1,0 +1,55 @@
+"""The course of an effect shows the law that was put into the arm, the mount or the part."""
+
+import numpy as np
+import pytest
+
+from data_synth import kinematics
+from stitch import frames
+from stitch.diagnosis.candidates import candidate_of
+from stitch.diagnosis.effect_course import EffectCourse, course_of_candidate
+from stitch.diagnosis.score import score
+from stitch.effects.contract import EFFECTS
+from stitch.observations.linear_model import LinearModel
+from tests.diagnosis.freed_blade import FreedBlade, freed_blade
+
+JOINT = 2
+
+
+@pytest.fixture(scope="module")
+def cell() -> FreedBlade:
+    return freed_blade(4, 14)
+
+
+def _course(linear: LinearModel, effect: str) -> EffectCourse:
+    candidate = candidate_of(linear, EFFECTS[effect])
+    assert candidate is not None
+    course = course_of_candidate(linear, score(linear, candidate))
+    assert course is not None
+    return course
+
+
+def test_a_gear_shows_its_sine_over_the_joints_angle(cell: FreedBlade):
+    plan, size = cell.measured.plan, 2e-3
+    joints = plan.joints.copy()
+    law = size * np.sin(joints[:, JOINT])
+    joints[:, JOINT] += law
+    course = _course(cell.seen(kinematics.flange(plan.arm, joints)), "gear_eccentricity")
+    assert (course.of, course.value_unit, course.follows) == ("joint 3", "rad", "angle of joint 3")
+    np.testing.assert_allclose(course.at, np.degrees(plan.joints[:, JOINT]), atol=1e-9)
+    off = (course.measured - law) / course.sigma
+    # What a constant of the joint does the hand-eye does nearly as well.
+    assert np.std(off) < 2.5 and np.corrcoef(course.measured, law)[0, 1] > 0.8
+
+
+def test_a_slip_is_a_step_of_its_size_in_the_order_of_views(cell: FreedBlade):
+    """The part is on the flange: it sits elsewhere from view 8 on, where the scanner of the first views was."""
+    plan = cell.measured.plan
+    T_base_flange = kinematics.flange(plan.arm, plan.joints)
+    moved = np.array([0, 0, 0, 0.15, -0.1, 0.05])
+    T_base_flange[8:] = T_base_flange[8:] @ frames.exp(moved)
+    course = _course(cell.seen(T_base_flange), "part_slip")
+    assert (course.of, course.follows) == ("the part", "view order") and list(course.views) == list(range(14))
+    before, after = course.measured[:8], course.measured[8:]
+    assert after.mean() - before.mean() == pytest.approx(np.linalg.norm(moved[3:]), rel=0.15)
+    np.testing.assert_allclose(course.predicted[:8], 0, atol=1e-3)
+    assert np.abs(course.measured - course.predicted).max() < 4 * course.sigma.max()
