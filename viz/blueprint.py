@@ -5,12 +5,11 @@ import os
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from matplotlib import colormaps
 
 from stitch.comparison.disagreement_field import effect_changes
 from stitch.frames import Array
 from stitch.runs.run import Run
-from viz.colours import UNSEEN
+from viz.colours import UNSEEN, unsigned_colours
 from viz.model_timeline import FRAMES, ModelScene, shown_steps
 from viz.part_surface import Camera
 
@@ -21,9 +20,9 @@ _LENGTH, _HEIGHT = 256, 14
 WIDE, HIGH = (-28.0, _LENGTH + 44.0), (-4.0, _HEIGHT + 54.0)
 
 
-def log_colour_bar(recording: rr.RecordingStream, path: str, name: str, ticks: list[str], grey: str) -> None:
-    """The colours of a map from left to right, with labels at equal distances below, and what grey means below them."""
-    row = np.asarray(colormaps[name](np.linspace(0, 1, _LENGTH))[:, :3] * 255, np.uint8)
+def log_colour_bar(recording: rr.RecordingStream, path: str, ticks: list[str], grey: str) -> None:
+    """The colours of the field with labels at equal distances below them, and below these what grey means."""
+    row = unsigned_colours(np.linspace(0, 1, _LENGTH), 1.0)
     recording.log(f"{path}/colours", rr.Image(np.tile(row, (_HEIGHT, 1, 1))), static=True)
     places = np.column_stack([np.linspace(0, _LENGTH, len(ticks)), np.full(len(ticks), _HEIGHT + 6.0)])
     marks = rr.Points2D(places, labels=ticks, radii=0.4, colors=[(128, 128, 128)], show_labels=True)

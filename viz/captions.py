@@ -1,9 +1,20 @@
-"""One line under every figure: what to read from it."""
+"""One line under every figure: what to read from it, and what its axes are called."""
+
+_UNITS = (("_deg", "°"), ("_c", "°C"), ("_percent", "%"), ("_s", "s"), ("_nm", "N m"), ("_nm_per_kg", "N m/kg"))
+
+
+def covariate(name: str) -> str:
+    """Return a covariate with its unit in brackets: j2_deg → j2 (°)."""
+    for ending, unit in _UNITS:
+        if name.endswith(ending):
+            return f"{name.removesuffix(ending)} ({unit})".replace("_", " ")
+    return name.replace("_", " ")
+
 
 FIELD = (
     "Per place of the part, how far each view puts the surface from where the others put it, averaged over a patch so "
-    "that the scanner's noise is gone. What fades from one step to the next is what that step explained. Grey: seen by "
-    "one view only."
+    "that the scanner's noise is gone. What fades from one step to the next is what that step explained. Hatched: seen "
+    "by one view only."
 )
 CARRIED_TARGETS = (
     "In the frame of the robot's base. Every target stands wherever a view saw it on the arm; its colour says how far "
@@ -16,15 +27,6 @@ SEEN_TARGETS = (
     "What fades from one step to the next is what that step explained. Grey: the robot's base."
 )
 HANDLING = "Drag to turn, click and scroll to come closer."
-CONVERGENCE = "Near the dashed line only the scanner's own noise remains; further iterations bring nothing."
-PER_VIEW = (
-    "Left: how far each view had to move beyond what the model says. Right: the rms that remains. "
-    "One bar that stands out is a view to look at; bars that rise together are a missing effect."
-)
-WATERFALL = (
-    "An effect earns its place if the bar of the views left out falls too; the dashed line is what the sensor's "
-    "noise alone would leave."
-)
 BUDGET = (
     "Of how far whole views lie from where the robot and one hand-eye put them: how large each source is (rms), and "
     "its share of the variance; the shares add up to 100 %. White repeatability is the arm's scatter, new in every "
@@ -38,14 +40,6 @@ SCANNER_FIELD = (
     "views overlap. What moving the views does as well no overlap shows, so that a constant, a slope and a bowl over "
     "the field are not in it; nor is what is finer than a sixth of the field. Before correcting by it, have it "
     "confirmed by a calibration of the scanner, which shows those too."
-)
-CANDIDATES = (
-    "Log Bayes factor: to the right of zero an effect explains more than its parameters cost; 3 is odds of 20 to 1. "
-    "Orange: named."
-)
-ADDED_VARIABLE = (
-    "A dot is one number of the evidence. A candidate effect that is there as fitted puts the dots along the line; "
-    "a cloud that is narrow sideways explains nothing."
 )
 SHAPE = "Mean displacement in bins with two sigmas. Bars that all reach zero follow nothing."
 COURSES = (
@@ -61,18 +55,13 @@ ALIASES = (
     "1 in a row: in these views the effect of the column can do the same, and only other views or an artefact "
     "tell the two apart."
 )
-VIEWS = "Where the overlaps would put each view against where the model puts it, along the axes of the reference frame."
 COMPARISON = (
     "Signed mean distance between the views against each property with two sigmas, clearest first; "
     "a slope or a bend is what the model does not know. The sample is the view."
 )
-STICKS = (
-    "Where each view puts every target against the place they share; sticks that all point one way in a region repeat."
-)
-TARGETS = "The farthest target of every view, in the order of views, and how the distances are distributed."
 TWO_FIELDS = (
     "Per place of the part, how far each view puts the surface from where the others put it, by the model of each run; "
-    "one scale of colours for both. Grey: seen by one view only."
+    "one scale of colours for both. Hatched: seen by one view only."
 )
 HANDLING_OF_TWO = "Drag to turn: both turn."
 WATCHED = (

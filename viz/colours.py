@@ -1,37 +1,7 @@
 """Colours that mean the same in the recording, the figures and the page."""
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
-
-# What all figures have in common.
-
-_UNITS = (("_deg", "°"), ("_c", "°C"), ("_percent", "%"), ("_s", "s"), ("_nm", "N m"), ("_nm_per_kg", "N m/kg"))
-
-
-def plain(figure: Figure) -> Figure:
-    """No frame at the top and on the right."""
-    for axes in figure.axes:
-        axes.spines[["top", "right"]].set_visible(False)
-    return figure
-
-
-def above(axes: Axes) -> None:
-    """The legend above the drawing, where it covers nothing."""
-    handles, labels = axes.get_legend_handles_labels()
-    axes.legend(handles, labels, frameon=False, ncols=len(labels), loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
-
-
-def covariate(name: str) -> str:
-    """A covariate with its unit in brackets: j2_deg → j2 (°)."""
-    for ending, unit in _UNITS:
-        if name.endswith(ending):
-            return f"{name.removesuffix(ending)} ({unit})".replace("_", " ")
-    return name.replace("_", " ")
-
 
 Array = NDArray[np.float64]
 
@@ -41,21 +11,31 @@ BLUE, ORANGE, GREEN, YELLOW, DARK = "#0072B2", "#D55E00", "#009E73", "#E69F00", 
 COLOURS_OF_FEW = ((86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167))
 # What stands beside or behind what matters.
 GREY = (95, 100, 106)
-# Grey: no other view sees this place, so there is nothing to compare.
+# No other view sees this place, or it was not chosen: there is nothing to compare. Pages hatch it.
 UNSEEN = (160, 160, 160)
 # Blue–white–red: below, at and above the surface of the other views.
-SIGNED = "RdBu_r"
-# Grey to dark red: how far the views disagree; light grey is the part itself.
-FIELD = "stitch_field"
-_OF_FIELD = ["#e3e6ea", "#f7e3a1", "#fdb24f", "#f4722b", "#cf2a1e", "#7d0a1c"]
-if FIELD not in colormaps:
-    colormaps.register(LinearSegmentedColormap.from_list(FIELD, _OF_FIELD))
+SIGNED = [
+    "#053061",
+    "#2065ab",
+    "#4393c3",
+    "#90c4dd",
+    "#d1e5f0",
+    "#f7f6f6",
+    "#fddbc7",
+    "#f3a481",
+    "#d6604d",
+    "#b1182b",
+    "#67001f",
+]
+# Pale blue to dark red: how far the views disagree. No stop is grey, which says that nothing is known.
+FIELD = ["#d3e8f0", "#f7e3a1", "#fdb24f", "#f4722b", "#cf2a1e", "#7d0a1c"]
 
 
 def view_colours(count: int) -> NDArray[np.uint8]:
     """(count, 3) distinct colours, the same for the same view everywhere."""
     hues = (np.arange(count) * 0.618034) % 1.0
-    return np.asarray(colormaps["hsv"](hues)[:, :3] * 200 + 30, np.uint8)
+    wheel = np.clip(np.abs((6 * hues[:, None] + np.array([0, 4, 2])) % 6 - 3) - 1, 0, 1)
+    return np.asarray(wheel * 200 + 30, np.uint8)
 
 
 def signed_colours(values: Array, limit: float) -> NDArray[np.uint8]:
@@ -68,8 +48,10 @@ def unsigned_colours(values: Array, limit: float) -> NDArray[np.uint8]:
     return _mapped(FIELD, np.asarray(values) / max(limit, 1e-12), values)
 
 
-def _mapped(name: str, share: Array, values: Array) -> NDArray[np.uint8]:
-    colours = np.asarray(colormaps[name](np.nan_to_num(np.clip(share, 0, 1)))[:, :3] * 255, np.uint8)
+def _mapped(scale: list[str], share: Array, values: Array) -> NDArray[np.uint8]:
+    own = np.array([[int(stop[i : i + 2], 16) for i in (1, 3, 5)] for stop in scale], float)
+    place, along = np.nan_to_num(np.clip(share, 0, 1)), np.linspace(0, 1, len(own))
+    colours = np.stack([np.interp(place, along, channel) for channel in own.T], axis=-1).astype(np.uint8)
     colours[~np.isfinite(values)] = UNSEEN
     return colours
 

@@ -2,72 +2,20 @@
 
 import os
 import subprocess
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rerun as rr
 
-from stitch.comparison.disagreement_field import DisagreementField, Patches, patches_of
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
-from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.system.files import whole_file
 from stitch.units import MICROMETRES
 from stitch.writing.diagnosis_document import effect_description, effect_in_words, plain_finding, suggested_command
 from viz.colours import COLOURS_OF_FEW
-from viz.part_data import packed_floats, packed_values
 from viz.rrd_file import RecordingFile, id_of, words
 from viz.viewer import rerun_program
-
-# What each candidate effect would leave of the field of disagreement, for the page.
-
-# Best candidate effects whose field a page holds.
-_BEST = 3
-
-
-@dataclass(frozen=True)
-class CandidateFields:
-    """The field as it is, and as it would be with each of the best candidate effects."""
-
-    patches: Patches
-    present: DisagreementField
-    if_added: dict[str, DisagreementField]
-
-
-def candidate_fields(found: Diagnosis) -> CandidateFields | None:
-    """None without clouds."""
-    linear = found.linear
-    present = predicted_distances(linear)
-    if present is None or not isinstance(linear.observation, SurfaceObservation):
-        return None
-    overlaps = linear.observation.unconstrained.overlaps
-    patches = patches_of(overlaps.matches, linear.measurement.views.count, overlaps.gram.scale, model_distances=present)
-    worth = [c for c in found.candidates if c.ranked.score.observable and c.ranked.score.fitted][:_BEST]
-    added = {}
-    for candidate in worth:
-        distances = predicted_distances(linear, candidate.ranked.score)
-        assert distances is not None
-        added[candidate.name] = patches.field(distances)
-    return CandidateFields(patches, patches.field(present), added)
-
-
-def packed_candidates(fields: CandidateFields, length_unit: str) -> dict[str, Any]:
-    """Plain data for the viewer of the page; µm."""
-    um = MICROMETRES[length_unit]
-    return {
-        "patches": packed_floats(fields.patches.points),
-        "mean": fields.present.mean_abs * um,
-        "noise": fields.present.noise * um,
-        "values": packed_values(fields.present.overall * um),
-        "candidates": [
-            {"name": name, "mean": field.mean_abs * um, "values": packed_values(field.overall * um)}
-            for name, field in fields.if_added.items()
-        ],
-    }
-
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
 
@@ -75,7 +23,7 @@ _SHOWN = 8
 NOT_YET = "Not asked yet: `stitch diagnose RUN` says which effect is missing."
 
 
-def add_diagnosis(found: Diagnosis, fields: CandidateFields | None, length_unit: str, path: Path) -> None:
+def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, length_unit: str, path: Path) -> None:
     """Put a diagnosis into a recording, in place of an earlier one; nothing where there is no recording.
 
     Raises:
@@ -86,7 +34,7 @@ def add_diagnosis(found: Diagnosis, fields: CandidateFields | None, length_unit:
     own = path.with_name(".diagnosis.part.rrd")
     try:
         file = RecordingFile("stitch", own, id_of(found.linear.measurement.capture.name))
-        log_diagnosis(file.stream, found, fields, length_unit)
+        log_diagnosis(file.stream, found, screen, length_unit)
         file.write()
         with whole_file(path) as scratch:
             subprocess.run(
@@ -101,11 +49,12 @@ def add_diagnosis(found: Diagnosis, fields: CandidateFields | None, length_unit:
         own.unlink(missing_ok=True)
 
 
-def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, fields: CandidateFields | None, length_unit: str) -> None:
+def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, screen: dict[str, Any] | None, length_unit: str) -> None:
     """Verdict with the table of candidate effects, bars of the evidence, displacements of the views."""
     um = MICROMETRES[length_unit]
     shown = [c for c in found.candidates if c.ranked.score.observable][:_SHOWN]
-    on_part = {} if fields is None else {name: f"{f.mean_abs * um:.3g}" for name, f in fields.if_added.items()}
+    told = [] if screen is None else screen["candidates"]
+    on_part = {c["effect"]: f"{c['mean'] * um:.3g}" for c in told if c["mean"] is not None}
     plain = plain_finding(found, length_unit)
     rec.log("diagnosis/plain", words(plain), static=True)
     courses = [line for told in curve_sentences(found, length_unit) for line in (told, "")]

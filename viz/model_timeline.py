@@ -17,7 +17,7 @@ from stitch.units import MICROMETRES, length_text
 from viz.colours import COLOURS_OF_FEW, GREY, unsigned_colours
 from viz.part_surface import PartSurface
 from viz.rrd_file import words
-from viz.run_figures import shown_points
+from viz.run_numbers import shown_points
 
 # What the timeline `model` of a recording shows: the part, where every step puts the views, and what is magnified.
 

@@ -2,16 +2,20 @@
 
 import html
 
+import numpy as np
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from stitch.comparison.disagreement_field import full_colour_distance, model_history
 from stitch.comparison.run_verdict import run_headline
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES
-from viz import run_figures
+from viz.colours import BLUE, ORANGE
+from viz.figures import plain
 from viz.page_parts import render
 from viz.part_picture import DISAGREE, part_picture, step_shown
 from viz.part_surface import camera_for, part_surface
+from viz.run_numbers import residual_vectors
 from viz.run_page import shown_part
 
 # Steps of the model side by side, the last ones.
@@ -37,9 +41,31 @@ def plot(run: Run) -> Figure:
     alone, the targets as every view puts them."""
     history, um = model_history(run), MICROMETRES[run.session.length_unit]
     if history is None:
-        return run_figures.sticks(run)
+        return _sticks(run)
     surface = part_surface(run.fused, history.patches)
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
     # Coarse is so far off that all would be red.
     shown = [step_shown(step, um) for step in history.steps[1:]]
     return part_picture(surface, camera, shown[-_STEPS:], full_colour_distance(history.models[0].field) * um, DISAGREE)
+
+
+# The longest stick covers this share of the targets' spread.
+_SHARE = 0.25
+_PLANES = ((0, 1), (0, 2), (1, 2))
+
+
+def _sticks(run: Run) -> Figure:
+    """Draw each target as seen by every view: magnified sticks from the target's place, in three planes."""
+    assert run.targets is not None
+    target, residual = residual_vectors(run)
+    place, unit = run.targets.landmarks.positions, run.session.length_unit
+    size = float(np.nanmax(np.ptp(place[target], axis=0))) or 1.0
+    magnified = _SHARE * size / max(float(np.quantile(np.linalg.norm(residual, axis=1), 0.99)), 1e-300)
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    for axes, (a, b) in zip(figure.subplots(1, 3), _PLANES, strict=True):
+        ends = np.stack([place[target], place[target] + magnified * residual], axis=1)[:, :, [a, b]]
+        axes.add_collection(LineCollection(ends.tolist(), colors=BLUE, linewidths=0.4, alpha=0.35))
+        axes.plot(place[:, a], place[:, b], "o", ms=4, color=ORANGE)
+        axes.set(aspect="equal", xlabel=f"{'xyz'[a]} ({unit})", ylabel=f"{'xyz'[b]} ({unit})")
+    figure.suptitle(f"sticks {magnified:.0f} times longer than they are", fontsize=9)
+    return plain(figure)

@@ -1,7 +1,5 @@
-"""Parts of every page: head with verdict and identity, templates, pictures, numbers that stay on one line."""
+"""Parts of every page: head with verdict and identity, templates, numbers that stay on one line."""
 
-import base64
-import io
 import json
 import platform
 import re
@@ -13,50 +11,14 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, select_autoescape
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 from stitch.comparison.run_verdict import ToleranceVerdict
 from stitch.measurement.session import Session
 from stitch.reading.session_folder import session_hash
 from stitch.runs.run import Run
 from stitch.system.files import whole_file
+from stitch.units import MICROMETRES, length_text
 from stitch.writing.diagnosis_document import effect_in_words
-
-# Figures of a page as data addresses, which need nothing beside it.
-
-
-def svg(figure: Figure) -> str:
-    """A figure as a data address, drawn by lines."""
-    return svg_address(svg_text(figure))
-
-
-def svg_text(figure: Figure) -> str:
-    """A figure as the text of an SVG file."""
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
-
-
-def svg_address(text: str) -> str:
-    """The text of an SVG file as a data address."""
-    return _address("svg+xml", text.encode())
-
-
-def png(figure: Figure, dpi: int) -> str:
-    """A figure as a data address, drawn by pixels."""
-    return _address("png", png_bytes(figure, dpi))
-
-
-def png_bytes(figure: Figure, dpi: int) -> bytes:
-    """A figure as the content of a PNG file."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
-    return buffer.getvalue()
-
-
-def _address(kind: str, data: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
-
 
 # Numbers and their units stay on one line.
 
@@ -81,6 +43,7 @@ def render(template: str, **content: object) -> str:
     environment = Environment(
         loader=PackageLoader("viz"), autoescape=select_autoescape(default=True), trim_blocks=True, finalize=_on_one_line
     )
+    environment.filters["script_json"] = lambda data: Markup(script_json(data))
     return environment.get_template(template).render(**content)
 
 
@@ -134,6 +97,29 @@ def _points(session: Session) -> str:
     labelled = sum(len(view.sighting.targets) for view in session.views if view.sighting is not None)
     told = [f"{n:,} {word}" for n, word in ((clouds, "points"), (labelled, "labelled points")) if n]
     return " and ".join(told) or "no points"
+
+
+def round_length(value: float, length_unit: str) -> str:
+    """Return a length as one remembers it: two digits, whole micrometres from a hundred on."""
+    return length_text(value, length_unit, 3 if 100 <= abs(value) * MICROMETRES[length_unit] < 1e3 else 2)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One of the numbers on top of a screen: as it was or is, and as it is or would be."""
+
+    key: str
+    name: str
+    values: Sequence[float]  # one, or two: before and after
+    length_unit: str
+
+    @property
+    def told(self) -> str:
+        """The number, or from where it came to where."""
+        texts = [round_length(value, self.length_unit) for value in self.values]
+        if len(texts) > 1 and texts[0].rpartition(" ")[2] == texts[1].rpartition(" ")[2]:
+            texts[0] = texts[0].rpartition(" ")[0]
+        return " → ".join(texts)
 
 
 @dataclass(frozen=True)

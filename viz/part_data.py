@@ -4,13 +4,12 @@ import base64
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from stitch.comparison.disagreement_field import ModelHistory, full_colour_distance
 from stitch.frames import Array
 from stitch.units import MICROMETRES
-from viz.colours import FIELD, SIGNED
+from viz.colours import signed_colours, unsigned_colours
 from viz.part_surface import Camera, PartSurface
 
 # Arrays as text for a browser, small.
@@ -37,7 +36,7 @@ def packed(numbers: NDArray[Any]) -> str:
 
 # Views whose own field a page holds.
 _VIEWS = 24
-_STOPS = 17
+_STOPS = 31
 
 
 class Extent(NamedTuple):
@@ -90,9 +89,19 @@ def part_data(
             for step in history.steps
         ],
         "views": [
-            {"name": names[v], "means": [_mean_abs(x[v]) for x in own], "steps": [packed_values(x[v]) for x in own]}
+            {
+                "name": names[v],
+                "index": v,
+                "means": [_mean_abs(x[v]) for x in own],
+                "steps": [packed_values(x[v]) for x in own],
+            }
             for v in sorted(int(v) for v in worst)
         ],
+        "names": names,
+        # Of the present model: how far each view lies off the others, how well each place is known, and who sees it.
+        "byView": [float(f"{x:.4g}") if np.isfinite(x) else None for x in history.models[-1].field.by_view * um],
+        "sigma": [round(x, 2) if np.isfinite(x) else None for x in (_standard_error(first.sigma) * um).tolist()],
+        "seen": np.isfinite(first.values).sum(axis=0).tolist(),
         "full": full_colour_distance(first) * um,
         "fullSigned": max(float(np.nanquantile(np.abs(first.values), 0.95)) * um, full_colour_distance(first) * um),
         "colours": colour_stops(),
@@ -110,7 +119,7 @@ def packed_surface(surface: PartSurface, camera: Camera, patches: Array, extent:
     return {
         "vertices": packed(np.round((flat - centre) / size * 32767).astype("<i2")),
         "normals": packed(np.round(surface.normals @ camera.axes.T * 127).astype("i1")),
-        "triangles": packed(surface.triangles.astype("<u4")),
+        "triangles": packed(surface.triangles.astype("<u4" if len(flat) > 65535 else "<u2")),
         "near": packed(surface.patch.astype("<u2")),
         "weight": packed(np.round(surface.weight * 255).astype("u1")),
         "patches": packed_floats((patches @ camera.axes.T - centre) / size),
@@ -126,10 +135,16 @@ def _mean_abs(values: Array) -> float:
     return float(seen.mean()) if len(seen) else 0.0
 
 
+def _standard_error(sigma: Array) -> Array:
+    """(K,) standard error of the mean over the views (V, K) that see a place."""
+    known = np.isfinite(sigma)
+    count = known.sum(axis=0)
+    square = np.where(known, np.nan_to_num(sigma) ** 2, 0.0).sum(axis=0)
+    return np.asarray(np.where(count > 0, np.sqrt(square) / np.maximum(count, 1), np.nan))
+
+
 def colour_stops() -> dict[str, list[list[int]]]:
-    """RGB of both colour maps of a viewer at equal steps."""
-    steps = np.linspace(0, 1, _STOPS)
-    return {
-        kind: [[round(255 * c) for c in colormaps[name](x)[:3]] for x in steps]
-        for kind, name in (("field", FIELD), ("signed", SIGNED))
-    }
+    """Return red, green and blue of both scales of a viewer at equal steps."""
+    place = np.linspace(0, 1, _STOPS)
+    signed, field = signed_colours(2 * place - 1, 1.0), unsigned_colours(place, 1.0)
+    return {"field": field.tolist(), "signed": signed.tolist()}

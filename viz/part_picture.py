@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -12,11 +11,13 @@ from stitch.comparison.disagreement_field import ModelStep
 from stitch.frames import Array, Indices
 from stitch.units import length_text
 from viz.colours import FIELD, unsigned_colours
+from viz.figures import colormap
 from viz.part_surface import Camera, PartSurface
 
-# Light that comes from the eye, a little from above and from the left.
+# Light that comes from the eye, a little from above and from the left: so little shade that no colour turns into
+# another.
 _LIGHT = np.array([-0.25, 0.45, 0.86])
-_AMBIENT = 0.55
+_AMBIENT = 0.84
 DISAGREE = "views disagree by (µm)"
 _PIXELS = 560  # along the longer side of the picture
 _INCHES = 4.4
@@ -52,7 +53,7 @@ def part_picture(
         axes.imshow(painted(surface, camera, seen, unsigned_colours(surface.coloured(values), limit)))
         axes.axis("off")
         axes.set_title(title, fontsize=9)
-    scale = ScalarMappable(Normalize(0, limit), colormaps[FIELD])
+    scale = ScalarMappable(Normalize(0, limit), colormap(FIELD))
     figure.colorbar(scale, ax=panels, label=label, extend="max", shrink=0.8, aspect=30)
     return figure
 

@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 from pykdtree.kdtree import KDTree
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from stitch.comparison.disagreement_field import Patches
 from stitch.errors import NoResultError
-from stitch.frames import Array, Indices
+from stitch.frames import Array, Indices, Mask
 from stitch.runs.run import FusedCloud
 from stitch.system.threads import release_mapped
 from stitch.writing.mesh import TriangleMesh, mesh_of
@@ -63,7 +63,7 @@ def camera_for(points: Array, normals: Array, upright: bool) -> Camera:
 
 
 # Points along the part's longest side: what a screen shows, and a page of a few megabytes holds.
-_FINENESS = 150
+_FINENESS = 120
 # Many for each of the cells; more would not be seen.
 _POINTS = 1_000_000
 # Share of the triangles up to which a piece of surface for itself is not shown.
@@ -99,7 +99,7 @@ def part_surface(fused: FusedCloud, patches: Patches) -> PartSurface:
     triangles = np.zeros((0, 3), np.int64)
     try:
         mesh = mesh_of(points, normals)
-        points, triangles = _whole_pieces(mesh)
+        points, triangles = _level_edges(*_whole_pieces(mesh))
         normals = vertex_normals(points, triangles)
     except NoResultError:
         pass
@@ -123,6 +123,47 @@ def _whole_pieces(mesh: TriangleMesh) -> tuple[Array, Indices]:
     share = np.bincount(piece[a], minlength=piece.max() + 1) / len(a)
     kept, triangles = np.unique(mesh.triangles[share[piece[a]] > _CRUMB], return_inverse=True)
     return mesh.vertices[kept], triangles.reshape(-1, 3).astype(np.int64)
+
+
+# The grid of cells leaves teeth along an edge: what is narrower than twice so many triangles is not shown.
+_TOOTH = 3
+# Steps towards the neighbours along an edge, and the share of the surface that has to be left.
+_EDGE_STEPS, _LEFT = 12, 0.8
+
+
+def _level_edges(vertices: Array, triangles: Indices) -> tuple[Array, Indices]:
+    """Vertices and triangles without teeth along open edges (an opening of the surface), the edges levelled."""
+    count = len(vertices)
+    sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    next_to = coo_matrix((np.ones(len(sides), np.int32), (sides[:, 0], sides[:, 1])), shape=(count, count)).tocsr()
+    next_to = next_to + next_to.T
+    gone = _on_open_edge(vertices, triangles)[0]
+    for _ in range(_TOOTH - 1):
+        gone = gone | (next_to @ gone > 0)
+    kept = ~gone
+    for _ in range(_TOOTH):
+        kept = kept | (next_to @ kept > 0)
+    inside = kept[triangles].all(axis=1)
+    if inside.mean() < _LEFT:
+        return vertices, triangles
+    used, own = np.unique(triangles[inside], return_inverse=True)
+    vertices, triangles = vertices[used].copy(), own.reshape(-1, 3).astype(np.int64)
+    on_edge, links = _on_open_edge(vertices, triangles)
+    # Where edges meet the corner stays.
+    along = np.flatnonzero(on_edge & (np.asarray(links.sum(axis=1)).ravel() == 2))
+    for _ in range(_EDGE_STEPS):
+        vertices[along] = 0.5 * vertices[along] + 0.25 * (links[along] @ vertices)
+    return vertices, triangles
+
+
+def _on_open_edge(vertices: Array, triangles: Indices) -> tuple[Mask, csr_matrix]:
+    """(N,) which vertices are on an open edge, and (N, N) which of them follow one another along it."""
+    count = len(vertices)
+    sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    key, times = np.unique(sides[:, 0] * count + sides[:, 1], return_counts=True)
+    a, b = key[times == 1] // count, key[times == 1] % count
+    links = coo_matrix((np.ones(2 * len(a)), (np.append(a, b), np.append(b, a))), shape=(count, count)).tocsr()
+    return np.asarray(links.sum(axis=1)).ravel() > 0, links
 
 
 def _thinned(fused: FusedCloud) -> tuple[Array, Array]:

@@ -14,13 +14,13 @@ from stitch.runs.run import Run, StageResult
 from stitch.units import MICROMETRES, length_text
 from stitch.writing.diagnosis_document import effect_in_words
 from viz.blueprint import log_colour_bar, model_blueprint, target_blueprint
-from viz.colours import COLOURS_OF_FEW, FIELD, GREY, robust_limit, unsigned_colours
+from viz.colours import COLOURS_OF_FEW, GREY, robust_limit, unsigned_colours
 from viz.diagnosis_recording import NOT_YET
 from viz.model_timeline import log_model, model_scene
 from viz.part_surface import camera_for, part_surface
 from viz.robot_scene import log_robot
 from viz.rrd_file import RecordingFile, id_of, words
-from viz.run_figures import residual_vectors, view_shifts
+from viz.run_numbers import residual_vectors, view_shifts
 
 # What a run found, as Markdown for the recording.
 
@@ -95,9 +95,7 @@ class RerunRecorder:
             log_model(rec, run, scene, camera.up)
             full = scene.limit * um
             fell = tuple(stage for stage, rms in self.rms.items() if rms[-1] < _FELL * rms[0])
-            log_colour_bar(
-                rec, "colours/field", FIELD, ["0", f"{full / 2:.3g}", f"{full:.3g} µm"], "seen by one view only"
-            )
+            log_colour_bar(rec, "colours/field", ["0", f"{full / 2:.3g}", f"{full:.3g} µm"], "seen by one view only")
             rec.send_blueprint(model_blueprint(scene, camera, run, fell))
         file.write()
 

@@ -10,7 +10,7 @@ from stitch.frames import Array
 from stitch.measurement.robot import LinkMesh, Robot, link_frames
 from stitch.runs.run import Run
 from viz.colours import view_colours
-from viz.run_figures import shown_points
+from viz.run_numbers import shown_points
 
 if TYPE_CHECKING:
     import trimesh

@@ -6,18 +6,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch.comparison.disagreement_field import ModelHistory, effect_changes, full_colour_distance, model_history
+from stitch.comparison.disagreement_field import ModelHistory, effect_changes, model_history
 from stitch.comparison.run_verdict import run_headline, run_light
 from stitch.model.model import expanded_uncertainty, uncertainty_scope
-from stitch.runs.run import Run
+from stitch.runs.run import Run, doubt_headline
 from stitch.units import MICROMETRES, value_uncertainty_text
-from viz import captions, run_figures
-from viz.history_figures import waterfall
-from viz.page_parts import Head, Subject, identity, png, script_json, svg, write_page
+from viz import captions
+from viz.page_parts import Head, Subject, Tile, identity, script_json, write_page
 from viz.part_data import part_data
-from viz.part_picture import DISAGREE, part_picture, step_shown
 from viz.part_surface import camera_for, part_surface
-from viz.run_figures import shown_points, view_shifts
+from viz.run_numbers import shown_points, view_shifts
 from viz.target_scene import target_scene
 
 # Tables of the page of a run, as rows of plain values.
@@ -120,8 +118,19 @@ def matrix(run: Run) -> str:
     return "pose = " + "[\n  " + ",\n  ".join(str([float(f"{x:.12g}") for x in row]) for row in run.T_mount) + ",\n]"
 
 
-# Views that are listed before the others are folded.
-_FIRST = 6
+def ledger_rows(run: Run) -> list[dict[str, Any]]:
+    """Return a row for every model that was fitted: its name and its errors, µm."""
+    um = MICROMETRES[run.session.length_unit]
+    largest = np.nanmax([step.heldout_rms for step in run.ledger]) if run.ledger else 1.0
+    return [
+        {
+            "name": effect_changes(run.ledger, i),
+            "rms": step.residual_rms * um,
+            "heldout": step.heldout_rms * um,
+            "share": 100 * float(np.nan_to_num(step.heldout_rms / largest)),
+        }
+        for i, step in enumerate(run.ledger)
+    ]
 
 
 def write_report(run: Run, path: Path, tolerance: float | None = None) -> None:
@@ -131,45 +140,61 @@ def write_report(run: Run, path: Path, tolerance: float | None = None) -> None:
         tolerance: within which the views have to agree on the part, length_unit.
     """
     history = model_history(run)
-    write_page(path, "report.html.j2", _head(run, history, tolerance), **_content(run, history))
+    write_page(path, "report.html.j2", _head(run, history, tolerance), **_content(run, history, tolerance))
 
 
 def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> Head:
     light = None if tolerance is None else run_light(run, history, tolerance)
     gone = [f"View {item.view} does not fit its robot pose and was left out: {item.why}." for item in run.left_out]
     hidden = [f"Not observable from these motions: {direction}." for direction in run.unobservable]
+    # What is doubted comes first, alone; without a doubt how far the views agree.
+    doubted, agreement = " ".join(map(doubt_headline, run.doubts)), run_headline(run, history)
+    agreement = agreement.removeprefix(doubted).strip()
     return Head(
         title=run.session.name,
-        verdict=run_headline(run, history),
-        doubts=run.doubts,
+        verdict=doubted or agreement,
         subjects=[Subject(identity(run))],
         lights=[] if light is None else [light],
-        evidence=run.verdict,
+        evidence=f"{agreement} {run.verdict}" if doubted else run.verdict,
         notes=[*gone, *hidden],
     )
 
 
-def _content(run: Run, history: ModelHistory | None) -> dict[str, object]:
-    unit = run.session.length_unit
-    rows = view_rows(run, history)
+def _content(run: Run, history: ModelHistory | None, tolerance: float | None) -> dict[str, object]:
+    um = MICROMETRES[run.session.length_unit]
     return {
         "run": run,
-        "um": MICROMETRES[unit],
+        "um": um,
+        "doubts": run.doubts,
+        "tolerance": None if tolerance is None else tolerance * um,
+        "tiles": run_tiles(run, history),
         "part": shown_part(run, history),
         "surfaces": history is not None,
-        "first": rows[:_FIRST],
-        "rest": rows[_FIRST:],
+        "views": view_rows(run, history),
         "hand_eye": hand_eye_rows(run),
         "uncertainty": uncertainty_scope(None),
         "hand_eye_matrix": matrix(run),
         "mount_frame": "base" if run.session.mount == "eye_to_hand" else "flange",
         "effects": effect_rows(run),
-        "waterfall": (svg(waterfall(run.ledger, unit)), captions.WATERFALL) if len(run.ledger) > 1 else None,
         "steps": [] if history is None else history.steps,
+        "ledger": ledger_rows(run),
         "notes": note_rows(run),
-        "pictures": _pictures(run),
         "targets": target_rows(run),
     }
+
+
+def run_tiles(run: Run, history: ModelHistory | None) -> list[Tile]:
+    """Return the three numbers of a run: those of the model before and of the present one."""
+    unit, before = run.session.length_unit, len(run.ledger) > 1
+    heldout = [step.heldout_rms for step in run.ledger[-2:]] if before else [run.heldout_or_fit_rms]
+    tiles = [Tile("heldout", "rms, views left out", heldout, unit)]
+    if history is not None:
+        fields = [step.field for step in history.models[-2:]]
+        tiles += [
+            Tile("mean", "mean on the part", [field.mean_abs for field in fields], unit),
+            Tile("worst", "worst place", [float(np.nanmax(field.overall)) for field in fields], unit),
+        ]
+    return tiles
 
 
 def shown_part(run: Run, history: ModelHistory | None) -> dict[str, Any] | None:
@@ -178,40 +203,32 @@ def shown_part(run: Run, history: ModelHistory | None) -> dict[str, Any] | None:
 
 
 def _part(run: Run, history: ModelHistory) -> dict[str, Any]:
-    """Data of the viewer, and the still picture in its place."""
-    um, steps = MICROMETRES[run.session.length_unit], history.steps
+    """Data of the viewer, and its words."""
     surface = part_surface(run.fused, history.patches)
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
-    names = run.session.names
-    data = part_data(surface, camera, history, names, run.session.length_unit)
-    # Coarse is so far off that all would be red.
-    shown = [step_shown(step, um) for step in steps[1:]]
-    still = part_picture(surface, camera, shown[-4:], full_colour_distance(history.models[0].field) * um, DISAGREE)
-    words = {"title": "Where the views disagree", "caption": captions.FIELD, "handling": captions.HANDLING}
-    words |= {"alt": "The part, coloured by how far the views disagree, at every step of the model"}
-    return {"data": script_json(data), "still": png(still, 110), **words}
+    data = part_data(surface, camera, history, run.session.names, run.session.length_unit)
+    return {
+        "data": script_json(data),
+        "title": "Where the views disagree",
+        "scale": "Views disagree by (µm)",
+        "caption": captions.FIELD,
+        "handling": captions.HANDLING,
+        "alt": "The part in 3D, coloured by how far the views disagree.",
+    }
 
 
 def _targets(run: Run) -> dict[str, Any] | None:
     """The same of labelled points; None where there are none."""
     scene = target_scene(run)
-    caption = captions.CARRIED_TARGETS if run.session.mount == "eye_to_hand" else captions.SEEN_TARGETS
-    words = {"title": "Where the targets lie off", "caption": caption, "handling": captions.HANDLING}
-    words |= {"alt": "The targets, coloured by how far the views see them off their place, at every step of the model"}
-    return None if scene is None else scene | words
-
-
-def _pictures(run: Run) -> list[tuple[str, str, str]]:
-    """Return the pictures of a run: those of overlaps or those of targets."""
-    out = []
-    if run.targets is not None:
-        out += [
-            ("Targets, as every view puts them", png(run_figures.sticks(run), 130), captions.STICKS),
-            ("Distance of the targets", svg(run_figures.errors(run)), captions.TARGETS),
-        ]
-    if run.overlaps is not None:
-        out += [
-            ("What register did to every view", svg(run_figures.per_view(run)), captions.PER_VIEW),
-            ("The error, iteration by iteration", svg(run_figures.convergence(run)), captions.CONVERGENCE),
-        ]
-    return out
+    return (
+        None
+        if scene is None
+        else {
+            "data": script_json(scene),
+            "title": "Where the targets lie off",
+            "scale": "Targets lie off by (µm)",
+            "caption": captions.CARRIED_TARGETS if run.session.mount == "eye_to_hand" else captions.SEEN_TARGETS,
+            "handling": captions.HANDLING,
+            "alt": "The targets in 3D, coloured by how far off their place they are seen.",
+        }
+    )

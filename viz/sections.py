@@ -1,12 +1,10 @@
-"""Add comparison and diagnosis to a run folder: sections of the page, pictures, a tab of the recording."""
+"""Add diagnosis and comparison to a run folder: the screen and the evidence of its page, a tab of its recording."""
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from markupsafe import escape
-from matplotlib.figure import Figure
 
 from stitch.comparison.residual_tables import ResidualTables
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
@@ -16,84 +14,110 @@ from stitch.runs.run import Run
 from stitch.system.files import whole_file
 from stitch.units import MICROMETRES, length_text
 from stitch.writing.diagnosis_document import (
+    diagnosis_screen,
     effect_description,
     largest_error_sources,
     plain_finding,
     suggested_command,
 )
+from stitch.writing.finding_screen import CandidateFields, candidate_fields
 from viz import captions
-from viz import diagnosis_figures as draw
-from viz.diagnosis_figures import budget, comparison, joint_courses, scanner_field, time_course
-from viz.diagnosis_recording import CandidateFields, add_diagnosis, candidate_fields, packed_candidates
-from viz.page_parts import render, script_json, svg_address, svg_text, unbroken
+from viz.diagnosis_plots import Plots, alias_rows, budget_rows, comparison_plots, diagnosis_plots
+from viz.diagnosis_recording import add_diagnosis
+from viz.page_parts import Tile, render, script_json, unbroken
+from viz.part_data import colour_stops
 
 # Candidate effects in the table of the page.
 _SHOWN = 8
+# Verdicts that name what is missing: the screen shows what adding it would change.
+_NAMING = ("missing_effect", "cannot_tell")
 
 
 def write_diagnosis(found: Diagnosis, state: Run, folder: Path) -> None:
-    """Section of report.html, pictures/*.svg and *.png, a tab of the recording."""
-    pictures = _pictures(found, state.session.length_unit)
-    addresses = _save(folder / "pictures", {name: picture.figure for name, picture in pictures.items()})
-    unit, fields = state.session.length_unit, candidate_fields(found)
-    plain = plain_finding(found, unit)
-    lacking = sorted({need for needs in found.missing.values() for need in needs})
-    html = render(
-        "diagnosis.html.j2",
-        found=found,
-        plain=plain,
-        rows=_rows(found, fields, MICROMETRES[unit]),
-        field=None if fields is None else script_json(packed_candidates(fields, unit)),
-        lacking=[(need, [name for name, needs in found.missing.items() if need in needs]) for need in lacking],
-        unseen=[s.name for s in found.candidates if not s.ranked.score.observable],
-        pictures=[(pictures[name].title, address, pictures[name].caption) for name, address in addresses.items()],
-    )
-    _insert(folder / "report.html", "diagnosis", html)
-    why, command = suggested_command(found, "RUN").rsplit(": ", 1)
-    then = f'<p class="evidence">{escape(why)}: <code>{escape(command)}</code>, RUN the folder of this page.</p>'
-    _insert(folder / "report.html", "finding", f'<p class="finding">{escape(unbroken(plain))}</p>{then}')
-    _insert(folder / "report.html", "uncertainty", f'<p class="soft">{uncertainty_scope(found.verdict)}</p>')
-    add_diagnosis(found, fields, unit, folder / "recording.rrd")
+    """Put a diagnosis on the screen and into the evidence of report.html, and into the recording."""
+    unit, screen = state.session.length_unit, diagnosis_screen(found)
+    shown = {"verdict": found.verdict, "named": list(found.effects), "um": MICROMETRES[unit], "colours": colour_stops()}
+    data = script_json({key: screen[key] for key in ("now", "why", "candidates", "places")} | shown)
+    parts = {
+        "finding": f'<p class="verdict">{_words(screen["headline"])}</p>\n'
+        f'<p class="evidence">{_words(screen["proof"])}</p>',
+        "doubts": render("doubts.html.j2", doubts=screen["doubts"]),
+        "missing": render("missing.html.j2", **_bars(found, screen, unit)),
+        "next": _next(found),
+        "screen": f'<script type="application/json" id="screen-data">{data}</script>',
+        "diagnosis": _evidence(found, unit),
+        "uncertainty": f'<p class="soft">{uncertainty_scope(found.verdict)}</p>',
+    }
+    if found.verdict in _NAMING and screen["candidates"]:
+        parts["numbers"] = render("tiles.html.j2", tiles=_tiles(screen, unit))
+    _insert(folder / "report.html", parts)
+    add_diagnosis(found, screen, unit, folder / "recording.rrd")
 
 
-class _Picture(NamedTuple):
-    title: str
-    figure: Figure | None  # where there is nothing to draw
-    caption: str
+def _words(text: str) -> str:
+    return str(escape(unbroken(text)))
 
 
-def _pictures(found: Diagnosis, unit: str) -> dict[str, _Picture]:
-    """File name → picture, in the order of the page."""
-    predicted = "What the views show against what the first candidate effects predict"
-    curves = joint_courses(found) if found.curves else None
-    in_time = None if found.time_curve is None else time_course(found, found.time_curve, unit)
+def _tiles(screen: dict[str, Any], unit: str) -> list[Tile]:
+    """Return the three numbers now, and with the candidate that is named."""
+    best, now = screen["candidates"][0], screen["now"]
+    names = {"heldout": "rms, views left out", "mean": "mean on the part", "worst": "worst place"}
+    return [
+        Tile(key, name, [now[key]] if best[key] is None else [now[key], best[key]], unit)
+        for key, name in names.items()
+        if now[key] is not None
+    ]
+
+
+def _bars(found: Diagnosis, screen: dict[str, Any], unit: str) -> dict[str, Any]:
+    """Return a bar of the error on views left out for the model as it is and for each candidate."""
+    rows = [{"words": "nothing added", "effect": "", "heldout": screen["now"]["heldout"]}, *screen["candidates"]]
+    most = max(row["heldout"] or 0.0 for row in rows) or 1.0
+    um = MICROMETRES[unit]
+    bars = [
+        {
+            "words": row["words"],
+            "effect": row["effect"],
+            "told": "–" if row["heldout"] is None else f"{row['heldout'] * um:.2g}",
+            "share": 100 * (row["heldout"] or 0.0) / most,
+            "noise": 100 * screen["noise"] / most,
+            "best": row["effect"] in found.effects,
+            "shown": bool(row["effect"]),
+        }
+        for row in rows
+    ]
+    tried = sum(c.ranked.score.observable for c in found.candidates)
+    title = "Tried beside the model" if found.verdict == "adequate" else "What is missing?"
     return {
-        "joint_courses": _Picture("Where and when a joint errs without a name", curves, captions.COURSES),
-        "time_course": _Picture("When in the session poses err without a name", in_time, captions.TIME_COURSE),
-        "field_map": _field_map(found, unit),
-        "budget": _Picture("Where the error comes from", budget(found, unit), _of_budget(found)),
-        "candidates": _Picture("How likely each candidate effect is", draw.candidates(found), captions.CANDIDATES),
-        "added_variable": _Picture(predicted, draw.added_variable(found), captions.ADDED_VARIABLE),
-        "shape": _Picture("What the unexplained displacement follows", draw.shape(found, unit), captions.SHAPE),
-        "aliases": _Picture("Aliases in these views", draw.alias_picture(found), captions.ALIASES),
-        "views": _Picture("Displacement of every view from the model", draw.view_arrows(found, unit), captions.VIEWS),
+        "title": title,
+        "bars": bars,
+        "noise": length_text(screen["noise"], unit, 2),
+        "others": tried - len(screen["candidates"]),
     }
 
 
-def _field_map(found: Diagnosis, unit: str) -> _Picture:
-    """Draw the errors of the scanner over its field, if any were found."""
-    title, shown = (
-        "How the scanner errs over its field",
-        None if found.scanner_error is None else found.scanner_error.map,
+def _next(found: Diagnosis) -> str:
+    why, command = suggested_command(found, "RUN").rsplit(": ", 1)
+    why = "Type, with RUN the folder of this page" if why == "Next" else f"{why.removeprefix('Next, ').capitalize()}"
+    return f'<div class="card next"><h2>Next</h2><p>{_words(why)}:</p><p><code>{escape(command)}</code></p></div>'
+
+
+def _evidence(found: Diagnosis, unit: str) -> str:
+    """Return sentences, candidates, budget and plots of a diagnosis as a section of the page."""
+    lacking = sorted({need for needs in found.missing.values() for need in needs})
+    return render(
+        "diagnosis.html.j2",
+        found=found,
+        plain=plain_finding(found, unit),
+        rows=_rows(found, candidate_fields(found), MICROMETRES[unit]),
+        lacking=[(need, [name for name, needs in found.missing.items() if need in needs]) for need in lacking],
+        unseen=[s.name for s in found.candidates if not s.ranked.score.observable],
+        budget=budget_rows(found, unit),
+        budget_caption=captions.BUDGET if largest_error_sources(found.budget) else captions.MEAN_SQUARES,
+        plots=diagnosis_plots(found, unit),
+        aliases=alias_rows(found),
+        alias_caption=captions.ALIASES,
     )
-    if shown is None:
-        return _Picture(title, None, "")
-    size, sigma = (length_text(x, unit, 2) for x in (shown.rms, shown.uncertainty))
-    return _Picture(title, scanner_field(shown, unit), captions.SCANNER_FIELD.format(size=size, sigma=sigma))
-
-
-def _of_budget(found: Diagnosis) -> str:
-    return captions.BUDGET if largest_error_sources(found.budget) else captions.MEAN_SQUARES
 
 
 def _rows(found: Diagnosis, fields: CandidateFields | None, um: float) -> list[dict[str, str]]:
@@ -122,42 +146,24 @@ def _rms(found: Diagnosis, candidate: CandidateEffect, which: int, um: float) ->
 
 
 def write_comparison(found: ResidualTables, state: Run, folder: Path) -> None:
-    """Section of report.html and pictures/compare.*."""
-    figure = comparison(found, state.session.length_unit)
-    picture = _save(folder / "pictures", {"compare": figure})["compare"]
-    um = MICROMETRES[state.session.length_unit]
+    """Put a comparison into the evidence of report.html."""
+    unit = state.session.length_unit
+    um = MICROMETRES[unit]
+    title = f"Where model and measurement differ ({found.rms * um:.1f} µm rms)"
     worst = []
     for table in found.labelled:
         worst.append((table.name, ", ".join(f"{table.label[i]} {table.rms[i] * um:.1f}" for i in table.worst(5))))
-    html = render("comparison.html.j2", picture=picture, caption=captions.COMPARISON, worst=worst, rms=found.rms * um)
-    _insert(folder / "report.html", "comparison", html)
+    one = Plots(title, captions.COMPARISON, comparison_plots(found, unit))
+    _insert(folder / "report.html", {"comparison": render("comparison.html.j2", one=one, worst=worst)})
 
 
-def _insert(page: Path, name: str, html: str) -> None:
-    """Put a section between its marks; a page from elsewhere without marks stays as it is."""
+def _insert(page: Path, parts: dict[str, str]) -> None:
+    """Put sections between their marks; a page from elsewhere without marks stays as it is."""
     if not page.is_file():
         return
-    begin, end = f"<!-- {name} begins -->", f"<!-- {name} ends -->"
     text = page.read_text(encoding="utf-8")
-    new = re.sub(f"{begin}.*?{end}", lambda _: begin + html + end, text, flags=re.S)
+    for name, html in parts.items():
+        begin, end = f"<!-- {name} begins -->", f"<!-- {name} ends -->"
+        text = re.sub(f"{begin}.*?{end}", lambda _, own=begin + html + end: own, text, flags=re.S)
     with whole_file(page) as file:
-        file.write_text(new, encoding="utf-8")
-
-
-def _save(folder: Path, figures: Mapping[str, Figure | None]) -> dict[str, str]:
-    """Each figure as SVG and PNG, none that an earlier one left where there is none; the SVG's data address by name."""
-    folder.mkdir(exist_ok=True)
-    addresses = {}
-    for name, figure in figures.items():
-        if figure is None:
-            for ending in ("png", "svg"):
-                (folder / f"{name}.{ending}").unlink(missing_ok=True)
-            continue
-        text = svg_text(figure)
-        figure.set_layout_engine("none")  # found once; it takes half of the time of a drawing
-        with whole_file(folder / f"{name}.png") as file:
-            figure.savefig(file, format="png", dpi=120)
-        with whole_file(folder / f"{name}.svg") as file:
-            file.write_text(text, encoding="utf-8")
-        addresses[name] = svg_address(text)
-    return addresses
+        file.write_text(text, encoding="utf-8")

@@ -9,11 +9,9 @@ from stitch import frames
 from stitch.comparison.disagreement_field import TargetStep, target_history
 from stitch.frames import Array, Indices
 from stitch.runs.run import Run
-from stitch.units import MICROMETRES, length_text
+from stitch.units import MICROMETRES
 from viz.colours import robust_limit
-from viz.page_parts import png, script_json
 from viz.part_data import colour_stops, extent_of, packed_surface, packed_values
-from viz.part_picture import part_picture
 from viz.part_surface import Camera, PartSurface, camera_for
 
 if TYPE_CHECKING:
@@ -218,8 +216,8 @@ _PICTURE = "The targets in 3D, coloured by how far off their place they are seen
 _ENDS = ["on their place", "off their place"]
 
 
-def target_scene(run: Run) -> dict[str, str] | None:
-    """Data of the viewer (JSON) and the still picture in its place; None where no targets were seen."""
+def target_scene(run: Run) -> dict[str, Any] | None:
+    """Return the data of the viewer; None where no targets were seen."""
     steps = target_history(run)
     if run.targets is None or not steps:
         return None
@@ -227,14 +225,8 @@ def target_scene(run: Run) -> dict[str, str] | None:
     values = [step_values(run, marks, step) * um for step in steps]
     limit = robust_limit(values[1])
     surface, camera = bodies(marks), camera_of(marks)
-    shown = [
-        (f"{step.name}\n{length_text(step.rms * um / 1e3, 'mm')} rms", own)
-        for step, own in zip(steps[1:], values[1:], strict=True)
-    ]
-    still = part_picture(surface, camera, shown[-4:], limit, "targets lie off by (µm)")
     packed = packed_surface(surface, camera, marks.T[:, :3, 3], extent_of(surface.vertices, camera))
-    told = _told(run, steps, values, limit) | {"marks": _names(run, marks)}
-    return {"data": script_json(packed | told), "still": png(still, 110)}
+    return packed | _told(run, steps, values, limit) | {"marks": _names(run, marks)}
 
 
 def step_values(run: Run, marks: Marks, step: TargetStep) -> Array:
@@ -256,6 +248,7 @@ def _told(run: Run, steps: tuple[TargetStep, ...], values: list[Array], limit: f
             for step, own in zip(steps, values, strict=True)
         ],
         "views": [],
+        "names": run.session.names,
         "full": limit,
         "colours": colour_stops(),
         "words": {"picture": _PICTURE, "all": _SEEN, "ends": _ENDS},

@@ -12,10 +12,8 @@ from stitch.frames import Array
 from stitch.runs.run import Run
 from stitch.units import MICROMETRES, length_text, value_uncertainty_text
 from viz import captions
-from viz.history_figures import two_bars
-from viz.page_parts import Head, Subject, identity, png, script_json, svg, write_page
+from viz.page_parts import Head, Subject, identity, script_json, write_page
 from viz.part_data import Extent, extent_of, part_data
-from viz.part_picture import DISAGREE, part_picture, step_shown
 from viz.part_surface import Camera, PartSurface, camera_for, part_surface
 
 
@@ -206,7 +204,6 @@ def _content(both: TwoRuns) -> dict[str, object]:
         "parts": _parts(both),
         "caption": captions.TWO_FIELDS,
         "handling": captions.HANDLING_OF_TWO,
-        "bars": svg(two_bars(both.a.run, both.b.run)),
         "errors": error_rows(both),
         "differing": [row for row in known if row.differs],
         "alike": [row for row in known if not row.differs],
@@ -252,18 +249,14 @@ def _parts(both: TwoRuns) -> list[dict[str, Any]]:
     ]
     limit = max(full_colour_distance(own.models[0].field) for own in histories) * um
     signed = max(own["fullSigned"] for own in data)
-    out = []
-    for i, letter in enumerate("AB"):
-        shown = [step_shown(step, um) for step in histories[i].steps[-2:]]
-        out.append(
-            {
-                "id": f"part-{letter.lower()}",
-                "name": f"{letter}: {sides[i].name}",
-                "data": script_json(data[i] | {"full": limit, "fullSigned": signed}),
-                "still": png(part_picture(surfaces[i], cameras[i], shown, limit, DISAGREE), 100),
-            }
-        )
-    return out
+    return [
+        {
+            "id": f"part-{letter.lower()}",
+            "name": f"{letter}: {side.name}",
+            "data": script_json(own | {"full": limit, "fullSigned": signed}),
+        }
+        for letter, side, own in zip("AB", sides, data, strict=True)
+    ]
 
 
 def _extents(surfaces: list[PartSurface], cameras: list[Camera], one_place: bool) -> list[Extent]:

@@ -59,9 +59,8 @@ def show_comparison(comparison: ResidualTables, state: Run, run: Path) -> None:
         _show_table(terminal, group, comparison, to_um)
     if rest := [_group_chance(comparison, group) for group in comparison.groups[_LISTED_TABLES:]]:
         terminal.print(f"Less clear (p = 1 where none is given): {'; '.join(rest)}.", soft_wrap=True)
-    for file in ("compare.json", "pictures/compare.png"):
-        if (run / file).exists():
-            terminal.print(f"  {run / file}")
+    if (run / "compare.json").exists():
+        terminal.print(f"  {run / 'compare.json'}")
     terminal.print(_next_command(run), soft_wrap=True)
 
 

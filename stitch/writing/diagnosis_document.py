@@ -236,8 +236,13 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         "field_map": _field_map(d.scanner_error),
         "views": d.linear.measurement.views.count,
         "evidence": d.linear.mixed.size,
-        "screen": finding_screen(d, _WORDS),
+        "screen": diagnosis_screen(d),
     }
+
+
+def diagnosis_screen(found: Diagnosis) -> dict[str, Any]:
+    """Return what one screen shows of a diagnosis."""
+    return finding_screen(found, _WORDS)
 
 
 def _curve(curve: JointCurve) -> dict[str, Any]:

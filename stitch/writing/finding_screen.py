@@ -75,12 +75,22 @@ def compared(found: Diagnosis) -> list[CandidateEffect]:
 # The screen as a dictionary.
 
 
+_last_screen: tuple[weakref.ref[Diagnosis], dict[str, Any]] | None = None
+
+
 def finding_screen(found: Diagnosis, descriptions: dict[str, str]) -> dict[str, Any]:
-    """Return the screen of a diagnosis; lengths in length_unit, angles in rad.
+    """Return the screen of the diagnosis that was asked for last; lengths in length_unit, angles in rad.
 
     Args:
         descriptions: effects in a few words.
     """
+    global _last_screen
+    if _last_screen is None or _last_screen[0]() is not found:
+        _last_screen = weakref.ref(found), _screen(found, descriptions)
+    return _last_screen[1]
+
+
+def _screen(found: Diagnosis, descriptions: dict[str, str]) -> dict[str, Any]:
     fields = candidate_fields(found)
     courses = {c.name: course_of_candidate(found.linear, c.ranked.score) for c in compared(found)}
     why = _why(found, courses)

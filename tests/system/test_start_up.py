@@ -62,3 +62,7 @@ def test_an_arm_without_meshes_needs_no_library_of_meshes():
 
 def test_a_batch_on_one_process_needs_no_cluster():
     assert not loaded("import stitch.cli.batch") & {"distributed", "dask", "tornado", "asyncio"}
+
+
+def test_page_recording_and_diagnosis_are_drawn_without_a_plotting_library():
+    assert "matplotlib" not in loaded("import viz.recording, viz.run_page, viz.sections, viz.two_runs_page")

@@ -1,6 +1,7 @@
 """Runs on labelled points where people look: page, page of two runs, review, terminal."""
 
 import base64
+import html
 import json
 import re
 import shutil
@@ -48,7 +49,10 @@ def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, caps
     assert diagnosed.startswith(f"{finding['plain']} {finding['sentence']}")
     assert (state["diagnosis"]["plain"], state["diagnosis"]["sentence"]) == (finding["plain"], finding["sentence"])
     page = (run / "report.html").read_text()
-    assert page.count(unbroken(finding["plain"])) == 2  # on top, and where the evidence stands
+    assert page.count(unbroken(finding["plain"])) == 1  # where the evidence stands
+    screen = finding["screen"]
+    assert all(unbroken(said) in html.unescape(page) for said in (screen["headline"], screen["proof"]))
+    assert screen["candidates"][0]["effect"] == "joint_offset" and screen["why"]["of"].startswith("joint ")
     holds = "U of the hand-eye holds for a complete model"
     assert f"{holds}; whether an effect is missing has not been asked" in (before / "report.html").read_text()
     assert all(

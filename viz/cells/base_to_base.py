@@ -16,7 +16,8 @@ from stitch.frames import Array
 from stitch.units import MICROMETRES
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
-from viz.colours import BLUE, GREEN, ORANGE, above
+from viz.colours import BLUE, GREEN, ORANGE
+from viz.figures import above
 from viz.page_parts import Row
 
 # Figures of two robots joined by a stand; each function returns a Figure.

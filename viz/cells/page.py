@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from stitch.comparison.run_verdict import ToleranceVerdict
 from stitch.reading.session_folder import UNKNOWN, content_hash
-from viz.page_parts import Head, Row, Subject, page_written, png, svg, versions, write_page
+from viz.figures import png, svg
+from viz.page_parts import Head, Row, Subject, page_written, versions, write_page
 
 # What the page of a measuring cell is about: the same block as on the page of a run.
 

@@ -15,7 +15,8 @@ from stitch.comparison.run_verdict import ToleranceVerdict
 from stitch.frames import Array, Indices
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
-from viz.colours import BLUE, DARK, GREEN, ORANGE, SIGNED, YELLOW, above, signed_colours
+from viz.colours import BLUE, DARK, GREEN, ORANGE, SIGNED, YELLOW, signed_colours
+from viz.figures import above, colormap
 from viz.page_parts import Row
 
 
@@ -50,7 +51,9 @@ def shape(job: PanelJob, result: PanelResult) -> Figure:
     for ax, (title, values) in zip(axes, shown, strict=True):
         _draw_panel(ax, job, result)
         at = _unrolled(job, job.control.nominal)
-        drawn = ax.scatter(*at.T, c=values, s=70, cmap=SIGNED, vmin=-limit, vmax=limit, edgecolor="0.3", zorder=3)
+        drawn = ax.scatter(
+            *at.T, c=values, s=70, cmap=colormap(SIGNED), vmin=-limit, vmax=limit, edgecolor="0.3", zorder=3
+        )
         _write_values(ax, at, values, job.control.clamp)
         ax.set(title=f"{title}: {np.abs(values).max():.2f} mm at most", xlabel="along the panel's axis (mm)")
     axes[0].set_ylabel("around it (mm)")

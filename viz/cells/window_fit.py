@@ -14,6 +14,7 @@ from stitch.frames import Array
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, ORANGE, SIGNED, signed_colours
+from viz.figures import colormap
 from viz.page_parts import Row
 
 # Pictures of a scan on its CAD: the deviation map, and how all distances are spread.
@@ -37,7 +38,7 @@ def deviation_map(found: Deviations, unit: str) -> Figure:
     ax = figure.subplots()
     pick = np.linspace(0, len(found.points) - 1, min(len(found.points), _MAP_POINTS)).astype(int)
     order = pick[np.argsort(np.abs(found.distance[pick]))]
-    colours = {"c": found.distance[order], "cmap": SIGNED, "vmin": -found.tolerance, "vmax": found.tolerance}
+    colours = {"c": found.distance[order], "cmap": colormap(SIGNED), "vmin": -found.tolerance, "vmax": found.tolerance}
     drawn = ax.scatter(found.points[order, i], found.points[order, j], s=5, lw=0, **colours)
     bad = found.cells.middle[found.outside]
     if len(bad):

@@ -58,3 +58,18 @@ function partEye(canvas, box, from, moved, clicked) {
     set(eye) { ({ yaw, pitch, zoom, panX, panY } = eye); },
   };
 }
+
+// The vertex nearest to the eye within a few pixels of a click tells which place was meant; -1 where there is none.
+function nearestVertex({ vertices, count }, canvas, look, e) {
+  const box = canvas.getBoundingClientRect(), m = look.turn(), [sx, sy] = look.scales(), [panX, panY] = look.shift();
+  const x = 2 * (e.clientX - box.left) / box.width - 1, y = 1 - 2 * (e.clientY - box.top) / box.height;
+  const near2 = (14 / Math.min(box.width, box.height)) ** 2;
+  let best = -1, depth = -Infinity;
+  for (let i = 0; i < count; i++) {
+    const [p, q, r] = [0, 1, 2].map(k => vertices[3 * i + k] / 32767);
+    const u = (m[0] * p + m[3] * q + m[6] * r) * sx + panX - x, v = (m[1] * p + m[4] * q + m[7] * r) * sy + panY - y;
+    const z = m[2] * p + m[5] * q + m[8] * r;
+    if (u * u + v * v < near2 && z > depth) { best = i; depth = z; }
+  }
+  return best;
+}

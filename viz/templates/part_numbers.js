@@ -6,7 +6,7 @@ const UNKNOWN = -1e9;  // a value that nobody knows
 function partNumbers(data) {
   const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
   const vertices = new Int16Array(bytes(data.vertices)), normals = new Int8Array(bytes(data.normals));
-  const triangles = new Uint32Array(bytes(data.triangles)), near = new Uint16Array(bytes(data.near));
+  const triangles = Uint32Array.from(new (vertices.length / 3 > 65535 ? Uint32Array : Uint16Array)(bytes(data.triangles))), near = new Uint16Array(bytes(data.near));
   const weight = new Uint8Array(bytes(data.weight)), count = vertices.length / 3;
   const unpack = packed => {
     const raw = new Int16Array(bytes(packed.data)), out = new Float32Array(raw.length);
@@ -25,5 +25,5 @@ function partNumbers(data) {
     }
     return out;
   };
-  return { bytes, vertices, normals, triangles, near, count, unpack, onVertices };
+  return { bytes, vertices, normals, triangles, near, weight, count, unpack, onVertices };
 }

@@ -3,9 +3,8 @@
 
 // Show a part in the elements of `root`; `more` are the fields of candidate effects, `eye` where it was looked at from.
 function showPart(root, data, more, eye) {
-  const numbers = partNumbers(data), { bytes, vertices, near, count, unpack, onVertices } = numbers;
+  const numbers = partNumbers(data), { bytes, vertices, near, unpack, onVertices } = numbers;
   const canvas = root.querySelector("canvas"), drawing = partDrawing(canvas, numbers, data.colours);
-  if (!drawing) return null;  // the still picture stays
   const slider = root.querySelector("input[type=range]"), choice = root.querySelector("select");
   const title = root.querySelector("[data-title]"), bar = root.querySelector("[data-bar]");
   const play = root.querySelector("button[data-play]");
@@ -123,17 +122,8 @@ function showPart(root, data, more, eye) {
   choice.onchange = () => { choose(); names(); label(); };
   play.onclick = () => { const last = steps.length - 1; slider.value = Math.min(data.begin, last - 1); glide(last); };
 
-  function pick(e) {  // the vertex nearest to the eye within a few pixels of the pointer tells which place was meant
-    const box = canvas.getBoundingClientRect(), m = look.turn(), [sx, sy] = look.scales(), [panX, panY] = look.shift();
-    const x = 2 * (e.clientX - box.left) / box.width - 1, y = 1 - 2 * (e.clientY - box.top) / box.height;
-    const near2 = (14 / Math.min(box.width, box.height)) ** 2;
-    let best = -1, depth = -Infinity;
-    for (let i = 0; i < count; i++) {
-      const [p, q, r] = [0, 1, 2].map(k => vertices[3 * i + k] / 32767);
-      const u = (m[0] * p + m[3] * q + m[6] * r) * sx + panX - x, v = (m[1] * p + m[4] * q + m[7] * r) * sy + panY - y;
-      const z = m[2] * p + m[5] * q + m[8] * r;
-      if (u * u + v * v < near2 && z > depth) { best = i; depth = z; }
-    }
+  function pick(e) {
+    const best = nearestVertex(numbers, canvas, look, e);
     if (best < 0) return;
     const flat = [0, 1, 2].map(k => vertices[3 * best + k] / 32767 * data.size + data.centre[k]);
     const place = [0, 1, 2].map(k => flat.reduce((sum, value, row) => sum + value * data.axes[row][k], 0));

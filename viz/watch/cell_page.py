@@ -21,7 +21,7 @@ from stitch.watch.report import (
     table_unit,
 )
 from viz import captions
-from viz.colours import covariate
+from viz.captions import covariate
 from viz.page_parts import render
 from viz.watch.small_multiples import channel_drawing, drawings
 

@@ -1,0 +1,45 @@
+"""What all figures by matplotlib have in common: frames, legends, scales of colours, data addresses for pages."""
+
+import base64
+import io
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+matplotlib.use("Agg")
+
+
+def plain(figure: Figure) -> Figure:
+    """No frame at the top and on the right."""
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def above(axes: Axes) -> None:
+    """The legend above the drawing, where it covers nothing."""
+    handles, labels = axes.get_legend_handles_labels()
+    axes.legend(handles, labels, frameon=False, ncols=len(labels), loc="lower left", bbox_to_anchor=(0, 1), fontsize=9)
+
+
+def colormap(scale: list[str]) -> LinearSegmentedColormap:
+    """Return a scale of `viz.colours` as matplotlib takes it."""
+    return LinearSegmentedColormap.from_list("scale", scale)
+
+
+def svg(figure: Figure) -> str:
+    """A figure as a data address, drawn by lines."""
+    return _address(figure, "svg", "svg+xml", metadata={"Date": None})
+
+
+def png(figure: Figure, dpi: int) -> str:
+    """A figure as a data address, drawn by pixels."""
+    return _address(figure, "png", "png", dpi=dpi)
+
+
+def _address(figure: Figure, form: str, kind: str, **options: object) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=form, **options)
+    return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -1,0 +1,9 @@
+// The page of one run: its screen, and the plots below it.
+"use strict";
+
+(() => {
+  const read = id => { const node = document.getElementById(id); return node && JSON.parse(node.textContent); };
+  const part = read("part-data"), found = read("screen-data");
+  showScreen(document.getElementById("screen"), part, found, found ? found.um : 1);
+  drawPlots(part ? part.colours : found ? found.colours : {});
+})();

@@ -1,0 +1,231 @@
+// One screen: the part as it is and as it was or would be, the legend as a histogram, why, and candidates to compare.
+"use strict";
+
+// `part` is the data of the part, `found` the screen of diagnosis.json or null; `um` micrometres in one length_unit.
+function showScreen(root, part, found, um) {
+  const at = name => root.querySelector(`[data-${name}]`);
+  const sides = ["now", "then"].map(name => at(name)).filter(Boolean);
+  const views = sides.length && part ? sides.map((side, i) => partStage(side, part, i)) : [];
+  views.forEach((view, i) => view.moved = () => views.forEach((other, k) => k !== i && other.look(view.eye())));
+  const numbers = part && partNumbers(part), own = part && part.steps.map(s => numbers.unpack(s.values));
+  const nearest = found && found.places && part ? nearestPlaces(part, numbers, found.places) : null;
+  const mapped = field => Float32Array.from(nearest, j => field[j] === null ? NaN : field[j] * um);
+  let shown = found && nearest && found.candidates.find(c => c.field && found.named.includes(c.effect)) || null, view = -1;
+
+  // What stands left and right: {title, values, mean}.
+  function pair() {
+    if (shown) return [
+      { title: "Now", values: mapped(found.now.field), mean: found.now.mean * um },
+      { title: `With ${shown.effect} (predicted)`, values: mapped(shown.field), mean: shown.mean * um }];
+    const { begin, end } = part, from = end > begin ? end - 1 : Math.max(0, begin - 1);
+    return [from, end].map(k => ({ title: k === end ? `Now${end > begin ? `, ${part.steps[k].name}` : ""}` : `Before: ${part.steps[k].name}`, values: own[k], mean: part.steps[k].mean }));
+  }
+
+  function draw() {
+    if (!views.length) return;
+    const both = pair(), one = part.views.find(v => v.index === view);
+    both.forEach((state, i) => {
+      const k = i === both.length - 1 || shown ? part.end : Math.max(0, part.end - 1);
+      const signed = one && (i === 0 || !shown);
+      const values = signed ? numbers.unpack(one.steps[k]) : state.values;
+      views[i].show(values, signed ? part.fullSigned : part.full, Boolean(signed));
+      views[i].title.textContent = signed ? `${state.title}: view ${one.name} against the others` : `${state.title}: ${roundLength(state.mean)} on average`;
+    });
+    views.forEach(v => v.tag(tags));
+    legend(both);
+  }
+
+  // Places with their numbers on both parts: at first the worst, the best and one between that are in sight.
+  let tags = [];
+  function firstTags() {
+    const values = pair()[0].values, front = views[0].front().filter(([k]) => Number.isFinite(values[k])).sort((a, b) => values[a[0]] - values[b[0]]);
+    for (const wanted of [1, 0, 0.5]) {
+      const order = front.map((f, i) => [Math.abs(i / front.length - wanted), f]).sort((a, b) => a[0] - b[0]);
+      const free = order.find(([, f]) => tags.every(t => Math.hypot(f[1] - t.x, f[2] - t.y) > 0.22));
+      if (free) tags.push({ patch: free[1][0], x: free[1][1], y: free[1][2] });
+    }
+  }
+  views.forEach(v => v.picked = patch => {
+    tags = tags.some(t => t.patch === patch) ? tags.filter(t => t.patch !== patch) : [...tags.slice(-3), { patch, picked: true }];
+    draw();
+    const [a, b] = pair(), sigma = part.sigma ? part.sigma[patch] : null, seen = part.seen ? part.seen[patch] : null;
+    const words = [`${shortLength(a.values[patch])} → ${shortLength(b.values[patch])}`, sigma && `± ${shortLength(sigma)}`, seen && `${seen} views see it`];
+    say(`This place: ${words.filter(Boolean).join(", ")}.`);
+  });
+  const say = text => { const told = at("told"); if (told) told.textContent = text; };
+
+  // The colours as a histogram of the surface, left grey and right blue, with what is allowed.
+  function legend(both) {
+    const place = at("legend");
+    if (!place) return;
+    const bins = 24, full = part.full, high = 330, wide = Math.max(place.clientWidth, 120);
+    const counts = both.map(state => {
+      const out = new Array(bins).fill(0), seen = state.values.filter(Number.isFinite);
+      seen.forEach(v => out[Math.min(bins - 1, Math.max(0, Math.floor(v / full * bins)))]++);
+      return out.map(n => n / Math.max(seen.length, 1));
+    });
+    // What lies beyond the scale may be nearly all: it does not press the others together.
+    const most = Math.max(...counts.flatMap(own => own.slice(0, -1)), 0.02), left = 50, room = wide - left - 22, Y = um => 12 + (1 - um / full) * (high - 34), step = (high - 34) / bins;
+    const svg = svgNode("svg", { class: "plot-svg", viewBox: `0 0 ${wide} ${high}`, width: wide, height: high, role: "img", "aria-label": "Share of the surface by how far the views disagree there" });
+    for (let i = 0; i < bins; i++) {
+      svg.append(svgNode("rect", { x: left, y: Y((i + 1) / bins * full), width: 14, height: step + 0.5, fill: colourAt(part.colours.field, (i + 0.5) / bins) }));
+      counts.forEach((own, k) => svg.append(svgNode("rect", { class: k ? "then" : "now", x: left + 18, y: Y((i + 1) / bins * full) + (k ? step * 0.3 : 0.5), width: room * Math.min(1, own[i] / most), height: k ? step * 0.5 : step - 1 },
+        svgNode("title", {}, `${shortNumber(i / bins * full)} to ${shortNumber((i + 1) / bins * full)} µm: ${Math.round(100 * own[i])} % of the surface`))));
+    }
+    for (const y of roundMarks(0, full, 6)) svg.append(svgNode("text", { x: left - 5, y: Y(y) + 4, "text-anchor": "end" }, shortNumber(y)));
+    const allowed = Number(place.dataset.tolerance);
+    if (allowed && allowed < full) svg.append(svgNode("line", { class: "allowed", x1: left - 4, x2: wide, y1: Y(allowed), y2: Y(allowed) }), svgNode("text", { class: "axis", x: wide, y: Y(allowed) - 4, "text-anchor": "end" }, `${shortNumber(allowed)} µm`));
+    svg.append(svgNode("text", { x: left, y: high - 4 }, "grey: left · blue: right"));
+    place.replaceChildren(svg);
+    const within = both.map(({ values }) => { const seen = values.filter(Number.isFinite); return Math.round(100 * seen.filter(v => v <= allowed).length / Math.max(seen.length, 1)); });
+    const told = at("within");
+    if (told) told.textContent = allowed ? `Within ${shortLength(allowed)}: ${within[0]} % → ${within[1]} %` : "";
+  }
+
+  // Why: measured dots and the predicted line over what the effect lives on.
+  function why() {
+    const place = at("why"), course = shown && shown.why || found && found.why, title = at("why-title");
+    if (!place) return;
+    if (!course) {
+      if (!part || !part.byView) return;
+      title.textContent = "How far each view lies off the others (µm)";
+      const said = part.names.map((name, i) => `${name}: ${part.byView[i] === null ? "nothing to compare" : shortLength(part.byView[i])}`), seen = part.byView.map((v, i) => [i, v]).filter(([, v]) => v !== null);
+      xyPlot(place, { x: { label: "views in their order", names: part.names }, y: { label: "µm" }, series: [{ kind: "dots", x: seen.map(s => s[0]), y: seen.map(s => s[1]), names: true, said: seen.map(s => said[s[0]]), tint: "dot" }] }, 230, i => chooseView(i < 0 ? -1 : seen[i][0]));
+      return;
+    }
+    const plot = coursePlot(course, part && part.names, um);
+    title.textContent = plot.title;
+    xyPlot(place, { ...plot.spec, pressed: course.views.indexOf(view) }, 230, i => chooseView(i < 0 ? -1 : course.views[i] ?? -1));
+  }
+  function chooseView(index) {
+    view = index;
+    const name = part && index >= 0 ? part.names[index] : "";
+    say(index < 0 ? "" : part.views.some(v => v.index === index) ? `Shown: view ${name} against the others; its dot again shows all.` : `View ${name} has no field of its own on this page.`);
+    draw();
+  }
+
+  root.querySelectorAll("[data-show]").forEach(button => button.addEventListener("click", () => {
+    shown = found.candidates.find(c => c.effect === button.dataset.show) || null; choose();
+  }));
+  function choose() {
+    root.querySelectorAll("[data-show]").forEach(b => b.setAttribute("aria-pressed", String(shown !== null && b.dataset.show === shown.effect)));
+    if (shown) for (const [key, value] of [["heldout", shown.heldout], ["mean", shown.mean], ["worst", shown.worst]]) {
+      const tile = root.ownerDocument.querySelector(`[data-tile=${key}]`);
+      if (tile) tile.textContent = found.now[key] === null || value === null ? "–" : fromTo(found.now[key] * um, value * um);
+    }
+    draw(); why();
+  }
+  if (views.length) firstTags();
+  choose();
+  let wide = root.clientWidth;
+  new ResizeObserver(() => { if (root.clientWidth !== wide) { wide = root.clientWidth; why(); if (views.length) legend(pair()); } }).observe(root);
+  return { show(effect) { shown = found && found.candidates.find(c => c.effect === effect && c.field) || null; choose(); } };
+}
+
+// Two lengths, as the tiles have them.
+function fromTo(a, b) {
+  const [[x, unit], [y, last]] = [a, b].map(um => roundLength(um).split("\u00a0"));
+  return unit === last ? `${x} → ${y}\u00a0${last}` : `${x}\u00a0${unit} → ${y}\u00a0${last}`;
+}
+
+// The plot of one course of diagnosis.json.
+function coursePlot(course, names, um) {
+  const mrad = course.value_unit === "rad", factor = mrad ? 1e3 : um, unit = mrad ? "mrad" : "µm";
+  const inOrder = course.follows === "view order", seconds = course.unit === "s";
+  const span = seconds ? Math.max(...course.at) : 0, [per, named] = span > 7200 ? [3600, "h"] : span > 120 ? [60, "min"] : [1, "s"];
+  const x = course.at.map(a => seconds ? a / per : a), scaled = values => values.map(v => v * factor);
+  const [measured, sigma, predicted] = [course.measured, course.sigma, course.predicted].map(scaled);
+  const label = inOrder ? "views in their order" : course.follows.replace(/_c$/, " (°C)").replaceAll("_", " ") + (seconds ? ` (${named})` : course.unit ? ` (${course.unit})` : "");
+  const named_ = course.views.map(v => names ? names[v] : String(v)), most = Math.max(...predicted.map(Math.abs));
+  const first = inOrder ? predicted.findIndex(p => Math.abs(p) > most / 2) : -1;
+  const jumps = inOrder && first > 0 && predicted.slice(first).every(p => Math.abs(p) > most / 2);
+  const said = measured.map((m, i) => `${course.views.length ? `${named_[i]}, ` : ""}${shortNumber(x[i])}: measured ${shortNumber(m)} ± ${shortNumber(2 * sigma[i])} ${unit}, predicted ${shortNumber(predicted[i])} ${unit}`);
+  return {
+    title: `Why: how far ${course.of} is off (${unit}). Dots: measured ± 2σ. Line: what the effect predicts`,
+    spec: {
+      x: { label, names: inOrder && course.views.length === (names || []).length ? named_ : undefined }, y: { label: unit },
+      shaded: jumps ? { from: (x[first - 1] + x[first]) / 2, said: `from ${named_[first]} on` } : undefined,
+      series: [{ kind: "line", x, y: predicted, step: jumps, tint: "predicted" }, { kind: "dots", x, y: measured, sigma, names: course.views.length > 0, said, tint: "dot" }],
+    },
+  };
+}
+
+// The place of a diagnosis that is nearest to each patch of the part.
+function nearestPlaces(data, { bytes }, places) {
+  const own = new Float32Array(bytes(data.patches)), out = new Uint16Array(own.length / 3);
+  const turned = places.map(p => data.axes.map((axis, k) => ((axis[0] * p[0] + axis[1] * p[1] + axis[2] * p[2]) - data.centre[k]) / data.size));
+  for (let i = 0; i < out.length; i++) {
+    let best = Infinity;
+    for (let j = 0; j < turned.length; j++) {
+      const d = (turned[j][0] - own[3 * i]) ** 2 + (turned[j][1] - own[3 * i + 1]) ** 2 + (turned[j][2] - own[3 * i + 2]) ** 2;
+      if (d < best) { best = d; out[i] = j; }
+    }
+  }
+  return out;
+}
+
+// One part on its stage: a canvas, and above it places with their numbers.
+function partStage(card, data, index) {
+  const canvas = card.querySelector("canvas"), above = card.querySelector("svg"), numbers = partNumbers(data);
+  const { vertices, normals, near, weight, count } = numbers, drawing = partDrawing(canvas, numbers, data.colours);
+  const stage = { title: card.querySelector("h2"), moved: null, picked: null };
+  const look = partEye(canvas, data.box, null, () => { draw(); if (stage.moved) stage.moved(); }, e => {
+    const best = nearestVertex(numbers, canvas, look, e);
+    if (best >= 0 && stage.picked) stage.picked(near[3 * best]);
+  });
+  let state = { values: null, full: 1, signed: false }, tags = [], wanted = false;
+  const project = i => {
+    const m = look.turn(), [sx, sy] = look.scales(), [panX, panY] = look.shift(), [p, q, r] = [0, 1, 2].map(k => vertices[3 * i + k] / 32767);
+    return [(m[0] * p + m[3] * q + m[6] * r) * sx + panX, (m[1] * p + m[4] * q + m[7] * r) * sy + panY, m[2] * p + m[5] * q + m[8] * r];
+  };
+  const depthOf = i => { const m = look.turn(); return (m[2] * normals[3 * i] + m[5] * normals[3 * i + 1] + m[8] * normals[3 * i + 2]) / 127; };
+  const vertexOf = patch => {
+    let best = -1, most = -1;
+    for (let i = 0; i < count; i++) if (near[3 * i] === patch && weight[3 * i] > most) { best = i; most = weight[3 * i]; }
+    return best;
+  };
+  function draw() {
+    if (wanted) return;
+    wanted = true;
+    requestAnimationFrame(() => { wanted = false; paint(); });
+  }
+  function paint() {
+    drawing.paint({ turn: look.turn(), scale: look.scales(), shift: look.shift(), zoom: look.now().zoom, blend: 0, full: state.full, signed: state.signed });
+    const w = canvas.clientWidth, h = canvas.clientHeight;
+    above.setAttribute("viewBox", `0 0 ${w} ${h}`);
+    const nodes = [], taken = { left: [], right: [] };
+    for (const tag of tags) {
+      const i = tag.vertex ?? (tag.vertex = vertexOf(tag.patch));
+      if (i < 0 || depthOf(i) < 0.05 || !state.values) continue;
+      const [x, y] = project(i), px = (x + 1) / 2 * w, py = (1 - y) / 2 * h, side = px > w / 2 ? "right" : "left", value = state.values[tag.patch];
+      if (px < 0 || px > w || py < 0 || py > h) continue;
+      let ty = Math.min(h - 16, Math.max(16, py + 14));
+      while (taken[side].some(t => Math.abs(t - ty) < 26)) ty += 26;
+      taken[side].push(ty);
+      const tx = side === "right" ? w - 40 : 40, text = Number.isFinite(value) ? roundLength(value) : "no value";
+      nodes.push(svgNode("line", { class: "lead", x1: px, y1: py, x2: tx, y2: ty }), svgNode("circle", { class: "spot", cx: px, cy: py, r: 4 }),
+        svgNode("rect", { class: "tag", x: tx - 36, y: ty - 12, width: 72, height: 23, rx: 5 }), svgNode("text", { class: "tag-text", x: tx, y: ty + 4, "text-anchor": "middle" }, text));
+    }
+    above.replaceChildren(...nodes);
+  }
+  new ResizeObserver(draw).observe(canvas);
+  // Paper shows what the screen shows.
+  const print = card.querySelector("img");
+  if (index >= 0) window.addEventListener("beforeprint", () => { paint(); print.src = canvas.toDataURL(); });
+  return Object.assign(stage, {
+    eye: look.now,
+    look(eye) { look.set(eye); draw(); },
+    show(values, full, signed) {
+      state = { values, full, signed };
+      const on = numbers.onVertices(values);
+      drawing.write(on, on); draw();
+    },
+    tag(next) { tags = next.map(t => ({ ...t })); draw(); },
+    // Patches in sight with where they stand in the picture.
+    front: () => {
+      const out = new Map();
+      for (let i = 0; i < count; i += 3) if (depthOf(i) > 0.4 && !out.has(near[3 * i])) out.set(near[3 * i], project(i));
+      return [...out].map(([k, [x, y]]) => [k, x, y]);
+    },
+  });
+}
