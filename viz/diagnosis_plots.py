@@ -27,7 +27,7 @@ _MAX_CURVES, _MAX_DEPENDENCES, _MAX_PROPERTIES = 3, 3, 9
 
 @dataclass(frozen=True)
 class Plots:
-    """Some plots with one caption; each is what `plots.js` draws."""
+    """Some plots with one caption; each is what `drawn_plots.js` draws."""
 
     title: str
     caption: str

@@ -77,7 +77,12 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
     plain = document.get("plain")
     candidates = document.get("candidates", [])
     follows = [row for row in document.get("depends_on", []) if row["p_value"] is not None and row["p_value"] < 0.05]
+    screen = document.get("screen") or {}
     return {
+        "headline": screen.get("headline", ""),
+        "proof": screen.get("proof", ""),
+        "why": screen.get("why"),
+        "courses": {row["effect"]: row["why"] for row in screen.get("candidates", [])},
         "verdict": document["verdict"],
         "named": document["effects"],
         "plain": plain or document["sentence"],
@@ -85,7 +90,10 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
         "candidates": [_candidate(row, um) for row in candidates if row["observable"]],
         "unseen": [row["effect"] for row in candidates if not row["observable"] and not row.get("needs")],
         "untested": [{"effect": row["effect"], "needs": row["needs"]} for row in candidates if row.get("needs")],
-        "follows": [{"covariate": row["covariate"], "p": f"{row['p_value']:.1g}"} for row in follows],
+        "follows": [
+            {"covariate": row["covariate"], "table": _table_of(row["covariate"]), "p": f"{row['p_value']:.1g}"}
+            for row in follows
+        ],
         "next": [{"do": row["do"], "separates": row["separates"]} for row in document.get("next", [])],
         "budget": [
             {"source": row["source"], "share": row["variance_share"]}
@@ -93,6 +101,24 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
             if row["variance_share"] and row["variance_share"] > 0.005
         ],
     }
+
+
+# What a diagnosis calls otherwise than a comparison does.
+_TABLES = {"view order": "order", "time_s": "time"}
+
+
+def _table_of(covariate: str) -> str:
+    """Return the table of compare.json that shows a covariate."""
+    joint = re.fullmatch(r"(j\d+)_deg", covariate)
+    return joint[1] if joint else _TABLES.get(covariate, covariate)
+
+
+def predicted_fields(document: dict[str, Any], um: float) -> dict[str, Any] | None:
+    """Return the fields of the candidates of diagnosis.json for the part's viewer; None where there are none."""
+    screen = document.get("screen") or {}
+    if not screen.get("places"):
+        return None
+    return {key: screen[key] for key in ("places", "now", "candidates")} | {"um": um}
 
 
 def _candidate(row: dict[str, Any], um: float) -> dict[str, Any]:
@@ -181,9 +207,11 @@ def _read(run: Path, version: str) -> Snapshot:
     result, ledger = read_documents(run)
     um = MICROMETRES[result["length_unit"]]
     comparison = _told(run / "compare.json", lambda document: (document, _tables(document, um)))
-    diagnosis = _told(run / "diagnosis.json", lambda document: told_diagnosis(document, um))
-    page = _text(run / "report.html")
-    part, predicted = (_script(page, name) for name in ("part-data", "candidate-data"))
+    diagnosis = _told(
+        run / "diagnosis.json", lambda document: (told_diagnosis(document, um), predicted_fields(document, um))
+    )
+    told, predicted = (None, None) if diagnosis is None else diagnosis
+    part = _script(_text(run / "report.html"), "part-data")
     steps = (result.get("disagreement") or {}).get("steps", [])
     model = version_of(run, ("result.json",))
     # A run without clouds says null; an older one says nothing.
@@ -207,18 +235,21 @@ def _read(run: Path, version: str) -> Snapshot:
         "ledger": [_step(ledger, i, um) for i in range(len(ledger))],
         "effects": _effects(result),
         "in_words": [effect_in_words(effect) for effect in result["effects"]],
-        "diagnosis": diagnosis,
+        "diagnosis": told,
+        "um": um,
+        "view_names": [row["view"] for row in result.get("views", [])],
         "comparison": None if comparison is None else comparison[1],
         "history": undo_history([step.effects for step in ledger]),
         "part": part is not None,
         # Written by an older version, or taken away.
-        "outdated": part is None or ("marks" if labelled else "patchRadius") not in part,
-        "pictured": re.findall(r'"name": "(\w+)"', predicted or ""),
+        "outdated": part is None or ("marks" if labelled else "byView") not in part,
+        "pictured": [] if predicted is None else [row["effect"] for row in predicted["candidates"]],
         "recording": (run / "recording.rrd").is_file(),
         "notes": [*result["notes"], *(f"Not observable from these motions: {x}." for x in result["unobservable"])],
     }
     document = None if comparison is None else comparison[0]
-    return Snapshot(version, model, state, part, predicted, result=result, comparison=document)
+    fields = None if predicted is None else json.dumps(predicted)
+    return Snapshot(version, model, state, part, fields, result=result, comparison=document)
 
 
 def _step(ledger: tuple[LedgerStep, ...], i: int, um: float) -> dict[str, Any]:

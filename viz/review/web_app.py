@@ -222,7 +222,7 @@ class ReviewActions:
 _SCRIPTS = Path(__file__).parent / "scripts"
 # Scripts that the page of a run holds too.
 _TEMPLATES = Path(__file__).parents[1] / "templates"
-_SHARED = ("part_numbers.js", "part_drawing.js", "part_eye.js", "part_viewer.js")
+_SHARED = ("part_numbers.js", "part_drawing.js", "part_eye.js", "part_viewer.js", "drawn_plots.js", "screen.js")
 _RECORDING = "recording.rrd"
 
 

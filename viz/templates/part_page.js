@@ -3,9 +3,8 @@
 
 (() => {
   const root = document.getElementById("part"), source = document.getElementById("part-data");
-  const extra = document.getElementById("candidate-data");
   if (!root || !source) return;
-  const data = JSON.parse(source.textContent), part = showPart(root, data, extra && JSON.parse(extra.textContent));
+  const data = JSON.parse(source.textContent), part = showPart(root, data);
   if (!part || data.end <= data.begin || matchMedia("(prefers-reduced-motion: reduce)").matches) return;
   // What was added is seen at work once: from the first model to the present one, as soon as the part is in sight.
   part.jump(data.begin);

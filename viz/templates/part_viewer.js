@@ -3,7 +3,7 @@
 
 // Show a part in the elements of `root`; `more` are the fields of candidate effects, `eye` where it was looked at from.
 function showPart(root, data, more, eye) {
-  const numbers = partNumbers(data), { bytes, vertices, near, unpack, onVertices } = numbers;
+  const numbers = partNumbers(data), { vertices, near, unpack, onVertices } = numbers;
   const canvas = root.querySelector("canvas"), drawing = partDrawing(canvas, numbers, data.colours);
   const slider = root.querySelector("input[type=range]"), choice = root.querySelector("select");
   const title = root.querySelector("[data-title]"), bar = root.querySelector("[data-bar]");
@@ -17,25 +17,11 @@ function showPart(root, data, more, eye) {
     const before = choice.value;
     candidates.length = 0;
     [...choice.options].filter(o => o.value.startsWith("c")).forEach(o => o.remove());
-    const axes = data.axes, own = new Float32Array(bytes(data.patches));
-    const other = new Float32Array(bytes(more.patches)), nearest = new Uint16Array(own.length / 3);
-    for (let i = 0; i < nearest.length; i++) {
-      let best = Infinity;
-      for (let j = 0; j < other.length / 3; j++) {
-        let d = 0;
-        for (let k = 0; k < 3; k++) {
-          const r = axes[k][0] * other[3 * j] + axes[k][1] * other[3 * j + 1] + axes[k][2] * other[3 * j + 2];
-          d += ((r - data.centre[k]) / data.size - own[3 * i + k]) ** 2;
-        }
-        if (d < best) { best = d; nearest[i] = j; }
-      }
-    }
-    for (const c of more.candidates) {
-      const of = packed => { const v = unpack(packed); return Float32Array.from(nearest, j => v[j]); };
-      candidates.push({ name: c.name, steps: [
-        { name: "as it is", mean: more.mean, noise: more.noise, values: of(more.values) },
-        { name: `if ${c.name} were added`, mean: c.mean, noise: more.noise, values: of(c.values) }] });
-    }
+    const nearest = nearestPlaces(data, numbers, more.places), um = more.um;
+    const of = field => Float32Array.from(nearest, j => field[j] === null ? NaN : field[j] * um);
+    for (const c of more.candidates) candidates.push({ name: c.effect, steps: [
+      { name: "as it is", mean: more.now.mean * um, values: of(more.now.field) },
+      { name: `if ${c.effect} were added`, mean: c.mean * um, values: of(c.field) }] });
     candidates.forEach((c, i) => choice.add(new Option(`predicted: ${c.name}`, `c${i}`)));
     if (choice.value !== before) { choose(); names(); label(); }  // what was shown is not there any more
   }
@@ -61,7 +47,7 @@ function showPart(root, data, more, eye) {
   function label() {
     const k = Math.round(Number(slider.value)), s = steps[k], signed = isSigned();
     const words = signed ? "this view lies off by {} on average" : data.words?.all ?? "the views disagree by {} on average";
-    title.textContent = `${s.name}: ${words.replace("{}", length(s.mean))}` + (s.noise === undefined ? "" : ` (noise alone ${length(s.noise)})`);
+    title.textContent = `${s.name}: ${words.replace("{}", length(s.mean))}`;
     slider.setAttribute("aria-valuetext", title.textContent);
     root.querySelectorAll("[data-steps] button").forEach((b, i) => b.setAttribute("aria-pressed", String(i === k)));
     const colours = data.colours[signed ? "signed" : "field"].map(c => `rgb(${c.join(",")})`).join(",");

@@ -150,20 +150,6 @@ function coursePlot(course, names, um) {
   };
 }
 
-// The place of a diagnosis that is nearest to each patch of the part.
-function nearestPlaces(data, { bytes }, places) {
-  const own = new Float32Array(bytes(data.patches)), out = new Uint16Array(own.length / 3);
-  const turned = places.map(p => data.axes.map((axis, k) => ((axis[0] * p[0] + axis[1] * p[1] + axis[2] * p[2]) - data.centre[k]) / data.size));
-  for (let i = 0; i < out.length; i++) {
-    let best = Infinity;
-    for (let j = 0; j < turned.length; j++) {
-      const d = (turned[j][0] - own[3 * i]) ** 2 + (turned[j][1] - own[3 * i + 1]) ** 2 + (turned[j][2] - own[3 * i + 2]) ** 2;
-      if (d < best) { best = d; out[i] = j; }
-    }
-  }
-  return out;
-}
-
 // One part on its stage: a canvas, and above it places with their numbers.
 function partStage(card, data, index) {
   const canvas = card.querySelector("canvas"), above = card.querySelector("svg"), numbers = partNumbers(data);

@@ -100,12 +100,15 @@ def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint, address):
     playwright.expect(title).not_to_have_text(everything)
     story.click("Find what is missing")
     story.says("#missing", "joint_compliance is missing")
+    assert story.page.locator("#sentence").inner_text().startswith("Joint ")
     story.click("Show the part as joint_compliance should leave it")
     playwright.expect(title).to_contain_text("if joint_compliance were added")
-    told = json.loads(
-        re.search(r'id="candidate-data">(.*?)</script>', (soft_joint / "report.html").read_text(), re.S)[1]
-    )
-    assert told["mean"] == pytest.approx(1e3 * mean_on_part(soft_joint, "hand-eye alone"), rel=0.05)
+    told = json.loads((soft_joint / "diagnosis.json").read_text())["screen"]
+    assert told["now"]["mean"] == pytest.approx(mean_on_part(soft_joint, "hand-eye alone"), rel=0.05)
+    # Why: a dot of the joint that gives way for every view, and one of them shows its view.
+    story.says("#why h3", "joint")
+    dots = story.page.locator("#why .dot")
+    assert dots.count() == 10
     # The numbers below speak of what is seen, and the choice is one click away.
     story.says("#chosen", "Predicted: joint_compliance")
     story.says("#chosen", "Back to ")
@@ -114,8 +117,8 @@ def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint, address):
     story.says("#sentence", "Adding joint_compliance brought the views from")
     assert story.clicks <= 6
     # What was predicted has come.
-    predicted = next(c["mean"] for c in told["candidates"] if c["name"] == "joint_compliance")
-    assert predicted == pytest.approx(1e3 * mean_on_part(soft_joint, "+ joint_compliance"), rel=0.2)
+    predicted = next(c["mean"] for c in told["candidates"] if c["effect"] == "joint_compliance")
+    assert predicted == pytest.approx(mean_on_part(soft_joint, "+ joint_compliance"), rel=0.2)
     ledger = json.loads((soft_joint / "ledger.json").read_text())
     before, after = (step["heldout_rms"] for step in ledger)
     assert after < 0.8 * before

@@ -1,6 +1,7 @@
 // What is missing: candidate effects with what they should leave, and the button that adds one.
 import { at, element, signed, um } from "./elements.js";
-import { predict } from "./scene.js";
+import { chooseView } from "./plots.js";
+import { foresee, predict } from "./scene.js";
 
 const FIRST = 4;
 let all = false;
@@ -8,6 +9,7 @@ let all = false;
 // `ask` sends a command; `busy` while one that changes the run is under way.
 export function showCandidates(state, ask, busy) {
   const root = at("missing"), found = state.diagnosis;
+  why(found && found.why, state);
   if (!found) {
     const button = element("button", { type: "button", class: "main", id: "diagnose", disabled: busy, onclick: () => ask({ kind: "diagnose" }) }, "Find what is missing");
     root.replaceChildren(element("p", { class: "soft" }, "Every effect of the library is tried on what the poses leave, and validated on views left out."),
@@ -50,9 +52,9 @@ function row(name, fit, out, most, floor) {
 function candidate(c, found, state, most, ask, busy) {
   const named = found.named.includes(c.effect);
   const add = element("button", { type: "button", class: named ? "main" : "", disabled: busy, "aria-label": `Add ${c.effect}`,
-    title: `stitch add ${state.run} ${c.effect}`, onclick: () => ask({ kind: "add", effects: [c.effect] }) }, "Add");
+    title: `stitch add ${state.run} ${c.effect}`, onclick: () => { foresee("add", c.effect); ask({ kind: "add", effects: [c.effect] }); } }, "Add");
   const look = state.pictured.includes(c.effect) && element("button", { type: "button", "aria-label": `Show the part as ${c.effect} should leave it`,
-    onclick: () => predict(c.effect) }, "Show");
+    onclick: () => { predict(c.effect); why(found.courses[c.effect], state); } }, "Show");
   return [
     element("tr", { class: named ? "best" : "" }, element("td", {}, c.effect + (c.own ? " (your own)" : "")),
       element("td", { class: "bars", "aria-label": numbers(c.rms_if_added, c.heldout_if_added) },
@@ -61,6 +63,16 @@ function candidate(c, found, state, most, ask, busy) {
     element("tr", {}, element("td", { class: "wide", colspan: "4" },
       [c.is, numbers(c.rms_if_added, c.heldout_if_added), signed(c.amounts), signed(`p = ${c.p}`), c.aliases.length && `aliases: ${c.aliases.join(", ")}`].filter(Boolean).join("; "))),
   ];
+}
+
+// Why: every view along what an effect does, and what it predicts; a dot chooses its view.
+function why(course, state) {
+  const root = at("why");
+  root.hidden = !course;
+  if (!course) return;
+  const plot = window.coursePlot(course, state.view_names, state.um);
+  root.querySelector("h3").textContent = plot.title;
+  window.xyPlot(root.querySelector("div"), plot.spec, 220, i => chooseView(i < 0 ? -1 : course.views[i] ?? -1));
 }
 
 function limits(found) {

@@ -1,6 +1,7 @@
 // The error, step by step: a step for every change of the model, its remarks, undo and redo.
 import { bars, legend } from "./candidates.js";
 import { at, element, signed, um } from "./elements.js";
+import { foresee } from "./scene.js";
 
 let drawn = 0;
 
@@ -19,7 +20,10 @@ export function showLedger(state, ask, busy) {
     const change = state.history[kind], button = at(kind), word = kind === "undo" ? "Undo" : "Redo";
     button.disabled = busy || !change;
     button.textContent = change ? `${word}: ${change.command} ${change.effects.join(", ")}` : word;
-    button.onclick = () => ask({ kind });
+    button.onclick = () => {
+      foresee(change.command === "add" ? "add" : "back", change.effects[0]);
+      ask({ kind });
+    };
   }
   parameters(state.effects, state.in_words);
 }

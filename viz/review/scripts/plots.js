@@ -22,6 +22,12 @@ export function choosePlace(place, within = 0, name = "a place of the part") {
   draw(); ask();
 }
 
+// A view by its number in the run, from a dot of another plot; again, and all count.
+export function chooseView(index) {
+  choice.views = index < 0 ? [] : [state.view_names[index]];
+  draw(); ask();
+}
+
 // A click on the part: a place of it, or among labelled points the view or the target that stands there.
 export function chooseOnPart(place, mark) {
   if (!mark) { choosePlace(place); return; }
@@ -40,7 +46,7 @@ function draw() {
     return;
   }
   root.style.minHeight = "";
-  const follows = state.diagnosis ? state.diagnosis.follows.map(f => f.covariate.replace(/_deg$/, "")) : [];
+  const follows = state.diagnosis ? state.diagnosis.follows.map(f => f.table) : [];
   const rank = table => follows.includes(table.name) ? follows.indexOf(table.name) - 100 : -table.clearest;
   const properties = state.comparison.filter(t => !t.label.length && t.low.length > 1).sort((a, b) => rank(a) - rank(b));
   const shown = all ? properties : properties.slice(0, FIRST);

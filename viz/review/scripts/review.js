@@ -29,8 +29,9 @@ async function refresh() {
 
 async function draw() {
   at("name").textContent = `Review of ${state.name}`;
-  at("sentence").textContent = unbroken(state.sentence);
-  at("evidence").textContent = state.evidence === state.sentence ? "" : unbroken(state.evidence);
+  const found = state.diagnosis && state.diagnosis.headline ? state.diagnosis : null;
+  at("sentence").textContent = unbroken(found ? found.headline : state.sentence);
+  at("evidence").textContent = unbroken(found ? found.proof : state.evidence === state.sentence ? "" : state.evidence);
   await show(state);
   showNumbers(state);
   showPlots(state);

@@ -42,6 +42,14 @@ function words(state) {
   at("fails-hint").textContent = `Choose bars, with Shift a range of them: colours and numbers follow, the rest is grey. ${click}`;
 }
 
+// What a change should bring, while its command runs: the prediction of an effect, or the model before.
+export function foresee(kind, effect) {
+  if (!viewer) return;
+  if (kind === "add") { viewer.predict(effect); return; }
+  const last = Math.max(viewer.names().length - 2, 0);
+  viewer.show("all"); viewer.jump(last); viewer.glide(Math.max(last - 1, 0));
+}
+
 export const predict = name => viewer !== null && viewer.predict(name);
 // View and target of a mark among labelled points, each null where it stands for all; null on a surface.
 export const markOf = patch => marks && { view: marks[patch][0], target: marks[patch][1] };
