@@ -6,10 +6,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from stitch.comparison.disagreement_field import effect_changes
 from stitch.frames import Array
-from stitch.runs.run import Run
 from viz.colours import UNSEEN, unsigned_colours
+from viz.course_recording import WHERE, X_RANGE, Y_RANGE
 from viz.model_timeline import FRAMES, ModelScene, shown_steps
 from viz.part_surface import Camera
 
@@ -66,11 +65,11 @@ _GROUND = [24, 27, 31]
 _COS, _SIN = np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
 
 
-def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[str, ...]) -> rrb.Blueprint:
-    """Before and after | the model step by step | what is missing | the cell | the error, step by step."""
+def model_blueprint(scene: ModelScene, camera: Camera) -> rrb.Blueprint:
+    """Before and after, and why | the model step by step | what is missing | the cell."""
     before, after = shown_steps(scene.history)
     unit = "" if len(scene.history.models) > 1 else " (single views moved)"
-    compare = rrb.Horizontal(
+    parts = rrb.Horizontal(
         _part("part/before", scene.title(before), scene, camera),
         _part("part/after", scene.title(after) + unit, scene, camera),
         rrb.Vertical(
@@ -80,8 +79,8 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
             row_shares=[20, 5, 5],
         ),
         column_shares=[3, 3, 2],
-        name="Before | after",
     )
+    compare = rrb.Vertical(parts, _why(), row_shares=[5, 2], name="Before | after")
     steps = rrb.Horizontal(
         _part("part/now", f"Where the views disagree; full colour at {scene.limit * scene.um:.3g} µm", scene, camera),
         rrb.Spatial3DView(
@@ -102,13 +101,13 @@ def model_blueprint(scene: ModelScene, camera: Camera, run: Run, stages: tuple[s
         name="The model, step by step",
     )
     time = rrb.TimePanel(state="collapsed", timeline="model", play_state="paused", fps=FRAMES)
-    tabs = rrb.Tabs(compare, steps, _diagnosis(), _cell(scene.cell), _errors(run, stages), active_tab=0)
+    tabs = rrb.Tabs(compare, steps, _diagnosis(), _cell(scene.cell), active_tab=0)
     return rrb.Blueprint(tabs, time, collapse_panels=True)
 
 
-def target_blueprint(cell: Array, run: Run) -> rrb.Blueprint:
-    """Targets and what was found | what is missing | the cell (points, (N, 3)) | the error, step by step."""
-    result = rrb.Horizontal(
+def target_blueprint(cell: Array) -> rrb.Blueprint:
+    """Targets, what was found and why | what is missing | the cell (points, (N, 3))."""
+    targets = rrb.Horizontal(
         rrb.Spatial3DView(
             origin="targets", name="Targets by the rms of their views; sticks magnified", line_grid=False
         ),
@@ -116,13 +115,12 @@ def target_blueprint(cell: Array, run: Run) -> rrb.Blueprint:
             rrb.TextDocumentView(origin="verdict", name="What was found"),
             _missing(),
             rrb.TextDocumentView(origin="now", name="Sticks"),
-            _moved(),
-            row_shares=[8, 3, 2, 4],
+            row_shares=[8, 3, 2],
         ),
         column_shares=[3, 2],
-        name="Targets",
     )
-    tabs = rrb.Tabs(result, _diagnosis(), _cell(cell), _errors(run, ()), active_tab=0)
+    result = rrb.Vertical(targets, _why(), row_shares=[5, 2], name="Targets")
+    tabs = rrb.Tabs(result, _diagnosis(), _cell(cell), active_tab=0)
     return rrb.Blueprint(tabs, collapse_panels=True)
 
 
@@ -160,31 +158,17 @@ def _cell(points: Array) -> rrb.Vertical:
     axes = np.array([aside, np.cross(towards, aside), towards])
     view = rrb.Spatial3DView(
         origin="robot",
-        name="Arm at every view (grey lines), scanner (pyramids, the large one its field), part (points); base frame",
+        name="Arm at every view (red or blue: off, as Why measures it), scanner (pyramids), part (points); base frame",
         background=_GROUND,
         eye_controls=eye_for(points, axes, up, _OF_CELL),
     )
     return rrb.Vertical(view, name="The cell")
 
 
-def _errors(run: Run, stages: tuple[str, ...]) -> rrb.Vertical:
-    """Every model that was fitted, in the fit and on views left out; below, the last fit closing in, and register.
-
-    A single model stands in words beside the part; a bar alone says nothing.
-    """
-    models = ", ".join(f"{i} {effect_changes(run.ledger, i)}" for i in range(len(run.ledger)))
-    fell = [
-        _bars("steps/residual_rms", f"Rms of each model in the fit (µm): {models}"),
-        _bars("steps/heldout_rms", "The same on views left out (µm)"),
-    ]
-    closed = [_bars(f"iterations/{s}", f"Rms of every iteration of the last fit (µm): {s}") for s in stages]
-    last = rrb.Horizontal(*closed, _moved())
-    rows = [rrb.Horizontal(*fell), last] if len(run.ledger) > 1 else [last]
-    return rrb.Vertical(*rows, row_shares=[2, 1][: len(rows)], name="The error, step by step")
-
-
-def _moved() -> rrb.BarChartView:
-    return _bars("bars/moved", "Each view, from 0 on, moved by register (µm)")
+def _why() -> rrb.Spatial2DView:
+    bounds = rrb.VisualBounds2D(x_range=X_RANGE, y_range=Y_RANGE)
+    name = "Why: dots measured ± 2σ, the line predicted"
+    return rrb.Spatial2DView(origin=WHERE, name=name, visual_bounds=bounds, background=_GROUND)
 
 
 def _missing() -> rrb.TextDocumentView:

@@ -14,6 +14,7 @@ from stitch.system.files import whole_file
 from stitch.units import MICROMETRES
 from stitch.writing.diagnosis_document import effect_description, effect_in_words, plain_finding, suggested_command
 from viz.colours import COLOURS_OF_FEW
+from viz.course_recording import log_course
 from viz.rrd_file import RecordingFile, id_of, words
 from viz.viewer import rerun_program
 
@@ -71,6 +72,8 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, screen: dict[str, A
     lines += ["", *(f"- {effect_in_words(c.name)}" for c in shown if effect_description(c.name))]
     lines += ["", *(f"- To measure next: {p.do} (separates {' and '.join(p.separates)})" for p in found.next)]
     rec.log("diagnosis/verdict", words("\n".join(lines)), static=True)
+    if screen is not None and screen["why"] is not None:
+        log_course(rec, screen["why"], [scan.name for scan in found.linear.measurement.capture.scans], um)
     evidence = np.array([c.ranked.score.log_bayes_factor for c in shown])
     rec.log("diagnosis/evidence", rr.BarChart(evidence, color=COLOURS_OF_FEW[1]), static=True)
     moved = np.linalg.norm(found.linear.view_displacements(), axis=1) * um

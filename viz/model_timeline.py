@@ -176,11 +176,10 @@ def _told(scene: ModelScene, k: int, share: float) -> str:
         told = "Nothing is fitted in between: colours, places and bars are drawn in proportion."
         return f"## {steps[k].name} → {steps[k + 1].name}\n{100 * share:.0f} % of the way. {told}"
     now = k + round(share)
-    noise = f"noise alone would leave {steps[now].field.noise * scene.um:.3g} µm"
     first = scene.history.models[0].name
     shown = f"Bars: the views in their order, from 0; behind them in grey those of {first}, darker where a view is "
     shown += "farther off than there."
-    return f"## {steps[now].name}\n{scene.title(steps[now]).partition(': ')[2]}; {noise}.\n\n{shown}"
+    return f"## {steps[now].name}\n{scene.title(steps[now]).partition(': ')[2]}.\n\n{shown}"
 
 
 def _log_part(recording: rr.RecordingStream, path: str, scene: ModelScene) -> None:

@@ -98,7 +98,7 @@ def part_surface(fused: FusedCloud, patches: Patches) -> PartSurface:
     points, normals = _thinned(fused)
     triangles = np.zeros((0, 3), np.int64)
     try:
-        mesh = mesh_of(points, normals)
+        mesh = _without_overhang(mesh_of(points, normals), points)
         points, triangles = _level_edges(*_whole_pieces(mesh))
         normals = vertex_normals(points, triangles)
     except NoResultError:
@@ -123,6 +123,23 @@ def _whole_pieces(mesh: TriangleMesh) -> tuple[Array, Indices]:
     share = np.bincount(piece[a], minlength=piece.max() + 1) / len(a)
     kept, triangles = np.unique(mesh.triangles[share[piece[a]] > _CRUMB], return_inverse=True)
     return mesh.vertices[kept], triangles.reshape(-1, 3).astype(np.int64)
+
+
+# A mesh runs on beyond the last points, in teeth; so far from them, in spacings of the points, it is shown.
+_OVERHANG = 1.0
+
+
+def _without_overhang(mesh: TriangleMesh, points: Array) -> TriangleMesh:
+    """The mesh where points (N, 3) are."""
+    tree = KDTree(np.ascontiguousarray(points))
+    spacing = float(np.median(tree.query(points[:: max(1, len(points) // _ASKED)], k=2)[0][:, 1]))
+    near = tree.query(np.ascontiguousarray(mesh.vertices), k=1)[0] < _OVERHANG * spacing
+    inside = near[mesh.triangles].all(axis=1)
+    return TriangleMesh(mesh.vertices, mesh.triangles[inside]) if inside.mean() > _LEFT else mesh
+
+
+# Points that tell the spacing of all.
+_ASKED = 5_000
 
 
 # The grid of cells leaves teeth along an edge: what is narrower than twice so many triangles is not shown.

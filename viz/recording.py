@@ -1,4 +1,4 @@
-"""The Rerun recording of a run: the model's history on the timeline `model`, the cell, every iteration."""
+"""The Rerun recording of a run: the model's history on the timeline `model`, why, and the cell."""
 
 import os
 from pathlib import Path
@@ -6,21 +6,21 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from stitch.comparison.disagreement_field import ModelHistory, model_history
+from stitch.comparison.disagreement_field import ModelHistory, effect_changes, model_history
 from stitch.comparison.run_verdict import run_headline
-from stitch.frames import Array
-from stitch.measurement.session import Session
-from stitch.runs.run import Run, StageResult
+from stitch.runs.recorder import SilentRecorder
+from stitch.runs.run import Run
 from stitch.units import MICROMETRES, length_text
 from stitch.writing.diagnosis_document import effect_in_words
 from viz.blueprint import log_colour_bar, model_blueprint, target_blueprint
-from viz.colours import COLOURS_OF_FEW, GREY, robust_limit, unsigned_colours
+from viz.colours import robust_limit, unsigned_colours
+from viz.course_recording import log_no_course
 from viz.diagnosis_recording import NOT_YET
 from viz.model_timeline import log_model, model_scene
 from viz.part_surface import camera_for, part_surface
 from viz.robot_scene import log_robot
 from viz.rrd_file import RecordingFile, id_of, words
-from viz.run_numbers import residual_vectors, view_shifts
+from viz.run_numbers import residual_vectors
 
 # What a run found, as Markdown for the recording.
 
@@ -37,6 +37,12 @@ def run_markdown(run: Run, history: ModelHistory | None) -> str:
         lines += ["| step of the model | views disagree by |", "|---|---:|"]
         lines += [f"| {s.name} | {length_text(s.field.mean_abs, run.session.length_unit)} |" for s in history.steps]
         lines += [""]
+    if len(run.ledger) > 1:
+        lines += ["| model | rms in the fit | on views left out |", "|---|---:|---:|"]
+        for i, step in enumerate(run.ledger):
+            told = [length_text(rms, run.session.length_unit) for rms in (step.residual_rms, step.heldout_rms)]
+            lines += [f"| {effect_changes(run.ledger, i)} | {' | '.join(told)} |"]
+        lines += [""]
     lines += [f"- Registered by {stage.remark}." for stage in run.stages if stage.method]
     lines += [f"- Not observable from these motions: {direction}" for direction in run.unobservable]
     lines += [f"- {note}" for note in run.notes]
@@ -45,29 +51,12 @@ def run_markdown(run: Run, history: ModelHistory | None) -> str:
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
 
-# A stage whose rms did not fall to this share of its first has no course that is worth a picture.
-_FELL = 0.95
 
-
-class RerunRecorder:
+class RerunRecorder(SilentRecorder):
     """A `stitch.runs.recorder.Recorder` that writes one .rrd file when the run has ended."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.rms: dict[str, list[float]] = {}
-
-    def start(self, session: Session) -> None:
-        """Forget what was seen before: a run that leaves views out begins again with the others."""
-        self.rms = {}
-
-    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Keep the rms of an iteration; a stage that begins anew, from another start, counts anew."""
-        if index == 0:
-            self.rms[stage] = []
-        self.rms.setdefault(stage, []).append(rms)
-
-    def stage(self, result: StageResult, poses: Array) -> None:
-        """Nothing: the steps are shown together at the end, by the same correspondences."""
 
     def finish(self, run: Run) -> None:
         """Log the run and close the file."""
@@ -77,26 +66,19 @@ class RerunRecorder:
         rec.log("verdict", words(run_markdown(run, history)), static=True)
         for place in ("diagnosis/plain", "diagnosis/verdict"):
             rec.log(place, words(NOT_YET), static=True)
-        for stage, rms in self.rms.items():
-            rec.log(f"iterations/{stage}", rr.BarChart(np.array(rms) * um, color=GREY), static=True)
-        for which, colour in (("residual_rms", COLOURS_OF_FEW[0]), ("heldout_rms", COLOURS_OF_FEW[1])):
-            fell = np.nan_to_num([getattr(step, which) * um for step in run.ledger])
-            rec.log(f"steps/{which}", rr.BarChart(fell, color=colour), static=True)
-        shift = np.linalg.norm(view_shifts(run), axis=1) * um
-        rec.log("bars/moved", rr.BarChart(shift, color=GREY), static=True)
+        log_no_course(rec, NOT_YET)
         cell = log_robot(rec, run)
         if history is None:
             _log_targets(rec, run)
-            rec.send_blueprint(target_blueprint(cell, run))
+            rec.send_blueprint(target_blueprint(cell))
         else:
             surface = part_surface(run.fused, history.patches)
             camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
             scene = model_scene(run, history, surface, cell)
             log_model(rec, run, scene, camera.up)
             full = scene.limit * um
-            fell = tuple(stage for stage, rms in self.rms.items() if rms[-1] < _FELL * rms[0])
             log_colour_bar(rec, "colours/field", ["0", f"{full / 2:.3g}", f"{full:.3g} µm"], "seen by one view only")
-            rec.send_blueprint(model_blueprint(scene, camera, run, fell))
+            rec.send_blueprint(model_blueprint(scene, camera))
         file.write()
 
 

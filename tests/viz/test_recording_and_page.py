@@ -21,10 +21,10 @@ from stitch.runs.run import Note
 from stitch.units import length_text
 from stitch.writing.result_document import result_document
 from viz.colours import UNSEEN, signed_colours
+from viz.course_recording import log_course
 from viz.diagnosis_recording import log_diagnosis
 from viz.model_timeline import one_above_the_other
 from viz.page_parts import unbroken
-from viz.recording import RerunRecorder
 from viz.rrd_file import RecordingFile
 from viz.run_page import write_report
 
@@ -75,15 +75,32 @@ def test_the_recording_is_whole_and_small_and_shows_everything(recorded):
     shown = {chunk.entity_path for chunk in RrdReader(str(path)).stream()}
     parts = {f"/part/{name}" for name in ("now", "before", "after")} | {f"/scans/{name}" for name in farthest}
     cell = {"/robot/arm", "/robot/flanges", "/robot/part", "/robot/scanner/scanner", "/robot/names"}
-    bars = {"/bars/views", "/bars/moved", "/iterations/correct", "/iterations/register", "/colours/field/ticks"}
-    assert parts | cell | bars | {"/stitched", "/displacements", "/now", "/verdict", "/diagnosis/verdict"} <= shown
+    drawn = {"/bars/views", "/colours/field/ticks", "/diagnosis/why/title"}
+    assert parts | cell | drawn | {"/stitched", "/displacements", "/now", "/verdict", "/diagnosis/verdict"} <= shown
 
 
-def test_a_stage_that_begins_anew_is_drawn_from_its_last_beginning(tmp_path):
-    recorder = RerunRecorder(tmp_path / "r.rrd")
-    for index, rms in ((0, 9.0), (1, 8.0), (0, 5.0), (1, 4.0), (2, 3.0)):
-        recorder.iteration("fit", index, np.zeros((0, 4, 4)), rms, 1.0)
-    assert recorder.rms == {"fit": [5.0, 4.0, 3.0]}
+def test_why_is_drawn_to_scale_and_colours_the_arms(tmp_path):
+    """Heights are in proportion to what was measured, upwards, and the largest offset has the strongest colour."""
+    course = {
+        "follows": "view order",
+        "unit": "",
+        "of": "the part",
+        "value_unit": "mm",
+        "views": [0, 1, 2],
+        "at": [0.0, 1.0, 2.0],
+        "measured": [0.0, 0.1, 0.2],
+        "sigma": [0.01] * 3,
+        "predicted": [0.0, 0.1, 0.2],
+    }
+    file = RecordingFile("stitch", tmp_path / "d.rrd")
+    log_course(file.stream, course, ["a", "b", "c"], 1e3)
+    file.write()
+    places = np.array(columns(tmp_path / "d.rrd", "Points2D:positions")["/diagnosis/why/dots"])
+    steps = np.diff(places, axis=0)
+    assert steps[0] == pytest.approx(steps[1], rel=1e-4) and steps[0][1] < 0 < steps[0][0]
+    colours = columns(tmp_path / "d.rrd", "LineStrips3D:colors")["/robot/arm"]
+    assert len(set(colours)) == 3
+    assert columns(tmp_path / "d.rrd", "Points2D:labels")["/diagnosis/why/names"] == ["a", "b", "c"]
 
 
 def test_no_name_of_a_view_covers_another():

@@ -24,7 +24,7 @@ def require_steps(recording, rows):
     told = told_at(recording)
     assert max(told) == FRAMES * (len(rows) - 1)
     for k, row in enumerate(rows):
-        words = unbroken(f"## {row['step']}\nviews disagree by {length_text(row['mean'], 'mm')} on average;")
+        words = unbroken(f"## {row['step']}\nviews disagree by {length_text(row['mean'], 'mm')} on average.")
         assert told[FRAMES * k].startswith(words)
 
 

@@ -1,0 +1,83 @@
+"""Why, in a recording: the course of an effect as a drawing of its own, and the arms of the cell in its colours."""
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from stitch.frames import Array
+from viz.captions import covariate
+from viz.colours import signed_colours
+
+# Width and height of the drawing, in its own units; y points downwards.
+_WIDE, _HIGH = 100.0, 22.0
+_LEFT, _BELOW, _ABOVE = 12.0, 5.0, 3.0
+# Names of views along the axis: more would cover one another.
+_NAMED = 20
+_DOTS, _LINE, _WHISKER, _AXIS = (232, 235, 239), (230, 159, 0), (150, 155, 160), (110, 115, 120)
+WHERE = "diagnosis/why"
+X_RANGE, Y_RANGE = (-2.0, _LEFT + _WIDE + 3.0), (-_ABOVE - 2.0, _HIGH + _BELOW + 1.0)
+
+
+def log_no_course(recording: rr.RecordingStream, told: str) -> None:
+    """Say that nothing is known yet where the drawing will stand."""
+    _label(recording, "title", [(_LEFT + _WIDE / 2, _HIGH / 2)], [told])
+
+
+def log_course(recording: rr.RecordingStream, course: dict[str, Any], names: list[str], um: float) -> None:
+    """Draw a course of diagnosis.json: dots measured with two sigmas, the line predicted; colour the arms by the dots.
+
+    Args:
+        um: micrometres in one length_unit.
+    """
+    factor, unit = (1e3, "mrad") if course["value_unit"] == "rad" else (um, "µm")
+    at, measured, sigma, predicted = (np.array(course[key]) for key in ("at", "measured", "sigma", "predicted"))
+    measured, sigma, predicted = measured * factor, sigma * factor, predicted * factor
+    x, to_y = _scales(at, measured, sigma, predicted)
+    order = np.argsort(x, kind="stable")
+    line = np.column_stack([x, to_y(predicted)])[order]
+    recording.log(f"{WHERE}/line", rr.LineStrips2D([line], colors=[_LINE], radii=rr.Radius.ui_points(1.5)), static=True)
+    ends = np.stack([np.column_stack([x, to_y(measured + s * 2 * sigma)]) for s in (-1, 1)], axis=1)
+    recording.log(
+        f"{WHERE}/sigma", rr.LineStrips2D(ends, colors=[_WHISKER], radii=rr.Radius.ui_points(0.7)), static=True
+    )
+    dots = rr.Points2D(np.column_stack([x, to_y(measured)]), colors=[_DOTS], radii=rr.Radius.ui_points(4.0))
+    recording.log(f"{WHERE}/dots", dots, static=True)
+    zero = [[_LEFT, float(to_y(np.zeros(1))[0])], [_LEFT + _WIDE, float(to_y(np.zeros(1))[0])]]
+    recording.log(f"{WHERE}/zero", rr.LineStrips2D([zero], colors=[_AXIS], radii=rr.Radius.ui_points(0.7)), static=True)
+    follows = "views in their order" if course["follows"] == "view order" else covariate(course["follows"])
+    along = f"{follows} ({course['unit']})" if course["unit"] else follows
+    _label(
+        recording, "title", [(_LEFT + _WIDE / 2, -_ABOVE)], [f"how far {course['of']} is off ({unit}), over {along}"]
+    )
+    heights = np.array([measured.max(), 0.0]) if measured.max() > -measured.min() else np.array([0.0, measured.min()])
+    _label(
+        recording, "heights", np.column_stack([np.full(2, _LEFT / 2), to_y(heights)]), [f"{h:+.3g}" for h in heights]
+    )
+    some = order[np.unique(np.linspace(0, len(x) - 1, min(len(x), _NAMED)).astype(int))]
+    told = [names[course["views"][i]] for i in some] if course["views"] else [f"{at[i]:.3g}" for i in some]
+    _label(recording, "names", np.column_stack([x[some], np.full(len(some), _HIGH + _BELOW / 2)]), told)
+    if len(course["views"]) == len(names):
+        colours = signed_colours(measured, float(np.abs(measured).max()))
+        recording.log("robot/flanges", rr.Points3D.from_fields(colors=colours), static=True)
+        recording.log("robot/arm", rr.LineStrips3D.from_fields(colors=colours), static=True)
+
+
+def _scales(at: Array, measured: Array, sigma: Array, predicted: Array) -> tuple[Array, Any]:
+    """(D,) places along the drawing, and how values become heights."""
+    x = _LEFT + _WIDE * (at - at.min()) / (float(np.ptp(at)) or 1.0)
+    low = min(float((measured - 2 * sigma).min()), float(predicted.min()), 0.0)
+    high = max(float((measured + 2 * sigma).max()), float(predicted.max()), 0.0)
+    size = (high - low) or 1.0
+
+    def to_y(values: Array) -> Array:
+        return _HIGH * (high - values) / size
+
+    return x, to_y
+
+
+def _label(recording: rr.RecordingStream, name: str, places: Any, texts: list[str]) -> None:
+    shown = rr.Points2D(
+        places, labels=texts, colors=[(200, 204, 210)], radii=rr.Radius.ui_points(0.1), show_labels=True
+    )
+    recording.log(f"{WHERE}/{name}", shown, static=True)
