@@ -68,24 +68,19 @@ def reveal(
     Examples:
       stitch reveal runs/blade cells/blade.truth.json
     """
-    from rich.table import Table
-
     from data_synth.judgement import judge
-    from stitch.system.process import console
+    from stitch.cli.terminal import show_block
 
     judged = judge(run, truth)
     if as_json:
         print(json.dumps(judged, indent=1))
         return
-    table = Table("", "", show_header=False, box=None)
     if judged["in_the_model"] and not judged["named"]:
         del judged["named"]
     # Values of what is in the model follow, each beside what was found.
     judged["hidden"] = {name: {} if name in judged["in_the_model"] else own for name, own in judged["hidden"].items()}
     judged["verdict"] = judged["verdict"].replace("_", " ")
-    for key, value in judged.items():
-        table.add_row(_LABELS.get(key, key), _told(value))
-    console().print(table)
+    show_block([(_LABELS.get(key, key), _told(value)) for key, value in judged.items()])
 
 
 def _told(value: object) -> str:

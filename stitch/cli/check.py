@@ -4,29 +4,42 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stitch.cli.options import Json
-from stitch.cli.terminal import emit
+from stitch.cli.progress import show_activity
+from stitch.cli.terminal import emit, say, show_block
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
     from stitch.measurement.session import Session
 
 
-# What `stitch check` does: what sessions hold, and what is wrong with them.
+def check(
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
+    deep: Annotated[
+        bool, typer.Option("--deep", help="Also try out what people do wrong: pairing, conventions, units, views.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Read sessions completely and say what is wrong; computes nothing unless asked to look deeper.
 
-
-def check_sessions(sessions: list[Path], as_json: bool) -> None:
-    """Read sessions and say what they hold; what cannot be read is said for each.
-
-    Raises:
-        typer.Exit: with 2, where one cannot be read.
+    \b
+    Examples:
+      stitch check blade-17
+      stitch check --deep blade-17 --json
     """
+    if deep:
+        _check_deeply(sessions, as_json)
+    else:
+        _check_readable(sessions, as_json)
+
+
+def _check_readable(sessions: list[Path], as_json: bool) -> None:
+    """Say what sessions hold; exit code 2 where one cannot be read."""
     from stitch.reading.session_folder import load_session
 
     facts, errors = [], []
@@ -39,26 +52,23 @@ def check_sessions(sessions: list[Path], as_json: bool) -> None:
         emit(json.dumps({"sessions": facts, "errors": errors}, indent=1))
     else:
         for fact in facts:
-            _print_summary(fact)
+            say(f"{fact['session']}: readable", bold=True)
+            show_block(_summary_rows(fact))
     for line in errors:
         print(f"stitch: {line}", file=sys.stderr)
     if errors:
         raise typer.Exit(2)
 
 
-def check_deeply(sessions: list[Path], as_json: bool) -> None:
-    """Every usual mistake tried on each session: what is wrong, in which views, how to fix it.
-
-    Raises:
-        typer.Exit: with 2, where something is wrong for certain.
-    """
+def _check_deeply(sessions: list[Path], as_json: bool) -> None:
+    """Try every usual mistake on each session; exit code 2 where something is wrong for certain."""
     from stitch.integrity.deep_check import deep_check
     from stitch.reading.session_folder import load_session
-    from stitch.system.process import console
     from stitch.writing.json_file import to_json
 
-    loaded = {str(path): load_session(path) for path in sessions}
-    found = {path: deep_check(session) for path, session in loaded.items()}
+    with show_activity("trying the usual mistakes"):
+        loaded = {str(path): load_session(path) for path in sessions}
+        found = {path: deep_check(session) for path, session in loaded.items()}
     documents = [
         {"session": path, "ok": not problems, "problems": [p.as_dict() for p in problems]}
         for path, problems in found.items()
@@ -68,13 +78,13 @@ def check_deeply(sessions: list[Path], as_json: bool) -> None:
     else:
         for path, problems in found.items():
             for line in [p.line(loaded[path].names) for p in problems] or ["nothing wrong was found"]:
-                console().print(f"{path}: {line}", soft_wrap=True)
+                say(f"{path}: {line}", hang=2)
     if any(p.certain for problems in found.values() for p in problems):
         raise typer.Exit(2)
 
 
 def session_summary(session: Session) -> dict[str, object]:
-    """What a session holds, in plain numbers."""
+    """Return what a session holds, in plain numbers."""
     import numpy as np
 
     from stitch.measurement.measurement import session_notes
@@ -99,52 +109,21 @@ def session_summary(session: Session) -> dict[str, object]:
     }
 
 
-def _print_summary(fact: dict[str, Any]) -> None:
-    from rich.table import Table
-
-    from stitch.system.process import console
-
-    table = Table(show_header=False, title=f"{fact['session']}: readable", title_justify="left")
-    for name, told in _summary_rows(fact):
-        table.add_row(name, told)
-    console().print(table)
-
-
-def _summary_rows(fact: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """The same for people: words for keys, lengths with their unit."""
+def _summary_rows(fact: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the same for people: words for keys, lengths with their unit."""
     carried = "the scanner" if fact["mount"] == "eye_in_hand" else "the part"
-    yield "mount", f"{fact['mount']}: {carried} sits at the flange"
-    yield "length unit", fact["length_unit"]
-    yield "views", str(fact["views"])
-    if fact["points"]:
-        yield "scanned points", f"{fact['points']:,}"
-    if fact["targets"]:
-        yield "labelled points", f"{fact['targets']} targets, seen {fact['sightings']} times"
-    if fact["median_range"] is not None:
-        yield "distance from the scanner", f"{fact['median_range']:g} {fact['length_unit']}, median"
-    yield "arm", fact["robot"] or "not stated: poses of the flange only"
-    yield "joint angles", "in views.csv" if fact["joints"] else "none: effects of joints cannot be tested"
-    yield "hand-eye", "a coarse one is stated" if fact["hand_eye_given"] else "not stated: it is found from the scans"
-    yield "beside the poses", ", ".join(fact["covariates"]) or "nothing"
-    yield from (("note", note) for note in fact["notes"])
-
-
-def check(
-    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
-    deep: Annotated[
-        bool, typer.Option("--deep", help="Also try out what people do wrong: pairing, conventions, units, views.")
-    ] = False,
-    as_json: Json = False,
-) -> None:
-    """Read sessions completely and say what is wrong; computes nothing unless asked to look deeper.
-
-    \b
-    Examples:
-      stitch check blade-17
-      stitch check --deep blade-17 --json
-    """
-
-    if deep:
-        check_deeply(sessions, as_json)
-    else:
-        check_sessions(sessions, as_json)
+    unit, far = fact["length_unit"], fact["median_range"]
+    rows = [
+        ("mount", f"{fact['mount']}: {carried} sits at the flange"),
+        ("length unit", unit),
+        ("views", str(fact["views"])),
+        ("scanned points", f"{fact['points']:,}" if fact["points"] else ""),
+        ("labelled points", f"{fact['targets']} targets, seen {fact['sightings']} times" if fact["targets"] else ""),
+        ("distance from the scanner", "" if far is None else f"{far:g} {unit}, median"),
+        ("arm", fact["robot"] or "not stated: poses of the flange only"),
+        ("joint angles", "in views.csv" if fact["joints"] else "none: effects of joints cannot be tested"),
+        ("hand-eye", "a coarse one is stated" if fact["hand_eye_given"] else "not stated: found from the scans"),
+        ("measured with each view", ", ".join(fact["covariates"]) or "nothing"),
+        *(("note", note) for note in fact["notes"]),
+    ]
+    return [row for row in rows if row[1]]

@@ -1,6 +1,7 @@
 """The commands of `stitch`: its own, and those that other packages add through the entry-point group `stitch.commands`.
 
-A command is imported when it is asked for, so that one does not wait for the libraries of all.
+A command is imported when it is asked for, and a list of all reads what they are for from their source: nobody waits
+for the libraries of all.
 """
 
 import ast
@@ -15,36 +16,6 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from stitch.cli.terminal import stdout_for_results
-
-# What a command is for, read from its source: a list of all commands does not wait for the libraries of all.
-
-
-def command_help(entry: EntryPoint) -> str | None:
-    """The docstring of the function behind an entry, or the `help` of a group of commands; None where it is neither."""
-    try:
-        nodes = ast.parse(_module_source(entry.module)).body
-    except (OSError, SyntaxError, ValueError):
-        return None
-    for node in nodes:
-        match node:
-            case ast.FunctionDef(name=name) if name == entry.attr:
-                return ast.get_docstring(node)
-            case ast.Assign(targets=[ast.Name(id=name)], value=ast.Call(keywords=keywords)) if name == entry.attr:
-                given = next((key.value for key in keywords if key.arg == "help"), None)
-                return given.value if isinstance(given, ast.Constant) and isinstance(given.value, str) else None
-    return None
-
-
-def _module_source(module: str) -> str:
-    """Source of a module; the packages above it are not imported."""
-    top, *inner = module.split(".")
-    spec = find_spec(top)
-    for folder in (spec.submodule_search_locations or ()) if spec else ():
-        file = Path(folder, *inner).with_suffix(".py")
-        if file.is_file():
-            return file.read_text(encoding="utf-8")
-    return ""
-
 
 GROUP = "stitch.commands"
 _OWN_COMMANDS = {
@@ -134,3 +105,30 @@ class CommandGroup(TyperGroup):
             return super().shell_complete(ctx, incomplete)
         finally:
             self.commands = loaded
+
+
+def command_help(entry: EntryPoint) -> str | None:
+    """The docstring of the function behind an entry, or the `help` of a group of commands; None where it is neither."""
+    try:
+        nodes = ast.parse(_module_source(entry.module)).body
+    except (OSError, SyntaxError, ValueError):
+        return None
+    for node in nodes:
+        match node:
+            case ast.FunctionDef(name=name) if name == entry.attr:
+                return ast.get_docstring(node)
+            case ast.Assign(targets=[ast.Name(id=name)], value=ast.Call(keywords=keywords)) if name == entry.attr:
+                given = next((key.value for key in keywords if key.arg == "help"), None)
+                return given.value if isinstance(given, ast.Constant) and isinstance(given.value, str) else None
+    return None
+
+
+def _module_source(module: str) -> str:
+    """Source of a module; the packages above it are not imported."""
+    top, *inner = module.split(".")
+    spec = find_spec(top)
+    for folder in (spec.submodule_search_locations or ()) if spec else ():
+        file = Path(folder, *inner).with_suffix(".py")
+        if file.is_file():
+            return file.read_text(encoding="utf-8")
+    return ""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stitch.cli.options import Json, require_new
+from stitch.cli.progress import show_activity
 from stitch.cli.terminal import emit, results_stream
 from stitch.errors import InputError
 
@@ -17,94 +18,8 @@ if TYPE_CHECKING:
     from stitch.intake.scan_targets import TargetSearch
     from stitch.measurement.session import Sighting
 
-
-# What `--board` and `--ball` say, read.
-
 # Larger balls fit on no table.
 _LARGEST_MM = 2000.0
-
-
-def parse_target_options(board: list[str] | None, ball: list[str] | None) -> TargetSearch:
-    """What the options say.
-
-    Raises:
-        InputError: no board that is known, or no radius.
-    """
-    from stitch.detection.boards import parse_board
-    from stitch.intake.scan_targets import TargetSearch
-
-    return TargetSearch(tuple(parse_board(text) for text in board or ()), _ball_radii(ball) if ball else None)
-
-
-def _ball_radii(stated: list[str]) -> tuple[float, ...]:
-    """Radii in mm; none for balls of any radius."""
-    if stated == ["any"]:
-        return ()
-    try:
-        radii = tuple(float(text) for text in stated)
-    except ValueError:
-        radii = (0.0,)
-    if not all(0 < radius < _LARGEST_MM for radius in radii):
-        raise InputError(f"--ball {' --ball '.join(stated)}: to fix: state radii in mm, above 0, or any alone")
-    return radii
-
-
-# What `stitch detect` does: boards and balls in the scans of a session, as a table.
-
-
-def run_detect(
-    session: Path, board: list[str] | None, ball: list[str] | None, output: Path | None, as_json: bool
-) -> None:
-    """Find targets and write them.
-
-    Raises:
-        InputError, NoResultError: as `stitch detect` ends.
-    """
-    from stitch.intake.scan_targets import find_targets, points_columns, scans_of_session, views_of_targets
-    from stitch.reading.session_folder import load_session
-    from stitch.system.files import whole_file
-    from stitch.writing.session_files import table_text, write_table
-
-    wanted = parse_target_options(board, ball)
-    if wanted.is_empty:
-        raise InputError("stitch detect: nothing to look for; to fix: state --board or --ball")
-    require_new(output)
-    loaded = load_session(session, at_most=None)
-    found, notes = find_targets(scans_of_session(loaded), wanted)
-    views = loaded.names
-    columns = points_columns(views, found)
-    if output is not None:
-        with whole_file(output) as scratch:
-            write_table(scratch, columns)
-    for note in notes:
-        print(f"{note}.", file=sys.stderr)
-    if as_json:
-        emit(json.dumps(_document(session, views, found, notes), indent=1))
-    elif output is None:
-        results_stream().write(table_text(columns))
-    showing = sum(bool(s.targets) for s in found)
-    count = len(views_of_targets(found))
-    where = output or "standard output"
-    print(f"{where}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views", file=sys.stderr)
-    if output == session / "points.csv":
-        print(f"Next: stitch run {session}", file=sys.stderr)
-
-
-def _document(session: Path, views: list[str], sightings: list[Sighting], notes: list[str]) -> dict[str, object]:
-    import numpy as np
-
-    from stitch.intake.scan_targets import views_of_targets
-
-    return {
-        "session": str(session),
-        "views": {view: len(s.targets) for view, s in zip(views, sightings, strict=True)},
-        "targets": views_of_targets(sightings),
-        "median_sigma": float(np.median(np.concatenate([s.sigma for s in sightings]))),
-        "notes": notes,
-    }
-
-
-# `--board` and `--ball`: what scans are said to show.
 
 BoardOption = Annotated[
     list[str] | None,
@@ -137,5 +52,71 @@ def detect(
       stitch detect calibration --board charuco:11x8:20:15:DICT_4X4_50 -o calibration/points.csv
       stitch detect calibration --ball any
     """
+    from stitch.intake.scan_targets import find_targets, points_columns, scans_of_session, views_of_targets
+    from stitch.reading.session_folder import load_session
+    from stitch.system.files import whole_file
+    from stitch.writing.session_files import table_text, write_table
 
-    run_detect(session, board, ball, output, as_json)
+    wanted = parse_target_options(board, ball)
+    if wanted.is_empty:
+        raise InputError("stitch detect: nothing to look for; to fix: state --board or --ball")
+    require_new(output)
+    with show_activity("looking for targets in the scans"):
+        loaded = load_session(session, at_most=None)
+        found, notes = find_targets(scans_of_session(loaded), wanted)
+    views = loaded.names
+    columns = points_columns(views, found)
+    if output is not None:
+        with whole_file(output) as scratch:
+            write_table(scratch, columns)
+    for note in notes:
+        print(f"{note}.", file=sys.stderr)
+    if as_json:
+        emit(json.dumps(_document(session, views, found, notes), indent=1))
+    elif output is None:
+        results_stream().write(table_text(columns))
+    showing = sum(bool(s.targets) for s in found)
+    count = len(views_of_targets(found))
+    where = output or "standard output"
+    print(f"{where}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views", file=sys.stderr)
+    if output == session / "points.csv":
+        print(f"Next: stitch run {session}", file=sys.stderr)
+
+
+def parse_target_options(board: list[str] | None, ball: list[str] | None) -> TargetSearch:
+    """Return what the options say.
+
+    Raises:
+        InputError: no board that is known, or no radius.
+    """
+    from stitch.detection.boards import parse_board
+    from stitch.intake.scan_targets import TargetSearch
+
+    return TargetSearch(tuple(parse_board(text) for text in board or ()), _ball_radii(ball) if ball else None)
+
+
+def _ball_radii(stated: list[str]) -> tuple[float, ...]:
+    """Return radii in mm; none for balls of any radius."""
+    if stated == ["any"]:
+        return ()
+    try:
+        radii = tuple(float(text) for text in stated)
+    except ValueError:
+        radii = (0.0,)
+    if not all(0 < radius < _LARGEST_MM for radius in radii):
+        raise InputError(f"--ball {' --ball '.join(stated)}: to fix: state radii in mm, above 0, or any alone")
+    return radii
+
+
+def _document(session: Path, views: list[str], sightings: list[Sighting], notes: list[str]) -> dict[str, object]:
+    import numpy as np
+
+    from stitch.intake.scan_targets import views_of_targets
+
+    return {
+        "session": str(session),
+        "views": {view: len(s.targets) for view, s in zip(views, sightings, strict=True)},
+        "targets": views_of_targets(sightings),
+        "median_sigma": float(np.median(np.concatenate([s.sigma for s in sightings]))),
+        "notes": notes,
+    }

@@ -3,55 +3,52 @@
 from __future__ import annotations
 
 from math import isfinite
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stitch.cli.options import EffectsFile, Json
-from stitch.cli.terminal import emit, results_stream
+from stitch.cli.terminal import emit, results_stream, say, show_table
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from stitch.effects.contract import Effect
 
 
-# What `stitch effects` does: the library as a table, one effect in full, or both as JSON.
+def effects(
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Show one effect.")] = None,
+    effects_file: EffectsFile = None,
+    as_json: Json = False,
+) -> None:
+    """List the physical effects with place, formula, parameters and plausible sizes.
 
-
-def run_effects(name: str | None, effects_file: Path | None, as_json: bool) -> None:
-    """Show the library, or one effect of it.
-
-    Raises:
-        InputError: no such effect, or a file of effects that is none.
+    \b
+    Examples:
+      stitch effects
+      stitch effects joint_compliance
+      stitch effects --effects-file mine.py --json
     """
-    from rich.table import Table
-
     from stitch.effects.contract import EFFECTS, find_effect
     from stitch.effects.user_file import load
-    from stitch.system.process import console
     from stitch.writing.json_file import to_json
 
     if effects_file:
         load(effects_file)
-    terminal = console(results_stream())
     if as_json:
         emit(to_json([_document(e) for e in ([find_effect(name)] if name else EFFECTS.values())]))
-        return
-    if name:
-        _show_effect(terminal, name)
-        return
-    table = Table()
-    for heading in ("effect", "place", "what nature does", "parameters"):
-        table.add_column(heading, overflow="fold", no_wrap=heading == "effect")
-    for effect in EFFECTS.values():
-        table.add_row(effect.name, effect.place, effect.formula, parameter_signature(effect))
-    terminal.print(table)
+    elif name:
+        _show_effect(find_effect(name))
+    else:
+        show_table(
+            "Physical effects",
+            ("effect", "place", "what nature does", "parameters"),
+            [(e.name, e.place, e.formula, parameter_signature(e)) for e in EFFECTS.values()],
+            words=("place", "what nature does", "parameters"),
+            stream=results_stream(),
+        )
 
 
 def parameter_signature(effect: Effect) -> str:
-    """The parameters with their units: c₁… (rad/(N m))."""
+    """Return the parameters with their units: c₁… (rad/(N m))."""
     return ", ".join(f"{key}{'' if s.kind == 'number' else '₁…'} ({s.unit})" for key, s in effect.specs.items())
 
 
@@ -78,12 +75,9 @@ def _document(effect: Effect) -> dict[str, Any]:
     }
 
 
-def _show_effect(terminal: Console, name: str) -> None:
-    from stitch.effects.contract import PLACES, find_effect
+def _show_effect(effect: Effect) -> None:
+    from stitch.effects.contract import PLACES
 
-    effect = find_effect(name)
-    terminal.print(f"{effect.name} ({effect.tier}), at {effect.place}: {PLACES[effect.place]}", soft_wrap=True)
-    terminal.print(f"  {effect.formula}")
     kinds = {
         "number": "",
         "offset": ", x, y, z, or zero",
@@ -91,28 +85,14 @@ def _show_effect(terminal: Console, name: str) -> None:
         "torque": ", one a gravity torque",
         "twist": ", a twist: rx … tz",
     }
+    lines = [f"{effect.name} ({effect.tier}), at {effect.place}: {PLACES[effect.place]}", f"  {effect.formula}"]
     for key, spec in effect.specs.items():
         shift = f" and {spec.typical_shift:g} {spec.unit_shift}" if spec.kind == "twist" else ""
         sizes = f"plausible {spec.typical:g}{shift}, doubtful beyond {spec.limit:g}"
-        terminal.print(f"  {key}: {spec.unit}{kinds[spec.kind]}; {sizes}", soft_wrap=True)
+        lines.append(f"  {key}: {spec.unit}{kinds[spec.kind]}; {sizes}")
     if effect.needs:
-        terminal.print(f"  needs {', '.join(effect.needs)}")
+        lines.append(f"  needs {', '.join(effect.needs)}")
     if effect.prefers:
-        terminal.print(f"  uses {', '.join(effect.prefers)} where the session has it")
-
-
-def effects(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Show one effect.")] = None,
-    effects_file: EffectsFile = None,
-    as_json: Json = False,
-) -> None:
-    """List the physical effects with place, formula, parameters and plausible sizes.
-
-    \b
-    Examples:
-      stitch effects
-      stitch effects joint_compliance
-      stitch effects --effects-file mine.py --json
-    """
-
-    run_effects(name, effects_file, as_json)
+        lines.append(f"  uses {', '.join(effect.prefers)} where the session has it")
+    for line in lines:
+        say(line, stream=results_stream())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust, require_new
-from stitch.cli.terminal import emit, results_stream
+from stitch.cli.terminal import emit, results_stream, say, show_table
 from stitch.errors import InputError
 from stitch.export.formats import ARM, CLOUD, HAND_EYE, LIMIT_MM
 
@@ -20,193 +20,10 @@ if TYPE_CHECKING:
     from stitch.export.robot_program import CompensatedProgram
     from stitch.frames import Array
 
-
-# What `stitch export --program` does: a compensated copy of a robot program, and the table of its moves.
-
 _J3_CONVENTIONS = ("own", "j2+j3")
 _LISTED_TARGETS = 40
 # Below this (mm) nothing remains: no arm knows a nanometre.
 _NEGLIGIBLE_MOVE = 1e-6
-
-
-def export_program(
-    file: Path,
-    arm: ArmModel,
-    output: Path | None,
-    frame: str | None,
-    tool: str | None,
-    *,
-    limit: float,
-    near: str | None,
-    j3: str | None,
-    as_json: bool,
-) -> None:
-    """Write the copy and show its moves.
-
-    Raises:
-        InputError: no place for it, a limit or joint angles that are none, and what `compensated_program` refuses.
-    """
-    from stitch.controllers.program import read_program
-    from stitch.export.robot_program import compensated_program
-    from stitch.writing.json_file import to_json
-
-    if output is None:
-        raise InputError(f"{file}: where to? to fix: name the copy with -o FILE")
-    if not 0 < limit < float("inf"):
-        raise InputError(f"--limit {limit:g}: to fix: give a length above zero, in mm")
-    program = read_program(file, frame, tool)
-    copy = compensated_program(program, arm, limit, _nearby_joints(near, arm), _is_j3_coupled(program, j3))
-    places = _output_files(program, output)
-    _write_program(copy, places)
-    if as_json:
-        emit(to_json(_program_document(copy, list(places.values()), limit)))
-    else:
-        _show_moves(copy, list(places.values()))
-
-
-def _nearby_joints(near: str | None, arm: ArmModel) -> Array | None:
-    import numpy as np
-
-    from stitch.reading.csv_files import is_number
-
-    if near is None:
-        return None
-    cells = near.split(",")
-    told: Array = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
-    if len(told) != arm.robot.n_joints or not np.isfinite(told).all():
-        raise InputError(f"--near {near}: to fix: write {arm.robot.n_joints} angles in degrees with commas")
-    return np.asarray(np.radians(told))
-
-
-def _is_j3_coupled(program: Program, j3: str | None) -> bool:
-    """A FANUC counts J3 from the horizontal: whether the session's arm does too, its joint angles cannot tell."""
-    if j3 not in (None, *_J3_CONVENTIONS):
-        raise InputError(f"--j3 {j3}: to fix: own, or j2+j3")
-    has_joints = any(point.joints is not None for point in program.points)
-    if program.controller == "fanuc" and has_joints and j3 is None:
-        raise InputError(
-            f"{program.file}: has joint targets, and a FANUC's J3 turns with J2; to fix: --j3 j2+j3 where the "
-            "session's third joint is J2 + J3, --j3 own where its views.csv has J3 as the controller shows it"
-        )
-    return program.controller == "fanuc" and j3 == "j2+j3"
-
-
-def _output_files(program: Program, output: Path) -> dict[Path, Path]:
-    """Where each file of the program goes: a KUKA's data list beside the copy, under the same name."""
-    if output.suffix.lower() != program.file.suffix.lower():
-        raise InputError(f"{output}: to fix: end the copy's name in {program.file.suffix}, as the program's does")
-    places = {program.file: output}
-    places |= {file: output.with_suffix(file.suffix) for file in program.texts if file != program.file}
-    for place in places.values():
-        require_new(place)
-    return places
-
-
-def _write_program(copy: CompensatedProgram, places: dict[Path, Path]) -> None:
-    from stitch.controllers.taught_points import program_bytes
-    from stitch.system.files import whole_file
-
-    with ExitStack() as stack:
-        for file, text in copy.texts.items():
-            stack.enter_context(whole_file(places[file])).write_bytes(program_bytes(text))
-
-
-def _program_document(copy: CompensatedProgram, places: list[Path], limit: float) -> dict[str, Any]:
-    return {
-        "format": "stitch-program/1",
-        "program": str(copy.program.file),
-        "controller": copy.program.controller,
-        "session": copy.arm.session,
-        "effects": [term.name for term in copy.arm.terms],
-        "not_compensated": list(copy.beyond),
-        "limit_mm": limit,
-        "targets": copy.rows(),
-        "notes": list(copy.notes),
-        "files": [str(place) for place in places],
-    }
-
-
-def _show_moves(copy: CompensatedProgram, places: list[Path]) -> None:
-    from rich.table import Table
-
-    from stitch.system.process import console
-    from stitch.units import angle_text, length_text
-
-    terminal, rows = console(), copy.rows()
-    table = Table(title=f"{copy.program.file.name}: targets moved", title_justify="left")
-    for heading in ("target", "line", "moved", "U (k = 2)", "turned"):
-        table.add_column(heading, justify="left" if heading == "target" else "right")
-    for row in rows[:_LISTED_TARGETS]:
-        moved, U = length_text(row["moved_mm"], "mm", 4, zeros=True), length_text(row["U_mm"], "mm", zeros=True)
-        table.add_row(row["target"], str(row["line"]), moved, U, angle_text(row["moved_mrad"] / 1e3))
-    terminal.print(table)
-    if len(rows) > _LISTED_TARGETS:
-        terminal.print(f"{len(rows) - _LISTED_TARGETS} more; --json has all.", soft_wrap=True)
-    far, left = max(rows, key=lambda row: row["moved_mm"]), max(row["left_mm"] for row in rows)
-    effects, unit = ", ".join(term.name for term in copy.arm.terms), "mm"
-    terminal.print(
-        f"Undone: {effects}. {far['target']} moves farthest, by {length_text(far['moved_mm'], unit)}; under the "
-        f"model {f'up to {length_text(left, unit)} remain' if left > _NEGLIGIBLE_MOVE else 'nothing remains'}.",
-        soft_wrap=True,
-    )
-    for note in copy.notes:
-        terminal.print(f"{note[0].upper()}{note[1:]}.", soft_wrap=True)
-    for place in places:
-        terminal.print(f"  {place}", soft_wrap=True)
-
-
-# What `stitch export --to` does: what a run found, in a format that another program reads.
-
-
-def export_result(
-    run: Path, to: str, output: Path | None, parent: str | None, child: str, effects_file: Path | None, *, trust: bool
-) -> None:
-    """Write a hand-eye, an arm or a cloud in a format that is known.
-
-    Raises:
-        InputError: the run has no such thing, or the format no place for it.
-    """
-    from stitch.export.arm_model import ARM_FORMATS, arm_of_run
-    from stitch.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_of_run, ros_launch
-
-    if to in ARM_FORMATS:
-        _export_text(ARM_FORMATS[to](arm_of_run(run, effects_file, trust)), to, output)
-    elif to in HAND_EYE_FORMATS:
-        eye = hand_eye_of_run(run, parent, child)
-        # ROS 1 knows launch files in XML only.
-        old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
-        _export_text(ros_launch(eye) if old else HAND_EYE_FORMATS[to](eye), to, output)
-    else:
-        _export_cloud(run, to, output)
-
-
-def _export_text(text: str, to: str, output: Path | None) -> None:
-    from stitch.system.files import whole_file
-
-    if output is None:
-        results_stream().write(text)
-        return
-    with whole_file(output) as file:
-        file.write_text(text, encoding="utf-8")
-    print(f"{to} to {output}", file=sys.stderr)
-
-
-def _export_cloud(run: Path, to: str, output: Path | None) -> None:
-    from stitch.export.cloud_formats import CLOUD_FORMATS, coloured_cloud
-    from stitch.system.files import whole_file
-    from stitch.units import MICROMETRES
-
-    if output is None or output.suffix.lower() != f".{to}":
-        raise InputError(f"--to {to}: where to? to fix: name the file with -o NAME.{to}")
-    write, lost = CLOUD_FORMATS[to]
-    cloud = coloured_cloud(run)
-    with whole_file(output) as file:
-        write(cloud, file)
-    span = cloud.span * MICROMETRES[cloud.length_unit]
-    told = [f"{output}: coloured by residual, from dark at 0 to yellow at {span:.3g} µm; grey: one view alone"]
-    told += [f"{to} does not hold {lost}"] if lost else []
-    print("; ".join(told), file=sys.stderr)
-
 
 _KINDS = f"hand-eye: {', '.join(HAND_EYE)}; arm: {', '.join(ARM)}; cloud: {', '.join(CLOUD)}"
 _To = Annotated[str | None, typer.Option("--to", metavar="FORMAT", help=f"{_KINDS}.")]
@@ -259,23 +76,172 @@ def export_run(
       stitch export runs/blade-17 --to glb -o blade.glb
       stitch export runs/blade-17 --program scan.src -o compensated.src --frame 0,0,0,0,0,0 --tool 0,0,150,0,0,0
     """
-    from stitch.export.arm_model import arm_of_run
+    from stitch.export.arm_model import ARM_FORMATS, arm_of_run
+    from stitch.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_of_run, ros_launch
 
-    _require_export_options(to, program, output)
-
-    if program is not None:
-        arm = arm_of_run(run, effects_file, trust)
-        export_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
-    else:
-        export_result(run, str(to), output, parent, child, effects_file, trust=trust)
-
-
-def _require_export_options(to: str | None, program: Path | None, output: Path | None) -> None:
-    """Refuse neither or both of format and program, a format that is none, and a file that has no place."""
     if (to is None) == (program is None):
         raise InputError("export what? to fix: name one of --to FORMAT and --program FILE")
     require_new(output)
-    if output is not None and not output.parent.is_dir():
-        raise InputError(f"{output}: there is no folder {output.parent}; to fix: make it, or name another")
     if program is None and to not in (*HAND_EYE, *ARM, *CLOUD):
         raise InputError(f"--to {to}: to fix: one of {_KINDS}")
+    if program is not None:
+        arm = arm_of_run(run, effects_file, trust)
+        _export_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
+    elif to in ARM_FORMATS:
+        _export_text(ARM_FORMATS[to](arm_of_run(run, effects_file, trust)), to, output)
+    elif to in HAND_EYE_FORMATS:
+        eye = hand_eye_of_run(run, parent, child)
+        # ROS 1 knows launch files in XML only.
+        old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
+        _export_text(ros_launch(eye) if old else HAND_EYE_FORMATS[to](eye), to, output)
+    else:
+        _export_cloud(run, str(to), output)
+
+
+def _export_text(text: str, to: str, output: Path | None) -> None:
+    from stitch.system.files import whole_file
+
+    if output is None:
+        results_stream().write(text)
+        return
+    with whole_file(output) as file:
+        file.write_text(text, encoding="utf-8")
+    print(f"{to} to {output}", file=sys.stderr)
+
+
+def _export_cloud(run: Path, to: str, output: Path | None) -> None:
+    from stitch.export.cloud_formats import CLOUD_FORMATS, coloured_cloud
+    from stitch.system.files import whole_file
+    from stitch.units import MICROMETRES
+
+    if output is None or output.suffix.lower() != f".{to}":
+        raise InputError(f"--to {to}: no output file; to fix: name the file with -o NAME.{to}")
+    write, lost = CLOUD_FORMATS[to]
+    cloud = coloured_cloud(run)
+    with whole_file(output) as file:
+        write(cloud, file)
+    span = cloud.span * MICROMETRES[cloud.length_unit]
+    told = [f"{output}: coloured by residual, from dark at 0 to yellow at {span:.3g} µm; grey: one view alone"]
+    told += [f"{to} does not hold {lost}"] if lost else []
+    print("; ".join(told), file=sys.stderr)
+
+
+def _export_program(
+    file: Path,
+    arm: ArmModel,
+    output: Path | None,
+    frame: str | None,
+    tool: str | None,
+    *,
+    limit: float,
+    near: str | None,
+    j3: str | None,
+    as_json: bool,
+) -> None:
+    """Write a compensated copy of a robot program, and print the table of its moves."""
+    from stitch.controllers.program import read_program
+    from stitch.controllers.taught_points import program_bytes
+    from stitch.export.robot_program import compensated_program
+    from stitch.system.files import whole_file
+    from stitch.writing.json_file import to_json
+
+    if output is None:
+        raise InputError(f"{file}: no output file; to fix: name the copy with -o FILE")
+    if not 0 < limit < float("inf"):
+        raise InputError(f"--limit {limit:g}: to fix: give a length above zero, in mm")
+    program = read_program(file, frame, tool)
+    copy = compensated_program(program, arm, limit, _nearby_joints(near, arm), _is_j3_coupled(program, j3))
+    places = _output_files(program, output)
+    with ExitStack() as stack:
+        for source, text in copy.texts.items():
+            stack.enter_context(whole_file(places[source])).write_bytes(program_bytes(text))
+    if as_json:
+        emit(to_json(_program_document(copy, list(places.values()), limit)))
+    else:
+        _show_moves(copy, list(places.values()))
+
+
+def _nearby_joints(near: str | None, arm: ArmModel) -> Array | None:
+    import numpy as np
+
+    from stitch.reading.csv_files import is_number
+
+    if near is None:
+        return None
+    cells = near.split(",")
+    told: Array = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
+    if len(told) != arm.robot.n_joints or not np.isfinite(told).all():
+        raise InputError(f"--near {near}: to fix: write {arm.robot.n_joints} angles in degrees with commas")
+    return np.asarray(np.radians(told))
+
+
+def _is_j3_coupled(program: Program, j3: str | None) -> bool:
+    """A FANUC counts J3 from the horizontal: whether the session's arm does too, its joint angles cannot tell."""
+    if j3 not in (None, *_J3_CONVENTIONS):
+        raise InputError(f"--j3 {j3}: to fix: own, or j2+j3")
+    has_joints = any(point.joints is not None for point in program.points)
+    if program.controller == "fanuc" and has_joints and j3 is None:
+        raise InputError(
+            f"{program.file}: has joint targets, and a FANUC's J3 turns with J2; to fix: --j3 j2+j3 where the "
+            "session's third joint is J2 + J3, --j3 own where its views.csv has J3 as the controller shows it"
+        )
+    return program.controller == "fanuc" and j3 == "j2+j3"
+
+
+def _output_files(program: Program, output: Path) -> dict[Path, Path]:
+    """Where each file of the program goes: a KUKA's data list beside the copy, under the same name."""
+    if output.suffix.lower() != program.file.suffix.lower():
+        raise InputError(f"{output}: to fix: end the copy's name in {program.file.suffix}, as the program's does")
+    places = {program.file: output}
+    places |= {file: output.with_suffix(file.suffix) for file in program.texts if file != program.file}
+    for place in places.values():
+        require_new(place)
+    return places
+
+
+def _program_document(copy: CompensatedProgram, places: list[Path], limit: float) -> dict[str, Any]:
+    return {
+        "format": "stitch-program/1",
+        "program": str(copy.program.file),
+        "controller": copy.program.controller,
+        "session": copy.arm.session,
+        "effects": [term.name for term in copy.arm.terms],
+        "not_compensated": list(copy.beyond),
+        "limit_mm": limit,
+        "targets": copy.rows(),
+        "notes": list(copy.notes),
+        "files": [str(place) for place in places],
+    }
+
+
+def _show_moves(copy: CompensatedProgram, places: list[Path]) -> None:
+    from stitch.units import angle_text, length_text
+
+    rows = copy.rows()
+    far, left = max(rows, key=lambda row: row["moved_mm"]), max(row["left_mm"] for row in rows)
+    remains = f"up to {length_text(left, 'mm')} remain" if left > _NEGLIGIBLE_MOVE else "nothing remains"
+    say(
+        f"{far['target']} moves farthest, by {length_text(far['moved_mm'], 'mm')}, to undo "
+        f"{', '.join(term.name for term in copy.arm.terms)}. Under the model {remains}.",
+        bold=True,
+    )
+    show_table(
+        f"{copy.program.file.name}: targets moved",
+        ("target", "line", "moved", "U (k = 2)", "turned"),
+        [
+            (
+                row["target"],
+                str(row["line"]),
+                length_text(row["moved_mm"], "mm", 4, zeros=True),
+                length_text(row["U_mm"], "mm", zeros=True),
+                angle_text(row["moved_mrad"] / 1e3),
+            )
+            for row in rows[:_LISTED_TARGETS]
+        ],
+    )
+    if len(rows) > _LISTED_TARGETS:
+        say(f"{len(rows) - _LISTED_TARGETS} more; --json has all.")
+    for note in copy.notes:
+        say(f"{note[0].upper()}{note[1:]}.")
+    for place in places:
+        say(f"  {place}")

@@ -4,47 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from stitch.cli.options import require_new, split_names
 from stitch.cli.terminal import results_stream
-
-if TYPE_CHECKING:
-    from stitch.intake.first_session import StatedTable
-
-
-# What `stitch import` does: the points of a program, of a tracker or of a table, as a table of a session.
-
-
-def run_import(
-    file: Path, output: Path | None, unit: str, stated: StatedTable, *, frame: str | None, tool: str | None
-) -> None:
-    """Read a file as a table of poses, where it is one or anything is stated of one, else as a controller's.
-
-    Raises:
-        InputError, NoResultError: as `stitch import` ends.
-    """
-    from stitch.controllers.program import import_file
-    from stitch.intake.first_session import StatedTable
-    from stitch.intake.import_table import import_table, is_table_of_poses
-    from stitch.system.files import whole_file
-
-    if stated != StatedTable() or is_table_of_poses(file):
-        imported = import_table(file, unit, stated)
-    else:
-        imported = import_file(file, unit, frame, tool)
-    if output is None:
-        results_stream().write(imported.text)
-    else:
-        with whole_file(output) as scratch:
-            scratch.write_text(imported.text, encoding="utf-8")
-    for warning in imported.warnings:
-        print(f"stitch: {file}: {warning}", file=sys.stderr)
-    where = output or "standard output"
-    print(f"{imported.rows} rows of {imported.table} to {where}; orientations: {imported.convention}", file=sys.stderr)
-
 
 _File = Annotated[
     Path,
@@ -94,9 +59,23 @@ def import_command(
       stitch import scan.ls -o views.csv --frame 0,0,0,0,0,0 --tool 0,0,150,0,0,0
       stitch import poses.txt -o views.csv --columns x,y,z,rx,ry,rz --rotation xyz-extrinsic --angles deg
     """
+    from stitch.controllers.program import import_file
     from stitch.intake.first_session import StatedTable
+    from stitch.intake.import_table import import_table, is_table_of_poses
+    from stitch.system.files import whole_file
 
     require_new(output)
-
     stated = StatedTable(split_names(columns), rotation, angles, length_unit=file_unit, inverse=inverse or None)
-    run_import(file, output, unit, stated, frame=frame, tool=tool)
+    if stated != StatedTable() or is_table_of_poses(file):
+        imported = import_table(file, unit, stated)
+    else:
+        imported = import_file(file, unit, frame, tool)
+    if output is None:
+        results_stream().write(imported.text)
+    else:
+        with whole_file(output) as scratch:
+            scratch.write_text(imported.text, encoding="utf-8")
+    for warning in imported.warnings:
+        print(f"stitch: {file}: {warning}", file=sys.stderr)
+    where = output or "standard output"
+    print(f"{imported.rows} rows of {imported.table} to {where}; orientations: {imported.convention}", file=sys.stderr)

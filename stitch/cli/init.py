@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,151 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stitch.cli.detect import BallOption, BoardOption
+from stitch.cli.detect import BallOption, BoardOption, parse_target_options
 from stitch.cli.options import split_names
-from stitch.cli.terminal import emit
+from stitch.cli.progress import show_activity
+from stitch.cli.terminal import emit, say, show_next
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
     from stitch.intake.first_session import FirstSession, StatedFolder
     from stitch.intake.folder_files import Guess
 
-
-# What `stitch init` does: guesses told, what cannot be told asked for, a session written.
-
 # Guesses that are asked for one by one; the fields of `StatedFolder` bear the same names.
 _QUESTIONS = ("rotation", "length_unit", "cloud_unit", "mount")
-
-
-def run_init(
-    folder: Path,
-    output: Path | None,
-    stated: StatedFolder,
-    *,
-    topic: str | None,
-    frames: str | None,
-    yes: bool,
-    as_json: bool,
-) -> None:
-    """A session of a bag, of which topic and frames may be stated, or of scans and poses.
-
-    Raises:
-        InputError, NoResultError: as `stitch init` ends.
-    """
-    from stitch.intake.ros_bag import is_bag
-
-    if is_bag(folder):
-        _init_from_bag(folder, output, topic, frames, as_json)
-        return
-    if topic or frames:
-        raise InputError(f"{folder}: --topic and --frames are for bags, which this is not; to fix: leave them out")
-    _init_from_scans(folder, output, stated, yes, as_json)
-
-
-def _init_from_scans(folder: Path, output: Path | None, stated: StatedFolder, yes: bool, as_json: bool) -> None:
-    """In their folder if nowhere else; what they do not tell is asked on a terminal, or guessed with `yes`."""
-    from stitch.intake.first_session import first_session
-    from stitch.intake.session_draft import require_free, write_draft
-
-    out = folder if output is None else output
-    require_free(out, not stated.targets.is_empty)
-    first = first_session(folder, stated)
-    _print_guesses(first.guesses)
-    if not yes:
-        first = _ask_uncertain(folder, out, first, stated)
-    write_draft(out, first)
-    _report_session(out, len(first.pairing.used), first.guesses, as_json)
-
-
-def _init_from_bag(bag: Path, output: Path | None, topic: str | None, named: str | None, as_json: bool) -> None:
-    """Beside it if nowhere else; what its messages do not say is not asked, flags state it."""
-    from stitch.intake.ros_bag import write_bag_session
-
-    out = output or bag.with_name(f"{bag.stem}-session")
-    frames = split_names(named)
-    if named and len(frames) not in (2, 3):
-        raise InputError(f"--frames {named}: to fix: name base and flange, and the scanner's frame if it is another")
-    made = write_bag_session(bag, out, topic, frames)
-    _print_guesses(made.guesses)
-    _report_session(out, made.views, made.guesses, as_json)
-
-
-def _report_session(out: Path, views: int, guesses: Sequence[Guess], as_json: bool) -> None:
-    if as_json:
-        emit(json.dumps(_document(out, views, guesses), indent=1))
-    print(f"{out / 'session.toml'} and views.csv: {views} views", file=sys.stderr)
-    untold = [guess for guess in guesses if not guess.determined]
-    if untold:
-        _warn_uncertain(out, untold)
-    print(f"Next: stitch run {out}", file=sys.stderr)
-
-
-def _warn_uncertain(out: Path, uncertain: Sequence[Guess]) -> None:
-    """What was guessed and may be wrong, where it is read last."""
-    from stitch.system.process import console
-
-    terminal = console()
-    terminal.print("NOT TOLD by files and scans, only guessed; any of it may be wrong:", style="bold red")
-    for guess in uncertain:
-        terminal.print(f"  {guess.what}: {guess.value}; to state it: {guess.flag}", soft_wrap=True)
-    terminal.print(
-        f"Until that is stated, results of {out} are worth no more than the guess; `stitch check --deep {out}` tries "
-        "the usual mistakes.",
-        soft_wrap=True,
-    )
-
-
-def _print_guesses(guesses: Sequence[Guess]) -> None:
-    for guess in guesses:
-        print(f"{'' if guess.determined else '? '}{guess.line}", file=sys.stderr)
-
-
-def _ask_uncertain(folder: Path, out: Path, first: FirstSession, stated: StatedFolder) -> FirstSession:
-    """On a terminal what cannot be told is asked, and judged anew; elsewhere it is refused.
-
-    Raises:
-        InputError: names the flags that would tell it; or a person does not want the session.
-    """
-    from stitch.intake.first_session import first_session
-
-    untold = [guess for guess in first.guesses if not guess.determined]
-    if not sys.stdin.isatty():
-        if untold:
-            flags = ", ".join(dict.fromkeys(guess.flag for guess in untold))
-            what = ", ".join(guess.what for guess in untold)
-            raise InputError(
-                f"{out}: {what} cannot be told from these views; to fix: state {flags}, or guess with --yes"
-            )
-        return first
-    answers: dict[str, Any] = {guess.what: _ask_guess(guess) for guess in untold if guess.what in _QUESTIONS}
-    if any(answers[guess.what] != _flag_value(guess) for guess in untold if guess.what in answers):
-        # What was kept counts as stated too: the person has seen it.
-        first = first_session(folder, replace(stated, **answers))
-        _print_guesses(first.guesses)
-    if not typer.confirm("Write the session?", default=True, err=True):
-        raise InputError(f"{out}: nothing was written; to fix: state what is wrong with the flags above")
-    return first
-
-
-def _ask_guess(guess: Guess) -> str:
-    """What a person says instead of a guess, or the guess."""
-    text = f"{guess.what} cannot be told from these views; enter another, or keep"
-    return str(typer.prompt(text, default=_flag_value(guess), err=True)).strip()
-
-
-def _flag_value(guess: Guess) -> str:
-    """The word of a guess, as its flag takes it."""
-    return guess.value.split(",")[0]
-
-
-def _document(out: Path, views: int, guesses: Sequence[Guess]) -> dict[str, object]:
-    return {
-        "session": str(out),
-        "views": views,
-        "told": all(guess.determined for guess in guesses),
-        "guesses": [guess.as_dict() for guess in guesses],
-    }
-
 
 _Folder = Annotated[
     Path, typer.Argument(metavar="FOLDER", help="Scans, and poses beside or below them; or a bag of ROS, MCAP.")
@@ -183,6 +51,7 @@ _Output = Annotated[
     typer.Option("-o", "--output", metavar="OUT", help="Folder of the session; default FOLDER, or BAG-session."),
 ]
 _Yes = Annotated[bool, typer.Option("--yes", "-y", help="Guess what cannot be told, do not ask.")]
+_Force = Annotated[bool, typer.Option("--force", help="Replace session.toml and views.csv that are there.")]
 _Json = Annotated[bool, typer.Option("--json", help="Print the guesses as JSON.")]
 
 
@@ -202,6 +71,7 @@ def init(
     frames: _Frames = None,
     output: _Output = None,
     yes: _Yes = False,
+    force: _Force = False,
     as_json: _Json = False,
 ) -> None:
     """Make a session of a folder of scans and poses; the scans tell which convention the poses are in.
@@ -213,9 +83,14 @@ def init(
       stitch init scans --rotation zyx-intrinsic --angles deg --unit mm --mount eye_in_hand -o session
       stitch init drive.mcap --topic /points
     """
-    from stitch.cli.detect import parse_target_options
     from stitch.intake.first_session import StatedFolder
+    from stitch.intake.ros_bag import is_bag
 
+    if is_bag(folder):
+        _init_from_bag(folder, output, topic, frames, as_json)
+        return
+    if topic or frames:
+        raise InputError(f"{folder}: --topic and --frames are for bags, which this is not; to fix: leave them out")
     stated = StatedFolder(
         split_names(columns),
         rotation,
@@ -227,4 +102,110 @@ def init(
         mount=mount,
         targets=parse_target_options(board, ball),
     )
-    run_init(folder, output, stated, topic=topic, frames=frames, yes=yes, as_json=as_json)
+    _init_from_scans(folder, output or folder, stated, yes, force, as_json)
+
+
+def _init_from_bag(bag: Path, output: Path | None, topic: str | None, named: str | None, as_json: bool) -> None:
+    """Write a session beside a bag if nowhere else; what its messages do not say is not asked, flags state it."""
+    from stitch.intake.ros_bag import write_bag_session
+
+    out = output or bag.with_name(f"{bag.stem}-session")
+    frames = split_names(named)
+    if named and len(frames) not in (2, 3):
+        raise InputError(f"--frames {named}: to fix: name base and flange, and the scanner's frame if it is another")
+    with show_activity("reading the bag"):
+        made = write_bag_session(bag, out, topic, frames)
+    _print_guesses(made.guesses)
+    _report_session(out, made.views, made.guesses, as_json)
+
+
+def _init_from_scans(folder: Path, out: Path, stated: StatedFolder, yes: bool, force: bool, as_json: bool) -> None:
+    """Write a session of scans; what they do not tell is asked on a terminal, or guessed with `yes`."""
+    from stitch.intake.session_draft import require_free, write_draft
+
+    if not force:
+        require_free(out, not stated.targets.is_empty)
+    first = _judge_folder(folder, stated)
+    if not yes:
+        first = _ask_uncertain(folder, out, first, stated)
+    write_draft(out, first, force)
+    _report_session(out, len(first.pairing.used), first.guesses, as_json)
+
+
+def _judge_folder(folder: Path, stated: StatedFolder) -> FirstSession:
+    """Return the session that files and scans tell of, after its guesses are printed."""
+    from stitch.intake.first_session import first_session
+
+    with show_activity(f"{folder.name}: reading the scans and trying conventions"):
+        first = first_session(folder, stated)
+    _print_guesses(first.guesses)
+    return first
+
+
+def _ask_uncertain(folder: Path, out: Path, first: FirstSession, stated: StatedFolder) -> FirstSession:
+    """Return the session with what a person answers on a terminal, judged anew; elsewhere refuse what is uncertain.
+
+    Raises:
+        InputError: names the flags that would tell it; or a person does not want the session.
+    """
+    untold = [guess for guess in first.guesses if not guess.determined]
+    if not sys.stdin.isatty():
+        if untold:
+            flags = ", ".join(dict.fromkeys(guess.flag for guess in untold))
+            what = ", ".join(guess.what for guess in untold)
+            raise InputError(
+                f"{out}: {what} cannot be told from these views; to fix: state {flags}, or guess with --yes"
+            )
+        return first
+    asked = [guess for guess in untold if guess.what in _QUESTIONS]
+    while asked:
+        answers: dict[str, Any] = {guess.what: _ask_guess(guess) for guess in asked}
+        if all(answers[guess.what] == _flag_value(guess) for guess in asked):
+            break
+        try:
+            # What was kept counts as stated too: the person has seen it.
+            first = _judge_folder(folder, replace(stated, **answers))
+            break
+        except InputError as error:
+            say(str(error), bold=True)
+    if not typer.confirm("Write the session?", default=True, err=True):
+        raise InputError(f"{out}: nothing was written; to fix: state what is wrong with the flags above")
+    return first
+
+
+def _ask_guess(guess: Guess) -> str:
+    """Return what a person says instead of a guess, or the guess."""
+    text = f"{guess.what} cannot be told from these views; enter another, or keep"
+    return str(typer.prompt(text, default=_flag_value(guess), err=True)).strip()
+
+
+def _flag_value(guess: Guess) -> str:
+    """Return the word of a guess, as its flag takes it."""
+    return guess.value.split(",")[0]
+
+
+def _print_guesses(guesses: Sequence[Guess]) -> None:
+    for guess in guesses:
+        say(f"{'' if guess.determined else '? '}{guess.line}", hang=2)
+
+
+def _report_session(out: Path, views: int, guesses: Sequence[Guess], as_json: bool) -> None:
+    """Print the files, what may be wrong in them, and the next command."""
+    untold = [guess for guess in guesses if not guess.determined]
+    if as_json:
+        document: dict[str, Any] = {
+            "session": str(out),
+            "views": views,
+            "told": not untold,
+            "guesses": [guess.as_dict() for guess in guesses],
+        }
+        emit(json.dumps(document, indent=1))
+    say(f"{out / 'session.toml'} and views.csv: {views} views")
+    folder = shlex.quote(str(out))
+    if untold:
+        say("NOT TOLD by files and scans, only guessed; any of it may be wrong:", bold=True)
+        for guess in untold:
+            say(f"  {guess.what}: {guess.value}; to state it: {guess.flag}")
+        say("Results are worth no more than these guesses.")
+        say(f"To try the usual mistakes: stitch check --deep {folder}")
+    show_next(f"Next: stitch run {folder}")

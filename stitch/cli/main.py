@@ -12,7 +12,8 @@ from typing import Annotated
 import typer
 
 from stitch.cli.commands import CommandGroup
-from stitch.cli.terminal import TimeLeft, live_line, speak_any_terminal
+from stitch.cli.progress import TimeLeft, live_line
+from stitch.cli.terminal import speak_any_terminal
 from stitch.errors import StitchError
 from stitch.reading.text_files import shortened
 from stitch.system import process
@@ -40,7 +41,7 @@ def _version(requested: bool) -> None:
 
 
 def build() -> typer.Typer:
-    """The application with the commands of every installed package."""
+    """Return the application with the commands of every installed package."""
     app = typer.Typer(
         cls=CommandGroup,
         help="Stitch robot scans: find and correct the hand-eye, register, fuse, and say what is left.",
@@ -81,13 +82,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         place = shortened(error.filename, 200).strip("'") if error.filename else "file system"
         _exit_with_message(f"{place}: {error.strerror or error}{fix}", 2)
     except MemoryError:
-        _exit_with_message("not enough memory; leave out views, or thin the scans", 1)
+        _exit_with_message("not enough memory; to fix: state --memory, leave out views, or thin the scans", 1)
     except Exception as error:
         _exit_with_message(_unexpected_message(error), 1)
 
 
 def _exit_with_message(message: str, code: int) -> None:
-    """One line on standard error, and the end of the process."""
+    """Print one line on standard error and end the process."""
     line = "".join(c if c.isprintable() else " " for c in " ".join(message.split()))
     print(f"stitch: {line if len(line) <= _LONGEST else line[:_LONGEST] + ' …'}", file=sys.stderr, flush=True)
     if process.running_over():
@@ -97,7 +98,7 @@ def _exit_with_message(message: str, code: int) -> None:
 
 
 def _unexpected_message(error: Exception) -> str:
-    """A fault of the program in one line; the environment variable STITCH_TRACEBACK shows all of it."""
+    """Return a fault of the program in one line; the environment variable STITCH_TRACEBACK shows all of it."""
     if os.environ.get("STITCH_TRACEBACK"):
         traceback.print_exception(error)
     last = traceback.extract_tb(error.__traceback__)[-1]

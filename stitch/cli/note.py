@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stitch.cli.options import Json, RunFolder
-from stitch.cli.terminal import emit
+from stitch.cli.terminal import emit, say
 from stitch.errors import InputError
 
 _LONGEST = 2000
@@ -25,27 +25,24 @@ def note(
     Examples:
       stitch note runs/blade-17 "fixture shimmed after this step" --step 0
     """
-    from stitch.system.process import console
-
-    text, by = text.strip(), by.strip()
-    if not text:
-        raise InputError("TEXT: is empty; to fix: say what to remark")
-    if len(text) > _LONGEST:
-        raise InputError(f"TEXT: has {len(text)} characters; to fix: shorten it to {_LONGEST}")
-    # Loaded by who runs something: whoever asks for help has it at once.
     from stitch.stored.stored_run import read_ledger
     from stitch.writing.json_file import to_json, write_json
     from stitch.writing.run_folder import lock_run_folder
 
+    text, by = text.strip(), by.strip()
+    if not text:
+        raise InputError("TEXT: empty; to fix: write the remark")
+    if len(text) > _LONGEST:
+        raise InputError(f"TEXT: has {len(text)} characters; to fix: shorten it to {_LONGEST}")
     with lock_run_folder(run):
         steps = read_ledger(run)
         at = len(steps) - 1 if step is None else step
         if not 0 <= at < len(steps):
-            raise InputError(f"--step {at}: {run}/ledger.json has the steps 0 to {len(steps) - 1}")
+            raise InputError(f"--step {at}: to fix: name one of the steps 0 to {len(steps) - 1} of {run}/ledger.json")
         when = datetime.now(UTC).isoformat(timespec="seconds")
         steps[at].setdefault("notes", []).append({"at": when, "by": by, "text": text})
         write_json(steps, run / "ledger.json")
     if as_json:
         emit(to_json(steps))
     else:
-        console().print(f"  step {at}, {when}{f', {by}' if by else ''}: {text}", soft_wrap=True)
+        say(f"  step {at}, {when}{f', {by}' if by else ''}: {text}")

@@ -25,18 +25,20 @@ Json = Annotated[bool, typer.Option("--json", help="Print the JSON result alone 
 
 
 def split_names(text: str | None) -> tuple[str, ...]:
-    """What a list with commas names, empty places too."""
+    """Return what a list with commas names, empty places too."""
     return tuple(name.strip() for name in text.split(",")) if text else ()
 
 
 def require_new(file: Path | None) -> None:
-    """Refuse to write over a file; a link counts, whether or not it leads anywhere.
+    """Refuse to write over a file, or into a folder that there is not; a link counts, wherever it leads.
 
     Raises:
-        InputError: there is one.
+        InputError: there is one, or no folder.
     """
     if file is not None and (file.exists() or file.is_symlink()):
-        raise InputError(f"{file}: exists already; name another file, or remove it")
+        raise InputError(f"{file}: exists already; to fix: name another file, or remove it")
+    if file is not None and not file.parent.is_dir():
+        raise InputError(f"{file}: there is no folder {file.parent}; to fix: make it, or name another")
 
 
 def require_tolerance(tolerance: float | None) -> None:
@@ -50,7 +52,7 @@ def require_tolerance(tolerance: float | None) -> None:
 
 
 def bytes_of(size: str | None) -> float | None:
-    """Bytes of a size as people write it, None for none.
+    """Return the bytes of a size as people write it, None for none.
 
     Raises:
         InputError: not a size.

@@ -2,286 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stitch.cli.options import Json, Trust
-from stitch.cli.terminal import emit
+from stitch.cli.progress import show_activity
+from stitch.cli.terminal import emit, say, show_block, show_table
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from stitch.frames import Array
     from stitch.measurement.session import Session
     from stitch.planning.detection_chances import EffectOutlook, EffectPair, Outlook
     from stitch.planning.expected_model import CellModel, ExpectedHandEye, PlannedCell
     from stitch.planning.plan import Plan, PlanRequest
 
-
-# What `stitch plan` says: U of the hand-eye, chances of every effect, pairs that stay alike, further views.
-
 # Pairs that are shown, and the share of wrong names from which they are told.
 _PAIRS, _MISTAKEN = 3, 0.05
-
-
-def show_plan(plan: Plan, cell: CellModel, output: Path | None) -> None:
-    """For people, on standard error."""
-    from stitch.system.process import console
-
-    terminal = console()
-    if plan.assumed:
-        terminal.print(f"Nobody stated, so assumed: {'; '.join(plan.assumed)}.", soft_wrap=True)
-    if plan.now is None:
-        terminal.print("Fewer than three views give no hand-eye; views are proposed.", soft_wrap=True)
-    else:
-        _show_outlook(terminal, plan, plan.now, cell)
-    _show_proposed(terminal, plan)
-    if plan.after is not None:
-        if plan.now is None:
-            _show_outlook(terminal, plan, plan.after, cell)
-        else:
-            _show_after(terminal, plan, plan.now, plan.after)
-    if output is not None:
-        terminal.print(f"  {output / 'views.csv' if plan.proposed else output / 'plan.json'}", soft_wrap=True)
-
-
-def _show_outlook(terminal: Console, plan: Plan, o: Outlook, cell: CellModel) -> None:
-    import numpy as np
-    from rich.table import Table
-
-    from stitch.model.model import expanded_uncertainty
-    from stitch.units import METRES, length_text
-
-    unit, frame = plan.session.length_unit, "base" if plan.session.mount == "eye_to_hand" else "flange"
-    terminal.print(f"What {o.views} views would tell:", style="bold", soft_wrap=True)
-    terminal.print(f"U (k = 2) of the hand-eye T_{frame}_scanner, in the frame of the {frame}:", soft_wrap=True)
-    U = expanded_uncertainty(cell.model.T_mount, o.hand_eye.covariance) * np.repeat([1e3, METRES[unit] * 1e3], 3)
-    position, turn = (", ".join(map(_axis_text, "xyz", sizes)) for sizes in (U[3:], U[:3]))
-    terminal.print(f"  position {position} mm", soft_wrap=True)
-    terminal.print(f"  rotation vector {turn} mrad", soft_wrap=True)
-    terminal.print(
-        f"  at the part {length_text(o.hand_eye.U, unit, 2)}, mostly {_source_shares(o.hand_eye)}; "
-        f"{length_text(o.ordinary.U, unit, 2)} with an arm that is a little wrong in every joint and link",
-        soft_wrap=True,
-    )
-    table = Table(title="Of an effect of usual size", title_justify="left")
-    for heading in ("effect", "detected from", "detected", "named", "misnamed"):
-        table.add_column(heading, justify="left" if heading == "effect" else "right", no_wrap=True)
-    for e in o.effects:
-        if e.chance is not None:
-            c = e.chance
-            table.add_row(e.name, _detectable_text(e), f"{c.detected:.0%}", f"{c.named:.0%}", f"{c.misnamed:.0%}")
-    terminal.print(table)
-    mistaken = [e.chance for e in o.effects if e.chance is not None and e.chance.misnamed >= _MISTAKEN]
-    for c in mistaken:
-        terminal.print(f"{c.effect} would be taken for {c.taken_for} most often.", soft_wrap=True)
-    unseen = [e.name for e in o.effects if not e.observable]
-    if unseen:
-        terminal.print(f"These views cannot show: {', '.join(unseen)}.", soft_wrap=True)
-    for need in sorted({need for needs in o.untestable.values() for need in needs}):
-        names = ", ".join(name for name, needs in o.untestable.items() if need in needs)
-        terminal.print(f"Not asked without {need}: {names}.", soft_wrap=True)
-    _show_pairs(terminal, o)
-
-
-def _axis_text(axis: str, U: float) -> str:
-    from stitch.units import uncertainty_text
-
-    return f"{axis} {uncertainty_text(U)}"
-
-
-def _source_shares(hand_eye: ExpectedHandEye) -> str:
-    shares = sorted(hand_eye.shares.items(), key=lambda item: -item[1])[:2]
-    return " and ".join(f"{name} ({share:.0%})" for name, share in shares)
-
-
-def _detectable_text(e: EffectOutlook) -> str:
-    """The parameter that shows best, at its smallest detectable size."""
-    from stitch.units import format_amount
-
-    if not e.detectable:
-        return "–"
-    name = min(e.detectable, key=lambda name: e.detectable[name] / e.usual[name])
-    told = format_amount(e.detectable[name], e.detectable[name] / 10, e.units[name])
-    return f"{name} {told._replace(sigma='–')}"
-
-
-def _show_pairs(terminal: Console, o: Outlook) -> None:
-    """Pairs that are not told apart at usual size, or the hardest one."""
-    hard = [pair for pair in o.pairs if pair.size > 1][:_PAIRS] or list(o.pairs[:1])
-    for pair in hard:
-        own, rival, size = (pair.a, pair.b, pair.size_a) if pair.size_a > pair.size_b else (pair.b, pair.a, pair.size_b)
-        terminal.print(f"{own} is told from {rival} {_multiple_text(size)}.", soft_wrap=True)
-
-
-def _show_proposed(terminal: Console, plan: Plan) -> None:
-    import numpy as np
-    from rich.table import Table
-
-    from stitch.units import length_text
-
-    if not plan.proposed:
-        terminal.print(f"Nothing is proposed: {_no_views_reason(plan)}.", soft_wrap=True)
-        return
-    unit = plan.session.length_unit
-    title = "Further views" + ("" if plan.split is None else f" (to tell {' from '.join(plan.split)})")
-    table = Table(title=title, title_justify="left")
-    table.add_column("view")
-    for heading in ("joints °", "travel °", "U at the part", "told apart"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for view in plan.proposed:
-        joints = " ".join(f"{x:.0f}" for x in np.degrees(view.joints))
-        apart = f"{view.separated_share:.0%}" if np.isfinite(view.separated_share) else "–"
-        travel = f"{np.degrees(view.travel):.0f}"
-        table.add_row(view.name, joints, travel, length_text(view.U, unit, 2, zeros=True), apart)
-    terminal.print(table)
-
-
-def _no_views_reason(plan: Plan) -> str:
-    if plan.session.robot is None or plan.session.joints is None:
-        return "that needs [robot] in session.toml, and joint angles of all views"
-    own = None if plan.split is None or plan.now is None else _find_pair(plan.now, plan.split)
-    if own is not None and own.size <= 1:
-        return f"at usual size these views tell {own.a} from {own.b} as they are"
-    return "no pose within reach brings more"
-
-
-def _show_after(terminal: Console, plan: Plan, now: Outlook, after: Outlook) -> None:
-    from stitch.units import length_text
-
-    unit = plan.session.length_unit
-    terminal.print(
-        f"With them U of the hand-eye at the part goes from {length_text(now.hand_eye.U, unit, 2)} to "
-        f"{length_text(after.hand_eye.U, unit, 2)}; what is left is mostly {_source_shares(after.hand_eye)}.",
-        soft_wrap=True,
-    )
-    if plan.split is not None:
-        before, then = (_find_pair(o, plan.split) for o in (now, after))
-        if before is not None and then is not None:
-            names = " and ".join(plan.split)
-            terminal.print(
-                f"{names} are told apart {_multiple_text(then.size)}; now {_multiple_text(before.size)}.",
-                soft_wrap=True,
-            )
-
-
-def _multiple_text(size: float) -> str:
-    import numpy as np
-
-    return f"from {size:.2g} times its usual size" if np.isfinite(size) else "at no size"
-
-
-def _find_pair(o: Outlook, names: tuple[str, str]) -> EffectPair | None:
-    return next((p for p in o.pairs if {p.a, p.b} == set(names)), None)
-
-
-# What `stitch plan` does: the cell of a session or a run, a plan of its views, as files and for people.
-
-
-@dataclass(frozen=True)
-class StatedCell:
-    """What options say of a cell that a session does not."""
-
-    part: Path | None
-    size: float | None  # mm
-    field: float | None  # degrees
-    start: str | None
-
-
-@dataclass(frozen=True)
-class PlanOptions:
-    """What further views are asked for."""
-
-    views: int | None
-    split: tuple[str, str] | None
-    halve: bool
-    feature: str | None
-
-
-def run_plan(
-    folder: Path, options: PlanOptions, stated: StatedCell, output: Path | None, *, trust: bool, as_json: bool
-) -> None:
-    """Plan, write the views and show them.
-
-    Raises:
-        InputError, NoResultError: as `stitch plan` ends.
-    """
-    from stitch.planning.plan import plan_further_views
-    from stitch.writing.json_file import to_json
-    from stitch.writing.plan_document import plan_document, view_columns
-    from stitch.writing.session_files import whole_folder, write_table
-
-    wanted = _plan_request(options)
-    session, planned = _planned_cell(folder, stated, trust=trust)
-    found = plan_further_views(session, planned, wanted)
-    document = plan_document(found, planned.cell.model.T_mount)
-    if output is not None:
-        with whole_folder(output) as scratch:
-            (scratch / "plan.json").write_text(to_json(document) + "\n", encoding="utf-8")
-            if found.proposed:
-                write_table(scratch / "views.csv", view_columns(found))
-    if as_json:
-        emit(to_json(document))
-    else:
-        show_plan(found, planned.cell, output)
-
-
-def _plan_request(options: PlanOptions) -> PlanRequest:
-    from stitch.effects.contract import find_effect
-    from stitch.planning.plan import PlanRequest
-
-    split = options.split
-    for name in split or ():
-        find_effect(name)
-    if split is not None and split[0] == split[1]:
-        raise InputError(f"--split {split[0]} {split[1]}: to fix: name two effects")
-    feature = options.feature
-    at = None if feature is None else _option_numbers("--for", feature, "a place as x,y,z, as 0,20,150", 3)
-    halve = options.halve or split is None
-    return PlanRequest(halve=halve, split=split, split_any=not options.halve, views=options.views, feature=at)
-
-
-def _planned_cell(folder: Path, stated: StatedCell, *, trust: bool) -> tuple[Session, PlannedCell]:
-    """A finished run says all of its cell; of a session the options may say the rest."""
-    import numpy as np
-
-    from stitch.planning.expected_model import cell_of_run, cell_of_session
-    from stitch.reading.session_folder import load_session
-    from stitch.stored.stored_run import load_run
-
-    if (folder / "result.json").is_file():
-        odd = next((f"--{name}" for name, value in vars(stated).items() if value is not None), None)
-        if odd is not None:
-            raise InputError(f"{odd}: {folder} is a run, which knows that; to fix: leave {odd} out")
-        state = load_run(folder, trust=trust)
-        return state.session, cell_of_run(state, folder)
-    start = None
-    if stated.start is not None:
-        start = np.radians(_option_numbers("--start", stated.start, "joint angles (°), as 0,-90,90,0,45,0"))
-    elif (folder / "session.toml").is_file() and not (folder / "views.csv").exists():
-        raise InputError(
-            f"{folder}: no views.csv; to fix: write planned joints or poses there, or give --start J1,J2,… in degrees, "
-            "where the scanner sees the part"
-        )
-    session = load_session(folder, scans=False, start=start)
-    return session, cell_of_session(session, stated.part, stated.size, stated.field)
-
-
-def _option_numbers(option: str, text: str, what: str, count: int | None = None) -> Array:
-    import numpy as np
-
-    try:
-        found = np.array([float(word) for word in text.split(",")])
-    except ValueError:
-        found = np.array([np.nan])
-    if not np.isfinite(found).all() or count not in (None, len(found)):
-        raise InputError(f"{option} {text!r}: to fix: give {what}")
-    return found
-
 
 _Folder = Annotated[
     Path, typer.Argument(metavar="SESSION|RUN", help="Session with planned views, or folder that `stitch run` wrote.")
@@ -335,10 +75,32 @@ def plan_views(
       stitch plan blade-18 --part blade.stl --split joint_compliance gear_eccentricity -o more
       stitch plan runs/blade-17 --halve
     """
-    _require_plan_options(views, size, field, output)
+    from stitch.planning.plan import plan_further_views
+    from stitch.writing.json_file import to_json
+    from stitch.writing.plan_document import plan_document, view_columns
+    from stitch.writing.session_files import whole_folder, write_table
 
-    stated = StatedCell(part, size, field, start)
-    run_plan(folder, PlanOptions(views, split, halve, feature), stated, output, trust=trust, as_json=as_json)
+    _require_plan_options(views, size, field, output)
+    wanted = _plan_request(views, split, halve, feature)
+    stated = {"part": part, "size": size, "field": field, "start": start}
+    with show_activity("planning: reading the cell"):
+        session, planned = (
+            _cell_of_run(folder, stated, trust)
+            if (folder / "result.json").is_file()
+            else _cell_of_session(folder, part, size, field, start)
+        )
+    with show_activity("planning: what views would tell, pose by pose"):
+        found = plan_further_views(session, planned, wanted)
+    document = plan_document(found, planned.cell.model.T_mount)
+    if output is not None:
+        with whole_folder(output) as scratch:
+            (scratch / "plan.json").write_text(to_json(document) + "\n", encoding="utf-8")
+            if found.proposed:
+                write_table(scratch / "views.csv", view_columns(found))
+    if as_json:
+        emit(to_json(document))
+    else:
+        _show_plan(found, planned.cell, output)
 
 
 def _require_plan_options(views: int | None, size: float | None, field: float | None, output: Path | None) -> None:
@@ -350,3 +112,194 @@ def _require_plan_options(views: int | None, size: float | None, field: float | 
         raise InputError(f"--field {field:g}: to fix: give the full angle in degrees, between 0 and 150")
     if output is not None and output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InputError(f"{output}: there is such a folder; to fix: name another, or move it away")
+
+
+def _plan_request(views: int | None, split: tuple[str, str] | None, halve: bool, feature: str | None) -> PlanRequest:
+    from stitch.effects.contract import find_effect
+    from stitch.planning.plan import PlanRequest
+
+    for name in split or ():
+        find_effect(name)
+    if split is not None and split[0] == split[1]:
+        raise InputError(f"--split {split[0]} {split[1]}: to fix: name two effects")
+    at = None if feature is None else _option_numbers("--for", feature, "a place as x,y,z, as 0,20,150", 3)
+    return PlanRequest(halve=halve or split is None, split=split, split_any=not halve, views=views, feature=at)
+
+
+def _cell_of_run(folder: Path, stated: Mapping[str, object], trust: bool) -> tuple[Session, PlannedCell]:
+    """Return the cell of a finished run, which says all of it."""
+    from stitch.planning.expected_model import cell_of_run
+    from stitch.stored.stored_run import load_run
+
+    odd = next((f"--{name}" for name, value in stated.items() if value is not None), None)
+    if odd is not None:
+        raise InputError(f"{odd}: {folder} is a run, which knows that; to fix: leave {odd} out")
+    state = load_run(folder, trust=trust)
+    return state.session, cell_of_run(state, folder)
+
+
+def _cell_of_session(
+    folder: Path, part: Path | None, size: float | None, field: float | None, start: str | None
+) -> tuple[Session, PlannedCell]:
+    """Return the cell of a session, of which options may say what the session does not."""
+    import numpy as np
+
+    from stitch.planning.expected_model import cell_of_session
+    from stitch.reading.session_folder import load_session
+
+    joints = None
+    if start is not None:
+        joints = np.radians(_option_numbers("--start", start, "joint angles (°), as 0,-90,90,0,45,0"))
+    elif (folder / "session.toml").is_file() and not (folder / "views.csv").exists():
+        raise InputError(
+            f"{folder}: no views.csv; to fix: write planned joints or poses there, or give --start J1,J2,… in degrees, "
+            "where the scanner sees the part"
+        )
+    session = load_session(folder, scans=False, start=joints)
+    return session, cell_of_session(session, part, size, field)
+
+
+def _option_numbers(option: str, text: str, what: str, count: int | None = None) -> Array:
+    import numpy as np
+
+    try:
+        found = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        found = np.array([np.nan])
+    if not np.isfinite(found).all() or count not in (None, len(found)):
+        raise InputError(f"{option} {text!r}: to fix: give {what}")
+    return found
+
+
+def _show_plan(plan: Plan, cell: CellModel, output: Path | None) -> None:
+    if plan.assumed:
+        say(f"Nobody stated, so assumed: {'; '.join(plan.assumed)}.")
+    if plan.now is None:
+        say("Fewer than three views give no hand-eye; views are proposed.", bold=True)
+    else:
+        _show_outlook(plan, plan.now, cell)
+    _show_proposed(plan)
+    if plan.after is not None:
+        if plan.now is None:
+            _show_outlook(plan, plan.after, cell)
+        else:
+            _show_after(plan, plan.now, plan.after)
+    if output is not None:
+        say(f"  {output / 'views.csv' if plan.proposed else output / 'plan.json'}")
+
+
+def _show_outlook(plan: Plan, o: Outlook, cell: CellModel) -> None:
+    """Print U of the hand-eye, chances of every effect, and pairs that stay alike."""
+    import numpy as np
+
+    from stitch.model.model import expanded_uncertainty
+    from stitch.units import METRES, length_text, uncertainty_text
+
+    unit, frame = plan.session.length_unit, "base" if plan.session.mount == "eye_to_hand" else "flange"
+    U = expanded_uncertainty(cell.model.T_mount, o.hand_eye.covariance) * np.repeat([1e3, METRES[unit] * 1e3], 3)
+    position, turn = (
+        ", ".join(f"{axis} {uncertainty_text(size)}" for axis, size in zip("xyz", sizes, strict=True))
+        for sizes in (U[3:], U[:3])
+    )
+    say(f"What {o.views} views would tell: U (k = 2) of T_{frame}_scanner, in the frame of the {frame}", bold=True)
+    show_block(
+        [
+            ("position", f"{position} mm"),
+            ("rotation vector", f"{turn} mrad"),
+            ("at the part", f"{length_text(o.hand_eye.U, unit, 2)}, mostly {_source_shares(o.hand_eye)}"),
+            ("", f"{length_text(o.ordinary.U, unit, 2)} with an arm that is a little wrong in every joint and link"),
+        ]
+    )
+    chances = [(e, e.chance) for e in o.effects if e.chance is not None]
+    show_table(
+        "Of an effect of usual size",
+        ("effect", "detected from", "detected", "named", "misnamed"),
+        [(e.name, _detectable_text(e), f"{c.detected:.0%}", f"{c.named:.0%}", f"{c.misnamed:.0%}") for e, c in chances],
+    )
+    for _, c in chances:
+        if c.misnamed >= _MISTAKEN:
+            say(f"{c.effect} would be taken for {c.taken_for} most often.")
+    if unseen := [e.name for e in o.effects if not e.observable]:
+        say(f"These views cannot show: {', '.join(unseen)}.")
+    needs = sorted({need for own in o.untestable.values() for need in own})
+    without = [f"{', '.join(name for name, own in o.untestable.items() if need in own)} ({need})" for need in needs]
+    if without:
+        say(f"Not asked, with what that would need: {'; '.join(without)}.")
+    # Pairs that are not told apart at usual size, or the hardest one.
+    for pair in [pair for pair in o.pairs if pair.size > 1][:_PAIRS] or list(o.pairs[:1]):
+        own, rival, size = (pair.a, pair.b, pair.size_a) if pair.size_a > pair.size_b else (pair.b, pair.a, pair.size_b)
+        say(f"{own} is told from {rival} {_multiple_text(size)}.")
+
+
+def _source_shares(hand_eye: ExpectedHandEye) -> str:
+    shares = sorted(hand_eye.shares.items(), key=lambda item: -item[1])[:2]
+    return " and ".join(f"{name} ({share:.0%})" for name, share in shares)
+
+
+def _detectable_text(e: EffectOutlook) -> str:
+    """Return the parameter that shows best, at its smallest detectable size."""
+    from stitch.units import format_amount
+
+    if not e.detectable:
+        return "–"
+    name = min(e.detectable, key=lambda name: e.detectable[name] / e.usual[name])
+    told = format_amount(e.detectable[name], e.detectable[name] / 10, e.units[name])
+    return f"{name} {told._replace(sigma='–')}"
+
+
+def _show_proposed(plan: Plan) -> None:
+    import numpy as np
+
+    from stitch.units import length_text
+
+    if not plan.proposed:
+        say(f"Nothing is proposed: {_no_views_reason(plan)}.")
+        return
+    show_table(
+        "Further views" + ("" if plan.split is None else f" (to tell {' from '.join(plan.split)})"),
+        ("view", "joints °", "travel °", "U at the part", "told apart"),
+        [
+            (
+                view.name,
+                " ".join(f"{x:.0f}" for x in np.degrees(view.joints)),
+                f"{np.degrees(view.travel):.0f}",
+                length_text(view.U, plan.session.length_unit, 2, zeros=True),
+                f"{view.separated_share:.0%}" if np.isfinite(view.separated_share) else "–",
+            )
+            for view in plan.proposed
+        ],
+    )
+
+
+def _no_views_reason(plan: Plan) -> str:
+    if plan.session.robot is None or plan.session.joints is None:
+        return "that needs [robot] in session.toml, and joint angles of all views"
+    own = None if plan.split is None or plan.now is None else _find_pair(plan.now, plan.split)
+    if own is not None and own.size <= 1:
+        return f"at usual size these views tell {own.a} from {own.b} as they are"
+    return "no pose within reach brings more"
+
+
+def _show_after(plan: Plan, now: Outlook, after: Outlook) -> None:
+    from stitch.units import length_text
+
+    before, then = (length_text(o.hand_eye.U, plan.session.length_unit, 2) for o in (now, after))
+    say(
+        f"With them U of the hand-eye at the part goes from {before} to {then}; what is left is mostly "
+        f"{_source_shares(after.hand_eye)}."
+    )
+    if plan.split is not None:
+        pairs = [_find_pair(o, plan.split) for o in (now, after)]
+        if pairs[0] is not None and pairs[1] is not None:
+            names = " and ".join(plan.split)
+            say(f"{names} are told apart {_multiple_text(pairs[1].size)}; now {_multiple_text(pairs[0].size)}.")
+
+
+def _multiple_text(size: float) -> str:
+    import numpy as np
+
+    return f"from {size:.2g} times its usual size" if np.isfinite(size) else "at no size"
+
+
+def _find_pair(o: Outlook, names: tuple[str, str]) -> EffectPair | None:
+    return next((p for p in o.pairs if {p.a, p.b} == set(names)), None)

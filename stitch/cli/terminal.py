@@ -1,225 +1,128 @@
-"""One changing line on a terminal: where the work stands, and how long it still takes. Silent where nobody watches."""
+"""What a command prints: results alone on standard output, lines and tables for people on standard error."""
 
 from __future__ import annotations
 
-import atexit
 import codecs
-import json
 import os
+import re
 import sys
-import time
 import unicodedata
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
-from dataclasses import dataclass
-from functools import cache, wraps
-from math import isfinite
+from functools import wraps
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, TextIO, TypeVar
+from typing import IO, Any, TextIO, TypeVar
 
-if TYPE_CHECKING:
-    from stitch.frames import Array
-    from stitch.measurement.session import Session
-    from stitch.runs.recorder import Recorder
-    from stitch.runs.run import Run, StageResult
-
-
-# What ends sooner (s) needs no line.
-_SOON = 1.0
+# Where no line is broken: between a number and its unit, and beside a sign ("± 0.02 mm", "p = 1e-46").
+_UNIT = r"(?<=\d) (?=(?:[µmk]?m|m?rad|µ?rad|kg|ms|s|h|min|%|°|°C|ppm|points?|views?|σ|sigmas)(?!\w))"
+_SIGN = r"(?<=[±=<>≤≥×]) | (?=[±=<>≤≥×])"
+_GLUE = re.compile(rf"{_UNIT}|{_SIGN}")
+_GLUED = "\0"
 
 
-@dataclass(frozen=True)
-class _Elapsed:
-    """What is done, and for how long: how many iterations there will be nobody knows."""
+def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = None) -> None:
+    """Print a line for people; a terminal that is too narrow gets it in several, none of which cuts a word or a number.
 
-    text: str
-    started: float
+    Args:
+        hang: columns by which all lines but the first are indented.
+        stream: where it goes; None is standard error.
+    """
+    from stitch.system.process import console
 
-    def __rich__(self) -> Any:
-        from rich.text import Text
-
-        seconds = round(time.monotonic() - self.started)
-        return Text(f"{self.text}; {seconds // 60}:{seconds % 60:02d}")
-
-
-class LiveLine:
-    """A line on standard error that begins with the first text."""
-
-    def __init__(self) -> None:
-        self._status: Any = None
-        self._visible = False
-        self._elapsed: _Elapsed | None = None
-
-    def begin(self, text: str) -> None:
-        """Show a text with the time since it was first asked for, until `stop`; loops stand in its place meanwhile."""
-        self._elapsed = _Elapsed(text, time.monotonic() if self._elapsed is None else self._elapsed.started)
-        self.say(self._elapsed)
-
-    def loops_ended(self) -> None:
-        """What stood before the loops stands again; nothing if there was nothing."""
-        if self._elapsed is None:
-            self.stop()
-        else:
-            self.say(self._elapsed)
-
-    def say(self, text: str | _Elapsed) -> None:
-        """Show a text in place of the last."""
-        if not sys.stderr.isatty():
-            return
-        if self._status is None:
-            # Loaded by who shows something: most commands end before.
-            from stitch.system.process import console
-
-            self._status = console().status("")
-        if not self._visible:
-            # An error on the way must not leave the terminal without a cursor.
-            atexit.register(self._status.stop)
-            self._status.start()
-            self._visible = True
-        self._status.update(text)
-
-    def stop(self) -> None:
-        """Clear the line; the next text begins it anew."""
-        self._elapsed = None
-        if self._status is not None and self._visible:
-            self._status.stop()
-            self._visible = False
+    terminal = console(stream)
+    text = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+    lines = broken_lines(text, terminal.width, hang) if terminal.is_terminal else [text]
+    terminal.print("\n".join(lines), soft_wrap=True, style="bold" if bold else None)
 
 
-@cache
-def live_line() -> LiveLine:
-    """The one line of this process: two would fight for the cursor."""
-    return LiveLine()
+def broken_lines(text: str, width: int, hang: int = 0) -> list[str]:
+    """Return a text as lines of at most so many columns, but for words that are longer."""
+    from rich.cells import cell_len
+
+    margin = " " * (len(text) - len(text.lstrip(" ")))
+    lines, line = [], margin
+    for word in _GLUE.sub(_GLUED, text.strip(" ")).split(" "):
+        if line.strip() and cell_len(line) + 1 + cell_len(word) > width:
+            lines.append(line)
+            line = margin + " " * hang
+        line += word if not line.strip() else f" {word}"
+    return [own.replace(_GLUED, " ") for own in (*lines, line)]
+
+
+def show_block(rows: Sequence[tuple[str, str]]) -> None:
+    """Print names and what belongs to each, aligned."""
+    from rich.cells import cell_len
+
+    longest = max((cell_len(name) for name, _ in rows), default=0)
+    for name, text in rows:
+        pad = " " * (longest - cell_len(name))
+        for line in text.split("\n"):
+            say(f"  {name}{pad}  {line}", hang=longest + 2)
+            name, pad = "", " " * longest
+
+
+def show_table(
+    title: str,
+    headings: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    words: Sequence[str] = (),
+    stream: IO[str] | None = None,
+) -> None:
+    """Print a table: the first column and those named in `words` to the left, numbers to the right.
+
+    On a terminal that is too narrow every row is a line that names its cells.
+    """
+    from rich.cells import cell_len
+
+    from stitch.system.process import console
+
+    say(title, bold=True, stream=stream)
+    widths = [max(map(cell_len, column)) for column in zip(headings, *rows, strict=True)]
+    terminal = console(stream)
+    if terminal.is_terminal and sum(widths) + 2 * len(widths) > terminal.width:
+        for first, *cells in rows:
+            say(
+                f"  {first}: {', '.join(f'{h} {c}' for h, c in zip(headings[1:], cells, strict=True))}",
+                hang=4,
+                stream=stream,
+            )
+        return
+    left = [heading in (headings[0], *words) for heading in headings]
+    for row in (headings, *rows):
+        cells = [
+            cell + pad if to_left else pad + cell
+            for cell, pad, to_left in (
+                (cell, " " * (width - cell_len(cell)), own) for cell, width, own in zip(row, widths, left, strict=True)
+            )
+        ]
+        say(f"  {'  '.join(cells)}".rstrip(), stream=stream)
+
+
+def show_files(folder: Path, names: Sequence[str]) -> None:
+    """Print the paths of those files that there are."""
+    for name in names:
+        if (folder / name).exists():
+            say(f"  {folder / name}")
+
+
+_next_hidden: list[bool] = []
+
+
+def show_next(line: str) -> None:
+    """Print the line that names the next command, unless another command has called this one."""
+    if not _next_hidden:
+        say(line)
 
 
 @contextmanager
-def show_activity(text: str) -> Iterator[None]:
-    """While the block lasts, the line says what is done, and for how long, unless something more precise does."""
-    live_line().begin(text)
+def next_hidden() -> Iterator[None]:
+    """While the block lasts, commands do not name the next one: who calls them does."""
+    _next_hidden.append(True)
     try:
         yield
     finally:
-        live_line().stop()
+        _next_hidden.pop()
 
-
-class TimeLeft:
-    """Watches loops, and loops within them: sessions: 2 of 5, 1:07 left; scans: 12 of 40, 0:07 left."""
-
-    def __init__(self) -> None:
-        self._started: dict[str, float] = {}  # by label, the outermost first
-        self._texts: dict[str, str] = {}
-
-    def __call__(self, label: str, done: int, total: int) -> None:
-        """A step begins; after the last one the loop is no longer spoken of."""
-        now = time.monotonic()
-        if done == 0:
-            self._started[label] = now
-        if done >= total:
-            self._started.pop(label, None)
-            self._texts.pop(label, None)
-            if not self._texts:
-                live_line().loops_ended()
-            return
-        text = time_left_text(label, done, total, now - self._started.get(label, now))
-        if text is not None:
-            self._texts[label] = text
-            live_line().say("; ".join(self._texts[name] for name in self._started if name in self._texts))
-
-
-def time_left_text(label: str, done: int, total: int, seconds: float) -> str | None:
-    """What to say after so many seconds; None while it is too early to know."""
-    if seconds < _SOON or not 0 < done < total:
-        return None
-    left = round(seconds / done * (total - done))
-    return f"{label}: {done} of {total}, {left // 60}:{left % 60:02d} left"
-
-
-# Progress on a terminal, as one of the recorders.
-
-
-class Progress:
-    """The changing line of a terminal; silent elsewhere."""
-
-    def __init__(self) -> None:
-        self.unit = "mm"
-
-    def start(self, session: Session) -> None:
-        """Name what is being done."""
-        self.unit = session.length_unit
-        live_line().begin(f"{session.name}: {len(session.views)} views, finding the hand-eye")
-
-    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Show where the iteration stands."""
-        from stitch.units import length_text
-
-        # Labelled points have their partners by name.
-        within = f", partners within {length_text(gate, self.unit)}" if isfinite(gate) else ""
-        live_line().begin(f"{stage} {index + 1}: {length_text(rms, self.unit, 4)} rms{within}")
-
-    def stage(self, result: StageResult, poses: Array) -> None:
-        """A stage has ended."""
-
-    def finish(self, run: Run) -> None:
-        """What follows takes its time too."""
-        live_line().begin(f"{run.session.name}: writing cloud and page")
-
-
-# Progress for programs: one JSON object a line on standard error, where STITCH_PROGRESS=json asks for it.
-
-PROGRESS_VARIABLE = "STITCH_PROGRESS"
-
-
-def progress_lines_requested() -> bool:
-    """True where the program that started this one reads lines."""
-    return os.environ.get(PROGRESS_VARIABLE) == "json"
-
-
-class ProgressLines:
-    """A recorder that says where the work stands: {"progress": "fit", "iteration": 3, "rms_um": 32.7}."""
-
-    def __init__(self) -> None:
-        self.to_um = 1e3
-
-    def start(self, session: Session) -> None:
-        """What is worked on."""
-        from stitch.units import MICROMETRES
-
-        self.to_um = MICROMETRES[session.length_unit]
-        _print_line(progress="start", session=session.name, views=len(session.views))
-
-    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """One more iteration; the first is 1."""
-        _print_line(progress=stage, iteration=index + 1, rms_um=rms * self.to_um)
-
-    def stage(self, result: StageResult, poses: Array) -> None:
-        """A stage has ended."""
-        _print_line(progress=result.name, ended=True, rms_um=result.rms * self.to_um)
-
-    def finish(self, run: Run) -> None:
-        """Recording and page are written next."""
-        _print_line(
-            progress="writing", residual_um=run.residual_rms * self.to_um, heldout_um=run.heldout_rms * self.to_um
-        )
-
-
-def _print_line(**facts: Any) -> None:
-    known = {key: value for key, value in facts.items() if value == value}  # JSON has no NaN
-    print(json.dumps(known), file=sys.stderr, flush=True)
-
-
-# Who watches a command work: the terminal, a program that reads lines, and the recording.
-
-
-def recorder_for(folder: Path, recording: bool) -> Recorder:
-    """Progress on a terminal or as lines, and the recording."""
-    from stitch.runs.recorder import RecorderGroup
-    from stitch.writing.run_folder import recordings
-
-    lines: list[Recorder] = [ProgressLines()] if progress_lines_requested() else []
-    return RecorderGroup([Progress(), *lines, *(recordings(folder) if recording else [])])
-
-
-# Standard output carries results alone; what libraries and a user's effects print goes to standard error.
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 _REPLACEMENTS = {

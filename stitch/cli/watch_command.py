@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,162 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stitch.cli.options import Json, Tolerance, require_tolerance
-from stitch.cli.terminal import emit
+from stitch.cli.progress import show_activity
+from stitch.cli.terminal import emit, say, show_table
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from stitch.watch.history import History
     from stitch.watch.report import CellReport, ParameterReport
 
-
-# What `stitch watch` says for people: a table a cell, one line of verdict, the pages.
-
-
-def show_watch(reports: Sequence[CellReport], folders: Sequence[Path], added: int | None, pages: bool) -> None:
-    """For people, on standard error; verdicts last."""
-    from stitch.system.process import console
-    from stitch.watch.report import headline, report_notes
-
-    terminal = console()
-    if added is not None:
-        terminal.print(f"{added} new {'run' if added == 1 else 'runs'} in {folders[0]}", soft_wrap=True)
-    # Of a plant the verdicts are enough; its page has the rest.
-    for report in reports if len(reports) == 1 else ():
-        terminal.print(_cell_table(report))
-        for p in report.parameters:
-            if p.follows:
-                terminal.print(f"{p.name} follows {follows_text(p)}", soft_wrap=True)
-    for report in reports:
-        for note in report_notes(report):
-            terminal.print(f"{report.name}: {note}", soft_wrap=True)
-    for folder in folders if pages else ():
-        terminal.print(f"  {folder / 'watch.html'}", soft_wrap=True)
-    if pages and len(folders) > 1:
-        terminal.print(f"  {folders[0].parent / 'plant.html'}", soft_wrap=True)
-    for report in reports:
-        terminal.print(headline(report), soft_wrap=True, style="bold")
-
-
-def _cell_table(report: CellReport) -> Table:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    from stitch.units import rounded
-    from stitch.watch.report import day_text, table_unit
-
-    span = f"{day_text(report.first)} to {day_text(report.last)}"
-    title = f"{report.name}: {report.sessions:,} sessions, {span}; calibration of {report.in_use} in use"
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0, pad_edge=False)
-    for heading in ("parameter", "unit", "value", "sigma", "a day", "valid", "moved"):
-        words = heading in ("parameter", "unit", "moved")
-        table.add_column(heading, justify="left" if words else "right", no_wrap=heading != "moved")
-    for p in report.parameters:
-        factor, unit = table_unit(p.unit, report.length_unit)
-        # A drift that is not known to be one is a dash.
-        moves = abs(p.drift_per_day) > 3 * p.drift_sigma
-        drift = rounded(factor * p.drift_per_day, factor * p.drift_sigma) if moves else "–"
-        value = rounded(factor * p.value, factor * p.sigma / 10)
-        table.add_row(
-            p.name, unit, value, f"{factor * p.sigma:.2g}", drift, valid_text(report, p), moved_text(report, p)
-        )
-    return table
-
-
-def follows_text(p: ParameterReport) -> str:
-    """Channels that it follows, with its share."""
-    from stitch.watch.report import size_text
-
-    return ", ".join(f"{f.channel} ({size_text(f.per_unit, p.unit, f.sigma)} per unit)" for f in p.follows)
-
-
-def moved_text(report: CellReport, p: ParameterReport) -> str:
-    """The alarm that stands."""
-    if p.alarm is None:
-        return "–"
-    beside = f" with {p.alarm.channel}" if p.alarm.channel else ""
-    return f"{p.alarm.kind}{beside}, {report.run_names[p.alarm.since]}"
-
-
-def valid_text(report: CellReport, p: ParameterReport) -> str:
-    """Until when the calibration in use holds for it."""
-    from stitch.watch.report import day_text
-
-    if p.valid_until is None:
-        return "holds"
-    return "over" if p.valid_until <= report.last else day_text(p.valid_until)[:10]
-
-
-# What `stitch watch` does: runs appended, cells judged, pages and metrics written.
-
-_DRIFTS = 3
-
-
-def run_watch(
-    folders: list[Path],
-    runs: list[Path],
-    *,
-    add: bool,
-    at: str,
-    in_use: Path | None,
-    tolerance: float | None,
-    page: bool,
-    dfq: Path | None,
-    as_json: bool,
-) -> None:
-    """Judge cells; with `add` these runs are appended to the first, measured at a time that may be stated.
-
-    Raises:
-        InputError, NoResultError: as `stitch watch` ends.
-        typer.Exit: with 3, where something drifts.
-    """
-    from stitch.system.process import steps
-    from stitch.watch.history import known_run_hash, measured_at, open_history, read_record, use_calibration
-    from stitch.watch.report import cell_report, dfq_text, report_document
-    from stitch.watch.update import append_runs
-    from stitch.writing.json_file import to_json
-
-    records = [read_record(run, measured_at(at) if at else None) for run in steps("runs", runs)]
-    reports: list[CellReport] = []
-    with ExitStack() as stack:
-        histories = [stack.enter_context(open_history(folder, new=add)) for folder in folders]
-        used = None if in_use is None else known_run_hash(histories[0], in_use, records)
-        added = append_runs(histories[0], records) if add else 0
-        if used is not None:
-            use_calibration(histories[0], used)
-        reports = [cell_report(history, tolerance) for history in histories]
-        if page:
-            _write_pages(histories, reports, folders)
-        if dfq is not None:
-            _write_text(dfq_text(histories[0], reports[0]), dfq, encoding="utf-8-sig")
-    if as_json:
-        documents = [report_document(report) for report in reports]
-        emit(to_json(documents[0] if len(documents) == 1 else documents))
-    else:
-        show_watch(reports, folders, added if add else None, page)
-    if any(report.alarms for report in reports):
-        raise typer.Exit(_DRIFTS)
-
-
-def _write_pages(histories: list[History], reports: list[CellReport], folders: list[Path]) -> None:
-    """The page and the metrics of every cell, and beside the first the page of all."""
-    from stitch.watch.report import cell_trend, openmetrics
-    from stitch.writing.run_folder import call_entry_points
-
-    for history, report, folder in zip(histories, reports, folders, strict=True):
-        call_entry_points("stitch.watch_pages", cell_trend(history, report), folder / "watch.html")
-        _write_text(openmetrics([report]), folder / "watch.prom")
-    if len(reports) > 1:
-        links = [(report, folder / "watch.html") for report, folder in zip(reports, folders, strict=True)]
-        call_entry_points("stitch.plant_pages", links, folders[0].parent / "plant.html")
-
-
-def _write_text(text: str, path: Path, encoding: str = "utf-8") -> None:
-    from stitch.system.files import whole_file
-
-    with whole_file(path) as file:
-        file.write_bytes(text.encode(encoding))
+_DRIFTS = 3  # exit code where something drifts
 
 
 def watch(
@@ -189,12 +41,35 @@ def watch(
       stitch watch cell-7 --tolerance 0.1
       stitch watch cell-7 cell-8 cell-9
     """
-    require_tolerance(tolerance)
-    runs = cells[1:] if add else []
-    folders = cells[:1] if add else cells
-    _require_sense(add, runs, at, in_use, dfq, folders)
+    from stitch.system.process import steps
+    from stitch.watch.history import known_run_hash, measured_at, open_history, read_record, use_calibration
+    from stitch.watch.report import cell_report, dfq_text, report_document
+    from stitch.watch.update import append_runs
+    from stitch.writing.json_file import to_json
 
-    run_watch(folders, runs, add=add, at=at, in_use=in_use, tolerance=tolerance, page=page, dfq=dfq, as_json=as_json)
+    require_tolerance(tolerance)
+    folders, runs = (cells[:1], cells[1:]) if add else (cells, [])
+    _require_sense(add, runs, at, in_use, dfq, folders)
+    records = [read_record(run, measured_at(at) if at else None) for run in steps("runs", runs)]
+    reports: list[CellReport] = []
+    with show_activity("watching: judging the history"), ExitStack() as stack:
+        histories = [stack.enter_context(open_history(folder, new=add)) for folder in folders]
+        used = None if in_use is None else known_run_hash(histories[0], in_use, records)
+        added = append_runs(histories[0], records) if add else None
+        if used is not None:
+            use_calibration(histories[0], used)
+        reports = [cell_report(history, tolerance) for history in histories]
+        if page:
+            _write_pages(histories, reports, folders)
+        if dfq is not None:
+            _write_text(dfq_text(histories[0], reports[0]), dfq, encoding="utf-8-sig")
+    if as_json:
+        documents = [report_document(report) for report in reports]
+        emit(to_json(documents[0] if len(documents) == 1 else documents))
+    else:
+        _show_watch(reports, folders, added, page)
+    if any(report.alarms for report in reports):
+        raise typer.Exit(_DRIFTS)
 
 
 def _require_sense(
@@ -212,3 +87,85 @@ def _require_sense(
     names = [folder.resolve().name for folder in folders]
     if len(set(names)) < len(names):
         raise InputError(f"two cells are named {max(names, key=names.count)!r}; to fix: name each once")
+
+
+def _write_pages(histories: list[History], reports: list[CellReport], folders: list[Path]) -> None:
+    """Write the page and the metrics of every cell, and beside the first the page of all."""
+    from stitch.watch.report import cell_trend, openmetrics
+    from stitch.writing.run_folder import call_entry_points
+
+    for history, report, folder in zip(histories, reports, folders, strict=True):
+        call_entry_points("stitch.watch_pages", cell_trend(history, report), folder / "watch.html")
+        _write_text(openmetrics([report]), folder / "watch.prom")
+    if len(reports) > 1:
+        links = [(report, folder / "watch.html") for report, folder in zip(reports, folders, strict=True)]
+        call_entry_points("stitch.plant_pages", links, folders[0].parent / "plant.html")
+
+
+def _write_text(text: str, path: Path, encoding: str = "utf-8") -> None:
+    from stitch.system.files import whole_file
+
+    with whole_file(path) as file:
+        file.write_bytes(text.encode(encoding))
+
+
+def _show_watch(reports: list[CellReport], folders: list[Path], added: int | None, pages: bool) -> None:
+    """Print a table of one cell, notes, and the verdicts last; of a plant the verdicts are enough, its page has all."""
+    from stitch.watch.report import headline, report_notes, size_text
+
+    if added is not None:
+        say(f"{added} new {'run' if added == 1 else 'runs'} in {folders[0]}")
+    for report in reports if len(reports) == 1 else ():
+        _show_cell(report)
+        for p in report.parameters:
+            if p.follows:
+                told = ", ".join(f"{f.channel} ({size_text(f.per_unit, p.unit, f.sigma)} per unit)" for f in p.follows)
+                say(f"{p.name} follows {told}")
+    for report in reports:
+        for note in report_notes(report):
+            say(f"{report.name}: {note}")
+    for folder in folders if pages else ():
+        say(f"  {folder / 'watch.html'}")
+    if pages and len(folders) > 1:
+        say(f"  {folders[0].parent / 'plant.html'}")
+    for report in reports:
+        say(headline(report), bold=True)
+
+
+def _show_cell(report: CellReport) -> None:
+    from stitch.units import rounded
+    from stitch.watch.report import day_text, table_unit
+
+    rows = []
+    for p in report.parameters:
+        factor, unit = table_unit(p.unit, report.length_unit)
+        # A drift that is not known to be one is a dash.
+        moves = abs(p.drift_per_day) > 3 * p.drift_sigma
+        drift = rounded(factor * p.drift_per_day, factor * p.drift_sigma) if moves else "–"
+        value = rounded(factor * p.value, factor * p.sigma / 10)
+        sigma = f"{factor * p.sigma:.2g}"
+        rows.append((p.name, unit, value, sigma, drift, _valid_text(report, p), _moved_text(report, p)))
+    span = f"{day_text(report.first)} to {day_text(report.last)}"
+    show_table(
+        f"{report.name}: {report.sessions:,} sessions, {span}; calibration of {report.in_use} in use",
+        ("parameter", "unit", "value", "sigma", "a day", "valid", "moved"),
+        rows,
+        words=("unit", "moved"),
+    )
+
+
+def _moved_text(report: CellReport, p: ParameterReport) -> str:
+    """Return the alarm that stands."""
+    if p.alarm is None:
+        return "–"
+    beside = f" with {p.alarm.channel}" if p.alarm.channel else ""
+    return f"{p.alarm.kind}{beside}, {report.run_names[p.alarm.since]}"
+
+
+def _valid_text(report: CellReport, p: ParameterReport) -> str:
+    """Return until when the calibration in use holds for a parameter."""
+    from stitch.watch.report import day_text
+
+    if p.valid_until is None:
+        return "holds"
+    return "over" if p.valid_until <= report.last else day_text(p.valid_until)[:10]

@@ -34,16 +34,22 @@ def require_free(folder: Path, targets: bool = False) -> None:
     """
     for name in ("session.toml", "views.csv", *(["points.csv"] if targets else [])):
         if (folder / name).exists() or (folder / name).is_symlink():
-            raise InputError(f"{folder / name}: exists already; to fix: remove it, or name another folder with -o")
+            raise InputError(
+                f"{folder / name}: exists already; to fix: replace it with --force, or name another folder with -o"
+            )
 
 
-def write_draft(folder: Path, first: FirstSession) -> None:
+def write_draft(folder: Path, first: FirstSession, force: bool = False) -> None:
     """Write both files into a folder, which is made where it does not exist.
+
+    Args:
+        force: replace those that are there.
 
     Raises:
         InputError: there is a session already.
     """
-    require_free(folder, bool(first.sightings))
+    if not force:
+        require_free(folder, bool(first.sightings))
     folder.mkdir(parents=True, exist_ok=True)
     with whole_file(folder / "views.csv") as table, whole_file(folder / "session.toml") as toml:
         table.write_text(views_text(folder, first), encoding="utf-8")

@@ -33,6 +33,12 @@ def effect_cure(effect: str) -> str:
     return f"add the effect {effect}"
 
 
+def doubt_remedy(doubt: str) -> str:
+    """Return what a doubt says after its headline; empty where that is all."""
+    more = doubt[len(doubt_headline(doubt)) - 1 :].lstrip(";:. ")
+    return more[:1].upper() + more[1:]
+
+
 def _brackets_closed(text: str) -> bool:
     return text.count("(") == text.count(")")
 

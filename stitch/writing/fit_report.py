@@ -23,9 +23,9 @@ def fit_report(run: Run, at_part: tuple[float, float]) -> str:
     parts = [
         [head, f"  {run_verdict(run, model_history(run))}"],
         [f"[[Hand-eye]] {name.removeprefix('Hand-eye ')}", *numbers, f"  U at the part {place} mm and {turn} mrad"],
-        ["[[Errors]]", *_errors(run)],
-        _part("Effects", _effects(run)),
-        _part("History", _history(run)),
+        _part("Errors", _aligned(_errors(run))),
+        _part("Effects", _aligned(_effects(run))),
+        _part("History", _aligned(_history(run))),
         _part("Not observable", run.unobservable),
         _part("Left out", [f"{item.view}: {item.why}" for item in run.left_out]),
         _part("Notes", run.notes),
@@ -33,33 +33,41 @@ def fit_report(run: Run, at_part: tuple[float, float]) -> str:
     return "\n".join(line for part in parts for line in part)
 
 
+def report_rows(run: Run) -> list[tuple[str, str]]:
+    """Return names and values: errors, noise, scatter of the poses, the error of every model so far, its parameters."""
+    return [*_errors(run), *_history(run), *_effects(run)]
+
+
 def _part(heading: str, lines: Sequence[str]) -> list[str]:
     return [f"[[{heading}]]", *(f"  {line}" for line in lines)] if lines else []
 
 
-def _errors(run: Run) -> list[str]:
-    """Residuals, noise and the scatter of the poses, one a line."""
+def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
+    return [f"{name + ':':<30}{text}" for name, text in rows]
+
+
+def _errors(run: Run) -> list[tuple[str, str]]:
+    """Residuals, noise and the scatter of the poses."""
     unit, scatter = run.session.length_unit, run.repeatability
-    rows = [
+    return [
         ("on views left out", length_text(run.heldout_rms, unit)),
         ("in the fit", length_text(run.residual_rms, unit)),
         ("noise floor", length_text(run.noise_floor, unit)),
         ("scatter of the robot's poses", f"{length_text(scatter.translation, unit)}, {angle_text(scatter.rotation)}"),
     ]
-    return [f"  {name + ':':<30}{text}" for name, text in rows]
 
 
-def _effects(run: Run) -> list[str]:
+def _effects(run: Run) -> list[tuple[str, str]]:
     """Parameters that were fitted or tried."""
-    known = [(term.name, p) for term in run.terms for p in term.parameters if p.fitted or p.grid]
-    return [f"{f'{effect}.{p.name}:':<30}{p.formatted}" for effect, p in known]
-
-
-def _history(run: Run) -> list[str]:
-    """Every step of the model, where there are several, with its error on views left out."""
-    unit = run.session.length_unit
-    if len(run.ledger) < 2:
-        return []
     return [
-        f"{effect_changes(run.ledger, i) + ':':<30}{length_text(s.heldout_rms, unit)}" for i, s in enumerate(run.ledger)
+        (f"{term.name}.{p.name}", str(p.formatted)) for term in run.terms for p in term.parameters if p.fitted or p.grid
+    ]
+
+
+def _history(run: Run) -> list[tuple[str, str]]:
+    """Every step of the model, where there are several, with its error on views left out."""
+    steps = run.ledger if len(run.ledger) > 1 else ()
+    return [
+        (effect_changes(run.ledger, i), length_text(s.heldout_rms, run.session.length_unit))
+        for i, s in enumerate(steps)
     ]

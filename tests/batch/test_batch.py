@@ -81,7 +81,7 @@ def test_an_interrupt_keeps_what_is_finished(sessions, ran, monkeypatch, capsys,
 
     monkeypatch.setattr("stitch.batch.run_batch.run_jobs", stopped)
     batch(*sessions, code=1)
-    assert "stitch: stopped with 1 of 2 sessions" in capsys.readouterr().err.splitlines()[-1]
+    assert "stitch: stopped after 1 of 2 sessions" in capsys.readouterr().err.splitlines()[-1]
     monkeypatch.setattr("stitch.batch.run_batch.run_jobs", run_jobs)
     batch(*sessions)
     assert ran == ["monday", "tuesday"]

@@ -1,4 +1,4 @@
-"""Progress with the time that is left: on a terminal, and nowhere else."""
+"""Progress with the time that is left: a changing line on a terminal, a plain line a step elsewhere."""
 
 import os
 import pty
@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from stitch.cli import terminal as live_line
-from stitch.cli.terminal import TimeLeft, time_left_text
+from stitch.cli import progress as live_line
+from stitch.cli.progress import TimeLeft, time_left_text
 from stitch.system.process import steps, watched
 from stitch.system.threads import parallel
 
@@ -22,7 +22,7 @@ def said(monkeypatch):
     out, clock = [], count()
 
     class Line:
-        say = staticmethod(out.append)
+        say = staticmethod(lambda text, step: out.append(text))
         stop = loops_ended = staticmethod(lambda: out.append(""))
 
     monkeypatch.setattr(live_line, "live_line", Line)
@@ -61,16 +61,16 @@ def test_nobody_watches_nobody_counts(said):
 
 CODE = """
 import time
-from stitch.cli.terminal import TimeLeft, show_activity
+from stitch.cli.progress import TimeLeft, show_activity
 from stitch.system.process import steps, watched
 with watched(TimeLeft()), show_activity("diagnosing [2]"):
-    time.sleep(0.8)
+    time.sleep(1.2)
     for _ in steps("scans", range(4)): time.sleep(0.4)
     time.sleep(1.2)
 """
 
 
-def test_a_terminal_shows_it_and_a_pipe_does_not():
+def test_a_terminal_shows_it_and_a_pipe_gets_a_line_a_step():
     ours, theirs = pty.openpty()
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
     subprocess.run([sys.executable, "-c", CODE], stderr=theirs, env=environment, check=True)
@@ -81,4 +81,7 @@ def test_a_terminal_shows_it_and_a_pipe_does_not():
     seconds = [re.findall(rb"diagnosing \[2\]; 0:(\d\d)", part) for part in (before, after)]
     assert int(seconds[0][0]) < int(seconds[1][-1])
     os.close(ours)
-    assert not subprocess.run([sys.executable, "-c", CODE], stderr=subprocess.PIPE, check=True).stderr
+    piped = subprocess.run([sys.executable, "-c", CODE], stderr=subprocess.PIPE, check=True, text=True).stderr
+    assert re.fullmatch(r"diagnosing \[2\]; 0:02\nscans: 3 of 4, 0:0\d left\n", piped)
+    asked = {**os.environ, "STITCH_PROGRESS": "json"}
+    assert not subprocess.run([sys.executable, "-c", CODE], stderr=subprocess.PIPE, check=True, env=asked).stderr

@@ -115,7 +115,7 @@ def test_the_file_that_is_written_can_be_added(tmp_path, stitch_command, monkeyp
     assert stop.value.code == 2
 
 
-@pytest.mark.parametrize(("output", "told"), [("mine.txt", "mine.py"), ("there.py", "there is such a file")])
+@pytest.mark.parametrize(("output", "told"), [("mine.txt", "mine.py"), ("there.py", "exists already")])
 def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path, monkeypatch, capsys, output, told):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.py").write_text("# mine\n")

@@ -122,7 +122,7 @@ def test_glb_of_a_run_with_a_mesh_is_the_mesh(cloud, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "output", "content", "message"),
     [
-        ("ply", "c.pcd", b"", "--to ply: where to? to fix: name the file with -o NAME.ply"),
+        ("ply", "c.pcd", b"", "--to ply: no output file; to fix: name the file with -o NAME.ply"),
         ("ply", "c.ply", None, "r/stitched.ply: no stitched cloud there"),
         (
             "ply",

@@ -306,7 +306,7 @@ def test_what_is_too_large_or_out_of_reach_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--program", "w.script"], "w.script: where to? to fix"),
+        (["--program", "w.script"], "w.script: no output file; to fix"),
         (["--program", "w.script", "-o", "c.src"], "c.src: to fix: end the copy's name in .script"),
         (["--program", "w.script", "-o", "c.script", "--limit", "-1"], "--limit -1: to fix"),
         (["--program", "w.script", "-o", "c.script", "--limit", "0.01"], "more than the 0.01 mm"),

@@ -1,0 +1,245 @@
+"""Where the work stands: one changing line on a terminal, a plain line a step elsewhere, JSON where asked for."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stitch.frames import Array
+    from stitch.measurement.session import Session
+    from stitch.runs.recorder import Recorder
+    from stitch.runs.run import Run, StageResult
+
+_SOON = 1.0  # a loop that ends sooner (s) needs no time left
+_QUIET = 2.0  # work that ends sooner (s) needs no plain line
+_AGAIN = 10.0  # the same step is named again after so long (s)
+PROGRESS_VARIABLE = "STITCH_PROGRESS"
+
+
+@contextmanager
+def show_activity(text: str) -> Iterator[None]:
+    """Say what the block does, and for how long, wherever nothing more precise is said."""
+    live_line().begin(text)
+    try:
+        yield
+    finally:
+        live_line().stop()
+
+
+def recorder_for(folder: Path, recording: bool) -> Recorder:
+    """Return progress on a terminal or as lines, and the recording."""
+    from stitch.runs.recorder import RecorderGroup
+    from stitch.writing.run_folder import recordings
+
+    lines: list[Recorder] = [ProgressLines()] if progress_lines_requested() else []
+    return RecorderGroup([Progress(), *lines, *(recordings(folder) if recording else [])])
+
+
+@cache
+def live_line() -> LiveLine:
+    """Return the one line of this process: two would fight for the cursor."""
+    return LiveLine()
+
+
+class LiveLine:
+    """A line on standard error that begins with the first text."""
+
+    def __init__(self) -> None:
+        self._status: Any = None
+        self._visible = False
+        self._elapsed: _Elapsed | None = None
+        self._plain = _PlainLines()
+
+    def begin(self, step: str, detail: str = "") -> None:
+        """Show a step with the time since the first one, until `stop`; loops stand in its place meanwhile."""
+        self._elapsed = _Elapsed(step, detail, time.monotonic() if self._elapsed is None else self._elapsed.started)
+        self.say(self._elapsed, step)
+
+    def loops_ended(self) -> None:
+        """Show the step that stood before the loops; nothing if there was none."""
+        if self._elapsed is None:
+            self.stop()
+        else:
+            self.say(self._elapsed, self._elapsed.step)
+
+    def say(self, text: str | _Elapsed, step: str) -> None:
+        """Show a text of a step in place of the last."""
+        if not sys.stderr.isatty():
+            if not progress_lines_requested():
+                self._plain.show(step, text)
+            return
+        if self._status is None:
+            # Imported here: most commands end before they show something.
+            from stitch.system.process import console
+
+            self._status = console().status("")
+        if not self._visible:
+            # An error on the way must not leave the terminal without a cursor.
+            atexit.register(self._status.stop)
+            self._status.start()
+            self._visible = True
+        self._status.update(text)
+
+    def stop(self) -> None:
+        """Clear the line; the next text begins it anew."""
+        self._elapsed = None
+        self._plain.stop()
+        if self._status is not None and self._visible:
+            self._status.stop()
+            self._visible = False
+
+
+@dataclass(frozen=True)
+class _Elapsed:
+    """A step, and for how long the work has lasted: how many iterations there will be nobody knows."""
+
+    step: str
+    detail: str
+    started: float
+
+    def __str__(self) -> str:
+        seconds = round(time.monotonic() - self.started)
+        return f"{self.step}{self.detail}; {seconds // 60}:{seconds % 60:02d}"
+
+    def __rich__(self) -> Any:
+        from rich.text import Text
+
+        return Text(str(self))
+
+
+class _PlainLines:
+    """A line for each step on what is no terminal, once the work has lasted a while."""
+
+    def __init__(self) -> None:
+        self._timer: threading.Timer | None = None
+        self._step, self._text = "", object()
+        self._printed: dict[str, float] = {}  # when each step was printed
+
+    def show(self, step: str, text: object) -> None:
+        """Print a step as it begins, and again after a while; nothing while the work may soon be over."""
+        self._step, self._text = step, text
+        if self._timer is None:
+            self._timer = threading.Timer(_QUIET, self._print)
+            self._timer.daemon = True
+            self._timer.start()
+        elif self._printed and (step not in self._printed or time.monotonic() - max(self._printed.values()) > _AGAIN):
+            self._print()
+
+    def _print(self) -> None:
+        self._printed[self._step] = time.monotonic()
+        print(self._text, file=sys.stderr, flush=True)
+
+    def stop(self) -> None:
+        """Print nothing more; the next step begins anew."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer, self._printed = None, {}
+
+
+class TimeLeft:
+    """Watches loops, and loops within them: sessions: 2 of 5, 1:07 left; scans: 12 of 40, 0:07 left."""
+
+    def __init__(self) -> None:
+        self._started: dict[str, float] = {}  # by label, the outermost first
+        self._texts: dict[str, str] = {}
+
+    def __call__(self, label: str, done: int, total: int) -> None:
+        """Show that a step of a loop begins; clear the loop after its last one."""
+        now = time.monotonic()
+        if done == 0:
+            self._started[label] = now
+        if done >= total:
+            self._started.pop(label, None)
+            self._texts.pop(label, None)
+            if not self._texts:
+                live_line().loops_ended()
+            return
+        text = time_left_text(label, done, total, now - self._started.get(label, now))
+        if text is not None:
+            self._texts[label] = text
+            live_line().say("; ".join(self._texts[name] for name in self._started if name in self._texts), label)
+
+
+def time_left_text(label: str, done: int, total: int, seconds: float) -> str | None:
+    """Return what to say after so many seconds; None while it is too early to know."""
+    if seconds < _SOON or not 0 < done < total:
+        return None
+    left = round(seconds / done * (total - done))
+    return f"{label}: {done} of {total}, {left // 60}:{left % 60:02d} left"
+
+
+class Progress:
+    """A recorder that moves the changing line."""
+
+    def __init__(self) -> None:
+        self.unit = "mm"
+
+    def start(self, session: Session) -> None:
+        """Name what is being done."""
+        self.unit = session.length_unit
+        live_line().begin(f"{session.name}: {len(session.views)} views, finding the hand-eye")
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """Show where the iteration stands."""
+        from stitch.units import length_text
+
+        # Labelled points have their partners by name.
+        within = f", partners within {length_text(gate, self.unit)}" if isfinite(gate) else ""
+        live_line().begin(stage, f", iteration {index + 1}: {length_text(rms, self.unit, 4)} rms{within}")
+
+    def stage(self, result: StageResult, poses: Array) -> None:
+        """A stage has ended."""
+
+    def finish(self, run: Run) -> None:
+        """What follows takes its time too."""
+        live_line().begin(f"{run.session.name}: writing cloud and page")
+
+
+def progress_lines_requested() -> bool:
+    """Return whether the program that started this one reads lines of JSON."""
+    return os.environ.get(PROGRESS_VARIABLE) == "json"
+
+
+class ProgressLines:
+    """A recorder that prints where the work stands: {"progress": "fit", "iteration": 3, "rms_um": 32.7}."""
+
+    def __init__(self) -> None:
+        self.to_um = 1e3
+
+    def start(self, session: Session) -> None:
+        """What is worked on."""
+        from stitch.units import MICROMETRES
+
+        self.to_um = MICROMETRES[session.length_unit]
+        _print_line(progress="start", session=session.name, views=len(session.views))
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """One more iteration; the first is 1."""
+        _print_line(progress=stage, iteration=index + 1, rms_um=rms * self.to_um)
+
+    def stage(self, result: StageResult, poses: Array) -> None:
+        """A stage has ended."""
+        _print_line(progress=result.name, ended=True, rms_um=result.rms * self.to_um)
+
+    def finish(self, run: Run) -> None:
+        """Recording and page are written next."""
+        _print_line(
+            progress="writing", residual_um=run.residual_rms * self.to_um, heldout_um=run.heldout_rms * self.to_um
+        )
+
+
+def _print_line(**facts: Any) -> None:
+    known = {key: value for key, value in facts.items() if value == value}  # JSON has no NaN
+    print(json.dumps(known), file=sys.stderr, flush=True)
