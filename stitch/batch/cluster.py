@@ -27,7 +27,7 @@ _SETTINGS = {
 
 @contextmanager
 def local_client(workers: int) -> Iterator[Any]:
-    """A client of so many processes of this machine, one session each at a time; all end with the block.
+    """Yield a client of so many processes of this machine, one session each at a time; all end with the block.
 
     They speak by TLS under keys made for this batch: nobody else on the machine can hand them work.
 
@@ -61,7 +61,7 @@ def local_client(workers: int) -> Iterator[Any]:
 
 @contextmanager
 def joined_client(address: str) -> Iterator[Any]:
-    """A client of a scheduler that runs already.
+    """Yield a client of a scheduler that runs already.
 
     Raises:
         InputError: distributed is not installed, or nobody answers there.
@@ -80,7 +80,7 @@ def joined_client(address: str) -> Iterator[Any]:
 
 
 def sessions_at_once(client: Any) -> int:
-    """How many sessions the workers of the busiest machine may have at a time: they share its cores."""
+    """Return how many sessions the workers of the busiest machine may have at a time: they share its cores."""
     at_once: Counter[str] = Counter()
     for worker in client.scheduler_info(n_workers=-1)["workers"].values():
         at_once[worker["host"]] += worker["nthreads"]
@@ -88,7 +88,7 @@ def sessions_at_once(client: Any) -> int:
 
 
 def _interrupt_shield(distributed: Any) -> Any:
-    """What every worker does first, one that takes the place of a dead one too."""
+    """Return what every worker does first, one that takes the place of a dead one too."""
 
     class Deaf(distributed.WorkerPlugin):  # type: ignore[misc]
         """Who pressed Ctrl-C wants the batch to end: the workers are ended by it."""

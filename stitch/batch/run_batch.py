@@ -1,4 +1,4 @@
-"""Rows of a batch in the order in which they are finished."""
+"""Many sessions, each run once into a folder of its own; rows come in the order in which they are finished."""
 
 import csv
 import hashlib
@@ -25,8 +25,6 @@ from stitch.writing import run_folder
 from stitch.writing.json_file import require_free, sessions_in, write_json
 from stitch.writing.run_folder import call_entry_points, recordings
 
-# One session of a batch and where its run goes.
-
 
 @dataclass(frozen=True)
 class BatchJob:
@@ -40,14 +38,12 @@ class BatchJob:
     at_once: int = 1  # sessions that share the cores of the machine
 
 
-# Whether a session has been run already: its run folder says of which content it is.
-
 MARK = "batch-mark.json"
 _FORMAT = "stitch-batch-mark/1"
 
 
 def session_content_hash(session: Path) -> str | None:
-    """A hash of all that a run reads of a session: tables, clouds, and the files that session.toml names.
+    """Return a hash of all that a run reads of a session: tables, clouds, and the files that session.toml names.
 
     None where they cannot be read: such a session is never finished.
     """
@@ -62,14 +58,14 @@ def session_content_hash(session: Path) -> str | None:
 
 
 def write_mark(job: BatchJob, content: str | None, folder: Path) -> None:
-    """Say in a folder that becomes the run's of which content it is; both are there at once."""
+    """Write into a folder that becomes the run's of which content it is; both are there at once."""
     told = {"format": _FORMAT, "batch": job.batch, "content": content, "began_with": _first_step_hash(folder)}
     with whole_file(folder / MARK) as file:
         file.write_text(json.dumps(told) + "\n", encoding="utf-8")
 
 
 def finished_batch(job: BatchJob, content: str | None) -> str | None:
-    """The batch that has run a session, if the folder holds a run of this very content; effects may have joined it.
+    """Return the batch that has run a session, if the folder holds a run of its very content; effects may have joined.
 
     Of a batch that runs all again, only what it has run itself is finished.
     """
@@ -86,14 +82,14 @@ def finished_batch(job: BatchJob, content: str | None) -> str | None:
 
 
 def _first_step_hash(folder: Path) -> str:
-    """A hash of the numbers with which the history of the model begins; remarks may join it later."""
+    """Return a hash of the numbers with which the history of the model begins; remarks may join it later."""
     first = read_ledger(folder)[0]
     numbers = [first[key] for key in ("hand_eye", "residual_rms", "heldout_rms", "noise_floor")]
     return hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:16]
 
 
 def _document_texts(value: Any) -> Iterator[str]:
-    """All texts of a document."""
+    """Yield all texts of a document."""
     if isinstance(value, str) and value and "\0" not in value:
         yield value
     elif isinstance(value, dict):
@@ -104,12 +100,9 @@ def _document_texts(value: Any) -> Iterator[str]:
             yield from _document_texts(inner)
 
 
-# What became of one session: a row of the table, of the page and of batch.json.
-
-
 @dataclass(frozen=True)
 class SessionRow:
-    """Lengths in µm; None where nothing was measured."""
+    """What became of one session; lengths in µm, None where nothing was measured."""
 
     session: str
     name: str  # of the run's folder
@@ -129,14 +122,14 @@ class SessionRow:
     seconds: float | None = None  # of its stages
 
     def urgency(self) -> tuple[bool, float]:
-        """Sorts those first that need somebody: without a result, then by what one hand-eye leaves above the noise."""
+        """Return what sorts those first that have no result, then those with most above the noise."""
         if self.residual_um is None or not self.noise_floor_um:
             return self.error is None, 0.0
         return True, -self.residual_um / self.noise_floor_um
 
 
 def finished_row(session: Path, run: Path, skipped: bool = False) -> SessionRow:
-    """The row of a session with a run.
+    """Return the row of a session with a run.
 
     Raises:
         InputError: no run folder of one session, or a damaged one.
@@ -170,13 +163,11 @@ def finished_row(session: Path, run: Path, skipped: bool = False) -> SessionRow:
 
 
 def failed_row(session: Path, run: Path, error: BaseException) -> SessionRow:
-    """The row of a session without a result: why, in one line."""
+    """Return the row of a session without a result: why, in one line."""
     kind = "" if isinstance(error, StitchError) else f"{type(error).__name__}: "
     told = f"{kind}{' '.join(str(error).split())}"
     return SessionRow(str(session), run.name, error=told, bad_input=isinstance(error, InputError))
 
-
-# One session of a batch on whichever process it comes to: run once, or found where it has been run.
 
 # A worker that was given up may still be at work on a session: its successor waits for it, this long (s).
 LOCK_WAIT_SECONDS = 3600.0
@@ -192,19 +183,15 @@ def run_session(job: BatchJob) -> SessionRow:
             content = session_content_hash(job.session)
             batch = finished_batch(job, content)
             if batch is None:
-                _run_job(job, content)
+                session = load_session(job.session)
+                with run_folder.new_folder(job.run, [job.session], job.force) as scratch:
+                    result = run(session, recorder=RecorderGroup(recordings(scratch) if job.recording else []))
+                    run_folder.write_with_page(result, scratch)
+                    write_mark(job, content, scratch)
             # A worker may die between a run and its answer; the next finds a run of this batch.
             return finished_row(job.session, job.run, skipped=batch not in (None, job.batch))
     except Exception as error:  # whatever befalls one session, the others go on
         return failed_row(job.session, job.run, error)
-
-
-def _run_job(job: BatchJob, content: str | None) -> None:
-    session = load_session(job.session)
-    with run_folder.new_folder(job.run, [job.session], job.force) as scratch:
-        result = run(session, recorder=RecorderGroup(recordings(scratch) if job.recording else []))
-        run_folder.write_with_page(result, scratch)
-        write_mark(job, content, scratch)
 
 
 @contextmanager
@@ -223,14 +210,12 @@ def _locked_folder(folder: Path) -> Iterator[None]:
         yield
 
 
-# What a batch leaves beside its runs: batch.json for programs, batch.html for people.
-
-DOCUMENT, PAGE = "batch.json", "batch.html"
+DOCUMENT, PAGE = "batch.json", "batch.html"  # beside the runs: for programs, and for people
 BATCH_FORMAT = "stitch-batch/1"
 
 
 def batch_document(rows: Sequence[SessionRow]) -> dict[str, Any]:
-    """batch.json as a dictionary: how many, and a row a session; lengths in µm."""
+    """Return batch.json as a dictionary: how many, and a row a session; lengths in µm."""
     failed = sum(row.error is not None for row in rows)
     skipped = sum(row.skipped for row in rows)
     return {
@@ -250,13 +235,11 @@ def write_summary(rows: Sequence[SessionRow], folder: Path) -> None:
 
 
 def batch_sentence(rows: Sequence[SessionRow]) -> str:
-    """How many are run, were finished before, have failed."""
+    """Return how many are run, were finished before, have failed."""
     counts = batch_document(rows)
-    told = [f"{counts[key]} {words}" for key, words in _WORDS.items() if counts[key]]
+    words = {"done": "run", "skipped": "finished before", "failed": "without a result"}
+    told = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
     return f"{len(rows)} {'session' if len(rows) == 1 else 'sessions'}: {', '.join(told) or 'nothing to do'}."
-
-
-_WORDS = {"done": "run", "skipped": "finished before", "failed": "without a result"}
 
 
 _WORKERS_DIED = NoResultError(
@@ -293,7 +276,7 @@ def run_jobs(
 def rows_from(
     client: Any, jobs: Sequence[BatchJob], work: Callable[[BatchJob], SessionRow] = run_session
 ) -> Iterator[SessionRow]:
-    """Rows from the workers of a client: all jobs at once; then, one after the other, those whose workers died.
+    """Yield rows from the workers of a client: all jobs at once; then, one after the other, those whose workers died.
 
     Who has killed a worker is not certain where several sessions were with it, and what is too large beside another
     may have room alone.
@@ -322,7 +305,7 @@ def rows_from(
 
 
 def _row_of_future(future: Any, job: BatchJob) -> SessionRow | None:
-    """What a future holds; None where workers died."""
+    """Return what a future holds; None where workers died."""
     try:
         row: SessionRow = future.result()
         return row

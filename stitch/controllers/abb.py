@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught_points import TaughtPoint, WrittenNumber, line_of, quaternion_w_first
+from stitch.controllers.taught_points import CELL, TaughtPoint, WrittenNumber, line_of, quaternion_w_first
 from stitch.errors import InputError
 from stitch.reading.csv_files import finite_number
 
@@ -19,8 +19,6 @@ _MOVE = re.compile(r"\bMove(L|J|AbsJ)\s+(\[[^;]*?\]\s*\])\s*(?:\\|,)", re.I)
 UNREAD = re.compile(r"\bMoveC\s+[^;]*\[[^;]*;", re.I)
 _TARGET = re.compile(r"\[((?:[^\[\]]*\[[^\[\]]*\]){2,4})[^\[\]]*\]")
 _LIST = re.compile(r"\[([^\[\]]*)\]")
-# What stands between commas, without the space around it.
-_CELL = re.compile(r"[^,\s](?:[^,]*[^,\s])?")
 
 # Tool and work object are the last words of a move.
 _USED = re.compile(r"\bMove[LJ]\s+(\w+|\[[^;]*\])[^;]*,\s*(\w+)\s*(?:\\WObj\s*:=\s*(\w+))?\s*;", re.I)
@@ -29,12 +27,13 @@ _NONE = 8e9
 
 
 def read(file: Path, text: str) -> list[TaughtPoint]:
-    """Targets in the order of the file; arrays give one point per element.
+    """Return targets in the order of the file; arrays give one point per element.
 
     Raises:
         InputError: a target without numbers or with a quaternion that is none.
     """
-    clean = _without_comments(text)
+    # Comments run from an exclamation mark, outside strings, to the end of the line; lengths stay.
+    clean = re.sub(r'"[^"\n]*"|![^\n]*', lambda m: m[0] if m[0].startswith('"') else " " * len(m[0]), text)
     found: list[tuple[int, TaughtPoint]] = []
     for match in _DECLARED.finditer(clean):
         found += _targets(file, text, match.start(3), match[2], match[3], match[1].lower() == "jointtarget")
@@ -46,17 +45,12 @@ def read(file: Path, text: str) -> list[TaughtPoint]:
 
 
 def _frames(clean: str, text: str) -> dict[str, str]:
-    """Tool and work object by the name of a point; empty for one that is used with several."""
+    """Return tool and work object by the name of a point; empty for one that is used with several."""
     used: dict[str, set[str]] = {}
     for m in _USED.finditer(clean):
         name = f"line{line_of(text, m.start())}" if m[1].startswith("[") else m[1]
         used.setdefault(name, set()).add(f"{m[2]}, {m[3] or 'wobj0'}")
     return {name: told.pop() if len(told) == 1 else "" for name, told in used.items()}
-
-
-def _without_comments(text: str) -> str:
-    """Comments run from an exclamation mark, outside strings, to the end of the line; lengths stay."""
-    return re.sub(r'"[^"\n]*"|![^\n]*', lambda m: m[0] if m[0].startswith('"') else " " * len(m[0]), text)
 
 
 def _targets(file: Path, text: str, at: int, name: str, value: str, joint: bool) -> list[tuple[int, TaughtPoint]]:
@@ -72,14 +66,14 @@ def _targets(file: Path, text: str, at: int, name: str, value: str, joint: bool)
 
 
 def _point(file: Path, line: int, name: str, body: str, begin: int, *, joint: bool) -> TaughtPoint:
-    """A point from its lists, which stand at `begin`."""
+    """Return a point from its lists, which stand at `begin`."""
     lists = [
         [
             WrittenNumber(
                 finite_number(file, line, name, cell[0]),
                 (begin + part.start(1) + cell.start(), begin + part.start(1) + cell.end()),
             )
-            for cell in _CELL.finditer(part[1])
+            for cell in CELL.finditer(part[1])
         ]
         for part in _LIST.finditer(body)
     ]

@@ -25,7 +25,7 @@ _DECIMAL_COMMA = re.compile(r"=\s*([-+]?\d+,\d+)")
 
 
 def read(file: Path, text: str) -> list[TaughtPoint]:
-    """Points of one listing.
+    """Return the points of one listing.
 
     Raises:
         InputError: no /POS section, a point without numbers.

@@ -39,7 +39,7 @@ _FIELD = re.compile(r"\b([XYZABC]|[AE]\d)\s+([^,}\s]+)", re.I)
 
 
 def read(file: Path, text: str) -> list[TaughtPoint]:
-    """Points of a .dat (as declared) or a .src (as moved to).
+    """Return the points of a .dat (as declared) or a .src (as moved to).
 
     Raises:
         InputError: a point without numbers or with a brace that stays open, a name that is declared nowhere.
@@ -85,7 +85,7 @@ def _motion_target(file: Path, text: str, match: re.Match[str], known: dict[str,
 
 
 def _point(file: Path, name: str, line: int, body: str, begin: int) -> TaughtPoint:
-    """A point from the fields between its braces, which stand at `begin`."""
+    """Return a point from the fields between its braces, which stand at `begin`."""
     odd = next((cell for cell in body.split(",") if not _CELL.fullmatch(cell)), None)
     if odd is not None:
         raise InputError(

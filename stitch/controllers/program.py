@@ -18,15 +18,13 @@ from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.reading.csv_files import is_number
 
-# Rows of views.csv, frames.csv and points.csv.
-
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def view_rows(
     points: Sequence[TaughtPoint], T_base_frame: Array, T_tool_flange: Array, scale: float
 ) -> list[list[str]]:
-    """Header and rows of views.csv; `scale` from mm to the session's unit. What a point lacks stays empty."""
+    """Return header and rows of views.csv; `scale` from mm to the session's unit. What a point lacks stays empty."""
     joints = max((len(p.joints) for p in points if p.joints is not None), default=0)
     posed = any(p.T_frame_tool is not None for p in points)
     rows = [["view", *(f"j{i + 1}_deg" for i in range(joints)), *(POSE_COLUMNS if posed else ())]]
@@ -42,12 +40,12 @@ def view_rows(
 
 
 def pose_cells(T: Array, scale: float) -> list[str]:
-    """Position and quaternion of a pose (4, 4) as cells of a table."""
+    """Return position and quaternion of a pose (4, 4) as cells of a table."""
     return [*(f"{x * scale:.9g}" for x in T[:3, 3]), *(f"{q:.10f}" for q in frames.to_quaternion(T))]
 
 
 def numbered_names(names: Iterable[str]) -> list[str]:
-    """The names, numbered from the second on where one stands again."""
+    """Return the names, numbered from the second on where one stands again."""
     out: list[str] = []
     taken: set[str] = set()
     for name in names:
@@ -62,7 +60,7 @@ def numbered_names(names: Iterable[str]) -> list[str]:
 
 
 def csv_text(rows: Sequence[Sequence[str]]) -> str:
-    """Rows as the text of a CSV file."""
+    """Return rows as the text of a CSV file."""
     stream = io.StringIO()
     csv.writer(stream, lineterminator="\n").writerows(rows)
     return stream.getvalue()
@@ -80,6 +78,7 @@ NOTHING_IN_FORCE = ("UF 0, UT 0", "TOOL 0, BASE 0", "tool0, wobj0")
 # No length in mm and no angle of a controller is larger.
 _LARGEST = 1e9
 _NAMES = {fanuc: "fanuc", kuka: "kuka", abb: "abb", universal_robots: "ur"}
+_COMMENTS = {kuka: ";", universal_robots: "#", abb: "!"}
 
 
 @dataclass(frozen=True)
@@ -122,11 +121,12 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
         raise NoResultError(f"{file}: no taught points found; to fix: export the program with its positions")
     # A script of a UR has its poses in the base.
     needed = {"tool": tool} if reader is universal_robots else {"frame": frame, "tool": tool}
-    _require_stated(file, require_one_frame(file, points), [f"--{name}" for name in needed if needed[name] is None])
-    _require_own_motion(file, points)
+    _require_known_poses(file, points, [f"--{name}" for name in needed if needed[name] is None])
     files = dict.fromkeys(p.file for p in points if p.file is not None)
     texts = {file: text} | {path: program_text(path) for path in files}
     times = Counter(p.name for p in every)
+    mark = _COMMENTS.get(reader)
+    code = text if mark is None else without_comments(text, mark)
     return Program(
         file,
         _NAMES[reader],
@@ -136,23 +136,19 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
         T_flange_tool=stated_pose(reader.pose, "tool", tool),
         repeated=tuple(p.name for p in points if times[p.name] > 1),
         other=tuple(p.name for p in told if not p.is_target),
-        unread=tuple(line_of(text, m.start()) for m in reader.UNREAD.finditer(_without_comments(reader, text))),
+        unread=tuple(line_of(text, m.start()) for m in reader.UNREAD.finditer(code)),
     )
 
 
-def _require_stated(file: Path, taught_in: str | None, lacking: list[str]) -> None:
-    """Refuse poses of a frame and a tool that nobody states."""
-    if taught_in is None or taught_in in NOTHING_IN_FORCE or not lacking:
-        return
-    known = f" ({taught_in})" if taught_in else ""
-    raise InputError(
-        f"{file}: its poses are those of a tool in a frame{known} that the file does not hold; to fix: state "
-        f"{' and '.join(lacking)} as the controller shows them, zeros where none is in force"
-    )
-
-
-def _require_own_motion(file: Path, points: Sequence[TaughtPoint]) -> None:
-    """Refuse poses that an arm reaches on an external axis."""
+def _require_known_poses(file: Path, points: Sequence[TaughtPoint], lacking: list[str]) -> None:
+    """Refuse poses of a frame and a tool that nobody states, and those that an arm reaches on an external axis."""
+    taught_in = require_one_frame(file, points)
+    if lacking and taught_in is not None and taught_in not in NOTHING_IN_FORCE:
+        known = f" ({taught_in})" if taught_in else ""
+        raise InputError(
+            f"{file}: its poses are those of a tool in a frame{known} that the file does not hold; to fix: state "
+            f"{' and '.join(lacking)} as the controller shows them, zeros where none is in force"
+        )
     moved = next((p for p in points if p.moved_by and p.T_frame_tool is not None), None)
     if moved is not None:
         raise InputError(
@@ -161,14 +157,8 @@ def _require_own_motion(file: Path, points: Sequence[TaughtPoint]) -> None:
         )
 
 
-def _without_comments(reader: ModuleType, text: str) -> str:
-    """The text without comments; lengths stay."""
-    mark = {kuka: ";", universal_robots: "#", abb: "!"}.get(reader)
-    return text if mark is None else without_comments(text, mark)
-
-
 def stated_pose(pose: Callable[[Array], Array], name: str, value: str | None) -> Array:
-    """(4, 4) mm of the numbers that a person states as the controller shows them; the unit matrix without any.
+    """Return (4, 4) mm of the numbers that a person states as the controller shows them; the unit matrix without any.
 
     Raises:
         InputError: too few numbers, or a quaternion that is none.
@@ -188,7 +178,7 @@ def stated_pose(pose: Callable[[Array], Array], name: str, value: str | None) ->
 
 
 def require_one_frame(file: Path, points: Sequence[TaughtPoint]) -> str | None:
-    """Frame and tool of all poses as the file calls them, "" where it does not say of all; None without poses.
+    """Return frame and tool of all poses as the file calls them, "" where it does not say of all; None without poses.
 
     Raises:
         InputError: points of different frames or tools.
@@ -205,8 +195,6 @@ def require_one_frame(file: Path, points: Sequence[TaughtPoint]) -> str | None:
         )
     return told[0].frame if len(told) == len(posed) else ""
 
-
-# A controller's or tracker's file -> the text of views.csv, frames.csv or points.csv.
 
 _READERS = PROGRAMS | {".csv": universal_robots}
 # Programs are in mm; views.csv is in the session's length_unit.
@@ -261,7 +249,7 @@ def import_file(file: Path, unit: str = "mm", frame: str | None = None, tool: st
 
 
 def _check_frames(file: Path, points: Sequence[TaughtPoint], frame: str | None, tool: str | None) -> tuple[str, ...]:
-    """Points of one frame and tool, or a refusal; a warning where poses need them and none was given."""
+    """Refuse points of several frames and tools; return a warning where poses need them and none was given."""
     taught_in = require_one_frame(file, points)
     if taught_in is None:
         return ()
@@ -275,7 +263,7 @@ def _check_frames(file: Path, points: Sequence[TaughtPoint], frame: str | None, 
 
 
 def _import_tracker(file: Path, text: str, unit: str) -> ImportedTable:
-    """frames.csv from 6D probes; points.csv from reflectors, a new view whenever a name comes again."""
+    """Return frames.csv of 6D probes, or points.csv of reflectors, a new view whenever a name comes again."""
     measured: list[TrackerPoint] = tracker_csv.read(file, text)
     if not measured:
         raise NoResultError(f"{file}: no measurements; to fix: export them again")

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.frames import Array
 
-# A pose as the numbers of each controller, the inverse of the readers below. Among numbers that mean the same pose,
-# those nearest to the ones before, so that a target that hardly moves hardly changes.
+# A pose as the numbers of each controller. Among numbers that mean the same pose those nearest to the ones before are
+# taken, so that a target that hardly moves hardly changes.
 
 # cos B below which A and C turn about the same axis, and one of them is free (rad).
 _LOCKED = 1e-6
@@ -64,17 +64,16 @@ def _zyx(R: Array, near: Array | None) -> Array:
     first = np.array([np.arctan2(R[1, 0], R[0, 0]), b, np.arctan2(R[2, 1], R[2, 2])])
     if near is None:
         return first
-    both = [first, np.array([first[0] + np.pi, np.pi - b, first[2] + np.pi])]
-    return min((_within(angles, near) for angles in both), key=lambda angles: float(np.linalg.norm(angles - near)))
-
-
-def _within(angles: Array, near: Array) -> Array:
-    """Whole turns off, as near as can be to the angles before."""
-    return np.asarray(near + (angles - near + np.pi) % (2 * np.pi) - np.pi)
+    # Both ways to write the rotation, less whole turns.
+    both = np.array([first, [first[0] + np.pi, np.pi - b, first[2] + np.pi]])
+    off = (both - near + np.pi) % (2 * np.pi) - np.pi
+    return np.asarray(near + min(off, key=lambda own: float(np.linalg.norm(own))))
 
 
 _FEWEST_JOINTS = 4
 Span = tuple[int, int]  # begin and end in a text
+# What stands between commas, without the space around it.
+CELL = re.compile(r"[^,\s](?:[^,]*[^,\s])?")
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,7 @@ def taught_point(
     joint: str,
     frame: str = "",
 ) -> TaughtPoint | None:
-    """A point with the pose from the fields named by `axes`, else the joint angles from fields joint1, joint2, …
+    """Return a point with the pose from the fields named by `axes`, else the joint angles from fields joint1, joint2, …
 
     Args:
         pose: of the numbers of these fields.
@@ -171,20 +170,20 @@ def taught_point(
 
 
 def program_text(file: Path) -> str:
-    """A program's text from which its bytes come back as they are: with its ends of lines, in whatever encoding."""
+    """Return a program's text, of which `program_bytes` makes the same bytes: ends of lines, whatever encoding."""
     return file.read_bytes().decode("utf-8", errors="surrogateescape")
 
 
 def program_bytes(text: str) -> bytes:
-    """The way back."""
+    """Return the bytes of a program's text."""
     return text.encode("utf-8", errors="surrogateescape")
 
 
 def without_comments(text: str, mark: str) -> str:
-    """Comments run from the mark to the end of the line; they are blanked, so that positions stay."""
+    """Return a text with its comments, from the mark to the end of the line, blanked: positions stay."""
     return re.sub(rf"{mark}[^\n]*", lambda match: " " * len(match[0]), text)
 
 
 def line_of(text: str, position: int) -> int:
-    """Line number, from 1, of a position in a text."""
+    """Return the line number, from 1, of a position in a text."""
     return text.count("\n", 0, position) + 1

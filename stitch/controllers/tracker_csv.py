@@ -35,7 +35,7 @@ class TrackerPoint:
 
 
 def split_header(text: str) -> tuple[list[str], str]:
-    """Names of the columns, lower case without units, and the separator."""
+    """Return names of the columns, lower case without units, and the separator."""
     first = next((line for line in text.splitlines() if line.strip()), "")
     separator = next((s for s in ";\t," if s in first), ",")
     plain = [re.sub(r"[\[(].*|[\s_°]", "", cell.strip().strip('"').lower()) for cell in first.split(separator)]
@@ -43,7 +43,7 @@ def split_header(text: str) -> tuple[list[str], str]:
 
 
 def read(file: Path, text: str) -> list[TrackerPoint]:
-    """Measurements in the order of the file.
+    """Return measurements in the order of the file.
 
     Raises:
         InputError: names the line and how to fix it.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.controllers.taught_points import TaughtPoint, line_of, rotation_vector, without_comments
+from stitch.controllers.taught_points import CELL, TaughtPoint, line_of, rotation_vector, without_comments
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.csv_files import finite_number, is_number
@@ -20,8 +20,6 @@ CONVENTION = "rotation vector rx, ry, rz in rad; m (written as mm)"
 pose = rotation_vector
 
 _LIST = r"(p?)\[([^\[\]]*)\]"
-# What stands between commas, without the space around it.
-_CELL = re.compile(r"[^,\s](?:[^,]*[^,\s])?")
 _NAMED = re.compile(rf"\b(\w+)\s*=\s*{_LIST}")
 _MOVE = re.compile(rf"\bmove[jlpc]\s*\(\s*{_LIST}")
 # Arcs, whose second pose is not read, and targets that are computed in the call.
@@ -32,7 +30,7 @@ _JOINTS = tuple([f"{kind}_q_{i}" for i in range(6)] for kind in ("actual", "targ
 
 
 def read(file: Path, text: str) -> list[TaughtPoint]:
-    """Points of a .script, or one per row of a .csv.
+    """Return the points of a .script, or one per row of a .csv.
 
     Raises:
         InputError: names the line and how to fix it.
@@ -46,7 +44,7 @@ def _read_script(file: Path, text: str) -> list[TaughtPoint]:
     found += [(m.start(), f"line{line_of(text, m.start())}", m[1], m.span(2)) for m in _MOVE.finditer(clean)]
     points: dict[str, TaughtPoint] = {}
     for position, name, kind, (begin, end) in sorted(found):
-        spans = tuple((begin + m.start(), begin + m.end()) for m in _CELL.finditer(clean[begin:end]))
+        spans = tuple((begin + m.start(), begin + m.end()) for m in CELL.finditer(clean[begin:end]))
         cells = [clean[slice(*span)] for span in spans]
         line = line_of(text, position)
         if len(cells) != 6:
@@ -67,16 +65,15 @@ def _read_script(file: Path, text: str) -> list[TaughtPoint]:
         else:
             points[base] = replace(before, joints=values, joints_at=spans)
     used = {name for m in _USED.finditer(clean) for name in re.findall(r"\w+", m[1])}
-    return [replace(p, is_target=_is_motion_target(p, used)) for p in points.values()]
-
-
-def _is_motion_target(point: TaughtPoint, used: set[str]) -> bool:
-    """Whether a motion names the point: other poses are tools and planes."""
-    return point.name.startswith("line") or not used.isdisjoint({point.name, f"{point.name}_p", f"{point.name}_q"})
+    # A pose that no motion names is a tool or a plane.
+    return [
+        replace(p, is_target=p.name.startswith("line") or not used.isdisjoint({p.name, f"{p.name}_p", f"{p.name}_q"}))
+        for p in points.values()
+    ]
 
 
 def is_recording(text: str) -> bool:
-    """True for a robot's recording: a header with a pose or joints under one of the known names."""
+    """Return whether a text is a robot's recording: a header with a pose or joints under one of the known names."""
     first = text.lstrip().splitlines()[0]
     header = [cell.strip() for cell in first.split(_separator(first))]
     return any(all(name in header for name in names) for names in (*_POSE, *_JOINTS))

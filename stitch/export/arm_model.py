@@ -1,4 +1,4 @@
-"""The arm of a run as its model has it: where the flange truly goes for commanded joint angles."""
+"""The arm of a run as its model has it: where the flange truly goes; and as DH rows or URDF for other programs."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from stitch.export.hand_eye_formats import xml_comment
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import build_capture
-from stitch.measurement.measurement import PAYLOAD, Measurement, Torques, Views, no_torques, torques_of, views_of
+from stitch.measurement.measurement import PAYLOAD, Measurement, Views, no_torques, torques_of, views_of
 from stitch.measurement.robot import Robot
 from stitch.measurement.session import Session
 from stitch.model.forward import perturbed_frames
@@ -38,13 +38,13 @@ class ArmModel:
     covariance: EffectsCovariance = field(default_factory=EffectsCovariance)  # of all parameters together
 
     def at_rest(self) -> tuple["ArmModel", tuple[str, ...]]:
-        """The arm with what joint angles alone decide, and the names of effects that hang on time, speed or heat."""
+        """Return the arm with what joint angles alone decide, and the names of effects of time, speed or heat."""
         still = _measurement(self, self.joints[:1], self.joints[:1], np.zeros_like(self.joints[:1]))
         here = tuple(term for term in self.terms if not missing_need(still, term.effect))
         return replace(self, terms=here), tuple(term.name for term in self.terms if term not in here)
 
     def true_flange(self, joints: Array, previous: Array, approach: Array) -> Array:
-        """(K, 4, 4) T_base_flange of commanded joint angles (K, n) in rad.
+        """Return (K, 4, 4) T_base_flange of commanded joint angles (K, n) in rad.
 
         Args:
             previous: (K, n) of the targets before.
@@ -55,7 +55,7 @@ class ArmModel:
 
 
 def arm_of_run(folder: Path, effects_file: Path | None = None, trust: bool = False) -> ArmModel:
-    """The arm of a run folder; of its session robot and joint angles are read, no scans.
+    """Return the arm of a run folder; of its session robot and joint angles are read, no scans.
 
     Args:
         trust: run the Python file of effects that the model names.
@@ -66,7 +66,7 @@ def arm_of_run(folder: Path, effects_file: Path | None = None, trust: bool = Fal
     file, _ = trusted_model(folder, effects_file, trust)
     path = Path(read_result(folder)["session"])
     if not path.is_dir():
-        raise InputError(f"{folder}/result.json: its session {path} has gone; put it back, or correct the path there")
+        raise InputError(f"{folder}/result.json: its session {path} has gone; to fix: put it back, or correct the path")
     return arm_from(load_session(path, scans=False), file)
 
 
@@ -78,7 +78,7 @@ def arm_from(session: Session, file: ModelFile) -> ArmModel:
     """
     views = views_of(session)
     if session.robot is None or not views.joints.shape[1]:
-        raise InputError(f"{session.path}: no joint angles or no [robot]; where the arm goes needs both")
+        raise InputError(f"{session.path}: no joint angles or no [robot]; to fix: state both, which an arm needs")
     T_base_flange = np.array([view.T_base_flange for view in session.views])
     measurement = _arm_measurement(session.name, session.robot, T_base_flange, views, session.length_unit)
     own = {name: values for name, values in file.effects.items() if find_effect(name).place in ARM_PLACES}
@@ -97,8 +97,9 @@ def arm_from(session: Session, file: ModelFile) -> ArmModel:
 
 
 def _measurement(arm: ArmModel, joints: Array, previous: Array, approach: Array) -> Measurement:
-    """Targets of a program as views: at rest, at no stated time and temperature."""
+    """Return targets of a program as views: at rest, at no stated time and temperature."""
     count = len(joints)
+    payload = None if arm.payload is None else np.full(count, arm.payload)
     views = Views(
         count=count,
         time=np.zeros(count),
@@ -106,7 +107,8 @@ def _measurement(arm: ArmModel, joints: Array, previous: Array, approach: Array)
         previous=previous,
         approach=approach,
         velocity=None,
-        torques=_gravity_torques(arm, joints),
+        # A model that follows what drives report has none here: a program does not hold that.
+        torques=no_torques(count) if arm.torques_measured else torques_of(arm.robot, joints, payload),
         covariates={},
         standoff=1.0,
         first={},
@@ -116,24 +118,14 @@ def _measurement(arm: ArmModel, joints: Array, previous: Array, approach: Array)
     return _arm_measurement(arm.session, arm.robot, kinematics.forward(arm.robot, joints), views, arm.length_unit)
 
 
-def _gravity_torques(arm: ArmModel, joints: Array) -> Torques:
-    """Of gravity; none where the model follows what drives report: a program does not have that."""
-    if arm.torques_measured:
-        return no_torques(len(joints))
-    return torques_of(arm.robot, joints, None if arm.payload is None else np.full(len(joints), arm.payload))
-
-
 def _arm_measurement(name: str, robot: Robot, T_base_flange: Array, views: Views, length_unit: str) -> Measurement:
-    """A measurement of the arm alone; what carries the scanner does not matter."""
+    """Return a measurement of the arm alone; what carries the scanner does not matter."""
     capture = build_capture(name, (), T_base_flange, "eye_in_hand")
     return Measurement(capture, T_base_flange, False, robot, views, (), length_unit)
 
 
-# The calibrated arm as DH rows and as URDF, with the effects that such tables can hold.
-
-
 def arm_dh(arm: ArmModel) -> str:
-    """The [robot] table of session.toml: DH rows in the session's length_unit and degrees.
+    """Return the [robot] table of session.toml: DH rows in the session's length_unit and degrees.
 
     Raises:
         InputError: an arm that came as URDF has no DH rows.
@@ -141,26 +133,22 @@ def arm_dh(arm: ArmModel) -> str:
     found = calibrated_robot(arm.robot, arm.terms)
     table = robot_toml(found.robot, ["The [robot] table of session.toml", *_comment_lines(found)])
     if table is None:
-        raise InputError(f"the arm of session {arm.session} is stated as URDF and has no DH rows; use --to arm-urdf")
+        raise InputError(f"the arm of session {arm.session} is stated as URDF, without DH rows; to fix: --to arm-urdf")
     return table
 
 
 def arm_urdf(arm: ArmModel) -> str:
-    """URDF in m and rad: base_link, link_1 … link_n, flange."""
+    """Return URDF in m and rad: base_link, link_1 … link_n, flange."""
     found = calibrated_robot(arm.robot, arm.terms)
     declaration, chain = to_urdf(found.robot).split("\n", 1)
     return f"{declaration}\n{xml_comment([f'The arm of session {arm.session}', *_comment_lines(found)])}{chain}\n"
 
 
 def _comment_lines(calibrated: CalibratedRobot) -> list[str]:
-    """What is in it, what is not, and which command fits a table that stands alone."""
+    """Return what is in it, what is not, and which command fits a table that stands alone."""
     told = ["with the joint offsets and link errors that the model of the run has.", beyond_sentence(calibrated)]
-    if not calibrated.beyond:
-        return told
-    return [
-        *told,
-        "Without it this may leave more than the nominal arm; stitch calibrate robot fits a table for itself.",
-    ]
+    alone = "Without it this may leave more than the nominal arm; stitch calibrate robot fits a table for itself."
+    return [*told, alone] if calibrated.beyond else told
 
 
 ARM_FORMATS = {"arm-dh": arm_dh, "arm-urdf": arm_urdf}

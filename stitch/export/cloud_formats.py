@@ -44,7 +44,7 @@ class ColouredCloud:
 
 
 def coloured_cloud(folder: Path) -> ColouredCloud:
-    """The cloud of a run folder.
+    """Return the cloud of a run folder.
 
     Raises:
         InputError: no run, or one without a stitched cloud, as labelled points alone give it.
@@ -56,10 +56,10 @@ def coloured_cloud(folder: Path) -> ColouredCloud:
     try:
         fused = fused_cloud(file)
     except (LookupError, TypeError, ValueError, OSError, PlyParseError) as error:
-        raise InputError(f"{file}: damaged ({shortened(str(error))}); run `stitch run` again") from None
+        raise InputError(f"{file}: damaged ({shortened(str(error))}); to fix: run `stitch run` again") from None
     if not len(fused.points):
         raise InputError(
-            f"{file}: holds no points, the session shows labelled points alone; there is no cloud to export"
+            f"{file}: holds no points, since the session has labelled points alone; to fix: name a run with clouds"
         )
     mesh = folder / "mesh.ply"
     return coloured(fused, unit, mesh if mesh.is_file() else None)
@@ -73,7 +73,7 @@ def coloured(fused: FusedCloud, length_unit: str, mesh: Path | None = None) -> C
 
 
 def residual_colours(residual: Array, span: float) -> Colours:
-    """(N, 3) from dark blue at zero over green to yellow at `span` (viridis); grey where only one view has seen."""
+    """Return (N, 3) from dark blue at zero over green to yellow at `span` (viridis); grey where one view alone saw."""
     from matplotlib import colormaps
 
     share = np.clip(np.nan_to_num(residual) / max(span, 1e-300), 0, 1)
@@ -83,7 +83,7 @@ def residual_colours(residual: Array, span: float) -> Colours:
 
 
 def write_ply(cloud: ColouredCloud, path: Path) -> None:
-    """Everything that stitched.ply has, and red, green, blue."""
+    """Write everything that stitched.ply has, and red, green, blue."""
     fused = cloud.fused
     numbers = ("x", "y", "z", "nx", "ny", "nz", "residual")
     layout = [(name, "<f4") for name in numbers] + [(name, "u1") for name in ("red", "green", "blue")]
@@ -98,7 +98,7 @@ def write_ply(cloud: ColouredCloud, path: Path) -> None:
 
 
 def write_pcd(cloud: ColouredCloud, path: Path) -> None:
-    """Binary PCD 0.7: x, y, z, normals, rgb packed as PCL does, residual."""
+    """Write binary PCD 0.7: x, y, z, normals, rgb packed as PCL does, residual."""
     fused, fields = cloud.fused, "x y z normal_x normal_y normal_z rgb residual"
     red, green, blue = cloud.colours.astype(np.uint32).T
     packed = ((red << 16) | (green << 8) | blue).astype("<u4").view("<f4")
@@ -114,7 +114,7 @@ def write_pcd(cloud: ColouredCloud, path: Path) -> None:
 
 
 def write_las(cloud: ColouredCloud, path: Path, packed: bool = False) -> None:
-    """LAS 1.4, or LAZ, by laspy: colours, and residual and normals as extra dimensions; the session's unit."""
+    """Write LAS 1.4, or LAZ, by laspy: colours, and residual and normals as extra dimensions; the session's unit."""
     laspy = _package("laspy", path)
     las = laspy.create(point_format=7, file_version="1.4")
     middle = np.floor((cloud.fused.points.min(axis=0) + cloud.fused.points.max(axis=0)) / 2)
@@ -133,7 +133,7 @@ def write_las(cloud: ColouredCloud, path: Path, packed: bool = False) -> None:
 
 
 def write_e57(cloud: ColouredCloud, path: Path) -> None:
-    """E57 by pye57, in metres as its standard (ASTM E2807) has it: points and colours."""
+    """Write E57 by pye57, in metres as its standard (ASTM E2807) has it: points and colours."""
     points = cloud.fused.points * METRES[cloud.length_unit]
     columns = {f"cartesian{axis}": column.copy() for axis, column in zip("XYZ", points.T, strict=True)}
     names = ("colorRed", "colorGreen", "colorBlue")
@@ -143,7 +143,7 @@ def write_e57(cloud: ColouredCloud, path: Path) -> None:
 
 
 def write_glb(cloud: ColouredCloud, path: Path) -> None:
-    """Binary glTF 2.0 by trimesh, in metres: the mesh of the run, or its points."""
+    """Write binary glTF 2.0 by trimesh, in metres: the mesh of the run, or its points."""
     import trimesh
 
     metres = METRES[cloud.length_unit]

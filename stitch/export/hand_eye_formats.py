@@ -1,5 +1,6 @@
 """A hand-eye as the text of each format, with what it means and its U (k = 2) in comments."""
 
+import json
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -19,31 +20,6 @@ from stitch.model.model_toml import ModelFile, read_model
 from stitch.stored.stored_run import read_diagnosis, read_result
 from stitch.units import METRES, length_text
 from stitch.writing.urdf_file import roll_pitch_yaw
-
-# Numbers and comments as other programs read them.
-
-
-def digits(x: float) -> str:
-    """Shortest decimals that read back as the same float64, without an exponent that some readers do not take."""
-    return np.format_float_positional(x + 0.0, trim="0")
-
-
-def row(numbers: Iterable[float], separator: str = " ") -> str:
-    """Several of them."""
-    return separator.join(digits(x) for x in numbers)
-
-
-def commented(mark: str, lines: Sequence[str], end: str = "") -> str:
-    """Lines of comment between a mark and an end."""
-    return "".join(f"{mark}{' '.join(line.split())}{end}\n" for line in lines)
-
-
-def xml_comment(lines: Sequence[str]) -> str:
-    """The same in XML, where two hyphens would end a comment."""
-    return commented("<!-- ", [line.replace("--", "–") for line in lines], " -->")
-
-
-# The hand-eye of a run folder for other programs: frames by name, numbers with U, what no format can hold.
 
 _PARENTS = {"eye_to_hand": "base_link", "eye_in_hand": "flange"}
 _PARENT_WORDS = {"eye_to_hand": "base", "eye_in_hand": "flange"}
@@ -70,7 +46,7 @@ class ExportedHandEye:
         return f"T_{_PARENT_WORDS[self.mount]}_scanner"
 
     def head(self, numbers: Callable[[Array], Array], labels: Sequence[str], units: Sequence[str]) -> list[str]:
-        """Lines for comments: what it is, U (k = 2) of each number that the format states, and the notes.
+        """Return lines for comments: what it is, U (k = 2) of each number that the format states, and the notes.
 
         Args:
             numbers: what the format writes of T_parent_child in m, (n,).
@@ -88,14 +64,14 @@ class ExportedHandEye:
         ]
 
     def lengths(self, unit: str) -> Array:
-        """(4, 4) T_parent_child with lengths in "mm" or "m"."""
+        """Return (4, 4) T_parent_child with lengths in "mm" or "m"."""
         T = self.T_mount.copy()
         T[:3, 3] /= METRES[unit]
         return T
 
 
 def hand_eye_of_run(folder: Path, parent: str | None = None, child: str = "scanner") -> ExportedHandEye:
-    """The corrected hand-eye of a run folder.
+    """Return the corrected hand-eye of a run folder.
 
     Args:
         parent: name of the frame that carries the scanner; default base_link (eye_to_hand) or flange (eye_in_hand).
@@ -125,6 +101,10 @@ def hand_eye_from(
     metres = METRES[model.length_unit]
     T, scale = model.T_mount.copy(), np.repeat([1.0, metres], 3)
     T[:3, 3] *= metres
+    notes = [uncertainty_scope(told.get("verdict")).rstrip("."), *_undetectable_notes(told, model.length_unit)]
+    notes += [f"Not observable from these motions, left at the coarse value: {axis}" for axis in result["unobservable"]]
+    if model.effects:
+        notes.append(f"Not in these numbers, as they are one rigid motion: {', '.join(model.effects)}")
     return ExportedHandEye(
         session=str(result.get("name") or Path(result["session"]).name),
         T_mount=T,
@@ -133,12 +113,7 @@ def hand_eye_from(
         mount=model.mount,
         parent=_require_plain_name("--parent", parent or _PARENTS[model.mount]),
         child=_require_plain_name("--child", child),
-        notes=(
-            uncertainty_scope(told.get("verdict")).rstrip("."),
-            *_undetectable_notes(told.get("candidates", []), model.length_unit),
-            *_unobservable_notes(result["unobservable"]),
-            *_omitted_effect_notes(model),
-        ),
+        notes=tuple(notes),
     )
 
 
@@ -148,26 +123,15 @@ def _require_plain_name(flag: str, name: str) -> str:
     return name
 
 
-def _unobservable_notes(directions: Sequence[str]) -> list[str]:
-    return [f"Not observable from these motions, left at the coarse value: {direction}" for direction in directions]
-
-
-def _undetectable_notes(candidates: Sequence[dict[str, Any]], length_unit: str) -> list[str]:
-    """How far an effect that the views do not show could push the hand-eye: U is that of the model."""
+def _undetectable_notes(diagnosis: dict[str, Any], length_unit: str) -> list[str]:
+    """Return how far an effect that the views do not show could push the hand-eye: U is that of the model."""
+    candidates = diagnosis.get("candidates", [])
     known = [(c["hand_eye_if_missed"], c["effect"]) for c in candidates if c.get("hand_eye_if_missed") is not None]
     if not known:
         return []
     size, name = max(known)
     pushed = length_text(size, length_unit, 2)
     return [f"Not in U: an effect too small to be seen could displace it, at the part, by as much as {pushed} ({name})"]
-
-
-def _omitted_effect_notes(model: ModelFile) -> list[str]:
-    """Effects of the model that one rigid hand-eye does not hold."""
-    return [f"Not in these numbers, as they are one rigid motion: {', '.join(model.effects)}"] if model.effects else []
-
-
-# A hand-eye as a frame of a controller: KUKA, FANUC, ABB, UR, in the numbers that its screens show.
 
 
 @dataclass(frozen=True)
@@ -215,7 +179,7 @@ _CONTROLLERS = {
 
 
 def controller_frame(eye: ExportedHandEye, controller: str) -> str:
-    """The frame as a controller writes it, by "kuka", "fanuc", "abb" or "ur"."""
+    """Return the frame as a controller writes it, by "kuka", "fanuc", "abb" or "ur"."""
     form, near = _CONTROLLERS[controller], _frame_numbers(eye.T_mount, controller)
     head = eye.head(lambda T: _frame_numbers(T, controller, near), form.labels, form.units)
     lines = [*head, f"Entered as {form.place[eye.mount]}, in the controller's own base and flange"]
@@ -234,7 +198,7 @@ _QUATERNION = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def ros_yaml(eye: ExportedHandEye) -> str:
-    """A launch file of ROS 2 in YAML that publishes the transform: what MoveIt's own calibration saves."""
+    """Return a launch file of ROS 2 in YAML that publishes the transform: what MoveIt's own calibration saves."""
     numbers = zip(_QUATERNION, _pose_quaternion(eye.T_mount).tolist(), strict=True)
     flags = " ".join(f"--{key} {row([x])}" for key, x in numbers)
     return (
@@ -245,7 +209,7 @@ def ros_yaml(eye: ExportedHandEye) -> str:
 
 
 def ros_launch(eye: ExportedHandEye) -> str:
-    """The same as a launch file of ROS 1."""
+    """Return the same as a launch file of ROS 1."""
     args = f"{row(_pose_quaternion(eye.T_mount))} {eye.parent} {eye.child}"
     return (
         f"{xml_comment(_quaternion_head(eye))}<launch>\n"
@@ -255,7 +219,7 @@ def ros_launch(eye: ExportedHandEye) -> str:
 
 
 def urdf(eye: ExportedHandEye) -> str:
-    """A link and a fixed joint, to be included in the robot's URDF; m and rad."""
+    """Return a link and a fixed joint, to be included in the robot's URDF; m and rad."""
     near = _roll_pitch_yaw(eye.T_mount)
     labels, units = ("x", "y", "z", "roll", "pitch", "yaw"), ("m",) * 3 + ("rad",) * 3
     head = xml_comment(eye.head(lambda T: _roll_pitch_yaw(T, near), labels, units))
@@ -271,13 +235,13 @@ def urdf(eye: ExportedHandEye) -> str:
 
 
 def opencv(eye: ExportedHandEye) -> str:
-    """YAML of cv::FileStorage: the matrix and its covariance in the session's length_unit."""
+    """Return YAML of cv::FileStorage: the matrix and its covariance in the session's length_unit."""
     unit = eye.length_unit
     scale = np.repeat([1.0, 1 / METRES[unit]], 3)
     facts = {"session": eye.session, "parent": eye.parent, "child": eye.child, "length_unit": unit}
     return (
         f"%YAML:1.0\n---\n{commented('# ', _matrix_head(eye, unit))}"
-        + "".join(f"{key}: {_quoted(value)}\n" for key, value in facts.items())
+        + "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in facts.items())
         + _cv_matrix(eye.name, eye.lengths(unit))
         + "# Of a right perturbation T·exp(ξ) in the scanner's frame: rotation in rad, then translation\n"
         + _cv_matrix("covariance", eye.covariance * np.outer(scale, scale))
@@ -285,7 +249,7 @@ def opencv(eye: ExportedHandEye) -> str:
 
 
 def zivid(eye: ExportedHandEye) -> str:
-    """YAML as Zivid's SDK saves a Matrix4x4; mm."""
+    """Return YAML as Zivid's SDK saves a Matrix4x4; mm."""
     rows = ",\n".join(f"      [{row(line, ', ')}]" for line in eye.lengths("mm"))
     head = commented("# ", _matrix_head(eye, "mm"))
     return f"{head}__version__:\n  serializer: 1\n  data: 1\nFloatMatrix:\n  Data:\n    [\n{rows}\n    ]\n"
@@ -336,5 +300,21 @@ def _cv_matrix(name: str, matrix: Array) -> str:
     return f"{name}: !!opencv-matrix\n   rows: {len(matrix)}\n   cols: {len(matrix.T)}\n   dt: d\n   data: [ {rows} ]\n"
 
 
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+def digits(x: float) -> str:
+    """Return the shortest decimals that read back as the same float64, without an exponent: some readers take none."""
+    return np.format_float_positional(x + 0.0, trim="0")
+
+
+def row(numbers: Iterable[float], separator: str = " ") -> str:
+    """Return several of them."""
+    return separator.join(digits(x) for x in numbers)
+
+
+def commented(mark: str, lines: Sequence[str], end: str = "") -> str:
+    """Return lines of comment between a mark and an end."""
+    return "".join(f"{mark}{' '.join(line.split())}{end}\n" for line in lines)
+
+
+def xml_comment(lines: Sequence[str]) -> str:
+    """Return the same in XML, where two hyphens would end a comment."""
+    return commented("<!-- ", [line.replace("--", "–") for line in lines], " -->")

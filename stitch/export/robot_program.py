@@ -18,8 +18,6 @@ from stitch.measurement import robot as kinematics
 from stitch.measurement.robot import Robot
 from stitch.model.model import COVERAGE_FACTOR, Term, values_of, with_parameter_values
 
-# Joint angles for a pose of the nominal arm, found from joint angles nearby; any chain of revolute joints.
-
 # A radian weighs as much as this length, m: about the reach of an arm, so that both parts of a twist count alike.
 LEVER = 1.0
 _NEWTON_STEPS = 100
@@ -29,7 +27,7 @@ _CLOSE = 1e-11
 
 
 def joint_solutions(robot: Robot, T_base_flange: Array, near: Array) -> Array:
-    """(m, n) solutions in rad, each once, that damped Newton steps find from joint angles near (s, n); m may be 0.
+    """Return (m, n) solutions in rad, each once, found by damped Newton steps from joint angles (s, n); m may be 0.
 
     Levenberg-Marquardt on the pose error (Sugihara 2011, IEEE Trans. Robotics 27:984): the damping follows the error.
     """
@@ -49,17 +47,11 @@ def joint_solutions(robot: Robot, T_base_flange: Array, near: Array) -> Array:
     found: list[Array] = []
     # A singular pose is closed in slowly; a nanometre and a nanoradian are far below any arm.
     for solution in q[np.linalg.norm(off, axis=1) < 1e-9]:
-        if all(np.abs(_principal_angles(solution - other)).max() > 1e-4 for other in found):
+        # Whole turns apart they are the same.
+        if all(np.abs(np.angle(np.exp(1j * (solution - other)))).max() > 1e-4 for other in found):
             found.append(solution)
     return np.array(found).reshape(-1, robot.n_joints)
 
-
-def _principal_angles(angle: Array) -> Array:
-    """Less whole turns."""
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
-
-
-# Commanded joint angles with which the true arm goes where a program meant it to go.
 
 _COMPENSATION_STEPS = 30
 _STEP_TOLERANCE = 1e-13
@@ -89,7 +81,9 @@ def compensate_targets(arm: ArmModel, joints: Array, T_flange_tool: Array) -> Pr
         T_flange_tool: (4, 4) of the place that matters, length_unit.
     """
     meant = kinematics.forward(arm.robot, joints)
-    approach = _approach_directions(joints)
+    # How the joints come from the targets before: 0 where nobody knows or nothing moves.
+    turn = joints - _previous_joints(joints)
+    approach = np.where(np.abs(turn) > 1e-9, np.sign(turn), 0.0)
     weight = np.repeat([1.0, arm.robot.metres_per_unit / LEVER], 3)
     q = joints.copy()
 
@@ -111,18 +105,12 @@ def compensate_targets(arm: ArmModel, joints: Array, T_flange_tool: Array) -> Pr
 
 
 def _previous_joints(q: Array) -> Array:
-    """(K, n) of the targets before; its own for the first."""
+    """Return (K, n) of the targets before; its own for the first."""
     return np.vstack([q[:1], q[:-1]])
 
 
-def _approach_directions(q: Array) -> Array:
-    """(K, n) how the joints come from the targets before: 0 where nobody knows or nothing moves."""
-    move = q - _previous_joints(q)
-    return np.where(np.abs(move) > 1e-9, np.sign(move), 0.0)
-
-
 def _uncertainty(arm: ArmModel, q: Array, approach: Array, T_flange_tool: Array) -> Array:
-    """(K,) 2·√tr(J·Σ·Jᵀ), Σ of all fitted parameters together: errors of one make up for errors of another."""
+    """Return (K,) 2·√tr(J·Σ·Jᵀ), Σ of all fitted parameters together: errors of one make up for errors of another."""
 
     def place(terms: tuple[Term, ...]) -> Array:
         return np.asarray(
@@ -137,8 +125,6 @@ def _uncertainty(arm: ArmModel, q: Array, approach: Array, T_flange_tool: Array)
     )
     return np.asarray(COVERAGE_FACTOR * np.sqrt(np.einsum("pki,pki->k", moved, moved)))
 
-
-# The targets of a program as joint angles of the session's arm.
 
 # From the target before, an arm goes on in the same configuration while no joint turns by more than this (rad).
 _SAME = np.radians(90.0)
@@ -158,7 +144,11 @@ class ProgramTargets:
 
 
 def couple_j2_j3(joints: Array, sign: float = 1.0) -> Array:
-    """FANUC's J3 counts from the horizontal: the third joint of DH rows is J2 + J3 (sign −1 for the way back)."""
+    """Return joint angles of DH rows: FANUC's J3 counts from the horizontal, theirs is J2 + J3.
+
+    Args:
+        sign: −1 for the way back.
+    """
     out = np.array(joints, float)
     out[..., 2] += sign * out[..., 1]
     return out
@@ -167,7 +157,7 @@ def couple_j2_j3(joints: Array, sign: float = 1.0) -> Array:
 def program_targets(
     program: Program, arm: ArmModel, near: Array | None = None, j2_in_j3: bool = False
 ) -> ProgramTargets:
-    """Joint angles that the nominal arm takes at each target.
+    """Return joint angles that the nominal arm takes at each target.
 
     Those of a pose are found from the target before, the first from `near` or from the poses of the run: that arm
     configuration is taken which needs the least turn.
@@ -185,7 +175,6 @@ def program_targets(
     found: list[Array] = []
     for point in program.points:
         if point.T_frame_tool is None:
-            assert point.joints is not None
             found.append(_taught_joints(program, arm, point, j2_in_j3))
             continue
         T = T_base_frame @ _scaled_pose(point.T_frame_tool, unit) @ frames.inverse(T_flange_tool)
@@ -218,7 +207,7 @@ def _taught_joints(program: Program, arm: ArmModel, point: TaughtPoint, j2_in_j3
 def _nearest_solution(
     program: Program, arm: ArmModel, point: TaughtPoint, T: Array, before: Array | None, starts: Array
 ) -> Array:
-    """The solution nearest to the target before, or to the poses of the run."""
+    """Return the solution nearest to the target before, or to the poses of the run."""
     if before is not None:
         onward = joint_solutions(arm.robot, T, before[None])
         if len(onward) and np.abs(onward[0] - before).max() < _SAME:
@@ -243,8 +232,6 @@ def _require_agreement(program: Program, arm: ArmModel, point: TaughtPoint, T_jo
         )
 
 
-# A program's text with moved targets: their numbers change, every other byte stays.
-
 # Decimals of positions, of rotations and of joint angles: what each controller stores, so that a moved target is not
 # rounded away where its number was written short. FANUC listings have three, whatever they show.
 _DECIMALS = {"kuka": (4, 5, 5), "fanuc": (3, 3, 3), "abb": (4, 9, 5), "ur": (7, 7, 7)}
@@ -253,7 +240,7 @@ _NEGLIGIBLE_CHANGE = 1e-9
 
 
 def compensated_texts(program: Program, moves: Array, turns: Array, j2_in_j3: bool = False) -> dict[Path, str]:
-    """The program's texts with its targets moved.
+    """Return the program's texts with its targets moved: their numbers change, every other byte stays.
 
     Args:
         moves: (K, 4, 4) of each target's tool in mm: T_meant_commanded.
@@ -268,18 +255,25 @@ def compensated_texts(program: Program, moves: Array, turns: Array, j2_in_j3: bo
         if point.T_frame_tool is not None and np.abs(frames.log(move)).max() > _NEGLIGIBLE_CHANGE:
             old = _span_values(text, point.pose_at)
             new = NUMBERS[program.controller](point.T_frame_tool @ move, old)
-            new = _in_half_turns(new, old) if program.controller in ("kuka", "fanuc") else new
+            if program.controller in ("kuka", "fanuc"):
+                # Controllers take angles within ±180°; what was beyond already stays beyond.
+                new[3:] = np.where(np.abs(old[3:]) <= 180, (new[3:] + 180) % 360 - 180, new[3:])
             edits[file] += _edits(text, point.pose_at, new, [place] * 3 + [turn] * (len(new) - 3))
         if point.joints is not None and np.abs(step).max() > _NEGLIGIBLE_CHANGE:
             own = couple_j2_j3(step, -1.0) if j2_in_j3 else step
             angles = own if program.controller == "ur" else np.degrees(own)
             new = _span_values(text, point.joints_at) + angles
             edits[file] += _edits(text, point.joints_at, new, [joint] * len(new))
-    return {file: _apply_edits(text, edits[file]) for file, text in program.texts.items()}
+    out = dict(program.texts)
+    for file, changes in edits.items():
+        # From behind, so that places before a change stay.
+        for (begin, end), new_text in sorted(changes, reverse=True):
+            out[file] = out[file][:begin] + new_text + out[file][end:]
+    return out
 
 
 def number_text(old: str, value: float, decimals: int) -> str:
-    """A number in the manner of the one that it replaces; the same text where it says the same."""
+    """Return a number in the manner of the one that it replaces; the same text where it says the same."""
     own = len(old.lower().split("e")[0].partition(".")[2])
     text = f"{value:.{max(own, decimals)}f}"
     if float(text) == float(old):
@@ -293,24 +287,11 @@ def _span_values(text: str, spans: Sequence[Span]) -> Array:
     return np.array([float(text[begin:end]) for begin, end in spans])
 
 
-def _in_half_turns(new: Array, old: Array) -> Array:
-    """Angles in degrees within ±180, as controllers take them, unless they were beyond already."""
-    wrapped = (new[3:] + 180) % 360 - 180
-    return np.append(new[:3], np.where(np.abs(old[3:]) <= 180, wrapped, new[3:]))
-
-
 def _edits(text: str, spans: Sequence[Span], new: Array, decimals: Sequence[int]) -> list[tuple[Span, str]]:
     return [
         (span, number_text(text[slice(*span)], float(value), places))
         for span, value, places in zip(spans, new, decimals, strict=True)
     ]
-
-
-def _apply_edits(text: str, edits: Sequence[tuple[Span, str]]) -> str:
-    """From behind, so that places before an edit stay."""
-    for (begin, end), new in sorted(edits, reverse=True):
-        text = text[:begin] + new + text[end:]
-    return text
 
 
 # The rotation that goes with that, mrad for each mm: what moves a hand of half a metre by so much.
@@ -337,11 +318,11 @@ class CompensatedProgram:
 
     @property
     def mm(self) -> float:
-        """In one length_unit."""
+        """Return millimetres in one length_unit."""
         return self.arm.robot.metres_per_unit * 1e3
 
     def rows(self) -> list[dict[str, Any]]:
-        """One per target: moved, left under the model, U (k = 2)."""
+        """Return a row a target: moved, left under the model, U (k = 2)."""
         sizes = _move_sizes(frames.log(self.compensation.move), self.mm)
         left = _move_sizes(self.compensation.residual, self.mm)
         turned = np.degrees(self.compensation.joints - self.targets.joints)
@@ -367,14 +348,14 @@ def compensated_program(
     near: Array | None = None,
     j2_in_j3: bool = False,
 ) -> CompensatedProgram:
-    """Targets moved so that the true arm goes where the program meant.
+    """Return a program's copy with targets moved so that the true arm goes where the program meant.
 
     Args:
         limit_mm: a target that would move farther is not believed.
-        near, j2_in_j3: see `targets_of`.
+        near, j2_in_j3: see `program_targets`.
 
     Raises:
-        InputError: a target that would move too far, or see `targets_of`.
+        InputError: a target that would move too far, or see `program_targets`.
         NoResultError: the model has no effect of the arm that a program's targets decide.
     """
     still, beyond = arm.at_rest()
@@ -382,7 +363,7 @@ def compensated_program(
         raise NoResultError(
             f"the model of session {arm.session} has no effect of the arm"
             + (f" but {', '.join(beyond)}, which hangs on more than the targets" if beyond else "")
-            + ": a copy would be the same; diagnose, and add what is missing"
+            + ", so that a copy would be the same; to fix: diagnose, and add what is missing"
         )
     targets = program_targets(program, arm, near, j2_in_j3)
     found = compensate_targets(still, targets.joints, targets.T_flange_tool)
@@ -396,7 +377,7 @@ def compensated_program(
 
 
 def _move_sizes(twists: Array, mm: float) -> Array:
-    """(K, 2) mm and mrad of twists (K, 6)."""
+    """Return (K, 2) mm and mrad of twists (K, 6)."""
     return np.column_stack([np.linalg.norm(twists[:, 3:], axis=1) * mm, np.linalg.norm(twists[:, :3], axis=1) * 1e3])
 
 
@@ -445,14 +426,9 @@ def _program_notes(
             "beyond the joint angles on which the model was fitted, by more than "
             f"{np.degrees(_MAX_JOINT_EXCESS):.0f}°: {told}"
         )
-    crossing = _configuration_note(program, targets, compensation)
-    if crossing:
+    # Configurations count quadrants, signs and half turns.
+    before, after = (np.floor(q / (np.pi / 2)) for q in (targets.joints, compensation.joints))
+    crosses = (before != after).any(axis=1) & np.array(targets.cartesian)
+    if crossing := ", ".join(point.name for point, own in zip(program.points, crosses, strict=True) if own):
         notes.append(f"a joint passes a multiple of 90°, so that its configuration may have to be set anew: {crossing}")
     return tuple(notes)
-
-
-def _configuration_note(program: Program, targets: ProgramTargets, compensation: ProgramCompensation) -> str:
-    """Cartesian targets whose joints pass what configurations count: quadrants, signs, half turns."""
-    quadrants = [np.floor(q / (np.pi / 2)) for q in (targets.joints, compensation.joints)]
-    moved = (quadrants[0] != quadrants[1]).any(axis=1) & np.array(targets.cartesian)
-    return ", ".join(point.name for point, has in zip(program.points, moved, strict=True) if has)
