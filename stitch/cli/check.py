@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -55,7 +54,7 @@ def _check_readable(sessions: list[Path], as_json: bool) -> None:
             say(f"{fact['session']}: readable", bold=True)
             show_block(_summary_rows(fact))
     for line in errors:
-        print(f"stitch: {line}", file=sys.stderr)
+        say(f"stitch: {line}")
     if errors:
         raise typer.Exit(2)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +11,7 @@ import typer
 
 from stitch.cli.options import Json, require_new
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, results_stream
+from stitch.cli.terminal import emit, results_stream, say
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def detect(
         with whole_file(output) as scratch:
             write_table(scratch, columns)
     for note in notes:
-        print(f"{note}.", file=sys.stderr)
+        say(f"{note}.")
     if as_json:
         emit(json.dumps(_document(session, views, found, notes), indent=1))
     elif output is None:
@@ -78,9 +78,9 @@ def detect(
     showing = sum(bool(s.targets) for s in found)
     count = len(views_of_targets(found))
     where = output or "standard output"
-    print(f"{where}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views", file=sys.stderr)
+    say(f"{where}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views")
     if output == session / "points.csv":
-        print(f"Next: stitch run {session}", file=sys.stderr)
+        say(f"Next: stitch run {shlex.quote(str(session))}")
 
 
 def parse_target_options(board: list[str] | None, ball: list[str] | None) -> TargetSearch:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -106,7 +105,7 @@ def _export_text(text: str, to: str, output: Path | None) -> None:
         return
     with whole_file(output) as file:
         file.write_text(text, encoding="utf-8")
-    print(f"{to} to {output}", file=sys.stderr)
+    say(f"{to} to {output}")
 
 
 def _export_cloud(run: Path, to: str, output: Path | None) -> None:
@@ -123,7 +122,7 @@ def _export_cloud(run: Path, to: str, output: Path | None) -> None:
     span = cloud.span * MICROMETRES[cloud.length_unit]
     told = [f"{output}: coloured by residual, from dark at 0 to yellow at {span:.3g} µm; grey: one view alone"]
     told += [f"{to} does not hold {lost}"] if lost else []
-    print("; ".join(told), file=sys.stderr)
+    say("; ".join(told))
 
 
 def _export_program(

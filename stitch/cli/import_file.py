@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from stitch.cli.options import require_new, split_names
-from stitch.cli.terminal import results_stream
+from stitch.cli.terminal import results_stream, say
 
 _File = Annotated[
     Path,
@@ -76,6 +75,6 @@ def import_command(
         with whole_file(output) as scratch:
             scratch.write_text(imported.text, encoding="utf-8")
     for warning in imported.warnings:
-        print(f"stitch: {file}: {warning}", file=sys.stderr)
+        say(f"stitch: {file}: {warning}")
     where = output or "standard output"
-    print(f"{imported.rows} rows of {imported.table} to {where}; orientations: {imported.convention}", file=sys.stderr)
+    say(f"{imported.rows} rows of {imported.table} to {where}; orientations: {imported.convention}")

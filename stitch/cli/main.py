@@ -13,7 +13,7 @@ import typer
 
 from stitch.cli.commands import CommandGroup
 from stitch.cli.progress import TimeLeft, live_line
-from stitch.cli.terminal import speak_any_terminal
+from stitch.cli.terminal import say, speak_any_terminal
 from stitch.errors import StitchError
 from stitch.reading.text_files import shortened
 from stitch.system import process
@@ -90,7 +90,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _exit_with_message(message: str, code: int) -> None:
     """Print one line on standard error and end the process."""
     line = "".join(c if c.isprintable() else " " for c in " ".join(message.split()))
-    print(f"stitch: {line if len(line) <= _LONGEST else line[:_LONGEST] + ' …'}", file=sys.stderr, flush=True)
+    line = f"stitch: {line if len(line) <= _LONGEST else line[:_LONGEST] + ' …'}"
+    if sys.stderr.isatty():
+        say(line)
+    else:
+        print(line, file=sys.stderr, flush=True)
     if process.running_over():
         # The thread of an effect that never ends would be waited for.
         os._exit(code)

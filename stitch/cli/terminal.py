@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import codecs
 import os
-import re
 import sys
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
@@ -12,12 +11,6 @@ from contextlib import contextmanager, redirect_stdout, suppress
 from functools import wraps
 from pathlib import Path
 from typing import IO, Any, TextIO, TypeVar
-
-# Where no line is broken: between a number and its unit, and beside a sign ("± 0.02 mm", "p = 1e-46").
-_UNIT = r"(?<=\d) (?=(?:[µmk]?m|m?rad|µ?rad|kg|ms|s|h|min|%|°|°C|ppm|points?|views?|σ|sigmas)(?!\w))"
-_SIGN = r"(?<=[±=<>≤≥×]) | (?=[±=<>≤≥×])"
-_GLUE = re.compile(rf"{_UNIT}|{_SIGN}")
-_GLUED = "\0"
 
 
 def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = None) -> None:
@@ -27,26 +20,12 @@ def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = N
         hang: columns by which all lines but the first are indented.
         stream: where it goes; None is standard error.
     """
+    from stitch.system.lines import broken_lines, printable
     from stitch.system.process import console
 
-    terminal = console(stream)
-    text = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+    terminal, text = console(stream), printable(text)
     lines = broken_lines(text, terminal.width, hang) if terminal.is_terminal else [text]
     terminal.print("\n".join(lines), soft_wrap=True, style="bold" if bold else None)
-
-
-def broken_lines(text: str, width: int, hang: int = 0) -> list[str]:
-    """Return a text as lines of at most so many columns, but for words that are longer."""
-    from rich.cells import cell_len
-
-    margin = " " * (len(text) - len(text.lstrip(" ")))
-    lines, line = [], margin
-    for word in _GLUE.sub(_GLUED, text.strip(" ")).split(" "):
-        if line.strip() and cell_len(line) + 1 + cell_len(word) > width:
-            lines.append(line)
-            line = margin + " " * hang
-        line += word if not line.strip() else f" {word}"
-    return [own.replace(_GLUED, " ") for own in (*lines, line)]
 
 
 def show_block(rows: Sequence[tuple[str, str]]) -> None:

@@ -63,9 +63,9 @@ def _notify_watchers(label: str, done: int, total: int) -> None:
 
 def console(file: IO[str] | None = None) -> Console:
     """Standard error, or another stream, without markup, emoji codes and highlighting."""
-    from rich.console import Console
+    from stitch.system.lines import PeopleConsole
 
-    return Console(file=file, stderr=file is None, markup=False, emoji=False, highlight=False)
+    return PeopleConsole(file=file, stderr=file is None, markup=False, emoji=False, highlight=False)
 
 
 _GRACE = 3.0  # seconds from the interruption to the end of the process

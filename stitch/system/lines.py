@@ -1,0 +1,51 @@
+"""Lines for people: none is broken inside a word, a number, or between a number and its unit."""
+
+import re
+from typing import Any
+
+from rich.cells import cell_len
+from rich.console import Console
+
+# Blanks that hold together: between a number and its unit, and beside a sign ("± 0.02 mm", "p = 1e-46").
+_GLUE = re.compile(
+    r"(?<=\d) (?=(?:[µnk]?m|[µm]?rad|mm|kg|ms|s|h|min|%|°C?|ppm|points?|views?|σ|sigmas)(?!\w))"
+    r"|(?<=[±=<>≤≥×]) | (?=[±=<>≤≥×])"
+)
+_GLUED = "\N{NO-BREAK SPACE}"
+
+
+def broken_lines(text: str, width: int, hang: int = 0) -> list[str]:
+    """Return a text as lines of at most so many columns, but for words that are longer; blanks at its beginning stay.
+
+    Args:
+        hang: columns by which all lines but the first are indented further.
+    """
+    margin = " " * (len(text) - len(text.lstrip(" ")))
+    lines, line = [], margin
+    for word in _GLUE.sub(_GLUED, text.strip(" ")).split(" "):
+        if line.strip() and cell_len(line) + 1 + cell_len(word) > width:
+            lines.append(line.rstrip(" "))
+            line = margin + " " * hang
+        line += f" {word}" if line.strip() else word
+    return [own.replace(_GLUED, " ") for own in (*lines, line)]
+
+
+def printable(text: str) -> str:
+    """Return a text without what would steer a terminal: names of files and views may hold anything."""
+    return "".join(letter if letter.isprintable() or letter == "\n" else "\N{REPLACEMENT CHARACTER}" for letter in text)
+
+
+class PeopleConsole(Console):
+    """A console that breaks long lines between words where `soft_wrap` leaves them to a terminal, which cuts words."""
+
+    def print(self, *objects: Any, soft_wrap: bool | None = None, **options: Any) -> None:
+        """Print as rich does; texts printed with `soft_wrap` stay whole words, on what is no terminal whole lines."""
+        if soft_wrap:
+            objects = tuple(self._whole_words(own) if isinstance(own, str) else own for own in objects)
+        super().print(*objects, soft_wrap=soft_wrap, **options)
+
+    def _whole_words(self, text: str) -> str:
+        text = printable(text)
+        if not self.is_terminal:
+            return text
+        return "\n".join(line for own in text.split("\n") for line in broken_lines(own, self.width))
