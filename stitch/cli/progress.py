@@ -156,7 +156,10 @@ class TimeLeft:
         self._texts: dict[str, str] = {}
 
     def __call__(self, label: str, done: int, total: int) -> None:
-        """Show that a step of a loop begins; clear the loop after its last one."""
+        """Show that a step of a loop begins, or work that is no loop; clear the loop after its last step."""
+        if total == 0:
+            live_line().begin(label)
+            return
         now = time.monotonic()
         if done == 0:
             self._started[label] = now

@@ -29,6 +29,7 @@ from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.runs.run import Run
 from stitch.stages.results import linearise
+from stitch.system.process import announce
 from stitch.system.threads import library_threads_off, parallel, return_large_arrays
 
 
@@ -45,13 +46,16 @@ def diagnose_state(state: Run) -> Diagnosis:
 
 
 def _diagnose(state: Run) -> Diagnosis:
+    announce("diagnosing: what every view tells of its pose")
     linear, limit = linear_model_of(state), scatter_limit(state.session)
+    announce("diagnosing: trying every effect")
     candidates, missing = candidates_of(linear)
     within = overlap_misfit_beyond_noise(linear, state.session.scanner.noise)
     evidence = replace(gather_evidence(linear, candidates, limit), overlap_misfit=within)
     matrix = alias_matrix(linear, [r.score for r in evidence.ranked])
     examined = _examine_candidates(linear, evidence, matrix, sum(not c.empirical for c in candidates))
     unknown = evidence.verdict == "unknown_effect"
+    announce("diagnosing: errors without a name, and where the error comes from")
     unnamed = evidence.repeating_errors or ()
     if unknown and evidence.repeating_errors is None:
         unnamed = find_repeating_errors(linear)

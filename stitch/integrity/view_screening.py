@@ -36,6 +36,7 @@ from stitch.observations.targets.target_model import TargetModelFit
 from stitch.runs.run import ExcludedView, ViewLinks
 from stitch.stages.correct import Correction
 from stitch.stages.register_and_fuse import FittedRig
+from stitch.system.process import announce
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ def screen_views(session: Session, measurement: Measurement, correction: Correct
     own, T_mount = correction.captures[index], correction.model.T_mount
     if correction.given:
         require_own_model(session, correction, index)
+    announce("checking every view against the others")
     found = _snoop_session(session, measurement, correction, index)
     if poses_contradict_scans(session, found):
         if not correction.given:
@@ -118,6 +120,7 @@ def session_warnings(
     targets = target_warnings(session, measurement.capture.sightings)
     if correction is None:
         return targets
+    announce("checking every view against the others")
     found = _snoop_session(session, measurement, correction, index)
     return (*targets, *snooping_warnings(session, correction.captures[index], found, correction.model.T_mount))
 

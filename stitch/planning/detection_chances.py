@@ -35,6 +35,7 @@ from stitch.planning.expected_model import (
 from stitch.planning.information import RIDGE
 from stitch.statistics.distributions import f_limit
 from stitch.statistics.parameter_selection import log_mean_exp
+from stitch.system.process import steps
 
 # One candidate beside a model of planned views: its log Bayes factor and its F test on whatever these may see.
 #
@@ -352,7 +353,7 @@ def _effect_outlooks(
     linear: LinearModel, candidates: Sequence[Candidate], expected: ExpectedDiagnosis, chances: bool
 ) -> tuple[EffectOutlook, ...]:
     shown, rng, out = {c.name for c in expected.candidates}, np.random.default_rng(0), []
-    for c in candidates:
+    for c in steps("effects", candidates):
         sizes = detectable_sizes(linear, c, expected.tests)
         believable = {p.name: sizes[p.name] for p in c.parameters if p.name in sizes and sizes[p.name] < p.limit}
         chance = expected.chance(c.name, usual_shifts(c, rng), rng) if chances and c.name in shown else None

@@ -37,6 +37,7 @@ from stitch.observations.surfaces.normal_equations import (
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.statistics.least_squares import least_squares
+from stitch.system.process import announce
 
 # What the correction of a model from overlapping surfaces found.
 
@@ -147,6 +148,7 @@ def correct(
     """
     T_mount, overlaps, history = icp_hand_eye(captures, T_mount, [gate] * len(captures), recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
+    announce("correct: what every view tells of its pose")
     freed = tuple(unconstrained_poses(c, c.poses(T_mount), gate) for c, gate in zip(captures, gates, strict=True))
     T_first, scatters = step_hand_eye(captures, freed, T_mount)
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
@@ -154,6 +156,7 @@ def correct(
     freed = _update_unconstrained(captures, freed, gates, T_first)
     common = None if scanner_errors is None else {SCANNER_FIELD: scanner_errors(freed)}
     errors = None if pose_error_prior is None else pose_error_prior(freed, T_first)
+    announce("correct: how certain the hand-eye is")
     hand_eye = fit_hand_eye(captures, freed, T_first, scanner_errors=common, errors=errors)
     final = tuple(
         collect_overlaps(c, c.poses(hand_eye.T_mount), gate, [sample_points(s, FINE_SAMPLES) for s in c.scans])

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Loops that take long say how far they are; whoever watches decides what is shown. Without a watcher nothing is.
 
 Item = TypeVar("Item")
-# What is worked on, how many are done, of how many.
+# What is worked on, how many are done, of how many; of none where nobody knows.
 Watcher = Callable[[str, int, int], None]
 _watchers: list[Watcher] = []
 
@@ -51,6 +51,11 @@ def steps(label: str, items: Iterable[Item], total: int | None = None) -> Iterat
         _notify_watchers(label, done, count)
         yield item
     _notify_watchers(label, count, count)
+
+
+def announce(step: str) -> None:
+    """Tell watchers what is worked on next, where no loop says how far it is."""
+    _notify_watchers(step, 0, 0)
 
 
 def _notify_watchers(label: str, done: int, total: int) -> None:
