@@ -18,15 +18,9 @@ import numpy as np
 
 from data_synth.fixtures.raw_folders import Convention, session_poses, table_of
 from stitch import frames
-from stitch.intake.first_session import (
-    StatedTable,
-    all_readings,
-    candidate_units,
-    capture_of,
-    choose_convention,
-    choose_mounting,
-)
-from stitch.intake.folder_files import pairings
+from stitch.intake.cloud_pairs import pairings
+from stitch.intake.convention_choice import choose_convention, choose_mounting
+from stitch.intake.first_session import StatedTable, all_readings, candidate_units, capture_of
 from stitch.intake.raw_poses import RawPoses
 from stitch.integrity.conventions import register_scan_pairs
 from stitch.integrity.hypotheses import ORDERS

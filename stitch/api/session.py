@@ -15,8 +15,10 @@ from stitch.api.arrays import cloud_of, per_view, poses_of, sighting_of
 from stitch.calibrate.robot import repeatability_table, robot_toml
 from stitch.errors import InputError, NoResultError, StitchError
 from stitch.frames import Array
-from stitch.intake.first_session import StatedFolder, all_readings, capture_of, choose_convention, require_own_frames
-from stitch.intake.folder_files import MM, pairings
+from stitch.intake.cloud_pairs import pairings
+from stitch.intake.convention_choice import choose_convention, require_own_frames
+from stitch.intake.first_session import StatedFolder, all_readings, capture_of
+from stitch.intake.layouts import MM
 from stitch.intake.raw_poses import RawPoses
 from stitch.integrity.conventions import register_scan_pairs
 from stitch.integrity.deep_check import refuse_whole

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.intake.clock_times import EPOCH_S, since_1970
 from stitch.intake.pose_tables import read_names
-from stitch.intake.raw_poses import EPOCH_S, RawPoses, since_1970
+from stitch.intake.raw_poses import RawPoses
 from stitch.integrity.hypotheses import ORDERS
 from stitch.measurement.robot import Robot, forward
 from stitch.reading.robot_description import robot_from_urdf
@@ -370,6 +371,8 @@ def joint_layouts(raw: RawPoses) -> list[ColumnLayout]:
 
 # Which units lengths can have, by what robots reach and scanners see.
 
+# Scans are judged in millimetres.
+MM = 1e-3
 # Metres per unit in which people write poses.
 POSE_UNITS = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "inch": 0.0254}
 CLOUD_UNITS = {"mm": 1e-3, "m": 1.0}

@@ -11,6 +11,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.intake.clock_times import is_time_of_day
 from stitch.reading.text_files import read_any_text, shortened
 
 # Cells of a table as people write them, and the numbers in them.
@@ -19,6 +20,12 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 # A pose as Universal Robots writes it: p[0.1, 0.2, …].
 _POSE_OF_UR = re.compile(r"(?<!\w)p\s*\[(?=\s*[+-]?\.?\d)")
+# What programs write where they have no number.
+_NO_NUMBER = re.compile(r"[+-]?(nan|inf(inity)?)|null|none|#?n/?a|-?1\.#(qnan|ind|inf)", re.IGNORECASE)
+# A number behind a name, "pose 0: 0.83" or "P0 0.83", and before a name or a unit, "0.83 a.ply" or "0.83 mm".
+_DECIMAL = r"[+-]?\d*[.,]\d+(?:[eE][+-]?\d+)?"
+_NUMBER_BEHIND = re.compile(rf"(.*\S\s*[:=])\s+([+-]?\d[\d.,]*(?:[eE][+-]?\d+)?)|(.*[A-Za-z_].*?[:=\s])\s*({_DECIMAL})")
+_NUMBER_BEFORE = re.compile(rf"({_DECIMAL})\s*([A-Za-z°].*)")
 _BRACKETS = str.maketrans("[](){}", " " * 6)
 
 
@@ -32,8 +39,10 @@ def split_cells(line: str, separator: str) -> list[str]:
 
 
 def parse_number(cell: str) -> float | None:
-    """The number in a cell, with a point or a comma; None if there is none."""
+    """Return the number in a cell, with a point or a comma, NaN for what programs write for none; None of words."""
     cell = cell.rstrip("°").strip()
+    if _NO_NUMBER.fullmatch(cell):
+        return float("nan")
     if _NUMBER.fullmatch(cell):
         return float(cell)
     if DECIMAL_COMMA.fullmatch(cell):
@@ -116,6 +125,9 @@ _NAMED = {
     ("q0", "q1", "q2", "q3"): "quaternion-wxyz",
     ("q1", "q2", "q3", "q4"): "quaternion-wxyz",
     ("rotx", "roty", "rotz", "rotw"): "quaternion-xyzw",
+    ("rvx", "rvy", "rvz"): "rotation-vector",
+    ("azyx", "bzyx", "czyx"): "zyx-intrinsic",
+    ("ozyz", "azyz", "tzyz"): "zyz-intrinsic",
     ("w", "p", "r"): "xyz-extrinsic",
     ("roll", "pitch", "yaw"): "xyz-extrinsic",
     ("yaw", "pitch", "roll"): "zyx-intrinsic",
@@ -241,7 +253,7 @@ class NumberTable:
 
     file: Path
     header: tuple[str, ...] | None  # names of the columns of numbers
-    numbers: Array  # (n, C)
+    numbers: Array  # (n, C); NaN where a program wrote that it had none
     labels: tuple[tuple[str, ...], ...]  # texts of every row, from columns that hold no numbers
     lines: tuple[int, ...]  # line number of every row
     words: str  # how it was read
@@ -270,6 +282,7 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     above = len(read) - len(rows)
     comments = [(i, line) for i, line in kept if line.startswith(_COMMENTS) and i < body[0][0]]
     header, rows = _split_header(file, rows, comments[-1][1] if comments else "", separator)
+    header, rows = _split_labels(header, rows)
     text, numeric = _text_and_number_columns(rows)
     if len(numeric) < 3:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
@@ -292,7 +305,7 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
 
 def _cell_number(file: Path, line: int, cell: str) -> float:
     found = parse_number(cell)
-    if found is None or not abs(found) < 1e30:
+    if found is None or abs(found) >= 1e30:
         raise InputError(f"{file} line {line}: {shortened(cell)} is no number; to fix: write one there")
     return found
 
@@ -339,6 +352,33 @@ def _split_header(
     if header is not None and len(header) != width:
         raise InputError(f"{file} line {top}: {len(header)} names for {width} columns; to fix: name every column once")
     return header, rows
+
+
+def _split_labels(header: list[str] | None, rows: NumberedRows) -> tuple[list[str] | None, NumberedRows]:
+    """Part numbers from the words in their cells, so that none is lost; a unit behind them goes into the name."""
+    for c in range(len(rows[0][1]) - 1, -1, -1):
+        parts = [_label_and_number(row[c]) for _, row in rows]
+        known = [part for part in parts if part is not None]
+        if 2 * len(known) <= len(rows):
+            continue
+        behind = {words for words, _ in known}
+        rows = [
+            (i, [*row[:c], *(part or (row[c], "nan")), *row[c + 1 :]])
+            for (i, row), part in zip(rows, parts, strict=True)
+        ]
+        if header is not None:
+            unit = f"{header[c]} [{behind.pop()}]" if len(behind) == 1 else header[c]
+            header = [*header[:c], "", unit, *header[c + 1 :]]
+    return header, rows
+
+
+def _label_and_number(cell: str) -> tuple[str, str] | None:
+    if parse_number(cell) is not None or is_time_of_day(cell):
+        return None
+    if found := _NUMBER_BEHIND.fullmatch(cell):
+        return (found[1] or found[3]).rstrip(" :="), found[2] or found[4]
+    found = _NUMBER_BEFORE.fullmatch(cell)
+    return None if found is None else (found[2], found[1])
 
 
 def _text_and_number_columns(rows: Sequence[tuple[int, list[str]]]) -> tuple[list[int], list[int]]:

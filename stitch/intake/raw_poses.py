@@ -5,7 +5,6 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -14,107 +13,14 @@ import numpy as np
 from stitch.controllers.program import POSE_COLUMNS, csv_text, import_file
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.pose_tables import NumberTable, parse_number_table, read_number_table
+from stitch.intake.clock_times import ClockTimes, find_clock_column
+from stitch.intake.pose_formats import PoseRow, joint_state_rows, open3d_rows, read_pose_text
+from stitch.intake.pose_tables import NumberTable, parse_number_table
 from stitch.reading.range_image import poses_in_scans, times_in_scans
-from stitch.reading.text_files import read_text, require_file, shortened
+from stitch.reading.text_files import read_any_text, read_text, require_file, shortened
 from stitch.reading.yaml_file import parse_yaml
 
-# Times of day as tables have them, 09:14:13 with a date or without, as seconds; what cannot be told is said.
-
-_CLOCK = re.compile(
-    r"(?:(?P<date>[\d.\-/]+)[T ]+)?"
-    r"(?P<h>[01]?\d|2[0-3]):(?P<m>[0-5]\d)(?::(?P<s>[0-5]\d(?:[.,]\d+)?))?(?: ?(?P<half>[AP]M)|Z)?",
-    re.IGNORECASE,
-)
-_YEAR_FIRST = re.compile(r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})")
-_YEAR_LAST = re.compile(r"(\d{1,2})([-./])(\d{1,2})\2(\d{4}|\d{2})")
-DAY_S, _CENTURY = 86400.0, 2000
-# Of this century, counted in seconds since 1970.
-EPOCH_S = (0.9e9, 4.0e9)
-DAY_FIRST, MONTH_FIRST = "dates with the day first", "dates with the month first"
-
-
-@dataclass(frozen=True)
-class ClockTimes:
-    """A column of times of day."""
-
-    seconds: Array | None  # (n,) since the first; None where they are left out
-    words: str  # how dates were read, or why times are left out; empty where nothing is to be said
-    first_s: float = 0.0  # the first since the calendar's beginning, or since midnight where no date stands beside it
-
-
-def find_clock_column(labels: Sequence[tuple[str, ...]]) -> ClockTimes | None:
-    """The one column of times of day among the texts beside the rows of a table; None without, or with several."""
-    if len({len(texts) for texts in labels}) != 1:
-        return None
-    times = [t for column in zip(*labels, strict=True) if (t := clock_times(column)) is not None]
-    return times[0] if len(times) == 1 else None
-
-
-def clock_times(cells: Sequence[str]) -> ClockTimes | None:
-    """Read a column; None where a cell is no time, or where all are the same.
-
-    Dates whose order nobody states are read both ways. What runs backwards one way is read the other way.
-    """
-    both = [_column_seconds(cells, day_first) for day_first in (True, False)]
-    known = [moments for moments in both if moments is not None]
-    if not known or all((moments == moments[0]).all() for moments in known):
-        return None
-    forwards = [moments for moments in known if (np.diff(moments) >= 0).all()]
-    if not forwards:
-        return ClockTimes(None, "times of day run backwards and are left out; to fix: write the date beside them")
-    since_first = [moments - moments[0] for moments in forwards]
-    if len(forwards) == 2 and not np.array_equal(since_first[0], since_first[1]):
-        return ClockTimes(
-            None,
-            f"times are left out, as {cells[0].strip()} may begin with the day or the month; to fix: write dates as "
-            "2026-12-31",
-        )
-    alike = len(forwards) == 2
-    words = "" if alike else DAY_FIRST if forwards[0] is both[0] else MONTH_FIRST
-    return ClockTimes(np.asarray(since_first[0]), words, float(forwards[0][0]))
-
-
-def _column_seconds(cells: Sequence[str], day_first: bool) -> Array | None:
-    told = [_time_of_day_seconds(cell.strip(), day_first) for cell in cells]
-    if not told or any(t is None for t in told):
-        return None
-    moments: Array = np.array(told, float)
-    return moments
-
-
-def _time_of_day_seconds(cell: str, day_first: bool) -> float | None:
-    found = _CLOCK.fullmatch(cell)
-    if not found:
-        return None
-    day = _date_ordinal(found["date"], day_first) if found["date"] else 0
-    if day is None:
-        return None
-    hour = int(found["h"])
-    if found["half"]:
-        hour = hour % 12 + 12 * (found["half"].upper() == "PM")
-    return DAY_S * day + 3600.0 * hour + 60.0 * int(found["m"]) + float((found["s"] or "0").replace(",", "."))
-
-
-def _date_ordinal(text: str, day_first: bool) -> int | None:
-    """Days; None where it is no date. With dots the day always stands first."""
-    if found := _YEAR_FIRST.fullmatch(text):
-        year, month, day = map(int, found.groups())
-    elif found := _YEAR_LAST.fullmatch(text):
-        first, second, year = int(found[1]), int(found[3]), int(found[4])
-        year += _CENTURY * (len(found[4]) == 2)
-        day, month = (first, second) if day_first or found[2] == "." else (second, first)
-    else:
-        return None
-    try:
-        return date(year, month, day).toordinal()
-    except ValueError:
-        return None
-
-
 # Poses in JSON and YAML: lists, matrices and mappings, however deep, as rows of named numbers.
-
-PoseRow = tuple[tuple[str, ...], dict[str, float]]  # texts beside a pose, and its numbers by name
 
 # Sizes of a bare list of numbers that can be a pose or joint angles.
 _SIZES = (5, 6, 7, 8, 9, 12, 16)
@@ -228,9 +134,11 @@ def _is_number(value: Any) -> bool:
 
 
 STRUCTURED = (".json", ".yaml", ".yml", ".npy", ".npz")
-TABLES = (".txt", ".csv", ".dat", ".tsv", ".tab", ".asc", ".pose", ".poses")
+TABLES = (".txt", ".csv", ".dat", ".tsv", ".tab", ".asc", ".pose", ".poses", ".log", ".va", ".pos")
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 _MAX_POSES_MB = 50
+# Of files, or of rows, that have to hold a pose: where fewer do, the export is at fault and not a view.
+_FEWEST_WHOLE = 0.6
 
 
 @dataclass(frozen=True)
@@ -242,6 +150,7 @@ class RawPoses:
     numbers: Array  # (V, C)
     labels: tuple[tuple[str, ...], ...]  # per row the texts beside it, such as a view's name or its cloud's
     words: str  # how it was read
+    without_pose: frozenset[int] = frozenset()  # rows without a number where one belongs; they repeat another row
 
     @property
     def clock(self) -> ClockTimes | None:
@@ -277,22 +186,41 @@ def read_raw_poses(files: Sequence[Path]) -> RawPoses:
     """
     if len(files) == 1:
         return _read_file(files[0])
-    rows = [_read_file(file) for file in files]
-    odd = next((r for r in rows if len(r.numbers) != 1), None)
-    if odd is not None:
-        raise InputError(f"{odd.source}: holds {len(odd.numbers)} poses, one a file is expected; to fix: name one file")
+    rows, broken = _read_each(files)
     width = rows[0].numbers.shape[1]
     other = next((r for r in rows if r.numbers.shape[1] != width or r.header != rows[0].header), None)
     if other is not None:
         raise InputError(f"{other.source}: is written otherwise than {rows[0].source}; to fix: export all alike")
-    where = f"{files[0].name} … {files[-1].name}"
     return RawPoses(
-        source=where,
+        source=f"{files[0].name} … {files[-1].name}",
         header=rows[0].header,
         numbers=np.vstack([r.numbers for r in rows]),
         labels=tuple((file.stem, *row.labels[0]) for file, row in zip(files, rows, strict=True)),
         words=f"{len(files)} files, a pose each",
+        without_pose=broken,
     )
+
+
+def _read_each(files: Sequence[Path]) -> tuple[list[RawPoses], frozenset[int]]:
+    """Return the pose of each file, and the numbers of files that hold none: a few of many, which repeat another."""
+    rows: dict[int, RawPoses] = {}
+    refused: InputError | None = None
+    for i, file in enumerate(files):
+        try:
+            rows[i] = _read_file(file)
+        except InputError as error:
+            refused = refused or error
+            continue
+        if len(rows[i].numbers) != 1:
+            raise InputError(
+                f"{file}: holds {len(rows[i].numbers)} poses, one a file is expected; to fix: name the one file of "
+                "all poses with --poses FILE"
+            )
+    if refused is not None and len(rows) < _FEWEST_WHOLE * len(files):
+        raise refused
+    broken = {i for i in range(len(files)) if i not in rows or rows[i].without_pose}
+    first = next(row for i, row in rows.items() if i not in broken) if len(broken) < len(files) else rows[0]
+    return [first if i in broken else rows[i] for i in range(len(files))], frozenset(broken)
 
 
 def _read_file(file: Path) -> RawPoses:
@@ -304,9 +232,32 @@ def _read_file(file: Path) -> RawPoses:
         told = read_text(file, "name a file of poses", _MAX_POSES_MB)
         documents = [_from_json(file, told)] if suffix == ".json" else parse_yaml(file, told)
         document = documents[0] if len(documents) == 1 else documents
-        return _from_rows(file, nested_rows(document), suffix[1:].upper())
-    table = read_number_table(file)
-    return _matrix_blocks(table) or RawPoses(str(file), table.header, table.numbers, table.labels, table.words)
+        rows = open3d_rows(document) or joint_state_rows(document) or nested_rows(document)
+        return _from_rows(file, rows, suffix[1:].upper())
+    text = read_any_text(file, "name a table of poses", _MAX_POSES_MB)
+    found = read_pose_text(text)
+    if found is not None:
+        return _from_rows(file, *found)
+    table = parse_number_table(file, text)
+    return _matrix_blocks(table) or _raw_poses(str(file), table.header, table.numbers, table.labels, table.words)
+
+
+def _raw_poses(
+    source: str, header: tuple[str, ...] | None, numbers: Array, labels: Sequence[tuple[str, ...]], words: str
+) -> RawPoses:
+    """Return rows of numbers; those with one that is not finite repeat the first of the others.
+
+    Raises:
+        InputError: hardly a row is whole.
+    """
+    broken = np.asarray(~np.isfinite(numbers).all(axis=1), bool)
+    if len(numbers) > 1 and (~broken).sum() < _FEWEST_WHOLE * len(numbers):
+        raise InputError(
+            f"{source}: {broken.sum()} of {len(numbers)} rows hold a number that is not finite; to fix: export "
+            "the poses again"
+        )
+    whole = np.where(broken[:, None], numbers[np.argmin(broken)], numbers) if broken.any() else numbers
+    return RawPoses(source, header, whole, tuple(labels), words, frozenset(np.flatnonzero(broken).tolist()))
 
 
 def _matrix_blocks(table: NumberTable) -> RawPoses | None:
@@ -314,14 +265,23 @@ def _matrix_blocks(table: NumberTable) -> RawPoses | None:
     x = table.numbers
     if x.shape[1] != 4:
         return None
-    if len(x) % 4 == 0 and np.allclose(x[3::4], _LAST_ROW):
-        return RawPoses(str(table.file), None, x.reshape(-1, 16), ((),) * (len(x) // 4), "4×4 matrices")
-    if len(x) % 4 == 0 and np.allclose(x.reshape(-1, 4, 4)[:, :3, 3], 0) and np.allclose(x.reshape(-1, 16)[:, 15], 1):
-        return RawPoses(str(table.file), None, x.reshape(-1, 16), ((),) * (len(x) // 4), "4×4 matrices by columns")
-    if len(x) % 3 == 0:
-        R = x.reshape(-1, 3, 4)[:, :, :3]
-        if np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-3):
-            return RawPoses(str(table.file), None, x.reshape(-1, 12), ((),) * (len(x) // 3), "3×4 matrices")
+    for height in (4, 3):
+        if len(x) % height:
+            continue
+        blocks = x.reshape(-1, height, 4)
+        whole = blocks[np.isfinite(blocks).all(axis=(1, 2))]
+        if not len(whole):
+            continue
+        R = whole[:, :3, :3]
+        if height == 3 and np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-3):
+            words = "3×4 matrices"
+        elif height == 4 and np.allclose(whole[:, 3], _LAST_ROW):
+            words = "4×4 matrices"
+        elif height == 4 and np.allclose(whole[:, :3, 3], 0) and np.allclose(whole[:, 3, 3], 1):
+            words = "4×4 matrices by columns"
+        else:
+            continue
+        return _raw_poses(str(table.file), None, blocks.reshape(len(blocks), -1), ((),) * len(blocks), words)
     return None
 
 
@@ -345,10 +305,10 @@ def _from_numpy(file: Path) -> RawPoses:
         raise InputError(f"{file}: holds no array (V, C) or (V, 4, 4); to fix: save the poses as one of these")
     x = np.asarray(max(fitting, key=lambda a: a.ndim), float)
     flat = x.reshape(1, 16) if x.shape == (4, 4) else x.reshape(len(x), -1)
-    return RawPoses(str(file), None, flat, ((),) * len(flat), f"an array {'×'.join(map(str, x.shape))}")
+    return _raw_poses(str(file), None, flat, ((),) * len(flat), f"an array {'×'.join(map(str, x.shape))}")
 
 
-def _from_rows(file: Path, rows: Sequence[tuple[tuple[str, ...], dict[str, float]]], kind: str) -> RawPoses:
+def _from_rows(file: Path, rows: Sequence[PoseRow], kind: str) -> RawPoses:
     if not rows:
         raise InputError(f"{file}: holds no poses that are known; to fix: write a table or 4×4 matrices")
     names = tuple(rows[0][1])
@@ -356,10 +316,8 @@ def _from_rows(file: Path, rows: Sequence[tuple[tuple[str, ...], dict[str, float
         if tuple(row) != names:
             raise InputError(f"{file}: pose {i} is written otherwise than the first; to fix: write all alike")
     numbers = np.array([list(row.values()) for _, row in rows], float)
-    if not np.isfinite(numbers).all():
-        raise InputError(f"{file}: a number is not finite; to fix: leave that pose out")
     header = None if all(re.fullmatch(r"\d+", name) for name in names) else names
-    return RawPoses(str(file), header, numbers, tuple(labels for labels, _ in rows), kind)
+    return _raw_poses(str(file), header, numbers, [labels for labels, _ in rows], kind)
 
 
 # Poses of a folder without a table: those in the headers of its scans.
@@ -386,82 +344,6 @@ def header_poses(clouds: Sequence[Path]) -> RawPoses:
         labels=tuple((cloud.name, *time) for cloud, time in zip(clouds, times, strict=True)),
         words=words,
     )
-
-
-# Which pose belongs to which scan by the clock: times in the names of the clouds against times beside the poses.
-
-_STAMP = re.compile(
-    r"(?<!\d)(\d{4})[-_.]?(\d{2})[-_.]?(\d{2})[T_\- ]+(\d{2})[-_.h]?(\d{2})[-_.m]?(\d{2})(?:[-_.,](\d{3}|\d{6}))?(?!\d)"
-)
-# Seconds since 1970 with a fraction, or milli-, micro- or nanoseconds, as cameras and ROS call their files.
-_SINCE_1970 = re.compile(r"(?<![\d.])(\d{10}(?:[._]\d{1,9})?|\d{13}|\d{16}|\d{19})(?![\d.])")
-# Of the usual time from scan to scan: a pose farther from its scan was not taken with it.
-_NEAR = 0.1
-
-
-def rows_by_time(
-    clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None = None
-) -> tuple[list[int], float] | None:
-    """Per cloud the row nearest in time, and the farthest of them, s; None where times do not tell it.
-
-    Args:
-        labels: per row the texts beside it: times of day, for clouds that have date and time in their names.
-        numbers: (V, C) of the table: a column of seconds since 1970, for clouds that have these.
-    """
-    clock, own = find_clock_column(labels), [_calendar_seconds(cloud.stem) for cloud in clouds]
-    if clock is not None and clock.seconds is not None:
-        # Times of day without a date are of any day.
-        dated = clock.first_s >= DAY_S
-        poses = clock.first_s + clock.seconds
-        return _nearest_rows(own, poses if dated else poses % DAY_S, None if dated else DAY_S)
-    columns = [] if numbers is None else [t for c in numbers.T if (t := since_1970(c)) is not None]
-    return (
-        _nearest_rows([_unix_seconds(cloud.stem) for cloud in clouds], columns[0], None) if len(columns) == 1 else None
-    )
-
-
-def _nearest_rows(own: Sequence[float | None], poses: Array, day: float | None) -> tuple[list[int], float] | None:
-    """Rows and the farthest of them, unless one is too far away or belongs to two."""
-    if len(own) < 2 or None in own:
-        return None
-    scans: Array = np.array(own, float)
-    away = np.abs((scans if day is None else scans % day)[:, None] - poses)
-    rows = away.argmin(axis=1)
-    farthest = float(away.min(axis=1).max())
-    usual = float(np.median(np.diff(np.sort(scans))))
-    if len(set(rows.tolist())) < len(rows) or farthest > _NEAR * usual:
-        return None
-    return rows.tolist(), farthest
-
-
-def since_1970(times: Array) -> Array | None:
-    """Seconds since 1970 of a column (n,) of times of this century, in s, ms, µs or ns; None of other numbers."""
-    for second in (1.0, 1e-3, 1e-6, 1e-9):
-        seconds: Array = times * second
-        if len(times) and EPOCH_S[0] < seconds.min() and seconds.max() < EPOCH_S[1]:
-            return seconds
-    return None
-
-
-def _unix_seconds(name: str) -> float | None:
-    """Seconds since 1970 of the one such number in a name; None where there is none, or several."""
-    found = _SINCE_1970.findall(name)
-    told = since_1970(np.array([float(found[0].replace("_", "."))])) if len(found) == 1 else None
-    return None if told is None else float(told[0])
-
-
-def _calendar_seconds(name: str) -> float | None:
-    """Seconds since the calendar's beginning of the one time in a name; None where there is none, or several."""
-    found = _STAMP.findall(name)
-    if len(found) != 1:
-        return None
-    year, month, day, hour, minute, second, part = found[0]
-    try:
-        days = date(int(year), int(month), int(day)).toordinal()
-    except ValueError:
-        return None
-    clock = 3600 * int(hour) + 60 * int(minute) + int(second)
-    return DAY_S * days + clock + (float(f"0.{part}") if part else 0.0)
 
 
 # Poses of a robot program: its points that have one.

@@ -11,7 +11,8 @@ from stitch.detection.balls import ball_sightings
 from stitch.detection.boards import Board, PlacedBoard, board_sightings, boards_in
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
-from stitch.intake.folder_files import MM, FolderFiles, Guess
+from stitch.intake.folder_files import FolderFiles, Guess
+from stitch.intake.layouts import MM
 from stitch.integrity.conventions import RelativeScans
 from stitch.measurement.session import Session, Sighting
 from stitch.reading.range_image import read_range_image

@@ -12,8 +12,8 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.first_session import FirstSession
-from stitch.intake.folder_files import MM, Guess
-from stitch.intake.layouts import JOINT_ANGLES, POSE_UNITS, arm_from_urdf, covariate_columns
+from stitch.intake.folder_files import Guess
+from stitch.intake.layouts import JOINT_ANGLES, MM, POSE_UNITS, arm_from_urdf, covariate_columns
 from stitch.intake.scan_targets import points_columns
 from stitch.reading.session_folder import SESSION_FORMAT
 from stitch.system.files import whole_file

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stitch.errors import InputError
-from stitch.intake.folder_files import pairings
+from stitch.intake.cloud_pairs import pairings
 
 CLOUDS = [Path(f"scans/view_{i:02d}.ply") for i in (1, 2, 3, 10)]
 

@@ -7,10 +7,12 @@ from scipy.spatial.transform import Rotation
 from data_synth.fixtures.raw_folders import Convention, raw_folder, session_poses
 from data_synth.write import write_session
 from stitch.errors import InputError
+from stitch.intake.clock_times import DAY_FIRST, MONTH_FIRST, clock_times
+from stitch.intake.cloud_pairs import pairings
 from stitch.intake.first_session import StatedFolder, first_session
-from stitch.intake.folder_files import find_folder_files, pairings
+from stitch.intake.folder_files import find_folder_files
 from stitch.intake.layouts import covariate_columns, possible_layouts
-from stitch.intake.raw_poses import DAY_FIRST, MONTH_FIRST, clock_times, read_raw_poses
+from stitch.intake.raw_poses import read_raw_poses
 from stitch.intake.session_draft import write_draft
 from stitch.reading.session_folder import load_session
 
