@@ -20,8 +20,9 @@ from data_synth.fixtures.raw_folders import Convention, session_poses, table_of
 from stitch import frames
 from stitch.intake.cloud_pairs import pairings
 from stitch.intake.convention_choice import choose_convention, choose_mounting
-from stitch.intake.first_session import StatedTable, all_readings, candidate_units, capture_of
+from stitch.intake.first_session import capture_of
 from stitch.intake.raw_poses import RawPoses
+from stitch.intake.readings import StatedTable, all_readings, candidate_units
 from stitch.integrity.conventions import register_scan_pairs
 from stitch.integrity.hypotheses import ORDERS
 from stitch.measurement.capture import Capture

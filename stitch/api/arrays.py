@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.intake.layouts import possible_layouts, readings
+from stitch.intake.layouts import possible_layouts
 from stitch.intake.raw_poses import RawPoses
+from stitch.intake.readings import readings
 from stitch.measurement.session import Cloud, Sighting
 from stitch.reading.clouds import cloud_of_columns, measured_pixels
 from stitch.reading.depth_image import Intrinsics, lifted

@@ -17,9 +17,10 @@ from stitch.errors import InputError, NoResultError, StitchError
 from stitch.frames import Array
 from stitch.intake.cloud_pairs import pairings
 from stitch.intake.convention_choice import choose_convention, require_own_frames
-from stitch.intake.first_session import StatedFolder, all_readings, capture_of
+from stitch.intake.first_session import StatedFolder, capture_of
 from stitch.intake.layouts import MM
 from stitch.intake.raw_poses import RawPoses
+from stitch.intake.readings import all_readings
 from stitch.integrity.conventions import register_scan_pairs
 from stitch.integrity.deep_check import refuse_whole
 from stitch.measurement import session as measured

@@ -59,8 +59,8 @@ def import_command(
       stitch import poses.txt -o views.csv --columns x,y,z,rx,ry,rz --rotation xyz-extrinsic --angles deg
     """
     from stitch.controllers.program import import_file
-    from stitch.intake.first_session import StatedTable
     from stitch.intake.import_table import import_table, is_table_of_poses
+    from stitch.intake.readings import StatedTable
     from stitch.system.files import whole_file
 
     require_new(output)

@@ -38,6 +38,10 @@ _Rotation = Annotated[
 _Angles = Annotated[str | None, typer.Option("--angles", help="deg or rad.")]
 _Unit = Annotated[str | None, typer.Option("--unit", help="Of the poses: mm, m, cm or inch.")]
 _CloudUnit = Annotated[str | None, typer.Option("--cloud-unit", help="Of the clouds: mm or m.")]
+_Orientation = Annotated[
+    str | None,
+    typer.Option("--orientation", help="Of all poses, for a table of x, y, z alone: 180,0,0 or qx,qy,qz,qw."),
+]
 _Mount = Annotated[str | None, typer.Option("--mount", help="eye_in_hand or eye_to_hand.")]
 _Inverse = Annotated[
     bool | None, typer.Option("--inverse/--no-inverse", help="The poses are T_flange_base, or are not.")
@@ -64,6 +68,7 @@ def init(
     unit: _Unit = None,
     cloud_unit: _CloudUnit = None,
     mount: _Mount = None,
+    orientation: _Orientation = None,
     inverse: _Inverse = None,
     board: BoardOption = None,
     ball: BallOption = None,
@@ -100,6 +105,7 @@ def init(
         poses=poses,
         cloud_unit=cloud_unit,
         mount=mount,
+        orientation=_numbers("--orientation", orientation),
         targets=parse_target_options(board, ball),
     )
     _init_from_scans(folder, output or folder, stated, yes, force, as_json)
@@ -121,14 +127,16 @@ def _init_from_bag(bag: Path, output: Path | None, topic: str | None, named: str
 
 def _init_from_scans(folder: Path, out: Path, stated: StatedFolder, yes: bool, force: bool, as_json: bool) -> None:
     """Write a session of scans; what they do not tell is asked on a terminal, or guessed with `yes`."""
+    from stitch.intake.packed_scans import one_scan_a_file
     from stitch.intake.session_draft import require_free, write_draft
 
     if not force:
         require_free(out, not stated.targets.is_empty)
-    first = _judge_folder(folder, stated)
-    if not yes:
-        first = _ask_uncertain(folder, out, first, stated)
-    write_draft(out, first, force)
+    with one_scan_a_file(folder) as scans:
+        first = _judge_folder(scans, stated)
+        if not yes:
+            first = _ask_uncertain(scans, out, first, stated)
+        write_draft(out, first, force=force, unpacked=scans != folder)
     _report_session(out, len(first.pairing.used), first.guesses, as_json)
 
 
@@ -209,3 +217,11 @@ def _report_session(out: Path, views: int, guesses: Sequence[Guess], as_json: bo
         say("Results are worth no more than these guesses.")
         say(f"To try the usual mistakes: stitch check --deep {folder}")
     show_next(f"Next: stitch run {folder}")
+
+
+def _numbers(flag: str, text: str | None) -> tuple[float, ...]:
+    """Return the numbers of a flag."""
+    try:
+        return tuple(float(cell) for cell in split_names(text))
+    except ValueError:
+        raise InputError(f"{flag} {text}: is no list of numbers; to fix: write numbers with commas between") from None

@@ -1,8 +1,8 @@
 """Which row of a table belongs to which cloud: by name, by time, by number, by order."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -10,8 +10,8 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.clock_times import rows_by_time
 
-# Clouds or poses that a list may lack: more, and the lists do not belong together.
-_LACKING = 2
+# Clouds or poses that a list may lack where nothing but the order pairs them: more, and they do not belong together.
+LACKING = 2
 _SHIFTS = (1, -1, 2, -2)
 
 
@@ -28,6 +28,11 @@ class Pairing:
         """Clouds that have a pose."""
         return tuple(i for i, row in enumerate(self.rows) if row is not None)
 
+    def of(self, clouds: Sequence[int], without_pose: Collection[int]) -> "Pairing":
+        """Return the pairing of some of the clouds; those whose row holds no pose have none."""
+        rows = tuple(self.rows[i] for i in clouds)
+        return replace(self, rows=tuple(None if row in without_pose else row for row in rows))
+
 
 def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None = None) -> list[Pairing]:
     """Ways to pair, the likely one first; one where the names tell it.
@@ -40,12 +45,14 @@ def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
     Raises:
         InputError: so many more of one than of the other that they do not belong together.
     """
-    named = _by_text(clouds, labels) or _by_time(clouds, labels, numbers)
-    named = named or _by_number(clouds, labels) or _by_column(clouds, numbers)
+    named = named_pairing(clouds, labels, numbers)
     if named is not None:
         return [named]
     N, M = len(clouds), len(labels)
-    if abs(N - M) > _LACKING or min(N, M) < 3:
+    numbered = _by_row(clouds, M)
+    if numbered:
+        return numbered
+    if abs(N - M) > LACKING or min(N, M) < 3:
         raise InputError(
             f"{clouds[0].parent}: {N} clouds and {M} poses, and their names do not tell which belong together; to fix: "
             "write the cloud's file name beside each pose, or leave out what does not belong"
@@ -56,6 +63,27 @@ def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
         out.append(Pairing(same[::-1], "the poses in reverse order", False))
         return out + [_shifted_pairing(N, by) for by in _SHIFTS if N - abs(by) >= 4]
     return _incomplete_pairings(N, M)
+
+
+def named_pairing(
+    clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None = None
+) -> Pairing | None:
+    """Return the pairing that names, times or numbers tell; None where they do not."""
+    named = _by_text(clouds, labels) or _by_time(clouds, labels, numbers)
+    return named or _by_number(clouds, labels) or _by_column(clouds, numbers)
+
+
+def _by_row(clouds: Sequence[Path], rows: int) -> list[Pairing]:
+    """Return cloud N with row N, counted from 0, from 1, or both, of numbered clouds that are fewer than the rows."""
+    own = [n for cloud in clouds if (n := _last_number(cloud.stem)) is not None]
+    if not len(clouds) == len(set(own)) < rows or len(own) < 3 or 2 * len(own) < rows:
+        return []
+    out = []
+    for first in (0, 1):
+        if min(own) >= first and max(own) < rows + first:
+            words = f"cloud N with pose N, counted from {first}; {rows - len(own)} poses without a cloud"
+            out.append(Pairing(tuple(n - first for n in own), words, False))
+    return out
 
 
 def _shifted_pairing(count: int, by: int) -> Pairing:
@@ -113,12 +141,13 @@ def _by_time(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
 def _by_number(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairing | None:
     """The last number in the cloud's name is that in the name of the pose: view_07 and robot_pose_7."""
     own = [_last_number(cloud.stem) for cloud in clouds]
-    theirs = [_last_number(Path(texts[0]).stem) if texts else None for texts in labels]
-    if None in own or None in theirs or len(set(own)) < len(own) or len(set(theirs)) < len(theirs):
+    if None in own or len(set(own)) < len(own):
         return None
-    if not set(own) <= set(theirs):
-        return None
-    return Pairing(tuple(theirs.index(number) for number in own), "by the numbers in the names", True)
+    for column in range(min(map(len, labels), default=0)):
+        theirs = [_last_number(Path(texts[column]).stem) for texts in labels]
+        if None not in theirs and len(set(theirs)) == len(theirs) and set(own) <= set(theirs):
+            return Pairing(tuple(theirs.index(number) for number in own), "by the numbers in the names", True)
+    return None
 
 
 def _by_column(clouds: Sequence[Path], numbers: Array | None) -> Pairing | None:

@@ -15,7 +15,8 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.cloud_pairs import Pairing
 from stitch.intake.folder_files import Guess
-from stitch.intake.layouts import MM, POSE_UNITS, Reading
+from stitch.intake.layouts import MM, POSE_UNITS
+from stitch.intake.readings import Reading
 from stitch.integrity.conventions import (
     CLEARLY_BETTER,
     FEWEST,
@@ -169,6 +170,8 @@ class ConventionChoice:
     equivalent: tuple[Interpretation, ...]  # others that stitch alike: they differ from the best by one fixed frame
     scanner_away: float  # mm: of the scanner from the origin of its mount's frame
     part_away: float  # mm: of the part from the origin of the reference frame
+    overruled: str = ""  # the reading that the names of the columns tell, where the scans contradict it
+    only_believed: str = ""  # another reading under which the views meet as well as under the one that names tell
 
     @property
     def scanner_at_flange(self) -> bool:
@@ -218,6 +221,30 @@ def choose_convention(
     # What is a guess anyway leaves out no view for it.
     whole = len(every.best.interpretation.pairing.used) >= len(first.best.interpretation.pairing.used)
     return every if every.determined or (whole and every.best.misfit < first.best.misfit) else first
+
+
+def weigh_doubts(believed: ConventionChoice, doubted: ConventionChoice) -> ConventionChoice:
+    """Return what the names of columns tell, or the reading against them that the scans ask for.
+
+    Args:
+        doubted: the choice among readings against the names, or with an axis or a coupling taken into account.
+    """
+    own, other = believed.best, doubted.best
+    better = other.misfit * CLEARLY_BETTER < own.misfit
+    if doubted.determined and better and not believed.determined:
+        return replace(doubted, overruled=own.interpretation.reading.words)
+    if other.meets and other.misfit < own.misfit * CLEARLY_BETTER:
+        return replace(believed, only_believed=other.interpretation.reading.words)
+    return believed
+
+
+def fitted_scale(capture_motions: RelativeScans, decided: ConventionChoice) -> float | None:
+    """Return how many times larger than the robot's motions the scans are; None where the motions do not tell it."""
+    interpretation = decided.best.interpretation
+    tried = [replace(interpretation, carries=carries).hypothesis(i) for i, carries in enumerate((True, False))]
+    fitted = fit_hypotheses(tried, capture_motions, "mm", scaled=True)
+    best = equivalent_hypotheses([fit for fit in fitted if fit.scale > 0])
+    return best[0].scale if best else None
 
 
 def _choose_interpretation(

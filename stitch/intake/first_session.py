@@ -3,8 +3,8 @@
 What a person states is taken; what the files tell is read; the rest is decided by the scans (`choose_convention`).
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
@@ -19,56 +19,35 @@ from stitch.intake.convention_choice import (
     Mounting,
     choose_convention,
     choose_mounting,
+    fitted_scale,
     require_own_frames,
+    weigh_doubts,
 )
-from stitch.intake.folder_files import FolderFiles, Guess, find_folder_files
-from stitch.intake.layouts import (
-    CLOUD_UNITS,
-    JOINT_ANGLES,
-    MM,
-    POSE_UNITS,
-    Reading,
-    cloud_units,
-    covariate_columns,
-    joint_layouts,
-    joint_readings,
-    pose_units,
-    possible_layouts,
-    readings,
-    rotation_conventions,
-    size_words,
-)
+from stitch.intake.folder_files import FolderFiles, Guess, angles_in_names, find_folder_files
+from stitch.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, cloud_units, covariate_columns, size_words
 from stitch.intake.raw_poses import RawPoses, header_poses, is_program, program_poses, read_raw_poses
+from stitch.intake.readings import (
+    JOINT_ANGLES,
+    StatedTable,
+    all_readings,
+    candidate_units,
+    doubted_readings,
+    require_known_word,
+    with_joints_of,
+)
 from stitch.intake.scan_targets import TargetSearch, find_folder_targets, target_motions
+from stitch.intake.stops import rows_with_scans
 from stitch.integrity.conventions import register_scan_pairs
 from stitch.measurement.capture import Capture, thin_session
 from stitch.measurement.session import Cloud, Scanner, Session, Sighting, View
 from stitch.reading.clouds import read_cloud
+from stitch.reading.depth_image import DEPTH_SUFFIXES, find_intrinsics
+from stitch.reading.range_image import poses_in_scans
+from stitch.system.process import steps
 
 # What a person states with flags, of a table of poses and of the folder it lies in; None where nothing is stated.
 
 _MOUNTS = ("eye_in_hand", "eye_to_hand")
-
-
-@dataclass(frozen=True)
-class StatedTable:
-    """How a table of poses is to be read, checked."""
-
-    columns: tuple[str, ...] = ()
-    rotation: str | None = None
-    angle_unit: str | None = None
-    length_unit: str | None = None  # of the poses
-    inverse: bool | None = None  # the table holds T_flange_base
-
-    def __post_init__(self) -> None:
-        """Refuse words that mean nothing.
-
-        Raises:
-            InputError: names the flag and what it knows.
-        """
-        _require_known_word("--rotation", self.rotation, rotation_conventions())
-        _require_known_word("--angles", self.angle_unit, ("deg", "rad"))
-        _require_known_word("--unit, --file-unit", self.length_unit, POSE_UNITS)
 
 
 @dataclass(frozen=True)
@@ -78,13 +57,14 @@ class StatedFolder(StatedTable):
     poses: Path | None = None
     cloud_unit: str | None = None
     mount: str | None = None
+    orientation: tuple[float, ...] = ()  # of all poses, where the table has x, y, z alone
     targets: TargetSearch = field(default_factory=TargetSearch)  # boards and balls in the scans
 
     def __post_init__(self) -> None:
         """As of the table."""
         super().__post_init__()
-        _require_known_word("--cloud-unit", self.cloud_unit, CLOUD_UNITS)
-        _require_known_word("--mount", self.mount, _MOUNTS)
+        require_known_word("--cloud-unit", self.cloud_unit, CLOUD_UNITS)
+        require_known_word("--mount", self.mount, _MOUNTS)
 
     @property
     def carries(self) -> bool | None:
@@ -92,11 +72,6 @@ class StatedFolder(StatedTable):
         if self.mount is None or self.inverse is None:
             return None
         return (self.mount == "eye_in_hand") != self.inverse
-
-
-def _require_known_word(flag: str, value: str | None, known: Collection[str]) -> None:
-    if value is not None and value not in known:
-        raise InputError(f"{flag} {value}: to fix: use {', '.join(known)}")
 
 
 # The guesses of a first session, each with its reason in words.
@@ -167,8 +142,14 @@ def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
     best = decided.best.interpretation.reading
     if stated.rotation:
         return Guess("rotation", best.words, "stated with --rotation", True, "--rotation")
+    if decided.overruled:
+        reason = f"the scans contradict {decided.overruled}, as the columns are named; {score_words(decided.best)}"
+        return Guess("rotation", best.words, reason, decided.determined, "--rotation")
     if best.layout.convention is not None:
-        return Guess("rotation", best.words, "told by the file", True, "--rotation")
+        sure = best.layout.sure or (decided.determined and not decided.only_believed)
+        reason = f"only the names say so; {decided.only_believed or 'others'} would fit too"
+        reason = "told by the file" if sure else reason
+        return Guess("rotation", best.words, reason, sure, "--rotation")
     reason = score_words(decided.best)
     alike = [w.reading.words for w in decided.equivalent if w.reading.words != best.words]
     if alike:
@@ -240,66 +221,133 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
         InputError: no clouds or poses, or one that cannot be read; names the file and what to do.
     """
     found = find_folder_files(folder, stated.poses)
-    raw = _read_folder_poses(found)
-    raw = raw.renamed(stated.columns) if stated.columns else raw
-    ways_to_read = all_readings(raw, found.urdf, stated)
-    clouds = [read_cloud(file) for file in found.clouds]
-    for file, cloud in zip(found.clouds, clouds, strict=True):
-        if len(cloud.points) < _FEWEST:
-            raise InputError(f"{file}: {len(cloud.points)} points show no surface; to fix: take the scan out")
+    raw = _read_table(found, stated)
+    clouds, kept, lost = _read_clouds(found.clouds)
+    pairs = [pairing.of(kept, raw.without_pose) for pairing in pairings(found.clouds, raw.labels, raw.numbers)]
+    found = replace(found, clouds=tuple(found.clouds[i] for i in kept))
     points = [c.points for c in clouds]
     own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
-    pairs = pairings(found.clouds, raw.labels, raw.numbers)
     capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
+    ways_to_read = all_readings(raw, found.urdf, stated)
     units = candidate_units(ways_to_read, stated)
     seen, of_targets = find_folder_targets(found, points, CLOUD_UNITS[own_units[0]], stated.targets)
     motions = cache(lambda: register_scan_pairs(capture))
     shown = target_motions(seen) if seen else None
     decided = choose_convention(capture, motions, ways_to_read, pairs, units, stated.carries, shown)
     require_own_frames(folder, motions, decided)
+    if not decided.determined:
+        require_scale(found, fitted_scale(motions(), decided), stated)
+    believed = decided.best.interpretation.reading.layout
+    if not decided.determined or not (believed.sure or stated.rotation):
+        doubted = doubted_readings(raw, found.urdf, stated)
+        if doubted:
+            decided = weigh_doubts(
+                decided, choose_convention(capture, motions, doubted, pairs, units, stated.carries, shown)
+            )
     of_joints = decided.best.interpretation.reading.rotation == JOINT_ANGLES
-    settled = choose_mounting(decided, stated.mount, stated.inverse, of_joints)
+    turned = believed.turntable and stated.mount is None
+    settled = choose_mounting(decided, "eye_to_hand" if turned else stated.mount, stated.inverse, of_joints)
     axis, axis_guess = guess_optical_axis(clouds)
     told = session_guesses(found, raw, decided, points, own_units, stated)
-    guesses = (*told, settled.guess, axis_guess, *of_targets)
+    left = _left_out_guess(found, decided, lost)
+    guesses = (*told, settled.guess, axis_guess, *of_targets, *left)
     return FirstSession(found, raw, own_units[0], decided, settled, guesses, optical_axis=axis, sightings=seen)
+
+
+def _read_table(found: FolderFiles, stated: StatedFolder) -> RawPoses:
+    """Return the rows of the poses, named and completed as stated; of a recording those that belong to scans."""
+    raw = _read_folder_poses(found)
+    raw = raw.renamed(stated.columns) if stated.columns else raw
+    raw = raw.oriented(stated.orientation) if stated.orientation else raw
+    if found.urdf is not None and raw.header is not None and not stated.columns:
+        raw = with_joints_of(raw, found.urdf)
+    return rows_with_scans(raw, found.clouds, found.urdf, stated)
+
+
+def _read_clouds(files: Sequence[Path]) -> tuple[list[Cloud], list[int], list[str]]:
+    """Return the clouds that show something, their numbers among the files, and why the others do not.
+
+    Raises:
+        InputError: fewer than three do.
+    """
+    clouds, kept, lost = list[Cloud](), list[int](), list[InputError]()
+    for i, file in enumerate(steps("clouds", files)):
+        try:
+            cloud = read_cloud(file)
+            if len(cloud.points) < _FEWEST:
+                raise InputError(f"{file}: {len(cloud.points)} points show no surface; to fix: take the scan out")
+        except InputError as error:
+            lost.append(error)
+            continue
+        clouds.append(cloud)
+        kept.append(i)
+    if lost and (len(clouds) < _FEWEST or len(lost) > len(clouds)):
+        raise lost[0]
+    return clouds, kept, [str(error).split("; ")[0] for error in lost]
+
+
+def _left_out_guess(files: FolderFiles, decided: ConventionChoice, lost: Sequence[str]) -> tuple[Guess, ...]:
+    """Return what became of clouds and rows that hold nothing."""
+    pairing = decided.best.interpretation.pairing
+    unposed = [files.clouds[i].name for i, row in enumerate(pairing.rows) if row is None]
+    words = [*lost, *([f"no pose for {', '.join(unposed)}"] if unposed else [])]
+    if not words:
+        return ()
+    count = len(lost) + len(unposed)
+    return (Guess("left_out", f"{count} view{'s' * (count > 1)}", "; ".join(words), True, "views.csv"),)
+
+
+# Factors between clouds and robot that a fitted scale is taken for, within this share.
+_ROUND, _ROUND_NEAR = (1.0, 2.0, 2.5, 4.0, 5.0, 8.0), 0.02
+# Scanners and robots agree within this share; beyond, a unit is wrong.
+_SCALE = 0.05
+
+
+def require_scale(files: FolderFiles, scale: float | None, stated: StatedFolder) -> None:
+    """Refuse scans that move as the robot does, but so many times as far.
+
+    Raises:
+        InputError: names the file or the flag that states the unit, and what to write there.
+    """
+    if scale is None or abs(np.log(scale)) < _SCALE:
+        return
+    powers = [digit * 10.0**power for digit in _ROUND for power in range(-6, 7)]
+    near = min(powers, key=lambda x: abs(np.log(scale / x)))
+    factor = near if abs(scale / near - 1) < _ROUND_NEAR else float(f"{scale:.4g}")
+    first = files.clouds[0]
+    told = f"the clouds are {scale:.4g} times as large as the robot's motions"
+    if first.suffix.lower() in DEPTH_SUFFIXES:
+        camera = find_intrinsics(first)
+        per_metre = (camera.units_per_metre or 1000.0) * factor
+        raise InputError(
+            f"{camera.source}: {told}, so a count of depth is {1000 / per_metre:.4g} mm; to fix: write depth_scale = "
+            f'{per_metre:.6g} (counts per metre) there, as "depth_scale": {per_metre:.6g}'
+        )
+    if factor in (1000.0, 0.001) and stated.length_unit:
+        raise InputError(f"--unit {stated.length_unit}: {told}; to fix: leave --unit out")
+    if factor in (1000.0, 0.001):
+        unit = "mm" if factor == 0.001 else "m"
+        raise InputError(f"{files.folder}: {told}; to fix: state --cloud-unit {unit}")
+    raise InputError(
+        f"{files.folder}: {told}; to fix: multiply x, y, z of the clouds by {1 / factor:.6g}, or those of the poses by "
+        f"{factor:.6g}"
+    )
 
 
 def _read_folder_poses(files: FolderFiles) -> RawPoses:
     if not files.poses:
+        angles = angles_in_names(files.clouds)
+        if angles is not None and poses_in_scans(list(files.clouds)) is None:
+            labels = tuple((cloud.name,) for cloud in files.clouds)
+            source = f"{files.clouds[0].name} … {files.clouds[-1].name}"
+            return RawPoses(
+                source, ("turntable_deg",), np.array(angles)[:, None], labels, "angles in the names of the clouds"
+            )
         return header_poses(files.clouds)
     first = files.poses[0]
     if is_program(first):
         return program_poses(first)
     return read_raw_poses(files.poses)
-
-
-def all_readings(raw: RawPoses, urdf: Path | None, stated: StatedTable) -> list[Reading]:
-    """Every reading of a table that is not ruled out by what a person states.
-
-    Args:
-        urdf: of the robot, where the table may hold joint angles.
-
-    Raises:
-        InputError: columns that hold no pose.
-    """
-    out: list[Reading] = []
-    for layout in possible_layouts(raw):
-        if layout.rotation.shape[1]:
-            out += readings(layout, stated.rotation, stated.angle_unit)
-        else:
-            out += joint_readings(layout, urdf, stated.angle_unit)
-    if raw.header is None and raw.numbers.shape[1] >= 6 and urdf is not None and stated.rotation is None:
-        out += [r for layout in joint_layouts(raw) for r in joint_readings(layout, urdf, stated.angle_unit)]
-    return out
-
-
-def candidate_units(readings: Sequence[Reading], stated: StatedTable) -> list[str]:
-    """Units that positions can have of which the file does not say it: stated, or plausible."""
-    if stated.length_unit:
-        return [stated.length_unit]
-    open_ = [r for r in readings if r.layout.length_unit is None]
-    return list(dict.fromkeys(unit for r in open_ for unit in pose_units(r.T[:, :3, 3]))) or ["mm"]
 
 
 def capture_of(clouds: Sequence[Cloud], scale: float) -> Capture:

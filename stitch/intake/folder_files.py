@@ -12,14 +12,7 @@ from natsort import natsorted, ns
 
 from stitch.errors import InputError
 from stitch.intake.layouts import possible_layouts
-from stitch.intake.raw_poses import (
-    PROGRAMS,
-    STRUCTURED,
-    TABLES,
-    is_program,
-    read_by_its_program,
-    read_raw_poses,
-)
+from stitch.intake.raw_poses import PROGRAMS, STRUCTURED, TABLES, is_program, read_by_its_program, read_raw_poses
 from stitch.reading.clouds import CLOUD_SUFFIXES
 from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
 from stitch.reading.range_image import poses_in_scans
@@ -30,6 +23,8 @@ from stitch.reading.text_files import readable
 # Text files are clouds or tables of poses: a scan has more lines than a campaign has views.
 _EITHER = (".txt", ".csv", ".asc")
 _CLOUD_LINES = 400
+# A recording of a robot is as long as a scan; the names of its columns tell them apart.
+_RECORDED, _HEADER = re.compile(rb"tcp|pose|joint|flange|q[wxyz]\b|actual_|quat", re.IGNORECASE), 4096
 
 
 def clouds_among(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -51,6 +46,9 @@ def _is_cloud(file: Path) -> bool:
     if file.suffix.lower() not in _EITHER:
         return True
     with file.open("rb") as stream:
+        if _RECORDED.search(stream.readline(_HEADER)):
+            return False
+        stream.seek(0)
         return sum(1 for _, _ in zip(stream, range(_CLOUD_LINES), strict=False)) == _CLOUD_LINES
 
 
@@ -129,7 +127,7 @@ def find_folder_files(folder: Path, poses: Path | None = None) -> FolderFiles:
     _require_folder(folder)
     if poses is not None and not poses.exists():
         raise InputError(f"{poses}: no such file; to fix: name the file of the poses")
-    files = _list_files(folder, 0)
+    files = list_files(folder)
     named = {poses, *(poses.iterdir() if poses is not None and poses.is_dir() else ())}
     clouds, other_clouds = clouds_among([f for f in files if f not in named])
     if not clouds:
@@ -141,7 +139,7 @@ def find_folder_files(folder: Path, poses: Path | None = None) -> FolderFiles:
     rest: list[Path] = []
     if poses is not None:
         chosen, rest = _stated_pose_files(poses, taken)
-    elif candidates or poses_in_scans(clouds) is None:
+    elif candidates or (poses_in_scans(clouds) is None and angles_in_names(clouds) is None):
         chosen, rest = _choose_pose_files(folder, candidates, len(clouds))
     urdfs = [f for f in files if f.suffix.lower() == ".urdf"]
     return FolderFiles(
@@ -151,6 +149,23 @@ def find_folder_files(folder: Path, poses: Path | None = None) -> FolderFiles:
         urdf=urdfs[0] if len(urdfs) == 1 else None,
         unused=(*other_clouds, *rest),
     )
+
+
+# Angles of a turntable in names: scan_020deg, angle_45.5, 120°.
+_ANGLE = re.compile(
+    r"(?:angle|winkel|rot|turn|table|theta|deg)[a-z]*[_-]?([+-]?\d+(?:[.,]\d+)?)"
+    r"|(\d+(?:[.,p]\d+)?)[_ ]?(?:deg|grad|°)",
+    re.IGNORECASE,
+)
+
+
+def angles_in_names(clouds: Sequence[Path]) -> list[float] | None:
+    """Return the angle in each cloud's name, degrees; None where one has none, or two are alike."""
+    found = [_ANGLE.search(cloud.stem) for cloud in clouds]
+    if len(clouds) < 3 or None in found:
+        return None
+    angles = [float(re.sub("[,p]", ".", m[1] or m[2])) for m in found if m is not None]
+    return angles if len(set(angles)) == len(angles) else None
 
 
 def _require_folder(folder: Path) -> None:
@@ -173,8 +188,8 @@ def _no_clouds_message(folder: Path, files: Sequence[Path]) -> str:
     return f"{folder}: no clouds there{there}; to fix: put the scans there as {', '.join(CLOUD_SUFFIXES)}"
 
 
-def _list_files(folder: Path, depth: int) -> list[Path]:
-    """Files in a folder and below, hidden ones and folders of runs left out."""
+def list_files(folder: Path, depth: int = 0) -> list[Path]:
+    """Return files in a folder and below, hidden ones and folders of runs left out."""
     out = []
     for entry in natsorted(folder.iterdir(), alg=ns.IGNORECASE):
         if entry.name.startswith(".") or entry.name in _OWN:
@@ -182,7 +197,7 @@ def _list_files(folder: Path, depth: int) -> list[Path]:
         if entry.is_file():
             out.append(entry)
         elif entry.is_dir() and depth < _DEEPEST and not (entry / "result.json").exists():
-            out += _list_files(entry, depth + 1)
+            out += list_files(entry, depth + 1)
     return out
 
 

@@ -9,19 +9,10 @@ from stitch import frames
 from stitch.controllers import tracker_csv, universal_robots
 from stitch.controllers.program import POSE_COLUMNS, ImportedTable, csv_text, numbered_names, pose_cells
 from stitch.errors import InputError
-from stitch.intake.first_session import StatedTable
-from stitch.intake.layouts import (
-    POSE_UNITS,
-    ColumnLayout,
-    Reading,
-    angle_units,
-    covariate_columns,
-    pose_units,
-    possible_layouts,
-    readings,
-)
+from stitch.intake.layouts import POSE_UNITS, ColumnLayout, covariate_columns, pose_units, possible_layouts
 from stitch.intake.pose_tables import read_number_table
 from stitch.intake.raw_poses import PROGRAMS, STRUCTURED, RawPoses, read_raw_poses
+from stitch.intake.readings import Reading, StatedTable, angle_units, readings
 from stitch.reading.clouds import CLOUD_SUFFIXES
 from stitch.units import METRES
 

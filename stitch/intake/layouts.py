@@ -1,27 +1,24 @@
 """Which columns of a table hold the position, the rotation or the joint angles: by name, by count, by their values."""
 
 import re
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.clock_times import EPOCH_S, since_1970
 from stitch.intake.pose_tables import read_names
 from stitch.intake.raw_poses import RawPoses
-from stitch.integrity.hypotheses import ORDERS
-from stitch.measurement.robot import Robot, forward
-from stitch.reading.robot_description import robot_from_urdf
 
 # A quaternion with three digits has length 1 within this.
 _UNIT_LENGTH = 5e-3
 _ORTHONORMAL = 1e-2
+# Columns of a turntable's angle, and of joints by the words that drivers use.
+_TURNTABLE = re.compile(r"turn|table|angle|winkel|dreh|theta|azimut|rotat|plate|deg|^rot$|^phi$|^c$", re.IGNORECASE)
+_JOINT_WORDS = re.compile(r"joint|shoulder|elbow|wrist|axis_?\d", re.IGNORECASE)
+_FEWEST_JOINTS, _TURN = 5, 2 * np.pi + 1e-3
 # Larger numbers are no angles; with room for what rounding adds to a full turn.
 _DEGREES = 360.5
 
@@ -38,6 +35,8 @@ class ColumnLayout:
     length_unit: str | None = None
     angle_unit: str | None = None
     named: bool = False  # the file names its columns
+    sure: bool = True  # names that tell the convention cannot mean another
+    turntable: bool = False  # the part turns before the scanner
     rest: dict[str, Array] = field(default_factory=dict)  # other named columns (V,): times, temperatures
 
     @property
@@ -53,9 +52,10 @@ def possible_layouts(raw: RawPoses) -> list[ColumnLayout]:
         InputError: columns that hold no pose, with the flag that names them.
     """
     if raw.header is not None:
-        found = _layout_by_name(raw)
+        found = _layout_by_name(raw) or _turntable_layout(raw)
         if found is not None:
             return [found]
+        _require_rotation(raw)
     x, rest = _without_time(_without_index(raw.numbers))
     count = x.shape[1]
     tried = {6: _six_column_layouts, 7: _seven_column_layouts, 12: _twelve_column_layouts, 16: _sixteen_column_layouts}
@@ -92,8 +92,52 @@ def _layout_by_name(raw: RawPoses) -> ColumnLayout | None:
         length_unit=named.length_unit,
         angle_unit=named.angle_unit,
         named=True,
+        sure=named.sure,
         rest={name: x[:, i] for name, i in named.rest.items()},
     )
+
+
+def _turntable_layout(raw: RawPoses) -> ColumnLayout | None:
+    """Return the angles of a turntable as turns about z; None where one column of angles does not stand alone."""
+    header = raw.header or ()
+    angles = [i for i, name in enumerate(header) if _TURNTABLE.search(name) and np.ptp(raw.numbers[:, i]) > 0]
+    if len(angles) != 1 or read_names(header).position:
+        return None
+    values = raw.numbers[:, angles[0]]
+    in_radians = "rad" in header[angles[0]].lower() or ("deg" not in header[angles[0]] and np.ptp(values) <= _TURN)
+    half = (values if in_radians else np.radians(values)) / 2
+    none = np.zeros(len(values))
+    return ColumnLayout(
+        position=np.zeros((len(values), 3)),
+        rotation=np.column_stack([none, none, np.sin(half), np.cos(half)]),
+        joints=None,
+        words=f"{header[angles[0]]} is the angle of a turntable",
+        convention="quaternion-xyzw",
+        length_unit="mm",
+        named=True,
+        turntable=True,
+        rest={name: raw.numbers[:, i] for i, name in enumerate(header) if i != angles[0]},
+    )
+
+
+def _require_rotation(raw: RawPoses) -> None:
+    """Refuse columns that hold half a pose, or joint angles of no known order.
+
+    Raises:
+        InputError: with the flag that completes them, or what else is needed.
+    """
+    header = raw.header or ()
+    if read_names(header).position and not read_names(header).rotation:
+        raise InputError(
+            f"{raw.source}: x, y, z stand there without a rotation; to fix: state the one that all poses have, as with "
+            "--orientation 180,0,0 --rotation xyz-extrinsic, or name the columns of the rotation with --columns"
+        )
+    joints = [name for name in header if _JOINT_WORDS.search(name)]
+    if len(joints) >= _FEWEST_JOINTS:
+        raise InputError(
+            f"{raw.source}: {', '.join(joints)} are joint angles, of which the robot's URDF tells the order; to fix: "
+            "put the URDF beside the table, or name them with --columns j1,j2,j3,j4,j5,j6 as they stand"
+        )
 
 
 def _without_index(x: Array) -> Array:
@@ -151,6 +195,14 @@ def _is_rotation(rows: Array) -> bool:
     return bool(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < _ORTHONORMAL and (np.linalg.det(R) > 0).all())
 
 
+def joint_layouts(raw: RawPoses) -> list[ColumnLayout]:
+    """The meaning of columns without names as joint angles."""
+    nothing = np.zeros((len(raw.numbers), 0))
+    if raw.numbers.shape[1] not in (6, 7):
+        return []
+    return [ColumnLayout(nothing, nothing, raw.numbers, "columns are joint angles")]
+
+
 # Columns beside the poses, times and temperatures, as views.csv names them.
 
 _TIMES = re.compile(r"(?:time|timestamp|stamp|zeit|t|sec|seconds)(?:_(s|ms|us|µs|ns|min|h))?")
@@ -168,7 +220,7 @@ def covariate_columns(layout: ColumnLayout, rows: Sequence[int], time_s: Array |
     out: dict[str, list[str]] = {}
     timed = {} if time_s is None else {"time_s": time_s}
     for name, values in (timed | layout.rest).items():
-        plain = re.sub(r"[^\w]+", "_", name.strip().lower()).strip("_")
+        plain = _plain_name(name)
         picked = np.asarray(values)[list(rows)]
         if timing := _TIMES.fullmatch(plain):
             if (np.diff(picked) >= 0).all():
@@ -176,6 +228,19 @@ def covariate_columns(layout: ColumnLayout, rows: Sequence[int], time_s: Array |
         elif plain and not _is_row_count(values) and not _OWN.fullmatch(plain):
             out[plain] = [f"{x:.9g}" for x in picked]
     return out
+
+
+def recorded_times(layout: ColumnLayout) -> Array | None:
+    """Return the column of times (V,) in s since its first row; None where there is none that never falls."""
+    for name, values in layout.rest.items():
+        timing = _TIMES.fullmatch(_plain_name(name))
+        if timing and (np.diff(values) >= 0).all():
+            return np.asarray((values - values[0]) * _seconds_per_unit(values, timing[1]))
+    return None
+
+
+def _plain_name(name: str) -> str:
+    return re.sub(r"[^\w]+", "_", name.strip().lower()).strip("_")
 
 
 def _seconds_per_unit(times: Array, unit: str | None) -> float:
@@ -188,185 +253,6 @@ def _seconds_per_unit(times: Array, unit: str | None) -> float:
 def _is_row_count(values: Array) -> bool:
     """True of the numbers 0 or 1 to the last, in any order."""
     return len(values) > 2 and bool((np.diff(np.sort(values)) == 1).all()) and values.min() in (0, 1)
-
-
-# Between which links of a URDF the arm lies: the root, and what people call the flange.
-
-# tool0 and flange are those of ROS-Industrial.
-_FLANGES = ("tool0", "flange", "ee_link", "tcp")
-_GRAVITY = np.array([0.0, 0.0, -9.81])
-
-
-def arm_from_urdf(urdf: Path, joints: int) -> tuple[Robot, str, str]:
-    """The arm of so many joints, mm, with the links that it lies between.
-
-    Raises:
-        InputError: unreadable, or no chain of so many joints.
-    """
-    reasons = [f"{urdf}: not a readable URDF; to fix: export it as plain URDF"]
-    for base, flange in arm_link_pairs(urdf):
-        try:
-            robot = robot_from_urdf(urdf, base, flange, "mm", _GRAVITY)
-        except InputError as error:
-            reasons.append(str(error))
-            continue
-        if robot.n_joints == joints:
-            return robot, base, flange
-        reasons.append(f"{urdf}: has {robot.n_joints} joints, the table {joints}; to fix: name the columns (--columns)")
-    raise InputError(reasons[-1])
-
-
-def arm_link_pairs(urdf: Path) -> list[tuple[str, str]]:
-    """Root and flange by name, else root and the child of each turning joint, the last first."""
-    try:
-        root = ElementTree.parse(urdf).getroot()
-    except (OSError, ValueError, LookupError, ElementTree.ParseError):
-        return []
-    links = [str(link.get("name")) for link in root.findall("link")]
-    ends = [(j.get("type"), getattr(j.find("child"), "attrib", {}).get("link")) for j in root.findall("joint")]
-    children = {child for _, child in ends}
-    base = next((name for name in links if name not in children), None)
-    turned = [str(child) for kind, child in ends if kind in ("revolute", "continuous")]
-    flanges = [name for name in _FLANGES if name in links] + turned[::-1]
-    return [] if base is None else [(base, flange) for flange in flanges]
-
-
-# Every way to read the rotations of a table, each with the words that name it.
-#
-# Orders of Euler angles: twelve, about axes that turn along (intrinsic) or that stand still (extrinsic); Diebel (2006),
-# "Representing Attitude". `zyx-intrinsic` turns by the first number about z, by the second about the new y.
-
-# The usual ones first: roll, pitch, yaw (FANUC, ROS, Yaskawa); A, B, C (KUKA); the others as they come.
-_USUAL = ("xyz-extrinsic", "zyx-intrinsic", "xyz-intrinsic", "rotation-vector", "zyz-intrinsic")
-_BY_AXIS = ("XZY", "YXZ", "YZX", "ZXY")
-# Larger numbers are degrees; a rotation vector and Euler angles in radians stay below.
-_RADIANS = 2 * np.pi + 1e-3
-
-
-@dataclass(frozen=True)
-class Reading:
-    """The poses of a table read in one way."""
-
-    T: Array  # (V, 4, 4) lengths as the file has them
-    rotation: str  # as --rotation names it
-    angle_unit: str | None  # "deg" or "rad" where there are angles
-    layout: ColumnLayout
-    rank: int  # of the usual, 0 first
-
-    @property
-    def words(self) -> str:
-        """As a person says it."""
-        return self.rotation + (f", {'degrees' if self.angle_unit == 'deg' else 'radians'}" if self.angle_unit else "")
-
-
-def rotation_conventions() -> list[str]:
-    """Every word that --rotation knows."""
-    angles = [*_euler_words(), *(f"{o.lower()}-by-axis" for o in _BY_AXIS), "rotation-vector"]
-    return [*angles, "quaternion-xyzw", "quaternion-wxyz", "matrix", "matrix-transposed"]
-
-
-def _euler_words() -> list[str]:
-    return [f"{order.lower()}-{how}" for order in ORDERS for how in ("intrinsic", "extrinsic")]
-
-
-def readings(layout: ColumnLayout, rotation: str | None = None, angle_unit: str | None = None) -> list[Reading]:
-    """All readings of a layout that has a pose, the usual first; one where file or flags tell it.
-
-    Args:
-        rotation: one of `conventions()`, where a person says it.
-        angle_unit: "deg" or "rad", likewise.
-
-    Raises:
-        InputError: a convention that these columns cannot have.
-    """
-    stated = rotation or layout.convention
-    kinds = {3: _angle_readings, 4: _quaternion_readings, 9: _matrix_readings}
-    numbers = layout.rotation.shape[1]
-    found = list(kinds[numbers](layout, angle_unit or layout.angle_unit))
-    if stated is not None:
-        known = ", ".join(dict.fromkeys(r.rotation for r in found))
-        found = [r for r in found if r.rotation == stated]
-        if not found:
-            raise InputError(f"--rotation {stated}: the rotation has {numbers} numbers; to fix: use one of {known}")
-    return sorted(found, key=lambda r: r.rank)
-
-
-def angle_units(values: Array, stated: str | None) -> list[str]:
-    """Units that angles (V, k) can have: degrees where they exceed a turn in radians, else both, radians first."""
-    if stated is not None:
-        return [stated]
-    return ["deg"] if np.abs(values).max(initial=0.0) > _RADIANS else ["rad", "deg"]
-
-
-def _angle_readings(layout: ColumnLayout, stated: str | None) -> Iterator[Reading]:
-    for place, unit in enumerate(angle_units(layout.rotation, stated)):
-        angles = np.radians(layout.rotation) if unit == "deg" else layout.rotation
-        for word, R in _rotations(angles):
-            rank = _USUAL.index(word) if word in _USUAL else len(_USUAL)
-            yield _rotation_reading(layout, R, word, unit, rank + 100 * place)
-
-
-def _rotations(angles: Array) -> Iterator[tuple[str, Rotation]]:
-    for word in _euler_words():
-        order, how = word.split("-")
-        yield word, Rotation.from_euler(order.upper() if how == "intrinsic" else order, angles)
-    for order in _BY_AXIS:
-        # Columns name the axes x, y, z; the turns come in another order than the columns stand.
-        columns = ["XYZ".index(axis) for axis in order]
-        yield f"{order.lower()}-by-axis", Rotation.from_euler(order, angles[:, columns])
-    yield "rotation-vector", Rotation.from_rotvec(angles)
-
-
-def _quaternion_readings(layout: ColumnLayout, _: str | None) -> Iterator[Reading]:
-    q = layout.rotation / np.linalg.norm(layout.rotation, axis=1, keepdims=True)
-    yield _rotation_reading(layout, Rotation.from_quat(q), "quaternion-xyzw", None, 0)
-    if layout.convention == "quaternion-wxyz" or layout.convention is None:
-        yield _rotation_reading(layout, Rotation.from_quat(q[:, [1, 2, 3, 0]]), "quaternion-wxyz", None, 1)
-
-
-def _matrix_readings(layout: ColumnLayout, _: str | None) -> Iterator[Reading]:
-    R = layout.rotation.reshape(-1, 3, 3)
-    yield _rotation_reading(layout, Rotation.from_matrix(R), "matrix", None, 0)
-    if layout.convention is None:
-        yield _rotation_reading(layout, Rotation.from_matrix(R.transpose(0, 2, 1)), "matrix-transposed", None, 1)
-
-
-def _rotation_reading(layout: ColumnLayout, R: Rotation, word: str, unit: str | None, rank: int) -> Reading:
-    return Reading(frames.make(R.as_matrix(), layout.position), word, unit, layout, rank)
-
-
-# Joint angles as poses, where a URDF lies beside them.
-
-JOINT_ANGLES = "joint angles"
-
-
-def joint_readings(layout: ColumnLayout, urdf: Path | None, angle_unit: str | None) -> list[Reading]:
-    """Poses of joint angles, mm, in every unit that the angles can have.
-
-    Raises:
-        InputError: no URDF beside them, or one of another number of joints.
-    """
-    joints = layout.joints
-    assert joints is not None
-    if urdf is None:
-        raise InputError(
-            "joint angles need the robot: put its URDF into the folder, or give poses; with DH rows write session.toml "
-            "by hand"
-        )
-    robot, _, _ = arm_from_urdf(urdf, joints.shape[1])
-    out = []
-    for place, unit in enumerate(angle_units(joints, angle_unit or layout.angle_unit)):
-        T: Array = forward(robot, np.radians(joints) if unit == "deg" else joints)
-        out.append(Reading(T, JOINT_ANGLES, unit, replace(layout, length_unit="mm"), 100 * place))
-    return out
-
-
-def joint_layouts(raw: RawPoses) -> list[ColumnLayout]:
-    """The meaning of columns without names as joint angles."""
-    nothing = np.zeros((len(raw.numbers), 0))
-    if raw.numbers.shape[1] not in (6, 7):
-        return []
-    return [ColumnLayout(nothing, nothing, raw.numbers, "columns are joint angles")]
 
 
 # Which units lengths can have, by what robots reach and scanners see.

@@ -117,6 +117,7 @@ _ANGLES = {"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": 
 # In German degrees, elsewhere a four-hundredth of a turn: the unit of an angle, whichever.
 _ANGULAR = {*_ANGLES, "grad"}
 _UNIT = re.compile(r"[\[(]\s*([^\])]*)\s*[\])]|[_\s](mm|cm|deg|rad|inch|°|grad|(?<=\s)m)$")
+_COUNTED = re.compile(r".*tcp_?pose[_\[. ]*([0-6])\]?")
 _JOINT = re.compile(r"(?:j|joint|axis|theta|jt)_?([1-9])")
 
 # Triples of angles and quadruples of quaternions by name; a rotation stated by its names alone, or None.
@@ -141,6 +142,8 @@ _NAMED = {
     ("rot0", "rot1", "rot2"): None,
     ("rot0", "rot1", "rot2", "rot3"): None,
 }
+# Names under which nobody writes anything else; q0 … q3 have been x, y, z, w, and roll, pitch, yaw KUKA's A, B, C.
+_SURE = [{"qx", "qy", "qz", "qw"}, {"rvx", "rvy", "rvz"}, {"azyx", "bzyx", "czyx"}, {"ozyz", "azyz", "tzyz"}]
 
 
 @dataclass(frozen=True)
@@ -151,6 +154,7 @@ class NamedColumns:
     rotation: tuple[int, ...] = ()
     joints: tuple[int, ...] = ()
     convention: str | None = None  # of the rotation, where the names alone tell it
+    sure: bool = True  # nobody writes another convention under these names
     length_unit: str | None = None  # of the position
     angle_unit: str | None = None  # of rotation or joints
     rest: dict[str, int] = field(default_factory=dict)  # other named columns: times, temperatures
@@ -163,6 +167,14 @@ def read_names(header: Sequence[str]) -> NamedColumns:
     for i, name in enumerate(plain):
         where.setdefault(name, i)
     joints = _joint_columns(header)
+    counted = _counted_pose(header)
+    if counted:
+        plain = tuple(
+            ["rvx", "rvy", "rvz"][counted.index(i) - 3] if i in counted[3:] else n for i, n in enumerate(plain)
+        )
+        plain = tuple("xyz"[counted.index(i)] if i in counted[:3] else n for i, n in enumerate(plain))
+        units = tuple("m" if i in counted[:3] else unit for i, unit in enumerate(units))
+        where = {name: plain.index(name) for name in plain}
     position = tuple(where[a] for a in "xyz") if all(a in where for a in "xyz") else ()
     rotation, convention = _rotation_columns(where, set(position) | set(joints))
     matrix = _matrix_columns(header) if not rotation else ()
@@ -174,6 +186,7 @@ def read_names(header: Sequence[str]) -> NamedColumns:
         rotation=rotation,
         joints=joints,
         convention=convention,
+        sure=convention is None or {plain[i] for i in rotation} in _SURE,
         length_unit=next((_LENGTHS[units[i]] for i in position if units[i] in _LENGTHS), None),
         angle_unit=next((_ANGLES[units[i]] for i in (*rotation, *joints) if units[i] in _ANGLES), None),
         rest={header[i]: i for i in range(len(header)) if i not in used and header[i] not in ("", "-")},
@@ -205,6 +218,17 @@ def _bare_name(name: str) -> tuple[str, str]:
     # An axis with the unit of an angle is a turn, in whatever language it is named: "Drehung um Z [°]".
     turned = turned if last in ("w", "0", "1", "2", "3") else last in ("x", "y", "z") and (turned or unit in _ANGULAR)
     return (f"rot{last}" if turned else last), unit
+
+
+def _counted_pose(header: Sequence[str]) -> tuple[int, ...]:
+    """Return the columns actual_TCP_pose_0 … 5 in their order, as RTDE of Universal Robots records them; else none."""
+    for kind in ("actual", "target", ""):
+        found = [
+            (int(m[1]), i) for i, n in enumerate(header) if (m := _COUNTED.fullmatch(n.lower())) and kind in n.lower()
+        ]
+        if len(found) == 6 and len({number for number, _ in found}) == 6:
+            return tuple(i for _, i in sorted(found))
+    return ()
 
 
 def _rotation_columns(where: dict[str, int], taken: set[int]) -> tuple[tuple[int, ...], str | None]:
@@ -284,7 +308,7 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     header, rows = _split_header(file, rows, comments[-1][1] if comments else "", separator)
     header, rows = _split_labels(header, rows)
     text, numeric = _text_and_number_columns(rows)
-    if len(numeric) < 3:
+    if len(numeric) < (1 if header else _SEVERAL):
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
     numbers = np.array([[_cell_number(file, i, row[c]) for c in numeric] for i, row in rows])
     _require_one_decimal_mark(file, rows, numeric)

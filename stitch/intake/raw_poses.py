@@ -177,6 +177,23 @@ class RawPoses:
             )
         return replace(self, header=tuple(names), words=f"{self.words}; columns as named")
 
+    def oriented(self, orientation: Sequence[float]) -> "RawPoses":
+        """Return the same with the one rotation that all poses have behind x, y and z.
+
+        Raises:
+            InputError: other than three or four numbers, or a table that has more than x, y, z.
+        """
+        where = [i for i, name in enumerate(self.header or "xyz") if name.lower().split(" ")[0].rstrip("_m[(") in "xyz"]
+        if len(orientation) not in (3, 4) or len(where) != 3:
+            raise InputError(
+                f"--orientation: {len(orientation)} numbers for {self.source}; to fix: state three angles, or a "
+                "quaternion x,y,z,w, for a table of x, y, z alone"
+            )
+        names = ("rot0", "rot1", "rot2") if len(orientation) == 3 else ("qx", "qy", "qz", "qw")
+        header = (*(self.header or "xyz"), *names)
+        constant = np.tile(np.array(orientation, float), (len(self.numbers), 1))
+        return replace(self, header=header, numbers=np.hstack([self.numbers, constant]))
+
 
 def read_raw_poses(files: Sequence[Path]) -> RawPoses:
     """Read the rows of one file, or of several that hold one pose each.

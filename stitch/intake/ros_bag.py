@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import tomli_w
@@ -15,9 +14,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from stitch import frames
 from stitch.errors import InputError
-from stitch.frames import Array, Indices, Mask
+from stitch.frames import Array
 from stitch.intake.folder_files import Guess
-from stitch.intake.layouts import arm_link_pairs
+from stitch.intake.readings import arm_link_pairs, chain_joints
+from stitch.intake.stops import AROUND, middle_of_stops, stationary_scans
 from stitch.measurement.robot import forward
 from stitch.reading.robot_description import robot_from_urdf
 from stitch.reading.session_folder import SESSION_FORMAT
@@ -299,7 +299,6 @@ def _frame_name(frame: str) -> str:
 
 # Joint angles of a bag in the order of the arm, by the URDF that it recorded.
 
-_TURNING = ("revolute", "continuous")
 _MAX_JOINT_AGE = 0.5
 _GRAVITY = np.array([0.0, 0.0, -9.81])
 
@@ -358,29 +357,6 @@ def _temporary_urdf(urdf: str) -> Iterator[Path]:
         file = Path(folder) / "robot.urdf"
         file.write_text(urdf, encoding="utf-8")
         yield file
-
-
-def chain_joints(urdf: str, base: str, flange: str) -> list[str]:
-    """Names of the turning joints from base to flange; empty where there is no such chain."""
-    try:
-        root = ElementTree.fromstring(urdf)
-    except ElementTree.ParseError:
-        return []
-    above = {}
-    for joint in root.findall("joint"):
-        child, parent = joint.find("child"), joint.find("parent")
-        if child is not None and parent is not None:
-            above[child.get("link")] = (joint.get("name") or "", joint.get("type"), parent.get("link"))
-    names: list[str] = []
-    link: str | None = flange
-    for _ in range(len(above) + 1):
-        if link == base:
-            return names[::-1]
-        if link not in above:
-            return []
-        name, kind, link = above[link]
-        names += [name] if kind in _TURNING else []
-    return []
 
 
 def interpolated_joints(contents: BagContents, names: list[str], times: Array) -> Array | None:
@@ -459,50 +435,6 @@ def depth_array(message: Any, camera: Any) -> Array:
 def _camera_matrix(camera: Any) -> Any:
     """K, in ROS 1 and 2."""
     return camera.k if hasattr(camera, "k") else camera.K
-
-
-# Which scans of a bag were taken while the arm stood still: one of each stop.
-
-# The arm stands if it turns (rad) and shifts (m) by less from this long (s) before to this long after.
-AROUND = 0.2
-_STILL_TURN, _STILL_SHIFT = 1e-3, 5e-4
-# Two scans are of one stop if the flange has turned and shifted by less between them.
-_SAME_TURN, _SAME_SHIFT = 2e-3, 1e-3
-
-
-def stationary_scans(before: Array, at: Array, after: Array) -> Mask:
-    """(M,) bool of flange poses (M, 4, 4); a pose that was not recorded is NaN and says nothing."""
-    still = _is_recorded(at)
-    for other in (before, after):
-        both = np.flatnonzero(_is_recorded(other) & still)
-        still[both] = _is_near(at[both], other[both], _STILL_TURN, _STILL_SHIFT)
-    return still
-
-
-def _is_recorded(T: Array) -> Mask:
-    return np.asarray(np.isfinite(T).all(axis=(1, 2)), bool)
-
-
-def middle_of_stops(T: Array, still: Mask) -> Indices:
-    """Numbers of scans, in the order of time: the middle one of each stop.
-
-    Args:
-        T: (M, 4, 4) flange poses in the order of time.
-    """
-    groups: list[list[int]] = []
-    for i in np.flatnonzero(still):
-        last = groups[-1] if groups else None
-        goes_on = last is not None and last[-1] == i - 1
-        if last is not None and goes_on and _is_near(T[last[0]][None], T[i][None], _SAME_TURN, _SAME_SHIFT)[0]:
-            last.append(int(i))
-        else:
-            groups.append([int(i)])
-    return np.array([group[len(group) // 2] for group in groups], np.int64)
-
-
-def _is_near(a: Array, b: Array, turn: float, shift: float) -> Mask:
-    step = frames.log(frames.inverse(a) @ b)
-    return np.asarray((np.linalg.norm(step[:, :3], axis=1) < turn) & (np.linalg.norm(step[:, 3:], axis=1) < shift))
 
 
 _FEWEST = 3

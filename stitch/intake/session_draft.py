@@ -4,6 +4,8 @@ import csv
 import io
 import os
 import re
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,8 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.first_session import FirstSession
 from stitch.intake.folder_files import Guess
-from stitch.intake.layouts import JOINT_ANGLES, MM, POSE_UNITS, arm_from_urdf, covariate_columns
+from stitch.intake.layouts import MM, POSE_UNITS, covariate_columns
+from stitch.intake.readings import JOINT_ANGLES, arm_from_urdf
 from stitch.intake.scan_targets import points_columns
 from stitch.reading.session_folder import SESSION_FORMAT
 from stitch.system.files import whole_file
@@ -39,11 +42,12 @@ def require_free(folder: Path, targets: bool = False) -> None:
             )
 
 
-def write_draft(folder: Path, first: FirstSession, force: bool = False) -> None:
+def write_draft(folder: Path, first: FirstSession, *, force: bool = False, unpacked: bool = False) -> None:
     """Write both files into a folder, which is made where it does not exist.
 
     Args:
         force: replace those that are there.
+        unpacked: the clouds lie in a passing folder, and move into the session's.
 
     Raises:
         InputError: there is a session already.
@@ -51,6 +55,10 @@ def write_draft(folder: Path, first: FirstSession, force: bool = False) -> None:
     if not force:
         require_free(folder, bool(first.sightings))
     folder.mkdir(parents=True, exist_ok=True)
+    if unpacked:
+        (folder / "clouds").mkdir(exist_ok=True)
+        moved = [Path(shutil.copy(cloud, folder / "clouds")) for cloud in first.files.clouds]
+        first = replace(first, files=replace(first.files, clouds=tuple(moved), folder=folder))
     with whole_file(folder / "views.csv") as table, whole_file(folder / "session.toml") as toml:
         table.write_text(views_text(folder, first), encoding="utf-8")
         toml.write_text(toml_text(folder, first), encoding="utf-8")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stitch.errors import InputError
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.measurement.session import Cloud
 from stitch.reading.csv_files import is_number
 from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image, read_depth_columns
@@ -90,15 +90,25 @@ def read_ptx(path: Path) -> dict[str, Array]:
 
     The file has columns, rows, ten lines of frames, then x y z intensity; 0 0 0 where nothing was measured.
     """
-    lines = path.read_text(encoding="ascii", errors="replace").splitlines()
-    count = int(lines[0]) * int(lines[1])
-    rows = lines[_PTX_HEADER : _PTX_HEADER + count]
+    scans = ptx_scans(path)
+    if len(scans) != 1:
+        raise InputError(_several_scans_message(path, f"{len(scans)} scans"))
+    rows = scans[0][_PTX_HEADER:]
+    count = int(scans[0][0]) * int(scans[0][1])
     if len(rows) < count:
         raise InputError(f"{path}: {count} points announced, data for {len(rows)}; export it again")
-    if any(line.strip() for line in lines[_PTX_HEADER + count :]):
-        raise InputError(_several_scans_message(path, "several scans"))
-    table = np.loadtxt(rows, ndmin=2)
-    return dict(zip([*"xyz", "intensity"], table.T, strict=False))
+    return dict(zip([*"xyz", "intensity"], np.loadtxt(rows, ndmin=2).T, strict=False))
+
+
+def ptx_scans(path: Path) -> list[list[str]]:
+    """Return the lines of each scan of a PTX file; columns and rows in the first two tell how many."""
+    lines = [line for line in path.read_text(encoding="ascii", errors="replace").splitlines() if line.strip()]
+    scans = []
+    while lines:
+        end = _PTX_HEADER + int(lines[0]) * int(lines[1])
+        scans.append(lines[:end])
+        lines = lines[end:]
+    return scans
 
 
 def read_las(path: Path) -> dict[str, Array]:
@@ -262,7 +272,7 @@ def read_zdf_image(path: Path) -> tuple[Array, Array | None]:
 
 
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
-_TEXT_SUFFIXES = (".xyz", ".csv", ".txt", ".asc")
+_TEXT_SUFFIXES = (".xyz", ".csv", ".txt", ".asc", ".pts")
 # Kinds that are read, by the ending of the file's name.
 CLOUD_SUFFIXES = (
     ".ply",
@@ -331,6 +341,7 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
     missing = [axis for axis in "xyz" if axis not in columns]
     if missing:
         raise InputError(f"{where}: no column {', '.join(missing)}; a cloud needs x, y, z")
+    columns = _without_codes(columns)
     points = np.column_stack([columns.pop(axis) for axis in "xyz"]).astype(np.float64, copy=False)
     if not len(points):
         raise InputError(f"{where}: no points; leave this view out of views.csv or scan it again")
@@ -354,6 +365,38 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
     return Cloud(points if scale == 1.0 else points * scale, normals, scalars)
 
 
+# Points that a code for "nothing measured" is looked for among, the share of them that one has, and how far from the
+# others it lies, in their own extents.
+_CODE_SAMPLE, _CODE_SHARE, _CODE_AWAY = 4000, 0.005, 2.0
+
+
+def _without_codes(columns: dict[str, Array]) -> dict[str, Array]:
+    """Return the columns without points that are a code, as -99999 three times or z = -32.768.
+
+    A code is one value of a coordinate in a share of the points, to the last digit, far outside of what the rest spans.
+    """
+    sample = slice(None, None, -(-len(columns["x"]) // _CODE_SAMPLE) or 1)
+    away: Mask | None = None
+    for axis in "zxy":
+        values = np.asarray(columns[axis])[sample]
+        found, counts = np.unique(values, return_counts=True)
+        often = found[(counts >= max(_CODE_SHARE * len(values), 2)) & np.isfinite(found)]
+        rest = values[~np.isin(values, often) & np.isfinite(values)]
+        if not len(often) or len(rest) < len(values) / 2:
+            continue
+        low, high = np.percentile(rest, (1, 99))
+        span = max(high - low, 1e-9 * max(abs(low), abs(high)))
+        codes = often[(often < low - _CODE_AWAY * span) | (often > high + _CODE_AWAY * span)]
+        if len(codes):
+            coded = np.isin(columns[axis], codes)
+            away = coded if away is None else away | coded
+    if away is None:
+        return columns
+    for name in list(columns):
+        columns[name] = columns[name][~away] if len(columns[name]) == len(away) else columns[name]
+    return columns
+
+
 def read_ply(path: Path) -> dict[str, Array]:
     """Columns (N,) of the vertices of a PLY by name, as stored."""
     from plyfile import PlyData
@@ -362,9 +405,20 @@ def read_ply(path: Path) -> dict[str, Array]:
     with path.open("rb") as stream:
         if stream.read(3) != b"ply":
             raise InputError(f"{path}: is not a PLY file; export it again, or name it by its kind")
-    data: NDArray[np.void] = PlyData.read(path)["vertex"].data
+    data: NDArray[np.void] = PlyData.read(_without_blank_lines(path))["vertex"].data
     # List properties have no column of numbers.
     return {name: data[name] for name in data.dtype.names or () if not data.dtype[name].hasobject}
+
+
+def _without_blank_lines(path: Path) -> Path | io.BytesIO:
+    """Return the file, or its bytes without the blank lines that some programs leave in the header."""
+    with path.open("rb") as stream:
+        header, end, _ = stream.read(_HEADER_BYTES).partition(b"end_header")
+        lines = header.splitlines(keepends=True)
+        if not end or all(line.strip() for line in lines):
+            return path
+        stream.seek(len(header))
+        return io.BytesIO(b"".join(line for line in lines if line.strip()) + stream.read())
 
 
 def require_room(path: Path) -> None:
@@ -390,6 +444,9 @@ def _read_text(path: Path) -> dict[str, Array]:
     """
     told = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
     lines = [line for line in told if not _is_comment(line)]
+    # Leica's .pts and others write the number of points above them.
+    if len(lines) > 1 and lines[0].strip().isdigit() and int(lines[0]) == len(lines) - 1:
+        lines = lines[1:]
     if not lines:
         return {axis: np.empty(0) for axis in "xyz"}
     separator = next((s for s in ",;" if s in lines[0]), None)

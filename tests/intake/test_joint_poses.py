@@ -7,8 +7,9 @@ import pytest
 
 from data_synth.write import write_session
 from stitch.errors import InputError
-from stitch.intake.first_session import StatedFolder, StatedTable, all_readings, first_session
+from stitch.intake.first_session import StatedFolder, first_session
 from stitch.intake.raw_poses import read_raw_poses
+from stitch.intake.readings import StatedTable, all_readings
 from stitch.intake.session_draft import write_draft
 from stitch.reading.session_folder import load_session
 from stitch.writing.urdf_file import to_urdf

@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from stitch.errors import InputError
 from stitch.intake.folder_files import find_folder_files
-from stitch.intake.layouts import possible_layouts, readings
+from stitch.intake.layouts import possible_layouts
 from stitch.intake.raw_poses import read_raw_poses
+from stitch.intake.readings import readings
 
 POSE_OF_ROS = """  position:
     x: 0.5

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stitch.intake.layouts import possible_layouts, readings
+from stitch.intake.layouts import possible_layouts
 from stitch.intake.pose_formats import read_pose_text
 from stitch.intake.raw_poses import read_raw_poses
+from stitch.intake.readings import readings
 
 R = Rotation.from_rotvec([[0.3, -0.8, 1.9], [-1.2, 0.4, 0.7], [2.0, 0.1, -0.5]])
 P = np.array([[837.754, 184.587, 675.455], [703.404, -305.129, 659.081], [-58.119, 271.242, 1662.384]])  # mm

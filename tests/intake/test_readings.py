@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from stitch.errors import InputError
-from stitch.intake.layouts import ColumnLayout, readings, rotation_conventions
+from stitch.intake.layouts import ColumnLayout
+from stitch.intake.readings import readings, rotation_conventions
 
 
 def turn(axis, angle):
