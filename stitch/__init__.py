@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 # Type checkers do not read the table; `as` exports a name to them. A test compares the two.
 if TYPE_CHECKING:
+    from stitch.api.live import LiveSession as LiveSession
+    from stitch.api.live import live as live
     from stitch.api.run import Run as Run
     from stitch.api.session import Session as Session
     from stitch.api.session import load_session as load_session
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 MODULES = {
     "Diagnosis": "stitch.diagnosis.diagnosis",
     "InputError": "stitch.errors",
+    "LiveSession": "stitch.api.live",
     "Model": "stitch.model.model",
     "NoResultError": "stitch.errors",
     "Run": "stitch.api.run",
@@ -50,6 +53,7 @@ MODULES = {
     "drop": "stitch.api.verbs",
     "explain": "stitch.api.verbs",
     "export_run": "stitch.api.verbs",
+    "live": "stitch.api.live",
     "load_run": "stitch.api.verbs",
     "load_session": "stitch.api.session",
     "plan": "stitch.api.verbs",

@@ -121,23 +121,52 @@ class Session(measured.Session):
             T, q = _arm(known, names, poses, joints)
             rows = _rows(known, names, scans, points)
             views = _described(rows, T, q, times, covariates or {})
-            session = cls(
-                path=toml.parent,
-                name=name,
-                length_unit=unit,
-                mount=cast(Mount, mount),
-                scanner=known.scanner,
-                robot=known.robot,
-                sphere_radius=None,
-                cad=None,
-                cad_unit=None,
-                views=views,
-                repeatability=known.repeatability,
-            )
+            session = cls._of_cell(toml.parent, name, mount, known, views)
             check_scale(session, known.cloud_unit)
             if check:
-                _check_convention(session)
+                check_convention(session)
         return session
+
+    @classmethod
+    def empty(
+        cls,
+        *,
+        mount: str,
+        robot: Robot | Mapping[str, Any] | Path | str | None = None,
+        scanner: Scanner | Mapping[str, Any] | None = None,
+        unit: str = "mm",
+        cloud_unit: str | None = None,
+        name: str = "session",
+    ) -> "Session":
+        """Return a session without views, with what is stated of the cell; arguments as of `from_arrays`.
+
+        Raises:
+            InputError: as of `from_arrays`.
+
+        Example:
+            >>> stitch.Session.empty(mount="eye_in_hand", name="bracket").views
+            ()
+        """
+        toml = Path(f"<{require_folder_name('name', name, 'name')}>") / "session.toml"
+        with _in_arguments(toml.parent.name):
+            known = _stated(toml, unit=unit, cloud_unit=cloud_unit, mount=mount, robot=robot, scanner=scanner)
+        return cls._of_cell(toml.parent, name, mount, known, ())
+
+    @classmethod
+    def _of_cell(cls, path: Path, name: str, mount: str, known: "_Stated", views: tuple[View, ...]) -> "Session":
+        return cls(
+            path=path,
+            name=name,
+            length_unit=known.unit,
+            mount=cast(Mount, mount),
+            scanner=known.scanner,
+            robot=known.robot,
+            sphere_radius=None,
+            cad=None,
+            cad_unit=None,
+            views=views,
+            repeatability=known.repeatability,
+        )
 
     @property
     def in_memory(self) -> bool:
@@ -329,7 +358,7 @@ def _described(
     )
 
 
-def _check_convention(session: Session) -> None:
+def check_convention(session: Session) -> None:
     """Refuse poses that the scans contradict, tried in both directions and in other orders as `stitch init` does.
 
     Raises:

@@ -51,6 +51,10 @@ _Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Wr
 _Mesh = Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")]
 
 
+_Follow = Annotated[bool, typer.Option("--follow", help="Judge each view as it arrives in the folder, then run.")]
+_Views = Annotated[int | None, typer.Option("--views", min=1, help="With --follow: run after so many views.")]
+
+
 def run(
     sessions: _Sessions = None,
     output: _Output = None,
@@ -64,6 +68,8 @@ def run(
     register: _Register = None,
     recording: _Recording = True,
     mesh: _Mesh = False,
+    follow: _Follow = False,
+    views: _Views = None,
     tolerance: Tolerance = None,
     memory: Memory = None,
     as_json: Json = False,
@@ -79,6 +85,7 @@ def run(
       stitch run blade-18 --hand-eye found --mesh
       stitch run other-scanner --arm found
       stitch run fuselage --memory 4GB
+      stitch run blade-19 --follow
     """
     from stitch.effects.contract import find_effect
     from stitch.effects.user_file import load as load_effects
@@ -96,6 +103,8 @@ def run(
         find_effect(name)
     method = method_named(register or DEFAULT).name
     paths = sessions or [_current_session()]
+    if follow or views is not None:
+        _follow(paths, follow, views)
     loaded = _load_sessions(paths, memory)
     name = "+".join(session.name for session in loaded)
     target = output or Path("runs" if sessions else "../runs") / name
@@ -112,6 +121,17 @@ def run(
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
         _show_runs(runs, target, tolerance)
+
+
+def _follow(sessions: list[Path], follow: bool, views: int | None) -> None:
+    """Judge the views of a session as they arrive, until it is to be run."""
+    from stitch.cli.follow import follow_session
+
+    if not follow:
+        raise InputError("--views: counts views that arrive; to fix: add --follow, or leave it out")
+    if len(sessions) > 1:
+        raise InputError("--follow: several sessions; to fix: name the one that is being measured")
+    follow_session(sessions[0], views)
 
 
 def _current_session() -> Path:

@@ -527,10 +527,12 @@ def load_session(
     start: Array | None = None,
     at_most: int | None = MAX_POINTS,
     memory: float | None = None,
+    only: str | None = None,
 ) -> Session:
     """Read and check a session folder.
 
     Args:
+        only: name of the one view that is read; None: all.
         scans: False reads neither clouds nor labelled points, for questions about the arm alone.
         at_most: points of a view that stay in memory, the others in their files until they are fused; None: all.
         memory: bytes within which a run of the session has to stay; may be less than `at_most` asks for.
@@ -546,6 +548,7 @@ def load_session(
     mount = table_choice(file, document, "mount", get_args(Mount))
     robot = read_robot(file, document.get("robot"), unit)
     rows = read_views(path / "views.csv", robot) if start is None else [row_at(file, robot, start)]
+    rows = [row for row in rows if only is None or row.name == only]
     cloud_unit = table_choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
     scanner = read_scanner(file, document.get("scanner", {}))
     views = _read_session_views(path, document, rows, scanner, scans=scans, at_most=at_most, memory=memory)

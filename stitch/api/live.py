@@ -1,0 +1,416 @@
+"""A session that is measured while you watch: every view is judged as it comes."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch import frames
+from stitch.api.run import FittedHandEye, Run
+from stitch.api.session import Session, check_convention, public_session
+from stitch.api.verbs import run
+from stitch.errors import InputError, NoResultError
+from stitch.frames import Array
+from stitch.integrity.pose_tests import find_blunders, least_displacement
+from stitch.integrity.view_model import UsualEffects, view_model
+from stitch.integrity.view_screening import fit_screened_views
+from stitch.measurement import session as measured
+from stitch.measurement.capture import Capture, build_capture, prepare_capture
+from stitch.measurement.measurement import measurement_of
+from stitch.measurement.robot import Robot
+from stitch.measurement.session import Scanner, View
+from stitch.model.model import Model
+from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
+from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD
+from stitch.observations.surfaces.scanner_errors import rig_field_scatters
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
+from stitch.planning.expected_model import displacement
+from stitch.runs.recorder import Recorder, SilentRecorder
+from stitch.stages import surface_steps
+from stitch.stages.live_fit import LiveFit, fit_live_hand_eye, place_view, start_live_fit, without_view
+from stitch.system.threads import library_threads_off
+from stitch.units import length_text
+
+Verdict = Literal["waiting", "fits", "does_not_belong", "adds_nothing"]
+
+# Views before a hand-eye is searched, and before one that is stated is corrected: fewer leave nothing to test it by.
+_FEWEST_TO_SEARCH, _FEWEST_TO_CORRECT = 4, 3
+# A search whose second answer is as good as this decides nothing yet.
+_CLOSE = 1.1
+# A view adds nothing if others see so much of it already, and U falls by no more than this share.
+_SEEN_BEFORE, _LEAST_GAIN = 0.98, 0.05
+# Turns below this are not worth a word, rad.
+_SMALLEST_TURN = 5e-5
+# Views in a row that do not belong before one cause is named.
+_IN_A_ROW = 2
+
+
+@dataclass(frozen=True)
+class LiveView:
+    """What is said of one view as it comes."""
+
+    name: str
+    verdict: Verdict
+    why: str  # one sentence
+    hand_eye: FittedHandEye | None  # so far, with its U; None before there is one
+    seconds: float  # from the call to the answer
+
+    def __str__(self) -> str:
+        known = "" if self.hand_eye is None else f" U {self.hand_eye.U.mm:.2g} mm, {self.hand_eye.U.mrad:.2g} mrad."
+        return f"{self.name}: {self.verdict.replace('_', ' ')}. {self.why}{known}"
+
+
+@dataclass(frozen=True)
+class ProposedPose:
+    """A pose of the flange that would show more of the hand-eye; whether the arm can take it is not asked."""
+
+    T_base_flange: Array  # (4, 4) length_unit
+    like: str  # the view from which it is turned
+    turn_deg: Array  # (3,) rotation vector of the flange from there, base frame, degrees
+    U_mm: float  # of the hand-eye at the part, with this view
+
+    def __str__(self) -> str:
+        angle = float(np.linalg.norm(self.turn_deg))
+        axis = ", ".join(f"{x:.2f}" for x in self.turn_deg / angle)
+        return f"Next: view {self.like} turned by {angle:.0f}° about ({axis}) of the base, U {self.U_mm:.2g} mm."
+
+
+class LiveRecording(Protocol):
+    """Shows a session while it is measured."""
+
+    def view(self, view: View, T_reference_scanner: Array | None, said: LiveView) -> None:
+        """Show one view: its scan at its pose (4, 4) as far as that is known, and what is said of it."""
+
+
+class LiveSession:
+    """A session that grows by one view at a time; `stitch.live` begins one.
+
+    Every view is matched with those before it, once. `finish` runs the session as `stitch.run` does, so that its result
+    is that of a batch.
+
+    Example:
+        >>> live = stitch.live(mount="eye_in_hand", name="bracket")
+        >>> for cloud, pose in zip(clouds, poses):
+        ...     said = live.add_view(cloud, pose)
+        >>> said.name, said.verdict in ("fits", "adds_nothing")
+        ('v004', True)
+        >>> said.hand_eye.frame
+        'flange'
+        >>> run = live.finish()
+        >>> len(run.views)
+        5
+    """
+
+    def __init__(self, session: Session, recording: LiveRecording | None = None, cloud_unit: str | None = None) -> None:
+        self.session = session  # with the views so far
+        self.said: list[LiveView] = []  # of every view, in their order
+        self._recording = recording
+        self._cloud_unit = cloud_unit
+        self._members: list[int] = []  # views of the session that the fit holds
+        self._drawn = 0  # views that the recording shows in their places
+        self._fit: LiveFit | None = None
+
+    def add_view(
+        self,
+        cloud: Any,
+        pose: Any = None,
+        *,
+        joints: Any = None,
+        time_s: float | None = None,
+        covariates: Mapping[str, float] | None = None,
+        name: str | None = None,
+    ) -> LiveView:
+        """Take in one view and say whether it belongs.
+
+        Args:
+            cloud: a scan in the scanner frame, as `Session.from_arrays` takes one.
+            pose: T_base_flange, (4, 4) or any form that `Session.from_arrays` takes; None: from the joints.
+            joints: (n,) rad.
+            time_s: s, not before the view before.
+            covariates: numbers by name that errors may follow.
+            name: of the view; v000, v001, … by default.
+
+        Raises:
+            InputError: what does not fit, as of `Session.from_arrays`; the views before it stay as they are.
+
+        Example:
+            >>> live = stitch.live(mount="eye_in_hand")
+            >>> live.add_view(clouds[0], poses[0]).verdict
+            'waiting'
+        """
+        own = self.session
+        name = name or f"v{len(own.views):03d}"
+        if name in own.names:
+            raise InputError(f"view {name}: there is one of that name; to fix: give it another name")
+        one = Session.from_arrays(
+            {name: cloud},
+            None if pose is None else [pose],
+            mount=own.mount,
+            joints=None if joints is None else [joints],
+            robot=own.robot,
+            times=None if time_s is None else [time_s],
+            covariates={key: [value] for key, value in (covariates or {}).items()},
+            scanner=own.scanner,
+            unit=own.length_unit,
+            cloud_unit=self._cloud_unit,
+            name=own.name,
+            check=False,
+        )
+        return self.take(replace(one.views[0], approach=None))
+
+    def take(self, view: View) -> LiveView:
+        """Take in a view that was read before, as of a session folder, and say whether it belongs.
+
+        Raises:
+            InputError: an earlier time than that of the view before; poses of another convention than stated.
+        """
+        began = time.perf_counter()
+        with library_threads_off():
+            said = self._judged(self._after_last(view))
+        said = replace(said, seconds=time.perf_counter() - began)
+        self.said.append(said)
+        if self._recording is not None:
+            self._show(self._recording)
+        return said
+
+    @property
+    def hand_eye(self) -> FittedHandEye | None:
+        """The hand-eye so far; its U holds for a complete model. None before there is one."""
+        if self._fit is None:
+            return None
+        frame = "base" if self.session.mount == "eye_to_hand" else "flange"
+        middle = np.mean([points.mean(axis=0) for points in self._fit.capture.point_sets], axis=0)
+        return FittedHandEye(self._fit.T_mount, self._fit.covariance, frame, self.session.length_unit, middle)
+
+    def next_pose(self) -> ProposedPose | None:
+        """Return the pose, near those taken, that would lower U of the hand-eye most; None before there is one.
+
+        Poses are those of the views, turned about the middle of what they see by 15 to 45°. Every view counts as much
+        as the ones before did on average.
+        """
+        known = self.hand_eye
+        return None if self._fit is None or known is None else _next_pose(self._fit, self._views(), known)
+
+    def finish(self, recorder: Recorder | None = None, **options: Any) -> Run:
+        """Run the session: the same result as `stitch.run` on all its views.
+
+        Args:
+            recorder: is told of every stage.
+            options: further ones of `stitch.run`.
+
+        Raises:
+            InputError, NoResultError: as of `stitch.run`.
+        """
+        return run(self.session, recorder=recorder, **options)
+
+    def _after_last(self, view: View) -> View:
+        """Add the view to the session."""
+        before = self.session.views[-1] if self.session.views else None
+        if before is not None and None not in (before.time_s, view.time_s) and view.time_s < before.time_s:  # type: ignore[operator]
+            raise InputError(f"view {view.name}: its time lies before that of {before.name}; to fix: check the clock")
+        if view.joints is not None and view.approach is None:
+            from_there = view.joints if before is None or before.joints is None else before.joints
+            view = replace(view, approach=np.sign(view.joints - from_there))
+        self.session = replace(self.session, views=(*self.session.views, view))
+        return view
+
+    def _judged(self, view: View) -> LiveView:
+        if self._fit is None:
+            return self._first_fit(view)
+        before = self.hand_eye
+        assert before is not None
+        own = prepare_capture(replace(self.session, views=(view,)))
+        try:
+            new = place_view(self._fit, own.scans[0], own.T_reference_mount[0], own.T_reference_flange[0])
+        except NoResultError:
+            return self._rejected(
+                view, "It shares no surface with the others: its pose is far off, or it shows another part."
+            )
+        members = [*self._members, len(self.session.views) - 1]
+        off = self._blunders(new.fit, members)
+        if len(members) - 1 in off:
+            return self._rejected(view, off[len(members) - 1])
+        self._members, self._fit = members, new.fit
+        for v in sorted(off, reverse=True):
+            self._fit = without_view(self._fit, v)
+            del self._members[v]
+        self._fit = fit_live_hand_eye(self._fit, self._errors)
+        others = " ".join(f"{self.session.names[members[v]]} does not belong: {why}" for v, why in off.items())
+        gain = 1 - self.hand_eye.U.mm / before.U.mm  # type: ignore[union-attr]
+        idle = new.seen_before > _SEEN_BEFORE and gain < _LEAST_GAIN and not off
+        share = f"{100 * new.seen_before:.0f} % of it was seen before, U falls by {max(100 * gain, 0):.0f} %."
+        return self._said(view, "adds_nothing" if idle else "fits", f"{others} {share}".strip())
+
+    def _first_fit(self, view: View) -> LiveView:
+        """Fit the views so far, if they are enough."""
+        stated = self.session.scanner.T_mount is not None
+        count, least = len(self.session.views), _FEWEST_TO_CORRECT if stated else _FEWEST_TO_SEARCH
+        if count < least:
+            return self._said(view, "waiting", f"The hand-eye is fitted from {least} views on.")
+        check_convention(self.session)
+        measurement = measurement_of(self.session, prepare_capture(self.session))
+        try:
+            starts = surface_steps.initial_hand_eyes([self.session], [measurement], None)
+            if starts[0].candidates and starts[0].runner_up_ratio < _CLOSE:
+                return self._said(view, "waiting", "Two hand-eyes fit these views equally well; a turned view decides.")
+            fit = partial(surface_steps.fit, starts=starts, initial_model=None, recorder=SilentRecorder())
+            found = fit_screened_views([self.session], [measurement], fit)
+        except NoResultError as error:
+            return self._said(view, "waiting", f"No hand-eye yet: {error}.")
+        out = found.screenings[0]
+        assert found.fitted.correction is not None
+        self._members = [i for i in range(count) if self.session.names[i] not in out.names]
+        self._fit = start_live_fit(found.fitted.correction)
+        gone = out.line(self.session.names)
+        if view.name in out.names:
+            return self._said(view, "does_not_belong", gone)
+        return self._said(view, "fits", f"The first hand-eye.{f' {gone}.' if gone else ''}")
+
+    def _blunders(self, fit: LiveFit, members: list[int]) -> dict[int, str]:
+        """Return the views of a fit that contradict the others beyond what usual effects of an arm do, and why."""
+        model = view_model(fit.capture, fit.T_mount, fit.unconstrained)
+        found = find_blunders(model)
+        if not found.blunders:
+            return {}
+        measurement = measurement_of(self._session_of(members), fit.capture)
+        usual = UsualEffects(measurement, Model(fit.T_mount)).twists(fit.unconstrained)
+        sure = {b.view for b in find_blunders(model.with_usual(usual)).blunders}
+        off = [b.view for b in found.blunders if b.view in sure]
+        return {v: self._displacement(fit, v, [w for w in off if w != v]) for v in off}
+
+    def _displacement(self, fit: LiveFit, view: int, others: list[int]) -> str:
+        model = view_model(fit.capture, fit.T_mount, fit.unconstrained)
+        middle = frames.transform(fit.unconstrained.poses[view], fit.capture.scans[view].points.mean(axis=0)[None])[0]
+        rotation, shift = least_displacement(model, find_blunders(model), others, (), view, middle)
+        return (
+            f"Its pose is off by at least {length_text(shift, self.session.length_unit)} and {1e3 * rotation:.2g} mrad."
+        )
+
+    def _rejected(self, view: View, why: str) -> LiveView:
+        """Leave the view out of the fit; several in a row have one cause."""
+        row = 1
+        while row <= len(self.said) and self.said[-row].verdict == "does_not_belong":
+            row += 1
+        if row >= _IN_A_ROW:
+            first = self.said[len(self.said) - row + 1].name
+            why += f" The part or the scanner has probably moved: the last {row} views do not belong, from {first} on."
+        return self._said(view, "does_not_belong", why)
+
+    def _said(self, view: View, verdict: Verdict, why: str) -> LiveView:
+        return LiveView(view.name, verdict, why, self.hand_eye, 0.0)
+
+    def _session_of(self, members: list[int]) -> Session:
+        return replace(self.session, views=tuple(self.session.views[i] for i in members))
+
+    def _views(self) -> list[View]:
+        """Views that the fit holds."""
+        return [self.session.views[i] for i in self._members]
+
+    def _errors(
+        self, capture: Capture, freed: UnconstrainedPoses, T_mount: Array
+    ) -> tuple[PoseErrors, dict[str, list[Array]]]:
+        measurement = measurement_of(self._session_of(self._members), capture)
+        errors = prior_pose_errors([measurement], Model(T_mount), [freed.overlaps.gram.centre])
+        return errors, {SCANNER_FIELD: rig_field_scatters([measurement], [freed])}
+
+    def _show(self, recording: LiveRecording) -> None:
+        """Show the last view; with the first hand-eye all before it once more, in their places."""
+        first = self._drawn if self._fit is not None else len(self.said) - 1
+        for i in range(first, len(self.said)):
+            recording.view(self.session.views[i], self._pose_of(i), self.said[i])
+        self._drawn = len(self.said) if self._fit is not None else 0
+
+    def _pose_of(self, index: int) -> Array | None:
+        """(4, 4) T_reference_scanner of a view by the surfaces, or by the robot where it does not belong."""
+        if self._fit is None:
+            return None
+        if index in self._members:
+            return np.asarray(self._fit.unconstrained.poses[self._members.index(index)])
+        alone = self.session.views[index].T_base_flange[None]
+        capture = build_capture(self.session.name, (), alone, self.session.mount)
+        return np.asarray(capture.poses(self._fit.T_mount)[0])
+
+
+def live(
+    *,
+    mount: str,
+    robot: Robot | Mapping[str, Any] | Path | str | None = None,
+    scanner: Scanner | Mapping[str, Any] | None = None,
+    unit: str = "mm",
+    cloud_unit: str | None = None,
+    name: str = "session",
+    recording: Path | str | None = None,
+) -> LiveSession:
+    """Begin a session whose views come one by one.
+
+    Args:
+        mount, robot, scanner, unit, cloud_unit, name: as of `Session.from_arrays`; scanner.pose (4, 4), where it is
+            stated, saves the search and one view of waiting.
+        recording: shows the views as they come: "view" opens Rerun's viewer, "rerun+http://HOST:PORT/proxy" sends them
+            to one, the path of an .rrd file keeps them.
+
+    Returns:
+        The session, without a view; lengths in `unit`, angles in rad.
+
+    Raises:
+        InputError: what is stated of the cell does not fit.
+
+    Example:
+        >>> live = stitch.live(mount="eye_in_hand", unit="mm")
+        >>> live.hand_eye is None, live.next_pose() is None
+        (True, True)
+    """
+    session = Session.empty(mount=mount, robot=robot, scanner=scanner, unit=unit, cloud_unit=cloud_unit, name=name)
+    return LiveSession(session, None if recording is None else _recording(session, str(recording)), cloud_unit)
+
+
+def follow(session: measured.Session) -> LiveSession:
+    """Begin a live session with what a session folder states of its cell; its views come by `LiveSession.take`."""
+    return LiveSession(public_session(replace(session, views=())))
+
+
+def _recording(session: Session, target: str) -> LiveRecording:
+    found = next(iter(entry_points(group="stitch.live_recordings")), None)
+    if found is None:
+        raise InputError("recording: nothing here shows it; to fix: install rerun-sdk, or leave recording out")
+    made: LiveRecording = found.load()(session, target)
+    return made
+
+
+_TURNS_DEG = (15.0, 30.0, 45.0)
+
+
+def _next_pose(live_fit: LiveFit, views: list[View], known: FittedHandEye) -> ProposedPose:
+    """Return the turned pose after which the information of all views, each like the others, leaves the least U."""
+    own, g = live_fit.capture, live_fit.unconstrained.overlaps.gram
+    eye_in_hand = known.frame == "flange"
+    turns = [np.radians(angle) * axis for angle in _TURNS_DEG for axis in np.vstack([np.eye(3), -np.eye(3)])]
+    about = [_turned_about(g.centre, turn) for turn in turns]
+    poses = np.array([T @ mount for mount in own.T_reference_mount for T in about])
+    have = frames.adjoint(frames.make(np.eye(3), -g.centre) @ own.hand_eye_frames(live_fit.T_mount))
+    more = frames.adjoint(frames.make(np.eye(3), -g.centre) @ poses @ live_fit.T_mount)
+    unit = np.array([g.lever] * 3 + [1.0] * 3)[:, None]
+
+    def left(jacobians: Array) -> float:
+        """U up to a factor; what all views have in common shows nothing."""
+        apart = unit * (jacobians - jacobians.mean(axis=0))
+        return displacement(np.linalg.pinv(np.einsum("vki,vkj->ij", apart, apart), hermitian=True), known.middle)
+
+    after = [left(np.concatenate([have, J[None]])) for J in more]
+    best = int(np.argmin(after))
+    view = views[best // len(turns)]
+    T = poses[best] if eye_in_hand else frames.inverse(poses[best])
+    moved = Rotation.from_matrix(T[:3, :3] @ view.T_base_flange[:3, :3].T).as_rotvec(degrees=True)
+    return ProposedPose(T, view.name, moved, known.U.mm * after[best] / left(have))
+
+
+def _turned_about(centre: Array, turn: Array) -> Array:
+    T = frames.make(Rotation.from_rotvec(turn).as_matrix(), np.zeros(3))
+    T[:3, 3] = centre - T[:3, :3] @ centre
+    return T

@@ -1,0 +1,144 @@
+"""Views that come one by one: what is said of each, and that the end is that of a batch."""
+
+import shutil
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import stitch
+from stitch.cli.main import main
+
+
+@pytest.fixture(scope="module")
+def live_blade(arrays):
+    """The cell's views, taken one by one."""
+    live = stitch.live(mount="eye_in_hand", name="s")
+    clouds, poses = arrays
+    for cloud, pose in zip(clouds, poses, strict=True):
+        live.add_view(cloud, pose)
+    return live
+
+
+def test_the_end_is_that_of_a_batch_to_the_last_bit(live_blade, arrays):
+    clouds, poses = arrays
+    batch = stitch.run(stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", name="s"))
+    end = live_blade.finish()
+    assert (end.T_mount == batch.T_mount).all()
+    assert (end.mount_covariance == batch.mount_covariance).all()
+    assert (end.fused.points == batch.fused.points).all()
+
+
+def test_the_hand_eye_so_far_is_that_of_the_batch_within_its_uncertainty(live_blade, found):
+    apart = np.linalg.inv(found.T_mount) @ live_blade.hand_eye.pose
+    assert np.linalg.norm(apart[:3, 3]) < 0.5 * live_blade.hand_eye.U.mm
+
+
+def test_views_wait_until_there_are_enough(live_blade):
+    assert [said.verdict for said in live_blade.said[:4]] == ["waiting"] * 3 + ["fits"]
+    assert all(said.hand_eye is None for said in live_blade.said[:3])
+
+
+def test_a_knocked_view_is_named_when_it_comes_and_the_next_ones_say_since_when(arrays):
+    clouds, poses = arrays
+    live = stitch.live(mount="eye_in_hand")
+    for cloud, pose in zip(clouds, poses, strict=True):
+        live.add_view(cloud, pose)
+    before = live.hand_eye.pose
+    off = live.add_view(clouds[2] + [0.4, 0.3, 0.2], poses[2])
+    assert off.verdict == "does_not_belong" and "at least" in off.why
+    assert (live.hand_eye.pose == before).all(), "a view that does not belong moves nothing"
+    again = live.add_view(clouds[1] + [0.4, 0.3, 0.2], poses[1])
+    assert again.verdict == "does_not_belong" and "from v005 on" in again.why
+
+
+def test_another_part_does_not_belong(arrays):
+    clouds, poses = arrays
+    live = stitch.live(mount="eye_in_hand")
+    for cloud, pose in zip(clouds[:4], poses, strict=False):
+        live.add_view(cloud, pose)
+    said = live.add_view(clouds[4] + [400.0, 0.0, 0.0], poses[4])
+    assert said.verdict == "does_not_belong" and "shares no surface" in said.why
+
+
+def test_a_view_once_more_adds_nothing(arrays):
+    """The arm comes back to one pose again and again, each time with its own scatter of 20 µm."""
+    clouds, poses = arrays
+    live = stitch.live(mount="eye_in_hand")
+    rng = np.random.default_rng(0)
+    for k in (0, 1, 2, 3, 4, *[4] * 8):
+        noise = rng.normal(scale=0.002, size=clouds[k].shape) + rng.normal(scale=0.02, size=3)
+        live.add_view(clouds[k] + noise, poses[k])
+    said = [own.verdict for own in live.said]
+    assert "adds_nothing" in said[5:] and said[4] == "fits" and "does_not_belong" not in said
+
+
+def test_the_next_pose_lowers_U_as_it_says(arrays):
+    """Four views that turn about one axis alone: the next pose must turn about another."""
+    clouds, poses = arrays
+    live = stitch.live(mount="eye_in_hand")
+    assert live.next_pose() is None
+    for cloud, pose in zip(clouds, poses, strict=True):
+        live.add_view(cloud, pose)
+    proposed = live.next_pose()
+    assert proposed.U_mm < live.hand_eye.U.mm
+    R = proposed.T_base_flange[:3, :3]
+    assert np.allclose(R @ R.T, np.eye(3)) and proposed.like in live.session.names
+
+
+def test_inverted_poses_are_refused_when_the_first_hand_eye_is_sought(arrays):
+    clouds, poses = arrays
+    live = stitch.live(mount="eye_in_hand")
+    with pytest.raises(stitch.InputError, match="T_flange_base"):
+        for cloud, pose in zip(clouds, np.linalg.inv(poses), strict=True):
+            live.add_view(cloud, pose)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [({"name": "v000"}, "there is one of that name"), ({"time_s": 1.0}, "its time lies before")],
+)
+def test_a_view_that_cannot_follow_is_refused_and_changes_nothing(arrays, changes, message):
+    clouds, poses = arrays
+    live = stitch.live(mount="eye_in_hand")
+    live.add_view(clouds[0], poses[0], time_s=2.0)
+    with pytest.raises(stitch.InputError, match=message):
+        live.add_view(clouds[1], poses[1], **changes)
+    assert len(live.session.views) == len(live.said) == 1
+
+
+def test_a_folder_is_followed_as_it_fills(cell_folder, tmp_path, capfd):
+    """Rows come before their scans, and half a row before the rest, as a slow disk shows them."""
+    folder = tmp_path / "s"
+    folder.mkdir()
+    (folder / "clouds").mkdir()
+    shutil.copy(cell_folder / "session.toml", folder)
+    head, *rows = (cell_folder / "views.csv").read_text().splitlines(keepends=True)
+
+    def fill():
+        table = head
+        for i, row in enumerate(rows):
+            time.sleep(0.4)
+            (folder / "views.csv").write_text(table + row[: len(row) // 2])
+            time.sleep(0.4)
+            table += row
+            (folder / "views.csv").write_text(table)
+            cloud = sorted((cell_folder / "clouds").iterdir())[i]
+            shutil.copy(cloud, folder / "clouds")
+
+    writer = threading.Thread(target=fill)
+    writer.start()
+    with pytest.raises(SystemExit) as end:
+        main(["run", str(folder), "--follow", "--views", str(len(rows)), "-o", str(tmp_path / "run"), "--no-recording"])
+    writer.join()
+    assert not end.value.code
+    shown = capfd.readouterr().err
+    assert shown.count("waiting. The hand-eye is fitted") >= 2 and "The first hand-eye." in shown
+    assert (tmp_path / "run" / "result.json").is_file()
+
+
+def test_counting_views_needs_follow(cell_folder, capfd):
+    with pytest.raises(SystemExit) as end:
+        main(["run", str(cell_folder), "--views", "3"])
+    assert end.value.code == 2 and "add --follow" in capfd.readouterr().err
