@@ -233,6 +233,11 @@ def write_recording_and_page(command: str, recording: Path | None, report: Path 
                 writer.load()(*results, scratch)
 
 
+def fixed_digits(values: Array, digits: int) -> str:
+    """Numbers in a row of a table, without a negative zero."""
+    return " ".join(f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0)
+
+
 # Points that lie within this share of their extent of one line leave the turn about it open.
 _FLAT = 1e-3
 

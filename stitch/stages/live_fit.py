@@ -22,7 +22,6 @@ from stitch.observations.surfaces.normal_equations import Gram, Overlaps, gram, 
 from stitch.observations.surfaces.view_poses import (
     SAMPLES,
     UnconstrainedPoses,
-    displacement_factors,
     unconstrained_poses,
     visible_step,
 )
@@ -102,7 +101,7 @@ def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_f
         poses[last] = frames.inverse(to_centre) @ frames.exp(step) @ to_centre @ poses[last]
         gate = min(gate, max(next_gate(Overlaps([], matches, g, gate), own), 0.6 * gate))
         matches = _match_last(own, poses, gate, samples)
-        if np.linalg.norm(step * displacement_factors(g)) < _CONVERGED * g.scale and gate <= 1.01 * fit.gate:
+        if np.linalg.norm(step * g.displacement_factors) < _CONVERGED * g.scale and gate <= 1.01 * fit.gate:
             break
     together = _solve_together(own, poses, [*fit.unconstrained.overlaps.matches, *matches], min(gate, fit.gate))
     moved = np.linalg.norm(frames.log(frames.inverse(poses) @ together.poses)[:, 3:], axis=1)
@@ -166,7 +165,7 @@ def _sums(matches: Sequence[Match], views: int) -> Gram:
 
 def _last_step(g: Gram) -> Array:
     """(6,) twist of the last view that brings it onto the others, in the directions that they show."""
-    unit = displacement_factors(g)
+    unit = g.displacement_factors
     values, vectors = np.linalg.eigh(g.matrix.sum(axis=0) / np.outer(unit, unit))
     keep = values > _NEAR_NULL * values[-1]
     pull = vectors[:, keep].T @ (g.vector.sum(axis=0) / unit)
