@@ -22,8 +22,6 @@ from stitch.measurement.scan import prepare_scan
 from stitch.measurement.session import Sighting
 from stitch.system.threads import parallel
 
-# Circle (in a plane) or sphere (in space) through points with outliers: RANSAC, then a robust fit.
-
 _TRIALS = 200
 # Larger circles than this many sizes are of flat things beside the ball.
 _LARGEST = 3.0
@@ -45,10 +43,10 @@ class Ball:
 
 
 def fit_ball(points: Array, size: float, known: bool = False) -> Ball:
-    """Robust fit to points (N, k), k = 2 or 3.
+    """Fit a circle (k = 2) or a sphere (k = 3) to points (N, k), robustly.
 
     Other things may be in the scan: the search draws its points from neighbourhoods of the ball's size and
-    counts those within 2 % of it; the fit minimises a soft L1 loss of the distances at the scale that they
+    counts those within 2 % of it (RANSAC); the fit minimises a soft L1 loss of the distances at the scale that they
     show themselves.
 
     Args:
@@ -118,14 +116,6 @@ def _neighbours(points: Array, size: float, count: int, rng: np.random.Generator
     return out
 
 
-# Which ball is which, over all views: by radius, and by the distances to the others.
-#
-# Balls of one radius are told apart by the distances between their centres, which no pose changes: the views grow one
-# arrangement, largest first, and each is laid on it in the way in which most distances agree. Where two ways do as well
-# as each other, as in an arrangement with symmetry, the angle decides by which the arm has turned between views: a
-# rigid motion turns scanner and flange by the same angle (Shiu & Ahmad 1989). Where that does not decide either, the
-# view's balls stay without names.
-
 # Distances agree within this share, and within so many sigmas.
 _DISTANCE_SHARE, _DISTANCE_SIGMAS = 0.004, 5.0
 # Radii that differ by less belong together.
@@ -159,9 +149,13 @@ class _Arrangement:
 
 
 def label_balls(views: Sequence[ViewBalls]) -> list[list[int | None]]:
-    """Per view the number of each of its balls, from 0; None for balls that cannot be told.
+    """Return per view the number of each of its balls, from 0; None for balls that cannot be told.
 
-    Numbers run by radius, then as they were found.
+    Numbers run by radius, then as they were found. Balls of one radius are told apart by the distances between their
+    centres, which no pose changes: the views grow one arrangement, largest first, and each is laid on it in the way in
+    which most distances agree. Where two ways do as well as each other, as in an arrangement with symmetry, the angle
+    decides by which the arm has turned between views: a rigid motion turns scanner and flange by the same angle (Shiu &
+    Ahmad 1989). Where that does not decide either, the view's balls stay without names.
     """
     kinds = _radius_classes(views)
     order = sorted(range(len(views)), key=lambda v: -len(kinds[v]))
@@ -191,11 +185,7 @@ def label_balls(views: Sequence[ViewBalls]) -> list[list[int | None]]:
         names[v] = [
             int(np.flatnonzero(known == k)[0]) if k in single else name for k, name in zip(own, names[v], strict=True)
         ]
-    return _by_radius(names, known)
-
-
-def _by_radius(names: list[list[int | None]], kinds: Indices) -> list[list[int | None]]:
-    rank = {int(old): new for new, old in enumerate(np.argsort(kinds, kind="stable"))}
+    rank = {int(old): new for new, old in enumerate(np.argsort(known, kind="stable"))}
     return [[None if name is None else rank[name] for name in own] for own in names]
 
 
@@ -210,7 +200,7 @@ def _radius_classes(views: Sequence[ViewBalls]) -> list[Indices]:
 def _best_matching(
     arrangement: _Arrangement, views: Sequence[ViewBalls], v: int, kinds: Indices
 ) -> list[tuple[int, int]] | None:
-    """Pairs (ball of the view, name) of the one way in which most balls fit; None where there is none or several."""
+    """Return pairs (ball of the view, name) of the one way in which most balls fit; None for none or several."""
     view = views[v]
     ways = _largest_matchings(arrangement, view, kinds)
     if not ways:
@@ -219,7 +209,18 @@ def _best_matching(
     floor = float(view.sigma.mean()) + 1e-12
     close = [(T, way) for (T, rms), way in rated if rms <= _CLEARLY * max(rated[0][0][1], floor)]
     if len(close) > 1:
-        close = [(T, way) for T, way in close if _rotation_agrees(arrangement, views, v, T)]
+        # The scanner has turned by the flange's angle since each view that is placed.
+        turned = [(R, views[w].R_flange) for w, R in arrangement.views]
+        close = [
+            (T, way)
+            for T, way in close
+            if all(
+                view.R_flange is None
+                or flange is None
+                or abs(_angle(R.T @ T[:3, :3]) - _angle(flange.T @ view.R_flange)) <= _ANGLE
+                for R, flange in turned
+            )
+        ]
     return close[0][1] if len(close) == 1 else None
 
 
@@ -252,20 +253,10 @@ def _largest_matchings(arrangement: _Arrangement, view: ViewBalls, kinds: Indice
 def _matching_motion(
     arrangement: _Arrangement, view: ViewBalls, matching: Sequence[tuple[int, int]]
 ) -> tuple[Array, float]:
-    """T_arrangement_scanner (4, 4) of a way and the rms distance that it leaves."""
+    """Return T_arrangement_scanner (4, 4) of a way and the rms distance that it leaves."""
     own, other = view.centres[[b for b, _ in matching]], arrangement.places[[k for _, k in matching]]
     T = align_points(own, other)
     return T, float(np.sqrt(np.mean(np.sum((other - frames.transform(T, own)) ** 2, axis=1))))
-
-
-def _rotation_agrees(arrangement: _Arrangement, views: Sequence[ViewBalls], v: int, T: Array) -> bool:
-    """Whether the scanner has turned by the flange's angle since each view that is placed."""
-    own = views[v].R_flange
-    for w, R in arrangement.views:
-        other = views[w].R_flange
-        if own is not None and other is not None and abs(_angle(R.T @ T[:3, :3]) - _angle(other.T @ own)) > _ANGLE:
-            return False
-    return True
 
 
 def _angle(R: Array) -> float:
@@ -275,7 +266,7 @@ def _angle(R: Array) -> float:
 def _extend_arrangement(
     arrangement: _Arrangement, view: ViewBalls, kinds: Indices, matching: Sequence[tuple[int, int]], v: int
 ) -> tuple[list[int | None], _Arrangement]:
-    """Names of the view's balls; those that are new join the arrangement."""
+    """Name the view's balls; those that are new join the arrangement."""
     T, _ = _matching_motion(arrangement, view, matching)
     named = dict(matching)
     places, classes, names = list(arrangement.places), list(arrangement.kinds), list[int | None]()
@@ -317,7 +308,7 @@ class _ThinningLevel:
 
 
 def find_balls(points: Array, limits: tuple[float, float] = (0.0, np.inf)) -> list[Ball]:
-    """Convex balls in a scan (N, 3) seen from the origin, the one with most points first; radii free.
+    """Find convex balls in a scan (N, 3) seen from the origin, the one with most points first; radii free.
 
     Args:
         limits: of the radius.
@@ -334,7 +325,12 @@ def find_balls(points: Array, limits: tuple[float, float] = (0.0, np.inf)) -> li
             ball = _confirmed_ball(points, centre, radius, noise)
             if ball is not None and limits[0] <= ball.radius <= limits[1]:
                 found.append(ball)
-    return _without_overlaps(found)
+    # Of two that overlap, the one with more points.
+    out: list[Ball] = []
+    for ball in sorted(found, key=lambda ball: -int(ball.keep.sum())):
+        if all(np.linalg.norm(ball.centre - b.centre) > 0.7 * max(ball.radius, b.radius) for b in out):
+            out.append(ball)
+    return out
 
 
 def _thinning_levels(points: Array, min_radius: float, max_radius: float) -> list[_ThinningLevel]:
@@ -439,17 +435,6 @@ def _even_directions() -> Array:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
 
 
-def _without_overlaps(balls: list[Ball]) -> list[Ball]:
-    """Balls that do not overlap; of two that do, the one with more points."""
-    out: list[Ball] = []
-    for ball in sorted(balls, key=lambda ball: -int(ball.keep.sum())):
-        if all(np.linalg.norm(ball.centre - b.centre) > 0.7 * max(ball.radius, b.radius) for b in out):
-            out.append(ball)
-    return out
-
-
-# Centres of balls as labelled points: found in every view, checked against the radius, told apart over all views.
-
 # A radius belongs to the one stated within this share, and within so many sigmas.
 _STATED_RADIUS_SHARE, _STATED_RADIUS_SIGMAS = 0.02, 4.0
 # Radii around the stated ones that are looked at first.
@@ -468,7 +453,7 @@ class _AgreedBall:
 def ball_sightings(
     clouds: Sequence[Array | None], rotations: Sequence[Array | None], stated: Sequence[float], to_mm: float
 ) -> tuple[list[Sighting], list[str]]:
-    """Centres of the balls in every view.
+    """Find the centres of the balls in every view, checked against the radius and told apart over all views.
 
     Args:
         clouds: (N, 3) a view, scanner frame; None for a view without a scan.
@@ -491,13 +476,20 @@ def ball_sightings(
     agreed = _agree_on_radius(clouds, seen, stated)
     views = [_view_balls(balls, R) for balls, R in zip(agreed, rotations, strict=True)]
     labels = label_balls(views)
-    nameless = sum(name is None for names in labels for name in names)
-    notes = [_nameless_note(labels, nameless)] if nameless else []
-    return [_ball_sighting(view, names) for view, names in zip(views, labels, strict=True)], notes
+    out, nameless = [], [sum(name is None for name in names) for names in labels]
+    for view, names in zip(views, labels, strict=True):
+        told = np.array([name is not None for name in names], bool)
+        words = tuple(f"ball{name + 1}" for name in names if name is not None)
+        out.append(Sighting(words, view.centres[told], view.sigma[told]))
+    note = (
+        f"{sum(nameless)} balls in {np.count_nonzero(nameless)} views cannot be told from others of their size and are "
+        "left out; three or more a view at distances that all differ, or balls of different sizes, can"
+    )
+    return out, [note] if any(nameless) else []
 
 
 def _find_all_balls(clouds: Sequence[Array | None], stated: Sequence[float]) -> list[list[Ball]]:
-    """Balls of every view, near the radii stated; of any radius where there are none."""
+    """Find balls of every view, near the radii stated; of any radius where there are none."""
     limits = (min(stated) / _AROUND, max(stated) * _AROUND) if stated else (0.0, float("inf"))
     found = list(parallel(lambda cloud: [] if cloud is None else find_balls(cloud, limits), clouds))
     if any(found) or not stated:
@@ -523,7 +515,7 @@ def _stated_radius(ball: Ball, stated: Sequence[float]) -> float | None:
 
 
 def _radius_error(balls: Sequence[Sequence[Ball]], stated: Sequence[float], to_mm: float) -> InputError:
-    """A refusal that names the radius seen most."""
+    """Return a refusal that names the radius seen most."""
     radii = np.sort([ball.radius for view in balls for ball in view])
     groups = np.split(radii, np.flatnonzero(np.diff(radii) > 2 * _STATED_RADIUS_SHARE * radii[1:]) + 1)
     group = max(groups, key=len)
@@ -538,7 +530,7 @@ def _radius_error(balls: Sequence[Sequence[Ball]], stated: Sequence[float], to_m
 def _agree_on_radius(
     clouds: Sequence[Array | None], balls: Sequence[Sequence[Ball]], stated: Sequence[float]
 ) -> list[list[_AgreedBall]]:
-    """The balls fitted anew with one radius for each size: the one stated, or the mean over the views."""
+    """Fit the balls anew with one radius for each size: the one stated, or the mean over the views."""
     every = [ball for view in balls for ball in view]
     radii = np.array([ball.radius for ball in every])
     out = []
@@ -559,21 +551,7 @@ def _agree_on_radius(
 
 
 def _view_balls(balls: Sequence[_AgreedBall], R_flange: Array | None) -> ViewBalls:
-    """A radius that differs from view to view is an error of the scanner: the centre has one of that size too."""
+    # A radius that differs from view to view is an error of the scanner: the centre has one of that size too.
     sigma = [np.hypot(_sigma_of_centre(s.ball), s.scatter) for s in balls]
     centres = np.array([s.ball.centre for s in balls]).reshape(-1, 3)
     return ViewBalls(centres, np.array(sigma), np.array([s.radius for s in balls]), R_flange)
-
-
-def _ball_sighting(view: ViewBalls, names: Sequence[int | None]) -> Sighting:
-    told = np.array([name is not None for name in names], bool)
-    words = tuple(f"ball{name + 1}" for name in names if name is not None)
-    return Sighting(words, view.centres[told], view.sigma[told])
-
-
-def _nameless_note(labels: Sequence[Sequence[int | None]], nameless: int) -> str:
-    views = sum(any(name is None for name in names) for names in labels)
-    return (
-        f"{nameless} balls in {views} views cannot be told from others of their size and are left out; three or more a "
-        "view at distances that all differ, or balls of different sizes, can"
-    )

@@ -14,8 +14,6 @@ from stitch.errors import InputError
 from stitch.frames import Array, Mask
 from stitch.measurement.session import RangeImage, Sighting
 
-# A calibration board as a person states it: charuco:11x8:20:15:DICT_4X4_50, checkerboard:9x6:25, apriltag:36h11:40.
-
 _FORMS = (
     "charuco:11x8:20:15:DICT_4X4_50 (squares, their side and that of the markers in mm, OpenCV's dictionary), "
     "checkerboard:9x6:25 (squares, side in mm) or apriltag:36h11:40 (family, side of the black square in mm)"
@@ -78,10 +76,6 @@ def _length(word: str) -> float:
     return length
 
 
-# Corners of boards in an image, to a fraction of a pixel, with names that stay the same in every view (OpenCV).
-#
-# ChArUco: Garrido-Jurado et al. 2014; AprilTag: Olson 2011; checkerboards: Duda & Frese 2018.
-
 # Fewer corners of a board hold it on nothing.
 _MIN_BOARD_CORNERS = 4
 # Largest half width of the window in which corners are refined, of the distance to the next.
@@ -98,7 +92,10 @@ class Corners:
 
 
 def find_corners(grey: NDArray[np.uint8], board: Board, cv2: Any) -> list[Corners]:
-    """Corners of a board in a grey image (H, W); of tags each tag on its own; empty where none is seen.
+    """Find corners of a board in a grey image (H, W), to a fraction of a pixel; of tags each on its own.
+
+    Names stay the same in every view. ChArUco: Garrido-Jurado et al. 2014; AprilTag: Olson 2011; checkerboards: Duda &
+    Frese 2018.
 
     Args:
         cv2: the module of OpenCV.
@@ -136,12 +133,9 @@ def _charuco(grey: NDArray[np.uint8], board: Board, cv2: Any) -> list[Corners]:
         if ids is not None and (not best or len(ids) > len(best[0].names)):
             numbers = ids.ravel()
             found = _refined(grey, pixels.reshape(-1, 2), min(_REFINED, (1 - board.marker / board.square) / 2), cv2)
-            best = [Corners(tuple(f"c{i:03d}" for i in numbers), found, _drawn(drawn, numbers))]
+            places = np.asarray(drawn.getChessboardCorners(), float)[numbers]
+            best = [Corners(tuple(f"c{i:03d}" for i in numbers), found, places)]
     return best
-
-
-def _drawn(drawn: Any, numbers: NDArray[np.int32]) -> Array:
-    return np.asarray(drawn.getChessboardCorners(), float)[numbers]
 
 
 def _checkerboard(grey: NDArray[np.uint8], board: Board, cv2: Any) -> list[Corners]:
@@ -208,12 +202,6 @@ def _tags(grey: NDArray[np.uint8], board: Board, cv2: Any) -> list[Corners]:
     ]
 
 
-# Points of an image into space: the plane and the grid of the pixels around them, not one pixel's distance.
-#
-# Around an image point a plane is fitted to what the pixels measured, robustly; on that plane the places of the pixels
-# are a smooth function of column and row, here of second order, which gives the place of the point itself. Nothing is
-# assumed of the camera. What the pixels scatter by gives the point's sigma.
-
 # Pixels around a corner, and how many must have measured something.
 _MIN_WINDOW, _MAX_WINDOW = 3, 25
 _MIN_WINDOW_PIXELS, _SHARE = 12, 0.3
@@ -227,7 +215,11 @@ _ROUNDED = 1e-6
 
 
 def lift_points(image: RangeImage, pixels: Array, radius: Array, pixel_sigma: float) -> tuple[Array, Array]:
-    """Places (K, 3) and sigma of a coordinate (K,) of image points (K, 2); NaN where too little was measured.
+    """Return places (K, 3) and sigma of a coordinate (K,) of image points (K, 2); NaN where too little was measured.
+
+    Around an image point a plane is fitted to what the pixels measured, robustly; on that plane the places of the
+    pixels are a smooth function of column and row, here of second order, which gives the place of the point itself.
+    Nothing is assumed of the camera. What the pixels scatter by gives the point's sigma.
 
     Args:
         radius: (K,) half width of the window, pixels.
@@ -273,7 +265,7 @@ def _lift_pixel(image: RangeImage, pixel: Array, radius: float, pixel_sigma: flo
 
 
 def _on_plane(points: Array) -> Mask:
-    """Which points (N, 3) lie on the plane that most lie on (least median of squares, Rousseeuw 1984)."""
+    """Find the points (N, 3) that lie on the plane that most lie on (least median of squares, Rousseeuw 1984)."""
     draws = np.random.default_rng(0).integers(len(points), size=(_DRAWS, 3))
     a, b, c = (points[draws[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
@@ -323,7 +315,7 @@ class PlacedBoard:
 
 
 def boards_in(image: RangeImage, board: Board, cv2: Any) -> list[PlacedBoard]:
-    """A board in one view, of tags each tag; none where it is not seen.
+    """Find a board in one view, of tags each tag; none where it is not seen.
 
     Args:
         board: in the unit of the scan.
@@ -334,22 +326,19 @@ def boards_in(image: RangeImage, board: Board, cv2: Any) -> list[PlacedBoard]:
         # Rows from below make a mirror image, in which no marker is known.
         image = RangeImage(image.points[::-1], image.grey[::-1])
         found = find_corners(image.grey, board, cv2)
-    placed = [_placed_board(image, corners, board) for corners in found]
+    window, placed = _WINDOW_OF_TAG if board.kind == "apriltag" else _WINDOW, []
+    for corners in found:
+        apart = np.linalg.norm(corners.pixels[:, None] - corners.pixels[None], axis=2)
+        nearest = np.where(apart > 0, apart, np.inf).min(axis=1)
+        points, sigma = lift_points(image, corners.pixels, window * nearest, _PIXEL_SIGMA)
+        placed.append(PlacedBoard(corners.names, points, sigma, corners.drawing).only(np.isfinite(points[:, 0])))
     return [p for p in placed if len(p.names) >= _MIN_PLACED_CORNERS]
-
-
-def _placed_board(image: RangeImage, corners: Corners, board: Board) -> PlacedBoard:
-    apart = np.linalg.norm(corners.pixels[:, None] - corners.pixels[None], axis=2)
-    nearest = np.where(apart > 0, apart, np.inf).min(axis=1)
-    window = _WINDOW_OF_TAG if board.kind == "apriltag" else _WINDOW
-    points, sigma = lift_points(image, corners.pixels, window * nearest, _PIXEL_SIGMA)
-    return PlacedBoard(corners.names, points, sigma, corners.drawing).only(np.isfinite(points[:, 0]))
 
 
 def board_sightings(
     views: Sequence[Sequence[PlacedBoard]], board: Board, to_mm: float, label: str
 ) -> tuple[list[Sighting], list[str]]:
-    """Sightings of all views from what each shows; corners that do not fit the drawing go, sigmas follow the scatter.
+    """Return sightings of all views from what each shows; corners off the drawing go, sigmas follow the scatter.
 
     Args:
         to_mm: millimetres per unit of the scans, for messages.
@@ -367,9 +356,10 @@ def board_sightings(
     _require_size(seen, board, to_mm)
     kept = [[_consistent_corners(placed) for placed in view] for view in views]
     gone = sum(len(p.names) for p in seen) - sum(len(p.names) for view in kept for p in view)
-    squares = [_sum_of_squares(p) for view in kept for p in view if len(p.names) >= _MIN_PLACED_CORNERS]
-    freedom = sum(free for _, free in squares)
-    factor = max(np.sqrt(sum(total for total, _ in squares) / freedom), _MIN_SIGMA_FACTOR) if freedom else 1.0
+    judged = [p for view in kept for p in view if len(p.names) >= _MIN_PLACED_CORNERS]
+    freedom = sum(3 * len(p.names) - 6 for p in judged)
+    squares = sum(float((_drawing_deviation(p) ** 2).sum()) for p in judged)
+    factor = max(np.sqrt(squares / freedom), _MIN_SIGMA_FACTOR) if freedom else 1.0
     told = [f"{gone} corners of {board.stated} lie off the board's plane or grid and are left out"] if gone else []
     out = [_board_sighting(label, [replace(p, sigma=factor * p.sigma) for p in view]) for view in kept]
     return out, told
@@ -416,8 +406,3 @@ def _drawing_deviation(placed: PlacedBoard) -> Array:
     """(K,) distance from the drawing in sigmas under the rigid motion that fits best."""
     drawn = frames.transform(align_points(placed.drawing, placed.points, placed.sigma**-2), placed.drawing)
     return np.asarray(np.linalg.norm(placed.points - drawn, axis=1) / placed.sigma)
-
-
-def _sum_of_squares(placed: PlacedBoard) -> tuple[float, int]:
-    """Sum of squares about the drawing, in sigmas, and its degrees of freedom."""
-    return float((_drawing_deviation(placed) ** 2).sum()), 3 * len(placed.names) - 6

@@ -11,17 +11,16 @@ from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.integrity.conventions import (
     MotionFit,
+    SurfaceFit,
     hypotheses_by_surface,
     likeliest_hypotheses,
     proven_hypotheses,
     rank_hypotheses,
     register_scan_pairs,
 )
-from stitch.integrity.hypotheses import Hypothesis
 from stitch.integrity.pairing import explain_misplaced
-from stitch.integrity.placement import names_of_views
 from stitch.integrity.pose_tests import length_problem
-from stitch.integrity.problems import SessionProblem, displacement_text, likeliest_text, list_views
+from stitch.integrity.problems import SessionProblem, displacement_text, likeliest_text, list_views, names_of_views
 from stitch.integrity.scan_faults import find_occluder, find_static_background
 from stitch.integrity.snooping import MisplacedView, Snooping, snoop_views
 from stitch.integrity.target_checks import check_targets, target_problems
@@ -48,12 +47,17 @@ _VIEW_ROTATION, _VIEW_M = 0.005, 0.0025
 
 def apply_displacement_limits(session: Session, found: Snooping) -> Snooping:
     """Return the findings with those suspected views misplaced that are surely off by more than effects of an arm."""
+    sure = [m for m in found.suspected if _beyond_effects(session, *m.at_least)]
+    return replace(
+        found,
+        misplaced=tuple(sorted((*found.misplaced, *sure), key=lambda m: m.view)),
+        suspected=tuple(m for m in found.suspected if m not in sure),
+    )
 
-    def too_far(m: MisplacedView) -> bool:
-        rotation, distance = m.at_least
-        return rotation > _VIEW_ROTATION or distance * METRES[session.length_unit] > _VIEW_M
 
-    return found.with_misplaced(too_far)
+def _beyond_effects(session: Session, rotation: float, translation: float) -> bool:
+    """True if no effect of an arm is believed to displace a single view so far."""
+    return rotation > _VIEW_ROTATION or translation * METRES[session.length_unit] > _VIEW_M
 
 
 def poses_contradict_scans(session: Session, found: Snooping) -> bool:
@@ -64,7 +68,7 @@ def poses_contradict_scans(session: Session, found: Snooping) -> bool:
 
 def scatter_is_doubtful(session: Session, found: Snooping) -> bool:
     """True if all poses together scatter by what no arm is believed to do to a single view."""
-    return found.rotation > _VIEW_ROTATION or found.translation * METRES[session.length_unit] > _VIEW_M
+    return _beyond_effects(session, found.rotation, found.translation)
 
 
 def beyond_any_arm(session: Session, rotation: float, translation: float) -> bool:
@@ -78,7 +82,7 @@ def displacement_in_words(session: Session, found: MisplacedView) -> str:
     return f"is off by at least {amount}" if amount else "is off by an amount that its surface does not show"
 
 
-def contradiction_in_words(session: Session, found: Snooping) -> str:
+def _contradiction_in_words(session: Session, found: Snooping) -> str:
     """Return the scatter by which the poses contradict the scans, in words."""
     return f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
 
@@ -89,20 +93,15 @@ def background_problems(session: Session, own: Capture, T_mount: Array, found: S
     Args:
         T_mount: (4, 4) hand-eye under which `found` was made.
     """
-    out, size, names = list[SessionProblem](), part_size([own]), session.names
+    size, names = part_size([own]), session.names
     still = find_static_background(own.scans, own.poses(T_mount), found.tolerance, size)
     if still is not None:
-        out.append(
-            SessionProblem("foreign", tuple(names_of_views(still.views, names)), still.describe(session.length_unit))
-        )
-    if out or found.left_out or found.steps:
-        # What stands still stands elsewhere on the part in every view, and so does the part itself where a view is off;
-        # without that view it is asked again.
-        return out
+        return [SessionProblem("foreign", names_of_views(still.views, names), still.describe(session.length_unit))]
+    if found.left_out or found.steps:
+        # The part itself stands elsewhere where a view is off; without that view it is asked again.
+        return []
     stray = find_occluder(own.scans, found.unconstrained.poses, size)
-    if stray is not None:
-        out.append(SessionProblem("foreign", tuple(names_of_views(stray.views, names)), stray.describe(names)))
-    return out
+    return [SessionProblem("foreign", names_of_views(stray.views, names), stray.describe(names))] if stray else []
 
 
 _VIEWS = 3
@@ -115,10 +114,10 @@ def check_three_views(session: Session, found: Snooping) -> str | None:
 
     Three views show two motions: that something is wrong, but not which scan, row or effect.
     """
-    rotation, translation = usual_twist(session.length_unit)[[0, 3]]
+    unit = session.length_unit
+    rotation, translation = usual_twist(unit)[[0, 3]]
     if len(session.views) != _VIEWS or _global_model_test(found, np.array([rotation**2, translation**2, 1.0])):
         return None
-    unit = session.length_unit
     by = f"{length_text(found.translation, unit, 2)} and {angle_text(found.rotation, 2)}"
     usual = f"{length_text(translation, unit, 2)} and {angle_text(rotation, 2)}"
     return (
@@ -159,7 +158,7 @@ def snooping_warnings(session: Session, own: Capture, found: Snooping, T_mount: 
     worst = [v for v in np.argsort(-moved) if v not in found.left_out][:_LISTED]
     farthest = ", ".join(f"{names[v]} ({moved[v]:.3g} {session.length_unit})" for v in worst)
     return (
-        f"No arm scatters by {contradiction_in_words(session, found)}: several rows or scans are wrong, and hand-eye "
+        f"No arm scatters by {_contradiction_in_words(session, found)}: several rows or scans are wrong, and hand-eye "
         f"and pose errors are not reliable; to fix: check first {farthest}.",
         *warnings,
     )
@@ -196,7 +195,10 @@ def _check_clouds(session: Session) -> list[SessionProblem]:
         if undone is None:
             raise
         return [undone]
-    if not contradicted and not (problems and _stated_poses_rivalled(found)):
+    # The scanner's motions may agree with poses that were read otherwise, and with those as stated hardly.
+    stated = max((e.closed for e in found if e.hypothesis.kind == "stated"), default=1.0)
+    rivalled = bool(found) and stated < _CLOSES * found[0].closed
+    if not contradicted and not (problems and rivalled):
         return problems
     undone = (
         _convention_problem(session, named)
@@ -217,14 +219,13 @@ def _check_views(session: Session, capture: Capture, found: Sequence[MotionFit])
     contradicted = poses_contradict_scans(session, snooped) and not any(p.kind == "disconnected" for p in problems)
     if contradicted:
         problems.append(SessionProblem("displaced", tuple(session.names), _unexplained_text(session, snooped)))
-    problems += [_suspected_problem(session, m) for m in snooped.suspected]
+    for m in snooped.suspected:
+        fix = (
+            f"{displacement_in_words(session, m)}, which an effect of the arm may cause too; to fix: run and diagnose, "
+            "and look at this scan"
+        )
+        problems.append(SessionProblem("displaced", (session.names[m.view],), fix, certain=False))
     return problems + background_problems(session, capture, T_mount, snooped), contradicted
-
-
-def _stated_poses_rivalled(found: Sequence[MotionFit]) -> bool:
-    """True if the scanner's motions agree with poses that were read otherwise, and with those as stated hardly."""
-    stated = max((e.closed for e in found if e.hypothesis.kind == "stated"), default=1.0)
-    return bool(found) and stated < _CLOSES * found[0].closed
 
 
 def _starting_hand_eye(session: Session, capture: Capture, found: Sequence[MotionFit]) -> tuple[Array, float]:
@@ -266,7 +267,7 @@ def _mistake_from_surfaces(session: Session, capture: Capture, found: Sequence[M
         return None
     if poses_contradict_scans(right, snooped):
         return None
-    return _hypothesis_problem(session, best, [f.hypothesis.fix for f in fallen])
+    return _convention_problem(session, fallen)
 
 
 def _mistake_from_motions(session: Session, found: Sequence[MotionFit]) -> SessionProblem | None:
@@ -275,22 +276,11 @@ def _mistake_from_motions(session: Session, found: Sequence[MotionFit]) -> Sessi
     return _convention_problem(session, likely) if likely else None
 
 
-def _convention_problem(session: Session, named: tuple[MotionFit, ...]) -> SessionProblem:
-    """Return one problem from hypotheses that explain the motions equally well."""
-    return _hypothesis_problem(session, named[0].hypothesis, [e.hypothesis.fix for e in named])
-
-
-def _hypothesis_problem(session: Session, best: Hypothesis, fixes: Sequence[str]) -> SessionProblem:
-    """Return the problem of a hypothesis, with what is as likely."""
-    return SessionProblem(best.kind, tuple(names_of_views(best.rows, session.names)), likeliest_text(fixes))
-
-
-def _suspected_problem(session: Session, found: MisplacedView) -> SessionProblem:
-    fix = (
-        f"{displacement_in_words(session, found)}, which an effect of the arm may cause too; to fix: run and diagnose, "
-        "and look at this scan"
-    )
-    return SessionProblem("displaced", (session.views[found.view].name,), fix, certain=False)
+def _convention_problem(session: Session, named: Sequence[MotionFit | SurfaceFit]) -> SessionProblem:
+    """Return one problem from hypotheses that are as likely, the best first."""
+    best = named[0].hypothesis
+    fixes = [e.hypothesis.fix for e in named]
+    return SessionProblem(best.kind, names_of_views(best.rows, session.names), likeliest_text(fixes))
 
 
 _CHECK_ROWS = "check that rows and clouds belong together and how the poses were converted"
@@ -405,7 +395,7 @@ def unexplained_error(session: Session, found: Snooping) -> NoResultError:
 
 def _unexplained_text(session: Session, found: Snooping) -> str:
     return (
-        f"the poses contradict the scans by {contradiction_in_words(session, found)}, more than any arm, and no usual "
+        f"the poses contradict the scans by {_contradiction_in_words(session, found)}, more than any arm, and no usual "
         f"mistake explains it; to fix: {_CHECK_ROWS}"
     )
 

@@ -11,19 +11,16 @@ from stitch.integrity.placement import (
     CLOSE_SHARE,
     FEW_SHARED,
     ReferenceSurface,
-    names_of_views,
     place_scan,
     shows_no_surface,
     surface_of,
 )
-from stitch.integrity.problems import SessionProblem, displacement_text, list_views
-from stitch.integrity.scan_faults import ScanFault, find_copies, find_same_poses, scale_fault, scan_fault
+from stitch.integrity.problems import SessionProblem, displacement_text, list_views, names_of_views
+from stitch.integrity.scan_faults import find_copies, find_same_poses, scale_fault, scan_fault
 from stitch.integrity.snooping import MisplacedView, Snooping, end_runs
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.robot import forward
 from stitch.measurement.session import Session
-
-# Misplaced views that stand off by one and the same displacement: the part was clamped anew, or the scanner moved.
 
 # So many views make a step, and this share of those on its side; displacements agree within this share of their size.
 _FEWEST, _SHARE, _AGREES = 3, 0.7, 0.2
@@ -32,7 +29,9 @@ _FEWEST, _SHARE, _AGREES = 3, 0.7, 0.2
 def find_common_displacement(
     capture: Capture, poses: Array, misplaced: Sequence[MisplacedView]
 ) -> tuple[range, str] | None:
-    """The views at one end of the list that stand off alike, with what moved: part or scanner; None if none do.
+    """Find the views at one end of the list that stand off alike, with what moved: part or scanner; None if none do.
+
+    The part was clamped anew, or the scanner moved on its mount.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner of the model.
@@ -41,9 +40,8 @@ def find_common_displacement(
     runs = end_runs({m.view for m in misplaced}, len(poses))
     for views in (run for run in runs if len(run) >= _FEWEST):
         for what in ("part", "scanner"):
-            if _count_sharing_displacement(
-                capture, poses, {v: placed[v] for v in views if v in placed}, what
-            ) >= _SHARE * len(views):
+            some = {v: placed[v] for v in views if v in placed}
+            if _count_sharing_displacement(capture, poses, some, what) >= _SHARE * len(views):
                 return views, what
     return None
 
@@ -63,8 +61,6 @@ def _count_sharing_displacement(capture: Capture, poses: Array, placed: Mapping[
     return best if best >= _FEWEST else 0
 
 
-# Which joint angle, corrected, puts a displaced view where the surfaces want it: a wrong digit, a neighbour's row.
-
 # One joint explains a displacement if it leaves less than this share of it.
 _MAX_REMAINING_SHARE = 0.1
 
@@ -72,7 +68,7 @@ _MAX_REMAINING_SHARE = 0.1
 def find_wrong_joint(
     session: Session, capture: Capture, T_mount: Array, m: MisplacedView
 ) -> tuple[str, float, float, bool] | None:
-    """The joint that alone explains a displacement: name, degrees stated and that fit, whether a neighbour's."""
+    """Find the joint that alone explains a displacement: name, degrees stated and that fit, whether a neighbour's."""
     robot, joints = session.robot, session.views[m.view].joints
     if robot is None or joints is None or m.T is None:
         return None
@@ -102,8 +98,6 @@ def find_wrong_joint(
     return f"j{j + 1}_deg", float(np.degrees(joints[j])), float(np.degrees(fits)), neighbour
 
 
-# Scans that stand in the rows of others: which row's pose each of those that do not belong would fit.
-
 # A scan belongs to another row's pose if it lies this much closer to that than to its own, and this close absolutely
 # (`CLOSE_SHARE` of the part's size).
 _CLOSER_SHARE = 0.2
@@ -124,10 +118,10 @@ def find_fitting_rows(capture: Capture, found: Snooping, misplaced: Sequence[Mis
 
 
 def exchanged_pairs(rows: dict[int, int | None], misplaced: Sequence[MisplacedView]) -> list[tuple[int, int]]:
-    """Pairs of views of which the first one's scan fits the second one's pose, and the second's shows too little.
+    """Find pairs of views of which one's scan fits the other's pose, whose own scan shows too little.
 
     Args:
-        rows: of `rows_of`, less those of closed rounds.
+        rows: of `find_fitting_rows`, less those of closed rounds.
     """
     silent = {m.view for m in misplaced if rows.get(m.view) is None} & set(rows.values())
     claimed = {row: [v for v, other in rows.items() if other == row] for row in silent}
@@ -135,7 +129,7 @@ def exchanged_pairs(rows: dict[int, int | None], misplaced: Sequence[MisplacedVi
 
 
 def exchange_cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:
-    """Closed rounds of scans that stand in each other's rows."""
+    """Find closed rounds of scans that stand in each other's rows."""
     out, seen = [], set[int]()
     for start in sorted(rows):
         path, at = [start], rows[start]
@@ -149,7 +143,7 @@ def exchange_cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:
 
 
 def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | None:
-    """The row to whose pose a scan that was placed belongs, if to another one."""
+    """Return the row to whose pose a scan that was placed belongs, if to another one."""
     off = _pose_distances(capture, view, T, poses)
     best = int(np.argmin(off))
     close = off[best] < max(CLOSE_SHARE * part_size([capture]), 1e-12) and off[best] < _CLOSER_SHARE * off[view]
@@ -196,58 +190,53 @@ def explain_misplaced(session: Session, capture: Capture, T_mount: Array, found:
         session, capture: with the same views.
         T_mount: (4, 4) hand-eye under which `found` was made.
     """
-    names = session.names
-    poses = found.expected
-    out, explained = [], set[int]()
+    names, out, open_ones = session.names, list[SessionProblem](), {m.view: m for m in found.misplaced}
+
+    def explain(kind: str, views: Sequence[int], fix: str) -> None:
+        out.append(SessionProblem(kind, names_of_views(views, names), fix))
+        for v in views:
+            open_ones.pop(v, None)
+
     for v, w in find_copies(capture):
-        bad = v if v in found.left_out and w not in found.left_out else w
-        explained.add(bad)
-        good = v if bad == w else w
+        bad, good = (v, w) if v in found.left_out and w not in found.left_out else (w, v)
+        open_ones.pop(bad, None)
         out.append(SessionProblem("duplicate_scan", (names[v], names[w]), _COPY.format(names[good])))
-    misplaced = [m for m in found.misplaced if m.view not in explained]
-    rows = find_fitting_rows(capture, found, misplaced)
-    cycles = exchange_cycles(rows)
-    for cycle in cycles:
-        explained |= set(cycle)
-        out.append(
-            SessionProblem("exchanged", tuple(names_of_views(cycle, names)), _exchange_problem(cycle, rows, names))
-        )
-    left = {v: row for v, row in rows.items() if v not in explained}
-    for v, row in exchanged_pairs(left, [m for m in misplaced if m.view not in explained]):
-        explained |= {v, row}
-        out.append(
-            SessionProblem(
-                "exchanged", tuple(names_of_views(sorted((v, row)), names)), _EXCHANGED.format(names[v], names[row])
-            )
-        )
-    step = (
-        find_common_displacement(capture, poses, [m for m in misplaced if m.view not in explained])
-        if not found.steps
-        else None
-    )
+    rows = find_fitting_rows(capture, found, [*open_ones.values()])
+    for cycle in exchange_cycles(rows):
+        explain("exchanged", cycle, _exchange_fix(cycle, rows, names))
+    left = {v: row for v, row in rows.items() if v in open_ones}
+    for v, row in exchanged_pairs(left, [*open_ones.values()]):
+        explain("exchanged", sorted((v, row)), _EXCHANGED.format(names[v], names[row]))
+    step = None if found.steps else find_common_displacement(capture, found.expected, [*open_ones.values()])
     if step is not None:
-        explained |= set(step[0])
-        out.append(_reclamped_problem(step[0], step[1], names))
+        explain("reclamped", *_reclamped(step[0], step[1], names))
     same = find_same_poses(capture)
-    for m in misplaced:
-        if m.view not in explained:
-            out.append(_single_view_problem(session, capture, T_mount, found, m, same))
+    out += [_single_view_problem(session, capture, T_mount, found, m, same) for m in open_ones.values()]
     for s in found.steps:
         side = range(s.start) if s.start <= found.largest_segment.start else range(s.start, len(names))
-        out.append(_reclamped_problem(side, s.moved if s.distinguishable else "either", names))
+        explain("reclamped", *_reclamped(side, s.moved if s.distinguishable else "either", names))
     if len(found.disconnected) > 1:
         shown = " | ".join(list_views(names_of_views(group, names), names) for group in found.disconnected)
-        views = tuple(n for group in found.disconnected[1:] for n in names_of_views(group, names))
-        out.append(SessionProblem("disconnected", views, f"no surface links {shown}; to fix: add views between them"))
+        views = [v for group in found.disconnected[1:] for v in group]
+        explain("disconnected", views, f"no surface links {shown}; to fix: add views between them")
     return out
 
 
-def _exchange_problem(cycle: Sequence[int], rows: dict[int, int | None], names: Sequence[str]) -> str:
+def _exchange_fix(cycle: Sequence[int], rows: dict[int, int | None], names: Sequence[str]) -> str:
     if len(cycle) == 2:
         pair = f"{names[cycle[0]]} and {names[cycle[1]]}"
         return f"the scans of {pair} fit each other's poses; to fix: exchange the clouds of {pair} in views.csv"
     moves = ", ".join(f"the cloud of {names[v]} to row {names[int(rows[v] or 0)]}" for v in cycle)
     return f"the clouds of {len(cycle)} rows are mixed up; to fix: move {moves}"
+
+
+def _reclamped(views: range, moved: str, names: Sequence[str]) -> tuple[range, str]:
+    """Return views at one end of the list that stand off from the rest, and what to do."""
+    start = views.start or views.stop
+    what = {"part": "the part was clamped anew", "scanner": "the scanner moved on its mount"}.get(
+        moved, "the part or the scanner moved"
+    )
+    return views, f"{what} between {names[start - 1]} and {names[start]}; to fix: make two sessions of it"
 
 
 def _single_view_problem(
@@ -258,11 +247,16 @@ def _single_view_problem(
     m: MisplacedView,
     same: Sequence[tuple[int, int]],
 ) -> SessionProblem:
-    names = session.names
+    names, scan = session.names, capture.scans[m.view]
     own = (names[m.view],)
-    fault = _scan_problem(capture, found, m)
-    if fault is not None:
-        return SessionProblem(fault.kind, own, fault.fix)
+    if not shows_no_surface(scan):
+        # Something may be wrong with the cloud rather than with its pose.
+        others = [v for v in found.linkage.core if v != m.view]
+        surface = surface_of(capture.scans, found.unconstrained.poses, others, found.tolerance)
+        look = scan_fault if m.T is None else scale_fault
+        fault = look(scan, found.expected[m.view], surface, part_size([capture]), found.needed)
+        if fault is not None:
+            return SessionProblem(fault.kind, own, fault.fix)
     if m.kind == "torn":
         return SessionProblem("displaced", own, _TORN)
     if m.T is None:
@@ -289,24 +283,3 @@ def _single_view_problem(
     return SessionProblem(
         "displaced", own, f"its pose is {off}; to fix: correct the row, scan again or leave the view out"
     )
-
-
-def _scan_problem(capture: Capture, found: Snooping, m: MisplacedView) -> ScanFault | None:
-    """Return what is wrong with the cloud of a view, rather than with its pose; None if nothing is."""
-    scan, T_pose = capture.scans[m.view], found.expected[m.view]
-    if shows_no_surface(scan):
-        return None
-    others = [v for v in found.linkage.core if v != m.view]
-    surface = surface_of(capture.scans, found.unconstrained.poses, others, found.tolerance)
-    look = scan_fault if m.T is None else scale_fault
-    return look(scan, T_pose, surface, part_size([capture]), found.needed)
-
-
-def _reclamped_problem(views: range, moved: str, names: Sequence[str]) -> SessionProblem:
-    """Some views at one end of the list that stand off from the rest."""
-    start = views.start or views.stop
-    what = {"part": "the part was clamped anew", "scanner": "the scanner moved on its mount"}.get(
-        moved, "the part or the scanner moved"
-    )
-    fix = f"{what} between {names[start - 1]} and {names[start]}; to fix: make two sessions of it"
-    return SessionProblem("reclamped", tuple(names_of_views(views, names)), fix)

@@ -5,7 +5,7 @@ gate that shrinks. A placement is judged by its closure: of the points that come
 share that lies on it.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,8 +25,6 @@ from stitch.observations.surfaces.normal_equations import Overlaps
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.statistics.distributions import binomial_tail
 
-# What a scan shows of points that lie, or should lie, on the surface that it has seen.
-
 # The same side of a part: normals within 45°; at the same place: within two spacings along the surface.
 _SAME_SIDE, _SPACINGS = np.cos(np.radians(45.0)), 2.0
 # Elsewhere is farther than so many tolerances: what a lens or a slant does to a scan moves it by less.
@@ -37,7 +35,7 @@ PointVisibility = NDArray[np.int8]
 
 
 def classify_visibility(scan: Scan, points: Array, normals: Array, limits: tuple[float, float]) -> PointVisibility:
-    """(n,) what a scan shows of points (n, 3) with normals (n, 3), in its frame.
+    """Return (n,) what a scan shows of points (n, 3) with normals (n, 3), in its frame.
 
     Args:
         limits: distance along the normal that is the same place, and how far is looked, length_unit.
@@ -56,7 +54,7 @@ def points_in_place(scan: Scan, points: Array, normals: Array, tolerance: float)
 
 
 def nearest_partners(scan: Scan, points: Array, normals: Array, reach: float) -> tuple[Indices, Array, Array]:
-    """Of points in its frame the nearest one of a scan (n,), and how far they are from it (n,) along and beside its
+    """Return the point of a scan (n,) nearest to each one in its frame, and how far that is (n,) along and beside its
     normal: infinitely far beside where it is none, or of the other side of the part."""
     distance, partner = scan.tree.query(np.ascontiguousarray(points), distance_upper_bound=reach)
     found = np.isfinite(distance)
@@ -67,12 +65,6 @@ def nearest_partners(scan: Scan, points: Array, normals: Array, reach: float) ->
     beside = np.sqrt(np.maximum(distance**2 - along**2, 0.0), where=found, out=np.full(len(points), np.inf))
     return partner, along, beside
 
-
-# Which scans show a surface where others show it elsewhere, facing the same way: it cannot be in two places.
-#
-# Partners beyond the gate are no partners, so that such a scan keeps its few that fit and seems to fit well, and the
-# stitched cloud gets a second surface beside the first. What is torn in itself, because the part moved during the scan
-# or two scans are in one file, fits with one half and contradicts with the other.
 
 # Points of a scan that are asked, in so many other scans each (with more they take turns), and how far from their
 # surface, as a share of the part's size.
@@ -92,7 +84,12 @@ def find_contradicting_views(
     share: float = CONTRADICTS,
     groups: Sequence[Sequence[int]] = (),
 ) -> tuple[int, ...]:
-    """Views that contradict the others, most of all first; each is asked without those before it.
+    """Find views that show a surface where others show it elsewhere, facing the same way; the worst first.
+
+    Partners beyond the gate are no partners, so that such a scan keeps its few that fit and seems to fit well, and the
+    stitched cloud gets a second surface beside the first. What is torn in itself, because the part moved during the
+    scan or two scans are in one file, fits with one half and contradicts with the other. Each view is asked without
+    those before it.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner at which the views fit best.
@@ -145,12 +142,9 @@ def _point_visibility(
     return out
 
 
-# Which views hold each other: the graph of overlaps, its components and its weak places.
-#
-# Two views are linked if most of their correspondences close within the robust gate. A pair that only lies near,
-# with surfaces that cross, has correspondences too, but they do not close: it links nothing, and the robust weights
-# of the fit ignore it without a word.
-
+# Two views are linked if most of their correspondences close within the robust gate. A pair that only lies near, with
+# surfaces that cross, has correspondences too, but they do not close: it links nothing, and the robust weights of the
+# fit ignore it without a word.
 # Share of a pair's correspondences within four robust sigmas. Pairs of good sessions have 0.7 to 1, simulated and
 # real; pairs with a view displaced by more than the gate 0 to 0.3.
 LINKED_SHARE = 0.5
@@ -178,7 +172,6 @@ class Linkage:
     """The graph of overlaps of V views; components are sorted, largest first."""
 
     views: int
-    links: tuple[Link, ...]
     components: tuple[tuple[int, ...], ...]
     single: tuple[tuple[int, int], ...]  # (view, partner): held by this one pair alone
 
@@ -192,15 +185,9 @@ class Linkage:
         """Views outside the largest component."""
         return tuple(sorted(v for part in self.components[1:] for v in part))
 
-    def share(self, view: int) -> float:
-        """Share of the correspondences of a view that close, over all its pairs; 0 without any."""
-        own = [link for link in self.links if view in (link.v, link.w)]
-        total = sum(link.count / link.share for link in own if link.share > 0)
-        return sum(link.count for link in own) / total if total else 0.0
-
 
 def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkage:
-    """Components, and views held by a single pair, from the correspondences at the poses of `overlaps`.
+    """Find components, and views held by a single pair, from the correspondences at the poses of `overlaps`.
 
     Args:
         holding_nothing: views whose scans hold no pose, however well they lie on the others.
@@ -221,24 +208,14 @@ def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkag
 
 
 def linkage_of_links(views: int, links: Sequence[Link]) -> Linkage:
-    """The linkage of V views from their links."""
+    """Return the linkage of V views from their links."""
     near = np.zeros((views, views), bool)
     for link in links:
         near[link.v, link.w] = near[link.w, link.v] = link.holds
     single = [(v, int(np.argmax(near[v]))) for v in range(views) if near[v].sum() == 1]
-    return Linkage(views, tuple(links), _connected_components(near), tuple(single))
-
-
-def _connected_components(near: Mask) -> tuple[tuple[int, ...], ...]:
-    """Connected components of an adjacency (V, V), largest first."""
     count, label = connected_components(coo_array(near), directed=False)
     parts = [tuple(int(v) for v in np.flatnonzero(label == k)) for k in range(count)]
-    return tuple(sorted(parts, key=lambda part: (-len(part), part)))
-
-
-def names_of_views(indices: Indices | Sequence[int], names: Sequence[str]) -> list[str]:
-    """Names of some views."""
-    return [names[int(v)] for v in indices]
+    return Linkage(views, tuple(sorted(parts, key=lambda part: (-len(part), part))), tuple(single))
 
 
 # Points of the other views that make up their surface, and of the scan that is placed.
@@ -269,15 +246,15 @@ class ReferenceSurface:
         """Distance from its points within which a point lies near the surface."""
         return 2 * self.spacing + 3 * self.tolerance
 
-    def meets(self, poses: Array, points: Array, normals: Array, gate: float) -> tuple[Array, Array, Mask]:
-        """Signed distance (S, n), normal of the partner (S, n, 3), and whether there is one within `gate`."""
+    def meets(self, poses: Array, points: Array, normals: Array, gate: float) -> tuple[Array, Array, Mask, Mask]:
+        """Signed distance (S, n), normal of the partner (S, n, 3), whether one within `gate` faces alike, or is there."""
         placed = frames.transform(poses, points)
         distance, partner = self.tree.query(np.ascontiguousarray(placed.reshape(-1, 3)), distance_upper_bound=gate)
-        found = np.isfinite(distance).reshape(placed.shape[:2])
-        partner = np.where(np.isfinite(distance), partner, 0).astype(np.int64).reshape(placed.shape[:2])
+        near = np.isfinite(distance).reshape(placed.shape[:2])
+        partner = np.where(near, partner.reshape(near.shape), 0).astype(np.int64)
         normal = self.normals[partner]
-        found &= np.einsum("snj,snj->sn", frames.rotate(poses, normals), normal) > _NORMAL_COSINE
-        return np.einsum("snj,snj->sn", placed - self.points[partner], normal), normal, found
+        alike = np.einsum("snj,snj->sn", frames.rotate(poses, normals), normal) > _NORMAL_COSINE
+        return np.einsum("snj,snj->sn", placed - self.points[partner], normal), normal, near & alike, near
 
 
 @dataclass(frozen=True)
@@ -295,15 +272,21 @@ class Placement:
 
 
 def surface_of(scans: Sequence[Scan], poses: Array, views: Iterable[int], tolerance: float) -> ReferenceSurface:
-    """The surface that some views show under poses (V, 4, 4) T_reference_scanner."""
+    """Return the surface that some views show under poses (V, 4, 4) T_reference_scanner."""
     views = list(views)
     picked = {v: sample_points(scans[v], max(_SURFACE_POINTS // max(len(views), 1), 200)) for v in views}
-    points = np.concatenate([frames.transform(poses[v], scans[v].points[picked[v]]) for v in views])
-    normals = np.concatenate([frames.rotate(poses[v], scans[v].normals[picked[v]]) for v in views])
+    points, normals = _points_of(scans, poses, picked)
     spacing = float(
         np.median([scans[v].spacing * np.sqrt(len(scans[v].points) / max(len(picked[v]), 1)) for v in views])
     )
     return ReferenceSurface(points, normals, KDTree(np.ascontiguousarray(points), leafsize=16), spacing, tolerance)
+
+
+def _points_of(scans: Sequence[Scan], poses: Array, picked: Mapping[int, Indices]) -> tuple[Array, Array]:
+    """Return some points (N, 3) of views, and normals, in the reference frame."""
+    points = [frames.transform(poses[v], scans[v].points[index]) for v, index in picked.items()]
+    normals = [frames.rotate(poses[v], scans[v].normals[index]) for v, index in picked.items()]
+    return np.concatenate(points), np.concatenate(normals)
 
 
 def shows_no_surface(scan: Scan) -> bool:
@@ -329,8 +312,7 @@ def evaluate_placements(
     index = sample_points(scan, probes)
     if not len(index):
         return [Placement(T, 0.0, 0.0) for T in poses]
-    residual, _, meets = surface.meets(poses, scan.points[index], scan.normals[index], surface.near)
-    inside = _points_near_surface(scan, poses, surface, index, surface.near)
+    residual, _, meets, inside = surface.meets(poses, scan.points[index], scan.normals[index], surface.near)
     on = meets & (np.abs(residual) < surface.tolerance)
     return [
         Placement(T, float(i.mean()), float(o.sum() / max(i.sum(), 1)))
@@ -338,15 +320,8 @@ def evaluate_placements(
     ]
 
 
-def _points_near_surface(scan: Scan, poses: Array, surface: ReferenceSurface, index: Indices, near: float) -> Mask:
-    """(S, n) points with the surface near, whichever way it faces."""
-    placed = frames.transform(poses, scan.points[index])
-    distance, _ = surface.tree.query(np.ascontiguousarray(placed.reshape(-1, 3)), distance_upper_bound=near)
-    return np.asarray(np.isfinite(distance).reshape(placed.shape[:2]))
-
-
 def place_scan(scan: Scan, surface: ReferenceSurface, starts: Array, size: float) -> list[Placement]:
-    """Close in from every start (S, 4, 4); the best few placements, best first.
+    """Close in from every start (S, 4, 4); return the best few placements, best first.
 
     Args:
         size: of the part, length_unit: the search reaches a third of it.
@@ -369,7 +344,7 @@ def _icp_scan(scan: Scan, surface: ReferenceSurface, starts: Array, gates: Array
     centre = points.mean(axis=0)
     lever = float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean())) or 1.0
     for gate in gates:
-        residual, normal, found = surface.meets(poses, points, normals, gate)
+        residual, normal, found, _ = surface.meets(poses, points, normals, gate)
         # Twists about each pose's own centre, rotations in units of the lever: well scaled at every start.
         arm = frames.transform(poses, points) - frames.transform(poses, centre[None])
         J = np.concatenate([np.cross(arm, normal) / lever, normal], axis=2)
@@ -405,10 +380,6 @@ def starts_anywhere(surface: ReferenceSurface, scan: Scan, turns: int = 48) -> A
     return frames.make(R, there - R @ own)
 
 
-# Groups of views that link each other but not the others, placed as one scan each: they share what displaces them.
-#
-# Of such a group each view alone may show too little of the others, or close in a wrong place; all of it closes in one.
-
 # Points of each view that stand for it in its group.
 _GROUP_PROBES = 600
 # What shows less than this share of the surface cannot be seen to belong there.
@@ -417,6 +388,9 @@ FEW_SHARED = 0.1
 
 def place_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple[float, float]) -> dict[int, Placement]:
     """Find where the views of groups outside the core belong, each group moved as a whole; the core grows with them.
+
+    What displaces the views of a group they share. Each alone may show too little of the others, or close in a wrong
+    place; all of them close in one.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner at which the views of each group fit together.
@@ -432,7 +406,7 @@ def place_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple[
         if not closed:
             continue
         # A part may look alike from several sides: of the places in which the group closes, the nearest.
-        T = min(closed, key=lambda p: _rms_displacement(scan, p.T)).T
+        T = min(closed, key=lambda p: float(np.sum((frames.transform(p.T, scan.points) - scan.points) ** 2))).T
         placed |= {v: evaluate_placement(capture.scans[v], T @ poses[v], surface) for v in group}
         core += group
         poses = np.array([T @ pose if v in group else pose for v, pose in enumerate(poses)])
@@ -440,13 +414,13 @@ def place_groups(capture: Capture, poses: Array, linked: Linkage, limits: tuple[
 
 
 def _merge_scans(scans: Sequence[Scan], poses: Array, group: Sequence[int]) -> Scan:
-    """Some points of all views of a group as one scan in the reference frame."""
+    """Return some points of all views of a group as one scan in the reference frame."""
     picked = {v: sample_points(scans[v], _GROUP_PROBES) for v in group}
-    points = np.concatenate([frames.transform(poses[v], scans[v].points[picked[v]]) for v in group])
+    points, normals = _points_of(scans, poses, picked)
     return replace(
         scans[group[0]],
         points=points,
-        normals=np.concatenate([frames.rotate(poses[v], scans[v].normals[picked[v]]) for v in group]),
+        normals=normals,
         usable=np.ones(len(points), bool),
         area=np.concatenate([scans[v].area[picked[v]] for v in group]),
         confidence=np.concatenate([scans[v].confidence[picked[v]] for v in group]),
@@ -459,17 +433,10 @@ def _group_closes(scan: Scan, T: Array, surface: ReferenceSurface, needed: float
 
     Halves of a session may show the two sides of a thin wall: there what is near and faces the other way says nothing.
     """
-    residual, _, meets = surface.meets(T[None], scan.points, scan.normals, surface.near)
+    residual, _, meets, _ = surface.meets(T[None], scan.points, scan.normals, surface.near)
     on = meets & (np.abs(residual) < surface.tolerance)
     return bool(meets.mean() > FEW_SHARED and on.sum() > needed * meets.sum())
 
-
-def _rms_displacement(scan: Scan, T: Array) -> float:
-    """Return how far a motion (4, 4) carries the points of a scan, rms."""
-    return float(np.sqrt(np.mean(np.sum((frames.transform(T, scan.points) - scan.points) ** 2, axis=1))))
-
-
-# Views outside the largest component, tried wide: where on the surface of the linked ones they belong, if anywhere.
 
 # A placement is right if at least this share of what linked views have on the others' surface lies on it. Right ones
 # have 0.9 to 1 of it, scans of other parts up to 0.35, scaled by 2.5 % up to 0.7.
@@ -481,9 +448,17 @@ _NEAR_GATE = 0.2
 
 
 def needed_closure(capture: Capture, poses: Array, linked: Linkage, tolerance: float) -> float:
-    """Share of a scan on the surface of the others at which it counts as placed."""
-    compared = linked.unlinked and len(linked.core) > 1
-    return _ACCEPTED_CLOSURE * _usual_closure(capture, poses, linked.core, tolerance) if compared else _ACCEPTED_CLOSURE
+    """Return the share of a scan on the surface of the others at which it counts as placed."""
+    core = linked.core
+    if not linked.unlinked or len(core) < 2:
+        return _ACCEPTED_CLOSURE
+    usual = [
+        evaluate_placement(
+            capture.scans[v], poses[v], surface_of(capture.scans, poses, [w for w in core if w != v], tolerance)
+        ).closure
+        for v in core[:: max(len(core) // 6, 1)]
+    ]
+    return _ACCEPTED_CLOSURE * float(np.median(usual))
 
 
 def place_unlinked_views(
@@ -560,15 +535,3 @@ def _distances_from_rows(scan: Scan, found: Sequence[Placement], model_poses: Ar
     points = scan.points[::50]
     rows = frames.transform(model_poses, points)
     return [float(np.sqrt(((rows - frames.transform(p.T, points)) ** 2).sum(axis=2).mean(axis=1)).min()) for p in found]
-
-
-def _usual_closure(capture: Capture, poses: Array, core: Sequence[int], tolerance: float) -> float:
-    """Median closure of linked views on the surface of the other ones."""
-    some = core[:: max(len(core) // 6, 1)]
-    closures = [
-        evaluate_placement(
-            capture.scans[v], poses[v], surface_of(capture.scans, poses, [w for w in core if w != v], tolerance)
-        ).closure
-        for v in some
-    ]
-    return float(np.median(closures))

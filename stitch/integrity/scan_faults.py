@@ -17,11 +17,6 @@ from stitch.measurement.scan import Scan, prepare_scan
 from stitch.observations.surfaces.matching import sample_points
 from stitch.statistics.distributions import tukey
 
-# What one scan shows where others look through and see nothing: a cable, an arm, a box that stood there for a while.
-#
-# It belongs neither to the part nor to the scanner, stands elsewhere in every view, and is in the stitched cloud at
-# every place where it was seen.
-
 # Points of a scan that are asked, and other scans, evenly over the session, that are asked for each.
 _OCCLUDER_PROBES, _OCCLUDER_VIEWS_COMPARED = 400, 20
 # Of the part's size: what is farther from a scan's points it does not show, and what it sees farther behind it looks
@@ -55,7 +50,9 @@ def ray_tree(scan: Scan) -> KDTree:
 
 
 def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder | None:
-    """Return what single scans show where others see through; None if it is too little.
+    """Return what single scans show where others look through and see nothing; None if it is too little.
+
+    It belongs neither to the part nor to the scanner, and is in the stitched cloud at every place where it was seen.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner where surfaces put the views.
@@ -65,10 +62,7 @@ def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder 
     looks = {v: ray_tree(scans[v]) for v in views}
     shares = {}
     for v in views:
-        others = [w for w in views if w != v]
-        asked = [
-            others[i] for i in np.linspace(0, len(others) - 1, min(len(others), _OCCLUDER_VIEWS_COMPARED)).astype(int)
-        ]
+        asked = _evenly([w for w in views if w != v], _OCCLUDER_VIEWS_COMPARED)
         points = scans[v].points[sample_points(scans[v], _OCCLUDER_PROBES)]
         seen_from = {w: frames.inverse(poses[w]) @ poses[v] for w in asked}
         apart = {w: max(_APART * size, _SPACINGS * scans[w].spacing) for w in asked}
@@ -84,6 +78,11 @@ def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder 
         shares[v] = through.sum() / count if through.sum() >= _FEWEST else 0.0
     found = tuple(v for v, share in shares.items() if share > _OCCLUDER_MIN_SHARE)
     return Occluder(found, float(np.mean([shares[v] for v in found]))) if found else None
+
+
+def _evenly(views: Sequence[int], count: int) -> list[int]:
+    """Return so many of some views at most, all over the list."""
+    return [int(views[i]) for i in np.linspace(0, len(views) - 1, min(len(views), count)).astype(int)]
 
 
 def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Mask:
@@ -110,13 +109,6 @@ def _surrounded(rays: Array, looks: Array) -> Mask:
     gaps = np.diff(angles, axis=1, append=angles[:, :1] + 2 * np.pi)
     return np.asarray(gaps.max(axis=1, initial=0.0) < np.pi)
 
-
-# What the scans show at one place before the scanner whatever the arm did: a wall, a table, a bracket, and no part.
-#
-# Where scanner or part are carried around, what belongs to the part changes its place before the scanner with every
-# view. What does not belongs to the scanner, and every view puts it elsewhere in the stitched cloud. A panel that
-# slides along itself, or a disc that turns about its axis, looks as if it stood still too; but under the model others
-# show it where it is, and nobody looks through it.
 
 # Points of a scan that are asked, other scans in which they are sought, and how many of these must move them, by what
 # share of the part's size.
@@ -155,7 +147,12 @@ class StaticBackground:
 def find_static_background(
     scans: Sequence[Scan], poses: Array, tolerance: float, size: float
 ) -> StaticBackground | None:
-    """Return what stands still before the scanner; None if it is too little.
+    """Return what the scans show at one place before the scanner whatever the arm did; None if it is too little.
+
+    Where scanner or part are carried around, what belongs to the part changes its place before the scanner with every
+    view. What does not belongs to the scanner, and every view puts it elsewhere in the stitched cloud. A panel that
+    slides along itself, or a disc that turns about its axis, looks as if it stood still too; but under the model others
+    show it where it is, and nobody looks through it.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner under the model.
@@ -204,12 +201,12 @@ def _box_beyond_part(part: Array, other: Array, every: Array, size: float) -> Ar
 
 
 def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> list[int]:
-    """Views between which and view v the model moves its points before the scanner, evenly over the session."""
+    """Return views between which and view v the model moves its points before the scanner, all over the session."""
     if not len(points):
         return []
     there = frames.transform(frames.inverse(poses) @ poses[v], points[None])
     far = np.flatnonzero(np.median(np.linalg.norm(there - points, axis=2), axis=1) > _MOVED * size)
-    return [int(w) for w in far[np.linspace(0, len(far) - 1, min(len(far), _BACKGROUND_VIEWS_COMPARED)).astype(int)]]
+    return _evenly(far.tolist(), _BACKGROUND_VIEWS_COMPARED)
 
 
 def _static_points(scan: Scan, own: Indices, others: Sequence[Scan], tolerance: float) -> Mask:
@@ -277,13 +274,9 @@ def scan_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: float
 
     def closes(points: Array, eye: Array, reach: float) -> float:
         other = prepare_scan(scan.name, points, eye=eye)
-        found = [
-            evaluate_placement(other, T_pose, surface),
-            *place_scan(other, surface, starts_about(T_pose, other, size), size)[:1],
-        ]
-        middle = other.points.mean(axis=0)[None]
-        moved = [np.linalg.norm(frames.transform(f.T, middle) - frames.transform(T_pose, middle)) for f in found]
-        return max(f.closure if f.near > 0.3 and m < reach else 0.0 for f, m in zip(found, moved, strict=True))
+        placed = place_scan(other, surface, starts_about(T_pose, other, size), size)[0]
+        found = (evaluate_placement(other, T_pose, surface), placed)
+        return max(f.closure if f.near > 0.3 and _moved(other, T_pose, f.T) < reach else 0.0 for f in found)
 
     # The pose of a mirrored scan is right: on a part that looks alike in a mirror, others close elsewhere too.
     near = _STAYS * size
@@ -309,23 +302,28 @@ def scale_fault(scan: Scan, T_pose: Array, surface: ReferenceSurface, size: floa
     if found.closure < needed:
         # The factor from the shape is good to a thousandth; the range that it leaves is one of millimetres.
         found = place_scan(other, surface, T_pose[None], 0.2 * size)[0]
-        middle = other.points.mean(axis=0)[None]
-        moved = np.linalg.norm(frames.transform(found.T, middle) - frames.transform(T_pose, middle))
-        if found.closure < needed or moved > _RANGE_LEFT * abs(scale - 1) * np.linalg.norm(middle):
+        allowed = _RANGE_LEFT * abs(scale - 1) * np.linalg.norm(other.points.mean(axis=0))
+        if found.closure < needed or _moved(other, T_pose, found.T) > allowed:
             return None
     size_text = f"this cloud is {1 / scale:.4g} times as large as the part"
     return ScanFault("scale", f"{size_text}; to fix: multiply it by {scale:.5g}")
 
 
+def _moved(scan: Scan, T: Array, other: Array) -> float:
+    """Return how far apart two poses put the middle of a scan."""
+    middle = scan.points.mean(axis=0)[None]
+    return float(np.linalg.norm(frames.transform(other, middle) - frames.transform(T, middle)))
+
+
 def _similarity(scan: Scan, T: Array, surface: ReferenceSurface, size: float) -> float:
-    """Factor on the scan's points that fits a surface best, with its pose: point-to-plane, seven unknowns."""
+    """Fit a factor on the scan's points to a surface, with its pose: point-to-plane, seven unknowns."""
     index = sample_points(scan, 600)
     points, normals = scan.points[index], scan.normals[index]
     centre, scale = points.mean(axis=0), 1.0
     lever = float(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()))
     for gate in np.maximum(size * np.geomspace(0.1, 0.01, 25), 1.5 * surface.spacing):
         shown = centre + scale * (points - centre)
-        residual, normal, found = (x[0] for x in surface.meets(T[None], shown, normals, gate))
+        residual, normal, found, _ = (x[0] for x in surface.meets(T[None], shown, normals, gate))
         arm = frames.transform(T, shown) - frames.transform(T, centre[None])
         along = np.einsum("nj,nj->n", arm, normal)[:, None] / lever
         J = np.concatenate([np.cross(arm, normal) / lever, normal, along], axis=1)
@@ -341,23 +339,20 @@ def _similarity(scan: Scan, T: Array, surface: ReferenceSurface, size: float) ->
 
 
 def find_copies(capture: Capture) -> list[tuple[int, int]]:
-    """Pairs of views (v < w) that show the same measured points."""
-    pairs = []
-    for v, w in combinations(range(len(capture.scans)), 2):
-        a, b = capture.scans[v].points, capture.scans[w].points
-        if abs(len(a) - len(b)) <= 0.02 * max(len(a), len(b)) and _same_points(capture.scans[v], capture.scans[w]):
-            pairs.append((v, w))
-    return pairs
+    """Find pairs of views (v < w) that show the same measured points."""
+    return [(v, w) for (v, a), (w, b) in combinations(enumerate(capture.scans), 2) if _same_points(a, b)]
 
 
 def _same_points(a: Scan, b: Scan) -> bool:
     """True if nearly every point of `a` is found in `b`, far closer than two measurements ever agree."""
+    if abs(len(a.points) - len(b.points)) > 0.02 * max(len(a.points), len(b.points)):
+        return False
     index = np.linspace(0, len(a.points) - 1, min(len(a.points), 60)).astype(int)
     distance, _ = b.tree.query(np.ascontiguousarray(a.points[index]), k=1)
     return bool(np.mean(distance < 1e-4 * b.spacing) > 0.9)
 
 
 def find_same_poses(capture: Capture) -> list[tuple[int, int]]:
-    """Pairs of views (v < w) with the very same pose."""
+    """Find pairs of views (v < w) with the very same pose."""
     T = capture.T_reference_mount
     return [(v, w) for v, w in combinations(range(len(T)), 2) if np.allclose(T[v], T[w], rtol=0, atol=1e-9)]

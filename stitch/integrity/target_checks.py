@@ -15,8 +15,7 @@ from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.integrity.conventions import RelativeScans, rank_hypotheses
 from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses
-from stitch.integrity.placement import names_of_views
-from stitch.integrity.problems import SessionProblem, likeliest_text
+from stitch.integrity.problems import SessionProblem, likeliest_text, names_of_views
 from stitch.measurement.capture import Capture, Sightings, build_capture, sightings_of
 from stitch.measurement.session import Session
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
@@ -195,7 +194,7 @@ def target_problems(session: Session, sightings: Sightings | None) -> list[Sessi
     for moved in find_moved_targets(drop_mislabelled(every) or every):
         views = () if moved.drifts else names_of_views(range(moved.start, len(names)), names)
         length = length_text(moved.distance, session.length_unit)
-        out.append(SessionProblem("displaced", tuple(views), moved.describe(names[moved.start], length)))
+        out.append(SessionProblem("displaced", views, moved.describe(names[moved.start], length)))
     return out
 
 
@@ -243,7 +242,7 @@ def check_targets(session: Session) -> list[SessionProblem]:
         return [SessionProblem("displaced", tuple(names), fix)]
     h = best.hypothesis
     others = [f.hypothesis.fix for f in fits if f.spread < 2 * best.spread and f.hypothesis.fix != h.fix]
-    return [SessionProblem(h.kind, tuple(names_of_views(h.rows, names)), likeliest_text([h.fix, *others[:2]]))]
+    return [SessionProblem(h.kind, names_of_views(h.rows, names), likeliest_text([h.fix, *others[:2]]))]
 
 
 def _hypotheses_to_try(session: Session, capture: Capture, length: float) -> Iterator[Hypothesis]:

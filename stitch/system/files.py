@@ -13,12 +13,10 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from stitch.errors import BusyError
-
-# Two paths exchange their places in one step that nothing can interrupt.
 
 _AT_FDCWD = -100  # AT_FDCWD of Linux
 _RENAME_EXCHANGE = 2  # RENAME_EXCHANGE of Linux, RENAME_SWAP of macOS
@@ -39,12 +37,9 @@ def exchange_paths(first: Path, second: Path) -> bool:
         return False
 
 
-# Errors of the file system name what a person asked for, not a hidden file that is made for it.
-
-
 @contextmanager
 def report_errors_as(stated: Path, hidden: Path | None = None) -> Iterator[None]:
-    """Let errors at `hidden` name `stated`; without `hidden` every error does."""
+    """Let errors at `hidden`, a file made for what a person asked for, name `stated`; without `hidden` all do."""
     try:
         yield
     except OSError as error:
@@ -104,20 +99,11 @@ def _locked(lock: Path, what: Path) -> int:
             ) from None
         except OSError:
             return descriptor  # a file system that knows no locks
-        if _is_same_file(descriptor, lock):
-            return descriptor
-        # Its holder has removed the file between our opening and our locking it.
+        # Its holder may have removed the file between our opening and our locking it.
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(descriptor), lock.stat()):
+                return descriptor
         os.close(descriptor)
-
-
-def _is_same_file(descriptor: int, lock: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(descriptor), lock.stat())
-    except FileNotFoundError:
-        return False
-
-
-# Files that are there whole or not at all.
 
 
 @contextmanager
@@ -168,7 +154,9 @@ def claim_folder(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.parent if os.access(path.parent, os.W_OK) or not path.is_dir() else path
     with only_writer(beside / f".{path.name}.lock", asked):
-        home = _scratch_parent(path, beside)
+        # A new folder is made beside the old one, or in it where that must stay.
+        here = Path.cwd()
+        home = path if path in (here, *here.parents) or os.path.ismount(path) else beside
         _recover(home, path)
         yield home
 
@@ -197,12 +185,6 @@ def rewrite_folder(path: Path, ours: Ours) -> Iterator[Path]:
             raise OSError(error.errno, error.strerror or str(error), place) from None
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
-
-
-def _scratch_parent(path: Path, parent: Path) -> Path:
-    """Where a new folder is made: beside the old one, or in it where that must stay."""
-    here = Path.cwd()
-    return path if path in (here, *here.parents) or os.path.ismount(path) else parent
 
 
 def _prefix(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""Calls of foreign code that must end: past their time they are interrupted, and if that fails, the process ends."""
+"""How far long loops are, a terminal for people, and calls of foreign code that must end in time."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-# Loops that take long say how far they are; whoever watches decides what is shown. Without a watcher nothing is.
-
 Item = TypeVar("Item")
 # What is worked on, how many are done, of how many; of none where nobody knows.
 Watcher = Callable[[str, int, int], None]
@@ -37,7 +35,7 @@ def watched(watcher: Watcher) -> Iterator[None]:
 
 
 def steps(label: str, items: Iterable[Item], total: int | None = None) -> Iterator[Item]:
-    """The items, one after the other, each announced as it is asked for.
+    """Yield the items, each announced to whoever watches as it is asked for.
 
     Args:
         label: what is worked on, in the plural: "scans".
@@ -63,11 +61,8 @@ def _notify_watchers(label: str, done: int, total: int) -> None:
         watcher(label, done, total)
 
 
-# A terminal for people: names and paths are printed as they are, brackets and colons in them are no markup.
-
-
 def console(file: IO[str] | None = None) -> Console:
-    """Standard error, or another stream, without markup, emoji codes and highlighting."""
+    """Return standard error, or another stream, that prints names and paths as they are: no markup, no emoji codes."""
     from stitch.system.lines import PeopleConsole
 
     return PeopleConsole(file=file, stderr=file is None, markup=False, emoji=False, highlight=False)

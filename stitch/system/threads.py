@@ -23,8 +23,6 @@ from threadpoolctl import threadpool_limits
 from stitch.errors import InputError
 from stitch.system.process import steps
 
-# Memory of large arrays, given back when they are freed.
-
 # As mallopt(3) of glibc numbers them; allocations from the first on are mappings of their own, and what is free at the
 # top of a heap beyond the second goes back.
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
@@ -44,11 +42,10 @@ def return_large_arrays() -> None:
         mallopt(_TRIM_THRESHOLD, _TOP)
 
 
-# Arrays too large for memory, in files without a name that go with the process.
-
-
 def map_parts(parts: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    """Parts of the same named columns one after the other, each column mapped from a file of its own.
+    """Write parts of the same named columns one after the other; return each column mapped from a file of its own.
+
+    The files have no name and go with the process.
 
     Raises:
         InputError: no room in the folder for temporary files.
