@@ -247,7 +247,7 @@ class ReferenceSurface:
         return 2 * self.spacing + 3 * self.tolerance
 
     def meets(self, poses: Array, points: Array, normals: Array, gate: float) -> tuple[Array, Array, Mask, Mask]:
-        """Signed distance (S, n), normal of the partner (S, n, 3), whether one within `gate` faces alike, or is there."""
+        """Signed distance (S, n), normal of the partner (S, n, 3), and: one within `gate` faces alike, one is near."""
         placed = frames.transform(poses, points)
         distance, partner = self.tree.query(np.ascontiguousarray(placed.reshape(-1, 3)), distance_upper_bound=gate)
         near = np.isfinite(distance).reshape(placed.shape[:2])
