@@ -12,9 +12,11 @@ from stitch.cli.progress import show_activity
 from stitch.cli.terminal import emit, say, show_block, show_files, show_next, show_table
 
 if TYPE_CHECKING:
+    from stitch.comparison.displaced_views import FollowedCovariate
     from stitch.comparison.residual_tables import ResidualTable, ResidualTables
     from stitch.runs.run import Run
 
+_SCOPE = "This look shows what the error follows, one covariate at a time. The cause is for stitch diagnose to name."
 _WORST_ROWS = 5
 _LISTED_TABLES = 4
 
@@ -69,7 +71,8 @@ def show_comparison(comparison: ResidualTables, state: Run, run: Path) -> None:
     unit = state.session.length_unit
     to_um = MICROMETRES[unit]
     what = "between the views" if state.measurement.capture.scans else "from the targets to their place (3D)"
-    say(_significance_sentence(comparison), bold=True)
+    _show_followed(comparison.followed, to_um)
+    say(_significance_sentence(comparison), bold=not comparison.followed)
     worst = [(f"worst by {_row_names(table, state)}", _worst_rows(table, to_um)) for table in comparison.labelled]
     show_block([("under the model", f"{length_text(comparison.rms, unit)} rms {what}"), *worst])
     for group in comparison.groups[:_LISTED_TABLES]:
@@ -79,6 +82,39 @@ def show_comparison(comparison: ResidualTables, state: Run, run: Path) -> None:
     show_files(run, ("compare.json",))
     review = (run / "diagnosis.json").exists()
     show_next(f"Next: stitch {'review' if review else 'diagnose'} {shlex.quote(str(run))}")
+
+
+def _show_followed(followed: Sequence[FollowedCovariate], to_um: float) -> None:
+    """Print what whole views follow, and their course along the clearest covariate."""
+    from stitch.comparison.displaced_views import clear_beside, equally_clear
+
+    if not followed:
+        return
+    first = followed[0]
+    if not first.clear:
+        say(f"Whole views follow nothing known of them (clearest: {_followed_text(first)}).", bold=True)
+        say(_SCOPE)
+        return
+    same, beside = equally_clear(followed), clear_beside(followed)
+    say(f"Whole views follow {' or '.join(map(_followed_text, same))}.", bold=True)
+    say(_SCOPE)
+    if beside:
+        say(f"Beside that they follow {', '.join(f'{o.covariate} (p = {o.p_beside:.1g})' for o in beside)}.")
+    if idle := [own.covariate for own in followed if own.clear and own not in (*same, *beside)]:
+        say(f"Alike, but not needed beside it: {', '.join(idle)}.")
+    axis = ", ".join(f"{x:+.2f}" for x in first.direction)
+    unit = f" ({first.unit})" if first.unit else ""
+    course = zip(first.at, first.mean, first.sigma, strict=True)
+    show_table(
+        f"Displacement at the part along ({axis}), by {first.covariate}{unit}",
+        (first.covariate, "mean (µm)", "± 1 σ"),
+        [(f"{at:.4g}", f"{mean * to_um:+.1f}", f"{sigma * to_um:.1f}") for at, mean, sigma in course],
+    )
+
+
+def _followed_text(own: FollowedCovariate) -> str:
+    """Return a covariate with the shape of its course and the chance of it: time (a line, p = 3e-07)."""
+    return f"{own.covariate} ({own.shape}, p = {own.p_value:.1g})"
 
 
 def _significance_sentence(comparison: ResidualTables) -> str:
@@ -91,11 +127,11 @@ def _significance_sentence(comparison: ResidualTables) -> str:
         return "Nothing clear: the views are too few to say how well their means are known."
     clear = [_group_chance(comparison, group) for group in comparison.groups if comparison.is_clear(group[0])]
     if clear:
-        return f"Clear among {comparison.means} means of bins, p over all of them: {'; '.join(clear)}."
+        return f"Single points, clear among {comparison.means} means of bins: {'; '.join(clear)}."
     return (
-        f"Nothing clear: chance alone makes the clearest of {comparison.means} means of bins as clear as this one "
+        f"Single points follow nothing clear: chance makes one of {comparison.means} means of bins as clear "
         f"({_chance_text(comparison, comparison.groups[0][0])}; clear is p ≤ {CLEAR}). "
-        "Errors whose sign changes with the pose do not show in such means; `stitch diagnose` looks for those."
+        "Such means hide errors whose sign changes with the pose; whole views show them."
     )
 
 

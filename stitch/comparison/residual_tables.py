@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from stitch.comparison.displaced_views import FollowedCovariate, followed_covariates
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.measurement import Views
 from stitch.model.forward import corrected_capture
@@ -13,6 +14,7 @@ from stitch.observations.surfaces.matching import Match, sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, RMS_GATE, collect_overlaps
 from stitch.observations.targets.rows import drawing_of, initial_landmarks, target_rows
 from stitch.runs.run import Run
+from stitch.stages.results import linearise
 from stitch.statistics.distributions import f_tail
 from stitch.statistics.least_squares import BlockLeastSquares
 from stitch.system.threads import library_threads_off
@@ -187,6 +189,7 @@ class ResidualTables:
     scale: float
     views: tuple[str, ...] = ()  # names, V
     of_views: dict[str, Array] = field(default_factory=dict)  # property -> (V,) value of each view
+    followed: tuple[FollowedCovariate, ...] = ()  # what the displacements of whole views follow, clearest first
 
     def table(self, name: str) -> ResidualTable:
         """One table by its name."""
@@ -270,6 +273,7 @@ def comparison_document(found: ResidualTables) -> dict[str, object]:
     names = {t.name: [x.name for x in group if x is not t] for group in found.groups for t in group}
     return {
         "rms": found.rms,
+        "follows": [own.document() for own in found.followed],
         "means": found.means,
         "tables": [
             {"name": t.name, "unit": t.unit, "label": list(t.label), "clearest": t.clearest}
@@ -306,6 +310,7 @@ def compare_surfaces(state: Run) -> ResidualTables:
         own = corrected_capture(state.measurement, state.model)
         poses = own.poses(state.model.T_mount)
         overlaps = collect_overlaps(own, poses, state.gate, [sample_points(s, FINE_SAMPLES) for s in own.scans])
+        followed = followed_covariates(linearise(state.session, state.measurement, state.model, state.gate))
     rows = _CorrespondenceRows(state, poses, overlaps.matches, overlaps.gram.scale)
     names = state.session.names
     tables = [_view_table(rows, names), _pair_table(rows, names)]
@@ -319,6 +324,7 @@ def compare_surfaces(state: Run) -> ResidualTables:
         scale=overlaps.gram.scale,
         views=tuple(names),
         of_views={name: values for name, _, values in view_properties(state.measurement.views)},
+        followed=followed,
     )
 
 
@@ -448,7 +454,9 @@ def compare_targets(state: Run) -> ResidualTables:
             tables.append(binned_table(name, unit, edges, rows.statistics(bins, len(edges) - 1)))
     rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
     of_views = {name: values for name, _, values in known}
-    return ResidualTables(tuple(tables), rms, rms, tuple(state.session.names), of_views)
+    with library_threads_off():
+        followed = followed_covariates(linearise(state.session, state.measurement, state.model, state.gate))
+    return ResidualTables(tuple(tables), rms, rms, tuple(state.session.names), of_views, followed)
 
 
 def _target_offsets(state: Run) -> _Offsets:

@@ -23,7 +23,7 @@ def test_seven_clean_views_show_nothing_clear_and_every_table_once(tmp_path, cap
     errors = np.array([-11.7, 1.5, 13.8, 16.0, -12.4, -7.2, 0.0]) * 1e-3
     j3 = np.array([-51.5, -38.8, -24.0, 6.7, 23.1, 49.8, 56.9])
     told = said(errors, {"j3": j3, "torque 3_3": 2 * j3}, tmp_path, capsys)
-    assert "Nothing clear: chance alone makes the clearest" in told
+    assert "Single points follow nothing clear: chance makes one of" in told
     assert "By j3 (deg); torque 3_3 has the same bins: p = " in told and " over all means, not clear" in told
     assert told.count("By ") == 1
     assert told.endswith(f"Next: stitch diagnose {tmp_path}")
@@ -34,8 +34,8 @@ def test_what_is_off_with_the_approach_is_called_clear(tmp_path, capsys):
     approach = np.resize([-1.0, 1.0], 12)
     errors = 0.03 * approach + np.resize([0.004, 0.004, -0.004, -0.004], 12)
     told = said(errors, {"approach of j3": approach, "j1": np.arange(12.0) % 7}, tmp_path, capsys)
-    assert "Clear among" in told and "all of them: approach of j3 (p < 0.0001)." in told
-    assert "Nothing clear" not in told
+    assert "Single points, clear among" in told and "means of bins: approach of j3 (p < 0.0001)." in told
+    assert "nothing clear" not in told
     assert told.endswith(f"Next: stitch review {tmp_path}")
 
 
