@@ -92,7 +92,7 @@ def init(
     from stitch.intake.ros_bag import is_bag
 
     if is_bag(folder):
-        _init_from_bag(folder, output, topic, frames, as_json)
+        _init_from_bag(folder, output, mount, topic, frames, as_json)
         return
     if topic or frames:
         raise InputError(f"{folder}: --topic and --frames are for bags, which this is not; to fix: leave them out")
@@ -111,7 +111,9 @@ def init(
     _init_from_scans(folder, output or folder, stated, yes, force, as_json)
 
 
-def _init_from_bag(bag: Path, output: Path | None, topic: str | None, named: str | None, as_json: bool) -> None:
+def _init_from_bag(
+    bag: Path, output: Path | None, mount: str | None, topic: str | None, named: str | None, as_json: bool
+) -> None:
     """Write a session beside a bag if nowhere else; what its messages do not say is not asked, flags state it."""
     from stitch.intake.ros_bag import write_bag_session
 
@@ -120,7 +122,7 @@ def _init_from_bag(bag: Path, output: Path | None, topic: str | None, named: str
     if named and len(frames) not in (2, 3):
         raise InputError(f"--frames {named}: to fix: name base and flange, and the scanner's frame if it is another")
     with show_activity("reading the bag"):
-        made = write_bag_session(bag, out, topic, frames)
+        made = write_bag_session(bag, out, topic, frames, mount)
     _print_guesses(made.guesses)
     _report_session(out, made.views, made.guesses, as_json)
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,10 +16,16 @@ from scipy.spatial.transform import Rotation, Slerp
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
+from stitch.intake.cloud_pairs import Pairing
+from stitch.intake.convention_choice import choose_convention
+from stitch.intake.first_session import capture_of, score_words
 from stitch.intake.folder_files import Guess
-from stitch.intake.readings import arm_link_pairs, chain_joints
+from stitch.intake.layouts import ColumnLayout
+from stitch.intake.readings import Reading, arm_link_pairs, chain_joints
 from stitch.intake.stops import AROUND, middle_of_stops, stationary_scans
+from stitch.integrity.conventions import register_scan_pairs
 from stitch.measurement.robot import forward
+from stitch.reading.clouds import read_cloud
 from stitch.reading.robot_description import robot_from_urdf
 from stitch.reading.session_folder import SESSION_FORMAT
 from stitch.reading.text_files import import_extra, shortened
@@ -147,7 +154,7 @@ class BagFrames:
     base: str
     flange: str
     scanner: str
-    mount: str
+    mount: str | None  # None where tf does not know the scanner's frame
     reason: str
     hand_eye_known: bool  # tf says where the scanner sits
 
@@ -163,7 +170,7 @@ def identify_frames(tree: TransformTree, scanner: str, named: Sequence[str]) -> 
         InputError: a frame that tf does not know, or nothing that moves.
     """
     scanner = named[2] if len(named) > 2 else scanner
-    unknown = next((frame for frame in named if frame not in tree.names), None)
+    unknown = next((frame for frame in named[:2] if frame not in tree.names), None)
     if unknown is not None:
         raise InputError(f"--frames: tf has no {unknown}; to fix: use {', '.join(tree.names)}")
     path = tree.above(scanner)[::-1]
@@ -171,7 +178,7 @@ def identify_frames(tree: TransformTree, scanner: str, named: Sequence[str]) -> 
     known = len(path) > 1
     if len(named) > 1:
         base, flange, reason = named[0], named[1], "stated with --frames"
-        carried = bool(moving) and flange in path
+        carried: bool | None = None if scanner not in tree.names else bool(moving) and flange in path
     elif moving:
         first, last = moving[0], moving[-1]
         base = _most_usual_name(path[:first], _BASES) or path[first - 1]
@@ -190,8 +197,11 @@ def identify_frames(tree: TransformTree, scanner: str, named: Sequence[str]) -> 
         fixed = [f for f in tree.names if last_end in tree.above(f) and _is_rigid(tree, f, last_end)]
         flange = _most_usual_name(fixed, _FLANGES) or last_end
         carried, reason = False, f"the scanner's frame {scanner} does not move"
+        if scanner not in tree.names:
+            carried, reason = None, f"tf has no frame {scanner}"
         known = known and bool(set(path) & set(chain))
-    return BagFrames(base, flange, scanner, "eye_in_hand" if carried else "eye_to_hand", reason, known)
+    mount = None if carried is None else "eye_in_hand" if carried else "eye_to_hand"
+    return BagFrames(base, flange, scanner, mount, reason, known)
 
 
 def _most_usual_name(frames: Sequence[str], usual_names: Sequence[str]) -> str | None:
@@ -459,12 +469,15 @@ class _ChosenScans:
     guess: Guess
 
 
-def write_bag_session(bag: Path, out: Path, topic: str | None = None, named: Sequence[str] = ()) -> BagSession:
+def write_bag_session(
+    bag: Path, out: Path, topic: str | None = None, named: Sequence[str] = (), mount: str | None = None
+) -> BagSession:
     """Write a session of a bag into a new folder, whole or not at all; lengths in mm.
 
     Args:
         topic: of the scans, where there are several.
         named: frames of base, flange and scanner, as a person states them.
+        mount: eye_in_hand or eye_to_hand, likewise.
 
     Raises:
         InputError: no bag, no scans, several topics of them, no frame that moves, or fewer than three stops.
@@ -475,20 +488,41 @@ def write_bag_session(bag: Path, out: Path, topic: str | None = None, named: Seq
     told = identify_frames(tree, found.frame_of[topic], named)
     chosen = _choose_scans(bag, found, topic, tree, told)
     T_mount = _recorded_hand_eye(tree, told, chosen.times)
-    guesses = (of_topic, *_frame_guesses(told, T_mount), chosen.guess)
     with whole_folder(out) as scratch:
         (scratch / "clouds").mkdir()
         _write_scans(bag, topic, found, chosen, scratch / "clouds")
         robot, joints, of_joints = recorded_urdf(found, told, chosen.times, scratch)
-        guesses = (*guesses, of_joints)
         names = [f"v{i:03d}" for i in range(len(chosen.times))]
         columns: dict[str, Any] = {"view": names, "cloud": [f"clouds/{name}.npy" for name in names]}
         columns["time_s"] = [f"{t:.6f}" for t in chosen.times - chosen.times[0]]
         columns |= {f"j{i + 1}_deg": q for i, q in enumerate(np.degrees(joints).T)} if joints is not None else {}
         T = frames.make(chosen.T_base_flange[:, :3, :3], chosen.T_base_flange[:, :3, 3] * _MM_PER_METRE)
         write_table(scratch / "views.csv", columns | pose_columns(T))
-        (scratch / "session.toml").write_text(_session_toml(bag, told, T_mount, robot, guesses), encoding="utf-8")
+        of_mount = _mount_guess(told, mount, [scratch / cloud for cloud in columns["cloud"]], T)
+        guesses = (of_topic, *_frame_guesses(told, T_mount), of_mount, chosen.guess, of_joints)
+        toml = _session_toml(bag, of_mount.value, T_mount, robot, guesses)
+        (scratch / "session.toml").write_text(toml, encoding="utf-8")
     return BagSession(len(chosen.times), guesses)
+
+
+def _mount_guess(bag_frames: BagFrames, stated: str | None, clouds: Sequence[Path], T_base_flange: Array) -> Guess:
+    """Return who carries the scanner: as stated, as tf has it, or as the scans move.
+
+    Args:
+        T_base_flange: (V, 4, 4) mm.
+    """
+    if stated is not None:
+        return Guess("mount", stated, "stated with --mount", True, "--mount")
+    if bag_frames.mount is not None:
+        return Guess("mount", bag_frames.mount, bag_frames.reason, True, "--mount")
+    nothing = np.zeros((len(clouds), 0))
+    reading = Reading(T_base_flange, "matrix", None, ColumnLayout(nothing, nothing, None, "tf", length_unit="mm"), 0)
+    capture = capture_of([read_cloud(cloud) for cloud in clouds], 1.0)
+    in_order = Pairing(tuple(range(len(clouds))), "a scan a stop", True)
+    decided = choose_convention(capture, cache(lambda: register_scan_pairs(capture)), [reading], [in_order], ["mm"])
+    value = "eye_in_hand" if decided.best.interpretation.carries else "eye_to_hand"
+    reason = f"{bag_frames.reason}, and the scans decide; {score_words(decided.best)}"
+    return Guess("mount", value, reason, decided.determined, "--mount")
 
 
 def _choose_topic(bag: Path, contents: BagContents, stated: str | None) -> tuple[str, Guess]:
@@ -526,8 +560,8 @@ def _recorded_hand_eye(tree: TransformTree, bag_frames: BagFrames, times: Array)
     """T_mount (4, 4) mm as tf has it; None where tf says nothing, or that both frames are one."""
     if not bag_frames.hand_eye_known:
         return None
-    mount = bag_frames.flange if bag_frames.mount == "eye_in_hand" else bag_frames.base
-    T = tree.pose(mount, bag_frames.scanner, times[:1])[0]
+    carrier = bag_frames.flange if bag_frames.mount == "eye_in_hand" else bag_frames.base
+    T = tree.pose(carrier, bag_frames.scanner, times[:1])[0]
     if not np.isfinite(T).all() or np.allclose(T, np.eye(4)):
         return None
     return frames.make(T[:3, :3], T[:3, 3] * _MM_PER_METRE)
@@ -535,9 +569,8 @@ def _recorded_hand_eye(tree: TransformTree, bag_frames: BagFrames, times: Array)
 
 def _frame_guesses(bag_frames: BagFrames, T_mount: Array | None) -> tuple[Guess, ...]:
     poses = Guess("poses", f"{bag_frames.flange} in {bag_frames.base}", bag_frames.reason, True, "--frames")
-    mount = Guess("mount", bag_frames.mount, bag_frames.reason, True, "--frames")
     words = "not known" if T_mount is None else "as tf has it, to begin with"
-    return poses, mount, Guess("scanner.pose", words, f"of {bag_frames.scanner}", True, "session.toml")
+    return poses, Guess("scanner.pose", words, f"of {bag_frames.scanner}", True, "session.toml")
 
 
 def _write_scans(bag: Path, topic: str, contents: BagContents, chosen: _ChosenScans, folder: Path) -> None:
@@ -567,10 +600,8 @@ def _camera_info(contents: BagContents, topic: str, where: str) -> Any:
     return camera
 
 
-def _session_toml(
-    bag: Path, bag_frames: BagFrames, T_mount: Array | None, robot: dict[str, str], guesses: Sequence[Guess]
-) -> str:
-    head = {"format": SESSION_FORMAT, "name": bag.stem, "length_unit": "mm", "mount": bag_frames.mount}
+def _session_toml(bag: Path, mount: str, T_mount: Array | None, robot: dict[str, str], guesses: Sequence[Guess]) -> str:
+    head = {"format": SESSION_FORMAT, "name": bag.stem, "length_unit": "mm", "mount": mount}
     scanner = {} if T_mount is None else {"scanner": {"pose": T_mount.tolist()}}
     comments = "".join(f"# {guess.line}\n" for guess in guesses)
     return comments + "\n" + tomli_w.dumps({**head, **scanner, **({"robot": robot} if robot else {})})
