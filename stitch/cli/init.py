@@ -124,7 +124,7 @@ def _init_from_bag(
     with show_activity("reading the bag"):
         made = write_bag_session(bag, out, topic, frames, mount)
     _print_guesses(made.guesses)
-    _report_session(out, made.views, made.guesses, as_json)
+    _report_session(out, made.views, made.guesses, as_json, "run")
 
 
 def _init_from_scans(folder: Path, out: Path, stated: StatedFolder, yes: bool, force: bool, as_json: bool) -> None:
@@ -139,7 +139,8 @@ def _init_from_scans(folder: Path, out: Path, stated: StatedFolder, yes: bool, f
         if not yes:
             first = _ask_uncertain(scans, out, first, stated)
         write_draft(out, first, force=force, unpacked=scans != folder)
-    _report_session(out, len(first.pairing.used), first.guesses, as_json)
+    command = "run" if first.sphere_mm is None else "calibrate sphere"
+    _report_session(out, len(first.pairing.used), first.guesses, as_json, command)
 
 
 def _judge_folder(folder: Path, stated: StatedFolder) -> FirstSession:
@@ -199,7 +200,7 @@ def _print_guesses(guesses: Sequence[Guess]) -> None:
         say(f"{'' if guess.determined else '? '}{guess.line}", hang=2)
 
 
-def _report_session(out: Path, views: int, guesses: Sequence[Guess], as_json: bool) -> None:
+def _report_session(out: Path, views: int, guesses: Sequence[Guess], as_json: bool, command: str) -> None:
     """Print the files, what may be wrong in them, and the next command."""
     untold = [guess for guess in guesses if not guess.determined]
     if as_json:
@@ -218,7 +219,7 @@ def _report_session(out: Path, views: int, guesses: Sequence[Guess], as_json: bo
             say(f"  {guess.what}: {guess.value}; to state it: {guess.flag}")
         say("Results are worth no more than these guesses.")
         say(f"To try the usual mistakes: stitch check --deep {folder}")
-    show_next(f"Next: stitch run {folder}")
+    show_next(f"Next: stitch {command} {folder}")
 
 
 def _numbers(flag: str, text: str | None) -> tuple[float, ...]:

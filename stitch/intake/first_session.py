@@ -16,7 +16,9 @@ from stitch.intake.cloud_pairs import Pairing, pairings
 from stitch.intake.convention_choice import (
     ConventionChoice,
     ConventionScore,
+    Interpretation,
     Mounting,
+    all_interpretations,
     choose_convention,
     choose_mounting,
     fitted_scale,
@@ -98,6 +100,8 @@ def session_guesses(
 
 def score_words(score: ConventionScore) -> str:
     """What the scans say of a way."""
+    if not np.isfinite(score.misfit):
+        return "profiles do not tell it"
     if not score.meets:
         return "no two views meet"
     motions = "" if score.closed is None else f", {100 * score.closed:.0f} % of the scanner's motions close"
@@ -207,6 +211,7 @@ class FirstSession:
     guesses: tuple[Guess, ...]
     optical_axis: str
     sightings: tuple[Sighting, ...] = ()  # mm, of every cloud, where targets are looked for
+    sphere_mm: float | None = None  # radius, where the clouds are profiles of a sphere
 
     @property
     def pairing(self) -> Pairing:
@@ -227,9 +232,12 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     found = replace(found, clouds=tuple(found.clouds[i] for i in kept))
     points = [c.points for c in clouds]
     own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
-    capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
     ways_to_read = all_readings(raw, found.urdf, stated)
     units = candidate_units(ways_to_read, stated)
+    if all(_is_profile(cloud) for cloud in points):
+        way = all_interpretations(ways_to_read, pairs, units, (True,))[0]
+        return _profiles_of_a_sphere(found, raw, clouds, way, stated)
+    capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
     seen, of_targets = find_folder_targets(found, points, CLOUD_UNITS[own_units[0]], stated.targets)
     motions = cache(lambda: register_scan_pairs(capture))
     shown = target_motions(seen) if seen else None
@@ -252,6 +260,40 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     left = _left_out_guess(found, decided, lost)
     guesses = (*told, settled.guess, axis_guess, *of_targets, *left)
     return FirstSession(found, raw, own_units[0], decided, settled, guesses, optical_axis=axis, sightings=seen)
+
+
+# Of the width of a profile: how far its points lie from a plane through the scanner.
+_FLAT = 1e-3
+
+
+def _is_profile(points: Array) -> bool:
+    """Return True of one line of a laser: all points lie in a plane through the scanner's origin."""
+    extents = np.linalg.svd(points[:: -(-len(points) // _POINTS)], compute_uv=False)
+    return bool(extents[2] < _FLAT * extents[1])
+
+
+def _profiles_of_a_sphere(
+    files: FolderFiles, raw: RawPoses, clouds: Sequence[Cloud], way: Interpretation, stated: StatedFolder
+) -> FirstSession:
+    """Return the session for `stitch calibrate sphere`; profiles tell nothing of how the poses are to be read.
+
+    Raises:
+        InputError: no radius of the sphere is stated.
+    """
+    radii = stated.targets.balls or ()
+    if len(radii) != 1:
+        raise InputError(
+            f"{files.folder}: every cloud is one profile of a laser line and shows no surface; to fix: for profiles of "
+            f"one sphere state its radius in mm, stitch init {files.folder} --ball RADIUS --yes"
+        )
+    decided = ConventionChoice(ConventionScore(way, np.eye(4), np.inf, False, None), None, False, (), 0.0, 0.0)
+    points = [cloud.points for cloud in clouds]
+    own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
+    mounting = choose_mounting(decided, stated.mount, stated.inverse, way.reading.rotation == JOINT_ANGLES)
+    axis, axis_guess = guess_optical_axis(clouds)
+    sphere = Guess("sphere", f"radius {radii[0]:g} mm", "stated with --ball", True, "--ball")
+    guesses = (*session_guesses(files, raw, decided, points, own_units, stated), mounting.guess, axis_guess, sphere)
+    return FirstSession(files, raw, own_units[0], decided, mounting, guesses, axis, sphere_mm=radii[0])
 
 
 def _read_table(found: FolderFiles, stated: StatedFolder) -> RawPoses:

@@ -169,15 +169,8 @@ def read_names(header: Sequence[str]) -> NamedColumns:
     joints = _joint_columns(header)
     counted = _counted_pose(header)
     if counted:
-<<<<<<< HEAD
-        plain = tuple(
-            ["rvx", "rvy", "rvz"][counted.index(i) - 3] if i in counted[3:] else n for i, n in enumerate(plain)
-        )
-        plain = tuple("xyz"[counted.index(i)] if i in counted[:3] else n for i, n in enumerate(plain))
-=======
         called = dict(zip(counted, ("x", "y", "z", "rvx", "rvy", "rvz"), strict=True))
         plain = tuple(called.get(i, name) for i, name in enumerate(plain))
->>>>>>> 0a622d3 (A scanner's frame that tf does not have is not at rest: the scans tell the mount)
         units = tuple("m" if i in counted[:3] else unit for i, unit in enumerate(units))
         where = {name: plain.index(name) for name in plain}
     position = tuple(where[a] for a in "xyz") if all(a in where for a in "xyz") else ()

@@ -92,6 +92,8 @@ def toml_text(folder: Path, first: FirstSession) -> str:
     lines += ["", *_comment(told["cloud_unit"]), f'cloud_unit = "{first.cloud_unit}"']
     lines += ["", *_comment(told["mount"]), f'mount = "{first.mounting.mount}"']
     lines += ["", "[scanner]", *_comment(told["optical_axis"]), f'optical_axis = "{first.optical_axis}"']
+    if first.sphere_mm is not None:
+        lines += ["", "[sphere]", f"radius = {first.sphere_mm * MM / METRES[unit]:.9g}"]
     reading = first.choice.best.interpretation.reading
     urdf = first.files.urdf
     if reading.layout.joints is not None and urdf is not None:
