@@ -42,7 +42,8 @@ def sum_smooth_errors(
     The first are COARSE, along the ray over the field, and one over incidence.
 
     Args:
-        per_view: those of COARSE for either view of a pair its own; and after the one over incidence `shared_errors`.
+        per_view: those of COARSE for either view of a pair its own; and after the one over incidence what all views may
+            have in common besides.
     """
     capture, half = measurement.capture, half_field(measurement)
     further = point_effects or PointSlopes(measurement, ())
@@ -241,7 +242,7 @@ def view_error_likelihood(
     """Of sums over smooth errors for either view of a pair its own, those that all share, and what is beside them.
 
     Args:
-        sums: of `smooth_sums`, apart.
+        sums: of `sum_smooth_errors` with errors of every view.
     """
     g, part = unconstrained.overlaps.gram, part_of_view(unconstrained.overlaps.gram.views)
     at = _column_parameters(g.pairs, part, columns=sums.residual.shape[1])
@@ -391,7 +392,7 @@ def field_map(
     """The likeliest error, as far as the overlaps tell it; None where it is not most of what they show.
 
     Args:
-        sums: of `smooth_sums`, apart.
+        sums: of `sum_smooth_errors` with errors of every view.
         noise: of the scanner, length_unit.
         nuisance: so many of the last parameters may have any size.
     """
