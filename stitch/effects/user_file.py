@@ -39,7 +39,7 @@ def require_effect(effect: Effect, where: str) -> None:
         if spec.kind == "twist":
             sizes |= {"translation": spec.typical_shift, "limit_translation": spec.limit_shift}
         for name, size in sizes.items():
-            if not _is_positive(size) or (size == np.inf and name in ("typical", "translation")):
+            if not (_is_number(size) and size > 0) or (size == np.inf and name in ("typical", "translation")):
                 raise InputError(f"{where}: {name} of {key} is {size!r}; to fix: write a positive number")
         if not all(isinstance(unit, str) for unit in (spec.unit, spec.unit_shift)):
             raise InputError(f"{where}: the unit of {key} is {spec.unit!r}; to fix: write it in quotes")
@@ -57,7 +57,11 @@ def require_effect(effect: Effect, where: str) -> None:
 
 def read_only_arguments(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
     """The arguments, arrays among them read-only: an effect returns what changes and leaves what it is given."""
-    return tuple(_read_only(value) if isinstance(value, np.ndarray) else value for value in arguments)
+    out = [value.view() if isinstance(value, np.ndarray) else value for value in arguments]
+    for value in out:
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+    return tuple(out)
 
 
 def require_result(effect: Effect, arguments: tuple[Any, ...], result: Any, where: str) -> Any:
@@ -100,18 +104,8 @@ def _describe_result(result: Any) -> str:
     return "None" if result is None else f"a {type(result).__name__}"
 
 
-def _read_only(values: Array) -> Array:
-    view = values.view()
-    view.flags.writeable = False
-    return view
-
-
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float, np.number)) and not isinstance(value, (bool, np.complexfloating))
-
-
-def _is_positive(value: Any) -> bool:
-    return _is_number(value) and bool(value > 0)
 
 
 # Seconds for the file and for every call of an effect; a call on a million points takes less than one.

@@ -12,7 +12,6 @@ from stitch.frames import Array, Indices
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement, ScanView
 from stitch.measurement.robot import FlangeSlopes, Links, exact_links, flange_slopes, forward, forward_with_errors
-from stitch.measurement.scan import Scan
 from stitch.model.model import Model, Term
 
 
@@ -139,8 +138,10 @@ def corrected_capture(measurement: Measurement, model: Model) -> Capture:
     capture = _without_motion(measurement, terms)
     if moves_points(terms):
         poses, points = true_geometry(measurement, model)
-        scans = [_with_points(scan, p) for scan, p in zip(capture.scans, points, strict=True)]
-        capture = replace(capture, scans=tuple(scans))
+        # Points move by micrometres: normals, edges and spacing stay, the tree must follow.
+        moved = zip(capture.scans, points, strict=True)
+        scans = tuple(replace(scan, points=p, tree=KDTree(p, leafsize=16)) for scan, p in moved)
+        capture = replace(capture, scans=scans)
         if capture.sightings is not None:
             shown = capture.sightings.points + target_correction(measurement, terms, poses)
             capture = replace(capture, sightings=replace(capture.sightings, points=shown))
@@ -151,11 +152,6 @@ def _without_motion(measurement: Measurement, terms: Sequence[Term]) -> Capture:
     """The capture without effects of robot, mount and part; the points as they were scanned."""
     left, right = perturbed_frames(measurement, terms)
     return replace(measurement.capture, T_reference_mount=left, T_behind_mount=right)
-
-
-def _with_points(scan: Scan, points: Array) -> Scan:
-    """Points moved by micrometres: normals, edges and spacing stay, the tree must follow."""
-    return replace(scan, points=points, tree=KDTree(points, leafsize=16))
 
 
 # How poses answer to the parameters of a term, by central differences about a model.

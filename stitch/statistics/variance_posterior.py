@@ -21,7 +21,6 @@ from stitch.frames import Array, Mask
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.reml import (
     NOISE,
-    FurtherPrior,
     MixedModel,
     VarianceFit,
     flatten_blocks,
@@ -142,16 +141,11 @@ def _common_factor_mask(mixed: MixedModel) -> Mask:
 
 def _densities(mixed: MixedModel, grids: Sequence[Array]) -> list[Array]:
     """Per component (1, g) what is believed of its variance, or (F, g) at every factor on what is usual."""
-    return [
-        np.array(
-            [log_density(i, np.log(grid), _scale_prior(mixed.further, f)) for f in (_FACTORS if shared else (1.0,))]
-        )
-        for i, (grid, shared) in enumerate(zip(grids, _common_factor_mask(mixed), strict=True))
-    ]
-
-
-def _scale_prior(further: FurtherPrior | None, factor: float) -> FurtherPrior | None:
-    return None if further is None else further.scaled(factor)
+    out = []
+    for i, (grid, shared) in enumerate(zip(grids, _common_factor_mask(mixed), strict=True)):
+        priors = [mixed.further.scaled(f) for f in _FACTORS] if shared and mixed.further else [mixed.further]
+        out.append(np.array([log_density(i, np.log(grid), prior) for prior in priors]))
+    return out
 
 
 def _draw_factor(rng: np.random.Generator, densities: Sequence[Array]) -> int:

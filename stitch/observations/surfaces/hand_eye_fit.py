@@ -79,16 +79,12 @@ def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_fla
     to_centre = frames.make(np.eye(3), -g.centre)
     response = left @ hand_eye_jacobian(hand_eye_frames, g.centre)
     carried = frames.adjoint(to_centre @ T_reference_flange)
-    rotation, translation = (_unit_scatter(left, carried[:, :, half]) for half in (slice(0, 3), slice(3, 6)))
+    # Covariances of the visible directions for independent unit turns and shifts of every view's flange.
+    blocks = left.reshape(len(left), -1, 6).transpose(1, 0, 2) @ carried
+    rotation, translation = summed_squares(blocks[..., :3]), summed_squares(blocks[..., 3:])
     expansion = seen.scale[:, None] * seen.vectors
     z, noise = left @ twists.reshape(-1), np.diag(g.variance / seen.values)
     return ReducedPoses(left, expansion, z, response, rotation, translation, noise)
-
-
-def _unit_scatter(left: Array, carried: Array) -> Array:
-    """Covariance of the visible directions for independent unit twists of every view."""
-    blocks = left.reshape(len(left), -1, 6).transpose(1, 0, 2) @ carried
-    return summed_squares(blocks)
 
 
 def hand_eye_mixed_model(channel: ReducedPoses, further: Array | None = None) -> MixedModel:
@@ -357,10 +353,11 @@ def fit_hand_eye(
     errors = errors or white_scatter_only(sum(len(f.poses) for f in unconstrained))
     sources = _variance_sources(found, errors.repeating_only(), scanner_errors or {})
     covariance = np.sum(list(sources.values()), axis=0)
+    log_ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(found.gls.covariance)[1]
     return HandEyeFit(
         T_mount=T_mount @ frames.exp(found.x[:6]),
         covariance=covariance[:6, :6],
-        inflation=_covariance_inflation(covariance, found.gls.covariance),
+        inflation=float(max(1.0, np.exp(log_ratio / len(covariance)))),
         repeatability=found.scatter,
         heldout_ratio=_heldout_ratio(found.parts, found.scatter, (found.prior, found.prior_vector), found.x),
         rotation_shares=_source_shares(sources, slice(0, 3)),
@@ -387,11 +384,6 @@ def _variance_sources(
     # The rest is what the prior leaves where nothing is seen.
     sources["unseen"] = weighed.covariance @ found.prior @ weighed.covariance
     return sources
-
-
-def _covariance_inflation(covariance: Array, independent: Array) -> float:
-    ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(independent)[1]
-    return float(max(1.0, np.exp(ratio / len(covariance))))
 
 
 def _source_shares(sources: dict[str, Array], axes: slice) -> dict[str, float]:
