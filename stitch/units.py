@@ -28,6 +28,22 @@ def angle_text(value: float, digits: int = 3) -> str:
     return f"{_plain_decimal(value * 1e3, digits)} mrad" if np.isfinite(value) else "–"
 
 
+# What the name of a covariate ends in: scanner_temperature_c, humidity_percent, j2_deg.
+_ENDINGS = {"_c": "°C", "_percent": "%", "_s": "s", "_mm": "mm", "_deg": "°", "_nm": "N m", "_nm_per_kg": "N m/kg"}
+
+
+def covariate_unit(name: str) -> str:
+    """Return the unit that a covariate's name ends in; empty where it names none."""
+    return next((unit for ending, unit in _ENDINGS.items() if name.endswith(ending)), "")
+
+
+def covariate_text(name: str) -> str:
+    """Return a covariate with its unit in brackets: j2_deg → j2 (°)."""
+    ending = next((ending for ending in _ENDINGS if name.endswith(ending)), "")
+    told = name.removesuffix(ending).replace("_", " ")
+    return f"{told} ({_ENDINGS[ending]})" if ending else told
+
+
 def duration_text(seconds: float) -> str:
     """Seconds, minutes or hours, whichever leaves a number below a hundred or so."""
     size, unit = next((own for own in ((1, "s"), (60, "min")) if seconds < 120 * own[0]), (3600, "h"))

@@ -1,15 +1,4 @@
-"""One line under every figure: what to read from it, and what its axes are called."""
-
-_UNITS = (("_deg", "°"), ("_c", "°C"), ("_percent", "%"), ("_s", "s"), ("_nm", "N m"), ("_nm_per_kg", "N m/kg"))
-
-
-def covariate(name: str) -> str:
-    """Return a covariate with its unit in brackets: j2_deg → j2 (°)."""
-    for ending, unit in _UNITS:
-        if name.endswith(ending):
-            return f"{name.removesuffix(ending)} ({unit})".replace("_", " ")
-    return name.replace("_", " ")
-
+"""One line under every figure: what to read from it."""
 
 FIELD = (
     "Per place of the part, how far each view puts the surface from where the others put it, averaged over a patch so "

@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 
 from stitch.frames import Array
-from viz.captions import covariate
+from stitch.units import covariate_text
 from viz.colours import signed_colours
 
 # Width and height of the drawing, in its own units; y points downwards.
@@ -45,7 +45,7 @@ def log_course(recording: rr.RecordingStream, course: dict[str, Any], names: lis
     recording.log(f"{WHERE}/dots", dots, static=True)
     zero = [[_LEFT, float(to_y(np.zeros(1))[0])], [_LEFT + _WIDE, float(to_y(np.zeros(1))[0])]]
     recording.log(f"{WHERE}/zero", rr.LineStrips2D([zero], colors=[_AXIS], radii=rr.Radius.ui_points(0.7)), static=True)
-    follows = "views in their order" if course["follows"] == "view order" else covariate(course["follows"])
+    follows = "views in their order" if course["follows"] == "view order" else covariate_text(course["follows"])
     along = f"{follows} ({course['unit']})" if course["unit"] else follows
     _label(
         recording, "title", [(_LEFT + _WIDE / 2, -_ABOVE)], [f"how far {course['of']} is off ({unit}), over {along}"]

@@ -14,10 +14,9 @@ from stitch.diagnosis.unnamed_time_laws import ROTATION_PART, TRANSLATION_PART, 
 from stitch.frames import Array
 from stitch.observations.pose_errors import time_in_steps
 from stitch.observations.surfaces.scanner_errors import FieldMap
-from stitch.units import MICROMETRES, length_text
+from stitch.units import MICROMETRES, covariate_text, length_text
 from stitch.writing.diagnosis_document import OTHER_SOURCES, largest_error_sources, share_text
 from viz import captions
-from viz.captions import covariate
 
 _HOURS_FROM = 7200.0  # s that are better told in hours than in minutes
 _PLOT_HEIGHT = 170
@@ -50,7 +49,9 @@ def diagnosis_plots(found: Diagnosis, length_unit: str) -> list[Plots]:
     if found.scanner_error is not None and found.scanner_error.map is not None:
         told.append(_scanner_field(found.scanner_error.map, length_unit))
     panels = tuple(
-        _panel(d.bins, d.mean * um, d.sigma * um, f"{covariate(d.covariate)}, p = {d.p_value:.1g}", "displaced (µm)")
+        _panel(
+            d.bins, d.mean * um, d.sigma * um, f"{covariate_text(d.covariate)}, p = {d.p_value:.1g}", "displaced (µm)"
+        )
         for d in found.depends_on[:_MAX_DEPENDENCES]
     )
     told.append(Plots("What the unexplained displacement follows", captions.SHAPE, panels))
@@ -100,7 +101,7 @@ def _joint_course(c: JointCurve) -> dict[str, Any]:
 def _along(c: JointCurve) -> tuple[str, Array, Array]:
     """The axis of a joint's course, where the course is told and where the views stood along it."""
     if c.covariate != "time_s":
-        return covariate(c.covariate), c.at, c.view_values
+        return covariate_text(c.covariate), c.at, c.view_values
     first = float(c.view_values.min())
     unit, of_second = _unit_of(float(np.ptp(c.view_values)))
     return unit, (c.at - first) * of_second, (c.view_values - first) * of_second

@@ -111,6 +111,7 @@ def _write_text(text: str, path: Path, encoding: str = "utf-8") -> None:
 
 def _show_watch(reports: list[CellReport], folders: list[Path], added: int | None, pages: bool) -> None:
     """Print a table of one cell, notes, and the verdicts last; of a plant the verdicts are enough, its page has all."""
+    from stitch.units import covariate_unit
     from stitch.watch.report import headline, report_notes, size_text
 
     if added is not None:
@@ -119,7 +120,10 @@ def _show_watch(reports: list[CellReport], folders: list[Path], added: int | Non
         _show_cell(report)
         for p in report.parameters:
             if p.follows:
-                told = ", ".join(f"{f.channel} ({size_text(f.per_unit, p.unit, f.sigma)} per unit)" for f in p.follows)
+                told = ", ".join(
+                    f"{f.channel} ({size_text(f.per_unit, p.unit, f.sigma)} per {covariate_unit(f.channel) or 'unit'})"
+                    for f in p.follows
+                )
                 say(f"{p.name} follows {told}")
     for report in reports:
         for note in report_notes(report):
@@ -166,6 +170,8 @@ def _valid_text(report: CellReport, p: ParameterReport) -> str:
     """Return until when the calibration in use holds for a parameter."""
     from stitch.watch.report import day_text
 
+    if p.too_uncertain:
+        return "not known"
     if p.valid_until is None:
         return "holds"
     return "over" if p.valid_until <= report.last else day_text(p.valid_until)[:10]

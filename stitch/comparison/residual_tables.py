@@ -18,6 +18,7 @@ from stitch.stages.results import linearise
 from stitch.statistics.distributions import f_tail
 from stitch.statistics.least_squares import BlockLeastSquares
 from stitch.system.threads import library_threads_off
+from stitch.units import covariate_unit
 
 # How well the mean of a bin is known: views are the samples, because all points of a view share its pose error.
 
@@ -176,7 +177,6 @@ PLACE = "place on the part"
 APPROACH = "approach of j"
 _SAME_VALUE = 1e-9  # numbers closer than that are one
 _BINS = 6
-_ENDINGS = {"_c": "°C", "_percent": "%", "_s": "s", "_mm": "mm", "_deg": "°"}
 CLEAR = 0.05  # p over all means
 
 
@@ -238,12 +238,7 @@ def view_properties(views: Views) -> list[tuple[str, str, Array]]:
     out += [(f"torque {n}", "N m", views.torques.values[:, i]) for i, n in enumerate(views.torques.names)]
     if views.has("time"):
         out.append(("time", "s", views.time))
-    return out + [(name, _unit_of(name), values) for name, values in views.covariates.items()]
-
-
-def _unit_of(covariate: str) -> str:
-    """Return the unit that the name ends in: scanner_temperature_c, humidity_percent."""
-    return next((unit for ending, unit in _ENDINGS.items() if covariate.endswith(ending)), "")
+    return out + [(name, covariate_unit(name), values) for name, values in views.covariates.items()]
 
 
 def property_varies(name: str, values: Array) -> bool:

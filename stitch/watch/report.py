@@ -11,7 +11,7 @@ from scipy.special import ndtr, stdtr
 
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.units import MICROMETRES, display_unit, length_text
+from stitch.units import MICROMETRES, covariate_unit, display_unit, length_text
 from stitch.watch.history import History
 from stitch.watch.tracking import (
     COVARIATES,
@@ -168,8 +168,14 @@ class ParameterReport:
     in_use: float  # in the calibration in use; NaN where that does not have it
     limit: float  # how far from there it may be
     valid_until: float | None  # s since 1970; None beyond the horizon
+    own_sigma: float  # of the value, without what all sessions have in common
     changes: tuple[Change, ...]
     alarm: Change | None  # the latest that stands
+
+    @property
+    def too_uncertain(self) -> bool:
+        """True where even a parameter that has not moved might be beyond its limit."""
+        return bool(2 * ndtr(-self.limit / max(self.own_sigma, 1e-300)) > _RISK)
 
 
 @dataclass(frozen=True)
@@ -195,8 +201,15 @@ class CellReport:
 
     @property
     def recalibrate_before(self) -> float | None:
-        """The earliest end of validity, s since 1970."""
-        return min((p.valid_until for p in self.parameters if p.valid_until is not None), default=None)
+        """The earliest end of validity, s since 1970; of parameters that are known well enough to say."""
+        known = (p.valid_until for p in self.parameters if p.valid_until is not None and not p.too_uncertain)
+        return min(known, default=None)
+
+    @property
+    def too_uncertain(self) -> list[ParameterReport]:
+        """Those of which nobody can say whether they are within their limits, the worst first."""
+        found = [p for p in self.parameters if p.too_uncertain]
+        return sorted(found, key=lambda p: p.limit / max(p.own_sigma, 1e-300))
 
 
 # A history judged: where the parameters of the cell are, what stands, what may still be used.
@@ -271,6 +284,7 @@ def _assess_parameter(
         "unit": names.units[p],
         "value": float(best.origin[p] + unit * (best.mean[p, 0] @ x)),
         "sigma": float(np.hypot(own, common)),
+        "own_sigma": float(own),
         "common_sigma": float(common),
         "scatter": float(np.sqrt(scatter)),
         "drift_per_day": float(unit * slope),
@@ -576,15 +590,31 @@ def _event_sentence(report: CellReport, group: Sequence[_Alarmed]) -> str:
     parameter, change = group[0]
     if change.channel is not None:
         per = size_text(change.size, parameter.unit, change.sigma)
-        return f"{parameter.name} follows {change.channel} since session {since}, {per} per unit"
+        return f"{parameter.name} follows {change.channel} since session {since}, {per} per {_one_of(change.channel)}"
     per_day = size_text(change.size, parameter.unit, change.sigma)
     share = change.size / parameter.in_use if parameter.in_use and effect != "hand_eye" else float("nan")
     rate = f"{100 * share:+.2g} % a day" if np.isfinite(share) else f"{per_day} a day"
     return f"{parameter.name} drifts since session {since}, {rate}"
 
 
+def _one_of(channel: str) -> str:
+    """Return what one unit of a channel is called."""
+    return covariate_unit(channel) or "unit"
+
+
+def uncertainty_note(report: CellReport) -> str:
+    """Return what is not known well enough to be judged, as a sentence without its full stop; empty where all is."""
+    if not report.too_uncertain:
+        return ""
+    p = report.too_uncertain[0]
+    known, allowed = size_text(float(f"{2 * p.own_sigma:.2g}"), p.unit), size_text(float(f"{p.limit:.2g}"), p.unit)
+    return f"{p.name} is known to ± {known} (k = 2), allowed are {allowed}: more sessions tell whether it holds"
+
+
 def _recalibration_note(report: CellReport) -> str:
     end = report.recalibrate_before
+    if report.too_uncertain and (end is None or end > report.last):
+        return uncertainty_note(report)
     if end is None:
         return "the calibration in use holds"
     return (

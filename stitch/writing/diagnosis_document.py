@@ -242,7 +242,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
 
 def diagnosis_screen(found: Diagnosis) -> dict[str, Any]:
     """Return what one screen shows of a diagnosis."""
-    return finding_screen(found, _WORDS)
+    return finding_screen(found, _WORDS, open_doubts(found))
 
 
 def _curve(curve: JointCurve) -> dict[str, Any]:

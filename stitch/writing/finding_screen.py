@@ -4,6 +4,7 @@ The page of a run, its review and the first tab of its recording draw from this 
 """
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,15 +79,16 @@ def compared(found: Diagnosis) -> list[CandidateEffect]:
 _last_screen: tuple[weakref.ref[Diagnosis], dict[str, Any]] | None = None
 
 
-def finding_screen(found: Diagnosis, descriptions: dict[str, str]) -> dict[str, Any]:
+def finding_screen(found: Diagnosis, descriptions: dict[str, str], doubts: Sequence[str]) -> dict[str, Any]:
     """Return the screen of the diagnosis that was asked for last; lengths in length_unit, angles in rad.
 
     Args:
         descriptions: effects in a few words.
+        doubts: about the session, beside what was found.
     """
     global _last_screen
     if _last_screen is None or _last_screen[0]() is not found:
-        _last_screen = weakref.ref(found), _screen(found, descriptions)
+        _last_screen = weakref.ref(found), _screen(found, descriptions) | {"doubts": list(doubts)}
     return _last_screen[1]
 
 
@@ -97,8 +99,6 @@ def _screen(found: Diagnosis, descriptions: dict[str, str]) -> dict[str, Any]:
     return {
         "headline": _headline(found, why, descriptions),
         "proof": _proof(found, why),
-        # A doubt whose cure is to add what was found is the finding itself.
-        "doubts": [x for x in found.doubts if not any(f"effect {name}" in x for name in found.effects)],
         "now": {"heldout": found.heldout_rms} | _on_part(None if fields is None else fields.present),
         "noise": found.noise_floor,
         "why": None if why is None else _course(why),

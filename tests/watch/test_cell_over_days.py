@@ -8,6 +8,7 @@ from data_synth.fixtures.cell_records import records_of
 from stitch.watch.history import open_history
 from stitch.watch.report import cell_report, cell_trend, headline
 from stitch.watch.update import append_runs
+from viz.watch.cell_page import light
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +64,17 @@ def test_the_order_in_which_runs_arrive_does_not_matter(month, tmp_path):
                 assert append_runs(other, [record]) == 0
             answers.append([p.value for p in cell_report(other).parameters])
     np.testing.assert_allclose(answers[0], answers[1], rtol=1e-9)
+
+
+def test_one_session_that_is_worse_than_the_tolerance_says_so_and_does_not_recalibrate(month, tmp_path):
+    """Within half of its own U nobody can say whether a calibration holds; within five times of it everybody can."""
+    cell, _ = month
+    with open_history(tmp_path / "one", new=True) as history:
+        append_runs(history, list(records_of(cell))[:1])
+        sigma = max(p.own_sigma for p in cell_report(history).parameters if p.name in ("hand_eye.x", "hand_eye.y"))
+        narrow, wide = (cell_report(history, tolerance=share * 2 * sigma) for share in (0.5, 5.0))
+    assert narrow.recalibrate_before is None and light(narrow)[0] == "check"
+    worst = narrow.too_uncertain[0]
+    assert 2 * worst.own_sigma > worst.limit and "more sessions tell whether it holds" in headline(narrow)
+    assert not [p for p in wide.too_uncertain if p.name in ("hand_eye.x", "hand_eye.y")]
+    assert "recalibrate now" not in headline(narrow)

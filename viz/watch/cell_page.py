@@ -9,19 +9,20 @@ from typing import Any
 import numpy as np
 
 from stitch.system.files import whole_file
-from stitch.units import rounded
+from stitch.units import covariate_text, covariate_unit, rounded
 from stitch.watch.report import (
     CellReport,
     CellTrend,
+    FollowedChannel,
     ParameterReport,
     day_text,
     event_sentences,
     report_notes,
     size_text,
     table_unit,
+    uncertainty_note,
 )
 from viz import captions
-from viz.captions import covariate
 from viz.page_parts import render
 from viz.watch.small_multiples import channel_drawing, drawings
 
@@ -46,7 +47,7 @@ def write_page(course: CellTrend, path: Path) -> None:
         first=drawings(course, order[:first]),
         rest=drawings(course, order[first:]),
         channels=[
-            (covariate(name), channel_drawing(course.times, values, name))
+            (covariate_text(name), channel_drawing(course.times, values, name))
             for name, values in course.channels.items()
             if np.isfinite(values).any()
         ],
@@ -63,6 +64,8 @@ def light(report: CellReport) -> tuple[str, str]:
     end = report.recalibrate_before
     if end is not None and end <= report.last:
         return "bad", "The calibration in use does not hold any more: recalibrate now."
+    if report.too_uncertain:
+        return "check", f"{uncertainty_note(report)}."
     if report.alarms:
         until = "" if end is None else f" Recalibrate before {day_text(end)}."
         return "check", f"Something moves; the calibration in use still holds.{until}"
@@ -92,19 +95,25 @@ def _identity(report: CellReport) -> list[tuple[str, str]]:
 def _row(report: CellReport, p: ParameterReport) -> dict[str, Any]:
     factor, unit = table_unit(p.unit, report.length_unit)
     moves = abs(p.drift_per_day) > 3 * p.drift_sigma
-    until = "holds" if p.valid_until is None else "over" if p.valid_until <= report.last else day_text(p.valid_until)
+    until = _until(p.valid_until, report, p.too_uncertain)
     return {
         "name": p.name,
         "unit": unit,
         "value": rounded(factor * p.value, factor * p.sigma / 10),
         "sigma": f"{factor * p.sigma:.2g}",
         "drift": rounded(factor * p.drift_per_day, factor * p.drift_sigma) if moves else "–",
-        "follows": "; ".join(f"{covariate(f.channel)}: {factor * f.per_unit:.2g} per unit" for f in p.follows),
+        "follows": "; ".join(_follows(f, factor, unit) for f in p.follows),
         "limit": f"{factor * p.limit:.3g}" if np.isfinite(p.limit) else "–",
         "until": until,
         "scatter": f"{p.scatter:.2f}",
         "alarm": p.alarm is not None,
     }
+
+
+def _follows(followed: FollowedChannel, factor: float, unit: str) -> str:
+    """Return a channel with the share of it that a parameter follows."""
+    name = followed.channel.removesuffix("_c").replace("_", " ")
+    return f"{name}: {factor * followed.per_unit:.2g} {unit}/{covariate_unit(followed.channel) or 'unit'}"
 
 
 def _past(report: CellReport) -> list[dict[str, str]]:
@@ -145,7 +154,7 @@ def write_plant_page(cells: Sequence[tuple[CellReport, Path]], path: Path) -> No
             "words": "; ".join(event_sentences(report)) or "nothing moves",
             "sessions": f"{report.sessions:,}",
             "last": day_text(report.last),
-            "until": _until(report),
+            "until": _until(report.recalibrate_before, report, bool(report.too_uncertain)),
         }
         for report, page in cells
     ]
@@ -155,8 +164,10 @@ def write_plant_page(cells: Sequence[tuple[CellReport, Path]], path: Path) -> No
         file.write_text(render("plant.html.j2", rows=rows, sentence=_sentence(counts)), encoding="utf-8")
 
 
-def _until(report: CellReport) -> str:
-    end = report.recalibrate_before
+def _until(end: float | None, report: CellReport, too_uncertain: bool) -> str:
+    """Return until when a calibration holds."""
+    if too_uncertain:
+        return "not known"
     if end is None:
         return "holds"
     return "over" if end <= report.last else day_text(end)
