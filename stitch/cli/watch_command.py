@@ -42,8 +42,9 @@ def watch(
       stitch watch cell-7 cell-8 cell-9
     """
     from stitch.system.process import steps
+    from stitch.watch.exported import dfq_text, report_document
     from stitch.watch.history import known_run_hash, measured_at, open_history, read_record, use_calibration
-    from stitch.watch.report import cell_report, dfq_text, report_document
+    from stitch.watch.report import cell_report
     from stitch.watch.update import append_runs
     from stitch.writing.json_file import to_json
 
@@ -91,7 +92,8 @@ def _require_sense(
 
 def _write_pages(histories: list[History], reports: list[CellReport], folders: list[Path]) -> None:
     """Write the page and the metrics of every cell, and beside the first the page of all."""
-    from stitch.watch.report import cell_trend, openmetrics
+    from stitch.watch.exported import openmetrics
+    from stitch.watch.report import cell_trend
     from stitch.writing.run_folder import call_entry_points
 
     for history, report, folder in zip(histories, reports, folders, strict=True):

@@ -25,7 +25,6 @@ from stitch.reading.csv_files import is_number, read_csv_lines
 from stitch.reading.session_tables import covariate_names
 from stitch.stages.coarse import REUSED
 from stitch.stored.stored_run import read_result
-from stitch.watch.run_record import Estimate, RunRecord
 
 # When a session was measured, and under which conditions: the means of its covariates.
 
@@ -56,17 +55,13 @@ def session_conditions(session: Path, result: Path) -> SessionConditions:
     if not rows:
         raise InputError(f"{file}: no views; write one row per scan")
     names = [*covariate_names(header, rows), *(["time_s"] if "time_s" in header else [])]
-    columns = {name: _column_numbers([row[name] for _, row in rows]) for name in names}
+    cells = {name: [float(row[name]) for _, row in rows if is_number(row[name])] for name in names}
+    columns = {name: [x for x in numbers if np.isfinite(x)] for name, numbers in cells.items()}
     times = columns.pop("time_s", [])
     covariates = {name: float(np.mean(numbers)) for name, numbers in columns.items() if numbers}
     if times and min(times) > _EPOCH:
         return SessionConditions(float(np.mean(times)), "time_s of views.csv", covariates)
     return SessionConditions(file.stat().st_mtime, "file time of views.csv", covariates)
-
-
-def _column_numbers(cells: list[str]) -> list[float]:
-    numbers = [float(cell) for cell in cells if is_number(cell)]
-    return [x for x in numbers if np.isfinite(x)]
 
 
 # The hand-eye of a run as six numbers that can be compared from day to day: a twist about the part.
@@ -110,6 +105,38 @@ def _watch_frame(T_mount_first: Array, centre_scanner: Array) -> Array:
 
 
 # A run folder as the record of its cell's history: parameters with sigmas, when, under which conditions, of what.
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter of an effect as one run found it."""
+
+    name: str  # effect.parameter
+    unit: str
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """One run; lengths in length_unit, angles in rad."""
+
+    path: Path  # of the run
+    session: str  # path of the session
+    name: str
+    run_hash: str  # SHA-256 of model.toml and result.json
+    session_hash: str  # of the session's tables; of the run where these have gone
+    time: float  # s since 1970, UTC
+    time_from: str  # how that is known
+    length_unit: str
+    mount: str
+    T_mount: Array  # (4, 4)
+    covariance: Array  # (6, 6) of T·exp(ξ), scanner frame
+    estimates: tuple[Estimate, ...]
+    covariates: dict[str, float]
+    numbers: dict[str, float]  # residual, held-out error, noise floor, repeatability
+    document: dict[str, Any]  # result.json
+
 
 # Tables by which a session is known again; its clouds may be gigabytes.
 _TABLES = ("session.toml", "views.csv", "points.csv", "frames.csv", "targets.csv")

@@ -1,10 +1,9 @@
 """What a cell has to say, as plain data: where its parameters are, what moves, until when the calibration holds."""
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 from scipy.special import ndtr, stdtr
@@ -18,8 +17,6 @@ from stitch.watch.tracking import (
     SLOPE,
     Alarm,
     Bank,
-    Onset,
-    Sessions,
     find_onset,
     predicted_bank,
     smoothed_states,
@@ -68,8 +65,8 @@ def days_valid(bank: Bank, conditions: Array, in_use: Array, limits: Array) -> A
 
 # What happened to a parameter: its alarms with kind, size and onset, as all sessions since tell them.
 
-# Sessions before and after an onset that tell what began there.
-_AROUND = 300
+# Sessions before and after an onset that tell what began there, and how few tell nothing.
+_AROUND, _FEWEST = 300, 3
 
 
 @dataclass(frozen=True)
@@ -112,7 +109,17 @@ def _assess_change(history: History, own: Sequence[Alarm], i: int, order: dict[i
     begin = max(order[own[i - 1].onset] if i else 0, at - _AROUND)
     end = min(order[own[i + 1].raised] if i + 1 < len(own) else len(order), max(at + _AROUND, order[alarm.raised] + 1))
     runs = list(order)[begin:end]
-    found = _find_alarm_onset(sessions_from(history, runs), alarm.parameter, drifting)
+    sessions, found = sessions_from(history, runs), None
+    values = sessions.values[:, alarm.parameter]
+    if np.isfinite(values).sum() >= _FEWEST:
+        base = [sessions.covariates, sessions.days[:, None]] if drifting else [sessions.covariates]
+        found = find_onset(
+            values=values,
+            sigmas=sessions.sigmas[:, alarm.parameter],
+            days=sessions.days,
+            covariates=np.hstack(base),
+            channels=sessions.channels,
+        )
     shape = "step" if found is None else found.shape
     return Change(
         parameter=alarm.parameter,
@@ -124,20 +131,6 @@ def _assess_change(history: History, own: Sequence[Alarm], i: int, order: dict[i
         sigma=np.nan if found is None else found.sigma,
         p_value=np.nan if found is None else found.p_value,
         chart=alarm.chart,
-    )
-
-
-def _find_alarm_onset(sessions: Sessions, parameter: int, drifting: bool) -> Onset | None:
-    base = [sessions.covariates, sessions.days[:, None]] if drifting else [sessions.covariates]
-    values = sessions.values[:, parameter]
-    if np.isfinite(values).sum() < 3:
-        return None
-    return find_onset(
-        values=values,
-        sigmas=sessions.sigmas[:, parameter],
-        days=sessions.days,
-        covariates=np.hstack(base),
-        channels=sessions.channels,
     )
 
 
@@ -242,8 +235,12 @@ def cell_report(history: History, tolerance: float | None = None) -> CellReport:
     limits = _parameter_limits(history, names, ends.sigmas[at[used]], tolerance)
     best = bank.chosen(bank.best)
     days = days_valid(best, ends.covariates[at[used]], ends.values[at[used]], limits)
-    common = np.sqrt(np.maximum(1 - best.scatter[:, 0], 0.0)) * _typical_sigmas(ends.sigmas, best)
-    run_names, times = _runs_of(history, events)
+    # As the last session states them that shows a parameter, else the first.
+    stated = np.where(np.isfinite(ends.sigmas[-1]), ends.sigmas[-1], best.unit)
+    common = np.sqrt(np.maximum(1 - best.scatter[:, 0], 0.0)) * stated
+    named = {run for change in events for run in (change.since, change.raised)}
+    rows = [history.sql("SELECT id, name, time FROM runs WHERE id = ?", run)[0] for run in named]
+    times = {run: float(time) for run, _, time in rows}
     parameters = [
         _assess_parameter(p, names, best, _likeliest_sloped(bank), ends.covariates[at[last_run]], common[p])
         | {"in_use": float(ends.values[at[used], p]), "limit": float(limits[p])}
@@ -259,17 +256,10 @@ def cell_report(history: History, tolerance: float | None = None) -> CellReport:
         last=float(last),
         in_use=str(in_use),
         parameters=tuple(ParameterReport(**p) for p in parameters),  # type: ignore[arg-type]
-        run_names=run_names,
+        run_names={run: str(name) for run, name, _ in rows},
         run_times=times,
         run_length=float(history.stated("run_length")),
     )
-
-
-def _runs_of(history: History, events: list[Change]) -> tuple[dict[int, str], dict[int, float]]:
-    """Names and times of the sessions that events name."""
-    runs = {run for c in events for run in (c.since, c.raised)}
-    rows = [history.sql("SELECT id, name, time FROM runs WHERE id = ?", run)[0] for run in runs]
-    return {run: str(name) for run, name, _ in rows}, {run: float(time) for run, _, time in rows}
 
 
 def _assess_parameter(
@@ -322,11 +312,6 @@ def _likeliest_sloped(bank: Bank) -> Bank:
     return bank.chosen(believes[np.argmax(bank.log_likelihood[:, believes], axis=1)])
 
 
-def _typical_sigmas(sigmas: Array, bank: Bank) -> Array:
-    """(P,) stated sigma: of the last session that shows a parameter, else of the first."""
-    return np.where(np.isfinite(sigmas[-1]), sigmas[-1], bank.unit)
-
-
 def _parameter_limits(history: History, names: SessionColumns, sigmas: Array, tolerance: float | None) -> Array:
     """(P,) how far a parameter may be from the calibration in use; NaN where that does not have it."""
     limits = _COVERAGE_FACTOR * sigmas
@@ -377,12 +362,13 @@ def cell_trend(history: History, report: CellReport, max_sessions: int = MAX_SES
         sigmas=sessions.sigmas[part],
         smoothed=seen.values[part],
         smoothed_sigmas=np.hypot(seen.own_sigmas[part], common),
-        in_use=_in_use(history, len(report.parameters)),
+        in_use=calibration_in_use(history, len(report.parameters)),
         channels=_channels(history, list(sessions.ids[part])),
     )
 
 
-def _in_use(history: History, parameters: int) -> Array:
+def calibration_in_use(history: History, parameters: int) -> Array:
+    """(P,) values in the calibration in use; NaN where it has none."""
     out = np.full(parameters, np.nan)
     found = history.sql(
         "SELECT parameter, value FROM estimates WHERE run = (SELECT id FROM runs WHERE run_hash = ?)",
@@ -400,106 +386,6 @@ def _channels(history: History, runs: list[int]) -> dict[str, Array]:
         if run in place and name in out:
             out[name][place[run]] = value
     return out
-
-
-# The history of a cell as a Q-DAS file (ASCII transfer format, DFQ): a characteristic a parameter, a row a session.
-#
-# K-fields: K0100 number of characteristics, K1001 and K1002 the part, K2001 number and K2002 name of a characteristic,
-# K2101 nominal (the calibration in use), K2110 and K2111 limits, K2142 unit, K2022 digits. In a row of values,
-# characteristics are parted by the character SI, and within one value, attribute (0 valid, 256 not measured) and time
-# by DC4.
-
-_VALUE, _FIELD = "\x0f", "\x14"
-_VALID, _MISSING = 0, 256
-# Lengths and angles in units that leave digits before the point.
-_SCALES = {"rad": (1e3, "mrad"), "m": (1e3, "mm")}
-
-
-def dfq_text(history: History, report: CellReport) -> str:
-    """All sessions of a cell as the text of a DFQ file."""
-    rows = history.sql("SELECT id, time FROM runs ORDER BY time, id")
-    sessions = sessions_from(history, [run for run, _ in rows])
-    used = history.stated("in_use")
-    stated = dict(
-        history.sql(
-            "SELECT parameter - 1, value FROM estimates WHERE run = (SELECT id FROM runs WHERE run_hash = ?)", used
-        )
-    )
-    scales = [_SCALES.get(p.unit, (1.0, p.unit)) for p in report.parameters]
-    lines = [f"K0100 {len(scales)}", "K1001 1", f"K1002 {_dfq_text_safe(report.name)}"]
-    for i, (p, (scale, unit)) in enumerate(zip(report.parameters, scales, strict=True)):
-        lines += [f"K2001/{i + 1} {i + 1}", f"K2002/{i + 1} {_dfq_text_safe(p.name)}", f"K2142/{i + 1} {unit}"]
-        if i in stated and np.isfinite(p.limit):
-            middle = scale * stated[i]
-            limits = (("K2101", middle), ("K2110", middle - scale * p.limit), ("K2111", middle + scale * p.limit))
-            lines += [f"{key}/{i + 1} {x:.9g}" for key, x in limits]
-    factors = np.array([scale for scale, _ in scales])
-    for (_, time), values in zip(rows, sessions.values * factors, strict=True):
-        when = datetime.fromtimestamp(time, UTC).strftime("%d.%m.%Y/%H:%M:%S")
-        lines.append(_VALUE.join(_dfq_entry(x, when) for x in values))
-    return "\r\n".join([*lines, ""])
-
-
-def _dfq_entry(value: float, when: str) -> str:
-    measured = bool(np.isfinite(value))
-    return _FIELD.join([f"{value:.9g}" if measured else "0", str(_VALID if measured else _MISSING), when])
-
-
-def _dfq_text_safe(text: str) -> str:
-    """Without what parts fields and lines."""
-    return "".join(c if c.isprintable() else " " for c in text)
-
-
-# Cells as OpenMetrics text: for the text file collector of a Prometheus node exporter, or any scraper.
-
-_OF_PARAMETERS: tuple[tuple[str, str, Callable[[ParameterReport], float]], ...] = (
-    ("stitch_parameter", "Smoothed value of a parameter, in the unit that its label names.", lambda p: p.value),
-    ("stitch_parameter_sigma", "Standard deviation of the smoothed value.", lambda p: p.sigma),
-    ("stitch_parameter_drift_per_day", "Slope of the smoothed value, per day.", lambda p: p.drift_per_day),
-    ("stitch_parameter_alarm", "1 while an alarm stands, else 0.", lambda p: float(p.alarm is not None)),
-    (
-        "stitch_parameter_valid_until_seconds",
-        "When the calibration in use may have left its limits, seconds since 1970; infinite beyond the horizon.",
-        lambda p: np.inf if p.valid_until is None else p.valid_until,
-    ),
-)
-_OF_CELLS: tuple[tuple[str, str, Callable[[CellReport], float]], ...] = (
-    ("stitch_cell_sessions", "Sessions in the history of a cell.", lambda r: float(r.sessions)),
-    ("stitch_cell_last_session_seconds", "Time of the last session, seconds since 1970.", lambda r: r.last),
-)
-
-
-def openmetrics(reports: Sequence[CellReport]) -> str:
-    """OpenMetrics 1.0 text of some cells; the formats of Prometheus read it as well."""
-    lines = list[str]()
-    for name, meaning, of_parameter in _OF_PARAMETERS:
-        lines += _head(name, meaning)
-        for report in reports:
-            for p in report.parameters:
-                labels = _labels(cell=report.name, parameter=p.name, unit=p.unit)
-                lines.append(f"{name}{labels} {_number(of_parameter(p))}")
-    for name, meaning, of_cell in _OF_CELLS:
-        lines += _head(name, meaning)
-        lines += [f"{name}{_labels(cell=report.name)} {_number(of_cell(report))}" for report in reports]
-    return "\n".join([*lines, "# EOF", ""])
-
-
-def _head(name: str, meaning: str) -> list[str]:
-    return [f"# TYPE {name} gauge", f"# HELP {name} {meaning}"]
-
-
-def _labels(**labels: str) -> str:
-    return "{" + ",".join(f'{name}="{_escaped(text)}"' for name, text in labels.items()) + "}"
-
-
-def _escaped(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-
-
-def _number(value: float) -> str:
-    if np.isnan(value):
-        return "NaN"
-    return repr(float(value)) if np.isfinite(value) else ("+Inf" if value > 0 else "-Inf")
 
 
 # What moves in a cell, in one sentence an event.
@@ -590,16 +476,12 @@ def _event_sentence(report: CellReport, group: Sequence[_Alarmed]) -> str:
     parameter, change = group[0]
     if change.channel is not None:
         per = size_text(change.size, parameter.unit, change.sigma)
-        return f"{parameter.name} follows {change.channel} since session {since}, {per} per {_one_of(change.channel)}"
+        one = covariate_unit(change.channel) or "unit"
+        return f"{parameter.name} follows {change.channel} since session {since}, {per} per {one}"
     per_day = size_text(change.size, parameter.unit, change.sigma)
     share = change.size / parameter.in_use if parameter.in_use and effect != "hand_eye" else float("nan")
     rate = f"{100 * share:+.2g} % a day" if np.isfinite(share) else f"{per_day} a day"
     return f"{parameter.name} drifts since session {since}, {rate}"
-
-
-def _one_of(channel: str) -> str:
-    """Return what one unit of a channel is called."""
-    return covariate_unit(channel) or "unit"
 
 
 def uncertainty_note(report: CellReport) -> str:
@@ -622,66 +504,6 @@ def _recalibration_note(report: CellReport) -> str:
         if end <= report.last
         else f"recalibrate before {day_text(end)}"
     )
-
-
-# What a cell has to say, as JSON.
-
-REPORT_FORMAT = "stitch-watch/1"
-
-
-def report_document(report: CellReport) -> dict[str, Any]:
-    """A cell report as plain data; times in ISO 8601, UTC."""
-    return {
-        "format": REPORT_FORMAT,
-        "cell": report.name,
-        "sentence": headline(report),
-        "length_unit": report.length_unit,
-        "sessions": report.sessions,
-        "first": iso_time(report.first),
-        "last": iso_time(report.last),
-        "in_use": report.in_use,
-        "recalibrate_before": iso_time(report.recalibrate_before),
-        "sessions_to_a_false_alarm": report.run_length,
-        "parameters": [_parameter_document(report, p) for p in report.parameters],
-    }
-
-
-def iso_time(time: float | None) -> str | None:
-    """Seconds since 1970 as ISO 8601."""
-    return None if time is None else datetime.fromtimestamp(time, UTC).isoformat(timespec="seconds")
-
-
-def _parameter_document(report: CellReport, p: ParameterReport) -> dict[str, Any]:
-    return {
-        "name": p.name,
-        "unit": p.unit,
-        "value": p.value,
-        "sigma": p.sigma,
-        "common_sigma": p.common_sigma,
-        "scatter": p.scatter,
-        "drift_per_day": p.drift_per_day,
-        "drift_sigma": p.drift_sigma,
-        "process_noise": p.process_noise,
-        "follows": [vars(f) for f in p.follows],
-        "limit": p.limit,
-        "valid_until": iso_time(p.valid_until),
-        "alarm": None if p.alarm is None else _change_document(report, p.alarm),
-        "changes": [_change_document(report, c) for c in p.changes],
-    }
-
-
-def _change_document(report: CellReport, c: Change) -> dict[str, Any]:
-    return {
-        "since": report.run_names[c.since],
-        "since_time": iso_time(report.run_times[c.since]),
-        "raised": report.run_names[c.raised],
-        "kind": c.kind,
-        "p_value": c.p_value,
-        "channel": c.channel,
-        "size": c.size,
-        "size_sigma": c.sigma,
-        "chart": c.chart,
-    }
 
 
 # Units in which parameters are told in tables and drawings: those with digits before the point.

@@ -278,12 +278,6 @@ def empty_charts(parameters: int) -> Charts:
     return Charts(np.zeros((parameters, len(CUSUM_REFERENCES), 2)), np.zeros(parameters))
 
 
-def extended_charts(charts: Charts, more: int) -> Charts:
-    """The charts of further parameters beside them."""
-    new = empty_charts(more)
-    return Charts(np.concatenate([charts.cusums, new.cusums]), np.concatenate([charts.ewma, new.ewma]))
-
-
 def updated_charts(charts: Charts, innovations: Array) -> Charts:
     """One session more; innovations (P,), NaN where there is none."""
     seen = np.isfinite(innovations)
@@ -475,11 +469,9 @@ def next_state(state: CellState, sessions: Sessions, k: int, moved: Collection[i
     bank, charts = state.bank, state.charts
     known = len(bank.origin)
     if len(values) > known:
-        fresh = _first_values(sessions, known)
-        bank, charts = (
-            with_parameters(bank, *fresh, sessions.prior_sigmas),
-            extended_charts(charts, len(values) - known),
-        )
+        bank = with_parameters(bank, *_first_values(sessions, known), sessions.prior_sigmas)
+        more = empty_charts(len(values) - known)
+        charts = Charts(np.concatenate([charts.cusums, more.cusums]), np.concatenate([charts.ewma, more.ewma]))
     bank = predicted_bank(bank, max(sessions.days[k] - state.day, 0.0))
     if moved:
         mask = np.isin(np.arange(len(values)), list(moved))
@@ -555,7 +547,7 @@ def smoothed_states(
     """
     members = last.bank.best
     # Parameters that came since the state join all members and are thinned with the others.
-    filtered, state = list[Bank](), state
+    filtered = list[Bank]()
     for k, run in enumerate(sessions.ids):
         state = next_state(state, sessions, k, moved.get(run, ()))
         own = state.bank

@@ -12,14 +12,15 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.watch.history import (
     TWIST_NAMES,
+    Estimate,
     History,
+    RunRecord,
     insert_run,
     matrix_json,
     mount_twist,
     scanned_middle,
     twist_covariance,
 )
-from stitch.watch.run_record import Estimate, RunRecord
 from stitch.watch.tracking import (
     Alarm,
     Bank,
@@ -249,18 +250,15 @@ def _follow_remaining(history: History) -> float | None:
         number += 1
         _store_state(history, run, times[run], number, state, last=k == len(sessions.ids) - 1)
         if found := alarming_parameters(state, run_length):
-            new = [_store_alarm(history, run, parameter, chart, alarms) for parameter, chart in found]
+            recent = recent_sessions(history, run)
+            at = list(recent.ids).index(run)
+            new = [raise_alarm(recent, at, parameter, chart, alarms) for parameter, chart in found]
             history.many(
                 "INSERT INTO alarms (parameter, onset, raised, chart) VALUES (?, ?, ?, ?)",
                 [(a.parameter + 1, a.onset, a.raised, a.chart) for a in new],
             )
             return min(float(history.sql("SELECT time FROM runs WHERE id = ?", a.onset)[0][0]) for a in new)
     return None
-
-
-def _store_alarm(history: History, run: int, parameter: int, chart: str, before: list[Alarm]) -> Alarm:
-    sessions = recent_sessions(history, run)
-    return raise_alarm(sessions, list(sessions.ids).index(run), parameter, chart, before)
 
 
 def recent_sessions(history: History, run: int, most: int = 640) -> Sessions:
@@ -271,8 +269,7 @@ def recent_sessions(history: History, run: int, most: int = 640) -> Sessions:
         run,
         most,
     )
-    ids = [row[0] for row in rows]
-    return sessions_from(history, ids)
+    return sessions_from(history, [run for (run,) in rows])
 
 
 def _store_state(history: History, run: int, time: float, number: int, state: CellState, last: bool) -> None:

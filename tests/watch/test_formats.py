@@ -7,8 +7,9 @@ import pytest
 
 from data_synth.cell_history import CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
+from stitch.watch.exported import dfq_text, openmetrics
 from stitch.watch.history import open_history
-from stitch.watch.report import cell_report, dfq_text, openmetrics
+from stitch.watch.report import cell_report
 from stitch.watch.update import append_runs
 
 
