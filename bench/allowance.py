@@ -19,7 +19,8 @@ from data_synth.scanning import scan
 from data_synth.shapes import build_shape
 from data_synth.shapes.casting import around, with_stock
 from stitch import frames
-from stitch.cells.cad import CadSurface, JoinedScans, cad_surface, join_scans
+from stitch.cells.cad import CadSurface, cad_surface
+from stitch.cells.placed_scans import JoinedScans, join_scans
 from stitch.cells.scan_to_cad import AllowancePrior, CadFit, fit_cad
 from stitch.frames import Array
 from stitch.measurement.scan import prepare_scan

@@ -1,10 +1,12 @@
 """The tables of docs/results.md: real scans, and a synthetic blade of 18 views with 340,000 points.
 
-Usage: python bench/real_scans.py PATH_OF_REGHEC_SESSIONS > docs/results.md
+Usage: python bench/real_scans.py PATH_OF_REGHEC_SESSIONS
 """
 
 import sys
+from contextlib import redirect_stdout
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +23,15 @@ from stitch.reading.session_folder import load_session
 from stitch.stages.correct import correct
 from stitch.stages.register import register
 
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "results.md"
+BEGIN, END = "<!-- scans: begin -->", "<!-- scans: end -->"
 IN_HAND = ("david", "cone", "sphere", "rubik")
 OBJECTS = (*IN_HAND, "gripperopen")
 
 
 def main(folder: Path) -> None:
     """Print the page."""
-    print("# Results\n\nWritten by `bench/real_scans.py`; two cores.\n")
+    print("Written by `python bench/real_scans.py PATH_OF_REGHEC_SESSIONS`; two cores.\n")
     runs = {name: run(load_session(folder / name)) for name in OBJECTS}
     print("## Real scans, no hand-eye given (RegHEC: 5 objects, 9 views each)\n")
     print("| object | one hand-eye, rms (µm) | held-out (µm) | after register (µm) | sensor noise (µm) | seconds |")
@@ -134,4 +138,8 @@ def speed() -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    with redirect_stdout(StringIO()) as printed:
+        main(Path(sys.argv[1]))
+    page = PAGE.read_text(encoding="utf-8")
+    text = page.split(BEGIN)[0] + BEGIN + "\n" + printed.getvalue() + END + page.split(END)[1]
+    PAGE.write_text(text, encoding="utf-8")

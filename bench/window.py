@@ -15,7 +15,8 @@ from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from data_synth.window_scans import Weld, warp
 from stitch import frames
-from stitch.cells.cad import Box, Regions, cad_surface, join_scans
+from stitch.cells.cad import Box, Regions, cad_surface
+from stitch.cells.placed_scans import join_scans
 from stitch.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations
 from stitch.cells.seam import Limits, Station, measure_seam
 from stitch.measurement.scan import prepare_scan

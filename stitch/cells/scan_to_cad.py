@@ -17,7 +17,6 @@ from stitch.cells.cad import (
     MAD,
     TUKEY,
     CadSurface,
-    JoinedScans,
     NearestPartners,
     Regions,
     biweight,
@@ -28,6 +27,7 @@ from stitch.cells.cad import (
     sample_partners,
 )
 from stitch.cells.job_files import write_columns
+from stitch.cells.placed_scans import SOURCES, JoinedScans, PlacingErrors
 from stitch.closed_form import feature_matching
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array, Indices
@@ -237,6 +237,7 @@ class CadFit:
 
     T_base_part: Array  # (4, 4)
     covariance: Array  # (6, 6) of ξ about the CAD's centre, T·exp(ξ), rotation (rad) first
+    parts: dict[str, Array]  # (6, 6) shares of it by source: the scan's noise, and SOURCES where they are known
     scale: float  # robust 1-sigma of the distances less the allowance
     rms: float  # of the same of all points that have a partner, deformed places too
     inliers: float  # share of the fit's points with weight above a half
@@ -255,6 +256,7 @@ def fit_cad(
     T_base_part: Array,
     regions: Regions | None = None,
     prior: AllowancePrior = NO_ALLOWANCE,
+    errors: PlacingErrors | None = None,
 ) -> CadFit:
     """Refine a coarse T_base_part (4, 4) until it stands still, and with it the allowance if it is wanted.
 
@@ -262,6 +264,9 @@ def fit_cad(
     beyond 4.7 scales has no say. The rim of a dent leaves less, yet all to one side: so once the fit stands, whole
     cells of the surface are weighted by their means too (`cell_weights`). The points are drawn evenly over the
     directions they look to (`sample_normal_space`).
+
+    Args:
+        errors: how the scans' places may err; the covariance takes it up.
 
     Raises:
         NoResultError: too few points meet the CAD, or the surface leaves a direction or the allowance open.
@@ -289,11 +294,13 @@ def fit_cad(
             if by_cell:
                 break
             by_cell = True
-    covariance = _sandwich(seen.design, rest, weight, scale, shrink)
+    parts = _covariances(scan, seen, rest, weight, scale=scale, shrink=shrink, T_base_part=T_base_part, errors=errors)
+    covariance = sum(parts.values(), np.zeros_like(N))
     used = rest[seen.used]
     return CadFit(
         T_base_part,
         covariance=covariance[:6, :6],
+        parts={name: part[:6, :6] for name, part in parts.items()},
         scale=scale,
         rms=float(np.sqrt((used**2).mean())),
         inliers=float(np.mean(np.abs(used) < 0.54 * TUKEY * scale)),
@@ -308,16 +315,36 @@ def moved_about(T_base_part: Array, step: Array, centre: Array) -> Array:
     return np.asarray(T_base_part @ frames.inverse(shift @ frames.exp(step) @ frames.inverse(shift)))
 
 
-def _sandwich(design: Array, rest: Array, weight: Array, scale: float, shrink: Array) -> Array:
-    """Covariance (6 + K, 6 + K): the weights are not the inverse variances (Huber & Ronchetti 2009, ch. 7).
+def _covariances(
+    scan: JoinedScans,
+    seen: "_Correspondences",
+    rest: Array,
+    weight: Array,
+    *,
+    scale: float,
+    shrink: Array,
+    T_base_part: Array,
+    errors: PlacingErrors | None,
+) -> dict[str, Array]:
+    """Covariances (6 + K, 6 + K) by source.
 
-    What is shrunk is as large as believed, which is an error of its own.
+    Of the noise a sandwich: the weights are not the inverse variances (Huber & Ronchetti 2009, ch. 7). What is shrunk
+    is as large as believed, which is an error of its own. Of misplaced scans the sum of the fit's squared answers.
     """
-    u = rest / (TUKEY * scale)
+    design, u = seen.design, rest / (TUKEY * scale)
     slope = np.where(weight > 0, weight / np.maximum(biweight(u), 1e-12) * biweight_slope(u), 0.0)
     inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, slope, design) + np.diag(shrink))
     meat = np.einsum("ni,n,nj->ij", design, (weight * rest) ** 2, design) + np.diag(shrink) * scale**2
-    return np.asarray(inverse @ meat @ inverse)
+    out = {"scan": np.asarray(inverse @ meat @ inverse)}
+    if errors is not None:
+        normals = frames.rotate(T_base_part, seen.partners.normal)
+        for source in SOURCES:
+            answers = [
+                inverse @ (design[own].T @ (slope[own] * np.einsum("ni,ni->n", normals[own], moved)))
+                for own, moved in errors.modes(scan, source)
+            ]
+            out[source] = sum((np.outer(a, a) for a in answers), np.zeros_like(inverse))
+    return out
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stitch import frames
-from stitch.cells.cad import MAD, TUKEY, JoinedScans, biweight, biweight_slope
+from stitch.cells.cad import MAD, TUKEY, biweight, biweight_slope
+from stitch.cells.placed_scans import SOURCES, JoinedScans, PlacingErrors
 from stitch.errors import NoResultError
 from stitch.frames import Array
 
@@ -27,38 +28,40 @@ class SeamEdge:
     across: float
     height: float
     covariance: Array  # (2, 2) of (across, height)
+    moved: Array  # (2, P) of it by each of P motions of the points
 
 
-def find_edge(points: Array, normals: Array, facing: float) -> SeamEdge:
+def find_edge(points: Array, normals: Array, facing: float, moves: Array | None = None) -> SeamEdge:
     """Fit the outer surface (bent both ways) and the flank (straight down, bent along), intersect them at the station.
 
     Args:
         points: (N, 3) across, along and height in the station's frame, of one side of the seam only; length in mm.
         normals: (N, 3) in the same frame.
         facing: +1 if the flank looks towards positive `across`, else −1.
+        moves: (P, N, 3) small motions of the points to which the edge's answer is wanted.
 
     Raises:
         NoResultError: the surface or the flank was not seen; names which.
     """
     up, out = normals[:, 2], facing * normals[:, 0]
-    flank = points[(out > 0.75) & (up < 0.6)]
+    flank = np.flatnonzero((out > 0.75) & (up < 0.6))
     if len(flank) < _FEWEST:
         raise NoResultError(f"{len(flank)} points on the flank; to fix: scan it leaned by 30 to 45° towards it")
-    rim = np.median(flank[:, 0])
-    top = points[(up > 0.85) & (np.abs(points[:, 0] - rim) < _REACH)]
+    rim = np.median(points[flank, 0])
+    top = np.flatnonzero((up > 0.85) & (np.abs(points[:, 0] - rim) < _REACH))
     if len(top) < _FEWEST:
         raise NoResultError(f"{len(top)} points on the outer surface; to fix: scan the seam wider")
     # The flank of a bent sheet may bend too further down: only its upper part makes the edge.
-    flank = flank[flank[:, 2] > np.median(top[:, 2]) - _REACH / 2]
+    flank = flank[points[flank, 2] > np.median(points[top, 2]) - _REACH / 2]
     if len(flank) < _FEWEST:
         raise NoResultError(
             f"{len(flank)} points on the flank's upper part; to fix: scan it leaned by 30 to 45° towards it"
         )
-    a, s, h = top.T
+    a, s, h = points[top].T
     design = np.column_stack([a**0, a - rim, s, (a - rim) ** 2, s**2, (a - rim) * s])
-    surface, surface_spread = _robust(design, h, top)
-    a, s, h = flank.T
-    wall, wall_spread = _robust(np.column_stack([a**0, h, s, s**2]), a, flank)
+    surface, surface_spread, surface_gain = _robust(design, h, points[top])
+    a, s, h = points[flank].T
+    wall, wall_spread, wall_gain = _robust(np.column_stack([a**0, h, s, s**2]), a, points[flank])
     place = _meet(surface, wall, rim)
     step = 1e-5
     columns = [(_meet(surface + step * d, wall, rim) - place) / step for d in np.eye(6)]
@@ -66,7 +69,13 @@ def find_edge(points: Array, normals: Array, facing: float) -> SeamEdge:
     J = np.column_stack(columns)
     spread = np.zeros((10, 10))
     spread[:6, :6], spread[6:, 6:] = surface_spread, wall_spread
-    return SeamEdge(float(place[0]), float(place[1]), J @ spread @ J.T)
+    moves = np.zeros((0, *points.shape)) if moves is None else moves
+    # A moved surface is seen higher, a moved flank further across, each by its motion along the normal.
+    along = np.einsum("pni,ni->pn", moves, normals)
+    change = np.vstack(
+        [surface_gain @ (along[:, top] / up[top]).T, wall_gain @ (along[:, flank] / normals[flank, 0]).T]
+    )
+    return SeamEdge(float(place[0]), float(place[1]), J @ spread @ J.T, J @ change)
 
 
 def _meet(surface: Array, wall: Array, rim: float) -> Array:
@@ -78,8 +87,8 @@ def _meet(surface: Array, wall: Array, rim: float) -> Array:
     return np.array([a, h])
 
 
-def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array]:
-    """Coefficients and covariance of a linear fit with Tukey weights, 20 rounds.
+def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array, Array]:
+    """Coefficients, their covariance and their change per value, of a linear fit with Tukey weights, 20 rounds.
 
     What a facet or a bend leaves is shared by neighbours, so the covariance counts cubes of points (N, 3) and not
     points as independent (cluster-robust sandwich, Liang & Zeger 1986).
@@ -91,13 +100,18 @@ def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array]:
         residual = values - design @ found
         scale = max(MAD * float(np.median(np.abs(residual))), 1e-9)
         weight = biweight(residual / (TUKEY * scale))
-    inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, biweight_slope(residual / (TUKEY * scale)), design))
+    slope = biweight_slope(residual / (TUKEY * scale))
+    inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, slope, design))
     _, cube = np.unique(np.floor(points / _CUBE).astype(int), axis=0, return_inverse=True)
     scores = np.zeros((cube.max() + 1, design.shape[1]))
     np.add.at(scores, cube.ravel(), design * (weight * residual)[:, None])
     cubes, unknowns = scores.shape
     few = cubes / max(cubes - unknowns, 1)
-    return np.asarray(found), np.asarray(few * inverse @ scores.T @ scores @ inverse)
+    return (
+        np.asarray(found),
+        np.asarray(few * inverse @ scores.T @ scores @ inverse),
+        inverse @ (design * slope[:, None]).T,
+    )
 
 
 # Width of the strip along the seam that is fitted, and how far across and down it reaches, mm.
@@ -149,7 +163,12 @@ class Seam:
 
 
 def measure_seam(
-    scan: JoinedScans, T_base_part: Array, stations: Sequence[Station], limits: Limits, pose_sigma: float = 0.0
+    scan: JoinedScans,
+    T_base_part: Array,
+    stations: Sequence[Station],
+    limits: Limits,
+    pose_sigma: float = 0.0,
+    errors: PlacingErrors | None = None,
 ) -> list[Seam]:
     """Flush and gap at each station.
 
@@ -158,23 +177,39 @@ def measure_seam(
 
     Args:
         T_base_part: (4, 4) of the part in whose frame the stations are given.
-        pose_sigma: what one scan may stand off another, mm (the robot's pose error); it enters every sigma.
+        pose_sigma: what one scan may stand off another, mm; where it is stated, it takes the place of the robot's
+            scatter in `errors`.
+        errors: how the scans' places may err. What moves both edges alike does not count.
     """
-    return [_measure(scan, T_base_part, station, limits, pose_sigma) for station in stations]
+    sources = [source for source in SOURCES if errors is not None and not (pose_sigma and source == "robot")]
+    return [_measure(scan, T_base_part, station, limits, pose_sigma, errors, sources) for station in stations]
 
 
-def _measure(scan: JoinedScans, T_base_part: Array, station: Station, limits: Limits, pose_sigma: float) -> Seam:
+def _measure(
+    scan: JoinedScans,
+    T_base_part: Array,
+    station: Station,
+    limits: Limits,
+    pose_sigma: float,
+    errors: PlacingErrors | None,
+    sources: Sequence[str],
+) -> Seam:
     T_station_base = frames.inverse(T_base_part @ station.T_part_station)
     points = frames.transform(T_station_base, scan.points)
     near = scan.usable & (np.abs(points) < np.array([_ACROSS, _ALONG, _DEPTH])).all(axis=1)
     points, normals = points[near], frames.rotate(T_station_base, scan.normals[near])
+    found = [mode for source in sources if errors for mode in errors.modes(scan.take(near), source)]
+    moves = np.zeros((len(found), *points.shape))
+    for k, (own, moved) in enumerate(found):
+        moves[k, own] = frames.rotate(T_station_base, moved)
     try:
-        inner = _side(points, normals, -1.0, "inner part")
-        outer = _side(points, normals, 1.0, "outer part")
+        inner = _side(points, normals, -1.0, "inner part", moves)
+        outer = _side(points, normals, 1.0, "outer part", moves)
     except NoResultError as error:
         return Seam(station.name, reason=str(error))
     gap, flush = outer.across - inner.across, inner.height - outer.height
-    variance = np.diag(inner.covariance) + np.diag(outer.covariance) + pose_sigma**2
+    apart = ((outer.moved - inner.moved) ** 2).sum(axis=1)
+    variance = np.diag(inner.covariance) + np.diag(outer.covariance) + pose_sigma**2 + apart
     sigma_gap, sigma_flush = np.sqrt(variance)
     verdict = _verdict(
         (abs(flush - limits.flush) - limits.flush_tolerance, sigma_flush),
@@ -192,11 +227,11 @@ def _measure(scan: JoinedScans, T_base_part: Array, station: Station, limits: Li
     )
 
 
-def _side(points: Array, normals: Array, side: float, name: str) -> SeamEdge:
+def _side(points: Array, normals: Array, side: float, name: str, moves: Array) -> SeamEdge:
     """The edge on one side of the gap's middle: the inner part lies on its negative side, its flank looks to +."""
     here = side * points[:, 0] > 0
     try:
-        return find_edge(points[here], normals[here], -side)
+        return find_edge(points[here], normals[here], -side, moves[:, here])
     except NoResultError as error:
         raise NoResultError(f"{name}: {error}") from None
 

@@ -13,14 +13,9 @@ from stitch import frames
 from stitch.cells.cad import (
     Box,
     CadSurface,
-    JoinedScans,
-    PlacedScans,
     Regions,
-    assemble_scans,
     coverage,
     read_cad,
-    read_placed_session,
-    read_scan_table,
 )
 from stitch.cells.job_files import (
     POSE_COLUMNS,
@@ -35,6 +30,14 @@ from stitch.cells.job_files import (
     write_columns,
     write_poses,
     write_recording_and_page,
+)
+from stitch.cells.placed_scans import (
+    JoinedScans,
+    PlacedScans,
+    assemble_scans,
+    read_placed_session,
+    read_scan_table,
+    stated_errors,
 )
 from stitch.cells.scan_to_cad import (
     AllowancePrior,
@@ -72,7 +75,7 @@ def correct_path(T_base_tool: Array, T_base_part_nominal: Array, T_base_part: Ar
 # Job files of `stitch fit` and `stitch seam` (TOML); every check of the input is made here.
 
 FIT_FORMAT, SEAM_FORMAT = "stitch-fit/1", "stitch-seam/1"
-_SCANS = {"scans", "session", "hand_eye"}
+_SCANS = {"scans", "session", "hand_eye", "errors"}
 _FIT_KEYS = {"format", *_SCANS, "cad", "length_unit"}
 _FIT_KEYS |= {"instances", "tolerance", "cell", "region", "nominal", "path", "coverage"}
 _SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma"}
@@ -187,12 +190,14 @@ def _read_scans(document: JobTable) -> PlacedScans:
             f"{file}: hand_eye goes with session; to fix: leave it out, for a table of scans has the scanner's poses"
         )
     if "scans" in document:
-        return read_scan_table(document.path("scans"))
+        placed = read_scan_table(document.path("scans"))
+        return replace(placed, errors=stated_errors(document, placed))
     if "hand_eye" not in document:
         raise InputError(
             f"{file}: session has no hand_eye; to fix: name the file that `stitch calibrate sphere -o` wrote"
         )
-    return read_placed_session(document.path("session"), document.path("hand_eye"))
+    placed = read_placed_session(document.path("session"), document.path("hand_eye"))
+    return replace(placed, errors=stated_errors(document, placed))
 
 
 def _read_regions(document: JobTable) -> Regions:
@@ -264,7 +269,7 @@ def fit_parts(job: FitJob) -> list[FittedPart]:
 
 def _fit_part(job: FitJob, scan: JoinedScans) -> FittedPart:
     start = find_cad_start(scan, job.cad)
-    found = fit_cad(scan, job.cad, start.T_base_part, job.regions, job.allowance_prior)
+    found = fit_cad(scan, job.cad, start.T_base_part, job.regions, job.allowance_prior, job.placed.errors)
     T = frames.inverse(found.T_base_part)
     local, normals = frames.transform(T, scan.points[scan.usable]), frames.rotate(T, scan.normals[scan.usable])
     covered = {box.name: coverage(box, job.cad, local, normals) for box in job.regions.expected}
@@ -298,6 +303,7 @@ def _part_document(part: FittedPart) -> dict[str, Any]:
         "pose": dict(zip(POSE_COLUMNS.split(), pose, strict=True)),
         "sigma": part.fit.sigma[3:].tolist(),
         "sigma_deg": np.degrees(part.fit.sigma[:3]).tolist(),
+        "sigma_parts": {name: np.sqrt(np.diag(C)[3:]).tolist() for name, C in part.fit.parts.items()},
         "scale": part.fit.scale,
         "rms": part.fit.rms,
         "inliers": part.fit.inliers,
@@ -346,7 +352,7 @@ def solve_seam(job: SeamJob) -> list[Seam]:
     Raises:
         NoResultError: no station could be measured.
     """
-    seams = measure_seam(job.scan, job.T_base_part, job.stations, job.limits, job.pose_sigma)
+    seams = measure_seam(job.scan, job.T_base_part, job.stations, job.limits, job.pose_sigma, job.placed.errors)
     if all(seam.verdict == "not measured" for seam in seams):
         raise NoResultError(f"no station could be measured; the first: {seams[0].reason}")
     return seams
@@ -388,6 +394,7 @@ def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
         f"T_base_part: {place}, ± {uncertainty_text(shift)} at most; a {a:.4f}, b {b:.4f}, c {c:.4f}° about z, y', "
         f"x'', ± {uncertainty_text(turn)}° at most (1 σ)."
     )
+    yield _sigma_sentence(job, part)
     if part.fit.allowance is not None:
         yield allowance_sentence(part.fit.allowance, job.length_unit)
     if part.start.runner_up > 0.9 * part.start.share:
@@ -406,6 +413,22 @@ def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
     for name, count in part.forbidden.items():
         if count:
             yield f"{count} points in forbidden region {name} did not count."
+
+
+_SOURCE_WORDS = {"scan": "the scan's noise", "hand_eye": "the hand-eye", "robot": "the robot", "scanner": "the scanner"}
+
+
+def _sigma_sentence(job: FitJob, part: FittedPart) -> str:
+    """What the ± of the place counts, largest first."""
+    sizes = {name: float(np.sqrt(np.diag(C)[3:].max())) for name, C in part.fit.parts.items()}
+    if len(sizes) == 1:
+        return "± counts the scan's noise alone; [errors] in the job states those of robot and scanner."
+    ranked = sorted((name for name, size in sizes.items() if size), key=lambda name: -sizes[name])
+    return (
+        "± of the place by source: "
+        + ", ".join(with_unit(job, f"{_SOURCE_WORDS[name]} {uncertainty_text(sizes[name])}") for name in ranked)
+        + "."
+    )
 
 
 # The scans of a part or a seam as a cloud session, with the hand-eye that placed them and their CAD.

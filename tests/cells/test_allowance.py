@@ -13,7 +13,8 @@ from data_synth.scanning import scan
 from data_synth.shapes import build_shape
 from data_synth.shapes.casting import around, with_stock
 from stitch import frames
-from stitch.cells.cad import TUKEY, JoinedScans, biweight, cad_surface, cell_weights, join_scans, nearest_partners
+from stitch.cells.cad import TUKEY, biweight, cad_surface, cell_weights, nearest_partners
+from stitch.cells.placed_scans import JoinedScans, join_scans
 from stitch.cells.scan_to_cad import AllowancePrior, allowance_sentence, fit_cad, read_allowance
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
@@ -146,7 +147,9 @@ def box_sides(*sides):
         own[:, axis] = sign * (HALF[axis] + STOCK) + 0.01 * rng.standard_normal(600)
         normal[:, axis] = sign
     ones = np.ones(600 * len(sides))
-    return JoinedScans(points.reshape(-1, 3), normals.reshape(-1, 3), ones > 0, ones, 3.0, 0.01)
+    return JoinedScans(
+        points.reshape(-1, 3), normals.reshape(-1, 3), ones > 0, ones, 3.0, 0.01, np.zeros(len(ones), int)
+    )
 
 
 def test_what_a_shift_imitates_is_no_allowance(box_cad):

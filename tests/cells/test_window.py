@@ -1,6 +1,7 @@
 """Scan onto CAD and seam: scans of known meshes in known poses; truth from the meshes, not from the package."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from data_synth import window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from stitch import frames
-from stitch.cells.cad import Box, Regions, cad_surface, join_scans, nearest_partners
+from stitch.cells.cad import Box, Regions, cad_surface, nearest_partners
+from stitch.cells.placed_scans import join_scans
 from stitch.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations, split_instances
 from stitch.cells.seam import Limits, Station, find_edge, measure_seam
 from stitch.cells.window import correct_path
@@ -253,6 +255,6 @@ def test_expected_region_without_points_is_no_fit(pane_cad):
 def test_scans_thrown_apart_by_a_wrong_pose_are_refused(pane, pane_cad):
     scan = scan_pane(pane, truth(1), 1)
     points = scan.points + np.where(np.arange(len(scan.points)) < 2000, 1e8, 0.0)[:, None]
-    thrown = type(scan)(points, scan.normals, scan.usable, scan.area, scan.spacing, scan.noise)
+    thrown = replace(scan, points=points)
     with pytest.raises(NoResultError, match="correct a scanner's pose"):
         find_cad_start(thrown, pane_cad)

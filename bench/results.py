@@ -1,0 +1,313 @@
+"""The first table of docs/results.md: every row of the five sources and of the main line, each run by its command.
+
+Run: python bench/results.py
+
+Commands of `stitch` run in an empty folder, on the simulator's cells and on examples/. Rows of many cells belong to
+the scripts that are named; their figures are read from the pages that these scripts write.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch import frames
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "results.md"
+BEGIN, END = "<!-- systems: begin -->", "<!-- systems: end -->"
+
+
+class Room:
+    """An empty folder in which commands run once, with what they print as JSON and the truths beside the cells."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.printed: dict[str, str] = {}
+        (folder / "examples").symlink_to(ROOT / "examples")
+
+    def run(self, command: str) -> str:
+        """What a command prints, standard output first."""
+        if command not in self.printed:
+            call = [str(Path(sys.executable).parent / "stitch"), *command.split()[1:]]
+            environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "200"}
+            done = subprocess.run(call, cwd=self.folder, env=environment, check=False, capture_output=True, text=True)
+            self.printed[command] = done.stdout or done.stderr
+            print(f"{done.returncode} {command}", file=sys.stderr)
+        return self.printed[command]
+
+    def json(self, command: str) -> Any:
+        return json.loads(self.run(command))
+
+    def read(self, file: str) -> Any:
+        return json.loads((self.folder / file).read_text(encoding="utf-8"))
+
+    @cached_property
+    def blade(self) -> dict[str, Any]:
+        return self.read("blade-run/result.json")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table; the last command is the one whose figure is shown."""
+
+    what: str
+    commands: tuple[str, ...]
+    published: str
+    reached: Callable[[Room], str]
+
+
+def of_page(page: str, pattern: str) -> str:
+    """Figures of a page's table, by a pattern with one group."""
+    found = re.search(pattern, (ROOT / "docs" / page).read_text(encoding="utf-8"))
+    if found is None:
+        raise SystemExit(f"docs/{page}: no row {pattern}; run the script that writes it")
+    return found.group(1).strip()
+
+
+def off(T: Any, true: Any) -> tuple[float, float]:
+    """Angle (rad) and distance between two poses."""
+    T, true = np.array(T), np.array(true)
+    return float(frames.angle_between(T, true)), float(np.linalg.norm(T[:3, 3] - true[:3, 3]))
+
+
+# The main line and source 004: a blade on the flange before a fixed scanner.
+
+
+def blade_steps(room: Room) -> str:
+    coarse, correct, register, fuse = (1e3 * stage["rms"] for stage in room.blade["stages"])
+    return f"coarse {coarse:.0f} µm, correct {correct:.0f} µm, register {register:.0f} µm, fuse {fuse:.0f} µm"
+
+
+def blade_disagreement(room: Room) -> str:
+    return f"{1e3 * room.blade['disagreement']['steps'][-1]['mean']:.1f} µm between views on average over the part"
+
+
+def blade_hand_eye(room: Room) -> str:
+    told = room.json("stitch reveal blade-run blade.truth.json --json")
+    return f"{1e3 * told['hand_eye_error_coarse_mm']:.0f} µm before, {1e3 * told['hand_eye_error_mm']:.0f} µm after"
+
+
+def hidden_found(room: Room) -> str:
+    told = room.json("stitch reveal hidden-run hidden.truth.json --json")
+    before, after = (room.read(f"{run}/result.json") for run in ("hidden-before", "hidden-run"))
+    return (
+        f"named {', '.join(told['in_the_model'] or told['named'])}; held-out {1e3 * before['heldout_rms']:.0f} → "
+        f"{1e3 * after['heldout_rms']:.0f} µm"
+    )
+
+
+BLADE = ("stitch synth blade blade --seed 3", "stitch run blade -o blade-run")
+HIDDEN = (
+    "stitch synth blade hidden --seed 3 --views 12 --hide backlash=2",
+    "stitch run hidden -o hidden-before",
+    "stitch run hidden -o hidden-run",
+    "stitch add hidden-run --suggested",
+)
+LINE = (
+    "stitch synth window-line line --seed 3",
+    "stitch calibrate sphere line/sphere -o line/hand-eye.json",
+    "stitch fit line/window.toml -o line/found-window",
+    "stitch fit line/body.toml -o line/found-body",
+    "stitch seam line/seam.toml --json",
+)
+DRILL = ("stitch synth drilling drilling --seed 3", "stitch drill drilling/job.toml --json")
+PANEL = ("stitch synth panel-robots panel --seed 3", "stitch panel panel/job.toml --json")
+
+
+# Source 003: window and body.
+
+
+def sphere_hand_eye(room: Room) -> str:
+    angle, shift = off(room.read("line/hand-eye.json")["hand_eye"], room.read("line.truth.json")["hand_eye"])
+    return f"off by {shift:.3f} mm and {np.degrees(angle):.4f}°"
+
+
+def fitted(part: str) -> Callable[[Room], str]:
+    def reached(room: Room) -> str:
+        found = room.read(f"line/found-{part}/fit.json")["parts"][0]
+        _, shift = off(found["T_base_part"], room.read("line.truth.json")[f"T_cell_{part}"])
+        return f"rms {found['rms']:.3f} mm; pose off by {shift:.3f} mm"
+
+    return reached
+
+
+def seam(room: Room) -> str:
+    stations = room.json(LINE[-1])
+    flush, gap = (np.array([s[key] for s in stations]) for key in ("flush", "gap"))
+    good = sum(s["verdict"] == "good" for s in stations)
+    return f"{good} of {len(stations)} good; flush {np.abs(flush).max():.2f}, gap {gap.min():.2f} to {gap.max():.2f} mm"
+
+
+# Source 001: base to base.
+
+
+def base_of_experiment_1(room: Room) -> str:
+    found = room.json("stitch base examples/base_to_base.toml --json")
+    truth = frames.exp(np.array([0, 0, -np.pi / 2, 0, 0, 0]))
+    truth[:3, 3] = [4.0, -1.0, 1.0]
+    parts = []
+    for name, T in (("least squares", found["T_base1_base2"]), ("projection", found["projection"]["T_base1_base2"])):
+        angle, shift = off(T, truth)
+        parts.append(f"{name} {angle:.5f} rad, {shift:.5f} m")
+    return "; ".join(parts)
+
+
+def base_of_experiment_2(room: Room) -> str:
+    said = " ".join(room.run("stitch base examples/base_to_base_2.toml").split())
+    return f"refused: rod and joints differ by {re.search(r'difference of [+]?([-0-9.]+) m', said).group(1)} m"
+
+
+# Source 002: fuselage panel.
+
+
+def panel_model(room: Room) -> str:
+    robots = room.json(PANEL[-1])["robots"].values()
+    base, turn = (max(max(r[key]) for r in robots) for key in ("sigma_base", "sigma_base_deg"))
+    return f"bases within ± {base:.3f} mm, {turn:.4f}° (1 σ)"
+
+
+def panel_leg(room: Room) -> str:
+    hidden, legs = room.read("panel.truth.json")["hidden"], room.json(PANEL[-1])["leg_offsets"]
+    found = {f"{name}{leg['leg']}": leg["offset"] for name, leg in legs.items() if leg["found"]}
+    told = ", ".join(f"{name} {size:+.2f} mm" for name, size in found.items()) or "none"
+    return f"hidden {hidden['robot']}{hidden['leg']} {hidden['offset']:+.2f} mm; found {told}"
+
+
+# Source 000: drilling.
+
+
+def drill_errors(room: Room) -> str:
+    truth, found = room.read("drilling.truth.json")["holes"], room.json(DRILL[-1])
+    places, angles = [], []
+    for drive in found["drives"]:
+        hole = truth[drive["hole"]]
+        places.append(np.linalg.norm(np.subtract(drive["position"], hole["position"])))
+        angles.append(np.degrees(np.arccos(np.clip(np.dot(drive["direction"], hole["direction"]), -1, 1))))
+    return f"position ≤ {max(places):.2f} mm, direction ≤ {max(angles):.2f}°"
+
+
+def drill_before(room: Room) -> str:
+    errors = [e for group in room.json(DRILL[-1])["groups"].values() for e in group["drive_errors"]]
+    return f"{min(errors):.2f} to {max(errors):.2f} mm, mean {np.mean(errors):.2f}"
+
+
+def drill_camera(room: Room) -> str:
+    truth = room.read("drilling.truth.json")["hidden"]
+    named = {t["effect"]: t["value"] for t in room.json(DRILL[-1])["camera_effects"] if t["accepted"]}
+    return "; ".join(f"{name} {named.get(name, 0):.3g}, hidden {size:.3g}" for name, size in truth.items())
+
+
+SYSTEMS: dict[str, tuple[Row, ...]] = {
+    "Main line: scans, hand-eye, what is missing": (
+        Row("each stage's distance between surfaces", BLADE, "steps are visible with the coarse hand-eye", blade_steps),
+        Row("hand-eye, error at the part", (*BLADE, "stitch reveal blade-run blade.truth.json"), "–", blade_hand_eye),
+        Row("a hidden effect named and added", HIDDEN, "–", hidden_found),
+    ),
+    "004: blade stitched by hand-eye correction": (
+        Row("agreement of the stitched cloud", BLADE, "better than 100 µm", blade_disagreement),
+        Row(
+            "DPWVM against GICP, error of the view poses",
+            ("python bench/register_weights.py",),
+            "DPWVM named without a formula",
+            lambda _: "see [register](register.md)",
+        ),
+    ),
+    "003: window and car body": (
+        Row("hand-eye from a sphere", LINE[:2], "X 926.866, Y 652.648, Z 934.441 mm; no truth", sphere_hand_eye),
+        Row("body onto its CAD", (*LINE[:2], LINE[3]), "fit error 1.052", fitted("body")),
+        Row("window onto its CAD", LINE[:3], "fit error 0.573", fitted("window")),
+        Row("flush and gap at eight places", LINE, "flush 0 ± 1.5, gap 16 ± 2 mm", seam),
+        Row(
+            "the whole line, 5 cells: window set against its design place",
+            ("python bench/window_line.py",),
+            "–",
+            lambda _: of_page("window.md", r"\| all together \|(?:[^|]*\|){3}([^|]*)\|") + " mm (rms, largest)",
+        ),
+    ),
+    "001: base to base": (
+        Row(
+            "experiment 1 as printed",
+            ("stitch base examples/base_to_base.toml",),
+            "0.00010 rad, 0.00014 m at λ = 0.1",
+            base_of_experiment_1,
+        ),
+        Row(
+            "experiment 2 as printed",
+            ("stitch base examples/base_to_base_2.toml",),
+            "0.00014 rad, 0.00014 m at λ = 0.1",
+            base_of_experiment_2,
+        ),
+        Row(
+            "experiment 1, λ = 0.5, 1000 draws: rms in µrad / µm",
+            ("python bench/base_to_base.py",),
+            "170 / 220, one draw",
+            lambda _: of_page("base-to-base.md", r"\| 1 \| 0.5 \| least squares \|([^|]*)\|"),
+        ),
+    ),
+    "002: fuselage panel": (
+        Row("global model of robots and tracker", PANEL, "–", panel_model),
+        Row("a leg that is too long or short", PANEL, "–", panel_leg),
+        Row(
+            "pose after one adjustment, 30 cells, largest: x, y, z / mm",
+            ("python bench/panel.py",),
+            "0.047, 0.069, 0.036 mm; 0.008°",
+            lambda _: of_page("panel.md", r"\| after, largest \|((?:[^|]*\|){3})").replace(" |", ",").strip(" ,|"),
+        ),
+        Row(
+            "shape, 10 cells, largest deviation after one correction",
+            ("python bench/panel.py",),
+            "≤ 0.6 mm",
+            lambda _: of_page("panel.md", r"the rest gives way \|[^|]*\|([^|]*)\|") + " mm",
+        ),
+    ),
+    "000: drilling on curved structures": (
+        Row("drives by the drawing, before", DRILL, "2.28 to 2.85 mm, mean 2.55", drill_before),
+        Row("drilled holes, after", DRILL, "position ≤ 0.30 mm, direction ≤ 0.21°", drill_errors),
+        Row("what the homography hides", DRILL, "lens distortion neglected", drill_camera),
+        Row(
+            "drilled holes after, 200 cells: largest position / mm",
+            ("python bench/drilling.py",),
+            "≤ 0.30 mm",
+            lambda _: of_page("drilling.md", r"\| after \| position 3D / mm \|(?:[^|]*\|){2}([^|]*)\|"),
+        ),
+    ),
+}
+
+
+def lines(room: Room) -> list[str]:
+    """The table, a block of rows for each system."""
+    out = []
+    for system, rows in SYSTEMS.items():
+        out += [f"### {system}", "", "| what | command | published | reached |", "|---|---|---|---|"]
+        for row in rows:
+            for command in row.commands:
+                if command.startswith("stitch"):
+                    room.run(command)
+            out.append(f"| {row.what} | `{row.commands[-1]}` | {row.published} | {row.reached(room)} |")
+        prepared = [c for row in rows for c in row.commands[:-1]]
+        if prepared:
+            out += ["", "Before these commands:", "", "```sh", *dict.fromkeys(prepared), "```"]
+        out.append("")
+    return out
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        table = lines(Room(Path(folder)))
+    page = PAGE.read_text(encoding="utf-8")
+    head, tail = page.split(BEGIN)[0], page.split(END)[1]
+    PAGE.write_text("\n".join([head + BEGIN, "", *table]) + END + tail, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
