@@ -80,7 +80,15 @@ def reveal(
     # Values of what is in the model follow, each beside what was found.
     judged["hidden"] = {name: {} if name in judged["in_the_model"] else own for name, own in judged["hidden"].items()}
     judged["verdict"] = judged["verdict"].replace("_", " ")
-    show_block([(_LABELS.get(key, key), _told(value)) for key, value in judged.items()])
+    if "hand_eye_error_by_step_mm" in judged:
+        del judged["hand_eye_error_mm"]
+    rows: dict[str, str] = {}
+    for key, value in judged.items():
+        # Parameters of one effect stand in one row.
+        name, _, parameter = key.partition(".")
+        before = f"{rows[name]}; " if name in rows else ""
+        rows[name] = f"{before}{parameter} {_told(value)}" if parameter else _told(value)
+    show_block([(_LABELS.get(name, name), text) for name, text in rows.items()])
 
 
 def _told(value: object) -> str:

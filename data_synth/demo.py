@@ -33,7 +33,7 @@ def demo(
     from stitch.cli.change import add
     from stitch.cli.diagnose import diagnose_run
     from stitch.cli.run import run
-    from stitch.cli.terminal import next_hidden, say, show_files
+    from stitch.cli.terminal import headlines_only, say, show_files
 
     session = folder / "blade"
     if folder.exists() and not truth_path(session).is_file():
@@ -44,14 +44,14 @@ def demo(
     say(f"Scanned a blade from {len(measured.clouds)} poses, with one effect hidden → {session}")
     write_session(session, measured, "blade")
     write_truth(truth_path(session), measured, seed)
-    with next_hidden():
-        say("\nstitch run: correct the hand-eye, register, fuse")
+    with headlines_only():
+        say("stitch run: correct the hand-eye, register, fuse", bold=True)
         run([session], folder / "run", recording=False)
-        say("\nstitch diagnose: what is missing?")
+        say("stitch diagnose: what is missing?", bold=True)
         diagnose_run(folder / "run")
-        say("\nstitch add --suggested: add it, fit everything anew, ask again")
+        say("stitch add --suggested: add it, fit everything anew, ask again", bold=True)
         add(folder / "run", suggested=True)
-    say("\nstitch reveal: what was hidden")
+    say("stitch reveal: what was hidden", bold=True)
     reveal(folder / "run", truth_path(session))
     show_files(folder / "run", ("stitched.ply", "recording.rrd", "report.html"))
     say(f"Next: stitch review {shlex.quote(str(folder / 'run'))}")

@@ -11,7 +11,7 @@ import typer
 
 from stitch.cli.options import EffectsFile, Json, Trust
 from stitch.cli.progress import recorder_for, show_activity
-from stitch.cli.terminal import emit, say, show_next
+from stitch.cli.terminal import emit, in_full, say, show_next
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
@@ -133,14 +133,14 @@ def _add_diagnosed(
     from stitch.pipeline import change, suggest, suggest_group
     from stitch.stored.stored_run import load_run
     from stitch.writing import run_folder
-    from stitch.writing.diagnosis_document import suggested_command
+    from stitch.writing.diagnosis_document import plain_finding, suggested_command
 
     with run_folder.lock_run_folder(run):
         with show_activity("diagnosing"):
             state = load_run(run, effects_file, trust=trust)
             run_folder.preload_entry_points("stitch.reports")
             result, lines, found = suggest_group(state) if at_most is None else suggest(state, at_most)
-        for line in lines:
+        for line in lines if in_full() else ():
             say(line)
         if result is not None:
             with show_activity("writing cloud and page"), run_folder.replace_run_files(run) as scratch:
@@ -157,6 +157,8 @@ def _add_diagnosed(
         else:
             say("Nothing was added: the model is as it was.")
         write_diagnosis(found, result or state, run)
+    if not in_full():
+        say(plain_finding(found, state.session.length_unit))
     if not as_json:
         show_next(suggested_command(found, shlex.quote(str(run))))
 
@@ -170,7 +172,7 @@ def _show_changed(result: Run, run: Path, as_json: bool) -> None:
         emit(to_json(result_document(result)))
         return
     show_report(result)
-    for line in remarks(result):
+    for line in remarks(result) if in_full() else ():
         say(line)
     if others := others_of_rig(run):
         effects = f" --effects {','.join(result.effects)}" if result.effects else ""

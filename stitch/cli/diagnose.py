@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, say, show_next, show_table
+from stitch.cli.terminal import emit, in_full, say, show_next, show_table
 
 if TYPE_CHECKING:
     from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
@@ -104,37 +104,45 @@ def write_diagnosis(diagnosis: Diagnosis, state: Run, run: Path) -> dict[str, ob
 
 
 def show_diagnosis(diagnosis: Diagnosis, length_unit: str) -> None:
-    """Print the finding for everybody, the evidence, where the error comes from, and the likeliest effects."""
-    from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
-    from stitch.model.model import uncertainty_scope
+    """Print the finding for everybody, the evidence, the likeliest effects, and where the error comes from."""
     from stitch.runs.run import doubt_remedy
     from stitch.writing.diagnosis_document import open_doubts, plain_finding
 
     say(plain_finding(diagnosis, length_unit), bold=True)
-    for doubt in open_doubts(diagnosis):
-        if more := doubt_remedy(doubt):
-            say(more)
-    say(diagnosis.sentence)
-    if diagnosis.verdict != "adequate":
-        say(uncertainty_scope(diagnosis.verdict))
-    show_budget(diagnosis.budget, length_unit)
+    if in_full():
+        for doubt in open_doubts(diagnosis):
+            if more := doubt_remedy(doubt):
+                say(more)
+        say(diagnosis.sentence)
     listed = diagnosis.candidates[: max(_LISTED_CANDIDATES, len(diagnosis.effects))]
     show_table(
         "Likeliest effects",
         ("effect", "p", "posterior", "rms if added", "on views left out"),
         [_candidate_row(diagnosis, s, length_unit) for s in listed],
     )
+    if in_full():
+        _show_particulars(diagnosis, listed, length_unit)
+
+
+def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], length_unit: str) -> None:
+    """Print sizes and aliases of effects, the sources of the error, what was not tested, and what to measure next."""
+    from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
+    from stitch.model.model import uncertainty_scope
+
     if (left := 1 - sum(s.ranked.posterior for s in diagnosis.candidates)) > _MIN_DISPLACEMENT_SHARE:
         say(f"{left:.2f} of the posterior: nothing is missing, or something without a name.")
     for s in listed:
         if s.ranked.score.observable and (s.name in diagnosis.effects or s.ranked.adjusted < _CLEAR):
             alike = ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2])
             say(f"  {s.name}: {fitted_amounts(s.ranked)}{f'; aliases: {alike}' if alike else ''}", hang=2)
+    show_budget(diagnosis.budget, length_unit)
     if unseen := [s.name for s in diagnosis.candidates if not s.ranked.score.observable]:
         say(f"These views cannot show: {', '.join(unseen)}.")
     _show_untested(diagnosis)
     if diagnosis.verdict == "adequate":
         _show_missed(diagnosis, length_unit)
+    else:
+        say(uncertainty_scope(diagnosis.verdict))
     if follows := [x for x in diagnosis.depends_on if x.p_value < _CLEAR][:_LISTED_DEPENDENCES]:
         told = ", ".join(f"{x.covariate} (p = {x.p_value:.1g})" for x in follows)
         say(f"What the present model leaves follows {told}.")
@@ -149,12 +157,12 @@ def show_budget(budget: Sequence[BudgetLine], length_unit: str) -> None:
     from stitch.units import length_text
     from stitch.writing.diagnosis_document import largest_error_sources, share_text
 
-    rows = [
-        (line.source, share_text(line), length_text(line.sigma, length_unit, 2))
+    told = [
+        f"{line.source} {share_text(line)} ({length_text(line.sigma, length_unit, 2)})"
         for line in largest_error_sources(budget)
     ]
-    if rows:
-        show_table("Where the error of whole views comes from", ("source", "share", "size (rms)"), rows)
+    if told:
+        say(f"The error of whole views (rms) comes from: {', '.join(told)}.")
 
 
 def _candidate_row(diagnosis: Diagnosis, s: CandidateEffect, length_unit: str) -> list[str]:

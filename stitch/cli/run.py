@@ -21,7 +21,7 @@ from stitch.cli.options import (
     split_names,
 )
 from stitch.cli.progress import recorder_for, show_activity
-from stitch.cli.terminal import emit, say, show_block, show_files, show_next
+from stitch.cli.terminal import emit, in_full, say, show_block, show_files, show_next
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ def _show_runs(runs: list[Run], target: Path, tolerance: float | None) -> None:
     for result in runs:
         show_report(result, tolerance, with_hand_eye=each or result is runs[-1])
     folders = _run_folders(target, [result.session for result in runs])
-    for folder in folders:
+    for folder in folders if in_full() else ():
         show_files(folder, ("stitched.ply", "mesh.ply", "recording.rrd", "report.html"))
     show_next(f"Next: stitch diagnose {shlex.quote(str(folders[0]))}")
 
@@ -232,6 +232,8 @@ def show_report(result: Run, tolerance: float | None = None, with_hand_eye: bool
             say(more)
     show_light(result, tolerance)
     show_block(report_rows(result))
+    if not in_full():
+        return
     if with_hand_eye:
         for line in hand_eye_lines(result.T_mount, result.mount_covariance, session.mount, session.length_unit):
             say(line, hang=2)

@@ -84,23 +84,28 @@ def show_files(folder: Path, names: Sequence[str]) -> None:
             say(f"  {folder / name}")
 
 
-_next_hidden: list[bool] = []
+_briefly: list[bool] = []
+
+
+@contextmanager
+def headlines_only() -> Iterator[None]:
+    """While the block lasts, commands print headlines and their main numbers: who calls them tells the rest."""
+    _briefly.append(True)
+    try:
+        yield
+    finally:
+        _briefly.pop()
+
+
+def in_full() -> bool:
+    """Return whether a command prints all that it has to say."""
+    return not _briefly
 
 
 def show_next(line: str) -> None:
     """Print the line that names the next command, unless another command has called this one."""
-    if not _next_hidden:
+    if in_full():
         say(line)
-
-
-@contextmanager
-def next_hidden() -> Iterator[None]:
-    """While the block lasts, commands do not name the next one: who calls them does."""
-    _next_hidden.append(True)
-    try:
-        yield
-    finally:
-        _next_hidden.pop()
 
 
 Command = TypeVar("Command", bound=Callable[..., Any])

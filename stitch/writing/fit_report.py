@@ -34,8 +34,19 @@ def fit_report(run: Run, at_part: tuple[float, float]) -> str:
 
 
 def report_rows(run: Run) -> list[tuple[str, str]]:
-    """Return names and values: errors, noise, scatter of the poses, the error of every model so far, its parameters."""
-    return [*_errors(run), *_history(run), *_effects(run)]
+    """Return names and values: errors, of every model so far on views left out, noise, scatter, fitted effects."""
+    (_, heldout), (_, inside), (_, noise), scatter = _errors(run)
+    parameters = {
+        term.name: ", ".join(f"{p.name} = {p.formatted}" for p in term.parameters if p.fitted or p.grid)
+        for term in run.terms
+    }
+    return [
+        ("error on views left out", ", ".join(f"{model} {text}" for model, text in _history(run)) or heldout),
+        ("error in the fit", inside),
+        ("sensor's noise alone", noise),
+        scatter,
+        *((name, text) for name, text in parameters.items() if text),
+    ]
 
 
 def _part(heading: str, lines: Sequence[str]) -> list[str]:

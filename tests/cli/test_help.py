@@ -110,7 +110,7 @@ def test_run_takes_the_session_one_stands_in(session, monkeypatch, capsys):
         told,
     )
     assert re.search(r"rotation vector x .* mrad\n", told)
-    for name in ("on views left out", "in the fit", "noise floor"):
+    for name in ("error on views left out", "error in the fit", "sensor's noise alone"):
         assert re.search(rf"\n  {name} +[\d.]+ µm\n", told)
     assert told.rstrip().endswith(f"Next: stitch diagnose ../runs/{session.name}")
     assert "\x1b" not in told and "\r" not in told  # quiet where nobody watches
