@@ -172,7 +172,7 @@ class LiveSession:
         """
         began = time.perf_counter()
         with library_threads_off():
-            said = self._judged(self._after_last(view))
+            said = self._judge(self._after_last(view))
         said = replace(said, seconds=time.perf_counter() - began)
         self.said.append(said)
         if self._recording is not None:
@@ -220,7 +220,7 @@ class LiveSession:
         self.session = replace(self.session, views=(*self.session.views, view))
         return view
 
-    def _judged(self, view: View) -> LiveView:
+    def _judge(self, view: View) -> LiveView:
         if self._fit is None:
             return self._first_fit(view)
         before = self.hand_eye
@@ -245,32 +245,34 @@ class LiveSession:
         gain = 1 - self.hand_eye.U.mm / before.U.mm  # type: ignore[union-attr]
         idle = new.seen_before > _SEEN_BEFORE and gain < _LEAST_GAIN and not off
         share = f"{100 * new.seen_before:.0f} % of it was seen before, U falls by {max(100 * gain, 0):.0f} %."
-        return self._said(view, "adds_nothing" if idle else "fits", f"{others} {share}".strip())
+        return self._report(view, "adds_nothing" if idle else "fits", f"{others} {share}".strip())
 
     def _first_fit(self, view: View) -> LiveView:
         """Fit the views so far, if they are enough."""
         stated = self.session.scanner.T_mount is not None
         count, least = len(self.session.views), _FEWEST_TO_CORRECT if stated else _FEWEST_TO_SEARCH
         if count < least:
-            return self._said(view, "waiting", f"The hand-eye is fitted from {least} views on.")
+            return self._report(view, "waiting", f"The hand-eye is fitted from {least} views on.")
         check_convention(self.session)
         measurement = measurement_of(self.session, prepare_capture(self.session))
         try:
             starts = surface_steps.initial_hand_eyes([self.session], [measurement], None)
             if starts[0].candidates and starts[0].runner_up_ratio < _CLOSE:
-                return self._said(view, "waiting", "Two hand-eyes fit these views equally well; a turned view decides.")
+                return self._report(
+                    view, "waiting", "Two hand-eyes fit these views equally well; a turned view decides."
+                )
             fit = partial(surface_steps.fit, starts=starts, initial_model=None, recorder=SilentRecorder())
             found = fit_screened_views([self.session], [measurement], fit)
         except NoResultError as error:
-            return self._said(view, "waiting", f"No hand-eye yet: {error}.")
+            return self._report(view, "waiting", f"No hand-eye yet: {error}.")
         out = found.screenings[0]
         assert found.fitted.correction is not None
         self._members = [i for i in range(count) if self.session.names[i] not in out.names]
         self._fit = start_live_fit(found.fitted.correction)
         gone = out.line(self.session.names)
         if view.name in out.names:
-            return self._said(view, "does_not_belong", gone)
-        return self._said(view, "fits", f"The first hand-eye.{f' {gone}.' if gone else ''}")
+            return self._report(view, "does_not_belong", gone)
+        return self._report(view, "fits", f"The first hand-eye.{f' {gone}.' if gone else ''}")
 
     def _blunders(self, fit: LiveFit, members: list[int]) -> dict[int, str]:
         """Return the views of a fit that contradict the others beyond what usual effects of an arm do, and why."""
@@ -300,9 +302,9 @@ class LiveSession:
         if row >= _IN_A_ROW:
             first = self.said[len(self.said) - row + 1].name
             why += f" The part or the scanner has probably moved: the last {row} views do not belong, from {first} on."
-        return self._said(view, "does_not_belong", why)
+        return self._report(view, "does_not_belong", why)
 
-    def _said(self, view: View, verdict: Verdict, why: str) -> LiveView:
+    def _report(self, view: View, verdict: Verdict, why: str) -> LiveView:
         return LiveView(view.name, verdict, why, self.hand_eye, 0.0)
 
     def _session_of(self, members: list[int]) -> Session:

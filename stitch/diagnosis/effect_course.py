@@ -315,5 +315,13 @@ def _binned(
     follows, unit = _point_axis(term.name, linear.measurement.views)
     of = "the part" if term.effect.place == "shape" else "the scanner"
     return EffectCourse(
-        follows, length if unit is None else unit, of, length, place, np.zeros(0, np.int64), measured, sigma, predicted
+        follows=follows,
+        unit=length if unit is None else unit,
+        of=of,
+        value_unit=length,
+        at=place,
+        views=np.zeros(0, np.int64),
+        measured=measured,
+        sigma=sigma,
+        predicted=predicted,
     )
