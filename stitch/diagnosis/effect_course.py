@@ -21,7 +21,7 @@ from stitch.measurement.measurement import ScanView, Views
 from stitch.model.forward import moves_points, point_correction, scan_points
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.observations.surfaces.surface_model import surfaces_of
 
 # Dots along one course: more cannot be told apart.
 _MOST = 300
@@ -181,11 +181,11 @@ def _unit_rows(columns: Array) -> Array:
 
 def _displacements(linear: LinearModel, response: Array) -> Array:
     """(V, k, P) displacements at the part of responses (·, P); of surfaces a turn counts by what it does at the rim."""
-    observation = linear.observation
-    if not isinstance(observation, SurfaceObservation):
+    observation, surfaces = linear.observation, surfaces_of(linear)
+    if surfaces is None:
         return np.stack([observation.part_displacements(own) for own in observation.reduce(response).T], axis=2)
     out = response.reshape(linear.measurement.views.count, 6, -1).copy()
-    out[:, :3] *= observation.unconstrained.overlaps.gram.lever
+    out[:, :3] *= surfaces.reach
     return np.asarray(out)
 
 
@@ -222,8 +222,8 @@ def _lives_on(views: Views, term: Term, joint: int | None) -> tuple[str, str, Ar
 
 def _course_of_points(linear: LinearModel, scored: Score, term: Term) -> EffectCourse | None:
     """Means over bins of points, each the effect and what the model with it leaves along its motion."""
-    observation, left = linear.observation, predicted_distances(linear, scored)
-    if left is None or not isinstance(observation, SurfaceObservation):
+    observation, left = surfaces_of(linear), predicted_distances(linear, scored)
+    if left is None or observation is None:
         return None
     poses = observation.capture.poses(linear.model.T_mount)
     matches, rows = observation.unconstrained.overlaps.matches, list[tuple[Array, Array, Array, Array, Array]]()

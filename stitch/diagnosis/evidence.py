@@ -31,7 +31,7 @@ from stitch.model.forward import moves_points
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.scanner_errors import FieldError, field_error
-from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.observations.surfaces.view_poses import noise_floor
 
 # What remains between the views however each of them is moved: no error of poses, joints or mount leaves that.
@@ -49,9 +49,9 @@ def overlap_misfit_beyond_noise(linear: LinearModel, stated: float | None = None
     Args:
         stated: noise of the scanner, for scans too small to show their own.
     """
-    if not isinstance(linear.observation, SurfaceObservation):
+    surfaces = surfaces_of(linear)
+    if surfaces is None:
         return 0.0
-    surfaces = linear.observation
     freed, noise = (
         surfaces.unconstrained.overlaps,
         noise_floor(surfaces.capture, surfaces.unconstrained.overlaps, stated),
@@ -68,11 +68,10 @@ def find_scanner_error(linear: LinearModel, other_terms: Sequence[Term] = ()) ->
     Args:
         other_terms: effects of points that may have any size.
     """
-    if not isinstance(linear.observation, SurfaceObservation):
+    surfaces = surfaces_of(linear)
+    if surfaces is None:
         return None
-    found = field_error(
-        linear.measurement, linear.model, linear.observation.unconstrained, limits.ALPHA_UNKNOWN, other_terms
-    )
+    found = field_error(linear.measurement, linear.model, surfaces.unconstrained, limits.ALPHA_UNKNOWN, other_terms)
     return found if found.unusual else None
 
 

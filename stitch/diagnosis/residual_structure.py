@@ -19,7 +19,7 @@ from stitch.observations.linear_model import WHITE_COMPONENTS, LinearModel
 from stitch.observations.pose_errors import DRIFT_MEMORY, JOINT_SCATTER, PoseErrors
 from stitch.observations.surfaces.matching import Match, signed_distances
 from stitch.observations.surfaces.scanner_errors import field_scatter
-from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.statistics.least_squares import column_space, project_out
 from stitch.statistics.reml import fit_variances
 from stitch.statistics.variance_posterior import mean_variances
@@ -57,8 +57,8 @@ def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Arr
 
     In the order of the matches to which the views were freed. None without clouds.
     """
-    surfaces = linear.observation
-    if not isinstance(surfaces, SurfaceObservation):
+    surfaces = surfaces_of(linear)
+    if surfaces is None:
         return None
     fitted = linear.scatter_only
     if scored is not None and fitted is not linear:
@@ -155,8 +155,8 @@ def variance_budget(
 
 def _with_observed_field(linear: LinearModel) -> LinearModel:
     """Replace smooth errors of the scanner by those that the overlaps show; an alarm allows for larger ones."""
-    seen = linear.observation
-    if linear.mixed.fixed is None or not isinstance(seen, SurfaceObservation):
+    seen = surfaces_of(linear)
+    if linear.mixed.fixed is None or seen is None:
         return linear
     field = linear.reduce(field_scatter(linear.measurement, seen.unconstrained, share=None))
     return replace(linear, mixed=replace(linear.mixed, fixed=(field @ field.T)[None]))

@@ -8,12 +8,11 @@ import numpy as np
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Form
 from stitch.diagnosis.score import Score, score
-from stitch.frames import Array, Indices
+from stitch.frames import Array
 from stitch.observations.linear_model import CoefficientPrior, LinearModel, LinearTrial
-from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.statistics.distributions import chi2_tail, normal_tail
 from stitch.statistics.folds import JointEnd, halves_of
-from stitch.statistics.least_squares import column_space, mean_square_share
+from stitch.statistics.least_squares import mean_square_share
 from stitch.statistics.parameter_selection import log_evidence
 
 # Whether a candidate helps where nothing was measured: at ends of joints' ranges that were left out.
@@ -270,24 +269,17 @@ class _HalfEvidence:
 def validate_in_halves(scored: Score) -> Halves | None:
     """The best form of a candidate, and all its forms, in halves of the views; None where pose errors have no prior."""
     base = scored.base_model
-    if base is None or not isinstance(base.observation, SurfaceObservation):
+    if base is None or base.observation.numbers_per_view is not None:
         return None
-    surfaces = base.observation
     gains, p_values, shares = [], [], []
-    ways = halves_of(surfaces.capture.T_reference_mount, surfaces.unconstrained.overlaps.gram.lever)
+    ways = halves_of(base.observation.T_reference_mount, base.observation.reach)
     for way in ways:
-        bases = [explained_basis(base, surfaces, other) for other in reversed(way)]
+        bases = [base.explained_without(other) for other in reversed(way)]
         gains.append(sum(_predictive_factor(scored, base, *pair) for pair in (bases, bases[::-1])))
         a, b = (_half_evidence(base, U, scored.form) for U in bases)
         p_values.append(_size_consistency(a, b, scored.form.sizes))
         shares.append(_least_confirmed_share(a, b, scored.form.sizes))
     return Halves(float(np.mean(gains)), min(1.0, len(ways) * min(p_values)), min(shares))
-
-
-def explained_basis(base: LinearModel, surfaces: SurfaceObservation, out: Indices) -> Array:
-    """(n, r) orthonormal basis of what the model, and the views that are left out moving freely, explain."""
-    free = np.eye(surfaces.reduced_poses.reduction.shape[1])[:, (6 * out[:, None] + np.arange(6)).ravel()]
-    return column_space(np.hstack([base.white_design, base.whiten(surfaces.reduce(free))]))
 
 
 def _half_evidence(base: LinearModel, explained: Array, form: Form) -> _HalfEvidence:

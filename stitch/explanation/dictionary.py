@@ -13,8 +13,6 @@ from stitch.frames import Array
 from stitch.measurement.measurement import Views
 from stitch.model.model import Term, term_of
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.surface_model import SurfaceObservation
-from stitch.observations.targets.target_model import TargetObservation
 from stitch.units import METRES
 
 # A factor of a formula: its text, its code and its value in every view.
@@ -402,7 +400,7 @@ def build_dictionary(linear: LinearModel, factors: Sequence[Quantity]) -> Dictio
         place: linear.responses([_displacement_term(linear, place)])[0].columns
         for place in {i.place for i in ingredients}
     }
-    return Dictionary(ingredients, bases, _rows_per_view(linear))
+    return Dictionary(ingredients, bases, linear.observation.numbers_per_view or 6)
 
 
 def group_addends(ingredients: Sequence[Ingredient]) -> list[tuple[int, ...]]:
@@ -460,11 +458,3 @@ def _joints(joints: Array, views: Views, d: Array) -> Array:
 def _twists(views: Views, xi: Array) -> Array:
     """Return the same twist in every view."""
     return np.tile(xi, (views.count, 1))
-
-
-def _rows_per_view(linear: LinearModel) -> int:
-    observation = linear.observation
-    if isinstance(observation, SurfaceObservation):
-        return 6
-    assert isinstance(observation, TargetObservation)
-    return int(observation.rows.residual.shape[1])

@@ -20,13 +20,11 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from stitch.diagnosis.thresholds import CONFIRMED_FORMULA, FALSE_ADDEND, ODDS
-from stitch.diagnosis.validation import explained_basis
 from stitch.explanation.dictionary import Dictionary, Ingredient, Quantity, group_addends, scaled_values
 from stitch.frames import Array, Indices
 from stitch.measurement.scan import even_indices
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import DRIFT_MEMORY
-from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.statistics.distributions import chi2_tail, f_tail
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.parameter_selection import log_evidence
@@ -45,7 +43,7 @@ class HalfModel:
         """Restrict a linear model to the views to keep; all others move freely."""
         self._linear, self._terms, self._keep = linear, terms, keep
         # Where each view is a block of its own, the blocks and the numbers of those kept; of surfaces views share all.
-        self._blocks = None if isinstance(linear.observation, SurfaceObservation) else keep
+        self._blocks = None if linear.observation.numbers_per_view is None else keep
         size = linear.mixed.z.shape[1]
         rows = (keep[:, None] * size + np.arange(size)).ravel()
         self._rows: slice | Indices = slice(None) if self._blocks is None else rows
@@ -54,10 +52,10 @@ class HalfModel:
     @cached_property
     def _explained(self) -> Array:
         """(n, r) orthonormal."""
-        linear, seen = self._linear, self._linear.observation
+        linear = self._linear
         out = np.setdiff1d(np.arange(linear.measurement.views.count), self._keep)
-        if isinstance(seen, SurfaceObservation) and len(out):
-            return explained_basis(linear, seen, out)
+        if self._blocks is None and len(out):
+            return linear.explained_without(out)
         return column_space(linear.white_design[self._rows])
 
     @cached_property
@@ -435,7 +433,7 @@ def _view_splits(linear: LinearModel, slow: bool) -> list[tuple[Indices, Indices
     """Views in which a sum is chosen, and those in which it is tested."""
     # Over the same region of poses: view by view, or in blocks of time.
     count = linear.measurement.views.count
-    blocks = count if isinstance(linear.observation, SurfaceObservation) else min(_BLOCKS, count)
+    blocks = count if linear.observation.numbers_per_view is None else min(_BLOCKS, count)
     block = np.arange(count) * blocks // count
     parts = [[np.flatnonzero(block % n == k) for k in range(n)] for n in (2, 3)]
     parts += [np.array_split(np.arange(count), 2)] if slow else []

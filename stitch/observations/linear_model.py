@@ -4,10 +4,11 @@
 
 z are the numbers that were seen (channel), A what hand-eye, landmarks and effects in use do to them. An observation
 says how its own coordinates (responses: twists of the views, or rows of targets) become numbers of the channel, how
-a model with further columns is tried, and which views may be left out. A further kind of observation implements
-`Observation` and a function that returns a `LinearModel`; nothing of diagnosis changes.
+a model with further columns is tried, and which views may be left out. A further kind is a subclass of `Rows`
+(`rows.py`) where every view has numbers of its own; nothing of diagnosis changes.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,7 +20,7 @@ from stitch.frames import Array, Indices, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model, Term
 from stitch.observations.pose_errors import JOINT_SCATTER, USUAL_JOINT_SCATTER, PoseErrors
-from stitch.statistics.folds import JointEnd
+from stitch.statistics.folds import JointEnd, grouped_folds
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.reml import (
     ALWAYS_PRESENT,
@@ -235,30 +236,49 @@ class LinearTrial(Protocol):
         ...
 
 
-class Observation(Protocol):
-    """What was observed of one session under its model, in its own coordinates."""
+class Observation(ABC):
+    """What was observed of one session under its model: of numbers that a response counts as they are.
+
+    One whose responses count something else overrides `reduce` and `expand`; what its views share, `numbers_per_view`.
+    """
 
     @property
+    @abstractmethod
+    def T_reference_mount(self) -> Array:
+        """(V, 4, 4) of the views, in the order of time."""
+
+    @property
+    @abstractmethod
     def centre(self) -> Array:
         """(3,) about which twists of the views count, reference frame."""
-        ...
 
+    @property
+    @abstractmethod
+    def reach(self) -> float:
+        """Length that makes a radian of orientation comparable with a distance."""
+
+    @property
+    def numbers_per_view(self) -> int | None:
+        """Numbers of the channel that belong to one view, block after block; None where views share them."""
+        return None
+
+    @abstractmethod
     def from_twists(self, moved: Array) -> Array:
         """(n, P) numbers of the channel of left twists (6V, P) of the views."""
-        ...
 
+    @abstractmethod
     def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
         """Per term how the observation answers to its parameters."""
-        ...
 
     def reduce(self, response: Array) -> Array:
         """(n, P) numbers of the channel of a response (·, P)."""
-        ...
+        return response
 
     def expand(self, columns: Array) -> Array:
         """(·, P) a response that has these numbers (n, P) of the channel."""
-        ...
+        return columns
 
+    @abstractmethod
     def trial(
         self,
         linear: "LinearModel",
@@ -267,23 +287,26 @@ class Observation(Protocol):
         prior: CoefficientPrior | None = None,
     ) -> LinearTrial:
         """A model with the columns of a response (·, k); `points` belong to its last ones; prior of k coefficients."""
-        ...
 
+    @abstractmethod
     def affected_squares(self, views: Indices) -> Mask:
         """(units,) which squares of a trial some views have a part in."""
-        ...
 
     def folds(self) -> list[Indices]:
         """Groups of views to leave out."""
-        ...
+        return self._folds
+
+    @cached_property
+    def _folds(self) -> list[Indices]:
+        return grouped_folds(self.T_reference_mount, self.reach)
 
     def joint_ends(self, joints: Array) -> list[JointEnd]:
         """Ends of joints' ranges that may be left out; none where a square of a trial is no view's own."""
-        ...
+        return []
 
+    @abstractmethod
     def part_displacements(self, numbers: Array) -> Array:
         """(V, 3) what numbers (n,) of the channel displace at the part, reference frame, without a common motion."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -324,6 +347,11 @@ class LinearModel(ErrorModel):
     def _explained(self) -> Array:
         """(n, r) orthonormal basis of `white_design`."""
         return column_space(self.white_design)
+
+    def explained_without(self, views: Indices) -> Array:
+        """(n, r) orthonormal basis of what the model explains, with some views that move freely."""
+        twists = np.eye(6 * self.measurement.views.count)[:, (6 * views[:, None] + np.arange(6)).ravel()]
+        return column_space(np.hstack([self.white_design, self.whiten(self.observation.from_twists(twists))]))
 
     def residual(self, columns: Array) -> Array:
         """(n, P) whitened columns of the channel, what the model explains projected out."""

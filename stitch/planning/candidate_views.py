@@ -12,7 +12,7 @@ from stitch.measurement.measurement import PAYLOAD, Measurement, Torques, Views,
 from stitch.measurement.robot import Robot, forward
 from stitch.measurement.session import Session, View
 from stitch.model.model import Model, Term
-from stitch.observations.targets.rows import Landmarks, TargetRows, effect_rows, mixed_model_of_rows, target_rows
+from stitch.observations.targets.rows import Landmarks, TargetRows, target_rows
 from stitch.planning.expected_model import FEWEST, CellModel, expected_scans
 
 _SAMPLES = 6000
@@ -160,8 +160,8 @@ def candidate_rows(
     rows = target_rows(measurement.capture, seen.T_mount, undrawn)
     unknown = np.zeros((*rows.residual.shape, landmarks.size - rows.landmarks.shape[2]))
     rows = replace(rows, landmarks=np.concatenate([rows.landmarks, unknown], axis=2))
-    covariance = mixed_model_of_rows(rows, rows.hand_eye).covariance(variances)
-    return rows, effect_rows(rows, measurement, Model(seen.T_mount), terms), covariance
+    covariance = rows.mixed_model(rows.hand_eye).covariance(variances)
+    return rows, rows.effect_columns(measurement, Model(seen.T_mount), terms), covariance
 
 
 def _all_seen(measurement: Measurement, seen: TargetRows, landmarks: Landmarks, known: Indices) -> Measurement:

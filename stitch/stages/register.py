@@ -31,7 +31,7 @@ from stitch.observations.surfaces.normal_equations import (
     next_gate,
 )
 from stitch.observations.surfaces.view_poses import LastStep, has_converged, take_step
-from stitch.observations.targets.rows import TargetRows, mixed_model_of_rows
+from stitch.observations.targets.rows import TargetRows
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.stages.correspondence_weights import OffsetSums, dpwvm_weights, plane_weights, with_offsets
 
@@ -47,7 +47,7 @@ def register_targets(rows: TargetRows, variances: Array, poses: Array) -> tuple[
     to_centre = frames.make(np.eye(3), -rows.centre)
     carried = frames.adjoint(to_centre @ rows.capture.T_reference_flange)
     scatter = carried * np.repeat(variances[:2], 3) @ carried.transpose(0, 2, 1)
-    covariance = mixed_model_of_rows(rows, rows.hand_eye).covariance(variances)[:V]
+    covariance = rows.mixed_model(rows.hand_eye).covariance(variances)[:V]
     pushed = np.linalg.solve(covariance, -rows.residual[:V, :, None])
     twist = (scatter @ rows.lever.transpose(0, 2, 1) @ pushed)[..., 0]
     moved = frames.inverse(to_centre) @ frames.exp(twist) @ to_centre @ poses

@@ -28,10 +28,8 @@ from stitch.observations.targets.outliers import Outlier, find_mislabelled, find
 from stitch.observations.targets.rows import (
     Landmarks,
     TargetRows,
-    effect_columns,
     fit_landmarks,
     landmarks_covariance,
-    mixed_model_of_rows,
     target_rows,
 )
 from stitch.observations.targets.target_model import TargetModelFit, rms_of
@@ -83,7 +81,7 @@ def evaluate_targets(measurement: Measurement, model: Model) -> TargetModelFit:
         inflation=1.0,
         landmarks=landmarks,
         landmarks_covariance=_with_known_sigmas(covariance, own.sightings, model),
-        variances=fit_variances(mixed_model_of_rows(rows, nothing), both_starts=True).variances,
+        variances=fit_variances(rows.mixed_model(nothing), both_starts=True).variances,
         rows=rows,
         heldout=distances,
         history=(rms_of(distances),),
@@ -326,7 +324,7 @@ class LinearisedTargets:
         every = []
         for session, begin in zip(self.sessions, self.begins, strict=True):
             B, m = session.rows.residual.shape
-            every.append(mixed_model_of_rows(session.rows, A[begin : begin + B, :m]))
+            every.append(session.rows.mixed_model(A[begin : begin + B, :m]))
         return stack_mixed_models(every, A)
 
     def _variances(self, mixed: MixedModel) -> Array:
@@ -394,7 +392,7 @@ class _TargetProblem:
 
 def _linearise_session(measurement: Measurement, model: Model, landmarks: Landmarks) -> LinearisedTargetSession:
     rows = target_rows(corrected_capture(measurement, model), model.T_mount, landmarks)
-    return LinearisedTargetSession(model, landmarks, rows, effect_columns(rows, measurement, model))
+    return LinearisedTargetSession(model, landmarks, rows, rows.columns_in_use(measurement, model))
 
 
 def fit_targets(sessions: Sequence[TargetStart], recorder: Recorder | None = None) -> list[TargetModelFit]:

@@ -21,7 +21,7 @@ from stitch.diagnosis.effect_course import (
 from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
 from stitch.frames import Array
-from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.units import angle_text, length_text
 
 # What each of the best candidate effects would leave of the field of disagreement.
@@ -55,9 +55,10 @@ def candidate_fields(found: Diagnosis) -> CandidateFields | None:
 def _fields(found: Diagnosis) -> CandidateFields | None:
     linear = found.linear
     present = predicted_distances(linear)
-    if present is None or not isinstance(linear.observation, SurfaceObservation):
+    surfaces = surfaces_of(linear)
+    if present is None or surfaces is None:
         return None
-    overlaps = linear.observation.unconstrained.overlaps
+    overlaps = surfaces.unconstrained.overlaps
     patches = patches_of(overlaps.matches, linear.measurement.views.count, overlaps.gram.scale, model_distances=present)
     added = {}
     for candidate in compared(found):

@@ -13,7 +13,7 @@ from stitch.measurement.measurement import measurement_of
 from stitch.model.forward import PointSlopes, corrected_capture, target_correction
 from stitch.model.model import Model, term_of
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
-from stitch.observations.targets.rows import effect_rows, initial_landmarks, target_rows
+from stitch.observations.targets.rows import initial_landmarks, target_rows
 
 
 def off(T, true):
@@ -48,7 +48,7 @@ def test_rows_are_the_slopes_of_what_is_left():
         zero, plain = term_of(measurement, effect), Model(T_mount)
         landmarks = initial_landmarks(measurement.capture, T_mount)
         rows = target_rows(measurement.capture, T_mount, landmarks)
-        (slopes,) = effect_rows(rows, measurement, plain, [zero])
+        (slopes,) = rows.effect_columns(measurement, plain, [zero])
         for i, parameter in enumerate(zero.parameters):
             step = 0.01 * parameter.typical
             stepped = [zero.at(s * step * np.eye(len(zero.values))[i]) for s in (1, -1)]
@@ -67,7 +67,7 @@ def test_a_turn_of_the_flange_is_exactly_a_turn_of_the_targets():
     measurement = measurement_of(session, prepare_capture(session))
     term = term_of(measurement, EFFECTS["joint_offset"])
     rows = target_rows(measurement.capture, T_mount, initial_landmarks(measurement.capture, T_mount))
-    column = effect_rows(rows, measurement, Model(T_mount), [term])[0][..., 5].ravel()
+    column = rows.effect_columns(measurement, Model(T_mount), [term])[0][..., 5].ravel()
     landmarks = rows.landmarks.reshape(rows.residual.size, -1)
     left = column - landmarks @ np.linalg.lstsq(landmarks, column, rcond=None)[0]
     assert np.abs(left).max() < 1e-6 * np.abs(column).max()

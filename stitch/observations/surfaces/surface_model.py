@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -10,7 +9,14 @@ from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model, Term, sizes_of, values_of
-from stitch.observations.linear_model import CoefficientPrior, LinearModel, PointSums, Response, with_pose_errors
+from stitch.observations.linear_model import (
+    CoefficientPrior,
+    LinearModel,
+    Observation,
+    PointSums,
+    Response,
+    with_pose_errors,
+)
 from stitch.observations.pose_errors import MANY_VIEWS, prior_pose_errors
 from stitch.observations.surfaces.effect_columns import PointGram, view_columns, view_responses
 from stitch.observations.surfaces.hand_eye_fit import (
@@ -22,7 +28,6 @@ from stitch.observations.surfaces.hand_eye_fit import (
 from stitch.observations.surfaces.normal_equations import pair_squares
 from stitch.observations.surfaces.scanner_errors import field_scatter
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.statistics.folds import JointEnd, grouped_folds
 from stitch.statistics.least_squares import column_space, fit_columns, independent
 from stitch.statistics.reml import MixedModel, VarianceFit, at_variances, fit_variances
 
@@ -90,7 +95,7 @@ _UNSEEN = 0.25
 
 
 @dataclass(frozen=True)
-class SurfaceObservation:
+class SurfaceObservation(Observation):
     """V freed views; a response counts twists (6V, P), the channel their n visible directions."""
 
     capture: Capture  # without the effects in use
@@ -101,6 +106,16 @@ class SurfaceObservation:
     def centre(self) -> Array:
         """(3,) of the overlaps, reference frame."""
         return self.unconstrained.overlaps.gram.centre
+
+    @property
+    def T_reference_mount(self) -> Array:
+        """(V, 4, 4) of the views, in the order of time."""
+        return self.capture.T_reference_mount
+
+    @property
+    def reach(self) -> float:
+        """Rms lever of the correspondences about the centre."""
+        return self.unconstrained.overlaps.gram.lever
 
     def from_twists(self, moved: Array) -> Array:
         """(n, P) visible directions of twists (6V, P): a response counts nothing else."""
@@ -132,22 +147,15 @@ class SurfaceObservation:
         """(pairs,) with one of the views."""
         return np.asarray(np.isin(self.unconstrained.overlaps.gram.pairs, views).any(axis=1))
 
-    def folds(self) -> list[Indices]:
-        """Groups of views to leave out."""
-        return self._folds
-
-    @cached_property
-    def _folds(self) -> list[Indices]:
-        return grouped_folds(self.capture.T_reference_mount, self.unconstrained.overlaps.gram.lever)
-
-    def joint_ends(self, joints: Array) -> list[JointEnd]:
-        """None: what overlaps leave belongs to pairs of views."""
-        return []
-
     def part_displacements(self, numbers: Array) -> Array:
         """(V, 3) translations of the twists that make numbers (n,) of the channel, less the common motion."""
         out = self.expand(numbers).reshape(-1, 6)[:, 3:]
         return np.asarray(out - out.mean(axis=0))
+
+
+def surfaces_of(linear: LinearModel) -> SurfaceObservation | None:
+    """Find the overlapping surfaces that a linear model is of; None where something else was observed."""
+    return linear.observation if isinstance(linear.observation, SurfaceObservation) else None
 
 
 def surface_model(

@@ -17,7 +17,6 @@ from stitch.observations.targets.rows import (
     COMPARED_TARGETS,
     TargetRows,
     distance_sigma,
-    mixed_model_of_rows,
     target_distances,
     target_positions,
 )
@@ -49,7 +48,7 @@ def find_outliers(rows: TargetRows, variances: Array) -> list[Outlier]:
     sightings = rows.capture.sightings
     assert sightings is not None
     V, S = sightings.used.shape
-    mixed, left = mixed_model_of_rows(rows, rows.hand_eye), rows.residual[:V]
+    mixed, left = rows.mixed_model(rows.hand_eye), rows.residual[:V]
     P = np.asarray(np.linalg.inv(mixed.covariance(variances)[:V]), float)
     free = np.linalg.inv(mixed.covariance(variances * [_ANYWHERE**2, _ANYWHERE**2, 1.0])[:V])
     seen = sightings.used.any(axis=1)

@@ -5,7 +5,6 @@ twist δ of the view about `centre` moves them by lever·δ, the landmarks by th
 are further blocks of three rows: the target less its place in the drawing.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,12 +14,10 @@ from stitch import frames
 from stitch.closed_form.feature_matching import align_points
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture, Sightings
-from stitch.measurement.measurement import Measurement
 from stitch.measurement.session import NominalTargets
-from stitch.model.forward import PointSlopes, moves_points, pose_derivatives
-from stitch.model.model import Model, Term
+from stitch.observations.rows import Rows
 from stitch.statistics.least_squares import BlockLeastSquares
-from stitch.statistics.reml import MixedModel, fit_variances
+from stitch.statistics.reml import fit_variances
 
 # Distances between the targets of one view: what they are wherever the arm stood, whatever the hand-eye is.
 
@@ -126,20 +123,17 @@ def initial_landmarks(own: Capture, T_mount: Array, drawing: Drawing | None = No
     return Landmarks(positions, orientation, drawing, T)
 
 
-@dataclass(frozen=True)
-class TargetRows:
-    """V views, B ≥ V blocks of m rows; U unknowns of the landmarks."""
+@dataclass(frozen=True, kw_only=True)
+class TargetRows(Rows):
+    """Rows of labelled points; U unknowns of the landmarks."""
 
-    capture: Capture  # without the effects in use
-    T_mount: Array  # (4, 4)
-    centre: Array  # (3,) of the targets, reference frame
-    residual: Array  # (B, m) where a view puts a target less where it is
-    lever: Array  # (V, m, 6) rows per left twist of the view about the centre
-    hand_eye: Array  # (B, m, 6) per right perturbation of the hand-eye
-    landmarks: Array  # (B, m, U)
-    noise: Array  # (B, m) variance of the sensor; 0 where a row is absent or none of the sensor's
-    fixed: Array  # (B, m) variance that is known: 1 in absent rows, that of the drawing in its own
+    variance: Array  # (B, m) that is known: 1 in absent rows, that of the drawing in its own
     positions: int  # the first 3S rows of a view are coordinates
+
+    @property
+    def fixed(self) -> Array:
+        """(B, m) variance that is known: 1 in absent rows, that of the drawing in its own."""
+        return self.variance
 
     @property
     def sightings(self) -> Sightings:
@@ -148,20 +142,14 @@ class TargetRows:
         return self.capture.sightings
 
     @property
-    def used(self) -> Mask:
-        """(V, m) bool: rows of the views that were measured."""
-        return np.asarray(self.noise[: len(self.lever)] > 0)
+    def distances_used(self) -> Mask:
+        """(V, m) bool: coordinates that were measured; a probe's turn is no length."""
+        return np.asarray(self.used & (np.arange(self.residual.shape[1]) < self.positions))
 
-    @property
-    def reach(self) -> float:
-        """Distance of the targets from the flange: what a turn of it moves them by."""
-        away = np.linalg.norm(self.centre - self.capture.T_reference_flange[:, :3, 3], axis=1)
-        return float(max(np.median(away), 1e-9))
-
-    def from_twists(self, moved: Array) -> Array:
-        """(B, m, P) of left twists (6V, P) of the views about the centre."""
-        out = np.zeros((*self.residual.shape, moved.shape[1]))
-        out[: len(self.lever)] = self.lever @ moved.reshape(-1, 6, moved.shape[1])
+    def point_rows(self, moved: Array) -> Array:
+        """(P, V, m) the coordinates; a probe's turn stays."""
+        out = np.zeros((*moved.shape[:2], self.residual.shape[1]))
+        out[..., : self.positions] = moved.reshape(*moved.shape[:2], -1)
         return out
 
     def distances(self, left: Array) -> Array:
@@ -189,17 +177,15 @@ def target_rows(own: Capture, T_mount: Array, landmarks: Landmarks) -> TargetRow
     left[absent], lever[absent], columns[absent] = 0.0, 0.0, 0.0
     of_drawing, moved_in_drawing, known = _drawing_rows(landmarks, left.shape[1])
     nothing = np.zeros_like(of_drawing)
-    hand_eye = lever @ frames.adjoint(frames.make(np.eye(3), -centre) @ own.hand_eye_frames(T_mount))
     return TargetRows(
         capture=own,
         T_mount=T_mount,
         centre=centre,
         residual=np.concatenate([left, of_drawing]),
         lever=lever,
-        hand_eye=np.concatenate([hand_eye, np.repeat(nothing[..., None], 6, axis=2)]),
         landmarks=np.concatenate([columns, moved_in_drawing]),
         noise=np.concatenate([noise, nothing]),
-        fixed=np.concatenate([absent.astype(float), known]),
+        variance=np.concatenate([absent.astype(float), known]),
         positions=3 * s.used.shape[1],
     )
 
@@ -252,55 +238,6 @@ def _drawing_rows(landmarks: Landmarks, m: int) -> tuple[Array, Array, Array]:
     return left, columns, fixed
 
 
-def mixed_model_of_rows(rows: TargetRows, A: Array) -> MixedModel:
-    """Rows as blocks for the variance components; `A` (B, m, a) are the columns of the free mean."""
-    V, (B, m) = len(rows.lever), rows.residual.shape
-    to_centre = frames.make(np.eye(3), -rows.centre)
-    carried = rows.lever @ frames.adjoint(to_centre @ rows.capture.T_reference_flange)
-    components = np.zeros((3, B, m, m))
-    for i, half in enumerate((slice(0, 3), slice(3, 6))):
-        components[i, :V] = carried[..., half] @ carried[..., half].transpose(0, 2, 1)
-    diagonal = np.arange(m)
-    components[2][:, diagonal, diagonal] = rows.noise
-    fixed = np.zeros((B, m, m))
-    fixed[:, diagonal, diagonal] = rows.fixed
-    # A view errs in six ways, whatever it shows; what it shows beyond that, the landmarks take up.
-    independent = int(np.minimum(rows.used.sum(axis=1), 6).sum()) + max(rows.landmarks.shape[2] - 6, 0)
-    return MixedModel(-rows.residual, A, components, fixed, independent)
-
-
-# How the rows of labelled points answer to the parameters of effects.
-
-
-def effect_rows(rows: TargetRows, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Array]:
-    """Per term (B, m, P) how the rows answer to its parameters, at `model`."""
-    of_views = pose_derivatives(measurement, model, [t for t in terms if not moves_points([t])], rows.centre)
-    out = []
-    for term in terms:
-        if moves_points([term]):
-            out.append(_point_rows(rows, measurement, model, term))
-        else:
-            moved = next(of_views)
-            out.append(rows.from_twists(moved.reshape(len(moved), -1).T))
-    return out
-
-
-def _point_rows(rows: TargetRows, measurement: Measurement, model: Model, term: Term) -> Array:
-    """(B, m, P) of an effect that changes the points."""
-    poses = rows.capture.poses(rows.T_mount)
-    slopes = frames.rotate(poses, PointSlopes.about_model(measurement, model, [term]).at_targets(poses))  # (P, V, S, 3)
-    out = np.zeros((*rows.residual.shape, len(slopes)))
-    out[: len(poses), : rows.positions] = slopes.reshape(*slopes.shape[:2], -1).transpose(1, 2, 0)
-    out[: len(poses)][~rows.used] = 0.0
-    return out
-
-
-def effect_columns(rows: TargetRows, measurement: Measurement, model: Model) -> Array:
-    """(B, m, P) how the rows answer to all parameters of the effects in use."""
-    found = effect_rows(rows, measurement, model, model.terms)
-    return np.concatenate([np.zeros((*rows.residual.shape, 0)), *found], axis=2)
-
-
 # Where the targets lie, and how well that is known, under a hand-eye that is given.
 
 
@@ -315,7 +252,7 @@ def fit_landmarks(own: Capture, T_mount: Array) -> tuple[Landmarks, BlockLeastSq
     """
     landmarks = initial_landmarks(own, T_mount)
     rows = target_rows(own, T_mount, landmarks)
-    mixed = mixed_model_of_rows(rows, rows.landmarks)
+    mixed = rows.mixed_model(rows.landmarks)
     variances = fit_variances(mixed, both_starts=True).variances
     assert own.sightings is not None
     # One working distance for what nobody sees.

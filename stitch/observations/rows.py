@@ -1,0 +1,256 @@
+"""Observations in rows: every view shows numbers of its own, each of a point or a turn that it sees.
+
+A kind of observation is a subclass of `Rows`: what is left of each number, how it answers to a motion of its view and
+to what is unknown beside the hand-eye, its noise, and how it answers to points that move. `row_model` makes of it the
+linear model that all of diagnosis reads.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array, Indices, Mask
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Measurement
+from stitch.model.forward import PointSlopes, moves_points, pose_derivatives
+from stitch.model.model import Model, Term, sizes_of, stack_parameters, values_of
+from stitch.observations.linear_model import CoefficientPrior, LinearModel, Observation, PointSums, Response
+from stitch.observations.pose_errors import joint_offset_twists, mean_square_per_axis
+from stitch.statistics.folds import JointEnd, joint_ends
+from stitch.statistics.least_squares import BlockLeastSquares, equilibrated, independent
+from stitch.statistics.parameter_selection import UNSEEN
+from stitch.statistics.reml import MixedModel, fit_variances, whitener
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rows:
+    """V views, B ≥ V blocks of m rows, those beyond V of no view; U unknowns beside the hand-eye."""
+
+    capture: Capture  # without the effects in use
+    T_mount: Array  # (4, 4)
+    centre: Array  # (3,) about which twists of the views count, reference frame
+    residual: Array  # (B, m) what a view shows less what it should
+    lever: Array  # (V, m, 6) rows per left twist of the view about the centre
+    landmarks: Array  # (B, m, U) rows per unknown of what is seen: places of targets, a plane
+    noise: Array  # (B, m) variance of the sensor; 0 where a row is absent or none of the sensor's
+
+    @abstractmethod
+    def point_rows(self, moved: Array) -> Array:
+        """(P, V, m) change of the rows where labelled points move by (P, V, S, 3), reference frame."""
+
+    @property
+    def fixed(self) -> Array:
+        """(B, m) variance that is known: 1 in absent rows."""
+        return np.asarray(self.noise == 0, float)
+
+    @property
+    def used(self) -> Mask:
+        """(V, m) bool: rows of the views that were measured."""
+        return np.asarray(self.noise[: len(self.lever)] > 0)
+
+    @property
+    def distances_used(self) -> Mask:
+        """(V, m) bool: those of them that are lengths, as what remains is told."""
+        return self.used
+
+    @cached_property
+    def hand_eye(self) -> Array:
+        """(B, m, 6) rows per right perturbation of the hand-eye."""
+        to_centre = frames.make(np.eye(3), -self.centre)
+        own = self.lever @ frames.adjoint(to_centre @ self.capture.hand_eye_frames(self.T_mount))
+        return np.concatenate([own, np.zeros((len(self.residual) - len(own), *own.shape[1:]))])
+
+    @property
+    def reach(self) -> float:
+        """Distance of what is seen from the flange: what a turn of it moves the points by."""
+        away = np.linalg.norm(self.centre - self.capture.T_reference_flange[:, :3, 3], axis=1)
+        return float(max(np.median(away), 1e-9))
+
+    def from_twists(self, moved: Array) -> Array:
+        """(B, m, P) of left twists (6V, P) of the views about the centre."""
+        out = np.zeros((*self.residual.shape, moved.shape[1]))
+        out[: len(self.lever)] = self.lever @ moved.reshape(-1, 6, moved.shape[1])
+        return out
+
+    def effect_columns(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Array]:
+        """Per term (B, m, P) how the rows answer to its parameters, at `model`."""
+        of_views = pose_derivatives(measurement, model, [t for t in terms if not moves_points([t])], self.centre)
+        poses, out = self.capture.poses(self.T_mount), []
+        for term in terms:
+            if not moves_points([term]):
+                moved = next(of_views)
+                out.append(self.from_twists(moved.reshape(len(moved), -1).T))
+                continue
+            slopes = PointSlopes.about_model(measurement, model, [term]).at_targets(poses)
+            own = np.zeros((*self.residual.shape, len(slopes)))
+            own[: len(poses)] = np.moveaxis(self.point_rows(frames.rotate(poses, slopes)), 0, -1)
+            own[: len(poses)][~self.used] = 0.0
+            out.append(own)
+        return out
+
+    def columns_in_use(self, measurement: Measurement, model: Model) -> Array:
+        """(B, m, P) how the rows answer to all parameters of the effects in use."""
+        found = self.effect_columns(measurement, model, model.terms)
+        return np.concatenate([np.zeros((*self.residual.shape, 0)), *found], axis=2)
+
+    def mixed_model(self, A: Array) -> MixedModel:
+        """Rows as blocks for the variance components; `A` (B, m, a) are the columns of the free mean."""
+        V, (B, m) = len(self.lever), self.residual.shape
+        to_centre = frames.make(np.eye(3), -self.centre)
+        carried = self.lever @ frames.adjoint(to_centre @ self.capture.T_reference_flange)
+        components = np.zeros((3, B, m, m))
+        for i, half in enumerate((slice(0, 3), slice(3, 6))):
+            components[i, :V] = carried[..., half] @ carried[..., half].transpose(0, 2, 1)
+        diagonal = np.arange(m)
+        components[2][:, diagonal, diagonal] = self.noise
+        fixed = np.zeros((B, m, m))
+        fixed[:, diagonal, diagonal] = self.fixed
+        # A view errs in six ways, whatever it shows; what it shows beyond that, the landmarks take up.
+        independent = int(np.minimum(self.used.sum(axis=1), 6).sum()) + max(self.landmarks.shape[2] - 6, 0)
+        return MixedModel(-self.residual, A, components, fixed, independent)
+
+
+# Views of largest influence on the estimates: if one alone carries them, it is among these.
+_CARRIERS = 20
+
+
+@dataclass(frozen=True)
+class RowTrial:
+    """Columns X (B, m, k) of rows with the covariance of the null, fitted as a run fits them."""
+
+    rows: Rows
+    covariance: Array  # (B, m, m)
+    X: Array
+    prior: CoefficientPrior | None = None
+
+    @cached_property
+    def blocks(self) -> BlockLeastSquares:
+        zero = np.zeros(self.X.shape[2])
+        precision, middle = (zero, zero) if self.prior is None else (self.prior.precision, self.prior.mean)
+        return BlockLeastSquares(-self.rows.residual, self.X, self.covariance, precision, precision * middle)
+
+    def solve(self, left_out: Indices | None = None) -> Array:
+        """Coefficients (k,) without some views."""
+        return self.blocks.solve(left_out)
+
+    def squares(self, coefficients: Array) -> Array:
+        """(V,) sums of the squares of a view's distances."""
+        return np.asarray(np.sum(self._rest(coefficients) ** 2 * self.rows.distances_used, axis=1))
+
+    def scatter(self, left_out: Indices, coefficients: Array) -> float:
+        """Of the left-out views' distances, in units of the sensor's noise: each is seen as it is."""
+        own = self.rows.distances_used[left_out]
+        rest = self._rest(coefficients)[left_out]
+        return float(np.sum(rest[own] ** 2 / self.rows.noise[left_out][own]))
+
+    def influential_views(self, coefficients: Array) -> Indices:
+        """(n,) the views without which the coefficients would move most, to first order."""
+        scaled, unit = equilibrated(self.blocks.information)
+        moves = self.blocks.residual_vectors(coefficients) * unit @ np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
+        sizes = np.linalg.norm(moves[: len(self.rows.lever)], axis=1)
+        return np.asarray(np.argsort(-sizes, kind="stable")[:_CARRIERS], np.int64)
+
+    def _rest(self, coefficients: Array) -> Array:
+        return np.asarray((self.rows.residual + self.X @ coefficients)[: len(self.rows.lever)])
+
+
+@dataclass(frozen=True)
+class RowObservation(Observation):
+    """A response counts rows: n = B·m of them, those of absent points at zero."""
+
+    rows: Rows
+
+    @property
+    def T_reference_mount(self) -> Array:
+        """(V, 4, 4) of the views, in the order of time."""
+        return self.rows.capture.T_reference_mount
+
+    @property
+    def centre(self) -> Array:
+        """(3,) about which twists of the views count, reference frame."""
+        return self.rows.centre
+
+    @property
+    def reach(self) -> float:
+        """Length that makes a radian of orientation comparable with a distance."""
+        return self.rows.reach
+
+    @property
+    def numbers_per_view(self) -> int:
+        """Those of a view's block."""
+        return int(self.rows.residual.shape[1])
+
+    def from_twists(self, moved: Array) -> Array:
+        """(n, P) rows of left twists (6V, P) of the views."""
+        return self.rows.from_twists(moved).reshape(self.rows.residual.size, -1)
+
+    def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
+        """Rows (n, P) of each term."""
+        found = self.rows.effect_columns(measurement, model, terms)
+        return [Response(c.reshape(self.rows.residual.size, c.shape[2])) for c in found]
+
+    def trial(
+        self,
+        linear: LinearModel,
+        response: Array,
+        points: PointSums | None = None,
+        prior: CoefficientPrior | None = None,
+    ) -> RowTrial:
+        """A model with the columns of rows (n, k)."""
+        return RowTrial(self.rows, linear.covariance, linear.in_blocks(response), prior)
+
+    def affected_squares(self, views: Indices) -> Mask:
+        """(V,) the views themselves."""
+        return np.asarray(np.isin(np.arange(len(self.rows.lever)), views))
+
+    def joint_ends(self, joints: Array) -> list[JointEnd]:
+        """Both ends of every joint's range, of the views that show anything."""
+        return joint_ends(joints, np.flatnonzero(self.rows.used.any(axis=1)))
+
+    def part_displacements(self, numbers: Array) -> Array:
+        """(V, 3) motion of a view that makes its rows by shifts alone; zero for one that shows nothing."""
+        V = len(self.rows.lever)
+        shifts = self.rows.lever[..., 3:] * self.rows.distances_used[..., None]
+        left = numbers.reshape(self.rows.residual.shape)[:V, :, None]
+        return np.asarray((np.linalg.pinv(shifts) @ left)[..., 0])
+
+
+def row_model(measurement: Measurement, model: Model, observation: RowObservation) -> LinearModel:
+    """Linearise what a session shows in rows about its model: hand-eye, landmarks and effects in use are free.
+
+    Args:
+        measurement: with the sightings that count.
+    """
+    rows = observation.rows
+    base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
+    extra = rows.columns_in_use(measurement, model)
+    sizes, values = sizes_of(model.terms), values_of(model.terms)
+    # Parameters that the fit left at zero are not in the model.
+    used = np.array([p.value != 0 and not p.discrete for p in stack_parameters(model.terms)], bool)
+    whole = rows.mixed_model(np.concatenate([base, extra[..., used]], axis=2))
+    null = fit_variances(whole, both_starts=True)
+    half, n = whitener(whole, null.variances), rows.residual.size
+    own_columns, further = ((half @ c).reshape(n, c.shape[2]) for c in (base, extra))
+    seen = used & independent(own_columns, further * used, sizes, 1 / UNSEEN)
+    A = np.concatenate([base, extra[..., seen]], axis=2)
+    mixed = rows.mixed_model(A)
+    if (seen != used).any():
+        null = fit_variances(mixed, both_starts=True)
+    offsets = joint_offset_twists(measurement, model, rows.centre)
+    per_joint = np.zeros(2) if offsets is None else mean_square_per_axis(offsets, [measurement], [rows.centre])
+    return LinearModel(
+        measurement,
+        model,
+        observation,
+        A.reshape(n, -1),
+        sizes=np.append(np.full(base.shape[2], np.inf), sizes[seen]),
+        values=np.append(np.zeros(base.shape[2]), values[seen]),
+        mixed=mixed,
+        null=null,
+        offsets=None if offsets is None else rows.from_twists(offsets),
+        flange_per_joint=per_joint,
+    )
