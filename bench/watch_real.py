@@ -21,7 +21,7 @@ from stitch.watch.history import open_history, read_record
 from stitch.watch.report import CellReport, cell_report
 from stitch.watch.update import append_runs
 from stitch.writing.result_document import model_of
-from stitch.writing.run_folder import write_run
+from stitch.writing.run_folder import write_with_page
 
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 BLOCKS, POSES, EFFECTS = 24, 120, ["joint_offset", "link_geometry"]
@@ -59,7 +59,7 @@ def real() -> list[str]:
             runs.append(found)
             out = Path(folder) / f"b{k:02d}"
             out.mkdir()
-            write_run(found, out)
+            write_with_page(found, out)
         with open_history(Path(folder) / "ur10", new=True) as history:
             records = []
             for k, index in enumerate(parts):

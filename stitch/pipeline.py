@@ -13,6 +13,8 @@ from stitch.diagnosis.score import start_with_effects
 from stitch.diagnosis.stepwise_selection import find_effect_to_drop
 from stitch.diagnosis.thresholds import HELDOUT_RISE
 from stitch.diagnosis.validation import group_helps, group_share
+from stitch.effects.contract import find_effect, require_available
+from stitch.errors import InputError
 from stitch.integrity.deep_check import refuse_explained_mistake
 from stitch.integrity.model_transfer import (
     ArmTransfer,
@@ -155,19 +157,33 @@ def _assemble_runs(
     return runs
 
 
-def add(run: Run, *effects: str, recorder: Recorder | None = None) -> Run:
-    """Fit a run again with further effects in its model: hand-eye and all effects together.
+def effects_with(run: Run, further: Sequence[str], where: object) -> list[str]:
+    """Return the effects of a run's model and further ones, for `change`.
+
+    Args:
+        where: name of the run, for messages.
 
     Raises:
-        InputError: an effect that is not known, or that the session cannot have.
-        NoResultError: no two views overlap.
+        InputError: an effect that is not known, that the session cannot have, or that is in the model already.
     """
-    return change(run, [*run.model.effects, *effects], recorder)
+    for name in further:
+        require_available(run.measurement, find_effect(name))
+        if name in run.effects:
+            raise InputError(f"{where}: {name} is in its model already; to fix: leave it out")
+    return [*run.effects, *further]
 
 
-def drop(run: Run, *effects: str, recorder: Recorder | None = None) -> Run:
-    """Fit a run again without some of its effects."""
-    return change(run, [name for name in run.model.effects if name not in effects], recorder)
+def effects_without(run: Run, dropped: Sequence[str], where: object) -> list[str]:
+    """Return the effects of a run's model but some, for `change`.
+
+    Raises:
+        InputError: an effect that is not in the model.
+    """
+    for name in dropped:
+        if name not in run.effects:
+            has = f"one of {', '.join(run.effects)}" if run.effects else "nothing can be dropped"
+            raise InputError(f"{where}: {name} is not in its model; to fix: {has}")
+    return [name for name in run.effects if name not in dropped]
 
 
 def change(state: Run, effects: Sequence[str], recorder: Recorder | None = None) -> Run:

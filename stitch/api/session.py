@@ -28,9 +28,7 @@ from stitch.measurement.capture import MAX_POINTS
 from stitch.measurement.robot import Robot, forward
 from stitch.measurement.session import Cloud, Mount, Scanner, StatedRepeatability, View
 from stitch.reading import session_folder
-from stitch.reading import session_folder as scanner_toml
-from stitch.reading import session_folder as session_toml
-from stitch.reading.session_folder import check_scale, checked_scan
+from stitch.reading.session_folder import check_scale, checked_scan, read_repeatability, read_robot, read_scanner
 from stitch.reading.session_tables import require_agreement
 from stitch.reading.text_files import require_folder_name, require_name, table_choice
 from stitch.system.threads import parallel
@@ -259,12 +257,12 @@ def _stated(
     ):
         table_choice(toml, {key: value}, key, known)
     if not isinstance(scanner, Scanner):
-        scanner = scanner_toml.read_scanner(toml, dict(scanner or {}))
+        scanner = read_scanner(toml, dict(scanner or {}))
     if robot is None or isinstance(robot, Robot):
         return _Stated(unit, cloud_unit, scanner, robot, StatedRepeatability())
     table = {"urdf": str(Path(robot).resolve())} if isinstance(robot, str | Path) else dict(robot)
-    stated = session_toml.read_repeatability(toml, table)
-    return _Stated(unit, cloud_unit, scanner, session_toml.read_robot(toml, table, unit), stated)
+    stated = read_repeatability(toml, table)
+    return _Stated(unit, cloud_unit, scanner, read_robot(toml, table, unit), stated)
 
 
 def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[str], list[Any]]:

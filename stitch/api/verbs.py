@@ -13,7 +13,7 @@ from stitch.api.session import Session, public_session
 from stitch.comparison.residual_tables import ResidualTables, compare_surfaces, compare_targets
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.effects.contract import find_effect, require_available
+from stitch.effects.contract import find_effect
 from stitch.errors import InputError
 from stitch.explanation import explain as explanation
 from stitch.explanation.explain import EFFECT_NAME, Explanation
@@ -22,7 +22,6 @@ from stitch.export.cloud_formats import CLOUD_FORMATS, coloured
 from stitch.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_from
 from stitch.frames import Array
 from stitch.measurement import session as measured
-from stitch.measurement.capture import part_size
 from stitch.model.forward import corrected_capture
 from stitch.model.model_toml import ModelFile, keep_arm_effects
 from stitch.planning import plan as planning
@@ -30,7 +29,8 @@ from stitch.planning.expected_model import PlannedCell, cell_of_session, cell_of
 from stitch.planning.plan import Plan, PlanRequest
 from stitch.runs import run as runs
 from stitch.runs.recorder import Recorder
-from stitch.stages.correct import REUSE_GATE, converged_gate
+from stitch.stages.correct import gate_of_model
+from stitch.stages.register import DEFAULT
 from stitch.stored import stored_run
 from stitch.system.files import whole_file
 from stitch.system.threads import library_threads_off
@@ -45,6 +45,7 @@ def run(
     effects: Sequence[str] = (),
     keep: bool = False,
     arm: ModelFile | runs.Run | None = None,
+    register: str = DEFAULT,
 ) -> Run:
     """Stitch one session: correct the hand-eye from the scans, register, fuse.
 
@@ -54,6 +55,7 @@ def run(
         effects: names of effects to fit together with the hand-eye.
         keep: fuse also the views that do not belong.
         arm: a run, or a model, of whose joints and links the effects stay as they are, while all else is fitted.
+        register: method by which single views are registered, "dpwvm" or "gicp"; labelled points need none.
 
     Returns:
         The run: hand-eye (4, 4) in the mount frame, poses (V, 4, 4) and cloud (N, 3) in the reference frame; lengths in
@@ -68,7 +70,7 @@ def run(
         >>> run.hand_eye.pose.shape
         (4, 4)
     """
-    return run_rig([session], model, None if recorder is None else [recorder], effects, keep, arm)[0]
+    return run_rig([session], model, None if recorder is None else [recorder], effects, keep, arm, register)[0]
 
 
 def run_rig(
@@ -78,12 +80,13 @@ def run_rig(
     effects: Sequence[str] = (),
     keep: bool = False,
     arm: ModelFile | runs.Run | None = None,
+    register: str = DEFAULT,
 ) -> list[Run]:
     """Stitch several sessions of one rig with one common hand-eye and common effects; one run a session.
 
     Args:
         sessions: of one scanner on one mount, in one length_unit.
-        model, recorders, effects, keep, arm: as `stitch.run` takes them, a recorder a session.
+        model, recorders, effects, keep, arm, register: as `stitch.run` takes them, a recorder a session.
 
     Returns:
         A run a session, shapes and frames as of `stitch.run`; their hand-eyes (4, 4) are the same.
@@ -100,7 +103,8 @@ def run_rig(
     others: Sequence[Recorder | None] = recorders or [None] * len(sessions)
     replays = [ReplayRecorder(other) for other in others]
     stated = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, runs.Run) else arm
-    found = pipeline.run_rig(sessions, None if model is None else _model(model), replays, _names(effects), keep, stated)
+    fitted = None if model is None else _model(model)
+    found = pipeline.run_rig(sessions, fitted, replays, _names(effects), keep, stated, register)
     return [public_run(*own) for own in zip(found, map(public_session, sessions), replays, strict=True)]
 
 
@@ -168,12 +172,7 @@ def add(run: runs.Run, *effects: str, recorder: Recorder | None = None) -> Run:
         >>> better.effects, len(better.ledger)
         (['range_scale'], 2)
     """
-    state = _state(run)
-    for name in effects:
-        require_available(state.measurement, find_effect(name))
-        if name in state.model.effects:
-            raise InputError(f"{name} is in the model of {state.session.name} already; to fix: leave it out")
-    return _changed(run, state, [*state.model.effects, *effects], recorder)
+    return _changed(run, pipeline.effects_with(run, effects, run.session.name), recorder)
 
 
 def drop(run: runs.Run, *effects: str, recorder: Recorder | None = None) -> Run:
@@ -194,14 +193,7 @@ def drop(run: runs.Run, *effects: str, recorder: Recorder | None = None) -> Run:
         >>> stitch.drop(better, *better.effects).effects
         []
     """
-    state = _state(run)
-    used = state.model.effects
-    for name in effects:
-        if name not in used:
-            raise InputError(
-                f"{name} is not in the model of {state.session.name}; in it are {', '.join(used) or 'none'}"
-            )
-    return _changed(run, state, [name for name in used if name not in effects], recorder)
+    return _changed(run, pipeline.effects_without(run, effects, run.session.name), recorder)
 
 
 def compare(run: runs.Run) -> ResidualTables:
@@ -370,18 +362,14 @@ def _names(effects: Sequence[str]) -> list[str]:
 
 def _state(run: runs.Run) -> runs.Run:
     """Return what a command reads of the run's folder: partners are looked for within the gate of the model alone."""
-    own = corrected_capture(run.measurement, run.model)
-    if not own.scans:
-        return run
     with library_threads_off():
-        gate = converged_gate(own, run.T_mount, REUSE_GATE * part_size([own]))
-    return replace(run, gate=gate)
+        return replace(run, gate=gate_of_model(corrected_capture(run.measurement, run.model), run.T_mount))
 
 
-def _changed(run: runs.Run, state: runs.Run, effects: Sequence[str], recorder: Recorder | None) -> Run:
+def _changed(run: runs.Run, effects: Sequence[str], recorder: Recorder | None) -> Run:
     replay = ReplayRecorder(recorder)
     whole_session: Session | None = run.measured if isinstance(run, Run) else None
-    return public_run(pipeline.change(state, effects, replay), whole_session, replay)
+    return public_run(pipeline.change(_state(run), effects, replay), whole_session, replay)
 
 
 def _cell_of(run: runs.Run) -> PlannedCell:

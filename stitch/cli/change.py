@@ -76,18 +76,13 @@ def add_effects(
     Raises:
         InputError, NoResultError: as `stitch add` ends.
     """
-    from stitch.effects.contract import find_effect, require_available
+    from stitch.pipeline import effects_with
     from stitch.stored.stored_run import load_run
     from stitch.writing import run_folder
 
     with run_folder.lock_run_folder(run):
         state = load_run(run, effects_file, trust=trust)
-        used = state.model.effects
-        for name in effects:
-            require_available(state.measurement, find_effect(name))
-            if name in used:
-                raise InputError(f"{name} is in the model of {run} already; to fix: leave it out")
-        _refit_run(run, state, [*used, *effects], recording, as_json)
+        _refit_run(run, state, effects_with(state, effects, run), recording, as_json)
 
 
 def drop_effects(
@@ -98,17 +93,13 @@ def drop_effects(
     Raises:
         InputError, NoResultError: as `stitch drop` ends.
     """
+    from stitch.pipeline import effects_without
     from stitch.stored.stored_run import load_run
     from stitch.writing import run_folder
 
     with run_folder.lock_run_folder(run):
         state = load_run(run, effects_file, trust=trust)
-        used = state.model.effects
-        for name in effects:
-            if name not in used:
-                raise InputError(f"{name} is not in the model of {run}; in it are {', '.join(used) or 'none'}")
-        kept = [name for name in used if name not in effects]
-        _refit_run(run, state, kept, recording, as_json)
+        _refit_run(run, state, effects_without(state, effects, run), recording, as_json)
 
 
 def _refit_run(run: Path, state: Run, effects: list[str], recording: bool, as_json: bool) -> None:

@@ -275,8 +275,9 @@ def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[Mov
         (moved, k): test_alternative(under, step_columns(model, k, moved)) for moved in MOVED_BODIES for k in starts
     }
     alone = {v: test_alternative(under, model.views[v]) for v in free}
-    view, likelier = min(alone, key=lambda v: alone[v].rank), min(tests, key=lambda at: tests[at].rank)
-    if alone[view].rank < tests[likelier].rank:
+    view, likelier = min(alone, key=lambda v: alone[v].rank), min(tests, key=lambda at: tests[at].rank, default=None)
+    # Of few views every start of a step may be taken.
+    if likelier is None or alone[view].rank < tests[likelier].rank:
         return _Pick(model.views[view], alone[view].p_value * model.count, model.count)
     best = {moved: max(starts, key=lambda k: tests[moved, k].statistic) for moved in MOVED_BODIES}
     moved, start = likelier

@@ -233,6 +233,18 @@ def converged_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlap
     return collect_overlaps(capture, capture.poses(T_mount), converged_gate(capture, T_mount, gate), samples)
 
 
+def gate_of_model(own: Capture, T_mount: Array) -> float:
+    """Return the distance that partners may have under a model that was fitted, length_unit; NaN without clouds.
+
+    Args:
+        own: the capture without the model's effects.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    return converged_gate(own, T_mount, REUSE_GATE * part_size([own])) if own.scans else float("nan")
+
+
 def converged_gate(capture: Capture, T_mount: Array, gate: float) -> float:
     """The distance that partners may have, from one that is too large.
 

@@ -14,7 +14,7 @@ from plyfile import PlyData, PlyParseError
 from stitch.effects.user_file import load
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.measurement.capture import Capture, part_size, prepare_capture
+from stitch.measurement.capture import Capture, prepare_capture
 from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.model.forward import corrected_capture
 from stitch.model.model import EffectsCovariance
@@ -27,7 +27,7 @@ from stitch.reading.clouds import require_room
 from stitch.reading.session_folder import load_session
 from stitch.reading.text_files import read_text, shortened
 from stitch.runs.run import ExcludedView, Fit, FusedCloud, LedgerStep, Note, Run, StageResult, ViewLinks
-from stitch.stages.correct import REUSE_GATE, converged_gate, converged_overlaps
+from stitch.stages.correct import converged_overlaps, gate_of_model
 from stitch.stages.target_fit import evaluate_targets
 from stitch.system.threads import library_threads_off
 from stitch.writing.result_document import restore_counted_targets
@@ -267,8 +267,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         session, measurement = session.without([item.view for item in left_out]), measurement.without(gone)
         model = bind_to_session(file, measurement)
         measurement = restore_counted_targets(measurement, session, document)
-        own = corrected_capture(measurement, model)
-        gate = converged_gate(own, model.T_mount, REUSE_GATE * part_size([own])) if own.scans else float("nan")
+        gate = gate_of_model(corrected_capture(measurement, model), model.T_mount)
     return Run(
         session=session,
         measurement=measurement,

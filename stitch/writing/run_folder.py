@@ -179,29 +179,20 @@ def preload_entry_points(group: str) -> None:
     Thread(target=load, daemon=True).start()
 
 
-def write_run(run: Run, folder: Path) -> None:
-    """Write model.toml, result.json, ledger.json, stitched.ply and residuals.parquet into `folder`."""
-    _write_documents(run, folder)
-    _write_points(run, folder)
-
-
 def write_with_page(run: Run, folder: Path, tolerance: float | None = None) -> None:
-    """The same and report.html, drawn while the points are written.
+    """Write model.toml, result.json, ledger.json, stitched.ply, residuals.parquet and report.html into `folder`.
 
     Args:
         tolerance: within which the views have to agree on the part, length_unit.
     """
-    _write_documents(run, folder)
+    write_model(model_of(run), folder / "model.toml")
+    write_json(result_document(run), folder / "result.json")
+    write_json(ledger(run), folder / "ledger.json")
+    # The page is drawn while the points are written.
     with ThreadPoolExecutor(1) as beside:
         written = beside.submit(_write_points, run, folder)
         call_entry_points("stitch.reports", run, folder / "report.html", tolerance)
         written.result()
-
-
-def _write_documents(run: Run, folder: Path) -> None:
-    write_model(model_of(run), folder / "model.toml")
-    write_json(result_document(run), folder / "result.json")
-    write_json(ledger(run), folder / "ledger.json")
 
 
 def _write_points(run: Run, folder: Path) -> None:

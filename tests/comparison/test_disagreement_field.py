@@ -13,11 +13,11 @@ from stitch import frames
 from stitch.comparison.disagreement_field import model_history, patches_of
 from stitch.observations.surfaces.matching import sample_points, signed_distances
 from stitch.observations.surfaces.normal_equations import collect_overlaps
-from stitch.pipeline import add, run
+from stitch.pipeline import change, run
 from stitch.reading.session_folder import load_session
 from stitch.stored.stored_run import load_run
 from stitch.writing.result_document import result_document
-from stitch.writing.run_folder import write_run
+from stitch.writing.run_folder import write_with_page
 
 HIDDEN = {"joint_compliance": 2.0}
 
@@ -36,7 +36,7 @@ def changed(bent, tmp_path_factory):
 
 def with_compliance(measured, folder):
     write_session(folder, measured, "bent")
-    return add(run(load_session(folder)), "joint_compliance")
+    return change(run(load_session(folder)), ["joint_compliance"])
 
 
 def lacked_and_taken(changed, T_reference_scanner):
@@ -103,7 +103,7 @@ def test_a_view_that_is_moved_lies_off_by_its_motion():
 
 
 def test_the_history_is_the_same_when_it_is_read_again(changed, tmp_path):
-    write_run(changed, tmp_path)
+    write_with_page(changed, tmp_path)
     again = model_history(load_run(tmp_path))
     stated = result_document(changed)["disagreement"]
     assert [s.name for s in again.steps] == [row["step"] for row in stated["steps"]]

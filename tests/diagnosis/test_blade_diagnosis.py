@@ -9,7 +9,7 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.pipeline import add, diagnose, run
+from stitch.pipeline import change, diagnose, run
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json
 
@@ -40,7 +40,7 @@ def test_a_hidden_effect_is_named_added_and_the_error_falls(name, mount, size):
     found = diagnose(before)
     assert found.verdict in ("missing_effect", "cannot_tell"), found.sentence
     assert name in found.effects, found.sentence
-    after = add(before, name)
+    after = change(before, [name])
     assert after.residual_rms < before.residual_rms
     assert after.heldout_rms < before.heldout_rms
     assert [s.effects for s in after.ledger] == [(), (name,)]
@@ -79,7 +79,7 @@ def test_offset_of_the_first_joint_is_never_named_where_the_hand_eye_hides_it():
     """eye_to_hand: joint 1 turns everything about one axis of the base; that is a hand-eye."""
     measured = measured_blade(3, views=16, pixels=90)
     session = session_of(measured)
-    result = add(run(session), "joint_offset")
+    result = change(run(session), ["joint_offset"])
     offsets, sigmas = result.terms[0].values, result.terms[0].sigmas
     assert offsets[0] == 0.0
     assert np.isnan(sigmas[0])

@@ -5,7 +5,7 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_cell
 from stitch.diagnosis.stepwise_selection import find_effect_to_drop
-from stitch.pipeline import add, diagnose, run, suggest
+from stitch.pipeline import change, diagnose, run, suggest
 
 
 def test_a_hidden_joint_offset_is_named_and_found():
@@ -14,7 +14,7 @@ def test_a_hidden_joint_offset_is_named_and_found():
     before = run(session)
     found = diagnose(before)
     assert "joint_offset" in found.effects, found.sentence
-    after = add(before, "joint_offset")
+    after = change(before, ["joint_offset"])
     assert after.heldout_rms < 0.2 * before.heldout_rms
     values = {p.name: p.value for p in after.terms[0].parameters}
     for name, true in zip(("d2", "d3", "d5"), offset[[1, 2, 4]], strict=True):

@@ -16,7 +16,7 @@ from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Cloud, Sighting
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
-from stitch.pipeline import add, run
+from stitch.pipeline import change, run
 from stitch.stages.register_and_fuse import FittedRig
 from stitch.stages.target_fit import FittedSession
 
@@ -83,7 +83,7 @@ def test_exchanged_scans_are_named_and_left_out_and_stay_out(good):
     assert {item.view for item in found.left_out} == {"v002", "v006"}
     assert all("exchange the clouds of v002 and v006" in item.why for item in found.left_out)
     assert found.notes[0].startswith("View v002 does not fit its robot pose") and len(found.poses) == 8
-    again = add(found, "range_scale")
+    again = change(found, ["range_scale"])
     assert again.left_out == found.left_out and len(again.poses) == 8
     kept = run(swapped, keep=True)
     assert kept.left_out == () and len(kept.poses) == 10 and "kept as asked" in kept.notes[0]

@@ -9,7 +9,7 @@ import pytest
 
 import stitch
 from stitch.system import threads
-from stitch.writing.run_folder import write_run
+from stitch.writing.run_folder import write_with_page
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -106,7 +106,7 @@ def test_a_cloud_walks_as_the_page_says(session, tmp_path):
     threading.setprofile(watch)
     sys.setprofile(watch)
     try:
-        write_run(stitch.run(stitch.load_session(session)), tmp_path)
+        write_with_page(stitch.run(stitch.load_session(session)), tmp_path)
     finally:
         sys.setprofile(None)
         threading.setprofile(None)

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from data_synth.fixtures.drilled_plate import measured_plate
 from data_synth.fixtures.in_memory import clouds_of, labelled_session_of, points_of
 from stitch.measurement.session import Sighting
-from stitch.pipeline import add, run
+from stitch.pipeline import change, run
 
 # Minutes of work: `make check` runs it, `make test` does not.
 pytestmark = pytest.mark.slow
@@ -108,7 +108,7 @@ def test_a_wrong_point_is_found_and_listed_and_pulls_nothing():
 
 def test_a_sensor_effect_that_acts_on_both_is_found():
     measured = measured_plate(3, hidden={"range_scale": 4.0})
-    after = add(run(labelled_session_of(measured)), "range_scale")
+    after = change(run(labelled_session_of(measured)), ["range_scale"])
     value, sigma = after.terms[0].values[0], after.terms[0].sigmas[0]
     # Normal errors stay within 3.3 sigmas in 999 of 1000 cases; the effect itself is larger.
     assert abs(value - measured.hidden["range_scale"]["s"]) < 3.3 * sigma < abs(value)

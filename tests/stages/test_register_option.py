@@ -5,13 +5,14 @@ import json
 import numpy as np
 import pytest
 
+import stitch
 from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.pipeline import change, run
 from stitch.reading.session_folder import load_session
 from stitch.stages.register import DEFAULT, METHODS
 from stitch.stored.stored_run import load_run
-from stitch.writing.run_folder import write_run
+from stitch.writing.run_folder import write_with_page
 from viz.recording import run_markdown
 
 
@@ -21,7 +22,7 @@ def test_the_method_is_written_read_again_and_kept_by_a_change(session, tmp_path
     assert usual.register_method == DEFAULT
     assert asked.register_method == "gicp"
     assert not np.array_equal(usual.poses, asked.poses)
-    write_run(asked, tmp_path)
+    write_with_page(asked, tmp_path)
     stages = json.loads((tmp_path / "result.json").read_text())["stages"]
     assert [stage.get("method") for stage in stages] == [None, None, "gicp", None]
     state = load_run(tmp_path)
@@ -38,6 +39,14 @@ def test_a_method_of_another_name_is_bad_input(session):
     with pytest.raises(SystemExit) as ended:
         main(["run", str(session), "--register", "icp"])
     assert ended.value.code == 2
+
+
+def test_from_python_the_method_is_that_of_the_command(session):
+    loaded = stitch.load_session(session)
+    found = stitch.run(loaded, register="gicp")
+    assert found.register_method == "gicp"
+    assert np.array_equal(found.poses, run(loaded, register="gicp").poses)
+    assert stitch.run_rig([loaded], register="gicp")[0].register_method == "gicp"
 
 
 def test_both_methods_stand_by_their_names():

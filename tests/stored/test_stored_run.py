@@ -11,7 +11,7 @@ from stitch.pipeline import run as stitched
 from stitch.reading.session_folder import load_session
 from stitch.stored.stored_run import load_run
 from stitch.writing.result_document import model_of
-from stitch.writing.run_folder import write_run
+from stitch.writing.run_folder import write_with_page
 from viz.run_page import write_report
 
 
@@ -23,7 +23,7 @@ def test_labelled_points_of_a_folder_lie_where_its_run_put_them(tmp_path):
     found = stitched(loaded, effects=["joint_offset"])
     assert len(found.outliers) == 1
     (tmp_path / "r").mkdir()
-    write_run(found, tmp_path / "r")
+    write_with_page(found, tmp_path / "r")
     again = load_run(tmp_path / "r")
     for name in ("positions", "orientation"):
         np.testing.assert_array_equal(getattr(again.targets.landmarks, name), getattr(found.targets.landmarks, name))

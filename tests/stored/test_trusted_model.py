@@ -10,7 +10,7 @@ from data_synth.fixtures.labelled_files import write_labelled
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model
-from stitch.pipeline import add, drop, run
+from stitch.pipeline import change, run
 from stitch.reading.session_folder import load_session
 from stitch.stored.stored_run import load_run, trusted_model
 from stitch.writing import run_folder
@@ -77,11 +77,11 @@ def test_a_file_is_named_while_an_effect_of_it_is_in_use(tmp_path):
     session = load_session(write_labelled(tmp_path / "s", labelled_cell(views=12)[0]))
     folder.mkdir()
     try:
-        run_folder.write_run(replace(run(session), effects_file=str(file)), folder)
+        run_folder.write_with_page(replace(run(session), effects_file=str(file)), folder)
         assert read_model(folder).effects_file is None
-        for change, *names in ((add, "of_my_own"), (add, "joint_offset"), (drop, "of_my_own")):
-            run_folder.write_run(change(load_run(folder, file), *names), folder)
-            used = change is add
+        for effects in (["of_my_own"], ["of_my_own", "joint_offset"], ["joint_offset"]):
+            run_folder.write_with_page(change(load_run(folder, file), effects), folder)
+            used = "of_my_own" in effects
             assert read_model(folder).effects_file == (str(file) if used else None)
     finally:
         EFFECTS.pop("of_my_own", None)

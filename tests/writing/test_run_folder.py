@@ -17,7 +17,7 @@ from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import LedgerStep
 from stitch.stored.stored_run import load_run
-from stitch.writing.run_folder import write_run
+from stitch.writing.run_folder import write_with_page
 from viz import run_page
 
 EFFECT = "scanner_thermal_scale"
@@ -80,7 +80,7 @@ def test_a_page_made_anew_is_the_page_of_the_run(folder, name, stitch_command):
 @pytest.mark.slow
 def test_a_page_of_a_rig_shows_the_hand_eye_of_all(folder, tmp_path):
     runs = run_rig([load_session(folder / name) for name in "so"])
-    write_run(runs[1], tmp_path)
+    write_with_page(runs[1], tmp_path)
     again = load_run(tmp_path)
     np.testing.assert_array_equal(again.T_mount, runs[0].T_mount)
     assert again.residual_rms == runs[1].residual_rms and again.heldout_rms == runs[1].heldout_rms
