@@ -11,7 +11,7 @@ from stitch.diagnosis.diagnose import diagnose_state
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.score import start_with_effects
 from stitch.diagnosis.stepwise_selection import find_effect_to_drop
-from stitch.diagnosis.thresholds import HELDOUT_RISE
+from stitch.diagnosis.thresholds import FAINT_SIGMAS
 from stitch.diagnosis.validation import group_helps, group_share
 from stitch.effects.contract import find_effect, require_available
 from stitch.errors import InputError
@@ -27,7 +27,6 @@ from stitch.measurement.capture import part_size, prepare_capture
 from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.measurement.session import Session
 from stitch.model.model_toml import ModelFile, arm_model, convert_unit
-from stitch.observations.pose_errors import MANY_VIEWS
 from stitch.planning.next_view import propose_measurements
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.runs.run import Run, StageResult
@@ -219,7 +218,8 @@ def change(state: Run, effects: Sequence[str], recorder: Recorder | None = None)
             links=state.links,
             doubts=session_warnings(session, own, fitted.correction, 0),
         )
-        return assemble_run(session, 0, end, before, recorder)
+        tried = {name: why for name, why in state.tried.items() if name not in effects}
+        return replace(assemble_run(session, 0, end, before, recorder), tried=tried)
 
 
 def diagnose(run: Run) -> Diagnosis:
@@ -235,41 +235,63 @@ def diagnose(run: Run) -> Diagnosis:
 def suggest(state: Run, at_most: int) -> tuple[Run | None, list[str], Diagnosis]:
     """Return the run with everything that the diagnosis names, what happened in lines, and the last diagnosis.
 
-    The run is None where nothing is named.
-
-    An effect stays unless the held-out residual rises: the diagnosis has asked already whether it predicts the poses
-    of views left out, and a small effect moves them by less than the sensor's noise shows in a residual. What is less
-    likely than nothing being missing is not added. At the end
-    effects that came early go, if those that came later explain the same; what was in the model before stays.
+    The run is None where nothing is named. What was found together is added together, and what does not hold its place
+    beside the rest goes again. An effect stays if it lowers the error on views left out beyond its uncertainty
+    (`CrossValidation.fit_rejection_reason`); one that was dropped in this run is not tried again. What is less likely
+    than nothing being missing is not added. What was in the model before stays.
     """
-    lines: list[str] = []
+    lines, given, left = list[str](), set(state.model.effects), at_most
     result: Run | None = None
-    found: Diagnosis | None = None
-    given = set(state.model.effects)
-    for _ in range(at_most):
+    while True:
         found = diagnose(state)
         lines += [*_finding_and_evidence(found), *(f"{note}." for note in found.notes if note not in found.sentence)]
         if found.verdict != "missing_effect":
-            break
+            return result, lines, found
+        name = found.effects[0]
         if not found.likelier_than_not:
-            name = found.effects[0]
             lines.append(f"{name} was not added: chance is more likely. To add it anyway: stitch add RUN {name}.")
-            break
-        tried = change(state, [*state.model.effects, found.effects[0]])
-        if not _improves_heldout(state, tried):
-            lines.append(f"{found.effects[0]} was tried and not added: the error on views left out rose.")
-            break
-        result, state = tried, tried
-        lines.append(f"Added {found.effects[0]}. With it:")
+            return result, lines, found
+        if found.dropped_before is not None:
+            lines.append(f"{name} was dropped in this run before. To add it all the same: stitch add RUN {name}.")
+            return result, lines, found
+        if not left:
+            lines.append(f"Stopped after {at_most} effects; run it again to go on.")
+            return result, lines, found
+        before = result
+        result, told = _add_found(state, found, left, given)
+        lines += told
+        if not set(result.effects) - set(state.effects):
+            return before, lines, replace(found, tried=result.tried)
+        left -= min(len(set(result.effects) - set(state.effects)), left)
+        state = result
         # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
-        found = None
-    else:
-        lines.append(f"Stopped after {at_most} effects; run it again to go on.")
-    if result is not None and not state.session.has_clouds and state.measurement.views.count >= MANY_VIEWS:
-        result, dropped = _drop_unneeded(result, given)
-        lines += dropped
-        state, found = (result, None) if dropped else (state, found)
-    return result, lines, diagnose(state) if found is None else found
+        del found
+
+
+def _add_found(state: Run, found: Diagnosis, at_most: int, given: set[str]) -> tuple[Run, list[str]]:
+    """Return the run with what a diagnosis found together, as far as it earns its place, and what happened.
+
+    Args:
+        given: effects that stay in any case.
+    """
+    names = [name for name in found.together if name not in state.tried][:at_most]
+    validations = {c.name: c.cross_validation for c in found.candidates}
+    while names:
+        tried, lines = _drop_unneeded(change(state, [*state.effects, *names]), given)
+        kept = [name for name in names if name in tried.effects]
+        share = (tried.heldout_rms / state.heldout_or_fit_rms) ** 2
+        validation = validations.get(names[0])
+        zero = max((t.sigmas_from_zero for t in tried.terms if t.name in kept), default=0.0) < FAINT_SIGMAS
+        reason = validation.fit_rejection_reason(" and ".join(kept), share, zero=zero) if validation and kept else None
+        if kept and reason is None:
+            return tried, [*lines, f"Added {' and '.join(kept)}. With it:"]
+        if len(names) == 1:
+            why = reason or tried.tried[names[0]]
+            dropped = replace(state, tried=state.tried | tried.tried | {names[0]: why})
+            return dropped, [f"{names[0]} was tried and dropped: {why}."]
+        # Together they do not earn their place: the one that is named is asked alone.
+        names = names[:1]
+    return state, []
 
 
 def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:
@@ -309,14 +331,17 @@ def _finding_and_evidence(found: Diagnosis) -> list[str]:
 
 
 def _drop_unneeded(result: Run, given: set[str]) -> tuple[Run, list[str]]:
-    """Return the run without added effects that later ones made idle, and why each was dropped."""
+    """Return the run without added effects that others made idle, which it remembers, and why each was dropped.
+
+    Of labelled points alone: scans are matched anew for every effect that is asked.
+    """
     lines: list[str] = []
-    while (idle := find_effect_to_drop(result, set(result.effects) - given)) is not None:
+    while not result.session.has_clouds and len(added := set(result.effects) - given) > 1:
+        idle = find_effect_to_drop(result, added)
+        if idle is None:
+            break
         name, reason = idle
         lines.append(f"{reason}; it was dropped.")
-        result = change(result, [other for other in result.effects if other != name])
+        fewer = change(result, [other for other in result.effects if other != name])
+        result = replace(fewer, tried=result.tried | {name: reason})
     return result, lines
-
-
-def _improves_heldout(state: Run, tried: Run) -> bool:
-    return not state.ledger or tried.heldout_rms < HELDOUT_RISE * state.ledger[-1].heldout_rms

@@ -1,4 +1,4 @@
-"""A group of effects that cannot be told apart: added as one where it helps on views left out, and only there."""
+"""What a diagnosis adds stays where views left out are predicted better; what was dropped is not proposed again."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -7,8 +7,17 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
 from stitch import pipeline as stepwise
+from stitch.diagnosis.validation import CrossValidation, _squares_by_fold
+from stitch.effects.contract import find_effect, parameters_in
+from stitch.model.model import Term
 from stitch.pipeline import diagnose, run
+from stitch.reading.session_folder import load_session
+from stitch.stored.stored_run import load_run
+from stitch.writing.diagnosis_document import diagnosis_document, suggested_command
+from stitch.writing.json_file import write_json
+from stitch.writing.run_folder import write_run
 
 OFFSET = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
 
@@ -53,3 +62,64 @@ def test_what_is_less_likely_than_chance_is_not_added(first, monkeypatch):
     monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
     result, lines, _ = stepwise.suggest(first, at_most=3)
     assert result is None and lines[-1].startswith("joint_offset was not added: chance is more likely.")
+
+
+@pytest.mark.parametrize(
+    ("share", "poses", "zero", "stays"),
+    [
+        (0.80, 1.0, True, True),  # the error of left-out points fell by more than its uncertainty
+        (0.96, 0.8, False, True),  # it does not tell; that of left-out poses does
+        (0.96, 1.0, False, False),  # neither tells
+        (0.96, 0.8, True, False),  # the fit finds nothing of the effect
+        (1.06, 0.8, False, False),  # it rose
+    ],
+)
+def test_an_effect_stays_if_views_left_out_are_better_by_more_than_is_uncertain(share, poses, zero, stays):
+    judged = CrossValidation(0.5, 0.9, poses, poses_sigma=0.1, steadiness=1.0, heldout_sigma=0.05)
+    reason = judged.fit_rejection_reason("settling", share, zero=zero)
+    assert (reason is None) == stays
+    assert stays or f"{share:.2f} ± 0.05 of the mean square error" in reason
+
+
+def test_the_uncertainty_of_the_error_on_views_left_out_is_that_between_folds(first):
+    """As a ratio of sums over folds (Cochran 1977, eq. 2.39), by leaving folds out one by one."""
+    found = diagnose(first)
+    judged = found.candidates[0].cross_validation
+    scored, linear = found.candidates[0].ranked.score, found.linear.scatter_only
+    squares = _squares_by_fold(linear, scored)[1]
+    folds = squares.shape[1]
+    shares = [np.delete(squares[0], k).sum() / np.delete(squares[1], k).sum() for k in range(folds)]
+    jackknife = np.sqrt((folds - 1) / folds * np.sum((shares - np.mean(shares)) ** 2))
+    assert judged.heldout == pytest.approx(squares[0].sum() / squares[1].sum())
+    assert judged.heldout_sigma == pytest.approx(jackknife, rel=0.3)
+
+
+def test_what_was_tried_and_dropped_is_remembered_and_not_proposed_again(monkeypatch, tmp_path):
+    session, *_ = labelled_cell(1, views=24, offset=OFFSET)
+    first = run(load_session(write_labelled(tmp_path / "session", session)))
+    monkeypatch.setattr(stepwise, "change", lambda state, effects: replace(first, heldout_rms=9.0))
+    monkeypatch.setattr(stepwise, "_drop_unneeded", lambda run, given: (with_effect(run), []))
+    result, lines, found = stepwise.suggest(first, at_most=3)
+    assert result is None and "joint_offset was tried and dropped: with joint_offset the error" in lines[-1]
+    assert list(found.tried) == ["joint_offset"] and "It was tried in this run and dropped: with" in said(found)
+    assert "--suggested" not in suggested_command(found, "RUN")
+    # In a later process too, as diagnosis.json of the run has it.
+    (tmp_path / "run").mkdir()
+    write_run(first, tmp_path / "run")
+    write_json(diagnosis_document(found), tmp_path / "run" / "diagnosis.json")
+    again = load_run(tmp_path / "run")
+    assert again.tried == found.tried
+    monkeypatch.setattr(stepwise, "change", lambda state, effects: pytest.fail("it is fitted again"))
+    result, lines, later = stepwise.suggest(again, at_most=3)
+    assert result is None and "was dropped in this run before" in lines[-1] and later.tried == found.tried
+
+
+def said(found):
+    return diagnosis_document(found)["plain"]
+
+
+def with_effect(state):
+    """The run as if joint_offset had been fitted, and were far from zero."""
+    effect = find_effect("joint_offset")
+    parameters = tuple(replace(p, value=1e-3, sigma=1e-5) for p in parameters_in(state.measurement, effect))
+    return replace(state, model=state.model.with_terms([Term(effect, parameters)]))

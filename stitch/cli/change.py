@@ -15,7 +15,6 @@ from stitch.cli.terminal import emit, in_full, say, show_next
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
-    from stitch.model.model import Term
     from stitch.runs.run import Run
 
 _AT_MOST = 5  # effects that --suggested adds one by one
@@ -185,14 +184,14 @@ def remarks(result: Run) -> list[str]:
         if after.heldout_rms < HELDOUT_FALL * before.heldout_rms:
             earned = set(grown)
         elif grown:
-            clear = max(_clearest(term) for term in result.terms if term.name in grown)
+            clear = max(term.sigmas_from_zero for term in result.terms if term.name in grown)
             rose = after.heldout_rms > HELDOUT_RISE * before.heldout_rms
             out.append(_unseen_in_residuals(", ".join(grown), clear, "rose" if rose else "did not fall"))
     for term in result.terms:
         wild = [p.name for p in term.parameters if not p.grid and abs(p.value) > p.limit]
         if wild:
             out.append(f"{term.name}: {', '.join(wild)} is larger than anybody would believe.")
-        if _clearest(term) < FAINT_SIGMAS:
+        if term.sigmas_from_zero < FAINT_SIGMAS:
             out.append(
                 f"{term.name}: views left out are predicted better with it, though none of its parameters differs from "
                 "zero by two sigmas."
@@ -218,8 +217,3 @@ def _unseen_in_residuals(names: str, clear: float, residual: str) -> str:
         f"{names}: the held-out residual {residual}, and the clearest number is {clear:.1f} sigmas from zero. To learn "
         "whether it is there, drop it and diagnose: that asks the poses of views left out."
     )
-
-
-def _clearest(term: Term) -> float:
-    """Return the largest |value|/sigma of an effect's parameters; 0 where the views see none."""
-    return max((abs(p.value) / p.sigma for p in term.parameters if p.fitted and not p.grid), default=0.0)

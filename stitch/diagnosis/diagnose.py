@@ -87,11 +87,19 @@ def _diagnose(state: Run) -> Diagnosis:
         follows_field=of_field,
         scanner_error=evidence.scanner_error or (find_scanner_error(linear) if unknown else None),
         doubts=state.doubts,
+        together=_named_together(evidence),
+        tried=state.tried,
         budget=_error_budget(linear, evidence, said),
     )
     return replace(
         found, sentence=diagnosis_sentence(found, state.session.length_unit, _rescore_pair(linear, evidence))
     )
+
+
+def _named_together(evidence: Evidence) -> tuple[str, ...]:
+    """Return the effects that are missing at once, the one that is named first; else those that are named."""
+    named, together = [r.name for r in evidence.named], [r.name for r in evidence.together]
+    return tuple(together if evidence.verdict == "missing_effect" and together[:1] == named else named)
 
 
 def _rescore_pair(linear: LinearModel, evidence: Evidence) -> tuple[Ranked, Ranked] | None:

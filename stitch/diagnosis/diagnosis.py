@@ -1,6 +1,6 @@
 """What a diagnosis says: verdict, candidate effects, what depends on what, what to measure next."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -82,6 +82,8 @@ class Diagnosis:
     scanner_error: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer
     # Of the session as a whole, as sentences: what is found may be no more than their mark.
     doubts: tuple[str, ...] = ()
+    together: tuple[str, ...] = ()  # effects that are missing beside each other, the one that is named first
+    tried: dict[str, str] = field(default_factory=dict)  # effects that were fitted in this run and dropped, and why
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -92,6 +94,11 @@ class Diagnosis:
     def certain(self) -> bool:
         """False where a name, or a group, is less than 20 to 1 likelier than nothing being missing."""
         return self.log_odds_over_nothing > ODDS
+
+    @property
+    def dropped_before(self) -> str | None:
+        """Why the one effect that is named was dropped in this run before; None where it was not tried."""
+        return self.tried.get(self.effects[0]) if self.verdict == "missing_effect" else None
 
     def rms_if_added(self, validation: CrossValidation) -> tuple[float, float]:
         """Return the rms with an effect, in the fit and on views left out (length_unit)."""

@@ -239,7 +239,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
         two = find_missing_pair(linear, candidates, best)
         if two is not None:
             return replace(found, explanation=two[:1], further=two[1])
-    return replace(found, explanation=group, further=second)
+    return replace(found, explanation=group, further=second, together=(best, *others))
 
 
 def _select_jointly(

@@ -111,11 +111,28 @@ class CrossValidation:
     poses: float  # the same for where the views were freed to, in units of their scatter, without the sensor's noise
     poses_sigma: float  # spread of `poses` over folds; each view is in two of them: some 0.6 standard errors
     steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
+    heldout_sigma: float = 0.0  # standard error of `heldout`, folds as samples
 
     @property
     def helps(self) -> bool:
         """True if views left out are predicted better, by more than folds differ."""
         return self.poses <= 1 - self.poses_sigma
+
+    def fit_rejection_reason(self, name: str, share: float, *, zero: bool) -> str | None:
+        """Say why an effect that was fitted does not stay, if it does not: what views left out say beyond uncertainty.
+
+        Where the error of their points does not tell, that of their poses does.
+
+        Args:
+            share: of the mean square error on views left out that the fit with the effect leaves.
+            zero: no parameter of the fitted effect differs from zero.
+        """
+        told = f"it leaves {share:.2f} ± {self.heldout_sigma:.2f} of the mean square error on views left out"
+        if share > 1 + self.heldout_sigma:
+            return f"with {name} the error on views left out rose: {told}"
+        if share >= 1 - self.heldout_sigma and (zero or not self.helps):
+            return f"{name} does not help on views left out beyond its uncertainty: {told}"
+        return None
 
     def rejection_reason(self, name: str) -> str | None:
         """Why an effect should not be in a model of many poses, if it should not: these show even what hardly helps."""
@@ -133,18 +150,19 @@ def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
     """
     fitted = linear.scatter_only
     beside = scored.base_model or linear
-    trial, shares, weights, scatter = _residual_shares_by_fold(beside, scored)
+    trial, squares, scatter = _squares_by_fold(beside, scored)
     whole = trial
     if beside is not fitted:
-        whole, shares, weights, _ = _residual_shares_by_fold(fitted, score(fitted, scored.candidate))
-    poses, poses_sigma = mean_square_share(*scatter)
+        whole, squares, _ = _squares_by_fold(fitted, score(fitted, scored.candidate))
+    (heldout, heldout_sigma), (poses, poses_sigma) = mean_square_share(*squares), mean_square_share(*scatter)
     present = fitted.baseline_trial
     return CrossValidation(
         inside=float(whole.squares(whole.solve()).sum() / present.squares(present.solve()).sum()),
-        heldout=float(np.average(shares, weights=weights)),
+        heldout=heldout,
         poses=poses,
         poses_sigma=poses_sigma,
         steadiness=_steadiness(beside, trial, _model_and_candidate_columns(beside, scored), trial.solve()),
+        heldout_sigma=heldout_sigma,
     )
 
 
@@ -153,23 +171,21 @@ def _model_and_candidate_columns(linear: LinearModel, scored: Score) -> Array:
     return np.hstack([linear.design, scored.form.response])
 
 
-def _residual_shares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, list[float], list[float], Array]:
-    """The fit with a candidate; per fold the share of its squares that a fit without it leaves, their weights, and
-    (2, G) scatter of its poses."""
+def _squares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, Array, Array]:
+    """The fit with a candidate; (2, G) squares of each fold that fits without it leave, with the candidate and without;
+    and (2, G) scatter of its poses."""
     X, points = _model_and_candidate_columns(linear, scored), scored.candidate.points
     own = None if points is None else points.select(scored.form.keep)
     trial, present = linear.trial(X, own), linear.baseline_trial
     believed = linear.trial(X, own, prior_of_sizes(linear, scored))
-    shares, weights, scatter = [], [], np.zeros((2, 0))
+    squares, scatter = [], []
     for fold in linear.observation.folds():
         touched = linear.observation.affected_squares(fold)
         without = [t.solve(fold) for t in (believed, present)]
-        squares = [t.squares(x)[touched].sum() for t, x in zip((trial, present), without, strict=True)]
-        shares.append(squares[0] / max(squares[1], 1e-300))
-        weights.append(squares[1])
-        off = [t.scatter(fold, x) for t, x in zip((trial, present), without, strict=True)]
-        scatter = np.column_stack([scatter, off])
-    return trial, shares, weights, scatter
+        pairs = list(zip((trial, present), without, strict=True))
+        squares.append([t.squares(x)[touched].sum() for t, x in pairs])
+        scatter.append([t.scatter(fold, x) for t, x in pairs])
+    return trial, np.array(squares).reshape(-1, 2).T, np.array(scatter).reshape(-1, 2).T
 
 
 def prior_of_sizes(linear: LinearModel, scored: Score) -> CoefficientPrior:

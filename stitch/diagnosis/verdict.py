@@ -26,6 +26,7 @@ class Evidence:
     alarm: bool = False
     # Effects of which each would explain the alarm, likeliest first; alone where none comes within 20 to 1.
     explanation: tuple[Ranked, ...] = ()
+    together: tuple[Ranked, ...] = ()  # effects that were selected beside each other, the first to be named first
     further: Ranked | None = None  # an effect that is missing too, beside the first of `explanation`
     unnamed_explains_it: bool = False  # an error without a name explains these views as well as `explanation`
     refuted: bool = False  # `explanation` fails on views left out, in halves of the views, or rests on one view

@@ -29,6 +29,11 @@ class Term:
         return self.effect.name
 
     @property
+    def sigmas_from_zero(self) -> float:
+        """The largest |value|/sigma of its parameters; 0 where the views see none."""
+        return max((abs(p.value) / p.sigma for p in self.parameters if p.fitted and not p.grid), default=0.0)
+
+    @property
     def values(self) -> Array:
         """(P,) in each parameter's unit."""
         return values_of([self])

@@ -158,6 +158,7 @@ class Run:
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences: they stand before the verdict
     left_out: tuple[ExcludedView, ...] = ()  # views of the session that are not fused
     links: ViewLinks = field(default_factory=ViewLinks)
+    tried: dict[str, str] = field(default_factory=dict)  # effects that were fitted and dropped again, and why
 
     @cached_property
     def fit(self) -> Fit:

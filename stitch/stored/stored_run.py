@@ -80,7 +80,8 @@ RESULT = _object_schema(
 )
 _CANDIDATES = _list_schema(_object_schema({"effect": _TEXT}, hand_eye_if_missed=_NUMBER_OR_NULL))
 _VERDICT = {"enum": ["adequate", "missing_effect", "cannot_tell", "unknown_effect"]}
-DIAGNOSIS = _object_schema({"verdict": _VERDICT}, candidates=_CANDIDATES)
+_TRIED = _list_schema(_object_schema({"effect": _TEXT, "dropped": _TEXT}))
+DIAGNOSIS = _object_schema({"verdict": _VERDICT}, candidates=_CANDIDATES, tried=_TRIED)
 _STEP = {
     "effects": _list_schema(_TEXT),
     "residual_rms": _NUMBER,
@@ -283,6 +284,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         left_out=left_out,
         links=links,
         doubts=tuple(document.get("doubts", ())),
+        tried={row["effect"]: row["dropped"] for row in read_diagnosis(folder).get("tried", ())},
         register_method=next((stage["method"] for stage in document["stages"] if "method" in stage), ""),
     )
 

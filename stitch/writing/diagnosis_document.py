@@ -130,6 +130,8 @@ def _finding(found: Diagnosis, length_unit: str) -> str:
     if (same := _same_as_finding(found)) is not None:
         seen = doubt_headline(same).removesuffix(".")
         named = f"{found.effects[0]} ({seen[0].lower()}{seen[1:]})"
+    if found.dropped_before is not None:
+        return f"{missing}: {named}.{doubt} It was tried in this run and dropped: {found.dropped_before}."
     if validation is None:
         return f"{missing}: {named}.{doubt}"
     return f"{missing}: {named}.{doubt} {_expected_gain(found.residual_rms, validation, length_unit)}"
@@ -187,6 +189,8 @@ def suggested_command(found: Diagnosis, run: str) -> str:
     match found.verdict:
         case "missing_effect" if not found.likelier_than_not:
             return f"Next, for views that would separate it from chance: stitch next {run}"
+        case "missing_effect" if found.dropped_before is not None:
+            return f"Next, to see where the model fails: stitch review {run}"
         case "missing_effect":
             return f"Next: stitch add {run} --suggested"
         case "cannot_tell" if not _group_helps(found):
@@ -232,6 +236,8 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         "log_odds_over_nothing": d.log_odds_over_nothing if np.isfinite(d.log_odds_over_nothing) else None,
         "notes": list(d.notes),
         "doubts": list(d.doubts),
+        "together": list(d.together),
+        "tried": [{"effect": name, "dropped": why} for name, why in d.tried.items()],
         "budget": rows_of_fields(d.budget, "source variance_share sigma unit"),
         "field_map": _field_map(d.scanner_error),
         "views": d.linear.measurement.views.count,

@@ -33,6 +33,7 @@ def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve)
         curves=curves,
         time_curve=time_curve,
         doubts=(),
+        dropped_before=None,
         linear=None,
         candidates=(),
         likelier_than_not=True,
@@ -53,6 +54,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
         effects=("play",),
         candidates=(cause,),
         doubts=(),
+        dropped_before=None,
         certain=True,
         likelier_than_not=True,
         sentence="",
@@ -75,6 +77,7 @@ def test_no_model_is_built_on_a_doubtful_session(verdict):
         curves=("of joint 3",),
         time_curve=None,
         doubts=("knocked",),
+        dropped_before=None,
         likelier_than_not=True,
     )
     command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
@@ -92,6 +95,7 @@ def test_a_slip_that_is_named_is_no_doubt_beside_it(moved, distinguishable, furt
         effects=("part_slip",),
         candidates=(SimpleNamespace(name="part_slip", cross_validation=None),),
         doubts=(step.describe(["a", "b", "c", "d"], "mm"), *further),
+        dropped_before=None,
         certain=True,
         likelier_than_not=True,
     )
@@ -109,7 +113,13 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
     own = FieldError(0.0, 0.012, 9.0, over_noise=False, by_view=True)
     for smooth, said in ((None, "arm's scatter explain"), (same, "own error (17 µm over"), (own, "own error (12 µm, ")):
         found = SimpleNamespace(
-            verdict="adequate", effects=(), scanner_error=smooth, doubts=(), certain=True, likelier_than_not=True
+            verdict="adequate",
+            effects=(),
+            scanner_error=smooth,
+            doubts=(),
+            dropped_before=None,
+            certain=True,
+            likelier_than_not=True,
         )
         assert said in plain_finding(found, "mm")
 
@@ -130,6 +140,7 @@ def test_a_name_that_may_be_chance_is_no_statement(odds, said):
         effects=("settling",),
         candidates=(candidate,),
         doubts=(),
+        dropped_before=None,
         log_odds_over_nothing=np.log(odds),
     )
     found.certain = Diagnosis.certain.fget(found)
@@ -155,6 +166,7 @@ def test_an_error_that_should_rise_is_no_gain(inside, poses, said):
         effects=("settling",),
         candidates=(SimpleNamespace(name="settling", cross_validation=left),),
         doubts=(),
+        dropped_before=None,
         certain=True,
         likelier_than_not=True,
         residual_rms=0.04,
