@@ -284,9 +284,18 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         left_out=left_out,
         links=links,
         doubts=tuple(document.get("doubts", ())),
-        tried={row["effect"]: row["dropped"] for row in read_diagnosis(folder).get("tried", ())},
+        tried=_dropped_before(folder),
         register_method=next((stage["method"] for stage in document["stages"] if "method" in stage), ""),
     )
+
+
+def _dropped_before(folder: Path) -> dict[str, str]:
+    """Return the effects that were dropped in this run, and why; a damaged diagnosis, which is soon written anew, holds
+    none."""
+    try:
+        return {row["effect"]: row["dropped"] for row in read_diagnosis(folder).get("tried", ())}
+    except InputError:
+        return {}
 
 
 def _read_fit(folder: Path, run: Run) -> Fit:
