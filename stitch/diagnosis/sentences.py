@@ -54,6 +54,7 @@ def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] 
     candidate = next(c for c in d.candidates if c.name == d.effects[0])
     ranked = pair[0] if pair else candidate.ranked
     yield f"{candidate.name} {_is_missing(d)} ({fitted_amounts(ranked)}; p = {ranked.adjusted:.1g})."
+    yield from _why_not_the_likeliest(d)
     yield _odds_over_chance(d)
     yield _residual_sentence(d, length_unit)
     if candidate.cross_validation is not None:
@@ -63,6 +64,21 @@ def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] 
         yield f"{pair[1].name} seems to be missing too ({fitted_amounts(pair[1])})."
         yield "Both sizes hold for a model with both effects."
     yield _implausible_sizes(ranked)
+
+
+def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
+    """Say why another effect is named than the one that explains most alone, which stands first in the table."""
+    first, named = d.candidates[0], d.effects[0]
+    if first.name == named:
+        return
+    yield f"Alone, {first.name} would explain more (posterior {first.ranked.posterior:.2f})."
+    objection = next((note for note in d.notes if first.name in note), None)
+    if first.name in d.together:
+        yield f"It is missing too; beside it, most stays unexplained without {named}."
+    elif objection is not None:
+        yield f"But {objection}."
+    else:
+        yield f"Beside {' and '.join(d.together or d.effects)} it is not needed."
 
 
 def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:

@@ -55,6 +55,30 @@ def said_at(odds: float, verdict: str, *effects: str, score=NOT_FITTED) -> str:
     return diagnosis_sentence(found, "mm", None)
 
 
+@pytest.mark.parametrize(
+    ("together", "notes", "said"),
+    [
+        (("settling", "backlash"), (), "It is missing too; beside it, most stays unexplained without settling."),
+        (("settling",), ("backlash helps among the measured poses, but not beyond",), "But backlash helps among the"),
+        (("settling", "latency"), (), "Beside settling and latency it is not needed."),
+    ],
+)
+def test_the_sentence_says_why_the_likeliest_in_the_table_is_not_named(together, notes, said):
+    ranked = SimpleNamespace(score=NOT_FITTED, adjusted=1e-3, posterior=1.0)
+    found = SimpleNamespace(
+        verdict="missing_effect",
+        effects=("settling",),
+        candidates=[SimpleNamespace(name=n, ranked=ranked, cross_validation=None) for n in ("backlash", "settling")],
+        residual_rms=0.0132,
+        noise_floor=0.0110,
+        certain=True,
+        together=together,
+        notes=notes,
+    )
+    told = diagnosis_sentence(found, "mm", None)
+    assert f"Alone, backlash would explain more (posterior 1.00). {said}" in told
+
+
 @pytest.mark.parametrize(("odds", "said"), [(25.0, "is missing ("), (4.0, "may be missing (")])
 def test_a_name_less_than_twenty_to_one_over_chance_may_be_missing(odds, said):
     told = said_at(odds, "missing_effect", "settling")
