@@ -238,13 +238,28 @@ def weigh_doubts(believed: ConventionChoice, doubted: ConventionChoice) -> Conve
     return believed
 
 
-def fitted_scale(capture_motions: RelativeScans, decided: ConventionChoice) -> float | None:
-    """Return how many times larger than the robot's motions the scans are; None where the motions do not tell it."""
+def choose_by_surfaces(capture: Capture, readings: Sequence[Reading], like: Interpretation) -> ConventionChoice:
+    """Choose among readings by the surfaces alone, paired, in the unit and the direction of a way that is believed."""
+    ways = all_interpretations(readings, [like.pairing], [like.length_unit], [like.carries])
+    return _choose_interpretation(capture, ways, None)
+
+
+def fitted_scale(motions: RelativeScans, decided: ConventionChoice, sizes: Sequence[float] = (1.0,)) -> float | None:
+    """Return how many times larger than the robot's motions the scans are; None where the motions do not tell it.
+
+    Args:
+        sizes: of the scans against the robot's motions, from which the factor is fitted.
+    """
     interpretation = decided.best.interpretation
     tried = [replace(interpretation, carries=carries).hypothesis(i) for i, carries in enumerate((True, False))]
-    fitted = fit_hypotheses(tried, capture_motions, "mm", scaled=True)
-    best = equivalent_hypotheses([fit for fit in fitted if fit.scale > 0])
-    return best[0].scale if best else None
+    found = []
+    for size in sizes:
+        # What a motion may leave open is stated for scans of the true size.
+        T = frames.make(motions.T[:, :3, :3], motions.T[:, :3, 3] / size)
+        fitted = fit_hypotheses(tried, RelativeScans(motions.pairs, T), "mm", scaled=True)
+        best = equivalent_hypotheses([fit for fit in fitted if fit.scale > 0])
+        found += [(best[0].open, best[0].scale * size)] if best else []
+    return min(found)[1] if found else None
 
 
 def _choose_interpretation(

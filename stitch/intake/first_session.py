@@ -19,6 +19,7 @@ from stitch.intake.convention_choice import (
     Interpretation,
     Mounting,
     all_interpretations,
+    choose_by_surfaces,
     choose_convention,
     choose_mounting,
     fitted_scale,
@@ -247,11 +248,15 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
         require_scale(found, fitted_scale(motions(), decided), stated)
     believed = decided.best.interpretation.reading.layout
     if not decided.determined or not (believed.sure or stated.rotation):
-        doubted = doubted_readings(raw, found.urdf, stated)
-        if doubted:
-            decided = weigh_doubts(
-                decided, choose_convention(capture, motions, doubted, pairs, units, stated.carries, shown)
-            )
+        doubted = [] if believed.turntable else doubted_readings(raw, found.urdf, stated)
+        if doubted and decided.determined:
+            decided = weigh_doubts(decided, choose_by_surfaces(capture, doubted, decided.best.interpretation))
+        elif doubted:
+            other = choose_convention(capture, motions, doubted, pairs, units, stated.carries, shown)
+            decided = weigh_doubts(decided, other)
+    if not decided.determined and found.clouds[0].suffix.lower() in DEPTH_SUFFIXES:
+        # Of counts that are far too large or small the motions close less well.
+        require_scale(found, fitted_scale(motions(), decided, (10.0, 0.1)), stated)
     of_joints = decided.best.interpretation.reading.rotation == JOINT_ANGLES
     turned = believed.turntable and stated.mount is None
     settled = choose_mounting(decided, "eye_to_hand" if turned else stated.mount, stated.inverse, of_joints)

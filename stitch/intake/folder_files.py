@@ -24,6 +24,7 @@ from stitch.reading.text_files import readable
 _EITHER = (".txt", ".csv", ".asc")
 _CLOUD_LINES = 400
 # A recording of a robot is as long as a scan; the names of its columns tell them apart.
+_RECORDINGS = 2
 _RECORDED, _HEADER = re.compile(rb"tcp|pose|joint|flange|q[wxyz]\b|actual_|quat", re.IGNORECASE), 4096
 
 
@@ -132,7 +133,9 @@ def find_folder_files(folder: Path, poses: Path | None = None) -> FolderFiles:
     clouds, other_clouds = clouds_among([f for f in files if f not in named])
     if not clouds:
         raise InputError(_no_clouds_message(folder, files))
-    taken = {*clouds, *other_clouds}
+    # A recording of the robot is as long as a scan, and the only text beside scans of another kind.
+    texts = [f for f in other_clouds if f.suffix.lower() in _EITHER]
+    taken = {*clouds, *(other_clouds if len(texts) > _RECORDINGS else set(other_clouds) - {*texts})}
     candidates = [f for f in files if f not in taken and _may_hold_poses(f) and not read_by_its_program(f)]
     _require_no_workbook(folder, [poses] if poses is not None else [] if candidates else files)
     chosen: list[Path] = []
@@ -147,7 +150,7 @@ def find_folder_files(folder: Path, poses: Path | None = None) -> FolderFiles:
         clouds=tuple(clouds),
         poses=tuple(chosen),
         urdf=urdfs[0] if len(urdfs) == 1 else None,
-        unused=(*other_clouds, *rest),
+        unused=tuple(dict.fromkeys((*(f for f in other_clouds if f not in chosen), *rest))),
     )
 
 

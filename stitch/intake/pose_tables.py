@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,7 @@ def split_cells(line: str, separator: str) -> list[str]:
     return [cell.strip().strip('"') for cell in row]
 
 
+@lru_cache(maxsize=1 << 17)
 def parse_number(cell: str) -> float | None:
     """Return the number in a cell, with a point or a comma, NaN for what programs write for none; None of words."""
     cell = cell.rstrip("°").strip()

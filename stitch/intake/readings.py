@@ -248,8 +248,8 @@ def joint_readings(layout: ColumnLayout, urdf: Path | None, angle_unit: str | No
     assert joints is not None
     if urdf is None:
         raise InputError(
-            "joint angles need the robot: put its URDF into the folder, or give poses; with DH rows write session.toml "
-            "by hand"
+            "joint angles need the robot; to fix: put the URDF into the folder, or give poses; with DH rows write "
+            "session.toml by hand"
         )
     robot, _, _ = arm_from_urdf(urdf, joints.shape[1])
     out = []

@@ -22,7 +22,7 @@ _SAME_TURN, _SAME_SHIFT = 2e-3, 1e-3
 # Stops are told from pauses by lasting so much longer.
 _LONGER = 3.0
 # Of a longer recording every second, third … row is read.
-_MOST_ROWS = 20_000
+_MOST_ROWS = 4_000
 # Stops that make a session, and rows a scan of what can only be a recording.
 _FEWEST, _MANY = 3, 5
 _TRUE = {"true", "on", "yes", "high", "trigger", "triggered", "1"}
@@ -84,10 +84,16 @@ def _triggered_rows(raw: RawPoses, count: int) -> Indices | None:
     return None
 
 
+def _rank(reading: Reading) -> int:
+    return -reading.rank
+
+
 def _rows_at_stops(found: Sequence[Reading], count: int) -> Indices:
     """Return the middle rows of the stops, of the longest ones where others are much shorter."""
     best: list[list[int]] = []
-    for reading in found:
+    # Where the arm stands, any order of angles shows it; a vector of rotation and quaternions have another sign at π.
+    usual = {(r.layout.words, r.angle_unit, r.rotation == "rotation-vector"): r for r in sorted(found, key=_rank)}
+    for reading in usual.values():
         unit = reading.layout.length_unit or pose_units(reading.T[:, :3, 3])[0]
         metres = 1e-3 if reading.rotation == JOINT_ANGLES else POSE_UNITS[unit]
         T = frames.make(reading.T[:, :3, :3], reading.T[:, :3, 3] * metres)
@@ -130,14 +136,15 @@ def middle_of_stops(T: Array, still: Mask) -> Indices:
 
 def _stops(T: Array, still: Mask) -> list[list[int]]:
     """Group rows that follow each other at one place."""
+    rows = np.flatnonzero(still)
     groups: list[list[int]] = []
-    for i in np.flatnonzero(still):
-        last = groups[-1] if groups else None
-        goes_on = last is not None and last[-1] == i - 1
-        if last is not None and goes_on and _is_near(T[last[0]][None], T[i][None], _SAME_TURN, _SAME_SHIFT)[0]:
-            last.append(int(i))
-        else:
-            groups.append([int(i)])
+    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+        left = run
+        while len(left):
+            near = _is_near(T[left[:1]], T[left], _SAME_TURN, _SAME_SHIFT)
+            end = len(left) if near.all() else int(np.argmin(near))
+            groups.append(left[:end].tolist())
+            left = left[end:]
     return groups
 
 

@@ -1,0 +1,249 @@
+"""Folders as people have them, through `stitch init`: python bench/field_folders.py [--cases] [--kinds] [--tables]
+
+--cases goes through ../shared/cases (STITCH_SHARED_CASES names another place), --kinds through the ways of writing in
+data_synth/fixtures/field_folders.py, --only NAME through one. Where init refuses, what it asks for is done to the letter,
+and it is asked again. Right: the views meet under the true hand-eye (cases), or poses, mount and pairing are those of the
+campaign (kinds). --tables writes the table of docs/own-data.md.
+"""
+
+import argparse
+import io
+import os
+import re
+import shutil
+import time
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.field_folders import KINDS, Campaign, Kind
+from data_synth.write import write_session
+from stitch import frames
+from stitch.cli.main import main as stitch
+from stitch.frames import Array
+from stitch.measurement.session import Session
+from stitch.reading.session_folder import load_session
+from stitch.writing.urdf_file import to_urdf
+
+ROOT = Path(__file__).resolve().parents[1]
+CASES = Path(os.environ.get("STITCH_SHARED_CASES") or ROOT.parent / "shared" / "cases")
+PAGE = ROOT / "docs" / "own-data.md"
+BEGIN, END = "<!-- field: begin -->\n", "<!-- field: end -->"
+# The hand-eye behind the cases; under it the views of a right session lie this near to each other, mm.
+T_CASES = frames.make(Rotation.from_rotvec([0.080, -0.120, 0.750]).as_matrix(), np.array([62.0, -38.0, 95.0]))
+MEET_MM, _NEIGHBOURS = 0.15, 8
+# Of poses as tables round them.
+NEAR_MM, NEAR_RAD = 0.05, 2e-4
+# Where the true hand-eye is another, or a wrist that never turns leaves it open.
+TURNTABLE, NO_HAND_EYE = (
+    "turntable_names_only",
+    ("gantry_constant_rotation", "line_profiles_xyz", "bag_without_tf_static", "quaternion_2_decimals"),
+)
+
+
+@dataclass
+class Outcome:
+    """What became of one folder."""
+
+    code: int
+    seconds: float
+    said: str
+
+    @property
+    def refusal(self) -> str:
+        """The sentence of a refusal."""
+        return self.said.strip().splitlines()[-1] if self.code else ""
+
+
+def init(folder: Path, out: Path, *flags: str) -> Outcome:
+    """Run `stitch init` as a person does who has no terminal."""
+    shutil.rmtree(out, ignore_errors=True)
+    said, begin, code = io.StringIO(), time.perf_counter(), 0
+    with redirect_stderr(said), redirect_stdout(said):
+        try:
+            stitch(["init", str(folder), "--yes", "-o", str(out), *flags])
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return Outcome(code, time.perf_counter() - begin, said.getvalue())
+
+
+def follow(refusal: str, folder: Path) -> tuple[str, ...] | None:
+    """Do what a refusal asks for, and return the flags that it asks for; None where it asks for something else."""
+    if found := re.search(r'^stitch: (\S+): .*as "depth_scale": (\S+)$', refusal):
+        file = Path(found[1])
+        file.write_text(file.read_text().rstrip().rstrip("}") + f', "depth_scale": {found[2]}}}')
+        return ()
+    if "--ball RADIUS" in refusal:
+        return ("--ball", "30")
+    found = re.search(r"state (--[a-z-]+) (\S+)$", refusal)
+    return (found[1], found[2]) if found else None
+
+
+def apart(session: Session, T_mount: Array) -> float:
+    """Return the median distance (mm) of points from planes through their neighbours in the next view."""
+    scale = {"mm": 1.0, "m": 1e3}[session.length_unit]
+    placed = []
+    for view in session.views:
+        T = np.array(view.T_base_flange)
+        T[:3, 3] *= scale
+        T = T if session.mount == "eye_in_hand" else frames.inverse(T[None])[0]
+        placed.append(frames.transform(T @ T_mount, view.cloud.points * scale))
+    found = []
+    for points, others in zip(placed, placed[1:], strict=False):
+        near = others[cKDTree(others).query(points[::9], k=_NEIGHBOURS)[1]]
+        middle = near.mean(axis=1)
+        normal = np.linalg.svd(near - middle[:, None])[2][:, 2]
+        found.append(np.median(np.abs(np.einsum("ni,ni->n", points[::9] - middle, normal))))
+    return float(np.median(found))
+
+
+def case_verdict(name: str, out: Path) -> str:
+    """Judge the session of a case."""
+    session = load_session(out)
+    if name == TURNTABLE:
+        return "right" if turns(session, [float(re.findall(r"\d+", v.name)[-1]) for v in session.views]) else "wrong"
+    if name in NO_HAND_EYE:
+        return "right" if session.mount == "eye_in_hand" else "wrong"
+    return "right" if apart(session, T_CASES) < MEET_MM else f"wrong ({apart(session, T_CASES):.2f} mm)"
+
+
+def turns(session: Session, degrees: Sequence[float]) -> bool:
+    """True if the poses turn the part about z by these angles, all in one sense."""
+    T = np.array([view.T_base_flange for view in session.views])
+    angles = np.degrees(np.unwrap(np.arctan2(T[:, 1, 0], T[:, 0, 0])))
+    wanted = np.array(degrees) - degrees[0]
+    off = min(np.abs((sign * (angles - angles[0]) - wanted + 180) % 360 - 180).max() for sign in (1, -1))
+    return session.mount == "eye_to_hand" and off < 0.01 and np.allclose(T[:, :3, 3], 0)
+
+
+def run_cases(scratch: Path, only: str | None) -> list[list[str]]:
+    """Every case with a folder `in`, on a copy of it."""
+    rows = []
+    for case in sorted(CASES.iterdir()):
+        if not (case / "in").is_dir() or only not in (None, case.name):
+            continue
+        folder, out = scratch / case.name, scratch / f"{case.name}-session"
+        shutil.copytree(case / "in", folder)
+        bag = next((f.parent for f in folder.rglob("metadata.yaml")), folder)
+        first = last = init(bag, out)
+        flags = follow(first.refusal, folder) if first.code else None
+        if flags is not None:
+            last = init(bag, out, *flags)
+        verdict = case_verdict(case.name, out) if not last.code else "refused"
+        if last.code and "pip install" in last.refusal:
+            verdict = "needs a package"
+        told = first.refusal.partition("; to fix: ")[2] if first.code else ""
+        rows.append(
+            [case.name, verdict + (" after the mend" if flags is not None else ""), f"{first.seconds:.1f}", told]
+        )
+        print(" | ".join(rows[-1]), flush=True)
+    return rows
+
+
+def campaigns(scratch: Path) -> dict[str, Campaign]:
+    """The campaign with joints, one of a part on a turntable, and one of a wrist that never turns."""
+    measured = measured_blade(11, views=10, mount="eye_in_hand", pixels=80, repeatability=(0.0, 0.0))
+    write_session(scratch / "campaign", measured, "campaign")
+    session = load_session(scratch / "campaign")
+    T = np.array([view.T_base_flange for view in session.views])
+    clouds = tuple(view.cloud.points for view in session.views)
+    arm = Campaign(clouds, T, np.array([view.joints for view in session.views]), to_urdf(session.robot))
+    part = np.vstack([frames.transform(pose @ measured.T_mount, c) for pose, c in zip(T, clouds, strict=True)])
+    part -= part.mean(axis=0)
+    angles = np.radians(np.arange(0, 360, 24.0))
+    spun = frames.make(Rotation.from_rotvec(np.outer(angles, [0, 0, 1])).as_matrix(), np.zeros(3))
+    X = frames.make(Rotation.from_euler("xz", [-115, 90], degrees=True).as_matrix(), np.array([400.0, 0.0, 130.0]))
+    turned = []
+    for pose in spun:
+        points = frames.transform(pose, part)
+        front = np.abs(np.arctan2(points[:, 1], points[:, 0])) < 1.2
+        turned.append(frames.transform(frames.inverse(X[None])[0], points[front]))
+    still = np.tile(T[0], (len(T), 1, 1))
+    still[:, :3, 3] += np.random.default_rng(5).uniform(-25, 25, (len(T), 3))
+    first = frames.transform(T[0] @ measured.T_mount, clouds[0])
+    seen = [frames.transform(frames.inverse((pose @ measured.T_mount)[None])[0], first) for pose in still]
+    return {"arm": arm, "turntable": Campaign(tuple(turned), spun), "still": Campaign(tuple(seen), still)}
+
+
+def kind_verdict(kind: Kind, campaign: Campaign, out: Path) -> str:
+    """Judge the session of a kind."""
+    session = load_session(out)
+    scale = {"mm": 1.0, "m": 1e3}[session.length_unit]
+    if kind.turntable:
+        angles = np.degrees(np.unwrap(np.arctan2(campaign.T[:, 1, 0], campaign.T[:, 0, 0])))
+        return "right" if len(session.views) == len(campaign.T) and turns(session, angles.tolist()) else "wrong"
+    middles = np.array([np.median(cloud, axis=0) for cloud in campaign.clouds])
+    own = np.array([np.median(view.cloud.points, axis=0) * scale for view in session.views])
+    which = np.linalg.norm(own[:, None] - middles, axis=2).argmin(axis=1)
+    wanted = [i for i in range(len(middles)) if i not in (kind.views or ())]
+    T = np.array([view.T_base_flange for view in session.views])
+    T[:, :3, 3] *= scale
+    if session.mount != "eye_in_hand" or sorted(which.tolist()) != wanted:
+        return f"wrong: {session.mount}, views {sorted(which.tolist())}"
+    shift = np.abs(T[:, :3, 3] - campaign.T[which][:, :3, 3]).max()
+    turn = frames.angle_between(T, campaign.T[which]).max()
+    return "right" if shift < NEAR_MM and turn < NEAR_RAD else f"wrong by {shift:.3g} mm, {turn:.2g} rad"
+
+
+def run_kinds(scratch: Path, only: str | None) -> list[list[str]]:
+    """Every kind, and its mend where it is refused."""
+    rows = []
+    known = campaigns(scratch)
+    for name, kind in KINDS.items():
+        if only not in (None, name):
+            continue
+        campaign = known["turntable" if kind.turntable else "still" if name == "xyz-alone" else "arm"]
+        folder, out = scratch / name, scratch / f"{name}-session"
+        folder.mkdir()
+        kind.write(folder, campaign)
+        first = last = init(folder, out, *kind.flags)
+        if first.code and kind.expected and kind.mend and re.search(kind.expected, first.refusal):
+            last = init(folder, out, *kind.mend(folder))
+        if last.code:
+            verdict = (
+                "rightly refused" if kind.expected and re.search(kind.expected, last.refusal) else "wrongly refused"
+            )
+        else:
+            verdict = kind_verdict(kind, campaign, out)
+            verdict = verdict if verdict == "right" or "NOT TOLD" not in last.said else f"guessed, said so: {verdict}"
+        words = first.refusal.partition("; to fix: ")[2] or first.refusal
+        rows.append([name, verdict + (" after the mend" if last is not first else ""), f"{first.seconds:.1f}", words])
+        print(" | ".join(rows[-1]), flush=True)
+    return rows
+
+
+def table(rows: Sequence[Sequence[str]]) -> str:
+    """The rows for a page."""
+    head = "| folder | what becomes of it | s | what a refusal asks for |\n|---|---|---|---|\n"
+    return head + "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def main() -> None:
+    """Print the rows and how many are right."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cases", action="store_true")
+    parser.add_argument("--kinds", action="store_true")
+    parser.add_argument("--only")
+    parser.add_argument("--tables", action="store_true")
+    asked = parser.parse_args()
+    with TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        rows = run_cases(scratch, asked.only) if asked.cases else []
+        rows += run_kinds(scratch, asked.only) if asked.kinds else []
+    good = sum(row[1].startswith(("right", "rightly")) for row in rows)
+    print(f"{good} of {len(rows)} right or rightly refused")
+    if asked.tables:
+        page = PAGE.read_text(encoding="utf-8")
+        before, rest = page.split(BEGIN)
+        PAGE.write_text(before + BEGIN + table(rows) + END + rest.split(END)[1], encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
