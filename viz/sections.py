@@ -73,12 +73,11 @@ def _bars(found: Diagnosis, screen: dict[str, Any], unit: str) -> dict[str, Any]
     """Return a bar of the error on views left out for the model as it is and for each candidate."""
     rows = [{"words": "nothing added", "effect": "", "heldout": screen["now"]["heldout"]}, *screen["candidates"]]
     most = max(row["heldout"] or 0.0 for row in rows) or 1.0
-    um = MICROMETRES[unit]
     bars = [
         {
             "words": row["words"],
             "effect": row["effect"],
-            "told": "–" if row["heldout"] is None else f"{row['heldout'] * um:.2g}",
+            "told": "–" if row["heldout"] is None else _in_um(row["heldout"], unit),
             "share": 100 * (row["heldout"] or 0.0) / most,
             "noise": 100 * screen["noise"] / most,
             "best": row["effect"] in found.effects,
@@ -94,6 +93,12 @@ def _bars(found: Diagnosis, screen: dict[str, Any], unit: str) -> dict[str, Any]
         "noise": length_text(screen["noise"], unit, 2),
         "others": tried - len(screen["candidates"]),
     }
+
+
+def _in_um(value: float, unit: str) -> str:
+    """Return a length in µm as one remembers it, without its unit."""
+    um = value * MICROMETRES[unit]
+    return f"{um:,.0f}" if um >= 10 else f"{um:.2g}"
 
 
 def _next(found: Diagnosis) -> str:

@@ -1,14 +1,12 @@
 """docs/gallery.md as text, and its pictures out of the pages of runs."""
 
-import base64
-import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import Image
+from bench.docs.report_pictures import shot
 
-_WIDE, _QUALITY = 760, 85
+_SIZE, _WIDE, _QUALITY = (1400, 1040), 900, 60
 
 _VERDICTS = {
     "adequate": "nothing is missing",
@@ -44,18 +42,13 @@ class Made:
 
 
 def picture_of(report: Path, path: Path) -> int:
-    """The still picture of a report, small; its bytes, 0 where the report has none."""
-    found = re.search(r'class="still"[^>]*src="data:image/png;base64,([^"]+)"', _text(report))
-    if found is None:
+    """A picture of a page's screen, small; its bytes, 0 where there is no page."""
+    if not report.is_file():
         return 0
-    shot = Image.open(io.BytesIO(base64.b64decode(found[1]))).convert("RGB")
-    shot.thumbnail((_WIDE, _WIDE))
-    shot.save(path, quality=_QUALITY, method=6)
+    picture = shot(report, *_SIZE)
+    picture.thumbnail((_WIDE, _WIDE))
+    picture.save(path, quality=_QUALITY, method=6)
     return path.stat().st_size
-
-
-def _text(file: Path) -> str:
-    return file.read_text(encoding="utf-8") if file.is_file() else ""
 
 
 @dataclass(frozen=True)
@@ -125,9 +118,7 @@ _SECTION = r"^### (\S+)$.*?(?=^##|\Z)"
 _HEAD = """# Gallery
 
 Scenes of the simulator and measured objects, run and diagnosed by the command line. Made by
-`python -m bench.docs.gallery`; the pictures are those of the pages of the runs: the part by the hand-eye alone and in
-the stitched cloud, light where the views agree, dark red where they do not, grey where one view alone saw it, each with
-a scale of its own ([how to read them](report.md)).
+`python -m bench.docs.gallery`; the pictures are the screens of the runs' pages ([how to read them](report.md)).
 
 Recordings are not kept in the project; `python -m bench.docs.gallery --keep FOLDER` makes them, then
 `stitch view FOLDER/blade/run` shows one.

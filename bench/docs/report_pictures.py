@@ -1,14 +1,13 @@
 """Pictures of pages and recording of the demo's cell, as people see them: python -m bench.docs.report_pictures.
 
-Writes docs/pictures/report-*.png (light, dark, phone, paper), two-runs.png (the run before and after an effect was
-added) and recording-*.png (tabs, five moments of `model`).
-Needs a Chromium on the path, a software renderer for Rerun (Mesa's Vulkan drivers), and pypdfium2 for paper.
+Writes docs/pictures/report-*.png (light, dark, phone), two-runs.png (the run before and after an effect was added) and
+recording-*.png (the first tab and the cell). Needs a Chromium on the path, and a software renderer for Rerun (Mesa's
+Vulkan drivers).
 """
 
 import argparse
 import io
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -20,29 +19,25 @@ import rerun.experimental as viewer
 from PIL import Image
 
 from stitch.cli.main import main as stitch
-from stitch.cli.report import print_page, printing_browser
+from stitch.cli.report import printing_browser
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 _DRAWN = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--hide-scrollbars")
 _PAGES = {
-    "report-light": (1100, 1500),
-    "report-dark": (1100, 1500, "--blink-settings=preferredColorScheme=0"),
+    "report-light": (1400, 1040),
+    "report-dark": (1400, 1040, "--blink-settings=preferredColorScheme=0"),
     "report-phone": (500, 1500),
 }
-_PORT, _WINDOW, _TITLE = 9923, "1400x760", 37
-MOMENTS = (0, 10, 15, 20, 30)  # of the timeline `model`: a step every 10
+_PORT, _WINDOW, _TITLE = 9923, "1400x860", 37
+_TABS = {"before-after": 0, "cell": 3}
 
 
 def demo_run(folder: Path) -> Path:
-    """A blade cell with two joints that give way, what is missing found and added."""
-    session, run = folder / "blade", folder / "after"
-    call(
-        ["synth", "blade", session, "--hide", "joint_compliance=2", "--seed", "3"],
-        ["run", session, "-o", run, "--no-recording"],
-    )
-    shutil.copytree(run, folder / "before")
-    call(["add", run, "--suggested"])
-    return run
+    """The demo's cell, what is missing found and added; beside it the run before."""
+    call(["demo", folder / "demo"])
+    session, before = folder / "demo" / "blade", folder / "before"
+    call(["run", session, "-o", before, "--tolerance", "0.05"], ["diagnose", before])
+    return folder / "demo" / "run"
 
 
 def call(*commands: list[object]) -> None:
@@ -63,17 +58,9 @@ def two(before: Path, run: Path) -> None:
 
 
 def pages(run: Path) -> None:
-    """The page in a browser: light, dark, on a phone, on paper."""
-    browser, page = printing_browser(), run / "report.html"
+    """The page in a browser: light, dark, on a phone."""
     for name, (width, height, *more) in _PAGES.items():
-        keep(shot(page, width, height, *more), name)
-    print_page(browser, page, run / "report.pdf")
-    try:
-        from pypdfium2 import PdfDocument
-    except ImportError:
-        print("report-print.png: not made, pypdfium2 is not installed")
-        return
-    keep(PdfDocument(run / "report.pdf")[0].render(scale=1.4).to_pil(), "report-print")
+        keep(shot(run / "report.html", width, height, *more), name)
 
 
 def shot(page: Path, width: int, height: int, *more: str) -> Image.Image:
@@ -87,14 +74,14 @@ def shot(page: Path, width: int, height: int, *more: str) -> Image.Image:
 
 
 def recording(run: Path) -> None:
-    """Every tab of the recording, and the moments of `model`."""
+    """Tabs of the recording."""
     program = Path(sys.executable).with_name("rerun")
     arguments = [program, run / "recording.rrd", "--headless", "--port", str(_PORT), "--window-size", _WINDOW]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     shown = subprocess.Popen(arguments, **quiet, start_new_session=True)
     try:
         client = _loaded()
-        for tab, name in enumerate(("before-after", "model", "missing", "cell", "error")):
+        for name, tab in _TABS.items():
             blueprint = client.get_blueprint().blueprint
             for node in blueprint.values():
                 tabs = node.get("ContainerBlueprint", {})
@@ -102,14 +89,9 @@ def recording(run: Path) -> None:
                     tabs["active_tab"] = tabs["contents"][tab]
             client.set_blueprint(blueprint, of="recording")
             time.sleep(5)
-            for moment in MOMENTS if name == "model" else (None,):
-                if moment is not None:
-                    client.set_time("model", sequence=moment, play_state="paused")
-                    time.sleep(2)
-                picture = Image.open(io.BytesIO(_taken(client)))
-                # The window's own bar says what machine took the picture.
-                picture = picture.crop((0, _TITLE, *picture.size))
-                keep(picture, f"recording-{name}" + ("" if moment is None else f"-{moment}"))
+            picture = Image.open(io.BytesIO(_taken(client)))
+            # The window's own bar says what machine took the picture.
+            keep(picture.crop((0, _TITLE, *picture.size)), f"recording-{name}")
     finally:
         # The viewer too, which the launcher leaves behind: the next recording would open in it.
         os.killpg(shown.pid, signal.SIGTERM)
@@ -161,10 +143,11 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="a run folder, instead of the demo's cell")
     given = parser.parse_args().run
     with tempfile.TemporaryDirectory() as folder:
-        run = given or demo_run(Path(folder))
+        added = None if given else demo_run(Path(folder))
+        run = given or Path(folder) / "before"
         pages(run)
-        if given is None:
-            two(Path(folder) / "before", run)
+        if added is not None:
+            two(run, added)
         recording(run)
 
 

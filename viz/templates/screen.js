@@ -186,7 +186,8 @@ function partStage(card, data, index) {
       const [x, y] = project(i), px = (x + 1) / 2 * w, py = (1 - y) / 2 * h, side = px > w / 2 ? "right" : "left", value = state.values[tag.patch];
       if (px < 0 || px > w || py < 0 || py > h) continue;
       let ty = Math.min(h - 16, Math.max(16, py + 14));
-      while (taken[side].some(t => Math.abs(t - ty) < 26)) ty += 26;
+      const away = ty > h / 2 ? -26 : 26;
+      while (taken[side].some(t => Math.abs(t - ty) < 26)) ty += away;
       taken[side].push(ty);
       const tx = side === "right" ? w - 40 : 40, text = Number.isFinite(value) ? roundLength(value) : "no value";
       nodes.push(svgNode("line", { class: "lead", x1: px, y1: py, x2: tx, y2: ty }), svgNode("circle", { class: "spot", cx: px, cy: py, r: 4 }),
