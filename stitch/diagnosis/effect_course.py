@@ -15,6 +15,7 @@ from stitch import frames
 from stitch.diagnosis.candidates import Form, candidate_as_fitted
 from stitch.diagnosis.residual_structure import Dependence, predicted_distances
 from stitch.diagnosis.score import Score, score
+from stitch.diagnosis.unnamed_joint_laws import JointCurve
 from stitch.effects.contract import EFFECTS, Effect, parameters_in, twist
 from stitch.frames import Array, Indices
 from stitch.measurement.measurement import ScanView, Views
@@ -22,6 +23,7 @@ from stitch.model.forward import moves_points, point_correction, scan_points
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import surfaces_of
+from stitch.units import covariate_text
 
 # Dots along one course: more cannot be told apart.
 _MOST = 300
@@ -73,10 +75,24 @@ def course_in_model(linear: LinearModel, term: Term) -> EffectCourse | None:
     return _course_of_views(fitted, term, form, term.values[form.keep], fitted.design @ fitted.baseline_trial.solve())
 
 
+def course_of_curve(linear: LinearModel, curve: JointCurve) -> EffectCourse | None:
+    """How far a joint is off along what its error follows without a name, beside its mean."""
+    fitted, joint = linear.scatter_only, curve.joint - 1
+    law = np.interp(curve.view_values, curve.at, curve.error)
+    turned = _joint_columns(fitted)[:, joint : joint + 1]
+    response = turned * _of_rows(fitted, law[:, None], len(turned))
+    X = np.hstack([fitted.design, response])
+    found = fitted.trial(X).solve()
+    columns = _displacements(fitted, turned)[..., 0]
+    motion = _Motion(f"joint {curve.joint}", "rad", columns, found[-1] * law[:, None] * columns, joint)
+    axis = (covariate_text(curve.covariate), "") if curve.covariate != "time_s" else ("time", "s")
+    return _along_motion(fitted, motion, X @ found, 1, (*axis, curve.view_values))
+
+
 def course_of_dependence(linear: LinearModel, found: Dependence) -> EffectCourse:
-    """Where the views lie off along what their displacement follows without a name, and the shape that fits best."""
+    """Where the views lie off along what their displacement follows without a name, and its means in bins."""
     shown = _some(len(found.at))
-    fitted = found.fitted - found.fitted.mean() + found.moved.mean()
+    fitted = np.interp(found.at, found.bins, found.mean)
     sigma = float(np.std(found.moved - fitted, ddof=1)) if len(fitted) > 1 else 0.0
     dots = {"measured": found.moved, "sigma": np.full(len(fitted), sigma), "predicted": fitted}
     return EffectCourse(
@@ -119,6 +135,28 @@ def _course_of_views(
         explained: response of the whole model with the effect.
     """
     motion = _motion(linear, term, form, values)
+    axis = _lives_on(linear.measurement.views, term, motion.joint)
+    # Where the part sat at first is nobody's error.
+    return _along_motion(linear, motion, explained, len(values), axis, from_first=term.effect.place == "part")
+
+
+def _along_motion(
+    linear: LinearModel,
+    motion: _Motion,
+    explained: Array,
+    free: int,
+    axis: tuple[str, str, Array],
+    *,
+    from_first: bool = False,
+) -> EffectCourse | None:
+    """Every view along its unit motion: the line, and beside it what the model with the effect leaves.
+
+    Args:
+        explained: response of the whole model with the effect.
+        free: number of fitted parameters of the effect.
+        axis: what the effect lives on, its unit, and where the views stand along it (V,).
+        from_first: count from where the first view is.
+    """
     square = np.sum(motion.columns**2, axis=1)
     if not (square > 0).any():
         return None
@@ -127,10 +165,9 @@ def _course_of_views(
     left = linear.mixed.z.ravel() - linear.reduce(explained[:, None])[:, 0]
     line = np.sum(motion.columns * motion.response, axis=1) / square
     off = np.sum(motion.columns * _displacements(linear, linear.observation.expand(left[:, None]))[..., 0], axis=1)
-    scatter = float(np.sqrt(np.mean(off**2 / square) * len(line) / max(len(line) - len(values), 1)))
-    follows, unit, at = _lives_on(linear.measurement.views, term, motion.joint)
-    if term.effect.place == "part":
-        # Where the part sat at first is nobody's error.
+    scatter = float(np.sqrt(np.mean(off**2 / square) * len(line) / max(len(line) - free, 1)))
+    follows, unit, at = axis
+    if from_first:
         line = line - line[np.argmin(at)]
     sign = 1.0 if motion.joint is not None or line[np.argmax(np.abs(line))] >= 0 else -1.0
     shown = _some(len(line))
@@ -145,11 +182,9 @@ def _motion(linear: LinearModel, term: Term, form: Form, values: Array) -> _Moti
     response = _displacements(linear, form.response @ values[:, None])[..., 0]
     unit, fitted = linear.measurement.length_unit, form.at(values)
     if term.effect.place == "robot":
-        of_joints = Term(EFFECTS["joint_offset"], parameters_in(linear.measurement, EFFECTS["joint_offset"]))
-        turned = linear.responses([of_joints])[0].columns
+        turned = _joint_columns(linear)
         law = _joint_laws(linear.measurement.views, fitted)
-        per_view = len(turned) // len(law)
-        seen = linear.reduce(turned * np.repeat(law, per_view, axis=0)) if len(turned) == per_view * len(law) else law
+        seen = linear.reduce(turned * _of_rows(linear, law, len(turned)))
         joint = int(np.argmax(np.sum(seen**2, axis=0)))
         columns = _displacements(linear, turned[:, joint : joint + 1])[..., 0]
         return _Motion(f"joint {joint + 1}", "rad", columns, law[:, joint : joint + 1] * columns, joint)
@@ -162,6 +197,20 @@ def _motion(linear: LinearModel, term: Term, form: Form, values: Array) -> _Moti
     direction = np.linalg.svd(response - response.mean(axis=0), full_matrices=False)[2][0]
     of = "the part" if term.effect.place == "part" else "the arm"
     return _Motion(of, unit, np.tile(direction, (len(response), 1)), response)
+
+
+def _joint_columns(linear: LinearModel) -> Array:
+    """(·, n) response to a turn of each joint."""
+    of_joints = Term(EFFECTS["joint_offset"], parameters_in(linear.measurement, EFFECTS["joint_offset"]))
+    return linear.responses([of_joints])[0].columns
+
+
+def _of_rows(linear: LinearModel, values: Array, count: int) -> Array:
+    """(count, P) values of the views (V, P) for every row of a response; zero for rows of no view."""
+    observation = linear.observation
+    each = 6 if isinstance(observation, SurfaceObservation) else len(linear.mixed.z[0])
+    own = np.repeat(values, each, axis=0)
+    return np.vstack([own, np.zeros((count - len(own), values.shape[1]))])
 
 
 def _constant(views: Views, xi: Array) -> Array:

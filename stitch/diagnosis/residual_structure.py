@@ -194,7 +194,6 @@ class Dependence:
     shape: str  # the empirical form that fits best, in words
     at: Array  # (V,) the covariate of every view
     moved: Array  # (V,) displacement of every view along that direction, length_unit
-    fitted: Array  # (V,) what the empirical form says of it
 
 
 def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Dependence]:
@@ -257,7 +256,6 @@ def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependenc
         shape=effect.formula,
         at=course,
         moved=y,
-        fitted=fitted @ direction,
     )
 
 

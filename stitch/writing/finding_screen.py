@@ -3,6 +3,7 @@
 The page of a run, its review and the first tab of its recording draw from this part of diagnosis.json alone.
 """
 
+import re
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,13 +17,14 @@ from stitch.diagnosis.effect_course import (
     EffectCourse,
     course_in_model,
     course_of_candidate,
+    course_of_curve,
     course_of_dependence,
 )
 from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
 from stitch.frames import Array
 from stitch.observations.surfaces.surface_model import surfaces_of
-from stitch.units import angle_text, length_text
+from stitch.units import angle_text, covariate_text, length_text
 
 # What each of the best candidate effects would leave of the field of disagreement.
 
@@ -163,6 +165,8 @@ def _why(found: Diagnosis, courses: dict[str, EffectCourse | None]) -> EffectCou
     terms = found.linear.model.terms
     if found.verdict == "adequate":
         return course_in_model(found.linear, terms[-1]) if terms else None
+    if found.curves:
+        return course_of_curve(found.linear, found.curves[0])
     return course_of_dependence(found.linear, found.depends_on[0]) if found.depends_on else None
 
 
@@ -199,7 +203,11 @@ def _headline(found: Diagnosis, why: EffectCourse | None, descriptions: dict[str
             named = " and ".join(found.linear.model.effects)
             return f"With {named} in the model, nothing more is missing." if named else "Nothing is missing."
         case "unknown_effect":
-            follows = "" if why is None or not _follows_clearly(found) else f": the error follows {why.follows}"
+            follows = ""
+            if found.curves:
+                follows = f": the error follows joint {found.curves[0].joint}"
+            elif found.depends_on and found.depends_on[0].p_value < CLEAR_DEPENDENCE:
+                follows = f": the error follows {_plain_covariate(found.depends_on[0].covariate)}"
             return f"Something is missing that no known effect explains{follows}."
     causes = [_cause(c, why, descriptions) for c in compared(found) if c.name in found.effects]
     if len(causes) > 1:
@@ -208,8 +216,10 @@ def _headline(found: Diagnosis, why: EffectCourse | None, descriptions: dict[str
     return f"{'' if found.certain else 'Perhaps: '}{causes[0]}."
 
 
-def _follows_clearly(found: Diagnosis) -> bool:
-    return bool(found.depends_on) and found.depends_on[0].p_value < CLEAR_DEPENDENCE
+def _plain_covariate(name: str) -> str:
+    """Return a covariate as people call it: j2_deg is the angle of joint 2."""
+    joint = re.fullmatch(r"j(\d+)_deg", name)
+    return f"the angle of joint {joint[1]}" if joint else covariate_text(name).partition(" (")[0]
 
 
 def _proof(found: Diagnosis, why: EffectCourse | None) -> str:

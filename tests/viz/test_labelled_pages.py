@@ -46,7 +46,7 @@ def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, caps
     named = "Missing in the model: joint_offset (a joint counts its angle from a wrong zero). "
     assert finding["plain"].startswith(f"{named}Adding it should reduce the error from ")
     state = RunReview(run).state()
-    assert diagnosed.startswith(f"{finding['plain']} {finding['sentence']}")
+    assert f"{finding['plain']} {finding['sentence']}" in diagnosed
     assert (state["diagnosis"]["plain"], state["diagnosis"]["sentence"]) == (finding["plain"], finding["sentence"])
     page = (run / "report.html").read_text()
     assert page.count(unbroken(finding["plain"])) == 1  # where the evidence stands

@@ -10,7 +10,10 @@ function showScreen(root, part, found, um) {
   const numbers = part && partNumbers(part), own = part && part.steps.map(s => numbers.unpack(s.values));
   const nearest = found && found.places && part ? nearestPlaces(part, numbers, found.places) : null;
   const mapped = field => Float32Array.from(nearest, j => field[j] === null ? NaN : field[j] * um);
-  let shown = found && nearest && found.candidates.find(c => c.field && found.named.includes(c.effect)) || null, view = -1;
+  // Without a name, and nothing added yet, the best candidate stands beside the model as it is.
+  const first = found && nearest && (found.candidates.find(c => c.field && found.named.includes(c.effect))
+    || found.verdict === "unknown_effect" && found.candidates.find(c => c.field)) || null;
+  let shown = first, asked = null, view = -1;
 
   // What stands left and right: {title, values, mean}.
   function pair() {
@@ -84,7 +87,7 @@ function showScreen(root, part, found, um) {
 
   // Why: measured dots and the predicted line over what the effect lives on.
   function why() {
-    const place = at("why"), course = shown && shown.why || found && found.why, title = at("why-title");
+    const place = at("why"), course = asked && asked.why || found && found.why, title = at("why-title");
     if (!place) return;
     if (!course) {
       if (!part || !part.byView) return;
@@ -105,11 +108,11 @@ function showScreen(root, part, found, um) {
   }
 
   root.querySelectorAll("[data-show]").forEach(button => button.addEventListener("click", () => {
-    shown = found.candidates.find(c => c.effect === button.dataset.show) || null; choose();
+    shown = asked = found.candidates.find(c => c.effect === button.dataset.show) || null; choose();
   }));
   function choose() {
     root.querySelectorAll("[data-show]").forEach(b => b.setAttribute("aria-pressed", String(shown !== null && b.dataset.show === shown.effect)));
-    if (shown) for (const [key, value] of [["heldout", shown.heldout], ["mean", shown.mean], ["worst", shown.worst]]) {
+    if (asked) for (const [key, value] of [["heldout", shown.heldout], ["mean", shown.mean], ["worst", shown.worst]]) {
       const tile = root.ownerDocument.querySelector(`[data-tile=${key}]`);
       if (tile) tile.textContent = found.now[key] === null || value === null ? "–" : fromTo(found.now[key] * um, value * um);
     }
@@ -119,7 +122,6 @@ function showScreen(root, part, found, um) {
   choose();
   let wide = root.clientWidth;
   new ResizeObserver(() => { if (root.clientWidth !== wide) { wide = root.clientWidth; why(); if (views.length) legend(pair()); } }).observe(root);
-  return { show(effect) { shown = found && found.candidates.find(c => c.effect === effect && c.field) || null; choose(); } };
 }
 
 // Two lengths, as the tiles have them.
@@ -141,7 +143,7 @@ function coursePlot(course, names, um) {
   const jumps = inOrder && first > 0 && predicted.slice(first).every(p => Math.abs(p) > most / 2);
   const said = measured.map((m, i) => `${course.views.length ? `${named_[i]}, ` : ""}${shortNumber(x[i])}: measured ${shortNumber(m)} ± ${shortNumber(2 * sigma[i])} ${unit}, predicted ${shortNumber(predicted[i])} ${unit}`);
   return {
-    title: `Why: how far ${course.of} is off (${unit}). Dots: measured ± 2σ. Line: what the effect predicts`,
+    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are" : "is"} off (${unit}). Dots: measured ± 2σ. Line: ${course.of.endsWith("views") ? "means" : "what the effect predicts"}`,
     spec: {
       x: { label, names: inOrder && course.views.length === (names || []).length ? named_ : undefined }, y: { label: unit },
       shaded: jumps ? { from: (x[first - 1] + x[first]) / 2, said: `from ${named_[first]} on` } : undefined,
