@@ -1,9 +1,9 @@
 """Folders as people have them, through `stitch init`: python bench/field_folders.py [--cases] [--kinds] [--tables]
 
 --cases goes through ../shared/cases (STITCH_SHARED_CASES names another place), --kinds through the ways of writing in
-data_synth/fixtures/field_folders.py, --only NAME through one. Where init refuses, what it asks for is done to the letter,
-and it is asked again. Right: the views meet under the true hand-eye (cases), or poses, mount and pairing are those of the
-campaign (kinds). --tables writes the table of docs/own-data.md.
+data_synth/fixtures/field_folders.py, --only NAME through one. Where init refuses, what it asks for is done to the
+letter, and it is asked again. Right: the views meet under the true hand-eye (cases), or poses, mount and pairing are
+those of the campaign (kinds). --tables writes the table of docs/own-data.md.
 """
 
 import argparse

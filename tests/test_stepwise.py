@@ -17,7 +17,7 @@ from stitch.reading.session_folder import load_session
 from stitch.stored.stored_run import load_run
 from stitch.writing.diagnosis_document import diagnosis_document, suggested_command
 from stitch.writing.json_file import write_json
-from stitch.writing.run_folder import write_run
+from stitch.writing.run_folder import write_with_page
 
 OFFSET = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
 
@@ -105,7 +105,7 @@ def test_what_was_tried_and_dropped_is_remembered_and_not_proposed_again(monkeyp
     assert "--suggested" not in suggested_command(found, "RUN")
     # In a later process too, as diagnosis.json of the run has it.
     (tmp_path / "run").mkdir()
-    write_run(first, tmp_path / "run")
+    write_with_page(first, tmp_path / "run")
     write_json(diagnosis_document(found), tmp_path / "run" / "diagnosis.json")
     again = load_run(tmp_path / "run")
     assert again.tried == found.tried

@@ -194,8 +194,8 @@ def _intrinsics(item: Any, where: str) -> Intrinsics:
         raise InputError(
             f"{where}: the intrinsics are no matrix (3, 3) with focal lengths; to fix: pass fx, fy, cx, cy in pixels"
         )
-    f, c = (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2]))
-    return Intrinsics(Path(where), *f, *c, distortion=np.zeros(0), size=size, units_per_metre=None)
+    fx, fy, cx, cy = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    return Intrinsics(Path(where), fx, fy, cx, cy, distortion=np.zeros(0), size=size, units_per_metre=None)
 
 
 def poses_of(poses: Any, where: str) -> Array:

@@ -207,8 +207,7 @@ def _joint_columns(linear: LinearModel) -> Array:
 
 def _of_rows(linear: LinearModel, values: Array, count: int) -> Array:
     """(count, P) values of the views (V, P) for every row of a response; zero for rows of no view."""
-    observation = linear.observation
-    each = 6 if isinstance(observation, SurfaceObservation) else len(linear.mixed.z[0])
+    each = len(linear.mixed.z[0]) if surfaces_of(linear) is None else 6
     own = np.repeat(values, each, axis=0)
     return np.vstack([own, np.zeros((count - len(own), values.shape[1]))])
 
