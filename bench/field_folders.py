@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -96,7 +97,7 @@ def apart(session: Session, T_mount: Array) -> float:
         T = T if session.mount == "eye_in_hand" else frames.inverse(T[None])[0]
         placed.append(frames.transform(T @ T_mount, view.cloud.points * scale))
     found = []
-    for points, others in zip(placed, placed[1:], strict=False):
+    for points, others in pairwise(placed):
         near = others[cKDTree(others).query(points[::9], k=_NEIGHBOURS)[1]]
         middle = near.mean(axis=1)
         normal = np.linalg.svd(near - middle[:, None])[2][:, 2]

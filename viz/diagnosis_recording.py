@@ -10,6 +10,7 @@ import rerun as rr
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
+from stitch.measurement.session import Session
 from stitch.system.files import whole_file
 from stitch.units import MICROMETRES
 from stitch.writing.diagnosis_document import effect_description, effect_in_words, plain_finding, suggested_command
@@ -24,8 +25,11 @@ _SHOWN = 8
 NOT_YET = "Not asked yet: `stitch diagnose RUN` says which effect is missing."
 
 
-def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, length_unit: str, path: Path) -> None:
+def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, session: Session, path: Path) -> None:
     """Put a diagnosis into a recording, in place of an earlier one; nothing where there is no recording.
+
+    Args:
+        session: with the views that were diagnosed.
 
     Raises:
         OSError: the recording cannot be written.
@@ -35,7 +39,7 @@ def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, length_unit: 
     own = path.with_name(".diagnosis.part.rrd")
     try:
         file = RecordingFile("stitch", own, id_of(found.linear.measurement.capture.name))
-        log_diagnosis(file.stream, found, screen, length_unit)
+        log_diagnosis(file.stream, found, screen, session)
         file.write()
         with whole_file(path) as scratch:
             subprocess.run(
@@ -50,8 +54,9 @@ def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, length_unit: 
         own.unlink(missing_ok=True)
 
 
-def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, screen: dict[str, Any] | None, length_unit: str) -> None:
+def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, screen: dict[str, Any] | None, session: Session) -> None:
     """Verdict with the table of candidate effects, bars of the evidence, displacements of the views."""
+    length_unit = session.length_unit
     um = MICROMETRES[length_unit]
     shown = [c for c in found.candidates if c.ranked.score.observable][:_SHOWN]
     told = [] if screen is None else screen["candidates"]
@@ -73,7 +78,7 @@ def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, screen: dict[str, A
     lines += ["", *(f"- To measure next: {p.do} (separates {' and '.join(p.separates)})" for p in found.next)]
     rec.log("diagnosis/verdict", words("\n".join(lines)), static=True)
     if screen is not None and screen["why"] is not None:
-        log_course(rec, screen["why"], [scan.name for scan in found.linear.measurement.capture.scans], um)
+        log_course(rec, screen["why"], session.names, um)
     evidence = np.array([c.ranked.score.log_bayes_factor for c in shown])
     rec.log("diagnosis/evidence", rr.BarChart(evidence, color=COLOURS_OF_FEW[1]), static=True)
     moved = np.linalg.norm(found.linear.view_displacements(), axis=1) * um

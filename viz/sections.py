@@ -51,7 +51,7 @@ def write_diagnosis(found: Diagnosis, state: Run, folder: Path) -> None:
     if found.verdict in _NAMING and screen["candidates"]:
         parts["numbers"] = render("tiles.html.j2", tiles=_tiles(screen, unit))
     _insert(folder / "report.html", parts)
-    add_diagnosis(found, screen, unit, folder / "recording.rrd")
+    add_diagnosis(found, screen, state.session, folder / "recording.rrd")
 
 
 def _words(text: str) -> str:

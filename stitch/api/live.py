@@ -89,7 +89,7 @@ class LiveRecording(Protocol):
 
 
 class LiveSession:
-    """A session that grows by one view at a time; `stitch.live` begins one.
+    """Session that grows by one view at a time; `stitch.live` begins one.
 
     Every view is matched with those before it, once. `finish` runs the session as `stitch.run` does, so that its result
     is that of a batch.
@@ -349,7 +349,7 @@ def live(
     name: str = "session",
     recording: Path | str | None = None,
 ) -> LiveSession:
-    """Begin a session whose views come one by one.
+    """Return a session without views, which are taken in and judged one by one.
 
     Args:
         mount, robot, scanner, unit, cloud_unit, name: as of `Session.from_arrays`; scanner.pose (4, 4), where it is

@@ -139,7 +139,7 @@ def test_forbidden_region_keeps_a_gripper_out_of_the_fit(pane, pane_cad):
     local = frames.transform(np.linalg.inv(T), scan.points)
     box = Box("gripper", np.array([250.0, -99, -99]), np.array([430.0, 99, 999]))
     lifted = scan.points + np.where(box.holds(local), 1.0, 0.0)[:, None] * scan.normals
-    scan = type(scan)(lifted, scan.normals, scan.usable, scan.area, scan.spacing, scan.noise)
+    scan = replace(scan, points=lifted)
     found = fit_cad(scan, pane_cad, T, Regions(forbidden=(box,)))
     assert furthest(found.T_base_part, T, pane) < 0.05
 

@@ -146,11 +146,12 @@ def test_what_was_suggested_shows_another_map_before_than_after(few_effects, tmp
 
 
 def test_the_recording_says_where_a_joint_errs_without_a_name(tmp_path):
-    found = diagnose(run(labelled_cell(3, views=30)[0]))
+    session = labelled_cell(3, views=30)[0]
+    found = diagnose(run(session))
     angle, error = np.array([-60.0, 0.0, 40.0]), np.array([-1e-4, 0.0, 2.5e-4])
     course = JointCurve(2, "j3_deg", 0.8, angle, error, np.full(3, 1e-5), view_values=angle)
     file = RecordingFile("stitch", tmp_path / "d.rrd")
-    log_diagnosis(file.stream, replace(found, curves=(course,)), None, "mm")
+    log_diagnosis(file.stream, replace(found, curves=(course,)), None, session)
     file.write()
     said = columns(tmp_path / "d.rrd", "TextDocument:text")["/diagnosis/verdict"][0]
     assert unbroken("Joint 2 is off by -0.1 ± 0.01 mrad at j3 = -60°, and by 0.25 ± 0.01 mrad at j3 = 40°") in said
