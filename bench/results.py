@@ -162,6 +162,11 @@ def base_of_experiment_1(room: Room) -> str:
     return "; ".join(parts)
 
 
+def flange_of_p1(room: Room) -> str:
+    alpha, _, gamma = room.json("stitch base examples/base_to_base_joints.toml --json")["flange_rpy"]["P1"]
+    return f"P1 α {alpha:.4f}, γ {gamma:.4f}"
+
+
 def base_of_experiment_2(room: Room) -> str:
     said = " ".join(room.run("stitch base examples/base_to_base_2.toml").split())
     return f"refused: rod and joints differ by {re.search(r'difference of [+]?([-0-9.]+) m', said).group(1)} m"
@@ -199,6 +204,25 @@ def drill_errors(room: Room) -> str:
 def drill_before(room: Room) -> str:
     errors = [e for group in room.json(DRILL[-1])["groups"].values() for e in group["drive_errors"]]
     return f"{min(errors):.2f} to {max(errors):.2f} mm, mean {np.mean(errors):.2f}"
+
+
+def trials(stage: str, what: str, unit: str) -> Callable[[Room], str]:
+    def reached(room: Room) -> str:
+        values = [t[what] for t in room.json(DRILL[-1])["trials"] if t["stage"] == stage]
+        return f"{min(values):.2f} to {max(values):.2f} {unit}, mean {np.mean(values):.2f}"
+
+    return reached
+
+
+def pin(room: Room) -> str:
+    bounds = [(t["pin_position"], t["pin_tilt_deg"]) for t in room.json(DRILL[-1])["trials"] if t["pin_position"]]
+    position, tilt = np.max(bounds, axis=0)
+    return f"≤ {position:.2f} mm, ≤ {tilt:.2f}°"
+
+
+def plate(room: Room) -> str:
+    found = room.json(DRILL[-1])["plate"]
+    return f"h {found['height']:.2f} mm, {found['stated']:.2f} stated; parallel within {found['parallelism']:.2f} mm"
 
 
 def drill_camera(room: Room) -> str:
@@ -242,6 +266,12 @@ SYSTEMS: dict[str, tuple[Row, ...]] = {
             base_of_experiment_1,
         ),
         Row(
+            "the same by joint angles, 6R and SCARA",
+            ("stitch base examples/base_to_base_joints.toml",),
+            "table 3: P1 α −3.1415, γ 0.6283",
+            flange_of_p1,
+        ),
+        Row(
             "experiment 2 as printed",
             ("stitch base examples/base_to_base_2.toml",),
             "0.00014 rad, 0.00014 m at λ = 0.1",
@@ -271,7 +301,12 @@ SYSTEMS: dict[str, tuple[Row, ...]] = {
         ),
     ),
     "000: drilling on curved structures": (
-        Row("drives by the drawing, before", DRILL, "2.28 to 2.85 mm, mean 2.55", drill_before),
+        Row("plate against the flange", DRILL, "h 186.61 mm, 186.60 measured; parallel within 0.11 mm", plate),
+        Row("reference holes by the drawing", DRILL, "–", drill_before),
+        Row("table 4: by the drawing, 3D", DRILL, "2.28 to 2.85 mm, mean 2.55", trials("drawing", "distance", "mm")),
+        Row("table 4: direction", DRILL, "2.09 to 3.93°, mean 3.30", trials("drawing", "tilt_deg", "°")),
+        Row("table 6: corrected and levelled, 2D", DRILL, "0.03 to 0.15 mm", trials("levelled", "in_plane", "mm")),
+        Row("table 7: a pin went in", DRILL, "≤ 0.30 mm, ≤ 0.21°", pin),
         Row("drilled holes, after", DRILL, "position ≤ 0.30 mm, direction ≤ 0.21°", drill_errors),
         Row("what the homography hides", DRILL, "lens distortion neglected", drill_camera),
         Row(

@@ -71,6 +71,7 @@ class DrillingCell:
         self.linearity_phase = rng.uniform(0, 2 * np.pi, (4, 1))
         self.stretch = rng.normal(0, s.stretch, (3, 3))
         self.actual = {name: self._actual(*hole) for name, hole in self.nominal.items()}
+        self.reached: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # drive coordinates of holes that were found
         tilt = np.radians(25 + rng.normal(0, 1))
         # The camera stands beside the tool, looks at the work plane's centre and keeps 280 mm from it.
         look = Rotation.from_euler("y", tilt).as_matrix()

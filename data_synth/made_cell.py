@@ -60,6 +60,7 @@ def _drilling(folder: Path, seed: int) -> Truth:
     """A lens with distortion and a plate that is a little too high, both unknown to the job."""
     cell = DrillingCell(seed, Sizes(k1=-0.004, plate_height=0.3))
     T_measuring_base = drilling_job.write_job(folder, cell)
+    drilling_job.write_trials(folder, cell)
     holes = {name: {"position": p, "direction": d} for name, (p, d) in cell.actual.items()}
     return {"T_measuring_base": T_measuring_base, "holes": holes, "hidden": {"k1": -0.004, "plate_height": 0.3}}
 

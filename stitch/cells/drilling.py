@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,18 @@ import numpy as np
 from rich.table import Table
 
 from stitch import frames
+from stitch.cells.drill_checks import (
+    STAGES,
+    Pin,
+    PlatePlace,
+    Trial,
+    TrialError,
+    holes_in_flange,
+    plate_place,
+    read_pin,
+    read_trials,
+    trial_error,
+)
 from stitch.cells.drilling_sensors import (
     CameraEffectTest,
     EffectSelection,
@@ -54,8 +67,8 @@ from stitch.writing.session_files import SessionFiles, pose_columns, write_sessi
 # A drilling job on disk (TOML and CSV) -> `Job`; every check of the input is made here.
 
 DRILL_FORMAT = "stitch-drill/1"
-_FILES = {"plate", "plate_image", "holes", "placed", "rangers", "joint1", "joint6", "checks"}
-_KEYS = {"format", "length_unit", "height", "image_size", *_FILES}
+_FILES = {"plate", "plate_image", "holes", "placed", "rangers", "joint1", "joint6", "checks", "locating", "trials"}
+_KEYS = {"format", "length_unit", "height", "image_size", "home", "joint6_height", "pin", *_FILES}
 # Cosine of the largest angle between tool and hole that a small error explains.
 _ALONG = float(np.cos(np.radians(30)))
 _NEEDED = ("plate", "holes", "placed")
@@ -94,6 +107,10 @@ class DrillJob:
     rangers: dict[str, tuple[Array, Array]]  # planes (M, 4), readings (M,)
     marker_paths: tuple[Array, Array] | None  # joint 6, joint 1, in the measuring system
     checks: HoleObservations | None  # plate and check holes together
+    joint6_height: float = 0.0  # of the axis of joint 6 above the base's origin
+    locating_rms: float | None = None  # of the plate's locating holes; None: the plate is given in the flange frame
+    trials: tuple[Trial, ...] = ()
+    pin: Pin | None = None
     file: Path | None = None  # that was read
 
 
@@ -110,7 +127,15 @@ def read_drill_job(file: Path | str) -> DrillJob:
         if key not in paths:
             raise InputError(f"{file}: {key} is missing; to fix: name the CSV file")
     plate_xyz, plate_uv = _read_plate(paths["plate"], paths.get("plate_image"))
-    holes = _read_holes(paths["holes"])
+    marker_paths, joint6_height = _read_marker_paths(file, paths), document.number("joint6_height", 0.0)
+    locating_rms = None
+    if "locating" in paths:
+        if marker_paths is None or "home" not in document:
+            raise InputError(f"{file}: locating goes with joint1, joint6 and [home]; to fix: add them")
+        T_measuring_flange = _base_frame(file, marker_paths, joint6_height) @ document.pose("home")
+        plate_xyz, locating_rms = holes_in_flange(paths["locating"], plate_xyz, T_measuring_flange)
+    holes, pin = _read_holes(paths["holes"]), read_pin(document)
+    rangers = _read_ranger_tables(paths["rangers"]) if "rangers" in paths else {}
     return DrillJob(
         length_unit=document.choice("length_unit", METRES),
         height=document.number("height", positive=True),
@@ -118,9 +143,13 @@ def read_drill_job(file: Path | str) -> DrillJob:
         plate_uv=plate_uv,
         holes=holes,
         placed=_read_placed_tools(paths["placed"], holes, plate_xyz, plate_uv),
-        rangers=_read_ranger_tables(paths["rangers"]) if "rangers" in paths else {},
-        marker_paths=_read_marker_paths(file, paths),
+        rangers=rangers,
+        marker_paths=marker_paths,
         checks=_read_check_holes(document, paths["checks"], plate_xyz, plate_uv) if "checks" in paths else None,
+        joint6_height=joint6_height,
+        locating_rms=locating_rms,
+        trials=read_trials(paths["trials"], tuple(rangers), pin) if "trials" in paths else (),
+        pin=pin,
         file=file,
     )
 
@@ -197,6 +226,13 @@ def _read_marker_paths(file: Path, paths: dict[str, Path]) -> tuple[Array, Array
     return joint6, joint1
 
 
+def _base_frame(file: Path, marker_paths: tuple[Array, Array], joint6_height: float) -> Array:
+    try:
+        return base_frame(*marker_paths, joint6_height)
+    except NoResultError as error:
+        raise InputError(f"{file}: {error}") from None
+
+
 def _read_check_holes(document: JobTable, file: Path, plate_xyz: Array, plate_uv: Array) -> HoleObservations:
     """Read holes of the plate and check holes together."""
     width, height = document.vectors("image_size", (2,), "[width, height] in pixels, which the checks need").tolist()
@@ -238,6 +274,8 @@ class DrillResult:
     T_measuring_base: Array | None
     effects: EffectSelection | None  # of the camera; None without check holes
     tool_axis: ToolAxis | None
+    plate: PlatePlace
+    trials: tuple[TrialError, ...]
 
 
 def solve_drill_job(job: DrillJob) -> DrillResult:
@@ -264,15 +302,20 @@ def solve_drill_job(job: DrillJob) -> DrillResult:
         np.array([job.placed[name].T_base_tool[:3, :3] for name in once]),
         np.array([groups[h.group].T_actual_nominal[:3, :3] @ h.direction for h in once.values()]),
     )
+    rangers = {name: fit_ranger(*readings) for name, readings in job.rangers.items()}
     return DrillResult(
         H,
         leave_one_out_errors=leave_one_out(xy, job.plate_uv) if len(xy) > 4 else np.empty((0, 2)),
         groups=groups,
         drives=tuple(_corrected_drive(hole, groups[hole.group], tool_axis) for hole in job.holes if not hole.reference),
-        rangers={name: fit_ranger(*readings) for name, readings in job.rangers.items()},
-        T_measuring_base=base_frame(*job.marker_paths) if job.marker_paths else None,
+        rangers=rangers,
+        T_measuring_base=base_frame(*job.marker_paths, job.joint6_height) if job.marker_paths else None,
         effects=effects,
         tool_axis=tool_axis,
+        plate=plate_place(job.plate_xyz, job.height, job.locating_rms),
+        trials=tuple(
+            trial_error(trial, rangers, partial(_in_plane, H, effects), job.height, job.pin) for trial in job.trials
+        ),
     )
 
 
@@ -296,9 +339,13 @@ def hole_in_plane(job: DrillJob, H: Array, effects: EffectSelection | None, name
     were selected; else as if the hole lay in the work plane: a camera tilted by 25° is then off by 0.47 mm for each mm.
     """
     placed = job.placed[name]
+    return _in_plane(H, effects, placed.uv, placed.height)
+
+
+def _in_plane(H: Array, effects: EffectSelection | None, uv: Array, height: float) -> Array:
     if effects is not None:
-        return np.asarray(effects.camera.plane(placed.uv[None], placed.height)[0])
-    return np.asarray(to_plane(H, placed.uv[None])[0])
+        return np.asarray(effects.camera.plane(uv[None], height)[0])
+    return np.asarray(to_plane(H, uv[None])[0])
 
 
 # What a drilling job found, as a document and as a table that a person or a controller can read.
@@ -353,7 +400,17 @@ def drill_document(result: DrillResult) -> dict[str, Any]:
             "p_value": tool.p_value,
             "accepted": tool.accepted,
         },
+        "plate": vars(result.plate),
+        "trials": [_trial_document(t) for t in result.trials],
         "camera_effects": result.effects and [vars(trial) for trial in result.effects.trials],
+    }
+
+
+def _trial_document(t: TrialError) -> dict[str, Any]:
+    angles = {"tilt_deg": t.tilt, "pin_tilt_deg": t.pin_tilt}
+    return {
+        **{key: value for key, value in vars(t).items() if not key.endswith("tilt")},
+        **{key: None if angle is None else float(np.degrees(angle)) for key, angle in angles.items()},
     }
 
 
@@ -381,6 +438,35 @@ def hand_eye_sentences(result: DrillResult, length_unit: str) -> Iterator[str]:
             "Hand-eye: each hole of the plate mapped by the others is off by "
             f"{sizes.mean():.3f} {length_unit} on average, {sizes.max():.3f} {length_unit} at most."
         )
+
+
+def plate_sentence(plate: PlatePlace, length_unit: str) -> str:
+    """Where the plate lies against the flange."""
+    return (
+        f"Plate: its holes lie {plate.height:.2f} {length_unit} from the flange, {plate.stated:.2f} stated, and "
+        f"parallel to it within {plate.parallelism:.2f} {length_unit}."
+    )
+
+
+def trial_sentences(trials: tuple[TrialError, ...], length_unit: str) -> Iterator[str]:
+    """Errors of the trial drives by stage, and what the pin bounds."""
+    for stage in STAGES:
+        own = [t for t in trials if t.stage == stage]
+        if own:
+            tilts = np.degrees([t.tilt for t in own])
+            yield (
+                f"Trial drives, {stage}: 3D {_range_text([t.distance for t in own])} {length_unit}, 2D "
+                f"{_range_text([t.in_plane for t in own])} {length_unit}, direction {_range_text(tilts)}°."
+            )
+    bounds = [(t.pin_position, t.pin_tilt) for t in trials if t.pin_position is not None and t.pin_tilt is not None]
+    if bounds:
+        position, tilt = np.max(bounds, axis=0)
+        angle = f"{np.degrees(tilt):.2f}°"
+        yield f"The pin went in: position within {position:.2f} {length_unit}, direction within {angle}."
+
+
+def _range_text(values: Any) -> str:
+    return f"{np.min(values):.2f} to {np.max(values):.2f} (mean {np.mean(values):.2f})"
 
 
 def significant_effect_sentences(result: DrillResult, length_unit: str) -> Iterator[str]:
@@ -462,8 +548,12 @@ def run_drill(file: Path, wanted: Wanted) -> None:
         return
     terminal, unit = console(), job.length_unit
     terminal.print(correction_sentence(result, unit))
+    terminal.print(plate_sentence(result.plate, unit))
     for line in chain(
-        hand_eye_sentences(result, unit), significant_effect_sentences(result, unit), absent_effect_sentences(result)
+        hand_eye_sentences(result, unit),
+        significant_effect_sentences(result, unit),
+        absent_effect_sentences(result),
+        trial_sentences(result.trials, unit),
     ):
         terminal.print(line)
     if result.rangers:

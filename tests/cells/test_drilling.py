@@ -19,7 +19,7 @@ from bench.drilling_loop import (
 )
 from data_synth.drilling_cell import FOCAL, GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.drilling_image import ellipse_centres, render_holes, render_plate
-from data_synth.drilling_job import write_job
+from data_synth.drilling_job import write_job, write_locating, write_trials
 from stitch import frames
 from stitch.cells import drilling_sensors
 from stitch.cells.drilling import read_drill_job, solve_drill_job
@@ -459,3 +459,50 @@ def test_two_reference_holes_are_too_few(tmp_path):
     (tmp_path / "holes.csv").write_text("\n".join(kept), encoding="utf-8")
     with pytest.raises(NoResultError, match="group 1: 2 reference holes"):
         solve_drill_job(read_drill_job(tmp_path / "job.toml"))
+
+
+def test_locating_holes_give_the_plate_in_the_flange_frame(tmp_path, capsys):
+    """Axes of joints from markers of 0.02 mm: at the flange 1.25 m away the plate is off by up to 0.3 mm."""
+    cell = DrillingCell(2)
+    T = write_job(tmp_path, cell)
+    stated = read_drill_job(tmp_path / "job.toml").plate_xyz
+    write_locating(tmp_path, cell, T)
+    job = read_drill_job(tmp_path / "job.toml")
+    found = solve_drill_job(job).plate
+    assert np.abs(job.plate_xyz - stated).max() < 0.3
+    assert found.height == pytest.approx(job.plate_xyz[:, 2].mean()) and abs(found.height - HEIGHT) < 0.3
+    assert found.parallelism == pytest.approx(np.abs(job.plate_xyz[:, 2] - job.plate_xyz[:, 2].mean()).max())
+    assert found.locating_rms < 0.05
+    text = (tmp_path / "job.toml").read_text()
+    (tmp_path / "job.toml").write_text(text.split("[home]")[0])
+    with pytest.raises(InputError, match=r"locating goes with joint1, joint6 and \[home\]; to fix"):
+        read_drill_job(tmp_path / "job.toml")
+
+
+def test_trial_drives_show_the_errors_that_the_simulator_knows(tmp_path):
+    cell = DrillingCell(3)
+    write_job(tmp_path, cell)
+    write_trials(tmp_path, cell)
+    job = read_drill_job(tmp_path / "job.toml")
+    trials = solve_drill_job(job).trials
+    assert len(trials) == 24
+    for t in trials:
+        if t.stage == "drawing":
+            position, direction = cell.nominal[t.hole]
+            x = np.cross([0.0, 1.0, 0.0], direction)
+            R = np.column_stack([x / np.linalg.norm(x), np.cross(direction, x / np.linalg.norm(x)), direction])
+            distance, angle = cell.errors(t.hole, frames.make(R, position))
+            # Rangers of 0.05 mm over 50 mm, and the robot's repeatability.
+            assert abs(t.distance - distance) < 0.25 and abs(np.degrees(t.tilt) - angle) < 0.15
+        elif t.stage == "levelled":
+            assert np.degrees(t.tilt) < 0.35 and t.distance < 0.35
+            assert t.pin_position <= 0.205 and t.pin_tilt == pytest.approx(np.arctan(t.pin_position / 87.0))
+
+
+def test_trials_name_what_is_wrong(tmp_path):
+    write_job(tmp_path, cell := DrillingCell(1))
+    write_trials(tmp_path, cell)
+    table = tmp_path / "trials.csv"
+    table.write_text(table.read_text().replace("drawing", "drawn"))
+    with pytest.raises(InputError, match="stage is 'drawn'; to fix: write one of drawing, corrected, levelled"):
+        read_drill_job(tmp_path / "job.toml")
