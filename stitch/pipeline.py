@@ -149,7 +149,8 @@ def _assemble_runs(
     for i, (session, own) in enumerate(zip(found.sessions, found.screenings, strict=True)):
         if len(session.views) < len(sessions[i].views):
             recorders[i].start(session)
-        out, kept = ((), own.left_out) if keep else (own.left_out, ())
+        left_out = tuple(sorted(own.left_out, key=lambda item: sessions[i].names.index(item.view)))
+        out, kept = ((), left_out) if keep else (left_out, ())
         last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links)
         last = replace(last, doubts=(*end.doubts, *own.doubts))
         runs.append(assemble_run(session, i, last, before[i], recorders[i]))

@@ -2,11 +2,14 @@
 
 import base64
 import io
+import warnings
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 matplotlib.use("Agg")
 
@@ -39,7 +42,19 @@ def png(figure: Figure, dpi: int) -> str:
     return _address(figure, "png", "png", dpi=dpi)
 
 
+def save_figure(figure: Figure, file: Any, **options: Any) -> None:
+    """Save a figure with names of views and columns as they are: a dollar sign begins no formula.
+
+    Letters that no font here has become boxes, without a word.
+    """
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        figure.savefig(file, **options)
+
+
 def _address(figure: Figure, form: str, kind: str, **options: object) -> str:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=form, **options)
+    save_figure(figure, buffer, format=form, **options)
     return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -120,7 +120,7 @@ def log_model(recording: rr.RecordingStream, run: Run, scene: ModelScene, up: Ar
     for v, own, colour in zip(scene.farthest, at_rest, COLOURS_OF_FEW, strict=False):
         points = own[np.linspace(0, len(own) - 1, min(len(own), _POINTS)).astype(int)] - scene.centre
         shown = rr.Points3D(points.astype(np.float32), colors=[colour])
-        recording.log(f"scans/{scene.names[v]}", shown, static=True)
+        recording.log(["scans", scene.names[v]], shown, static=True)
     places = one_above_the_other(at_rest, up)
     first = mean_sizes(scene.history.models[0].field.values) * scene.um
     recording.log("bars/first", rr.BarChart(first, color=GREY), static=True)
@@ -151,7 +151,7 @@ def _log_frame(recording: rr.RecordingStream, scene: ModelScene, at: float, plac
     T = frames.exp(moved)
     for v in scene.farthest:
         placed = rr.Transform3D(translation=T[v, :3, 3] + scene.centre, mat3x3=T[v, :3, :3])
-        recording.log(f"scans/{scene.names[v]}", placed)
+        recording.log(["scans", scene.names[v]], placed)
     few, from_centre = list(scene.farthest), places - scene.centre
     ends = np.einsum("vij,vj->vi", T[few, :3, :3], from_centre) + T[few, :3, 3]
     arrows = rr.Arrows3D(

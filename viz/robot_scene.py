@@ -41,7 +41,7 @@ def log_meshes(recording: rr.RecordingStream, robot: Robot, joints: Array) -> No
             triangle_indices=mesh.faces,
             albedo_factor=_PAINT,
         )
-        recording.log(f"robot/links/{own.link} {own.file.stem} {i}", shown, static=True)
+        recording.log(["robot", "links", f"{own.link} {own.file.stem} {i}"], shown, static=True)
 
 
 def _read(own: LinkMesh) -> "trimesh.Trimesh | None":

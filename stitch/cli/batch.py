@@ -135,7 +135,7 @@ def _show_rows(rows: Sequence[SessionRow], sentence: str) -> None:
         worst = "–" if row.worst_view is None else f"{row.worst_view} {_um(row.worst_view_um)}"
         cells.append((row.name, *lengths, worst, "–" if row.seconds is None else f"{row.seconds:.1f}"))
     headings = ("session", "before", "one hand-eye", "registered", "noise", "worst view", "s")
-    show_table("Distance between the views (rms)", headings, cells, words=("worst view",))
+    show_table("Distance between the views (rms)", headings, cells, words=("session", "worst view"))
     if len(shown) < len(rows):
         say(f"The {_MOST} of {len(rows)} that need somebody first; the page has all.")
     for row in rows:

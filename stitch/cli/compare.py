@@ -73,7 +73,7 @@ def show_comparison(comparison: ResidualTables, state: Run, run: Path) -> None:
     what = "between the views" if state.measurement.capture.scans else "from the targets to their place (3D)"
     _show_followed(comparison.followed, to_um)
     say(_significance_sentence(comparison), bold=not comparison.followed)
-    worst = [(f"worst by {_row_names(table, state)}", _worst_rows(table, to_um)) for table in comparison.labelled]
+    worst = [(f"worst by {table.name}", _worst_rows(table, state, to_um)) for table in comparison.labelled]
     show_block([("under the model", f"{length_text(comparison.rms, unit)} rms {what}"), *worst])
     for group in comparison.groups[:_LISTED_TABLES]:
         _show_group(group, comparison, to_um)
@@ -109,6 +109,7 @@ def _show_followed(followed: Sequence[FollowedCovariate], to_um: float) -> None:
         f"Displacement at the part along ({axis}), by {first.covariate}{unit}",
         (first.covariate, "mean (µm)", "± 1 σ"),
         [(f"{at:.4g}", f"{mean * to_um:+.1f}", f"{sigma * to_um:.1f}") for at, mean, sigma in course],
+        words=(),
     )
 
 
@@ -152,25 +153,21 @@ def _group_names(group: Sequence[ResidualTable]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def _row_names(table: ResidualTable, state: Run) -> str:
-    """Return what the rows are; of places, in which unit and frame they are written."""
-    from stitch.comparison.residual_tables import PLACE
-
-    if table.name != PLACE:
-        return table.name
-    frame = "base" if state.session.mount == "eye_in_hand" else "flange"
-    return f"{table.name} (x, y, z in {state.session.length_unit}, frame of the {frame})"
-
-
-def _worst_rows(table: ResidualTable, to_um: float) -> str:
+def _worst_rows(table: ResidualTable, state: Run, to_um: float) -> str:
+    """Return the worst rows of a table with their rms; of places, in which unit and frame they are written."""
     import numpy as np
+
+    from stitch.comparison.residual_tables import PLACE
 
     told = ", ".join(
         f"{table.label[i]} {table.rms[i] * to_um:.1f}"
         + (f" ± {table.rms_sigma[i] * to_um:.1f}" if np.isfinite(table.rms_sigma[i]) else "")
         for i in table.worst(_WORST_ROWS)
     )
-    return f"{told} µm rms"
+    if table.name != PLACE:
+        return f"{told} µm rms"
+    frame = "base" if state.session.mount == "eye_in_hand" else "flange"
+    return f"{told} µm rms; (x, y, z) in {state.session.length_unit} in the frame of the {frame}"
 
 
 def _show_group(group: Sequence[ResidualTable], comparison: ResidualTables, to_um: float) -> None:
@@ -196,4 +193,5 @@ def _show_group(group: Sequence[ResidualTable], comparison: ResidualTables, to_u
         f"By {table.name}{unit}{others}: {_chance_text(comparison, table)} over all means{clear}",
         ("from", "to", "mean (µm)", "± 1 σ", "rms (µm)", "count", "views"),
         rows,
+        words=(),
     )

@@ -42,7 +42,7 @@ def effects(
             "Physical effects",
             ("effect", "place", "what nature does", "parameters"),
             [(e.name, e.place, e.formula, parameter_signature(e)) for e in EFFECTS.values()],
-            words=("place", "what nature does", "parameters"),
+            words=("effect", "place", "what nature does", "parameters"),
             stream=results_stream(),
         )
 

@@ -230,6 +230,9 @@ def show_report(result: Run, tolerance: float | None = None, with_hand_eye: bool
     for doubt in result.doubts:
         if more := doubt_remedy(doubt):
             say(more)
+    gone = len(result.left_out)
+    for note in result.notes[:gone]:
+        say(note, bold=True)
     show_light(result, tolerance)
     show_block(report_rows(result))
     if not in_full():
@@ -242,7 +245,7 @@ def show_report(result: Run, tolerance: float | None = None, with_hand_eye: bool
             say(f"{stage.name}: {stage.note}.")
     for direction in result.unobservable:
         say(f"Not observable from these motions: {direction}.")
-    for note in result.notes:
+    for note in result.notes[gone:]:
         say(note)
 
 

@@ -44,10 +44,10 @@ def show_table(
     title: str,
     headings: Sequence[str],
     rows: Sequence[Sequence[str]],
-    words: Sequence[str] = (),
+    words: Sequence[str] | None = None,
     stream: IO[str] | None = None,
 ) -> None:
-    """Print a table: the first column and those named in `words` to the left, numbers to the right.
+    """Print a table: columns of `words`, if not stated the first, to the left, numbers to the right.
 
     On a terminal that is too narrow every row is a line that names its cells.
     """
@@ -66,7 +66,7 @@ def show_table(
                 stream=stream,
             )
         return
-    left = [heading in (headings[0], *words) for heading in headings]
+    left = [heading in (headings[:1] if words is None else words) for heading in headings]
     for row in (headings, *rows):
         cells = [
             cell + pad if to_left else pad + cell

@@ -156,7 +156,7 @@ def _show_cell(report: CellReport) -> None:
         f"{report.name}: {report.sessions:,} sessions, {span}; calibration of {report.in_use} in use",
         ("parameter", "unit", "value", "sigma", "a day", "valid", "moved"),
         rows,
-        words=("unit", "moved"),
+        words=("parameter", "unit", "moved"),
     )
 
 

@@ -4,6 +4,7 @@ import csv
 import io
 import os
 import re
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -85,8 +86,10 @@ def toml_text(folder: Path, first: FirstSession) -> str:
     """session.toml."""
     told = {guess.what: guess for guess in first.guesses}
     lines = [f'format = "{SESSION_FORMAT}"', f'name = "{_session_name(first.files.folder)}"']
+    lines += ["", "# What follows as a comment alone was read so into views.csv. To read it otherwise:"]
+    lines += [f"# stitch init {shlex.quote(str(first.files.folder))} --force, with the flag that is named beside it."]
     for what in ("files", "pairing", "columns", "rotation"):
-        lines += ["", *_comment(told[what])]
+        lines += ["", *_comment(told[what], with_flag=True)]
     unit = length_unit(first)
     lines += ["", *_comment(told["length_unit"]), f'length_unit = "{unit}"']
     lines += ["", *_comment(told["cloud_unit"]), f'cloud_unit = "{first.cloud_unit}"']
@@ -103,9 +106,10 @@ def toml_text(folder: Path, first: FirstSession) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _comment(guess: Guess) -> list[str]:
-    """A guess in lines that begin with #."""
-    words, lines = guess.line.split(), [""]
+def _comment(guess: Guess, with_flag: bool = False) -> list[str]:
+    """Return a guess in lines that begin with #."""
+    flag = f" ({guess.flag})" if with_flag and guess.determined else ""
+    words, lines = f"{guess.line}{flag}".split(), [""]
     for word in words:
         if len(lines[-1]) + len(word) + 1 > _WIDTH - 2:
             lines.append("")

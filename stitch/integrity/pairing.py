@@ -174,7 +174,7 @@ def _pose_distances(capture: Capture, view: int, T: Array, poses: Array) -> Arra
 
 _TORN = (
     "a part of this scan contradicts the other scans wherever it is put: something moved during the scan, or two scans "
-    "are in one file; to fix: scan again or leave the view out"
+    "are in one file; to fix: scan again"
 )
 _EXCHANGED = (
     "the scan of {0} fits the pose of {1}, whose own scan shows too little of the others to be placed; to fix: "
@@ -279,7 +279,5 @@ def _single_view_problem(
         joint_name, stated, fits, neighbour = digit
         kind = "joint_row" if neighbour else "displaced"
         reads = f"{joint_name} of {own[0]} reads {stated:.4f}, {fits:.4f} would fit (it is {off})"
-        return SessionProblem(kind, own, f"{reads}; to fix: correct it or leave the view out")
-    return SessionProblem(
-        "displaced", own, f"its pose is {off}; to fix: correct the row, scan again or leave the view out"
-    )
+        return SessionProblem(kind, own, f"{reads}; to fix: correct it")
+    return SessionProblem("displaced", own, f"its pose is {off}; to fix: correct the row, or scan again")

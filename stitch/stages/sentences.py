@@ -161,6 +161,8 @@ def view_notes(
 ) -> tuple[str, ...]:
     """Return a note for views that were left out, kept as asked, or stand out."""
     notes = [f"View {item.view} does not fit its robot pose and was left out: {item.why}." for item in left_out]
+    if left_out:
+        notes.append(f"To fuse {'it' if len(left_out) == 1 else 'them'} all the same: stitch run --keep.")
     notes += [f"View {item.view} does not fit its robot pose and was kept as asked: {item.why}." for item in kept]
     if suspected:
         names = "; ".join(f"{item.view} {item.why}" for item in suspected)

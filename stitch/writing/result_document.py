@@ -148,10 +148,7 @@ def result_document(run: Run) -> dict[str, Any]:
             "parameters": list(run.model.effects_covariance.names),
             "matrix": run.model.effects_covariance.matrix.tolist(),
         },
-        "views": [
-            *(_view(run, v) for v in range(len(run.session.views))),
-            *(_left_out_view(item) for item in run.left_out),
-        ],
+        "views": _views(run),
         "left_out": [{"view": item.view, "why": item.why} for item in run.left_out],
         "linkage": _linkage(run),
         "targets": target_rows(run.targets),
@@ -220,6 +217,14 @@ def _disagreement(run: Run) -> dict[str, Any] | None:
             for s in history.steps
         ],
     }
+
+
+def _views(run: Run) -> list[dict[str, Any]]:
+    """All views of the session in their order; those that were left out stand between those that are fused."""
+    rows = {int(number): _view(run, v) for v, number in enumerate(run.measurement.views.number)}
+    free = (number for number in range(len(rows) + len(run.left_out)) if number not in rows)
+    rows |= {number: _left_out_view(item) for number, item in zip(free, run.left_out, strict=True)}
+    return [rows[number] for number in sorted(rows)]
 
 
 def _left_out_view(item: ExcludedView) -> dict[str, Any]:

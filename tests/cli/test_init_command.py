@@ -46,6 +46,13 @@ def test_what_is_stated_is_taken(raw, session, tmp_path, capsys):
     for a, b in zip(made.views, true.views, strict=True):
         assert abs(a.T_base_flange - b.T_base_flange).max() < 1e-3
     assert not (raw / "session.toml").exists()
+    code, _, err = ended(capsys, "init", raw, *STATED, "--yes", "-o", tmp_path / "made")
+    assert code == 2 and "exists already; to fix: replace it with --force" in err
+    other = [*STATED[:-1], "eye_in_hand"]
+    code, _, err = ended(capsys, "init", raw, *other, "--yes", "-o", tmp_path / "made", "--force")
+    assert code == 0 and load_session(tmp_path / "made").mount == "eye_in_hand"
+    comment = (tmp_path / "made" / "session.toml").read_text(encoding="utf-8")
+    assert "--force, with the flag" in comment and "(--rotation" in " ".join(comment.split())
 
 
 @pytest.mark.slow
@@ -61,14 +68,16 @@ def test_without_a_terminal_what_cannot_be_told_is_asked_for_by_its_flag(raw, ca
 def test_a_terminal_is_asked_what_cannot_be_told(raw, capsys, monkeypatch):
     table = raw / "RobotPoses.dat"
     table.write_text("".join(f"0.{i},0.3,-0.{i},100,200,{300 + i}\n" for i in range(3)))
-    answers = iter(["zyx-intrinsic", "", "eye_in_hand", "y"])
+    # A typing error costs a question, not the work so far.
+    answers = iter(["zyx-intrinsik", "", "", "zyx-intrinsic", "", "eye_in_hand", "y"])
     asked = []
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     monkeypatch.setattr("typer.prompt", lambda text, default, err: asked.append(text) or next(answers) or default)
     monkeypatch.setattr("typer.confirm", lambda text, default, err: next(answers) == "y")
     code, _, err = ended(capsys, "init", raw)
     assert code == 0, err
-    assert [text.split()[0] for text in asked] == ["rotation", "length_unit", "mount"]
+    assert [text.split()[0] for text in asked] == ["rotation", "length_unit", "mount"] * 2
+    assert "--rotation zyx-intrinsik" in err
     text = (raw / "session.toml").read_text(encoding="utf-8")
     assert "zyx-intrinsic" in text and 'mount = "eye_in_hand"' in text
 

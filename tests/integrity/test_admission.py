@@ -19,6 +19,7 @@ from stitch.model.model_toml import ModelFile
 from stitch.pipeline import change, run
 from stitch.stages.register_and_fuse import FittedRig
 from stitch.stages.target_fit import FittedSession
+from stitch.writing.result_document import result_document
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +81,8 @@ def test_a_scan_that_stands_beside_the_others_is_no_second_surface(good, axis):
 def test_exchanged_scans_are_named_and_left_out_and_stay_out(good):
     swapped = with_view(with_view(good, 2, cloud=good.views[6].cloud), 6, cloud=good.views[2].cloud)
     found = run(swapped)
-    assert {item.view for item in found.left_out} == {"v002", "v006"}
+    assert [item.view for item in found.left_out] == ["v002", "v006"]
+    assert [view["view"] for view in result_document(found)["views"]] == good.names
     assert all("exchange the clouds of v002 and v006" in item.why for item in found.left_out)
     assert found.notes[0].startswith("View v002 does not fit its robot pose") and len(found.poses) == 8
     again = change(found, ["range_scale"])

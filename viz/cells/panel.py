@@ -16,7 +16,7 @@ from stitch.frames import Array, Indices
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, DARK, GREEN, ORANGE, SIGNED, YELLOW, signed_colours
-from viz.figures import above, colormap
+from viz.figures import above, colormap, save_figure
 from viz.page_parts import Row
 
 
@@ -132,7 +132,7 @@ def write_pictures(job: PanelJob, result: PanelResult, folder: Path) -> list[str
     names = ["errors.png", "errors.svg"]
     figure = errors_figure(job.robots, job.master, result.errors.shift, result.errors.turn)
     for name in names:
-        figure.savefig(folder / name, dpi=110)
+        save_figure(figure, folder / name, dpi=110)
     return names
 
 
