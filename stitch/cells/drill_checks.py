@@ -8,7 +8,8 @@ import numpy as np
 
 from stitch import frames
 from stitch.cells.drilling_sensors import RangerFit
-from stitch.cells.job_files import JobTable, align_points, on_a_line, read_columns
+from stitch.cells.job_files import JobTable, on_a_line, read_columns
+from stitch.closed_form.feature_matching import align_points
 from stitch.errors import InputError
 from stitch.frames import Array
 

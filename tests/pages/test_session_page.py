@@ -36,4 +36,5 @@ def test_every_key_that_a_run_writes_stands_on_the_page(few_effects):
     candidates = [row | {"candidates": None} for row in diagnosed.pop("candidates")]
     named = set(re.findall(r"`([\w]+)`", PAGE.read_text(encoding="utf-8")))
     documents = (result_document(found), *ledger(found), diagnosed, *candidates)
-    assert not {key for document in documents for key in document} - named
+    missing = sorted({key for document in documents for key in document} - named)
+    assert not missing
