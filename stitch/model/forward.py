@@ -103,19 +103,61 @@ def point_correction(terms: Sequence[Term], points: Array, view: ScanView, pose:
     return np.asarray(true - points)
 
 
-def target_correction(measurement: Measurement, terms: Sequence[Term], poses: Array) -> Array:
-    """(V, S, 3) the same as `shift` for the labelled points of all views; zero in empty slots."""
+def target_correction(
+    measurement: Measurement, terms: Sequence[Term], poses: Array, places: Array | None = None
+) -> Array:
+    """(V, S, 3) what must be added to the labelled points of all views to undo sensor and part effects; zero in empty
+    slots.
+
+    Args:
+        places: (V, S, 3) of the points, as `target_places` finds them under the same effects.
+    """
     sightings = measurement.capture.sightings
     assert sightings is not None
     if not moves_points(terms):
         return np.zeros(sightings.points.shape)
-    # An empty slot borrows a point: its own zero has no ray.
-    first = sightings.points[np.arange(len(poses)), (sightings.target >= 0).argmax(axis=1)]
-    filled = np.where((sightings.target >= 0)[..., None], sightings.points, first[:, None])
-    blank = ~(sightings.target >= 0).any(axis=1)
-    filled[blank] = filled[~blank].mean(axis=0)
-    moved = [point_correction(terms, filled[v], view, poses[v]) for v, view in enumerate(measurement.target_views)]
-    return np.where((sightings.target >= 0)[..., None], np.array(moved), 0.0)
+    places = target_places(measurement, terms, poses) if places is None else places
+    views = zip(measurement.target_views, poses, places, strict=True)
+    moved = [_displaced(terms, place, view, pose) for view, pose, place in views]
+    apart = frames.transform(frames.inverse(poses), places) - np.array(moved)
+    return np.where((sightings.target >= 0)[..., None], apart, 0.0)
+
+
+def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array, steps: int = 2) -> Array:
+    """(V, S, 3) where the targets in the slots of all views lie, reference frame: the mean of the views that use each.
+
+    An effect is evaluated there. At a point as it was measured it would hold the error of that point, times the effect,
+    and explain the error by itself (errors in variables; Fuller 1987, Measurement Error Models).
+    """
+    s = measurement.capture.sightings
+    assert s is not None
+    placed, used, blank = frames.transform(poses, s.points), s.used, s.target.max(axis=1) < 0
+    count = np.maximum(s.view_counts, 1)[:, None]
+    # An empty slot borrows the first target of its view, a view without any the first of all: its own zero has no ray.
+    first = np.maximum(s.target.max(axis=1), 0)
+    slots = np.where(s.target >= 0, s.target, first[:, None])
+
+    def mean(points: Array) -> Array:
+        sums = np.zeros((len(s.targets), 3))
+        np.add.at(sums, s.target[used], points[used])
+        out = np.where((s.view_counts[slots] > 0)[..., None], (sums / count)[slots], points)
+        return np.where(blank[:, None, None], points[used].mean(axis=0), out)
+
+    places = mean(placed)
+    for _ in range(steps if moves_points(terms) else 0):
+        correction = target_correction(measurement, terms, poses, places)
+        places = mean(placed + frames.rotate(poses, correction))
+    return places
+
+
+def _displaced(terms: Sequence[Term], places: Array, view: ScanView, pose: Array) -> Array:
+    """(N, 3) where the sensor of a view reports points that lie at places (N, 3) of the reference frame, its frame."""
+    for term in (t for t in reversed(terms) if t.effect.place == "shape"):
+        places = term.effect.function(places, view, **term.arguments)
+    points = frames.transform(frames.inverse(pose), places)
+    for term in (t for t in reversed(terms) if t.effect.place == "sensor"):
+        points = term.effect.function(points, view, **term.arguments)
+    return points
 
 
 def moves_points(terms: Sequence[Term]) -> bool:
@@ -267,13 +309,13 @@ class PointSlopes:
 
     measurement: Measurement
     steps: tuple["_ParameterStep", ...]
+    about: tuple[Term, ...] = ()  # effects in use
 
     @classmethod
     def about_model(cls, measurement: Measurement, model: Model, terms: Sequence[Term]) -> "PointSlopes":
         """About a model with each term in place of its own, or added at its values."""
-        return cls(
-            measurement, tuple(_parameter_step(model, term, i) for term in terms for i in range(len(term.parameters)))
-        )
+        steps = tuple(_parameter_step(model, term, i) for term in terms for i in range(len(term.parameters)))
+        return cls(measurement, steps, model.terms)
 
     def at(self, v: int, pose: Array, index: Indices | slice) -> Array:
         """(P, N, 3) for some points of view v, which stands at `pose` (4, 4) T_reference_scanner."""
@@ -282,7 +324,8 @@ class PointSlopes:
 
     def at_targets(self, poses: Array) -> Array:
         """(P, V, S, 3) for the labelled points of all views."""
-        return self._differences(lambda terms: target_correction(self.measurement, terms, poses))
+        places = target_places(self.measurement, self.about, poses)
+        return self._differences(lambda terms: target_correction(self.measurement, terms, poses, places))
 
     def _differences(self, moved: Callable[[Sequence[Term]], Array]) -> Array:
         if not self.steps:

@@ -78,7 +78,21 @@ def test_slopes_of_shifts_are_linear_in_small_steps():
     measurement = measurement_of(session, prepare_capture(session))
     term = term_of(measurement, EFFECTS["range_scale"])
     poses = measurement.capture.poses(T_mount)
-    moved = target_correction(measurement, [term.at([1e-4])], poses)
+    moved = target_correction(measurement, [term.at([1e-6])], poses)
     np.testing.assert_allclose(
-        moved, 1e-4 * PointSlopes.about_model(measurement, Model(T_mount), [term]).at_targets(poses)[0], rtol=1e-3
+        moved, 1e-6 * PointSlopes.about_model(measurement, Model(T_mount), [term]).at_targets(poses)[0], rtol=1e-3
     )
+
+
+def test_effects_of_points_act_where_the_targets_lie_and_not_where_an_error_puts_them():
+    # A ball on the flange, half a millimetre off in every view: its error must not be part of any effect's column.
+    session, T_mount, _ = labelled_cell(1, views=12, scatter=(1e-3, 0.5), targets=np.array([[0.0, 0.0, 120.0]]))
+    measurement = measurement_of(session, prepare_capture(session))
+    capture = measurement.capture
+    rows = target_rows(capture, T_mount, initial_landmarks(capture, T_mount))
+    poses = capture.poses(T_mount)
+    place = np.mean([T[:3, :3] @ p[0] + T[:3, 3] for T, p in zip(poses, capture.sightings.points, strict=True)], axis=0)
+    down = np.array([T[:3, :3].T @ [0, 0, -1.0] for T in measurement.T_base_flange])
+    for name, expected in (("range_scale", poses[:, :3, 3] - place), ("part_sag", -(place[2] ** 2) * down)):
+        (column,) = rows.effect_columns(measurement, Model(T_mount), [term_of(measurement, EFFECTS[name])])
+        np.testing.assert_allclose(column[..., 0], expected, rtol=1e-6, atol=1e-6)
