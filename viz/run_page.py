@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from stitch.comparison.disagreement_field import ModelHistory, effect_changes, model_history
 from stitch.comparison.run_verdict import run_headline, run_light
 from stitch.model.model import expanded_uncertainty, uncertainty_scope
+from stitch.observations.observability import NUMBERS
 from stitch.runs.run import Run, doubt_headline
 from stitch.units import MICROMETRES, value_uncertainty_text
 from viz import captions
@@ -100,10 +101,16 @@ def hand_eye_rows(run: Run) -> list[dict[str, str]]:
     U = expanded_uncertainty(run.T_mount, run.mount_covariance)
     units = [*(U[3:] * mm), *(U[:3] * 1e3)]
     names = [(f"translation {axis}", "mm") for axis in "xyz"] + [(f"rotation vector {axis}", "mrad") for axis in "xyz"]
-    return [
+    rows = [
         {"name": name, "unit": unit} | _told(coarse, corrected, u)
         for (name, unit), coarse, corrected, u in zip(names, values[0], values[1], units, strict=True)
     ]
+    stated = run.session.scanner.T_mount is not None
+    for number, row in zip(NUMBERS, rows, strict=True):
+        if number in run.unknown:
+            row |= {"corrected": "as stated"} if stated else {"coarse": "–", "corrected": "not known"}
+            row["U"] = "–"
+    return rows
 
 
 def _told(coarse: float, corrected: float, U: float) -> dict[str, str]:
@@ -115,7 +122,9 @@ def _told(coarse: float, corrected: float, U: float) -> dict[str, str]:
 
 def matrix(run: Run) -> str:
     """The corrected hand-eye as four rows to copy, in the form of session.toml."""
-    return "pose = " + "[\n  " + ",\n  ".join(str([float(f"{x:.12g}") for x in row]) for row in run.T_mount) + ",\n]"
+    open_numbers = f"# Not shown by these views: {', '.join(run.unknown)}\n" if run.unknown else ""
+    rows = ",\n  ".join(str([float(f"{x:.12g}") for x in row]) for row in run.T_mount)
+    return f"{open_numbers}pose = [\n  {rows},\n]"
 
 
 def ledger_rows(run: Run) -> list[dict[str, Any]]:

@@ -45,6 +45,7 @@ class FittedHandEye:
     frame: str  # "base" (eye_to_hand) or "flange" (eye_in_hand)
     length_unit: str
     middle: Array  # (3,) of what the scanner saw, scanner frame, length_unit: where the part is
+    unknown: tuple[str, ...] = ()  # of x, y, z, rx, ry, rz: what the views do not show
 
     @property
     def name(self) -> str:
@@ -72,6 +73,8 @@ class FittedHandEye:
 
     def __repr__(self) -> str:
         place = ", ".join(f"{x:.5g}" for x in self.pose[:3, 3])
+        if self.unknown:
+            return f"FittedHandEye({self.name}, {', '.join(self.unknown)} not known)"
         return (
             f"FittedHandEye({self.name} at ({place}) {self.length_unit}, "
             f"U at the part {self.U.mm:.2g} mm and {self.U.mrad:.2g} mrad)"
@@ -204,7 +207,7 @@ class Run(runs.Run):
         """Where the scanner sits: pose (4, 4), covariance (6, 6), and U in mm and mrad at the part."""
         middle = np.mean([points.mean(axis=0) for points in self.measurement.capture.point_sets], axis=0)
         frame = "base" if self.session.mount == "eye_to_hand" else "flange"
-        return FittedHandEye(self.T_mount, self.mount_covariance, frame, self.session.length_unit, middle)
+        return FittedHandEye(self.T_mount, self.mount_covariance, frame, self.session.length_unit, middle, self.unknown)
 
     @property
     def stitched(self) -> Stitched:

@@ -221,9 +221,8 @@ def show_report(result: Run, tolerance: float | None = None, with_hand_eye: bool
     """Print what a run found: a headline, what to do about it, numbers in a block, the hand-eye, and notes."""
     from stitch.comparison.disagreement_field import model_history
     from stitch.comparison.run_verdict import run_headline
-    from stitch.model.model import hand_eye_lines
     from stitch.runs.run import doubt_remedy
-    from stitch.writing.fit_report import report_rows
+    from stitch.writing.fit_report import report_rows, run_hand_eye_lines
 
     session = result.session
     say(f"{session.name}: {run_headline(result, model_history(result))}", bold=True)
@@ -238,7 +237,7 @@ def show_report(result: Run, tolerance: float | None = None, with_hand_eye: bool
     if not in_full():
         return
     if with_hand_eye:
-        for line in hand_eye_lines(result.T_mount, result.mount_covariance, session.mount, session.length_unit):
+        for line in run_hand_eye_lines(result):
             say(line, hang=2)
     for stage in result.stages[1:]:
         if stage.note:

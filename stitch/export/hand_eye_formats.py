@@ -96,17 +96,25 @@ def hand_eye_from(
         parent, child: names of frames, as `hand_eye_of` takes them.
 
     Raises:
-        InputError: a name that a frame cannot have.
+        InputError: a name that a frame cannot have, or numbers that the views do not show and nobody states.
     """
+    unknown = result.get("hand_eye_unknown", [])
+    session = str(result.get("name") or Path(result["session"]).name)
+    if unknown and not result.get("hand_eye_stated"):
+        raise InputError(
+            f"{session}: these views do not show {', '.join(unknown)} of the hand-eye; to fix: add views turned about "
+            "other axes, or state [scanner] pose in session.toml"
+        )
     metres = METRES[model.length_unit]
     T, scale = model.T_mount.copy(), np.repeat([1.0, metres], 3)
     T[:3, 3] *= metres
     notes = [uncertainty_scope(told.get("verdict")).rstrip("."), *_undetectable_notes(told, model.length_unit)]
     notes += [f"Not observable from these motions, left at the coarse value: {axis}" for axis in result["unobservable"]]
+    notes += [f"As stated in session.toml, not measured: {', '.join(unknown)}"] if unknown else []
     if model.effects:
         notes.append(f"Not in these numbers, as they are one rigid motion: {', '.join(model.effects)}")
     return ExportedHandEye(
-        session=str(result.get("name") or Path(result["session"]).name),
+        session=session,
         T_mount=T,
         covariance=model.covariance * np.outer(scale, scale),
         length_unit=model.length_unit,

@@ -202,15 +202,34 @@ def expanded_uncertainty(T_mount: Array, covariance: Array) -> Array:
     return COVERAGE_FACTOR * np.sqrt(np.diag(printed_covariance(T_mount, covariance)))
 
 
-def hand_eye_lines(T_mount: Array, covariance: Array, mount: str, length_unit: str) -> list[str]:
-    """Return text: position in mm and rotation vector in mrad with U (k = 2), in the frame that carries the scanner."""
+def hand_eye_lines(
+    T_mount: Array,
+    covariance: Array,
+    mount: str,
+    length_unit: str,
+    *,
+    unknown: Sequence[str] = (),
+    stated: bool = False,
+) -> list[str]:
+    """Return text: position in mm and rotation vector in mrad with U (k = 2), in the frame that carries the scanner.
+
+    Args:
+        unknown: of x, y, z, rx, ry, rz: numbers that the views do not show.
+        stated: such a number is printed as session.toml states it, and else not at all.
+    """
     frame = "base" if mount == "eye_to_hand" else "flange"
     to_mm = METRES[length_unit] * 1e3
     rotation = Rotation.from_matrix(T_mount[:3, :3]).as_rotvec() * 1e3
     U = expanded_uncertainty(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
+
+    def number(name: str, value: float, u: float) -> str:
+        if name in unknown:
+            return f"{value:.5g} as stated" if stated else "not known"
+        return value_uncertainty_text(value, u)
+
     position, turn = (
-        ", ".join(f"{axis} {value_uncertainty_text(x, u)}" for axis, x, u in zip("xyz", values, size, strict=True))
-        for values, size in ((T_mount[:3, 3] * to_mm, U[3:]), (rotation, U[:3]))
+        ", ".join(f"{axis} {number(kind + axis, x, u)}" for axis, x, u in zip("xyz", values, size, strict=True))
+        for kind, values, size in (("", T_mount[:3, 3] * to_mm, U[3:]), ("r", rotation, U[:3]))
     )
     return [
         f"Hand-eye T_{frame}_scanner, in the frame of the {frame}, ± U (k = 2) for a complete model:",

@@ -133,6 +133,7 @@ class Fit:
     targets: TargetModelFit | None = None  # what the labelled points say, where there are any
     outliers: tuple[Outlier, ...] = ()  # labelled points that do not count
     unobservable: tuple[str, ...] = ()  # plain words, one per unobservable direction
+    unknown: tuple[str, ...] = ()  # of x, y, z, rx, ry, rz of the hand-eye: what those directions leave open
     notes: tuple[str, ...] = ()
 
 
@@ -248,6 +249,10 @@ class Run:
     @property
     def unobservable(self) -> tuple[str, ...]:
         return self.fit.unobservable
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        return self.fit.unknown
 
     @property
     def verdict(self) -> str:

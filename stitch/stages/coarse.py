@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
+from scipy.linalg import null_space
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +24,7 @@ from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.scan import Scan, subsample
+from stitch.observations.observability import hidden_translations
 from stitch.observations.surfaces.matching import NeighbourQueries, neighbour_queries, sample_points
 from stitch.stages.correct import icp_hand_eye, next_gates
 from stitch.system.process import steps
@@ -44,9 +46,15 @@ def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
     The centroid of a view leans to the side it sees, so this is coarse: 2–17° and 20–60 mm.
     """
     centroids = [np.array([s.points.mean(axis=0) for s in c.scans]) for c in captures]
+    # A shift that moves all views alike has a column of zeros but for rounding: along it the start stays at zero.
+    hidden = hidden_translations(captures, np.eye(4))
+    shifts = null_space(hidden.T) if hidden.size else np.eye(3)
+
+    def hand_eye(x: Array) -> Array:
+        return frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), shifts @ x[3:])
 
     def residual(x: Array) -> Array:
-        T = frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), x[3:])
+        T = hand_eye(x)
         rows = []
         for c, centroid in zip(captures, centroids, strict=True):
             placed = frames.transform(c.poses(T), centroid[:, None])[:, 0]
@@ -55,12 +63,13 @@ def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
 
     fits = []
     for start in Rotation.random(_STARTS, rng=np.random.default_rng(0)):
-        fit = least_squares(residual, np.r_[start.as_rotvec(), np.zeros(3)], method="trf", max_nfev=100, x_scale="jac")
+        first = np.r_[start.as_rotvec(), np.zeros(shifts.shape[1])]
+        fit = least_squares(residual, first, method="trf", max_nfev=100, x_scale="jac")
         fits.append((float(fit.cost), fit.x))
     fits.sort(key=lambda pair: pair[0])
     found: list[Array] = []
     for _, x in fits:
-        T = frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), x[3:])
+        T = hand_eye(x)
         if all(np.degrees(frames.angle_between(T, other)) > 3 for other in found):
             found.append(T)
     return found
@@ -306,8 +315,18 @@ def find_coarse_hand_eye(captures: Sequence[Capture]) -> CoarseHandEye:
             "no hand-eye makes the scans overlap: check mount (eye_to_hand or eye_in_hand), the pose "
             "convention and that scans and poses are paired rightly, or give scanner.pose"
         )
+    # Starts were turned about the part, which carries the scanner along: a shift that nothing shows ends at zero.
+    tried = [replace(c, T_mount=_without_hidden_shift(captures, c.T_mount)) for c in tried]
     answers = distinct_hand_eyes(captures, tried, size)
     return CoarseHandEye(answers[0].T_mount, 0.2 * size, answers[0].source, tuple(answers))
+
+
+def _without_hidden_shift(captures: Sequence[Capture], T_mount: Array) -> Array:
+    """Return the hand-eye (4, 4) with no shift along what the motions leave open."""
+    hidden = T_mount[:3, :3] @ hidden_translations(captures, T_mount)
+    T = T_mount.copy()
+    T[:3, 3] -= hidden @ (hidden.T @ T[:3, 3])
+    return T
 
 
 def _starting_hand_eyes(captures: Sequence[Capture], size: float) -> list[tuple[str, Array]]:

@@ -14,6 +14,7 @@ from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.capture import Capture, part_size
 from stitch.model.model import Model
+from stitch.observations.observability import seen_part, visible_twists
 from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.hand_eye_fit import (
     SCANNER_FIELD,
@@ -62,8 +63,10 @@ _MAXIMUM_ITERATIONS = 40
 _CONVERGED = 2e-3
 
 
-def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array) -> tuple[Array, float]:
-    """ξ (6,) = −D⁻¹b over all captures, and the rms displacement of the part that it makes."""
+def common_step(
+    captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array, visible: Array
+) -> tuple[Array, float]:
+    """Return ξ (6,) = −D⁻¹b over all captures, along visible twists (6, k), and how far it moves the part, rms."""
     D, b = np.zeros((6, 6)), np.zeros(6)
     jacobians = [
         hand_eye_jacobian(c.hand_eye_frames(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)
@@ -73,7 +76,7 @@ def common_step(captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mou
         H, vector = assemble(o.gram)
         D += J.T @ H @ J / o.gram.scale**2
         b += J.T @ vector / o.gram.scale**2
-    xi = least_squares(D, b)
+    xi = visible @ least_squares(visible.T @ D @ visible, visible.T @ b)
     moved = [(J @ xi).reshape(-1, 6)[:, 3:] / o.gram.scale for J, o in zip(jacobians, overlaps, strict=True)]
     return xi, float(np.sqrt(np.mean(np.concatenate(moved) ** 2)))
 
@@ -98,14 +101,14 @@ def icp_hand_eye(
     """
     recorder = recorder or SilentRecorder()
     picked = [common_samples(capture.scans, samples) for capture in captures]
-    gates, history = list(gates), []
+    gates, history, part = list(gates), [], seen_part(captures)
     before: Sequence[Overlaps | None] = [None] * len(captures)
     for index in range(maximum):
         every = zip(captures, gates, picked, before, strict=True)
         before = overlaps = [collect_overlaps(c, c.poses(T_mount), gate, own, last) for c, gate, own, last in every]
         history.append(pooled_rms(overlaps))
         recorder.iteration("correct", index, captures[0].poses(T_mount), history[-1], gates[0])
-        xi, moved = common_step(captures, overlaps, T_mount)
+        xi, moved = common_step(captures, overlaps, T_mount, visible_twists(captures, T_mount, part))
         T_mount = T_mount @ frames.exp(xi)
         tighter = [min(g, next_gate(o, c)) for g, o, c in zip(gates, overlaps, captures, strict=True)]
         settled = all(new > 0.9 * old for new, old in zip(tighter, gates, strict=True))

@@ -7,11 +7,11 @@ from stitch.measurement.measurement import Measurement, session_notes
 from stitch.measurement.session import Session
 from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.observability import unknown_numbers, unobservable
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import ExcludedView, LedgerStep, Run, StageResult, ViewLinks
 from stitch.stages import surface_steps, target_steps
-from stitch.stages.coarse import CoarseHandEye
-from stitch.stages.observability import unobservable
+from stitch.stages.coarse import REUSED, CoarseHandEye
 from stitch.stages.register import DEFAULT
 from stitch.stages.register_and_fuse import FittedRig, Pipeline
 from stitch.stages.sentences import view_notes
@@ -65,6 +65,8 @@ def assemble_run(session: Session, index: int, end: FitSummary, before: StageRes
         targets=own.targets,
         outliers=own.outliers,
         unobservable=unobservable(shared, model.T_mount, session.robot, joints),
+        # A hand-eye of another run is as well known as it was there.
+        unknown=() if begun.source == REUSED else unknown_numbers(shared, model.T_mount),
         notes=(
             *view_notes(end.left_out, end.kept, end.suspected),
             *course.notes(session, fitted, index, begun),

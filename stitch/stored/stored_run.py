@@ -73,6 +73,7 @@ RESULT = _object_schema(
         {"parameters": _list_schema(_TEXT), "matrix": _list_schema(_list_schema(_NUMBER))}
     ),
     cloud_noise_factor=_NUMBER,
+    hand_eye_unknown=_list_schema(_TEXT),
     left_out=_list_schema(_object_schema({"view": _TEXT, "why": _TEXT})),
     linkage=_object_schema(
         {}, components=_list_schema(_list_schema(_TEXT)), weak=_list_schema(_object_schema({"view": _TEXT}))
@@ -341,6 +342,7 @@ def _restore_fit(folder: Path, document: dict[str, Any], run: Run) -> Fit:
     scatter = document["repeatability"]
     return Fit(
         unobservable=tuple(document["unobservable"]),
+        unknown=tuple(document.get("hand_eye_unknown", ())),
         stages=tuple(_stage_result(row) for row in document["stages"]),
         poses_model=own.poses(model.T_mount),
         poses=poses,

@@ -18,11 +18,12 @@ def fit_report(run: Run, at_part: tuple[float, float]) -> str:
     session = run.session
     left = f" of {len(session.views) + len(run.left_out)}" if run.left_out else ""
     head = f"[[{session.name}]] {len(session.views)}{left} views, {session.mount}, {session.length_unit}"
-    name, *numbers = hand_eye_lines(run.T_mount, run.mount_covariance, session.mount, session.length_unit)
+    name, *numbers = run_hand_eye_lines(run)
     place, turn = (uncertainty_text(x) if x > 0 else "–" for x in at_part)
+    at = "not known" if run.unknown else f"{place} mm and {turn} mrad"
     parts = [
         [head, f"  {run_verdict(run, model_history(run))}"],
-        [f"[[Hand-eye]] {name.removeprefix('Hand-eye ')}", *numbers, f"  U at the part {place} mm and {turn} mrad"],
+        [f"[[Hand-eye]] {name.removeprefix('Hand-eye ')}", *numbers, f"  U at the part {at}"],
         _part("Errors", _aligned(_errors(run))),
         _part("Effects", _aligned(_effects(run))),
         _part("History", _aligned(_history(run))),
@@ -31,6 +32,18 @@ def fit_report(run: Run, at_part: tuple[float, float]) -> str:
         _part("Notes", run.notes),
     ]
     return "\n".join(line for part in parts for line in part)
+
+
+def run_hand_eye_lines(run: Run) -> list[str]:
+    """Return the hand-eye of a run with U (k = 2); what its views do not show is not known, or as it was stated."""
+    return hand_eye_lines(
+        run.T_mount,
+        run.mount_covariance,
+        run.session.mount,
+        run.session.length_unit,
+        unknown=run.unknown,
+        stated=run.session.scanner.T_mount is not None,
+    )
 
 
 def report_rows(run: Run) -> list[tuple[str, str]]:

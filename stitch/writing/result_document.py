@@ -138,6 +138,8 @@ def result_document(run: Run) -> dict[str, Any]:
         "hand_eye_sigma": np.sqrt(np.diag(run.mount_covariance)).tolist(),
         "hand_eye_covariance": run.mount_covariance.tolist(),
         "unobservable": list(run.unobservable),
+        "hand_eye_unknown": list(run.unknown),
+        "hand_eye_stated": run.session.scanner.T_mount is not None,
         "stages": [_stage(s) for s in run.stages],
         "residual_rms": run.residual_rms,
         "heldout_rms": run.heldout_rms,

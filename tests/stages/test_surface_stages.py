@@ -15,13 +15,13 @@ from stitch.errors import NoResultError
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
+from stitch.observations.observability import unobservable
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.stages.coarse import find_coarse_hand_eye
 from stitch.stages.correct import correct
 from stitch.stages.fuse import fuse
-from stitch.stages.observability import unobservable
 from stitch.stages.register import register
 
 

@@ -11,12 +11,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, null_space
 
 from stitch import frames
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture
 from stitch.observations.linear_model import WHITE_COMPONENTS
+from stitch.observations.observability import seen_part, visible_twists
 from stitch.observations.pose_errors import PoseErrors, white_scatter_only
 from stitch.observations.surfaces.normal_equations import Gram, pair_squares
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
@@ -35,6 +36,8 @@ from stitch.statistics.variance_posterior import mean_variances
 
 # Combinations of hand-eye and effects weaker than this share of the strongest are unobservable.
 _OBSERVABLE_SHARE = 1e-6
+# Precision along what the motions do not show, over that of the weak prior: it stays where it is.
+_HELD = 1e12
 
 
 @dataclass(frozen=True)
@@ -251,6 +254,7 @@ class HandEyeSolution:
     gls: GeneralisedFit
     x: Array
     values: Array  # (P,) of the effects at which it was made
+    hidden: Array  # (6, m) twists of the hand-eye that the motions do not show, one sigma of the weak prior each
 
 
 def solve_hand_eye(
@@ -272,11 +276,29 @@ def solve_hand_eye(
         tuple(estimate_repeatability(e.reduced_poses, e.effect_columns) for e in parts),
     )
     prior = weak_prior(captures, unconstrained, T_mount, columns.prior)
+    hidden = _hidden_twists(captures, T_mount, prior)
+    held = prior.copy()
+    held[:6, :6] += _HELD * prior[:6, :6] @ hidden @ hidden.T @ prior[:6, :6]
     pull = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
-    weighed = rig.fit_gls(scatter, prior)
+    weighed = rig.fit_gls(scatter, held)
     return HandEyeSolution(
-        parts, rig, scatter, prior, prior_vector=pull, gls=weighed, x=weighed.solve(rig.z, pull), values=columns.values
+        parts=parts,
+        rig=rig,
+        scatter=scatter,
+        prior=held,
+        prior_vector=pull,
+        gls=weighed,
+        x=weighed.solve(rig.z, pull),
+        values=columns.values,
+        hidden=hidden,
     )
+
+
+def _hidden_twists(captures: Sequence[Capture], T_mount: Array, prior: Array) -> Array:
+    """Return twists (6, m) of the hand-eye, one sigma of the prior each, across those that the motions show."""
+    sigma = np.diag(prior)[:6] ** -0.5
+    visible = visible_twists(captures, T_mount, seen_part(captures)) / sigma[:, None]
+    return np.asarray(sigma[:, None] * null_space(visible.T, rcond=1e-9))
 
 
 def step_hand_eye(
@@ -284,7 +306,7 @@ def step_hand_eye(
 ) -> tuple[Array, tuple[Repeatability, ...]]:
     """T_mount (4, 4) as `fit_hand_eye` finds it, without its statistics, and how the poses scatter per capture."""
     found = solve_hand_eye(captures, unconstrained, T_mount)
-    return T_mount @ frames.exp(found.x), found.scatter
+    return T_mount @ frames.exp(found.x[:6]), found.scatter
 
 
 def weak_prior(
@@ -354,6 +376,9 @@ def fit_hand_eye(
     sources = _variance_sources(found, errors.repeating_only(), scanner_errors or {})
     covariance = np.sum(list(sources.values()), axis=0)
     log_ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(found.gls.covariance)[1]
+    # Held where they are, the hidden directions are no better known than before.
+    sources["unseen"][:6, :6] += found.hidden @ found.hidden.T
+    covariance[:6, :6] += found.hidden @ found.hidden.T
     return HandEyeFit(
         T_mount=T_mount @ frames.exp(found.x[:6]),
         covariance=covariance[:6, :6],

@@ -9,6 +9,7 @@ by ten micrometres.
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.frames import Array
@@ -16,22 +17,31 @@ from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import Capture
 from stitch.measurement.robot import Robot
 
+# Names of the hand-eye's numbers: position, then rotation vector.
+NUMBERS = ("x", "y", "z", "rx", "ry", "rz")
 _VISIBLE = 0.01
+# Step of a derivative, as a share of what moves the part by its unit.
+_SMALL = 1e-4
 _PARALLEL = np.cos(np.radians(2.0))
 # Joints that turn by less stand still.
 _TURNED = np.radians(0.5)
 
 
-def motion_gain(captures: Sequence[Capture], T_mount: Array, centre: Array) -> tuple[Array, Array]:
-    """Gains (6,) ascending and the directions (6, 6) as columns, twists about the part's centre.
-
-    Args:
-        centre: (3,) of the part in the scanner frame; twists are taken about it, so that a rotation
-            of the scanner is not mistaken for the translation it causes at the part.
-    """
+def seen_part(captures: Sequence[Capture]) -> tuple[Array, float]:
+    """Return the centre (3,) of what the scanner saw, scanner frame, and the size of the part, length_unit."""
+    centre = np.asarray(np.mean([p.mean(axis=0) for c in captures for p in c.point_sets], axis=0))
     size = float(np.median([np.sqrt(p.var(axis=0).sum()) for c in captures for p in c.point_sets]))
     # A probe is a point: a tenth of its distance stands in for its size.
-    size = size or 0.1 * float(np.linalg.norm(centre))
+    return centre, size or 0.1 * float(np.linalg.norm(centre))
+
+
+def motion_gain(captures: Sequence[Capture], T_mount: Array, centre: Array, size: float) -> tuple[Array, Array]:
+    """Return gains (6,) ascending and the directions (6, 6) as columns, twists about the part's centre.
+
+    Args:
+        centre, size: as `seen_part` has them; twists are taken about the centre, so that a rotation of the scanner is
+            not mistaken for the translation that it causes at the part.
+    """
     about = frames.make(np.eye(3), centre)
     scale = np.diag([1 / size] * 3 + [1.0] * 3)
     total, views = np.zeros((6, 6)), 0
@@ -46,12 +56,56 @@ def motion_gain(captures: Sequence[Capture], T_mount: Array, centre: Array) -> t
     return np.sqrt(np.maximum(values, 0)), scale @ vectors
 
 
+def visible_twists(captures: Sequence[Capture], T_mount: Array, part: tuple[Array, float]) -> Array:
+    """Return the twists (6, k) of the hand-eye that the motions show, T·exp(ξ); of all six the identity.
+
+    Along the others nothing may be fitted: what rounded poses seem to say there is thousands of times the truth.
+
+    Args:
+        part: as `seen_part` has it.
+    """
+    gains, directions = motion_gain(captures, T_mount, *part)
+    if gains[0] >= _VISIBLE:
+        return np.eye(6)
+    columns = frames.adjoint(frames.make(np.eye(3), part[0])) @ directions[:, gains >= _VISIBLE]
+    # A turn about the part carries the scanner along; where it stands is not seen, so there it stays.
+    shifts = hidden_translations(captures, T_mount)
+    columns[3:] -= shifts @ (shifts.T @ columns[3:])
+    return np.asarray(columns)
+
+
+def hidden_translations(captures: Sequence[Capture], T_mount: Array) -> Array:
+    """Return unit vectors (3, k), scanner frame, along which the hand-eye may shift and nothing shows."""
+    total, views = np.zeros((3, 3)), 0
+    for capture in captures:
+        R = capture.T_reference_mount[:, :3, :3]
+        off = R - R.mean(axis=0)
+        total += np.einsum("vji,vjk->ik", off, off)
+        views += len(R)
+    values, vectors = np.linalg.eigh(total / views)
+    return np.asarray(T_mount[:3, :3].T @ vectors[:, values < _VISIBLE**2])
+
+
+def unknown_numbers(captures: Sequence[Capture], T_mount: Array) -> tuple[str, ...]:
+    """Return which of x, y, z, rx, ry, rz of the hand-eye the motions leave open.
+
+    They are position and rotation vector in the frame that carries the scanner. A number is open where what is hidden
+    changes it by more than a hundredth of what it does to the part.
+    """
+    centre, size = seen_part(captures)
+    gains, directions = motion_gain(captures, T_mount, centre, size)
+    at_scanner = frames.adjoint(frames.make(np.eye(3), centre)) @ directions[:, gains < _VISIBLE]
+    moved = T_mount @ frames.exp(_SMALL * at_scanner.T)
+    turned = Rotation.from_matrix(moved[:, :3, :3]).as_rotvec() - Rotation.from_matrix(T_mount[:3, :3]).as_rotvec()
+    changes = np.concatenate([moved[:, :3, 3] - T_mount[:3, 3], size * turned], axis=1) / _SMALL
+    return tuple(np.array(NUMBERS)[np.linalg.norm(changes, axis=0) > _VISIBLE].tolist())
+
+
 def unobservable(
     captures: Sequence[Capture], T_mount: Array, robot: Robot | None = None, joints: Array | None = None
 ) -> tuple[str, ...]:
     """One phrase per direction of the hand-eye that these motions cannot show."""
-    centre = np.mean([p.mean(axis=0) for c in captures for p in c.point_sets], axis=0)
-    gains, directions = motion_gain(captures, T_mount, centre)
+    gains, directions = motion_gain(captures, T_mount, *seen_part(captures))
     hidden = directions[:, gains < _VISIBLE]
     axes = _named_axes(captures, robot, joints)
     phrases = []
