@@ -246,6 +246,24 @@ def thin_cloud(
     return _take_points(cloud, picked, whole)
 
 
+def distinct_points(cloud: Cloud) -> Cloud:
+    """Return the cloud with every point once, in its order; the same object where none stands twice.
+
+    A copy says nothing more, and normals, noise and spacing would be taken from a point's own copies.
+    """
+    x, y, z = cloud.points.T
+    # Of different points hardly any two agree in one number, which sorts ten times as fast as three.
+    if len(np.unique(x + np.sqrt(2) * y + np.sqrt(3) * z)) == len(cloud.points):
+        return cloud
+    _, first = np.unique(cloud.points, axis=0, return_index=True)
+    if len(first) == len(cloud.points):
+        return cloud
+    first.sort()
+    normals = None if cloud.normals is None else cloud.normals[first]
+    scalars = {name: values[first] for name, values in cloud.scalars.items()}
+    return replace(cloud, points=cloud.points[first], normals=normals, scalars=scalars)
+
+
 def _take_points(cloud: Cloud, index: Indices, whole: WholeCloud) -> Cloud:
     """Some of the points; those of the scan are the same, so that memory holds them once."""
     normals = None if cloud.normals is None else cloud.normals[index]

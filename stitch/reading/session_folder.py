@@ -14,7 +14,7 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
-from stitch.measurement.capture import MAX_POINTS, points_within, thin_cloud
+from stitch.measurement.capture import MAX_POINTS, distinct_points, points_within, thin_cloud
 from stitch.measurement.robot import Robot
 from stitch.measurement.session import (
     Cloud,
@@ -494,7 +494,11 @@ def checked_scan(
     Raises:
         InputError: too few points, or one farther away than any sensor sees.
     """
-    cloud = read()
+
+    def distinct() -> Cloud:
+        return distinct_points(read())
+
+    cloud = distinct()
     if len(cloud.points) < _FEWEST:
         raise InputError(
             f"{where}: {len(cloud.points)} of at least {_FEWEST} points; leave this view out of views.csv or scan "
@@ -502,7 +506,7 @@ def checked_scan(
         )
     # Looked at before some are taken: each of them will be fused.
     require_near(where, cloud.points * metres)
-    return cloud if at_most is None else thin_cloud(name, cloud, at_most, scanner, read)
+    return cloud if at_most is None else thin_cloud(name, cloud, at_most, scanner, distinct)
 
 
 def _read_cropped(file: Path, scale: float, within: Array | None) -> Cloud:

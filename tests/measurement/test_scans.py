@@ -10,10 +10,10 @@ from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need
 from stitch.errors import InputError
-from stitch.measurement.capture import prepare_capture
+from stitch.measurement.capture import distinct_points, prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.scan import prepare_scan
-from stitch.measurement.session import Scanner
+from stitch.measurement.session import Cloud, Scanner
 
 
 def test_normals_and_noise_of_a_sphere():
@@ -77,3 +77,18 @@ def test_profiles_show_no_surface(recwarn):
     with pytest.raises(InputError, match="every cloud is one profile.*to fix.*stitch calibrate sphere"):
         prepare_capture(session_of(replace(measured, clouds=clouds)))
     assert not recwarn
+
+
+def test_a_scan_that_holds_every_point_twice_is_the_scan_without_copies():
+    """Normals, noise and spacing would be taken from a point's own copy."""
+    rng = np.random.default_rng(3)
+    x, y = rng.uniform(-50, 50, (2, 3000))
+    points = np.column_stack([x, y, 400 + 0.004 * x**2 + 0.03 * rng.standard_normal(3000)])
+    intensity = rng.uniform(size=3000)
+    for order in (np.repeat(np.arange(3000), 2), np.tile(np.arange(3000), 2)):
+        again = distinct_points(Cloud(points[order], scalars={"intensity": intensity[order]}))
+        assert np.array_equal(again.points, points) and np.array_equal(again.scalars["intensity"], intensity)
+    once = Cloud(points)
+    assert distinct_points(once) is once
+    scan = prepare_scan("v", again.points)
+    assert scan.noise == pytest.approx(0.03, rel=0.1) and scan.spacing > 0.5
