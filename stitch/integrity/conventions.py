@@ -12,8 +12,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.frames import Array, Mask
-from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses, known_unit_ratio, scale_text
+from stitch.frames import Array, Indices, Mask
+from stitch.integrity.hypotheses import (
+    MOST_EXCHANGED,
+    UNITS,
+    Hypothesis,
+    distinct,
+    hypotheses,
+    known_unit_ratio,
+    scale_text,
+    stated_hypothesis,
+)
 from stitch.integrity.placement import Placement, place_scan, shows_no_surface, surface_of
 from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.session import Mount, Session
@@ -402,6 +411,8 @@ def hypotheses_by_table_part(
             continue
         near = np.array([[_motions_of_same_angle(R[a][v], R[b][w], seen) for b in (0, 1)] for a in (0, 1)])
         agree = [near[side[v].astype(int), side[w].astype(int), np.arange(len(v))].mean() for side in sides]
+        if max(agree) <= max(near[0, 0].mean(), near[1, 1].mean()):
+            continue
         # Both sides of one row may turn alike under a reading, and only the hand-eye tells which was read so.
         for side in (own for own, share in zip(sides, agree, strict=True) if share == max(agree)):
             rows = tuple(int(row) for row in np.flatnonzero(side))
@@ -452,7 +463,42 @@ def restore_stuck_columns(stated: MotionFit, motions: RelativeScans, length: flo
             yield Hypothesis("scale", frames.make(T[:, :3, :3], moved), h.mount, fix)
 
 
-# How well the surfaces of all views fall together under the best hand-eye of a hypothesis: the last, dear judge.
+# Of its length: how near the direction and the factor of a linear axis are to what they are taken for.
+_AXIS_NEAR = 0.05
+
+
+def poses_on_linear_axis(
+    session: Session, rows: Indices, stated: MotionFit, motions: RelativeScans
+) -> Iterator[Hypothesis]:
+    """The poses with a column beside them added along the direction that the motions ask for: a rail, a lift.
+
+    A direction of another length than the column's unit allows is none.
+    """
+    h = stated.hypothesis
+    T, R_mount = h.T_base_flange, stated.T_mount[:3, :3]
+    for name in session.views[0].covariates:
+        column = np.array([session.views[v].covariates.get(name, np.nan) for v in rows])
+        if not np.isfinite(column).all() or np.ptp(column) == 0:
+            continue
+        Q = column[:, None, None] * np.eye(3)
+        moved = fit_positions(T[:, :3, :3], (T[:, :3, 3], Q), h.mount, motions, range(len(T)), R_mount)
+        farthest = int(np.argmax(np.abs(column)))
+        along = (moved - T[:, :3, 3])[farthest] / column[farthest]
+        length = float(np.linalg.norm(along))
+        unit = min((1.0, 1000.0, 0.001), key=lambda u: abs(np.log(max(length, 1e-12) / u)))
+        if abs(length / unit - 1) > _AXIS_NEAR:
+            continue
+        axis = int(np.argmax(np.abs(along)))
+        exact = np.eye(3)[axis] * np.sign(along[axis]) * unit
+        straight = np.linalg.norm(along - exact) < _AXIS_NEAR * unit
+        by = exact if straight else along * unit / length
+        sign, times = ("+" if by[axis] > 0 else "-"), "" if unit == 1 else f" {unit:g} *"
+        where = f"write {'xyz'[axis]} {sign}{times} {name} in place of {'xyz'[axis]}"
+        if not straight:
+            where = f"add {name} times ({', '.join(f'{x:.4g}' for x in by)}) to x, y, z"
+        fix = f"{name} is a linear axis that carries the robot, and the positions leave it out; to fix: {where}"
+        yield Hypothesis("linear_axis", frames.make(T[:, :3, :3], T[:, :3, 3] + column[:, None] * by), h.mount, fix)
+
 
 # Another hypothesis is refuted by the surfaces if it leaves this much more between them. Under rows in any order, where
 # none is right, the best of 58 readings led by 1.12 at most (four views) and by 1.04 (seven to twelve); right ones led
@@ -535,22 +581,42 @@ _MANY_CLOSED, _FEW_CLOSED, _AS_MANY = 0.4, 0.2, 0.75
 _ALL = 0.95
 
 
-def rank_hypotheses(session: Session, motions: RelativeScans) -> list[MotionFit]:
-    """Return all hypotheses about the poses of a session, best first; empty if the scans show too little motion."""
+def rank_hypotheses(session: Session, motions: RelativeScans, rows: Indices | None = None) -> list[MotionFit]:
+    """Return all hypotheses about the poses of a session, best first; empty if the scans show too little motion.
+
+    Args:
+        rows: of the session between which the motions are, by their index among these; None: all.
+    """
     if len(motions.pairs) < FEWEST:
         return []
     length = TRANSLATION_M / METRES[session.length_unit]
-    tried = hypotheses(session)
-    out = [
-        fit_motions(tried[0], motions, length),
-        _other_length_unit(fit_motions(tried[0], motions, length, scaled=True)),
-    ]
+    every = np.arange(len(session.views)) if rows is None else rows
+    stated = stated_hypothesis(session, every)
+    out = [fit_motions(stated, motions, length)]
+    scaled = _other_length_unit(fit_motions(stated, motions, length, scaled=True))
     if out[0].closed < _ALL:
+        tried = hypotheses(session, every, _accused_views(out[0], motions, length))
         tried += restore_stuck_columns(out[0], motions, length)
-        tried += poses_between_rows(tried[0], motions, length)
-        tried += hypotheses_by_table_part(tried, motions, session.names)
+        tried += poses_on_linear_axis(session, every, out[0], motions)
+        tried += poses_between_rows(stated, motions, length)
+        tried += hypotheses_by_table_part(tried, motions, [session.names[v] for v in every])
         out += fit_hypotheses(tried, motions, session.length_unit)[1:]
+    # A scale that leaves nothing of the positions closes as well as what explains them.
+    if scaled.hypothesis.kind != "scale" or scaled.closed * _AS_MANY > max(e.closed for e in out):
+        out.append(scaled)
     return sorted(out, key=lambda e: (e.open, e.hypothesis.kind != "stated"))
+
+
+def _accused_views(stated: MotionFit, motions: RelativeScans, length: float) -> list[int]:
+    """Return the views of which the largest share of motions stays open under the poses as stated."""
+    T = stated.hypothesis.T_reference_mount
+    v, w = np.array(motions.pairs).T
+    off = frames.inverse(stated.T_mount) @ frames.inverse(T[v]) @ T[w] @ stated.T_mount @ frames.inverse(motions.T)
+    wrong = (rotation_angles(off) > ROTATION) | (np.linalg.norm(off[:, :3, 3], axis=1) > length)
+    open_share = np.array(
+        [wrong[(v == i) | (w == i)].mean() if np.any((v == i) | (w == i)) else 1 for i in range(len(T))]
+    )
+    return sorted(np.argsort(-open_share, kind="stable")[:MOST_EXCHANGED].tolist())
 
 
 def fit_hypotheses(

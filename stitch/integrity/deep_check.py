@@ -104,25 +104,29 @@ def background_problems(session: Session, own: Capture, T_mount: Array, found: S
     return [SessionProblem("foreign", names_of_views(stray.views, names), stray.describe(names))] if stray else []
 
 
-_VIEWS = 3
+# So many views leave too few degrees of freedom for their scatter to accuse one of them.
+_FEW = {3: "three", 4: "four", 5: "five"}
 # Chance that poses which repeat as those of arms do are said to disagree.
-_THREE_VIEWS_CHANCE = 1e-4
+_FEW_VIEWS_CHANCE = 1e-4
 
 
-def check_three_views(session: Session, found: Snooping) -> str | None:
-    """Return a warning of three views whose poses disagree by more than arms repeat; None where they do not.
+def check_few_views(session: Session, found: Snooping) -> str | None:
+    """Return a warning of three to five views whose poses disagree by more than arms repeat; None where they do not.
 
-    Three views show two motions: that something is wrong, but not which scan, row or effect.
+    They show two to four motions: that something is wrong, but not which scan, row or effect.
     """
+    count = _FEW.get(len(session.views))
+    if count is None or found.left_out or found.suspected:
+        return None
     unit = session.length_unit
     rotation, translation = usual_twist(unit)[[0, 3]]
-    if len(session.views) != _VIEWS or _global_model_test(found, np.array([rotation**2, translation**2, 1.0])):
+    if _global_model_test(found, np.array([rotation**2, translation**2, 1.0])):
         return None
     by = f"{length_text(found.translation, unit, 2)} and {angle_text(found.rotation, 2)}"
     usual = f"{length_text(translation, unit, 2)} and {angle_text(rotation, 2)}"
     return (
-        f"Three poses contradict their scans by {by}, where arms repeat to about {usual}: a scan, a row or the arm is "
-        "off; to fix: add views, since three do not show which."
+        f"{count.capitalize()} poses contradict their scans by {by}, where arms repeat to about {usual}: a scan, a row "
+        f"or the arm is off; to fix: add views, since {count} do not show which."
     )
 
 
@@ -132,7 +136,7 @@ def _global_model_test(found: Snooping, variances: Array) -> bool:
     C, A, z = mixed.covariance(variances)[0], mixed.A[0], mixed.z[0]
     CA, Cz = np.linalg.solve(C, A), np.linalg.solve(C, z)
     statistic = z @ Cz - Cz @ A @ np.linalg.solve(A.T @ CA, A.T @ Cz)
-    return chi2_tail(float(statistic), len(z) - A.shape[1]) > _THREE_VIEWS_CHANCE
+    return chi2_tail(float(statistic), len(z) - A.shape[1]) > _FEW_VIEWS_CHANCE
 
 
 _LISTED = 3
@@ -148,7 +152,7 @@ def snooping_warnings(session: Session, own: Capture, found: Snooping, T_mount: 
     background = (problem.fix for problem in background_problems(session, own, T_mount, found))
     warnings = (*background, *(step.describe(names, session.length_unit) for step in found.steps))
     if not scatter_is_doubtful(session, found):
-        few = check_three_views(session, found)
+        few = check_few_views(session, found)
         return warnings if few is None else (few, *warnings)
     twists = frames.log(found.unconstrained.poses @ frames.inverse(own.poses(T_mount)))
     middles = np.array([points.mean(axis=0) for points in own.visible_points])

@@ -5,7 +5,7 @@ Poses that are right after one of these changes, and only then, say which mistak
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 
 import numpy as np
@@ -49,10 +49,7 @@ def other_units(position: Array, units: Mapping[float, str]) -> Iterator[tuple[s
             yield f"{axis} of the positions alone is in {words}; to fix: convert this column", right
 
 
-# Rotations that were read in another way than they were written, undone.
-#
 # Orders of Euler angles are those of Diebel (2006), "Representing Attitude": six with three axes, six with two.
-
 ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "XYX", "XZX", "YXY", "YZY", "ZXZ", "ZYZ")
 
 
@@ -103,6 +100,17 @@ def degrees_for_radians(R: Rotation) -> Iterator[tuple[str, Rotation]]:
         yield f"{words} ({_order_name(order)}); {fix}", Rotation.from_euler(order, _angles(R, order) * 180 / np.pi)
 
 
+def _mixed_degrees(R: Rotation) -> Iterator[tuple[str, Rotation]]:
+    """Yield angles of which one column is in radians and was read as degrees, like the others."""
+    for order in (o for orders in (ORDERS[:6], [o.lower() for o in ORDERS[:6]]) for o in orders):
+        angles = _angles(R, order)
+        for k, axis in enumerate(order.lower()):
+            right = np.array(angles)
+            right[:, k] *= 180 / np.pi
+            words = f"the angle about {axis} alone is in radians ({_order_name(order)})"
+            yield f"{words}; to fix: convert this column to degrees", Rotation.from_euler(order, right)
+
+
 def _angles(R: Rotation, order: str) -> Array:
     with warnings.catch_warnings():
         # Gimbal lock sets an angle to zero: that reading is one of those to try.
@@ -127,8 +135,8 @@ UNITS = {
     10.0: "mm where cm are stated",
     0.1: "cm where mm are stated",
 }
-# A fitted factor is one between units if it is this near; beyond the other one it is no factor of lengths.
-_UNIT_NEAR, _LARGEST_SCALE = 0.05, 1000.0
+# A fitted factor is one between units if it is this near; no scanner's and no arm's own scale is off by the other one.
+_UNIT_NEAR, _LARGEST_SCALE = 0.05, 1.25
 
 
 def known_unit_ratio(scale: float) -> float | None:
@@ -141,9 +149,10 @@ def known_unit_ratio(scale: float) -> float | None:
 
 def scale_text(scale: float) -> str:
     """Return what a fitted factor between clouds and robot says, without the factor where lengths cannot differ so."""
-    possible = scale > 0 and 1 / _LARGEST_SCALE <= scale <= _LARGEST_SCALE
-    if possible or known_unit_ratio(scale) is not None:
-        return f"the clouds are {scale:.5g} times as large as the robot's motions; to fix: check the scale of both"
+    unit = known_unit_ratio(scale)
+    if unit is not None or 1 / _LARGEST_SCALE <= scale <= _LARGEST_SCALE:
+        factor = f"{scale:.5g}" if unit is None else f"{unit:.6g}"
+        return f"the clouds are {factor} times as large as the robot's motions; to fix: check the scale of both"
     return (
         "The robot's positions do not explain how the scanner moved; its rotations do; to fix: is an axis missing "
         "(column E1), or a column mixed up?"
@@ -155,6 +164,9 @@ _HANDED = (
     "the scans, or the frames of the poses, are left-handed; to fix: look for two exchanged columns, or one with the "
     "wrong sign"
 )
+# Without motions that accuse some rows, each pair is tried among so many views: in more, two that are exchanged neither
+# move a median nor a robust fit.
+MOST_EXCHANGED = 24
 _TEXT_ORDER = "the {} are sorted as text (1, 10, 11, 2, …), the {} by number; to fix: pair them by number"
 # Rows that a list may be shifted by.
 _SHIFTS = (1, -1, 2, -2, 3, -3)
@@ -165,7 +177,7 @@ class Hypothesis:
     """Poses with one mistake undone."""
 
     kind: str  # as in `stitch check --deep`; "stated" for the poses as they are
-    T_base_flange: Array  # (V, 4, 4)
+    T_base_flange: Array  # (V, 4, 4) of the views that are tried
     mount: Mount
     fix: str
     rows: tuple[int, ...] = ()  # whose poses change places; empty: all
@@ -177,32 +189,71 @@ class Hypothesis:
         return frames.inverse(self.T_base_flange) if self.mount == "eye_to_hand" else self.T_base_flange
 
 
-def hypotheses(session: Session) -> list[Hypothesis]:
-    """Return the poses as stated, first, and with every mistake undone that can be undone."""
+def stated_hypothesis(session: Session, rows: Indices | None = None) -> Hypothesis:
+    """Return the poses as stated, of some rows or of all."""
     T = np.array([view.T_base_flange for view in session.views])
-    mount = session.mount
-    out = [Hypothesis("stated", T, mount, "")]
-    out += _session_mistakes(session, T)
-    out += _row_mistakes(T, mount)
-    return out
+    return Hypothesis("stated", T if rows is None else T[rows], session.mount, "")
 
 
-def _session_mistakes(session: Session, T: Array) -> Iterator[Hypothesis]:
-    """Yield mistakes that change all poses in the same way."""
-    mount, joints = session.mount, [view.joints for view in session.views]
-    robot = session.robot
-    known = robot is not None and all(q is not None for q in joints)
-    other = f'the scanner is not mounted as stated; to fix: set mount = "{_OTHER_MOUNT[mount]}" in session.toml'
-    if known:
-        yield Hypothesis("mount", T, _OTHER_MOUNT[mount], other)
-        q = np.array(joints)
-        assert robot is not None
-        for factor, words in ((180 / np.pi, "radians, not degrees"), (np.pi / 180, "degrees turned twice")):
-            yield Hypothesis(
-                "degrees", forward(robot, q * factor), mount, f"the joint angles are {words}; to fix: convert them"
-            )
-    else:
+def hypotheses(
+    session: Session, rows: Indices | None = None, exchangeable: Sequence[int] | None = None
+) -> list[Hypothesis]:
+    """Return the poses as stated, first, and with every mistake undone that can be undone.
+
+    Args:
+        rows: of the session that are tried; None: all.
+        exchangeable: of these, views that may have changed places, by their index among them; None: of few views all.
+    """
+    every = np.arange(len(session.views)) if rows is None else rows
+    stated = stated_hypothesis(session, rows)
+    if exchangeable is None:
+        exchangeable = range(len(every)) if len(every) <= MOST_EXCHANGED else ()
+    out = [stated, *_joint_mistakes(session, every), *_pose_mistakes(stated)]
+    return [*out, *_row_mistakes(session, every), *_exchanges(stated, exchangeable)]
+
+
+def _joint_mistakes(session: Session, rows: Indices) -> Iterator[Hypothesis]:
+    """Yield mistakes with joint angles, and with the mount, which they tell from inverted poses."""
+    mount, robot, q = session.mount, session.robot, session.joints
+    T = stated_hypothesis(session, rows).T_base_flange
+    if robot is None or q is None:
         yield Hypothesis("inverse", frames.inverse(T), mount, _mount_or_inverse(mount))
+        return
+    q = q[rows]
+    other = f'the scanner is not mounted as stated; to fix: set mount = "{_OTHER_MOUNT[mount]}" in session.toml'
+    yield Hypothesis("mount", T, _OTHER_MOUNT[mount], other)
+    for factor, words in ((180 / np.pi, "radians, not degrees"), (np.pi / 180, "degrees turned twice")):
+        fix = f"the joint angles are {words}; to fix: convert them"
+        yield Hypothesis("degrees", forward(robot, q * factor), mount, fix)
+    if not np.allclose(forward(robot, q), T, rtol=0, atol=1e-6 * np.abs(T).max()):
+        # The poses were not taken from the joints.
+        return
+    for kind, by, fix in _joint_changes(q.shape[1]):
+        yield Hypothesis(kind, forward(robot, q @ by.T), mount, fix)
+
+
+def _joint_changes(joints: int) -> Iterator[tuple[str, Array, str]]:
+    """Yield kind, matrix on the angles and fix of joints that count otherwise than the robot's description."""
+    names = [f"j{j + 1}" for j in range(joints)]
+    for turned in (*combinations(range(joints), 1), *combinations(range(joints), 2)):
+        by = np.diag([-1.0 if j in turned else 1.0 for j in range(joints)])
+        named, counts = " and ".join(names[j] for j in turned), "counts" if len(turned) == 1 else "count"
+        yield "joint_sign", by, f"{named} {counts} the other way; to fix: negate {named} in views.csv"
+    for j in range(joints):
+        by = np.eye(joints)
+        by[j, j] = 180 / np.pi
+        yield "degrees", by, f"{names[j]} alone is in radians; to fix: convert this column to degrees"
+    if joints > 2:
+        for sign, words in ((1.0, "+"), (-1.0, "-")):
+            by = np.eye(joints)
+            by[2, 1] = sign
+            fix = f"j3 is shown as it moves with j2; to fix: write j3 {words} j2 in place of j3 in views.csv"
+            yield "joint_coupling", by, fix
+
+
+def _pose_mistakes(stated: Hypothesis) -> Iterator[Hypothesis]:
+    """Yield mistakes that change all poses in the same way."""
+    T, mount = stated.T_base_flange, stated.mount
     position, R = T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3])
     transposed = frames.make(R.inv().as_matrix(), position)
     yield Hypothesis("quaternion", transposed, mount, "the quaternions turn the other way; to fix: negate qx, qy, qz")
@@ -212,7 +263,7 @@ def _session_mistakes(session: Session, T: Array) -> Iterator[Hypothesis]:
         )
     for name, turned in other_angles(R):
         yield Hypothesis("euler", frames.make(turned.as_matrix(), position), mount, name)
-    for name, turned in degrees_for_radians(R):
+    for name, turned in (*degrees_for_radians(R), *_mixed_degrees(R)):
         yield Hypothesis("degrees", frames.make(turned.as_matrix(), position), mount, name)
     flip = np.diag([-1.0, 1, 1])
     yield Hypothesis("mirrored", frames.make(flip @ T[:, :3, :3] @ flip, position @ flip), mount, _HANDED)
@@ -237,48 +288,42 @@ def _mount_or_inverse(mount: Mount) -> str:
     )
 
 
-def _row_mistakes(T: Array, mount: Mount) -> Iterator[Hypothesis]:
-    """Yield poses that belong to other rows."""
-    V = len(T)
-    index = np.arange(V)
-    yield Hypothesis("reversed", T[::-1], mount, "the poses are in reverse order; to fix: turn the list around")
+def _row_mistakes(session: Session, rows: Indices) -> Iterator[Hypothesis]:
+    """Yield poses that belong to other rows, for all views alike."""
+    T, mount, V = stated_hypothesis(session).T_base_flange, session.mount, len(session.views)
+    yield Hypothesis("reversed", T[::-1][rows], mount, "the poses are in reverse order; to fix: turn the list around")
     for first in (0, 1):
         as_text = np.argsort([str(v + first) for v in range(V)])
-        yield Hypothesis("shifted", T[as_text], mount, _TEXT_ORDER.format("clouds", "poses"))
-        yield Hypothesis("shifted", T[np.argsort(as_text)], mount, _TEXT_ORDER.format("poses", "clouds"))
-    for by in _SHIFTS:
-        if abs(by) < V - 2:
-            kept = index[(index + by >= 0) & (index + by < V)]
-            yield _shifted(T, mount, by, kept)
-    for a, b in combinations(range(V), 2):
-        order = index.copy()
+        yield Hypothesis("shifted", T[as_text][rows], mount, _TEXT_ORDER.format("clouds", "poses"))
+        yield Hypothesis("shifted", T[np.argsort(as_text)][rows], mount, _TEXT_ORDER.format("poses", "clouds"))
+    for by in (by for by in _SHIFTS if abs(by) < V - 2):
+        used = np.flatnonzero((rows + by >= 0) & (rows + by < V))
+        where, plural = "below" if by > 0 else "above", "s" * (abs(by) > 1)
+        fix = f"every cloud belongs to the pose {abs(by)} row{plural} {where} it; to fix: shift the column back"
+        yield Hypothesis("shifted", np.roll(T, -by, axis=0)[rows], mount, fix, (), tuple(used.tolist()))
+
+
+def _exchanges(stated: Hypothesis, exchangeable: Sequence[int]) -> Iterator[Hypothesis]:
+    """Yield the poses with two of some views exchanged."""
+    fix = "the clouds of two rows are exchanged; to fix: exchange the clouds of these rows"
+    for a, b in combinations(exchangeable, 2):
+        order = np.arange(len(stated.T_base_flange))
         order[[a, b]] = [b, a]
-        yield Hypothesis(
-            "exchanged",
-            T[order],
-            mount,
-            "the clouds of two rows are exchanged; to fix: exchange the clouds of these rows",
-            (a, b),
-        )
-
-
-def _shifted(T: Array, mount: Mount, by: int, kept: Indices) -> Hypothesis:
-    where = "below" if by > 0 else "above"
-    fix = (
-        f"every cloud belongs to the pose {abs(by)} row{'s' * (abs(by) > 1)} {where} it; to fix: shift the column back"
-    )
-    return Hypothesis("shifted", np.roll(T, -by, axis=0), mount, fix, (), tuple(int(v) for v in kept))
+        yield replace(stated, kind="exchanged", T_base_flange=stated.T_base_flange[order], fix=fix, rows=(a, b))
 
 
 def distinct(found: Sequence[Hypothesis], angle: float, length: float) -> list[Hypothesis]:
     """Return hypotheses whose relative motions differ, the first of each kind kept."""
-    kept: list[Hypothesis] = []
-    signs: list[Array] = []
+    kept, signs = list[Hypothesis](), np.empty((len(found), 0))
     for h in found:
         relative = frames.inverse(h.T_reference_mount[:1]) @ h.T_reference_mount[1:]
-        sign = np.concatenate([relative[:, :3, :3].reshape(-1) / angle, relative[:, :3, 3].reshape(-1) / length])
-        if h.used is None and any(np.abs(sign - other).max() < 1 for other in signs):
+        # A motion at a time, so that few of them part most hypotheses.
+        sign = np.concatenate([relative[:, :3, :3].reshape(-1, 9) / angle, relative[:, :3, 3] / length], axis=1).ravel()
+        if not signs.size:
+            signs = np.empty((len(found), len(sign)))
+        alike = np.flatnonzero(np.abs(signs[: len(kept), :12] - sign[:12]).max(axis=1, initial=0.0) < 1)
+        if h.used is None and (np.abs(signs[alike] - sign).max(axis=1) < 1).any():
             continue
+        signs[len(kept)] = sign
         kept.append(h)
-        signs.append(sign)
     return kept

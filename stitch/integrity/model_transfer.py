@@ -23,11 +23,6 @@ from stitch.statistics.distributions import chi2_tail, f_tail
 from stitch.statistics.least_squares import equilibrated, significantly_smaller
 from stitch.units import length_text
 
-# Whether an arm that another session showed holds in this one: what it leaves beside what the nominal arm leaves.
-#
-# What imitates among the poses of one session may err at those of another; base, tool and targets are fitted with
-# either arm, so that nothing but the arm makes the difference.
-
 # That an arm which is right is doubted.
 _ARM_CHANCE = 0.01
 # A fit of the sessions with an arm, or with the nominal one.
@@ -67,6 +62,9 @@ class ArmTransfer:
 def check_arm_transfer(fit: FitWithArm, arm: ModelFile, found: FittedRig) -> ArmTransfer:
     """Hold the arm that was kept against the nominal one, and against itself without one of its effects.
 
+    What imitates among the poses of one session may err at those of another; base, tool and targets are fitted with
+    either arm, so that nothing but the arm makes the difference.
+
     Args:
         found: the fit with it.
     """
@@ -98,13 +96,11 @@ def view_mean_squares(fitted: FittedRig) -> Array:
     return np.concatenate([own.targets.view_squares for own in fitted.sessions if own.targets is not None])
 
 
-# Whether sessions of a rig share the effects that were fitted to all of them: each against a fit of its own.
-#
-# Two arms of one make have the same table and other errors. In one fit with both, what the one does wrong is left in
-# the other, and looks like an effect that is missing.
-
 # That one session of sound rigs is doubted.
 _SESSION_CHANCE = 0.001
+# Significant is not large: sessions of one arm, at other poses, differ by a tenth of an rms, and an rms of few views is
+# no better known than that. Less is no reason to give up what the others tell of the effects.
+_WORTH_A_TENTH = 0.1
 # Numbers that the views show of each pose at the least, and that a session has of its own: base or hand-eye, and tool.
 _NUMBERS_PER_VIEW, _NUMBERS_PER_SESSION = 3, 12
 
@@ -116,21 +112,27 @@ class SessionDisagreement:
     name: str
     shared_rms: float
     separate_rms: float
+    expected_rms: float  # of further views, with effects of its own
     p_value: float  # that effects of its own explain so much by chance
+    large: bool  # sharing costs more than it gives
 
     def doubt(self, unit: str) -> str:
-        """Return a warning."""
-        here, own = length_text(self.shared_rms, unit), length_text(self.separate_rms, unit)
+        """Return a warning with the size."""
+        here, own, further = (length_text(x, unit) for x in (self.shared_rms, self.separate_rms, self.expected_rms))
         return (
-            f"{self.name} does not share the effects of this rig: they leave {here}, fitted to it alone {own}; another "
-            "arm, or something that has changed between the sessions: stitch each by itself."
+            f"{self.name} does not share the effects of this rig: they leave {here}, fitted to it alone {own} "
+            f"({further} on views left out); another arm, or something that has changed between the sessions: stitch "
+            "each by itself."
         )
 
 
 def find_disagreeing_sessions(
     names: Sequence[str], found: FittedRig, fit_separately: Callable[[int], FittedRig]
 ) -> list[SessionDisagreement]:
-    """Sessions that want effects of their own, beyond chance (F test, Bonferroni over sessions).
+    """Find sessions that want effects of their own, beyond chance (F test, Bonferroni over sessions) and by size.
+
+    Two arms of one make have the same table and other errors. In one fit with both, what the one does wrong is left in
+    the other, and looks like an effect that is missing.
 
     Args:
         found: the fit of all.
@@ -141,25 +143,33 @@ def find_disagreeing_sessions(
     out = []
     for i, (name, together) in enumerate(zip(names, every, strict=True)):
         own = fit_separately(i)
-        tested = _test_session(name, together, view_mean_squares(own), _count_fitted_parameters(own))
-        out += [tested] if tested.p_value < _SESSION_CHANCE / len(names) else []
+        numbers = sum(int(np.count_nonzero(term.values)) for term in own.model.terms)
+        tested = compare_with_own_effects(name, together, view_mean_squares(own), numbers)
+        out += [tested] if tested.large and tested.p_value < _SESSION_CHANCE / len(names) else []
     return out
 
 
-def _count_fitted_parameters(fitted: FittedRig) -> int:
-    """Return the number of parameters of the effects that were fitted."""
-    return sum(int(np.count_nonzero(term.values)) for term in fitted.model.terms)
+def compare_with_own_effects(name: str, shared: Array, separate: Array, numbers: int) -> SessionDisagreement:
+    """Compare the mean squares of the views (V,) under the effects of all with those under a session's own.
 
+    What further views would leave is Akaike's (1970) final prediction error: each parameter that was fitted to these
+    views counts twice.
 
-def _test_session(name: str, shared: Array, separate: Array, numbers: int) -> SessionDisagreement:
+    Args:
+        numbers: parameters of the effects that were fitted.
+    """
     seen = np.isfinite(shared) & np.isfinite(separate)
+    views = max(int(seen.sum()), 1)
     whole, own = float(shared[seen].sum()), float(separate[seen].sum())
-    left = _NUMBERS_PER_VIEW * int(seen.sum()) - numbers - _NUMBERS_PER_SESSION
-    views, p = max(int(seen.sum()), 1), 1.0
-    if numbers and left > 0:
-        F = (whole - own) / numbers / max(own / left, 1e-300)
-        p = f_tail(max(F, 0.0), numbers, left)
-    return SessionDisagreement(name, float(np.sqrt(whole / views)), float(np.sqrt(own / views)), p)
+    count = _NUMBERS_PER_VIEW * views
+    left = count - numbers - _NUMBERS_PER_SESSION
+    here, alone = float(np.sqrt(whole / views)), float(np.sqrt(own / views))
+    if not numbers or left <= 0:
+        return SessionDisagreement(name, here, alone, here, 1.0, False)
+    p = f_tail(max((whole - own) / numbers / max(own / left, 1e-300), 0.0), numbers, left)
+    further = alone * float(np.sqrt((count + numbers) / (count - numbers)))
+    uncertain = max(_WORTH_A_TENTH, 2 / np.sqrt(2 * count))
+    return SessionDisagreement(name, here, alone, further, p, here > (1 + uncertain) * further)
 
 
 # That something which holds is doubted: half for the hand-eye, half for all targets.

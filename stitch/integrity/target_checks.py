@@ -14,7 +14,7 @@ from stitch.closed_form.feature_matching import align_points
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 from stitch.integrity.conventions import RelativeScans, rank_hypotheses
-from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses
+from stitch.integrity.hypotheses import UNITS, Hypothesis, distinct, hypotheses, stated_hypothesis
 from stitch.integrity.problems import SessionProblem, likeliest_text, names_of_views
 from stitch.measurement.capture import Capture, Sightings, build_capture, sightings_of
 from stitch.measurement.session import Session
@@ -207,55 +207,127 @@ def target_warnings(session: Session, sightings: Sightings | None) -> tuple[str,
 _LIMIT_M, _CLEARER = 0.005, 0.2
 # Hypotheses that are fitted in full, and targets in one line.
 _MAX_HYPOTHESES, _LINE = 12, 0.02
+# Views that are tried, of more of them so many in a row all over the session: what is wrong with all shows in these.
+_TRIED, _IN_A_ROW = 60, 6
+# Views that a side of a common displacement has at least, and the share of views that must be on their side of it.
+_SIDE_VIEWS, _ON_ITS_SIDE = 5, 0.9
 
 
 @dataclass(frozen=True)
 class ConventionFit:
-    """One hypothesis and how far apart it leaves the sightings of one target."""
+    """One hypothesis, with how far apart it leaves the sightings of one target."""
 
     hypothesis: Hypothesis
     spread: float  # median distance from the target's middle, length_unit
     T_mount: Array  # (4, 4)
+    middles: Array  # (K, 3) of the targets, reference frame; NaN where fewer than two views show one
 
 
 def check_targets(session: Session) -> list[SessionProblem]:
     """Return what is wrong with the poses of a session of labelled points; empty if nothing is found."""
-    T = np.array([view.T_base_flange for view in session.views])
-    capture = build_capture(session.name, (), T, session.mount, sightings_of(session))
+    rows, names = _tried_rows(len(session.views)), session.names
+    stated = stated_hypothesis(session, rows)
+    capture = _capture_of(session, rows)
     limit = _LIMIT_M / METRES[session.length_unit]
-    stated = _fit_hypothesis(capture, Hypothesis("stated", T, session.mount, ""))
-    if stated is not None and stated.spread < limit:
+    own = _fit_hypothesis(capture, stated)
+    most = own is not None and own.spread < limit
+    if own is not None and most and np.mean(_distances_from_middles(capture, own) > limit) < 1 - _ON_ITS_SIDE:
         return []
-    fits = [
-        fit for h in _hypotheses_to_try(session, capture, limit) if (fit := _fit_hypothesis(capture, h)) is not None
-    ]
-    names = session.names
+    moved = _find_common_move(session, rows, limit)
+    if moved is not None or most:
+        return [moved] if moved is not None else []
+    tried = _hypotheses_to_try(session, rows, capture, limit)
+    fits = [fit for h in tried if (fit := _fit_hypothesis(capture, h)) is not None]
     best = min(fits, key=lambda fit: fit.spread, default=None)
-    before = np.inf if stated is None else stated.spread
+    before = np.inf if own is None else own.spread
     if best is None or best.spread > max(_CLEARER * before, 0.0) or best.spread > limit:
-        if stated is None:
+        if own is None:
             return []
         fix = (
-            f"the targets scatter by {stated.spread:.3g} {session.length_unit} under the best hand-eye, and no usual "
+            f"the targets scatter by {own.spread:.3g} {session.length_unit} under the best hand-eye, and no usual "
             "mistake explains it; to fix: check names of targets, rows and how the poses were converted"
         )
         return [SessionProblem("displaced", tuple(names), fix)]
     h = best.hypothesis
     others = [f.hypothesis.fix for f in fits if f.spread < 2 * best.spread and f.hypothesis.fix != h.fix]
-    return [SessionProblem(h.kind, names_of_views(h.rows, names), likeliest_text([h.fix, *others[:2]]))]
+    views = names_of_views(rows[list(h.rows)], names)
+    return [SessionProblem(h.kind, views, likeliest_text([h.fix, *others[:2]]))]
 
 
-def _hypotheses_to_try(session: Session, capture: Capture, length: float) -> Iterator[Hypothesis]:
+def _tried_rows(views: int) -> Indices:
+    """Return the rows that are tried: all of few views."""
+    if views <= _TRIED:
+        return np.arange(views)
+    starts = np.linspace(0, views - _IN_A_ROW, _TRIED // _IN_A_ROW).astype(int)
+    return np.asarray(np.unique(starts[:, None] + np.arange(_IN_A_ROW)), np.int64)
+
+
+def _capture_of(session: Session, rows: Indices) -> Capture:
+    """Return the labelled points of some rows under the poses as stated."""
+    some = replace(session, views=tuple(session.views[v] for v in rows))
+    T = stated_hypothesis(some).T_base_flange
+    return build_capture(session.name, (), T, session.mount, sightings_of(some))
+
+
+def _find_common_move(session: Session, rows: Indices, limit: float) -> SessionProblem | None:
+    """Find the row from which on everything that the sensor shows stands elsewhere; None if there is none.
+
+    A tracker that was knocked over, or a table that was moved: each side of it fits by itself. One side is fitted to a
+    third of the views, and the others are held against it.
+
+    Args:
+        limit: distance from a target's middle that no arm makes, length_unit.
+    """
+    capture, count = _capture_of(session, rows), len(rows)
+    third = max(count // 3, _SIDE_VIEWS)
+    for at_end in (False, True):
+        order = np.arange(count)[::-1] if at_end else np.arange(count)
+        own = _fit_some(session, rows[np.sort(order[:third])], limit)
+        if own is None:
+            continue
+        off = (_distances_from_middles(capture, own) > limit)[order]
+        right = np.array([np.mean(np.append(~off[:k], off[k:])) for k in range(count)])
+        k = int(np.argmax(right))
+        if right[k] < _ON_ITS_SIDE or not _SIDE_VIEWS <= k <= count - _SIDE_VIEWS:
+            continue
+        if _fit_some(session, rows[np.sort(order[k:])], limit) is None:
+            continue
+        # Between the last row on the side that was fitted and the first one on the other.
+        near, far = sorted((int(rows[order[k - 1]]), int(rows[order[k]])))
+        between = np.arange(near, far + 1)
+        beyond = _distances_from_middles(_capture_of(session, between), own) > limit
+        start = near + int(np.sum(beyond) if at_end else np.sum(~beyond))
+        what = "the tracker" if session.mount == "eye_to_hand" else "all targets together"
+        names = session.names
+        fix = (
+            f"{what}, or the robot's base, moved between {names[start - 1]} and {names[start]}; to fix: make two "
+            "sessions of it"
+        )
+        return SessionProblem("reclamped", tuple(names[start:]), fix)
+    return None
+
+
+def _fit_some(session: Session, rows: Indices, limit: float) -> ConventionFit | None:
+    """Return the fit to some rows; None where they do not hold together."""
+    fit = _fit_hypothesis(_capture_of(session, rows), stated_hypothesis(session, rows))
+    return None if fit is None or fit.spread > limit else fit
+
+
+def _distances_from_middles(capture: Capture, fit: ConventionFit) -> Array:
+    """(V,) median distance of what a view shows from where a fit of other views has it; 0 where that has nothing."""
+    s = capture.sightings
+    assert s is not None
+    apart = np.linalg.norm(frames.transform(capture.poses(fit.T_mount), s.points) - fit.middles[s.target], axis=2)
+    return np.nan_to_num(nan_median(np.where(s.used, apart, np.nan).T))
+
+
+def _hypotheses_to_try(session: Session, rows: Indices, capture: Capture, length: float) -> Iterator[Hypothesis]:
     """Yield hypotheses to try: where targets show how the sensor moved, those that explain its motions best."""
-    motions = _sensor_motions(capture)
-    ranked = rank_hypotheses(session, motions)
+    ranked, stated = rank_hypotheses(session, _sensor_motions(capture), rows), stated_hypothesis(session, rows)
     if ranked:
         yield from (e.hypothesis for e in ranked[:_MAX_HYPOTHESES] if e.scale == 1.0)
-        found = hypotheses(session)[:1]
     else:
-        found = distinct(hypotheses(session), 1e-3, 0.1 * length)
-        yield from found[1:]
-    stated = found[0]
+        yield from distinct(hypotheses(session, rows), 1e-3, 0.1 * length)[1:]
     for factor, words in UNITS.items():
         T = np.array(stated.T_base_flange)
         T[:, :3, 3] *= factor
@@ -293,9 +365,10 @@ def _fit_hypothesis(capture: Capture, hypothesis: Hypothesis) -> ConventionFit |
     except (NoResultError, np.linalg.LinAlgError):
         return None
     placed = frames.transform(own.poses(T_mount), s.points)
-    apart = []
+    apart, middles = [], np.full((len(s.targets), 3), np.nan)
     for k in range(len(s.targets)):
         here = placed[s.used & (s.target == k)]
         if len(here) > 1:
-            apart.append(np.linalg.norm(here - np.median(here, axis=0), axis=1))
-    return ConventionFit(hypothesis, float(np.median(np.concatenate(apart))), T_mount) if apart else None
+            middles[k] = np.median(here, axis=0)
+            apart.append(np.linalg.norm(here - middles[k], axis=1))
+    return ConventionFit(hypothesis, float(np.median(np.concatenate(apart))), T_mount, middles) if apart else None
