@@ -1,5 +1,6 @@
 """Find what is wrong with a session without a run (`stitch check --deep`), and refuse or warn of it in a run."""
 
+import csv
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -18,9 +19,11 @@ from stitch.integrity.conventions import (
     rank_hypotheses,
     register_scan_pairs,
 )
+from stitch.integrity.hypotheses import known_unit_ratio
 from stitch.integrity.pairing import explain_misplaced
 from stitch.integrity.pose_tests import length_problem
 from stitch.integrity.problems import SessionProblem, displacement_text, likeliest_text, list_views, names_of_views
+from stitch.integrity.rounding import Rounding, find_rounding
 from stitch.integrity.scan_faults import find_occluder, find_static_background
 from stitch.integrity.snooping import MisplacedView, Snooping, snoop_views
 from stitch.integrity.target_checks import check_targets, target_problems
@@ -33,6 +36,7 @@ from stitch.observations.pose_errors import usual_twist
 from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
 from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.observations.targets.outliers import drop_mislabelled
+from stitch.reading.depth_image import DEPTH_SUFFIXES, find_intrinsics
 from stitch.runs.run import ExcludedView
 from stitch.stages.coarse import find_coarse_hand_eye
 from stitch.stages.correct import Correction, icp_hand_eye
@@ -139,6 +143,22 @@ def _global_model_test(found: Snooping, variances: Array) -> bool:
     return chi2_tail(float(statistic), len(z) - A.shape[1]) > _FEW_VIEWS_CHANCE
 
 
+# Rounding explains a scatter of no more than so many times what it makes, and no less than its part.
+_TIMES_ROUNDING = 2.0
+
+
+def rounding_that_explains(session: Session, found: Snooping) -> Rounding | None:
+    """Return the rounding of the table's rotations, if it turns poses by more than arms do and as much as they scatter.
+
+    It is asked before rows are blamed: no row of such a table is wrong.
+    """
+    rounded = find_rounding(np.array([view.T_base_flange for view in session.views]))
+    if rounded is None or rounded.rotation < usual_twist(session.length_unit)[0]:
+        return None
+    as_much = rounded.rotation / _TIMES_ROUNDING < found.rotation < _TIMES_ROUNDING * rounded.rotation
+    return rounded if as_much else None
+
+
 _LISTED = 3
 
 
@@ -151,6 +171,9 @@ def snooping_warnings(session: Session, own: Capture, found: Snooping, T_mount: 
     names = session.names
     background = (problem.fix for problem in background_problems(session, own, T_mount, found))
     warnings = (*background, *(step.describe(names, session.length_unit) for step in found.steps))
+    rounded = rounding_that_explains(session, found)
+    if rounded is not None:
+        return (f"{rounded.describe()}.", *warnings)
     if not scatter_is_doubtful(session, found):
         few = check_few_views(session, found)
         return warnings if few is None else (few, *warnings)
@@ -221,6 +244,10 @@ def _check_views(session: Session, capture: Capture, found: Sequence[MotionFit])
         return [size], False
     problems = explain_misplaced(session, capture, T_mount, snooped)
     contradicted = poses_contradict_scans(session, snooped) and not any(p.kind == "disconnected" for p in problems)
+    rounded = rounding_that_explains(session, snooped)
+    if rounded is not None:
+        problems = [SessionProblem(rounded.kind, (), rounded.describe(), certain=contradicted), *problems]
+        return problems, False
     if contradicted:
         problems.append(SessionProblem("displaced", tuple(session.names), _unexplained_text(session, snooped)))
     for m in snooped.suspected:
@@ -284,7 +311,27 @@ def _convention_problem(session: Session, named: Sequence[MotionFit | SurfaceFit
     """Return one problem from hypotheses that are as likely, the best first."""
     best = named[0].hypothesis
     fixes = [e.hypothesis.fix for e in named]
+    if best.kind == "unit" and isinstance(named[0], MotionFit):
+        fixes = depth_scale_fix(session, named[0].scale) or fixes
     return SessionProblem(best.kind, names_of_views(best.rows, session.names), likeliest_text(fixes))
+
+
+def depth_scale_fix(session: Session, scale: float) -> list[str]:
+    """Return what to write beside depth images whose counts are of another length; nothing for other clouds."""
+    factor, table = known_unit_ratio(scale), session.path / "views.csv"
+    if factor is None or not table.is_file():
+        return []
+    with table.open(encoding="utf-8", newline="") as rows:
+        image = session.path / str(next(csv.DictReader(rows), {}).get("cloud"))
+    if image.suffix.lower() not in DEPTH_SUFFIXES:
+        return []
+    camera = find_intrinsics(image)
+    per_metre = (camera.units_per_metre or 1000.0) * factor
+    return [
+        f"the clouds are {factor:.6g} times as large as the robot's motions, so a count of depth is "
+        f'{1000 / per_metre:.4g} mm; to fix: write "depth_scale": {per_metre:.6g} (counts per metre) in '
+        f"{camera.source.name}"
+    ]
 
 
 _CHECK_ROWS = "check that rows and clouds belong together and how the poses were converted"

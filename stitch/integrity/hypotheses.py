@@ -62,7 +62,7 @@ def other_quaternions(q: Array) -> Iterator[tuple[str, Rotation]]:
 def other_angles(R: Rotation) -> Iterator[tuple[str, Rotation]]:
     """Yield angles that were composed in one order and belong into another, columns by place or by axis."""
     for order in (*ORDERS, *(o.lower() for o in ORDERS)):
-        angles = _angles(R, order)
+        angles = euler_angles(R, order)
         for right in (*ORDERS, *(o.lower() for o in ORDERS)):
             if right != order:
                 yield _order_fix(order, right), Rotation.from_euler(right, angles)
@@ -97,13 +97,13 @@ def degrees_for_radians(R: Rotation) -> Iterator[tuple[str, Rotation]]:
     words, fix = "the angles are radians, and were read as degrees", "to fix: convert them to degrees"
     yield f"{words}; {fix}", Rotation.from_rotvec(R.as_rotvec() * 180 / np.pi)
     for order in ORDERS:
-        yield f"{words} ({_order_name(order)}); {fix}", Rotation.from_euler(order, _angles(R, order) * 180 / np.pi)
+        yield f"{words} ({_order_name(order)}); {fix}", Rotation.from_euler(order, euler_angles(R, order) * 180 / np.pi)
 
 
 def _mixed_degrees(R: Rotation) -> Iterator[tuple[str, Rotation]]:
     """Yield angles of which one column is in radians and was read as degrees, like the others."""
     for order in (o for orders in (ORDERS[:6], [o.lower() for o in ORDERS[:6]]) for o in orders):
-        angles = _angles(R, order)
+        angles = euler_angles(R, order)
         for k, axis in enumerate(order.lower()):
             right = np.array(angles)
             right[:, k] *= 180 / np.pi
@@ -111,7 +111,8 @@ def _mixed_degrees(R: Rotation) -> Iterator[tuple[str, Rotation]]:
             yield f"{words}; to fix: convert this column to degrees", Rotation.from_euler(order, right)
 
 
-def _angles(R: Rotation, order: str) -> Array:
+def euler_angles(R: Rotation, order: str) -> Array:
+    """Return angles (V, 3) in an order, rad."""
     with warnings.catch_warnings():
         # Gimbal lock sets an angle to zero: that reading is one of those to try.
         warnings.simplefilter("ignore")

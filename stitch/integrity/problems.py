@@ -78,7 +78,8 @@ class SessionProblem:
     """A problem of a session, its views and its remedy; no views where it concerns the whole session."""
 
     # exchanged | shifted | reversed | inverse | mount | euler | degrees | quaternion | unit | scale | mirrored |
-    # joint_row | duplicate_scan | duplicate_pose | displaced | foreign | reclamped | disconnected
+    # linear_axis | joint_sign | joint_coupling | joint_row | duplicate_scan | duplicate_pose | displaced | foreign |
+    # reclamped | disconnected
     kind: str
     views: tuple[str, ...]
     fix: str  # one line

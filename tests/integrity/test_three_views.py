@@ -1,4 +1,4 @@
-"""Three views cannot tell which of them is off, but that something is."""
+"""Three views, or four, cannot tell which of them is off, but that something is."""
 
 from dataclasses import replace
 
@@ -28,3 +28,11 @@ def test_one_of_three_views_that_is_off_is_doubted_and_none_accused(good):
     assert found.left_out == () and len(found.doubts) == 1
     assert found.doubts[0].startswith("Three poses contradict their scans by")
     assert "three do not show which" in found.doubts[0]
+
+
+def test_four_views_of_which_one_is_off_by_less_than_a_millimetre_are_doubted():
+    good = session_of(measured_blade(22, views=4, pixels=60))
+    first, off, *rest = good.views
+    moved = replace(off, cloud=Cloud(off.cloud.points + np.array([0.0, 0.36, 0.2])))
+    found = run(replace(good, views=(first, moved, *rest)))
+    assert found.left_out or found.doubts[0].startswith("Four poses contradict their scans by")
