@@ -186,7 +186,8 @@ def gather_evidence(linear: LinearModel, candidates: Sequence[Candidate], limit:
     What remains between the overlaps is not asked here (`overlap_misfit_beyond_noise`).
     """
     evidence = select(linear, candidates, limit)
-    return challenge(linear, candidates, replace(evidence, left_out=cross_validate_named(linear, evidence)))
+    evidence = challenge(linear, candidates, replace(evidence, left_out=cross_validate_named(linear, evidence)))
+    return with_equal_rivals(linear, evidence)
 
 
 def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:
@@ -312,6 +313,21 @@ def challenge(linear: LinearModel, candidates: Sequence[Candidate], evidence: Ev
         return found
     with_second = with_scanner_error(linear, replace(evidence, explanation=two[:1], further=two[1]))
     return with_second if with_second.named else found
+
+
+def with_equal_rivals(linear: LinearModel, evidence: Evidence) -> Evidence:
+    """Add to a single name the contenders that predict views left out as well: these views cannot tell which it is."""
+    if evidence.verdict != "missing_effect" or evidence.second is not None:
+        return evidence
+    named = evidence.named[0]
+    rivals = {
+        r.name: r
+        for r in evidence.ranked[: limits.CROSS_VALIDATED_CANDIDATES]
+        if r.name != named.name and is_contender(r) and not any(r.name in note for note in evidence.notes)
+    }
+    own = {name: cross_validate(linear, r.score) for name, r in rivals.items()}
+    as_good = [rivals[name] for name, found in own.items() if found.as_good_as(evidence.left_out[named.name])]
+    return replace(evidence, explanation=(named, *as_good), left_out=dict(evidence.left_out) | own)
 
 
 def cross_validate_named(linear: LinearModel, evidence: Evidence) -> dict[str, CrossValidation]:

@@ -112,6 +112,12 @@ class CrossValidation:
     poses_sigma: float  # spread of `poses` over folds; each view is in two of them: some 0.6 standard errors
     steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
     heldout_sigma: float = 0.0  # standard error of `heldout`, folds as samples
+    fold_squares: tuple[float, ...] = ()  # that each fold left out keeps with the candidate
+
+    def as_good_as(self, other: "CrossValidation") -> bool:
+        """True if views left out are predicted as well as by another candidate, within the uncertainty of the ratio."""
+        share, sigma = mean_square_share(np.array(self.fold_squares), np.array(other.fold_squares))
+        return share <= 1 + sigma
 
     @property
     def helps(self) -> bool:
@@ -163,6 +169,7 @@ def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
         poses_sigma=poses_sigma,
         steadiness=_steadiness(beside, trial, _model_and_candidate_columns(beside, scored), trial.solve()),
         heldout_sigma=heldout_sigma,
+        fold_squares=tuple(map(float, squares[0])),
     )
 
 

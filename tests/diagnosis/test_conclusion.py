@@ -17,7 +17,7 @@ USELESS = CrossValidation(inside=0.5, heldout=1.0, poses=1.0, poses_sigma=0.1, s
 def ranked(name, beside=None, adjusted=1e-6):
     of = SimpleNamespace(name=name, empirical=False)
     seen = {"observable": True, "values": (), "form": SimpleNamespace(free=()), "log_bayes_factor": 12.0}
-    score = SimpleNamespace(name=name, base_model=beside, candidate=of, **seen)
+    score = SimpleNamespace(name=name, base_model=beside, candidate=of, fitted=True, **seen)
     return Ranked(score, adjusted, log_posterior=9.0, posterior=0.9)
 
 
@@ -78,3 +78,22 @@ def test_a_second_effect_that_alone_may_be_chance_gets_no_name(monkeypatch):
     found = upheld(monkeypatch, evidence, together=None, refused=[])
     assert found.verdict == "unknown_effect" and not found.named
     assert "backlash" in found.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("squares", "notes", "rivals"),
+    [
+        ((1.02, 0.97, 1.05, 0.98), (), True),  # the same on views left out, though one is likelier in the fit
+        ((1.9, 2.1, 2.0, 2.2), (), False),
+        ((1.02, 0.97, 1.05, 0.98), ("lens_distortion helps among the measured poses, but not beyond",), False),
+    ],
+)
+def test_what_predicts_views_left_out_as_well_is_not_told_from_the_name(monkeypatch, squares, notes, rivals):
+    rival = replace(HELPS, fold_squares=squares)
+    monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: rival)
+    named = {FIRST.name: replace(HELPS, fold_squares=(1.0, 1.0, 1.0, 1.0))}
+    found = gathering.with_equal_rivals(None, replace(ALONE, left_out=named, notes=notes))
+    assert found.verdict == ("cannot_tell" if rivals else "missing_effect")
+    assert found.named == ((FIRST, SECOND) if rivals else (FIRST,))
+    # Where both are missing, each was asked beside the other.
+    assert gathering.with_equal_rivals(None, replace(PAIR, left_out=named)).named == (FIRST,)
