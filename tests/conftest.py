@@ -25,6 +25,9 @@ if os.environ.get("PYTEST_XDIST_WORKER") and hasattr(os, "sched_setaffinity"):
     _cores = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {_cores[int(os.environ["PYTEST_XDIST_WORKER"][2:]) % len(_cores)]})
 
+# What a command prints does not hang on how long the machine takes.
+os.environ.setdefault("STITCH_PROGRESS", "off")
+
 # As inside a run: the tests call the stages directly.
 library_threads_off()
 

@@ -90,9 +90,9 @@ def _wrapped(line: str) -> str:
 
 @contextmanager
 def _narrow() -> Iterator[None]:
-    """A page's width for tables, whatever the terminal has."""
-    before = {name: os.environ.get(name) for name in ("COLUMNS", "NO_COLOR")}
-    os.environ.update(COLUMNS=str(WIDTH), NO_COLOR="1")
+    """A page's width for tables, whatever the terminal has, and no word of how long the work takes."""
+    before = {name: os.environ.get(name) for name in ("COLUMNS", "NO_COLOR", "STITCH_PROGRESS")}
+    os.environ.update(COLUMNS=str(WIDTH), NO_COLOR="1", STITCH_PROGRESS="off")
     try:
         yield
     finally:

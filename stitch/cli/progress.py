@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _SOON = 1.0  # a loop that ends sooner (s) needs no time left
 _QUIET = 2.0  # work that ends sooner (s) needs no plain line
 _AGAIN = 10.0  # the same step is named again after so long (s)
-PROGRESS_VARIABLE = "STITCH_PROGRESS"
+PROGRESS_VARIABLE = "STITCH_PROGRESS"  # json: lines for programs; off: none on what is no terminal
 
 
 @contextmanager
@@ -77,7 +77,7 @@ class LiveLine:
     def say(self, text: str | _Elapsed, step: str) -> None:
         """Show a text of a step in place of the last."""
         if not sys.stderr.isatty():
-            if not progress_lines_requested():
+            if not os.environ.get(PROGRESS_VARIABLE):
                 self._plain.show(step, text)
             return
         if self._status is None:

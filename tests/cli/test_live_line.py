@@ -72,7 +72,8 @@ with watched(TimeLeft()), show_activity("diagnosing [2]"):
 
 def test_a_terminal_shows_it_and_a_pipe_gets_a_line_a_step():
     ours, theirs = pty.openpty()
-    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
+    quiet = {key: value for key, value in os.environ.items() if key != "STITCH_PROGRESS"}
+    environment = {**quiet, "TERM": "xterm", "COLUMNS": "100"}
     subprocess.run([sys.executable, "-c", CODE], stderr=theirs, env=environment, check=True)
     os.close(theirs)
     shown = os.read(ours, 100_000)
@@ -81,7 +82,9 @@ def test_a_terminal_shows_it_and_a_pipe_gets_a_line_a_step():
     seconds = [re.findall(rb"diagnosing \[2\]; 0:(\d\d)", part) for part in (before, after)]
     assert int(seconds[0][0]) < int(seconds[1][-1])
     os.close(ours)
-    piped = subprocess.run([sys.executable, "-c", CODE], stderr=subprocess.PIPE, check=True, text=True).stderr
+    command = [sys.executable, "-c", CODE]
+    piped = subprocess.run(command, stderr=subprocess.PIPE, check=True, text=True, env=quiet).stderr
     assert re.fullmatch(r"diagnosing \[2\]; 0:02\nscans: 3 of 4, 0:0\d left\n", piped)
-    asked = {**os.environ, "STITCH_PROGRESS": "json"}
-    assert not subprocess.run([sys.executable, "-c", CODE], stderr=subprocess.PIPE, check=True, env=asked).stderr
+    for asked in ("json", "off"):
+        told = {**quiet, "STITCH_PROGRESS": asked}
+        assert not subprocess.run(command, stderr=subprocess.PIPE, check=True, env=told).stderr
