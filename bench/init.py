@@ -71,7 +71,7 @@ class Cell:
         found = all_readings(raw, None, StatedTable())
         pairs = pairings(self.clouds, raw.labels)
         decided = choose_convention(self.capture, self.motions, found, pairs, candidate_units(found, StatedTable()))
-        settled = choose_mounting(decided, None, None, False)
+        settled = choose_mounting(decided, None, None)
         way = decided.best.interpretation
         said = f"{way.reading.words}, {way.length_unit}, {settled.mount}{', inverted' * settled.inverted}"
         said += f" ({decided.best.misfit:.2f} mm, next {decided.runner_up.misfit if decided.runner_up else 0:.2f})"

@@ -16,7 +16,7 @@ from stitch.frames import Array
 from stitch.intake.cloud_pairs import Pairing
 from stitch.intake.folder_files import Guess
 from stitch.intake.layouts import MM, POSE_UNITS
-from stitch.intake.readings import Reading
+from stitch.intake.readings import JOINT_ANGLES, Reading
 from stitch.integrity.conventions import (
     CLEARLY_BETTER,
     FEWEST,
@@ -350,13 +350,14 @@ class Mounting:
         return frames.inverse(T) if self.inverted else T
 
 
-def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool | None, of_joints: bool) -> Mounting:
-    """Settle it, by what a person states, else by where things lie.
+def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool | None) -> Mounting:
+    """Settle who carries the scanner: as a person states it, else by where things lie.
 
     Args:
         mount, inverse: as stated; None where they are not.
-        of_joints: poses are from joint angles, so that their direction is known.
     """
+    reading = decided.best.interpretation.reading
+    of_joints = reading.rotation == JOINT_ANGLES
     direct = "eye_in_hand" if decided.best.interpretation.carries else "eye_to_hand"
     other = "eye_to_hand" if decided.best.interpretation.carries else "eye_in_hand"
     nearer = "eye_in_hand" if decided.scanner_at_flange else "eye_to_hand"
@@ -367,6 +368,8 @@ def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool 
     told = True
     if mount is not None:
         chosen, reason = mount, "stated with --mount"
+    elif reading.layout.turntable:
+        chosen, reason = "eye_to_hand", "a turntable carries the part"
     elif inverse is not None or of_joints:
         chosen = other if inverse else direct
         reason = "the direction of the poses is " + ("stated" if inverse is not None else "known from joint angles")

@@ -30,7 +30,7 @@ from stitch.intake.folder_files import FolderFiles, Guess, angles_in_names, find
 from stitch.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, cloud_units, covariate_columns, size_words
 from stitch.intake.raw_poses import RawPoses, header_poses, is_program, program_poses, read_raw_poses
 from stitch.intake.readings import (
-    JOINT_ANGLES,
+    Reading,
     StatedTable,
     all_readings,
     candidate_units,
@@ -221,7 +221,7 @@ class FirstSession:
 
 
 def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
-    """Find, read and judge.
+    """Find clouds and poses in a folder, read them, and let the scans tell how they belong together.
 
     Raises:
         InputError: no clouds or poses, or one that cannot be read; names the file and what to do.
@@ -242,29 +242,28 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     seen, of_targets = find_folder_targets(found, points, CLOUD_UNITS[own_units[0]], stated.targets)
     motions = cache(lambda: register_scan_pairs(capture))
     shown = target_motions(seen) if seen else None
-    decided = choose_convention(capture, motions, ways_to_read, pairs, units, stated.carries, shown)
+
+    def choose(among: Sequence[Reading]) -> ConventionChoice:
+        return choose_convention(capture, motions, among, pairs, units, stated.carries, shown)
+
+    decided = choose(ways_to_read)
     require_own_frames(folder, motions, decided)
     if not decided.determined:
         require_scale(found, fitted_scale(motions(), decided), stated)
-    believed = decided.best.interpretation.reading.layout
-    if not decided.determined or not (believed.sure or stated.rotation):
-        doubted = [] if believed.turntable else doubted_readings(raw, found.urdf, stated)
-        if doubted and decided.determined:
-            decided = weigh_doubts(decided, choose_by_surfaces(capture, doubted, decided.best.interpretation))
-        elif doubted:
-            other = choose_convention(capture, motions, doubted, pairs, units, stated.carries, shown)
-            decided = weigh_doubts(decided, other)
+    layout = decided.best.interpretation.reading.layout
+    doubted = [] if layout.turntable else doubted_readings(raw, found.urdf, stated)
+    if doubted and not decided.determined:
+        decided = weigh_doubts(decided, choose(doubted))
+    elif doubted and not (layout.sure or stated.rotation):
+        decided = weigh_doubts(decided, choose_by_surfaces(capture, doubted, decided.best.interpretation))
     if not decided.determined and found.clouds[0].suffix.lower() in DEPTH_SUFFIXES:
-        # Of counts that are far too large or small the motions close less well.
+        # Where counts are far too large or small the motions close less well.
         require_scale(found, fitted_scale(motions(), decided, (10.0, 0.1)), stated)
-    of_joints = decided.best.interpretation.reading.rotation == JOINT_ANGLES
-    turned = believed.turntable and stated.mount is None
-    settled = choose_mounting(decided, "eye_to_hand" if turned else stated.mount, stated.inverse, of_joints)
     axis, axis_guess = guess_optical_axis(clouds)
+    settled = choose_mounting(decided, stated.mount, stated.inverse)
     told = session_guesses(found, raw, decided, points, own_units, stated)
-    left = _left_out_guess(found, decided, lost)
-    guesses = (*told, settled.guess, axis_guess, *of_targets, *left)
-    return FirstSession(found, raw, own_units[0], decided, settled, guesses, optical_axis=axis, sightings=seen)
+    guesses = (*told, settled.guess, axis_guess, *of_targets, *_left_out_guess(found, decided, lost))
+    return FirstSession(found, raw, own_units[0], decided, settled, guesses, axis, sightings=seen)
 
 
 # Of the width of a profile: how far its points lie from a plane through the scanner.
@@ -294,7 +293,7 @@ def _profiles_of_a_sphere(
     decided = ConventionChoice(ConventionScore(way, np.eye(4), np.inf, False, None), None, False, (), 0.0, 0.0)
     points = [cloud.points for cloud in clouds]
     own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
-    mounting = choose_mounting(decided, stated.mount, stated.inverse, way.reading.rotation == JOINT_ANGLES)
+    mounting = choose_mounting(decided, stated.mount, stated.inverse)
     axis, axis_guess = guess_optical_axis(clouds)
     sphere = Guess("sphere", f"radius {radii[0]:g} mm", "stated with --ball", True, "--ball")
     guesses = (*session_guesses(files, raw, decided, points, own_units, stated), mounting.guess, axis_guess, sphere)
