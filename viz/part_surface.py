@@ -126,7 +126,7 @@ def _whole_pieces(mesh: TriangleMesh) -> tuple[Array, Indices]:
 
 
 # A mesh runs on beyond the last points, in teeth; so far from them, in spacings of the points, it is shown.
-_OVERHANG = 1.0
+_OVERHANG = 1.25
 
 
 def _without_overhang(mesh: TriangleMesh, points: Array) -> TriangleMesh:

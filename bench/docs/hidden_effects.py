@@ -32,15 +32,12 @@ class Hidden:
 
 
 CASES = (
-    Hidden("joint_offset", 3, "robot"),
     Hidden("joint_compliance", 3, "robot"),
     Hidden("gear_eccentricity", 4, "robot"),
-    Hidden("backlash", 4, "robot"),
     Hidden("third_harmonic", 4, "robot, a law of no library"),
     Hidden("mount_drift", 2, "mount"),
     Hidden("mount_warmup", 2, "mount", "blade-table"),
     Hidden("part_slip", 2, "part"),
-    Hidden("part_growth", 3, "part", "blade-table"),
     Hidden("range_nonlinearity", 3, "scanner"),
     Hidden("field_curvature", 3, "scanner"),
     Hidden("scanner_thermal_scale", 3, "scanner"),

@@ -4,6 +4,9 @@
 // `part` is the data of the part, `found` the screen of diagnosis.json or null; `um` micrometres in one length_unit.
 function showScreen(root, part, found, um) {
   const at = name => root.querySelector(`[data-${name}]`);
+  // What is allowed is not red.
+  const allowed = Number(at("legend")?.dataset.tolerance) || 0;
+  if (part) part.full = Math.max(part.full, allowed);
   const sides = ["now", "then"].map(name => at(name)).filter(Boolean);
   const views = sides.length && part ? sides.map((side, i) => partStage(side, part, i)) : [];
   views.forEach((view, i) => view.moved = () => views.forEach((other, k) => k !== i && other.look(view.eye())));
@@ -76,8 +79,7 @@ function showScreen(root, part, found, um) {
         svgNode("title", {}, `${shortNumber(i / bins * full)} to ${shortNumber((i + 1) / bins * full)} µm: ${Math.round(100 * own[i])} % of the surface`))));
     }
     for (const y of roundMarks(0, full, 6)) svg.append(svgNode("text", { x: left - 5, y: Y(y) + 4, "text-anchor": "end" }, shortNumber(y)));
-    const allowed = Number(place.dataset.tolerance);
-    if (allowed && allowed < full) svg.append(svgNode("line", { class: "allowed", x1: left - 4, x2: wide, y1: Y(allowed), y2: Y(allowed) }), svgNode("text", { class: "axis", x: wide, y: Y(allowed) - 4, "text-anchor": "end" }, `${shortNumber(allowed)} µm`));
+    if (allowed && allowed <= full) svg.append(svgNode("line", { class: "allowed", x1: left - 4, x2: wide, y1: Y(allowed), y2: Y(allowed) }), svgNode("text", { class: "axis", x: wide, y: Y(allowed) - 4, "text-anchor": "end" }, `${shortNumber(allowed)} µm`));
     svg.append(svgNode("text", { x: left, y: high - 4 }, "grey: left · blue: right"));
     place.replaceChildren(svg);
     const within = both.map(({ values }) => { const seen = values.filter(Number.isFinite); return Math.round(100 * seen.filter(v => v <= allowed).length / Math.max(seen.length, 1)); });
