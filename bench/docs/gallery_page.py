@@ -122,6 +122,21 @@ Scenes of the simulator and measured objects, run and diagnosed by the command l
 
 Recordings are not kept in the project; `python -m bench.docs.gallery --keep FOLDER` makes them, then
 `stitch view FOLDER/blade/run` shows one.
+
+## Hidden effects and their laws
+
+One law of nature is hidden in a blade cell; the screen names it, and its plot shows the law: torque, angle, time, the
+order of views. Made by `python -m bench.docs.hidden_effects`.
+
+| hidden | screen |
+|---|---|
+| joint_compliance: joints give way under load | ![compliance](gallery/joint_compliance.webp) |
+| gear_eccentricity: a gear runs out of true | ![eccentricity](gallery/gear_eccentricity.webp) |
+| mount_drift: the scanner's mount creeps | ![drift](gallery/mount_drift.webp) |
+| mount_warmup: the mount moves while it warms up | ![warm-up](gallery/mount_warmup.webp) |
+| part_slip: the part slips between two views | ![slip](gallery/part_slip.webp) |
+| range_nonlinearity: the scanner is off away from its working distance | ![range](gallery/range_nonlinearity.webp) |
+| third_harmonic: a law that the library does not know | ![no name](gallery/third_harmonic.webp) |
 """
 
 _SCENES = """Twelve views each, seed 3. What is hidden is one law of nature ([scenes and laws](synth.md)) beside the

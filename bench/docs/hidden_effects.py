@@ -39,8 +39,6 @@ CASES = (
     Hidden("mount_warmup", 2, "mount", "blade-table"),
     Hidden("part_slip", 2, "part"),
     Hidden("range_nonlinearity", 3, "scanner"),
-    Hidden("field_curvature", 3, "scanner"),
-    Hidden("scanner_thermal_scale", 3, "scanner"),
 )
 
 
