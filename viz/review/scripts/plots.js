@@ -1,5 +1,5 @@
 // Where it fails: a small plot for each property. What is chosen in one changes part and numbers.
-import { at, digits, element, um } from "./elements.js";
+import { at, digits, element, signed, um } from "./elements.js";
 import { back, onShown, showChoice } from "./scene.js";
 import { send } from "./server.js";
 
@@ -46,13 +46,13 @@ function draw() {
     return;
   }
   root.style.minHeight = "";
-  const follows = state.diagnosis ? state.diagnosis.follows.map(f => f.table) : [];
+  const found = state.diagnosis ? state.diagnosis.follows : [], follows = found.map(f => f.table);
   const rank = table => follows.includes(table.name) ? follows.indexOf(table.name) - 100 : -table.clearest;
   const properties = state.comparison.filter(t => !t.label.length && t.low.length > 1).sort((a, b) => rank(a) - rank(b));
   const shown = all ? properties : properties.slice(0, FIRST);
   const focus = document.activeElement && document.activeElement.dataset.key;
   const parts = [named(VIEWS, "Views", "views", state.labelled ? "rms of the labelled points of each" : "rms of each against the others"),
-    named(TARGETS, "Targets", "targets", "rms of each over the views"), ...shown.map(table => plot(table, follows)), places(),
+    named(TARGETS, "Targets", "targets", "rms of each over the views"), ...shown.map(table => plot(table, found.find(f => f.table === table.name))), places(),
     properties.length > FIRST && element("button", { type: "button", onclick: () => { all = !all; draw(); }, "aria-expanded": String(all) },
       all ? "Fewer properties" : `${properties.length - FIRST} further properties`)];
   root.replaceChildren(...parts.filter(Boolean));
@@ -78,11 +78,11 @@ function named(name, title, key, what) {
   })), shown[0], shown[shown.length - 1]);
 }
 
-function plot(table, follows) {
+function plot(table, follows) {  // `follows` where the diagnosis says that what is unexplained follows it
   const spread = table.mean_sigma.map(x => 2 * (x ?? 0));
   const most = Math.max(...table.mean.map((x, i) => Math.abs(x ?? 0) + spread[i]), 1e-9);
   const unit = table.unit ? ` ${table.unit}` : "", chosen = choice.bins[table.name];
-  const told = (follows.includes(table.name) ? "what is unexplained follows it; " : "")
+  const told = (follows ? `what is unexplained follows it (p = ${signed(follows.p)}); ` : "")
     + (table.name.startsWith("approach of ") ? "−1: it last turned down, +1: up; " : "");
   return card(`${table.name}${table.unit ? ` (${table.unit})` : ""}`, `${told}signed mean ± 2σ, within ±${um(most)}`, "", table.mean.map((mean, i) => bar({
     key: `${table.name} ${i}`, height: (mean ?? 0) / most / 2, from: 0.5, spread: spread[i] / most / 2,
