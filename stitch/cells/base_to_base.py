@@ -21,6 +21,7 @@ from stitch.cells.job_files import (
 )
 from stitch.cells.stand import (
     BaseFit,
+    DhArm,
     DistanceComparison,
     Projection,
     Stand,
@@ -51,6 +52,7 @@ class BaseResult:
     projection: Projection | None
     no_projection: str | None  # why there is none
     comparisons: tuple[DistanceComparison, ...]
+    flange_rpy: dict[str, list[float]]  # α, β, γ by the points that joint angles gave
 
 
 def solve_stand(stand: Stand) -> BaseResult:
@@ -76,10 +78,16 @@ def solve_stand(stand: Stand) -> BaseResult:
             f"redundant readings; the largest misfit is {sizes[worst]:.4g} {stand.length_unit} at "
             f"{(stand.rail.names + stand.rod.names)[worst]}; to fix: read that point again, or state larger sigmas"
         )
+    turns = {
+        name: angles.tolist()
+        for touched in (stand.rail, stand.rod)
+        if touched.rpy is not None
+        for name, angles in zip(touched.names, touched.rpy, strict=True)
+    }
     try:
-        return BaseResult(stand.length_unit, solution, project(stand), None, comparisons)
+        return BaseResult(stand.length_unit, solution, project(stand), None, comparisons, turns)
     except NoResultError as error:
-        return BaseResult(stand.length_unit, solution, None, str(error), comparisons)
+        return BaseResult(stand.length_unit, solution, None, str(error), comparisons, turns)
 
 
 def comparison_text(c: DistanceComparison, unit: str) -> str:
@@ -105,6 +113,7 @@ def base_document(result: BaseResult) -> dict[str, Any]:
         "sigma": {"rotation": solution.sigma[:3].tolist(), "translation": solution.sigma[3:].tolist()},
         "covariance": solution.covariance.tolist(),
         "T_base1_stand": solution.T_base1_stand.tolist(),
+        "flange_rpy": result.flange_rpy,
         "rail_residuals": solution.rail_residuals.tolist(),
         "rod_residuals": solution.rod_residuals.tolist(),
         "chi_square": solution.chi_square,
@@ -198,13 +207,16 @@ def _touched_points(
     Args:
         unit, to_rad: metres per length unit and rad per angle unit.
     """
-    robot = document.table(name, {"points", "sigma"}, required=True)
+    robot = document.table(name, {"points", "sigma", "arm"}, required=True)
     listed = robot.entries.get("points")
     if not isinstance(listed, list) or len(listed) < 2:
         raise InputError(f"{document.file}: [[{name}.points]] has fewer than two entries; to fix: add one")
-    sigma = robot.table("sigma", {"point", *_CYLINDER})
-    known = {"name", "point", *_CYLINDER, *readings}
+    sigma = robot.table("sigma", {"point", "joint", *_CYLINDER})
+    known = {"name", "point", "joints", *_CYLINDER, *readings}
     entries = [checked_table(document.file, f"{name}.points[{i + 1}]", entry, known) for i, entry in enumerate(listed)]
+    names = tuple(str(entry.entries.get("name", f"{name} {i + 1}")) for i, entry in enumerate(entries))
+    if "arm" in robot:
+        return _points_of_joints(robot, entries, names, sigma, unit=unit, to_rad=to_rad), entries
     points: list[Array] = []
     covariances: list[Array] = []
     for entry in entries:
@@ -227,8 +239,41 @@ def _touched_points(
             sigma.number("height", default, positive=True),
         )
         covariances.append(cylinder_covariance(np.array(joint1 * to_rad), np.array(radius), spread))
-    names = tuple(str(entry.entries.get("name", f"{name} {i + 1}")) for i, entry in enumerate(entries))
     return TouchedPoints(names, np.array(points, float), np.array(covariances, float)), entries
+
+
+def _points_of_joints(
+    robot: JobTable, entries: list[JobTable], names: tuple[str, ...], sigma: JobTable, *, unit: float, to_rad: float
+) -> TouchedPoints:
+    """Where the tip stood by the joints' angles and the arm's DH rows, and how the flange was turned."""
+    table = robot.table("arm", {"dh", "joints", "tip"})
+    listed = table.entries.get("joints")
+    if not isinstance(listed, list) or not listed:
+        raise table.refusal("joints", "list the DH rows, as { a = 0.3, alpha_deg = -90, d = 0.5, theta_deg = 0 }")
+    place = f"{table.place}.joints"
+    rows = [
+        checked_table(robot.file, f"{place}[{i + 1}]", row, {"a", "alpha_deg", "d", "theta_deg", "slides"})
+        for i, row in enumerate(listed)
+    ]
+    slides = np.array([row.entries.get("slides", False) is True for row in rows])
+    arm = DhArm(
+        a=np.array([row.number("a", 0.0) for row in rows]),
+        alpha=np.radians([row.number("alpha_deg", 0.0) for row in rows]),
+        d=np.array([row.number("d", 0.0) for row in rows]),
+        theta=np.radians([row.number("theta_deg", 0.0) for row in rows]),
+        slides=slides,
+        modified=table.choice("dh", ("standard", "modified"), "standard") == "modified",
+        tip=table.vectors("tip", (3,), "[x, y, z] in the flange frame") if "tip" in table else np.zeros(3),
+    )
+    form = f"{len(rows)} numbers, one for each DH row"
+    units = np.where(slides, 1.0, to_rad)
+    joints = np.array([entry.vectors("joints", (len(rows),), form) for entry in entries]) * units
+    point = sigma.number("point", _POINT / unit, positive=True)
+    reach = max(float(np.linalg.norm(arm.flange(joints)[:, :3, 3], axis=1).max()), point)
+    turning = sigma.number("joint", point / reach / to_rad, positive=True) * to_rad
+    points, covariance, rpy = arm.touched(joints, np.where(slides, point, turning))
+    # The tip finds a cup to within the touch's own sigma, which also keeps the covariance regular.
+    return TouchedPoints(names, points, covariance + np.eye(3) * point**2, rpy)
 
 
 def _column(entries: list[JobTable], key: str, positive: bool = False) -> Array:
@@ -307,6 +352,8 @@ def _print_solution(result: BaseResult) -> None:
     )
     for comparison in result.comparisons:
         terminal.print(comparison_text(comparison, unit) + ".")
+    for name, angles in result.flange_rpy.items():
+        terminal.print(f"{name}: flange turned by α β γ {fixed_digits(np.array(angles), 4)} rad about x, y, z.")
     if result.no_projection:
         terminal.print(f"No projection: {result.no_projection}.")
     for row in solution.T_base1_base2:

@@ -4,11 +4,12 @@ Stand frame S: origin at slide zero, x along the rail away from P1, z the pivot 
 At angle 0 the rod lies on the rail and points back to P1, towards −x.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -16,6 +17,7 @@ from scipy.stats import chi2
 from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array
+from stitch.measurement.robot import elementary
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class TouchedPoints:
     names: tuple[str, ...]
     points: Array  # (N, 3), length unit
     covariance: Array  # (N, 3, 3)
+    rpy: Array | None = None  # (N, 3) α, β, γ of the flange, R = Rz(γ) Ry(β) Rx(α), where joint angles gave the points
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,41 @@ def cylinder_covariance(joint1: Array, radius: Array, sigma: tuple[float, float,
         axis=-2,
     )
     return np.asarray(jacobian @ np.diag(np.square(sigma)) @ np.swapaxes(jacobian, -1, -2))
+
+
+@dataclass(frozen=True)
+class DhArm:
+    """A chain of turning and sliding joints by DH rows; lengths in length unit, angles in rad."""
+
+    a: Array  # (n,)
+    alpha: Array
+    d: Array
+    theta: Array
+    slides: NDArray[np.bool_]  # joints that slide along z instead of turning about it
+    modified: bool = False  # Craig's rows; else those of Denavit and Hartenberg
+    tip: Array = field(default_factory=lambda: np.zeros(3))  # in the flange frame
+
+    def flange(self, joints: Array) -> Array:
+        """T_base_flange (..., 4, 4) at joints (..., n)."""
+        T = np.eye(4)
+        for i, q in enumerate(np.moveaxis(np.asarray(joints, float), -1, 0)):
+            turn = self.theta[i] + (0.0 if self.slides[i] else q)
+            shift = self.d[i] + (q if self.slides[i] else 0.0)
+            joint, link = elementary("z", turn, shift), elementary("x", self.alpha[i], self.a[i])
+            T = T @ (link @ joint if self.modified else joint @ link)
+        return T
+
+    def touched(self, joints: Array, sigma: Array) -> tuple[Array, Array, Array]:
+        """Tips (N, 3), their covariance (N, 3, 3) from the joints' sigmas (n,), and α, β, γ (N, 3) of the flange."""
+        T, steps = self.flange(joints), 1e-5 * np.eye(len(sigma))
+        ahead, back = (self._tips(joints[:, None] + sign * steps) for sign in (1, -1))
+        slopes = (ahead - back) / 2e-5 * sigma[:, None]
+        angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX")[:, ::-1]
+        return self._tips(joints), np.einsum("nki,nkj->nij", slopes, slopes), angles
+
+    def _tips(self, joints: Array) -> Array:
+        T = self.flange(joints)
+        return np.asarray(T[..., :3, 3] + T[..., :3, :3] @ self.tip)
 
 
 def rod_points(slide: Array, angle: Array, length: Array, turn: float) -> Array:

@@ -9,9 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch.cells.base_to_base import read_stand, solve_stand
-from stitch.cells.stand import Stand, TouchedPoints, compare_distances, fit_stand, project
+from stitch.cells.stand import DhArm, Stand, TouchedPoints, compare_distances, fit_stand, project
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
+from stitch.measurement.robot import forward, jacobian
+from stitch.reading.robot_description import robot_from_dh
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "base_to_base.toml"
 DRAWS = 1000
@@ -285,3 +287,81 @@ def main_(arguments):
     with pytest.raises(SystemExit) as stop:
         main(arguments)
     assert stop.value.code == 0
+
+
+JOINTS_EXAMPLE = EXAMPLE.with_name("base_to_base_joints.toml")
+# Table 3 of the source without noise: α, β, γ of the flange; its γ at R counts clockwise.
+TABLE_3 = {"P1": (np.pi, 0, 0.6283), "P2": (np.pi, 0, -0.6283), "R1": (0, 0, -0.4488), "R2": (0, 0, 0.4488)}
+
+
+def test_joint_angles_give_the_source_s_points_and_flange_angles():
+    s = read_stand(JOINTS_EXAMPLE)
+    by_points = printed(*EXPERIMENT_1, (0.6283, 0.4488))
+    assert np.abs(s.rail.points - by_points.rail.points).max() < 1e-6
+    assert np.abs(s.rod.points - by_points.rod.points).max() < 1e-6
+    for name, angles in solve_stand(s).flange_rpy.items():
+        off = Rotation.from_euler("ZYX", angles[::-1]).inv() * Rotation.from_euler("ZYX", TABLE_3[name][::-1])
+        assert off.magnitude() < 1e-6
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_dh_rows_as_the_sessions_of_stitch_read_them(convention):
+    rng = np.random.default_rng(4)
+    a, d = rng.uniform(0.05, 0.6, (2, 6))
+    alpha, theta, q = rng.uniform(-np.pi, np.pi, (3, 6))
+    keys = ("a", "alpha_deg", "d", "theta_deg")
+    rows = [dict(zip(keys, v, strict=True)) for v in zip(a, np.degrees(alpha), d, np.degrees(theta), strict=True)]
+    robot = robot_from_dh("6R", convention, rows, None, np.array([0, 0, -9.81]), "m")
+    tip = np.array([0.02, -0.1, 0.3])
+    arm = DhArm(a, alpha, d, theta, np.zeros(6, bool), convention == "modified", tip)
+    T = forward(robot, q)
+    assert np.abs(arm.flange(q) - T).max() < 1e-12
+    # Covariance by the screws of the joints.
+    points, covariance, _ = arm.touched(q[None], np.full(6, 1e-4))
+    J = jacobian(robot, q)
+    slopes = T[:3, :3] @ (np.cross(J[:3].T, tip).T + J[3:])
+    assert np.abs(points[0] - (T[:3, 3] + T[:3, :3] @ tip)).max() < 1e-12
+    assert np.abs(covariance[0] - 1e-8 * slopes @ slopes.T).max() < 1e-8 * 1e-6
+
+
+def test_scara_by_its_closed_form():
+    """Two links turn in the plane, the third joint is a length downwards, the fourth turns the flange."""
+    q = np.array([0.4, -0.9, 0.12, 0.3])
+    rows = np.array([[0.4, 0, 0.5], [0.3, 0, 0], [0, np.pi, 0], [0, 0, 0.0]])
+    arm = DhArm(rows[:, 0], rows[:, 1], rows[:, 2], np.zeros(4), np.array([False, False, True, False]))
+    T = arm.flange(q)
+    x, y = (0.4 * f(q[0]) + 0.3 * f(q[0] + q[1]) for f in (np.cos, np.sin))
+    assert np.abs(T[:3, 3] - [x, y, 0.5 + q[2]]).max() < 1e-12
+    assert np.arctan2(T[1, 0], T[0, 0]) == pytest.approx(q[0] + q[1] - q[3])
+    _, covariance, _ = arm.touched(q[None], np.array([0, 0, 2e-4, 0]))
+    assert np.abs(covariance[0] - np.diag([0, 0, 4e-8])).max() < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "joints = [0.4488, 0.0, 0.0, 0.0]",
+            "joints = [0.4488, 0.0]",
+            r"second.points[2].joints is [0.4488, 0.0]; to fix: write 4",
+        ),
+        ("{ a = 0.8 }", "{ b = 0.8 }", "unknown key 'main.arm.joints[2].b'; to fix: write"),
+        (
+            'dh = "standard"',
+            'dh = "hartenberg"',
+            "main.arm.dh is 'hartenberg'; to fix: write one of standard, modified",
+        ),
+    ],
+)
+def test_wrong_joints_are_named(tmp_path, old, new, message):
+    text = JOINTS_EXAMPLE.read_text()
+    assert old in text
+    (tmp_path / "stand.toml").write_text(text.replace(old, new))
+    with pytest.raises(InputError) as error:
+        read_stand(tmp_path / "stand.toml")
+    assert message in str(error.value)
+
+
+def test_contradiction_of_experiment_2_is_named():
+    with pytest.raises(NoResultError, match=r"R1 to R2 is 0\.6076 m by the stand and 0\.8229 m by the robot"):
+        solve_stand(read_stand(EXAMPLE.with_name("base_to_base_2.toml")))
