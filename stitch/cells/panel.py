@@ -163,7 +163,7 @@ def _read_robots(file: Path, names: tuple[str, ...], texts: str, numbers: str) -
 # A panel job (TOML) and its CSV files -> `Job`; every check of the input is made here.
 
 PANEL_FORMAT = "stitch-panel/1"
-_KEYS = {"format", "robots", "master", "target", "layout", "tracker", "shape", "legs", "files"}
+_KEYS = {"format", "robots", "master", "target", "layout", "tracker", "shape", "legs", "limits", "files"}
 _AXES = ("rx", "ry", "rz", "x", "y", "z")
 _FILES = {"calibration", "flanges", "targets", "control", "forces", "world"}
 _LAYOUT = ("radius", "clamp_width", "spacing", "clamp_height", "edge", "length")
@@ -186,6 +186,8 @@ class PanelJob:
     targets: PanelPoints | None
     control: PanelPoints | None
     forces: Array | None  # (N, 6) change of torques and forces
+    force_limit: float = np.inf  # N, at any clamp
+    torque_limit: float = np.inf  # N m
     file: Path | None = None  # that was read
 
 
@@ -213,6 +215,9 @@ def read_panel_job(file: Path | str) -> PanelJob:
         tracker = replace(tracker, position=T_world_tracker[:3, 3])
     tolerance, axes = _read_shape(document.table("shape", {"tolerance", "axes"}))
     flanges = read_per_robot(paths["flanges"], names, POSE_COLUMNS) if "flanges" in paths else None
+    limits = document.table("limits", ("force_N", "torque_Nm"))
+    if limits.entries and "forces" not in paths:
+        raise InputError(f"{file}: [limits] goes with files.forces; to fix: name the table of the sensors' changes")
     return PanelJob(
         robots=names,
         master=names.index(document.choice("master", names)),
@@ -227,6 +232,8 @@ def read_panel_job(file: Path | str) -> PanelJob:
         targets=read_panel_points(paths["targets"], None, T_world_tracker) if "targets" in paths else None,
         control=read_panel_points(paths["control"], names, T_world_tracker) if "control" in paths else None,
         forces=read_per_robot(paths["forces"], names, "tx ty tz fx fy fz") if "forces" in paths else None,
+        force_limit=limits.number("force_N", positive=True) if "force_N" in limits else np.inf,
+        torque_limit=limits.number("torque_Nm", positive=True) if "torque_Nm" in limits else np.inf,
         file=file,
     )
 
@@ -338,6 +345,7 @@ def solve_panel_job(job: PanelJob) -> PanelResult:
     Raises:
         NoResultError: a step has too few or degenerate readings; names the step.
     """
+    _require_forces_within_limits(job)
     models, offsets = calibrate_robots(job)
     bases, clamps = (np.array([getattr(m, name) for m in models]) for name in ("T_world_base", "T_flange_contact"))
     layout = clamp_contacts(job.layout)
@@ -373,6 +381,26 @@ def solve_panel_job(job: PanelJob) -> PanelResult:
         shape_largest=shape_largest,
         shape_commands=shape_commands,
     )
+
+
+def _require_forces_within_limits(job: PanelJob) -> None:
+    """Refuse to give commands while a clamp pulls harder than it may.
+
+    Raises:
+        NoResultError: names the clamp.
+    """
+    if job.forces is None:
+        return
+    for what, sizes, limit, unit in (
+        ("force", np.linalg.norm(job.forces[:, 3:], axis=1), job.force_limit, "N"),
+        ("torque", np.linalg.norm(job.forces[:, :3], axis=1) / 1000, job.torque_limit, "N m"),
+    ):
+        worst = int(np.argmax(sizes))
+        if sizes[worst] > limit:
+            raise NoResultError(
+                f"the {what} at clamp {job.robots[worst]} has changed by {sizes[worst]:.1f} {unit}, its limit is "
+                f"{limit:g} {unit}. No robot is told to move; to fix: release that clamp and lay the panel anew"
+            )
 
 
 def _flanges_with_offsets(job: PanelJob, offsets: tuple[LegOffset, ...], believed: Array, sign: float = 1.0) -> Array:

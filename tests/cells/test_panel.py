@@ -13,6 +13,7 @@ from data_synth import hexapod, panel_job
 from data_synth.panel_cell import NAMES, PanelCell, Sizes
 from data_synth.shell import Laminate, Shell
 from stitch import frames
+from stitch.cells.panel import read_panel_job, solve_panel_job
 from stitch.cells.panel_model import (
     ClampLayout,
     ControlPoints,
@@ -334,3 +335,38 @@ def test_bad_job_is_refused_in_one_line(tmp_path, capsys, old, new, message):
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        # The largest force of forces.csv is 2.1 N at E, the largest torque 0.4 N m.
+        (
+            "force_N = 2.0",
+            r"the force at clamp E has changed by 2\.1 N, its limit is 2 N\. No robot is told to move; to fix",
+        ),
+        ("torque_Nm = 0.01", r"the torque at clamp [A-F] has changed by 0\.\d N m, its limit is 0\.01 N m"),
+        ("force_N = 3.0\ntorque_Nm = 3.0", None),
+    ],
+)
+def test_forces_beyond_their_limit_stop_all_robots(tmp_path, limits, message):
+    for file in EXAMPLE.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    job = (tmp_path / "job.toml").read_text()
+    (tmp_path / "job.toml").write_text(f"{job}\n[limits]\n{limits}\n")
+    read = read_panel_job(tmp_path / "job.toml")
+    if message is None:
+        assert (read.force_limit, read.torque_limit) == (3.0, 3.0)
+        return
+    with pytest.raises(NoResultError, match=message):
+        solve_panel_job(read)
+
+
+def test_limits_without_forces_are_refused(tmp_path):
+    for file in EXAMPLE.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    job = (tmp_path / "job.toml").read_text()
+    lines = [line for line in job.splitlines() if not line.startswith("forces")]
+    (tmp_path / "job.toml").write_text("\n".join([*lines, "[limits]", "force_N = 5.0"]))
+    with pytest.raises(InputError, match=r"\[limits\] goes with files\.forces; to fix"):
+        read_panel_job(tmp_path / "job.toml")
