@@ -86,7 +86,7 @@ def show_comparison(comparison: ResidualTables, state: Run, run: Path) -> None:
 
 def _show_followed(followed: Sequence[FollowedCovariate], to_um: float) -> None:
     """Print what whole views follow, and their course along the clearest covariate."""
-    from stitch.comparison.displaced_views import clear_beside, equally_clear
+    from stitch.comparison.displaced_views import also_clear, equally_clear
 
     if not followed:
         return
@@ -95,7 +95,7 @@ def _show_followed(followed: Sequence[FollowedCovariate], to_um: float) -> None:
         say(f"Whole views follow nothing known of them (clearest: {_followed_text(first)}).", bold=True)
         say(_SCOPE)
         return
-    same, beside = equally_clear(followed), clear_beside(followed)
+    same, beside = equally_clear(followed), also_clear(followed)
     say(f"Whole views follow {' or '.join(map(_followed_text, same))}.", bold=True)
     say(_SCOPE)
     if beside:

@@ -78,7 +78,7 @@ def equally_clear(found: Sequence[FollowedCovariate]) -> tuple[FollowedCovariate
     return tuple(own for own in found if own.clear and own.p_value <= _AS_WELL * found[0].p_value)
 
 
-def clear_beside(found: Sequence[FollowedCovariate]) -> tuple[FollowedCovariate, ...]:
+def also_clear(found: Sequence[FollowedCovariate]) -> tuple[FollowedCovariate, ...]:
     """Return those that are clear beside the clearest too."""
     return tuple(own for own in found if own.clear and own.p_beside < FOLLOWS)
 
@@ -97,7 +97,9 @@ def followed_covariates(linear: LinearModel) -> tuple[FollowedCovariate, ...]:
     for k in np.argsort(p_values, kind="stable"):
         best.setdefault(courses[k].covariate, int(k))
     first, *others = best.values()
-    beside = dict(zip(others, _p_values(_beside(linear, numbers[first]), [numbers[k] for k in others]), strict=True))
+    beside = dict(
+        zip(others, _p_values(_conditioned(linear, numbers[first]), [numbers[k] for k in others]), strict=True)
+    )
     # Each is the likeliest of all that are tried.
     return tuple(
         _followed(
@@ -118,7 +120,7 @@ def _p_values(linear: LinearModel, numbers: Sequence[Array]) -> list[float]:
     found = [_p_value(linear, columns) for columns in numbers]
     refitted = _REFITTED if linear.mixed.size <= _FEW_NUMBERS else _REFITTED_OF_MANY
     for k in np.argsort(found, kind="stable")[:refitted]:
-        scatter = at_variances(linear.mixed, _beside(linear, numbers[k]).null.variances)
+        scatter = at_variances(linear.mixed, _conditioned(linear, numbers[k]).null.variances)
         found[k] = _p_value(replace(linear, null=scatter), numbers[k])
     return found
 
@@ -133,7 +135,7 @@ def _p_value(linear: LinearModel, columns: Array) -> float:
     return f_tail(float(np.sum((U.T @ linear.white_residual) ** 2)) / U.shape[1], U.shape[1], max(known, 1.0))
 
 
-def _beside(linear: LinearModel, columns: Array) -> LinearModel:
+def _conditioned(linear: LinearModel, columns: Array) -> LinearModel:
     """The model with the combinations of columns (n, k) that it does not explain itself."""
     white = linear.residual(columns)
     length = np.maximum(np.linalg.norm(white, axis=0), 1e-300)

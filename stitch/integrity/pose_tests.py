@@ -230,13 +230,13 @@ def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple
     back are two steps, and each hides in the scatter that the other makes, as a step does beside one view far off.
     """
 
-    def beside(some: Sequence[_Pick]) -> Array | None:
+    def with_columns_of(some: Sequence[_Pick]) -> Array | None:
         return hstack_columns(first, *(pick.columns for pick in some)) if some else first
 
     picked, significant = list[_Pick](), 0
     while model.count >= _MIN_VIEWS_FOR_STEP and len(picked) < significant + _MAX_STEPS:
         taken = [pick.starts for pick in picked if pick.starts is not None]
-        pick = _next_pick(model, beside(picked), taken) if len(taken) < _MAX_STEPS else None
+        pick = _next_pick(model, with_columns_of(picked), taken) if len(taken) < _MAX_STEPS else None
         if pick is None:
             break
         p = pick.p_value
@@ -250,12 +250,12 @@ def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple
         significant = len(picked) if p < chance else significant
     picked = picked[:significant]
     steps = [
-        likelier_step(model, beside([other for other in picked if other is not pick]), pick.starts, pick.tests)
+        likelier_step(model, with_columns_of([other for other in picked if other is not pick]), pick.starts, pick.tests)
         for pick in picked
         if pick.starts is not None
     ]
     # What was picked early may stand out no more beside the rest.
-    return [step for step in steps if step.p_value < chance], beside(picked)
+    return [step for step in steps if step.p_value < chance], with_columns_of(picked)
 
 
 def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[MovedBody, int]]) -> _Pick | None:

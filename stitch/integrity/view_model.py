@@ -105,11 +105,11 @@ class ViewModel:
     def mixed(self, further: Array | None = None) -> MixedModel:
         """Return the model with further columns (n, K) in its mean, ready for restricted maximum likelihood."""
         mean, usual = hstack_columns(self.hand_eye, further), None if self.usual is None else self.usual[None]
-        own = replace(self._alone, A=column_space(mean, SEEN)[None], fixed=usual)
+        own = replace(self._scatter_model, A=column_space(mean, SEEN)[None], fixed=usual)
         return own if self.errors is None else with_pose_errors(own, self.errors)
 
     @cached_property
-    def _alone(self) -> MixedModel:
+    def _scatter_model(self) -> MixedModel:
         return hand_eye_mixed_model(self.reduced)
 
     def fit(self, further: Array | None = None) -> VarianceFit:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.comparison.displaced_views import FOLLOWS, VIEW_ORDER, clear_beside, equally_clear, followed_covariates
+from stitch.comparison.displaced_views import FOLLOWS, VIEW_ORDER, also_clear, equally_clear, followed_covariates
 from stitch.comparison.residual_tables import compare_targets, comparison_document
 from stitch.pipeline import run
 from tests.diagnosis.freed_blade import freed_blade
@@ -26,7 +26,7 @@ def blade():
 
 def test_scans_that_only_scatter_follow_nothing(blade):
     found = followed_covariates(blade.seen(blade.measurement.T_base_flange))
-    assert found[0].p_value > FOLLOWS and not equally_clear(found) and not clear_beside(found)
+    assert found[0].p_value > FOLLOWS and not equally_clear(found) and not also_clear(found)
 
 
 def test_targets_that_only_scatter_follow_nothing():
@@ -53,7 +53,7 @@ def test_a_joint_is_told_from_time_and_from_the_others(joint):
     joints[:, joint] = 5e-4 * np.sin(session.joints[:, joint])
     found = followed(joints=joints)
     assert found[0].covariate == f"j{joint + 1}" and found[0].shape == "a wave, once a turn"
-    assert not clear_beside(found)
+    assert not also_clear(found)
 
 
 def test_two_things_are_both_told():
@@ -64,7 +64,7 @@ def test_two_things_are_both_told():
     flange[START:, 4] = 0.3
     found = followed(joints=joints, flange=flange)
     assert found[0].p_beside == 1
-    assert {VIEW_ORDER, "j3"} <= {found[0].covariate} | {own.covariate for own in clear_beside(found)}
+    assert {VIEW_ORDER, "j3"} <= {found[0].covariate} | {own.covariate for own in also_clear(found)}
 
 
 def test_the_document_holds_it_as_lists():
