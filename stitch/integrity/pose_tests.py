@@ -242,7 +242,7 @@ def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple
         p = pick.p_value
         if len(picked) > significant:
             # Each of the last two may hide in the scatter that the other makes, and then neither stands out alone.
-            columns, last = beside(picked[:-1]), picked[-1]
+            columns, last = with_columns_of(picked[:-1]), picked[-1]
             under = projector(model, model.fit(columns), columns)
             both = test_alternative(under, hstack_columns(last.columns, pick.columns))
             p = min(p, both.p_value * last.tests * pick.tests)
