@@ -33,9 +33,6 @@ class SilentRecorder:
     def finish(self, run: Run) -> None: ...
 
 
-# Several recorders as one.
-
-
 class RecorderGroup:
     """Several recorders at once."""
 

@@ -11,6 +11,7 @@ from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.comparison.disagreement_field import model_history
 from stitch.comparison.run_verdict import run_verdict
+from stitch.integrity import pose_tests
 from stitch.integrity.pose_tests import PoseTests, expected_poses, find_blunders, find_steps
 from stitch.measurement.session import Cloud
 from stitch.observations.pose_errors import PoseErrors
@@ -94,6 +95,15 @@ def test_half_of_the_views_let_go_explain_a_step_no_better_than_the_step():
 def test_where_every_view_stands_free_no_step_is_sought():
     """Left out and let go until nothing was left to be tested: the search ended in an error."""
     assert find_steps(direct(10), direct(10).columns(range(VIEWS - 1)), (None, 0), 0.01) == ()
+
+
+def test_of_six_views_every_start_of_a_step_may_be_taken():
+    """What is likeliest then is a single view: the search ended in an error."""
+    z = SIGMA * np.random.default_rng(0).standard_normal(36)
+    model = direct_views(z, errors=PoseErrors(("white",), SIGMA**2 * np.eye(36)[None], np.ones(1)))
+    pick = pose_tests._next_pick(model, None, [dict.fromkeys(pose_tests.MOVED_BODIES, k) for k in (2, 3, 4)])
+    assert pick is not None and pick.starts is None
+    assert pick.columns.shape == (36, 6) and pick.tests == 6
 
 
 def test_what_a_view_is_off_by_beside_a_step_is_its_own():
