@@ -180,6 +180,10 @@ _EXCHANGED = (
     "the scan of {0} fits the pose of {1}, whose own scan shows too little of the others to be placed; to fix: "
     "exchange the clouds of {0} and {1} in views.csv, or leave both out"
 )
+_SEVERAL = (
+    "this scan overlaps too little with the others at its pose, and fits the part at several other places alike; to "
+    "fix: add views that overlap with it, or leave it out"
+)
 _COPY = "this scan is a copy of that of {}; to fix: put the right file in its row"
 
 
@@ -249,7 +253,7 @@ def _single_view_problem(
 ) -> SessionProblem:
     names, scan = session.names, capture.scans[m.view]
     own = (names[m.view],)
-    if not shows_no_surface(scan):
+    if m.kind != "several" and not shows_no_surface(scan):
         # Something may be wrong with the cloud rather than with its pose.
         others = [v for v in found.linkage.core if v != m.view]
         surface = surface_of(capture.scans, found.unconstrained.poses, others, found.tolerance)
@@ -259,6 +263,8 @@ def _single_view_problem(
             return SessionProblem(fault.kind, own, fault.fix)
     if m.kind == "torn":
         return SessionProblem("displaced", own, _TORN)
+    if m.kind == "several":
+        return SessionProblem("foreign", own, _SEVERAL)
     if m.T is None:
         return SessionProblem(
             "foreign",

@@ -444,6 +444,8 @@ _ACCEPTED_CLOSURE = 0.8
 # A placement at some row's very pose is believed sooner: by chance none lies there. Other parts still do not reach it.
 _CLOSURE_AT_ROW = 0.75
 CLOSE_SHARE = 0.03  # of the part's size
+# Another place is as good as the best one if so large a share of what lies on the surface there does so.
+_AS_GOOD = 0.8
 _NEAR_GATE = 0.2
 
 
@@ -467,21 +469,27 @@ def place_unlinked_views(
     unconstrained: UnconstrainedPoses,
     linked: Linkage,
     limits: tuple[float, float],
-) -> tuple[dict[int, Placement], list[int]]:
+) -> tuple[dict[int, Placement], list[int], set[int]]:
     """Find where the views outside the core belong, and those that belong nowhere; the core grows as they are placed.
+
+    On a part that looks alike from several sides a view may close at several places: which is its own is not known, and
+    it belongs nowhere unless one of them is its row's.
 
     Args:
         model_poses: (V, 4, 4) T_reference_scanner by the robot.
         limits: distance from the surface that still lies on it, length_unit, and the closure needed.
+
+    Returns:
+        Views that are placed, those that are not, and of these the ones that close at several places.
     """
     if not linked.unlinked or len(linked.core) < 2:
-        return {}, list(linked.unlinked)
+        return {}, list(linked.unlinked), set()
     (tolerance, needed), size, poses = limits, part_size([capture]), np.array(unconstrained.poses)
     placed = place_groups(capture, poses, linked, limits)
     for v, placement in placed.items():
         poses[v] = placement.T
     alone = [v for v in linked.unlinked if v not in placed]
-    core, waiting = [*linked.core, *placed], alone
+    core, waiting, several = [*linked.core, *placed], alone, set[int]()
     while waiting:
         surface = surface_of(capture.scans, poses, core, tolerance)
         new = {}
@@ -494,8 +502,13 @@ def place_unlinked_views(
             # A part clamped anew lies near: a wide gate would lead past it.
             found += place_scan(scan, surface, model_poses[v][None], _NEAR_GATE * size)
             shared = max(FEW_SHARED, HOLDING / scan.usable.sum())
-            best = _likeliest_placement(scan, [p for p in found if p.near > shared], model_poses, (needed, size))
-            if best is not None:
+            closed = _closed_placements(scan, [p for p in found if p.near > shared], model_poses, (needed, size))
+            own = [p for p in closed if _distances_from_rows(scan, [p], model_poses[v : v + 1])[0] < CLOSE_SHARE * size]
+            best = next(iter(own or closed), None)
+            several.discard(v)
+            if best is not None and not own and _has_rival(scan, best, closed, size):
+                several.add(v)
+            elif best is not None:
                 new[v] = best
         if not new:
             break
@@ -505,7 +518,7 @@ def place_unlinked_views(
         core += list(new)
         waiting = [v for v in waiting if v not in new]
     unsure = {v for v in set(alone) & set(placed) if _placement_is_unsure(capture, linked, model_poses, v, placed[v])}
-    return {v: at for v, at in placed.items() if v not in unsure}, sorted([*waiting, *unsure])
+    return {v: at for v, at in placed.items() if v not in unsure}, sorted([*waiting, *unsure]), several
 
 
 def _placement_is_unsure(capture: Capture, linked: Linkage, model_poses: Array, view: int, placed: Placement) -> bool:
@@ -519,15 +532,21 @@ def _placement_is_unsure(capture: Capture, linked: Linkage, model_poses: Array, 
     return in_group and far
 
 
-def _likeliest_placement(
+def _closed_placements(
     scan: Scan, found: Sequence[Placement], model_poses: Array, limits: tuple[float, float]
-) -> Placement | None:
-    """Return the closing placement nearest to any row's pose: a part may look the same from several sides."""
+) -> list[Placement]:
+    """Return the placements that close, the nearest to any row's pose first."""
     needed, size = limits
     away = _distances_from_rows(scan, found, model_poses)
     limit = [needed * (_CLOSURE_AT_ROW if a < CLOSE_SHARE * size else 1.0) for a in away]
     closed = [i for i, p in enumerate(found) if p.closure > limit[i]]
-    return found[min(closed, key=lambda i: away[i])] if closed else None
+    return [found[i] for i in sorted(closed, key=lambda i: away[i])]
+
+
+def _has_rival(scan: Scan, best: Placement, closed: Sequence[Placement], size: float) -> bool:
+    """True if another placement elsewhere is about as good as the best one, wherever the rows' poses are."""
+    elsewhere = [p for p in closed if _distances_from_rows(scan, [p], best.T[None])[0] > CLOSE_SHARE * size]
+    return any(p.surface_share > _AS_GOOD * best.surface_share for p in elsewhere)
 
 
 def _distances_from_rows(scan: Scan, found: Sequence[Placement], model_poses: Array) -> list[float]:

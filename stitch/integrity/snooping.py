@@ -128,6 +128,7 @@ class PlacedViews:
     linkage: Linkage  # at the poses that overlaps alone give, from the model's
     placed: dict[int, Placement]  # views that nothing linked, and where they belong
     unplaced: list[int]  # views that belong nowhere
+    several: set[int]  # of these, views that close at several places alike
     torn: tuple[int, ...]  # views that contradict the others, and still do where they belong
     lines: list[int]  # views whose points lie in a line
     tolerance: float  # distance from the surface of the others that still lies on it, length_unit
@@ -153,13 +154,14 @@ def place_views(capture: Capture, model_poses: Array, unconstrained: Unconstrain
     torn = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, groups=groups)
     linked = linkage(unconstrained.overlaps, {*lines, *torn})
     needed = needed_closure(capture, unconstrained.poses, linked, tolerance)
-    placed, unplaced = place_unlinked_views(capture, model_poses, unconstrained, linked, (tolerance, needed))
+    placed, unplaced, several = place_unlinked_views(capture, model_poses, unconstrained, linked, (tolerance, needed))
     apart = linked.unlinked
     if placed and len(apart) > 1:
         # One displacement of all explains more than one of each, which may have closed in a wrong place.
         together = place_together(capture, model_poses, unconstrained, placed, unlinked=apart, tolerance=tolerance)
         if together is not None:
-            unconstrained, linked, placed, unplaced, torn = together, linkage(together.overlaps, lines), {}, [], ()
+            unconstrained, linked, torn = together, linkage(together.overlaps, lines), ()
+            placed, unplaced, several = {}, [], set()
     if placed:
         poses = np.array(unconstrained.poses)
         for v, placement in placed.items():
@@ -168,7 +170,9 @@ def place_views(capture: Capture, model_poses: Array, unconstrained: Unconstrain
         if torn:
             still = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, STILL_CONTRADICTS)
             torn = tuple(v for v in still if v in torn)
-    return PlacedViews(unconstrained, linked, placed, unplaced, torn, lines=lines, tolerance=tolerance, needed=needed)
+    return PlacedViews(
+        unconstrained, linked, placed, unplaced, several, torn, lines=lines, tolerance=tolerance, needed=needed
+    )
 
 
 @dataclass(frozen=True)
@@ -176,7 +180,9 @@ class MisplacedView:
     """A view that does not belong where its pose puts it."""
 
     view: int
-    kind: str  # displaced | foreign | torn: in itself, so that it contradicts the others wherever it is put
+    # displaced | foreign | several: it closes at several places alike | torn: in itself, so that it contradicts the
+    # others wherever it is put
+    kind: str
     rotation: float  # rad; NaN for a foreign scan
     distance: float  # length_unit, of the middle of its points; NaN for a foreign scan
     p_value: float  # family-wise, 0 where it is not even linked
@@ -265,7 +271,11 @@ def snoop_views(
         again = find_blunders(model.with_usual(usual.twists(located.unconstrained)), tests.excluded, tests.steps)
         sure &= {b.view for b in again.blunders} | tests.sure | torn
     groups = located.groups
-    foreign = [MisplacedView(v, "foreign", np.nan, np.nan, 0.0, None) for v in located.unplaced if (v,) in groups]
+    foreign = [
+        MisplacedView(v, "several" if v in located.several else "foreign", np.nan, np.nan, 0.0, None)
+        for v in located.unplaced
+        if (v,) in groups
+    ]
     misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in sure]
     return Snooping(
         linkage=located.linkage,
