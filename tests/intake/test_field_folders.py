@@ -60,7 +60,11 @@ def test_numbered_clouds_find_their_rows_though_three_are_missing(tmp_path, camp
     assert first.pairing.rows == (1, 3, 5) and "counted from 1" in first.pairing.words
 
 
-@pytest.mark.parametrize("name", ["q0-q3-xyzw", "rail-e1-y", "coupled-fanuc"])
+@pytest.mark.parametrize(
+    "name",
+    # Each tries dozens of readings on the scans: some seconds.
+    ["q0-q3-xyzw", *(pytest.param(name, marks=pytest.mark.slow) for name in ("rail-e1-y", "coupled-fanuc"))],
+)
 def test_the_scans_overrule_the_names_of_columns(tmp_path, campaign, name):
     first, out = made(tmp_path, name, campaign)
     assert kind_verdict(KINDS[name], campaign, out) == "right" and first.choice.overruled
@@ -74,7 +78,7 @@ def test_the_scans_overrule_the_names_of_columns(tmp_path, campaign, name):
         ("joint-states-no-urdf", "joint angles"),
         ("xyz-alone", "--orientation"),
         ("clouds-in-cm", "multiply x, y, z of the clouds by 10"),
-        ("depth-quarter-mm", '"depth_scale": 4000'),
+        pytest.param("depth-quarter-mm", '"depth_scale": 4000', marks=pytest.mark.slow),
     ],
 )
 def test_a_refusal_names_the_cause_and_what_mends_it(tmp_path, campaign, name, told):
