@@ -21,19 +21,21 @@ PLATFORM = ring(330.0, 12.0, 0.0)
 HOME_HEIGHT = 760.0
 
 
-def lengths(T_base_flange: Array) -> Array:
-    """(6,) leg lengths, mm."""
-    ends = PLATFORM @ T_base_flange[:3, :3].T + T_base_flange[:3, 3]
-    return np.asarray(np.linalg.norm(ends - BASE, axis=1))
+def lengths(T_base_flange: Array, base: Array = BASE, platform: Array = PLATFORM) -> Array:
+    """(6,) leg lengths, mm, between joints (6, 3) of base and platform."""
+    ends = platform @ T_base_flange[:3, :3].T + T_base_flange[:3, 3]
+    return np.asarray(np.linalg.norm(ends - base, axis=1))
 
 
-def forward(leg_lengths: Array, guess: Array) -> Array:
+def forward(leg_lengths: Array, guess: Array, base: Array = BASE, platform: Array = PLATFORM) -> Array:
     """T_base_flange (4, 4) of six leg lengths, near a guess."""
     T = np.array(guess, float)
     for _ in range(20):
-        miss = leg_lengths - lengths(T)
+        miss = leg_lengths - lengths(T, base, platform)
         if np.abs(miss).max() < 1e-10:
             break
-        slopes = [(lengths(T @ frames.exp(d)) - lengths(T @ frames.exp(-d))) / 2e-6 for d in 1e-6 * np.eye(6)]
-        T = T @ frames.exp(np.linalg.solve(np.array(slopes).T, miss))
+        ahead, back = (
+            np.array([lengths(T @ frames.exp(sign * d), base, platform) for d in 1e-6 * np.eye(6)]) for sign in (1, -1)
+        )
+        T = T @ frames.exp(np.linalg.solve((ahead - back).T / 2e-6, miss))
     return T

@@ -29,6 +29,7 @@ class Sizes:
     base: tuple[float, float] = (10.0, 1.0)  # mm, deg: robots against their drawing
     clamp: tuple[float, float] = (3.0, 0.5)  # mm, deg: clamps on their flanges
     leg: float = 0.004  # mm, repeatability of one leg
+    joint: float = 0.0  # mm, along each axis, of every joint of base and platform against the controller's
     tracker: tuple[float, float] = (0.010, 5e-6)
     laid: tuple[float, float] = (4.0, 0.12)  # mm, deg: the panel as it is laid on the clamps
     spring_in: float = 9.0  # mm at the panel's long edges, against the CAD
@@ -61,6 +62,9 @@ class PanelCell:
         self.T_world_base = upright @ home @ frames.exp(self._scatter(*self.sizes.base, 6))
         self.T_base_flange = np.tile(frames.make(np.eye(3), [0.0, 0.0, hexapod.HOME_HEIGHT]), (6, 1, 1))
         self.held: HeldShell | None = None
+        # Streams of their own: a cell without such errors is the same cell.
+        off = self.sizes.joint * np.random.default_rng([self.seed, 5]).standard_normal((2, 6, 6, 3))
+        self.base_joints, self.platform_joints = hexapod.BASE + off[0], hexapod.PLATFORM + off[1]
 
     def _scatter(self, mm: float, deg: float, count: int) -> Array:
         return self.rng.normal(size=(count, 6)) * np.repeat([np.radians(deg), mm], 3)
@@ -81,7 +85,8 @@ class PanelCell:
         """All robots to poses (6, 4, 4); the legs do what they can."""
         for i, T in enumerate(T_base_flange):
             wrong = self.leg_offsets[i] + self.sizes.leg * self.rng.standard_normal(6)
-            self.T_base_flange[i] = hexapod.forward(hexapod.lengths(T) + wrong, T)
+            joints = self.base_joints[i], self.platform_joints[i]
+            self.T_base_flange[i] = hexapod.forward(hexapod.lengths(T) + wrong, T, *joints)
 
     def see(self, points: Array) -> Array:
         """The tracker's readings of true points (..., 3), world frame."""

@@ -138,6 +138,17 @@ def test_true_flange_against_forward_kinematics():
     assert frames.angle_between(real, found) < 5e-6
 
 
+def test_joints_off_their_drawing_move_the_flange():
+    """Legs set for joints where the drawing has them, and the flange where the true joints then hold it."""
+    cell, T = PanelCell(1, Sizes(joint=0.05, leg=0.0)), pose(1, -2, 1, 10, 5, 765)
+    cell.drive(np.tile(T, (6, 1, 1)))
+    for i, real in enumerate(cell.T_base_flange):
+        held = hexapod.lengths(real, cell.base_joints[i], cell.platform_joints[i])
+        assert np.abs(held - hexapod.lengths(T)).max() < 1e-9
+        assert 5e-3 < np.linalg.norm(real[:3, 3] - T[:3, 3]) < 0.5
+    assert (PanelCell(1, Sizes(joint=0.05)).T_world_base == PanelCell(1).T_world_base).all()
+
+
 def test_hidden_leg_offset_is_found_in_its_robot_only():
     hidden = np.zeros((6, 6))
     hidden[2, 3] = 0.5
