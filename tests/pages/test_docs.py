@@ -18,6 +18,9 @@ FOLDERS = ("stitch", "viz", "data_synth", "bench", "tests", "docs", "examples")
 OTHERS = {
     "mine.py",
     "review_effects.py",
+    "line/window.toml",
+    "line/body.toml",
+    "line/seam.toml",
     "session.toml",
     "model.toml",
     "robot.toml",
