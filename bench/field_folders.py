@@ -171,7 +171,7 @@ def run_cases(scratch: Path, only: str | None) -> list[list[str]]:
             verdict = "needs a package"
         told = first.refusal.partition("; to fix: ")[2] if first.code else ""
         rows.append(
-            [case.name, verdict + (" after the mend" if flags is not None else ""), f"{first.seconds:.1f}", told]
+            [case.name, verdict + (" once it is stated" if flags is not None else ""), f"{first.seconds:.1f}", told]
         )
         print(" | ".join(rows[-1]), flush=True)
     return rows
@@ -244,7 +244,9 @@ def run_kinds(scratch: Path, only: str | None) -> list[list[str]]:
             verdict = kind_verdict(kind, campaign, out)
             verdict = verdict if verdict == "right" or "NOT TOLD" not in last.said else f"guessed, said so: {verdict}"
         words = first.refusal.partition("; to fix: ")[2] or first.refusal
-        rows.append([name, verdict + (" after the mend" if last is not first else ""), f"{first.seconds:.1f}", words])
+        rows.append(
+            [name, verdict + (" once it is stated" if last is not first else ""), f"{first.seconds:.1f}", words]
+        )
         print(" | ".join(rows[-1]), flush=True)
     return rows
 

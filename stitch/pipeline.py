@@ -181,7 +181,7 @@ def effects_without(run: Run, dropped: Sequence[str], where: object) -> list[str
     """
     for name in dropped:
         if name not in run.effects:
-            has = f"one of {', '.join(run.effects)}" if run.effects else "nothing can be dropped"
+            has = f"name one of {', '.join(run.effects)}" if run.effects else "leave it out: the model has no effects"
             raise InputError(f"{where}: {name} is not in its model; to fix: {has}")
     return [name for name in run.effects if name not in dropped]
 

@@ -203,7 +203,7 @@ def test_exports_are_those_of_the_command(found, tmp_path, stitch_command):
 def test_effects_are_asked_for_by_name(found):
     for call, says in (
         (lambda: stitch.add(found, "no_such"), "no_such"),
-        (lambda: stitch.drop(found, "range_scale"), "s: range_scale is not in its model; to fix: nothing can be"),
+        (lambda: stitch.drop(found, "range_scale"), "s: range_scale is not in its model; to fix: leave it out"),
         (lambda: stitch.add(stitch.add(found, "range_scale"), "range_scale"), "s: range_scale is in its model already"),
         (lambda: stitch.run(found.session, effects=["no_such"]), "no_such"),
     ):

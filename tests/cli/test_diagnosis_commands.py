@@ -75,7 +75,7 @@ def test_a_model_with_an_effect_is_used_compared_and_undone(session_on_disk, sti
         (["add", "RUN", "elbow"], ["no effect 'elbow'"]),
         (["add", "RUN"], ["--suggested", "--group"]),
         (["add", "RUN", "--suggested", "--group"], ["one of the three"]),
-        (["drop", "RUN", "backlash"], ["not in the model"]),
+        (["drop", "RUN", "backlash"], ["not in its model"]),
         (["run", "SESSION", "--effects", "elbow"], ["no effect 'elbow'"]),
         (["diagnose", "RUN", "--effects-file", "mine.py"], ["mine.py", "no such file"]),
         (["effects", "elbow"], ["no effect 'elbow'"]),

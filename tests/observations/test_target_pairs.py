@@ -12,7 +12,7 @@ from stitch import frames
 from stitch.effects.contract import EFFECTS
 from stitch.measurement.capture import Sightings, prepare_capture
 from stitch.measurement.measurement import measurement_of
-from stitch.model.forward import corrected_capture
+from stitch.model.forward import target_correction
 from stitch.model.model import Model, term_of
 from stitch.observations.surfaces.effect_columns import view_responses
 from stitch.observations.surfaces.normal_equations import Gram, append_targets, assemble, target_pairs
@@ -104,8 +104,9 @@ def test_sums_of_targets_are_the_slopes_of_what_sets_them_apart():
     step = 0.01 * term.parameters[0].typical
     pulls, squares = [], []
     for sign in (1, -1):
-        moved = corrected_capture(measurement, Model(T_mount, (term.at([sign * step]),)))
-        pairs = target_pairs(moved.sightings, freed.poses)
+        correction = target_correction(measurement, (term.at([sign * step]),), freed.poses)
+        moved = replace(own.sightings, points=own.sightings.points + correction)
+        pairs = target_pairs(moved, freed.poses)
         both = append_targets(no_surface(VIEWS, g.centre, g.variance), pairs, 1.0)
         pulls.append(both.vector[both.labelled])
         squares.append(both.square[both.labelled])
