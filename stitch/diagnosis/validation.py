@@ -112,12 +112,15 @@ class CrossValidation:
     poses_sigma: float  # spread of `poses` over folds; each view is in two of them: some 0.6 standard errors
     steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
     heldout_sigma: float = 0.0  # standard error of `heldout`, folds as samples
-    fold_squares: tuple[float, ...] = ()  # that each fold left out keeps with the candidate
+    # Per fold what it keeps with the candidate when it is left out, of its points and of its poses.
+    fold_squares: tuple[tuple[float, ...], ...] = ()
 
     def as_good_as(self, other: "CrossValidation") -> bool:
-        """True if views left out are predicted as well as by another candidate, within the uncertainty of the ratio."""
-        share, sigma = mean_square_share(np.array(self.fold_squares), np.array(other.fold_squares))
-        return share <= 1 + sigma
+        """True if points and poses of views left out are predicted as well as by another candidate, within the
+        uncertainty of the ratio."""
+        pairs = zip(self.fold_squares, other.fold_squares, strict=True)
+        shares = [mean_square_share(np.array(own), np.array(theirs)) for own, theirs in pairs]
+        return all(share <= 1 + sigma for share, sigma in shares)
 
     @property
     def helps(self) -> bool:
@@ -157,9 +160,9 @@ def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
     fitted = linear.scatter_only
     beside = scored.base_model or linear
     trial, squares, scatter = _squares_by_fold(beside, scored)
-    whole = trial
+    whole, alone = trial, scatter
     if beside is not fitted:
-        whole, squares, _ = _squares_by_fold(fitted, score(fitted, scored.candidate))
+        whole, squares, alone = _squares_by_fold(fitted, score(fitted, scored.candidate))
     (heldout, heldout_sigma), (poses, poses_sigma) = mean_square_share(*squares), mean_square_share(*scatter)
     present = fitted.baseline_trial
     return CrossValidation(
@@ -169,7 +172,7 @@ def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
         poses_sigma=poses_sigma,
         steadiness=_steadiness(beside, trial, _model_and_candidate_columns(beside, scored), trial.solve()),
         heldout_sigma=heldout_sigma,
-        fold_squares=tuple(map(float, squares[0])),
+        fold_squares=tuple(tuple(map(float, own[0])) for own in (squares, alone)),
     )
 
 

@@ -24,6 +24,7 @@ def ranked(name, beside=None, adjusted=1e-6):
 FIRST, SECOND = ranked("range_nonlinearity"), ranked("lens_distortion")
 ALONE = Evidence((FIRST, SECOND), (), alarm=True, explanation=(FIRST,))
 PAIR = replace(ALONE, further=SECOND)
+SAME, WORSE = (1.02, 0.97, 1.05, 0.98), (1.9, 2.1, 2.0, 2.2)
 SMOOTH = SimpleNamespace(gain=50.0, over_noise=False)
 
 
@@ -83,15 +84,16 @@ def test_a_second_effect_that_alone_may_be_chance_gets_no_name(monkeypatch):
 @pytest.mark.parametrize(
     ("squares", "notes", "rivals"),
     [
-        ((1.02, 0.97, 1.05, 0.98), (), True),  # the same on views left out, though one is likelier in the fit
-        ((1.9, 2.1, 2.0, 2.2), (), False),
-        ((1.02, 0.97, 1.05, 0.98), ("lens_distortion helps among the measured poses, but not beyond",), False),
+        ((SAME, SAME), (), True),  # the same on views left out, though one is likelier in the fit
+        ((WORSE, WORSE), (), False),
+        ((SAME, WORSE), (), False),  # where points do not tell, poses do
+        ((SAME, SAME), ("lens_distortion helps among the measured poses, but not beyond",), False),
     ],
 )
 def test_what_predicts_views_left_out_as_well_is_not_told_from_the_name(monkeypatch, squares, notes, rivals):
     rival = replace(HELPS, fold_squares=squares)
     monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: rival)
-    named = {FIRST.name: replace(HELPS, fold_squares=(1.0, 1.0, 1.0, 1.0))}
+    named = {FIRST.name: replace(HELPS, fold_squares=((1.0,) * 4, (1.0,) * 4))}
     found = gathering.with_equal_rivals(None, replace(ALONE, left_out=named, notes=notes))
     assert found.verdict == ("cannot_tell" if rivals else "missing_effect")
     assert found.named == ((FIRST, SECOND) if rivals else (FIRST,))
