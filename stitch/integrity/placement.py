@@ -502,11 +502,11 @@ def place_unlinked_views(
             # A part clamped anew lies near: a wide gate would lead past it.
             found += place_scan(scan, surface, model_poses[v][None], _NEAR_GATE * size)
             shared = max(FEW_SHARED, HOLDING / scan.usable.sum())
-            closed = _closed_placements(scan, [p for p in found if p.near > shared], model_poses, (needed, size))
+            closed = closed_placements(scan, [p for p in found if p.near > shared], model_poses, (needed, size))
             own = [p for p in closed if _distances_from_rows(scan, [p], model_poses[v : v + 1])[0] < CLOSE_SHARE * size]
             best = next(iter(own or closed), None)
             several.discard(v)
-            if best is not None and not own and _has_rival(scan, best, closed, size):
+            if best is not None and not own and has_rival(scan, best, closed, size):
                 several.add(v)
             elif best is not None:
                 new[v] = best
@@ -532,7 +532,7 @@ def _placement_is_unsure(capture: Capture, linked: Linkage, model_poses: Array, 
     return in_group and far
 
 
-def _closed_placements(
+def closed_placements(
     scan: Scan, found: Sequence[Placement], model_poses: Array, limits: tuple[float, float]
 ) -> list[Placement]:
     """Return the placements that close, the nearest to any row's pose first."""
@@ -543,7 +543,7 @@ def _closed_placements(
     return [found[i] for i in sorted(closed, key=lambda i: away[i])]
 
 
-def _has_rival(scan: Scan, best: Placement, closed: Sequence[Placement], size: float) -> bool:
+def has_rival(scan: Scan, best: Placement, closed: Sequence[Placement], size: float) -> bool:
     """True if another placement elsewhere is about as good as the best one, wherever the rows' poses are."""
     elsewhere = [p for p in closed if _distances_from_rows(scan, [p], best.T[None])[0] > CLOSE_SHARE * size]
     return any(p.surface_share > _AS_GOOD * best.surface_share for p in elsewhere)
