@@ -89,10 +89,10 @@ def init(
       stitch init drive.mcap --topic /points
     """
     from stitch.intake.first_session import StatedFolder
-    from stitch.intake.ros_bag import is_bag
+    from stitch.intake.ros_bag import find_bag
 
-    if is_bag(folder):
-        _init_from_bag(folder, output, mount, topic, frames, as_json)
+    if bag := find_bag(folder):
+        _init_from_bag(bag, output, mount, topic, frames, as_json)
         return
     if topic or frames:
         raise InputError(f"{folder}: --topic and --frames are for bags, which this is not; to fix: leave them out")

@@ -239,6 +239,14 @@ class BagContents:
     cameras: dict[str, Any] = field(default_factory=dict)  # by topic the last CameraInfo
 
 
+def find_bag(path: Path) -> Path | None:
+    """Return the bag that a path is, or that lies alone in a folder; None where there is none, or one of several."""
+    if is_bag(path):
+        return path
+    inside = [own for own in path.iterdir() if is_bag(own)] if path.is_dir() else []
+    return inside[0] if len(inside) == 1 and len(list(path.iterdir())) == 1 else None
+
+
 def is_bag(path: Path) -> bool:
     """True for .bag, .mcap and .db3, and for the folder of a rosbag2."""
     if path.is_dir():

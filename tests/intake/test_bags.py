@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from stitch import frames
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.intake.ros_bag import TransformTree, write_bag_session
+from stitch.intake.ros_bag import TransformTree, find_bag, write_bag_session
 from stitch.reading.range_image import read_range_image
 from stitch.reading.session_folder import load_session
 
@@ -312,3 +312,12 @@ def test_broken_bags_end_in_one_line(tmp_path, capsys):
             main(["init", str(tmp_path / name)])
         told = capsys.readouterr().err
         assert end.value.code == 2 and "cannot be read as a bag" in told and len(told.strip().splitlines()) == 1
+
+
+def test_a_bag_alone_in_a_folder_is_found_and_one_of_two_is_not(tmp_path):
+    (tmp_path / "drive").mkdir()
+    for name in ("metadata.yaml", "drive.db3"):
+        (tmp_path / "drive" / name).touch()
+    assert find_bag(tmp_path) == find_bag(tmp_path / "drive") == tmp_path / "drive"
+    (tmp_path / "later.mcap").touch()
+    assert find_bag(tmp_path) is None
