@@ -12,13 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch import frames
-from stitch.api.run import FittedHandEye, Run
+from stitch.api.run import FittedHandEye, Run, fitted_hand_eye
 from stitch.api.session import Session, check_convention, public_session
 from stitch.api.verbs import run
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
-from stitch.integrity.pose_tests import find_blunders, least_displacement
-from stitch.integrity.view_model import UsualEffects, view_model
+from stitch.integrity.pose_tests import BlunderSearch, find_blunders, least_displacement
+from stitch.integrity.view_model import UsualEffects, ViewModel, view_model
 from stitch.integrity.view_screening import fit_screened_views
 from stitch.measurement import session as measured
 from stitch.measurement.capture import Capture, build_capture, prepare_capture
@@ -26,6 +26,7 @@ from stitch.measurement.measurement import measurement_of
 from stitch.measurement.robot import Robot
 from stitch.measurement.session import Scanner, View
 from stitch.model.model import Model
+from stitch.observations.observability import unknown_numbers
 from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
 from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD
 from stitch.observations.surfaces.scanner_errors import rig_field_scatters
@@ -33,6 +34,7 @@ from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.planning.expected_model import displacement
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.stages import surface_steps
+from stitch.stages.coarse import turn_about
 from stitch.stages.live_fit import LiveFit, fit_live_hand_eye, place_view, start_live_fit, without_view
 from stitch.system.threads import library_threads_off
 from stitch.units import length_text
@@ -41,8 +43,6 @@ Verdict = Literal["waiting", "fits", "does_not_belong", "adds_nothing"]
 
 # Views before a hand-eye is searched, and before one that is stated is corrected: fewer leave nothing to test it by.
 _FEWEST_TO_SEARCH, _FEWEST_TO_CORRECT = 4, 3
-# A search whose second answer is as good as this decides nothing yet.
-_CLOSE = 1.1
 # A view adds nothing if others see so much of it already, and U falls by no more than this share.
 _SEEN_BEFORE, _LEAST_GAIN = 0.98, 0.05
 # Turns below this are not worth a word, rad.
@@ -62,7 +62,11 @@ class LiveView:
     seconds: float  # from the call to the answer
 
     def __str__(self) -> str:
-        known = "" if self.hand_eye is None else f" U {self.hand_eye.U.mm:.2g} mm, {self.hand_eye.U.mrad:.2g} mrad."
+        known = ""
+        if self.hand_eye is not None and self.hand_eye.unknown:
+            known = f" Of the hand-eye {', '.join(self.hand_eye.unknown)} are not known."
+        elif self.hand_eye is not None:
+            known = f" U {self.hand_eye.U.mm:.2g} mm, {self.hand_eye.U.mrad:.2g} mrad."
         return f"{self.name}: {self.verdict.replace('_', ' ')}. {self.why}{known}"
 
 
@@ -171,8 +175,13 @@ class LiveSession:
             InputError: an earlier time than that of the view before; poses of another convention than stated.
         """
         began = time.perf_counter()
-        with library_threads_off():
-            said = self._judge(self._after_last(view))
+        before = self.session
+        try:
+            with library_threads_off():
+                said = self._judge(self._after_last(view))
+        except InputError:
+            self.session = before
+            raise
         said = replace(said, seconds=time.perf_counter() - began)
         self.said.append(said)
         if self._recording is not None:
@@ -184,9 +193,10 @@ class LiveSession:
         """The hand-eye so far; its U holds for a complete model. None before there is one."""
         if self._fit is None:
             return None
-        frame = "base" if self.session.mount == "eye_to_hand" else "flange"
-        middle = np.mean([points.mean(axis=0) for points in self._fit.capture.point_sets], axis=0)
-        return FittedHandEye(self._fit.T_mount, self._fit.covariance, frame, self.session.length_unit, middle)
+        own = self._fit
+        return fitted_hand_eye(
+            self.session, own.capture, own.T_mount, own.covariance, unknown=unknown_numbers([own.capture], own.T_mount)
+        )
 
     def next_pose(self) -> ProposedPose | None:
         """Return the pose, near those taken, that would lower U of the hand-eye most; None before there is one.
@@ -257,7 +267,7 @@ class LiveSession:
         measurement = measurement_of(self.session, prepare_capture(self.session))
         try:
             starts = surface_steps.initial_hand_eyes([self.session], [measurement], None)
-            if starts[0].candidates and starts[0].runner_up_ratio < _CLOSE:
+            if starts[0].is_ambiguous:
                 return self._report(
                     view, "waiting", "Two hand-eyes fit these views equally well; a turned view decides."
                 )
@@ -284,15 +294,13 @@ class LiveSession:
         usual = UsualEffects(measurement, Model(fit.T_mount)).twists(fit.unconstrained)
         sure = {b.view for b in find_blunders(model.with_usual(usual)).blunders}
         off = [b.view for b in found.blunders if b.view in sure]
-        return {v: self._displacement(fit, v, [w for w in off if w != v]) for v in off}
+        return {v: self._displacement(fit, model, found, v, [w for w in off if w != v]) for v in off}
 
-    def _displacement(self, fit: LiveFit, view: int, others: list[int]) -> str:
-        model = view_model(fit.capture, fit.T_mount, fit.unconstrained)
+    def _displacement(self, fit: LiveFit, model: ViewModel, found: BlunderSearch, view: int, others: list[int]) -> str:
         middle = frames.transform(fit.unconstrained.poses[view], fit.capture.scans[view].points.mean(axis=0)[None])[0]
-        rotation, shift = least_displacement(model, find_blunders(model), others, (), view, middle)
-        return (
-            f"Its pose is off by at least {length_text(shift, self.session.length_unit)} and {1e3 * rotation:.2g} mrad."
-        )
+        rotation, shift = least_displacement(model, found, others, (), view, middle)
+        turn = f" and {1e3 * rotation:.2g} mrad" if rotation > _SMALLEST_TURN else ""
+        return f"Its pose is off by at least {length_text(shift, self.session.length_unit)}{turn}."
 
     def _rejected(self, view: View, why: str) -> LiveView:
         """Leave the view out of the fit; several in a row have one cause."""
@@ -386,6 +394,8 @@ def _recording(session: Session, target: str) -> LiveRecording:
 
 
 _TURNS_DEG = (15.0, 30.0, 45.0)
+# Weight of a prior on every direction, as a share of the clearest.
+_UNSEEN = 1e-8
 
 
 def _next_pose(live_fit: LiveFit, views: list[View], known: FittedHandEye) -> ProposedPose:
@@ -393,7 +403,7 @@ def _next_pose(live_fit: LiveFit, views: list[View], known: FittedHandEye) -> Pr
     own, g = live_fit.capture, live_fit.unconstrained.overlaps.gram
     eye_in_hand = known.frame == "flange"
     turns = [np.radians(angle) * axis for angle in _TURNS_DEG for axis in np.vstack([np.eye(3), -np.eye(3)])]
-    about = [_turned_about(g.centre, turn) for turn in turns]
+    about = [turn_about(turn, g.centre) for turn in turns]
     poses = np.array([T @ mount for mount in own.T_reference_mount for T in about])
     have = frames.adjoint(frames.make(np.eye(3), -g.centre) @ own.hand_eye_frames(live_fit.T_mount))
     more = frames.adjoint(frames.make(np.eye(3), -g.centre) @ poses @ live_fit.T_mount)
@@ -402,7 +412,10 @@ def _next_pose(live_fit: LiveFit, views: list[View], known: FittedHandEye) -> Pr
     def left(jacobians: Array) -> float:
         """U up to a factor; what all views have in common shows nothing."""
         apart = unit * (jacobians - jacobians.mean(axis=0))
-        return displacement(np.linalg.pinv(np.einsum("vki,vkj->ij", apart, apart), hermitian=True), known.middle)
+        information = np.einsum("vki,vkj->ij", apart, apart)
+        # What no view shows yet is far from known, not known without error.
+        weak = np.diag(_UNSEEN * np.diag(information).max() / unit[:, 0] ** 2)
+        return displacement(np.linalg.inv(information + weak), known.middle)
 
     after = [left(np.concatenate([have, J[None]])) for J in more]
     best = int(np.argmin(after))
@@ -410,9 +423,3 @@ def _next_pose(live_fit: LiveFit, views: list[View], known: FittedHandEye) -> Pr
     T = poses[best] if eye_in_hand else frames.inverse(poses[best])
     moved = Rotation.from_matrix(T[:3, :3] @ view.T_base_flange[:3, :3].T).as_rotvec(degrees=True)
     return ProposedPose(T, view.name, moved, known.U.mm * after[best] / left(have))
-
-
-def _turned_about(centre: Array, turn: Array) -> Array:
-    T = frames.make(Rotation.from_rotvec(turn).as_matrix(), np.zeros(3))
-    T[:3, 3] = centre - T[:3, :3] @ centre
-    return T

@@ -16,6 +16,7 @@ from stitch.errors import InputError
 from stitch.export.cloud_formats import Colours, coloured
 from stitch.frames import Array
 from stitch.measurement import session as measured
+from stitch.measurement.capture import Capture
 from stitch.model.model import COVERAGE_FACTOR
 from stitch.planning.expected_model import displacement
 from stitch.reading.session_folder import content_hash, measured_files
@@ -79,6 +80,19 @@ class FittedHandEye:
             f"FittedHandEye({self.name} at ({place}) {self.length_unit}, "
             f"U at the part {self.U.mm:.2g} mm and {self.U.mrad:.2g} mrad)"
         )
+
+
+def fitted_hand_eye(
+    session: measured.Session, capture: Capture, T_mount: Array, covariance: Array, *, unknown: tuple[str, ...]
+) -> FittedHandEye:
+    """Return a hand-eye (4, 4) with its covariance (6, 6), for the place where the views of a capture see the part.
+
+    Args:
+        unknown: of x, y, z, rx, ry, rz: what the views do not show.
+    """
+    middle = np.mean([points.mean(axis=0) for points in capture.point_sets], axis=0)
+    frame = "base" if session.mount == "eye_to_hand" else "flange"
+    return FittedHandEye(T_mount, covariance, frame, session.length_unit, middle, unknown)
 
 
 @dataclass(frozen=True)
@@ -205,9 +219,9 @@ class Run(runs.Run):
     @property
     def hand_eye(self) -> FittedHandEye:
         """Where the scanner sits: pose (4, 4), covariance (6, 6), and U in mm and mrad at the part."""
-        middle = np.mean([points.mean(axis=0) for points in self.measurement.capture.point_sets], axis=0)
-        frame = "base" if self.session.mount == "eye_to_hand" else "flange"
-        return FittedHandEye(self.T_mount, self.mount_covariance, frame, self.session.length_unit, middle, self.unknown)
+        return fitted_hand_eye(
+            self.session, self.measurement.capture, self.T_mount, self.mount_covariance, unknown=self.unknown
+        )
 
     @property
     def stitched(self) -> Stitched:

@@ -271,6 +271,8 @@ _STEPS_TO_MEET, _STEPS_AFTER = 4, 3
 COARSE_GATE, SCORE_SHARE = 0.35, 0.05
 # Where a hand-eye came from that was not searched.
 STATED, REUSED = "given in session.toml", "of another run, used as it is"
+# Two answers of the search whose scores differ by less than this ratio are equally good.
+_CLOSE = 1.1
 # Restarts about the best centroid solution: its error on real parts was 2–17°.
 _RESTART_DEG = 15.0
 
@@ -283,6 +285,11 @@ class CoarseHandEye:
     gate: float  # length_unit: first distance between partners for the correction
     source: str
     candidates: tuple[HandEyeCandidate, ...]
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """True if another distinct answer of the search is as good."""
+        return self.runner_up_ratio < _CLOSE
 
     @property
     def runner_up_ratio(self) -> float:
@@ -339,10 +346,10 @@ def _starting_hand_eyes(captures: Sequence[Capture], size: float) -> list[tuple[
     starts = [("centroids", T) for T in centroids[:3]]
     centre = scanner_centre(captures)
     for axis in np.vstack([np.eye(3), -np.eye(3)]):
-        starts.append(("centroids, turned", centroids[0] @ _turn_about(axis * np.radians(_RESTART_DEG), centre)))
+        starts.append(("centroids, turned", centroids[0] @ turn_about(axis * np.radians(_RESTART_DEG), centre)))
     for quarter in (1, 2, 3):
         turn = centre / np.linalg.norm(centre) * np.pi / 2 * quarter
-        starts.append((f"turned by {90 * quarter}° about the line of sight", centroids[0] @ _turn_about(turn, centre)))
+        starts.append((f"turned by {90 * quarter}° about the line of sight", centroids[0] @ turn_about(turn, centre)))
     motions = [(f"scan motions, {name}", T) for name, T in motion_candidates(captures)]
     kept: list[tuple[str, Array]] = []
     for name, T in motions:
@@ -351,7 +358,8 @@ def _starting_hand_eyes(captures: Sequence[Capture], size: float) -> list[tuple[
     return starts + kept
 
 
-def _turn_about(rotation: Array, centre: Array) -> Array:
+def turn_about(rotation: Array, centre: Array) -> Array:
+    """Return the (4, 4) turn by a rotation vector (3,) about a point (3,)."""
     T = frames.make(Rotation.from_rotvec(rotation).as_matrix(), np.zeros(3))
     T[:3, 3] = centre - T[:3, :3] @ centre
     return T

@@ -47,8 +47,6 @@ def unfitted(effect: str) -> str:
 _NEAR_FLOOR = 1.1
 # Sigmas that were widened by more than this factor on the variance are worth a note.
 _WIDENED = 2.5
-# Two answers of the search whose scores differ by less than this ratio are equally good.
-_CLOSE = 1.1
 _LISTED = 12
 
 
@@ -129,7 +127,7 @@ def coarse_note(start: CoarseHandEye) -> str:
 def warnings(start: CoarseHandEye, found: HandEyeFit) -> tuple[str, ...]:
     """Return what a user should know before trusting the hand-eye."""
     notes = []
-    if start.candidates and start.runner_up_ratio < _CLOSE:
+    if start.is_ambiguous:
         notes.append(
             f"Two different hand-eyes fit almost equally well (ratio {start.runner_up_ratio:.2f}); to fix: "
             "state scanner.pose in session.toml, or add views with other orientations."

@@ -93,6 +93,7 @@ def test_inverted_poses_are_refused_when_the_first_hand_eye_is_sought(arrays):
     with pytest.raises(stitch.InputError, match="T_flange_base"):
         for cloud, pose in zip(clouds, np.linalg.inv(poses), strict=True):
             live.add_view(cloud, pose)
+    assert len(live.session.views) == len(live.said) == 3, "the refused view is not there"
 
 
 @pytest.mark.parametrize(
