@@ -162,3 +162,9 @@ def right_jacobian_inverse(rotation: Array) -> Array:
     if angle < _SMALL_ANGLE:
         return np.asarray(np.eye(3) + hat / 2 + hat @ hat / 12)
     return np.asarray(np.eye(3) + hat / 2 + (1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2))) * hat @ hat)
+
+
+def moved_about(centre: Array, twists: Array, T: Array) -> Array:
+    """Return poses T (..., 4, 4) after left twists (..., 6) about a point (3,)."""
+    to_centre = make(np.eye(3), -centre)
+    return np.asarray(inverse(to_centre) @ exp(twists) @ to_centre @ T)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,9 +26,13 @@ from stitch.cli.terminal import emit, in_full, say, show_block, show_files, show
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
+    from stitch.api.live import LiveSession
     from stitch.measurement.session import Session
     from stitch.model.model_toml import ModelFile
     from stitch.runs.run import Run
+
+# Seconds between two looks, and how long a file may be half-written before that is said.
+_EVERY, _PATIENCE = 0.3, 5.0
 
 _Sessions = Annotated[
     list[Path] | None,
@@ -49,8 +54,6 @@ _Register = Annotated[
 ]
 _Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")]
 _Mesh = Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")]
-
-
 _Follow = Annotated[bool, typer.Option("--follow", help="Judge each view as it arrives in the folder, then run.")]
 _Views = Annotated[int | None, typer.Option("--views", min=1, help="With --follow: run after so many views.")]
 
@@ -125,13 +128,73 @@ def run(
 
 def _follow(sessions: list[Path], follow: bool, views: int | None) -> None:
     """Judge the views of a session as they arrive, until it is to be run."""
-    from stitch.cli.follow import follow_session
-
     if not follow:
         raise InputError("--views: counts views that arrive; to fix: add --follow, or leave it out")
     if len(sessions) > 1:
         raise InputError("--follow: several sessions; to fix: name the one that is being measured")
-    follow_session(sessions[0], views)
+    _follow_session(sessions[0], views)
+
+
+def _follow_session(folder: Path, views: int | None) -> None:
+    """Take in views as they come, until so many are there or Ctrl-C is pressed.
+
+    Args:
+        views: how many to wait for; None: until Ctrl-C.
+
+    Raises:
+        InputError: session.toml is missing or wrong, or the poses are of another convention than it states.
+    """
+    from stitch.api.live import follow
+    from stitch.reading.session_folder import load_session, read_session_document
+
+    table = folder / "views.csv"
+    read_session_document(folder / "session.toml")
+    end = "Ctrl-C ends it and runs the session" if views is None else f"the session is run once {views} views are there"
+    say(f"Following {folder}: each view is judged as its scan and its row in views.csv arrive; {end}.")
+    live: LiveSession | None = None
+    failed = _Failures()
+    try:
+        while views is None or live is None or len(live.said) < views:
+            try:
+                session = load_session(folder, scans=False) if table.is_file() else None
+            except InputError as error:
+                failed.note(str(error))
+                session = None
+            if session is not None:
+                live = live or follow(session)
+                for name in session.names:
+                    if name in live.session.names:
+                        continue
+                    try:
+                        view = load_session(folder, only=name).views[0]
+                    except InputError as error:
+                        failed.note(str(error))
+                        break
+                    say(str(live.take(view)))
+                    failed = _Failures()
+            time.sleep(_EVERY)
+    except KeyboardInterrupt:
+        if live is None:
+            raise
+    proposed = None if live is None else live.next_pose()
+    if proposed is not None and views is None:
+        say(str(proposed))
+
+
+class _Failures:
+    """What cannot be read yet: said once, after some patience, since a file may be half-written."""
+
+    def __init__(self) -> None:
+        self._since: float | None = None
+        self._said = ""
+
+    def note(self, message: str) -> None:
+        """Remember that reading failed, and print why if it has failed for long."""
+        now = time.monotonic()
+        self._since = self._since or now
+        if now - self._since > _PATIENCE and message != self._said:
+            say(f"waiting: {message}")
+            self._said = message
 
 
 def _current_session() -> Path:

@@ -366,8 +366,7 @@ def expected_poses(model: ViewModel, model_poses: Array, unconstrained: Unconstr
     twists[:, :3] /= model.lever
     # Surfaces do not say where all views together stand.
     twists += np.mean(np.delete(unconstrained.twists - twists, alone, axis=0), axis=0)
-    to_centre = frames.make(np.eye(3), -model.centre)
-    return np.asarray(frames.inverse(to_centre) @ frames.exp(twists) @ to_centre @ model_poses)
+    return frames.moved_about(model.centre, twists, model_poses)
 
 
 def _step_displacement(model: ViewModel, tests: PoseTests, excluded: list[int], k: int) -> Array:

@@ -17,8 +17,15 @@ from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.scan import Scan
 from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
-from stitch.observations.surfaces.matching import Match, match_pairs, near_pairs, sample_points, signed_distances
-from stitch.observations.surfaces.normal_equations import Gram, Overlaps, gram, next_gate, robust_scale
+from stitch.observations.surfaces.matching import (
+    MINIMUM_OVERLAP,
+    Match,
+    match_pairs,
+    near_pairs,
+    sample_points,
+    signed_distances,
+)
+from stitch.observations.surfaces.normal_equations import NEAR_NULL, Gram, Overlaps, next_gate, sum_matches
 from stitch.observations.surfaces.view_poses import (
     SAMPLES,
     UnconstrainedPoses,
@@ -30,12 +37,8 @@ from stitch.stages.correct import REUSE_GATE, Correction
 # A view that moves by less than this share of the robust sigma rests.
 _CONVERGED = 5e-3
 _MAXIMUM_ITERATIONS = 12
-# Directions of one view weaker than this share of its strongest carry no evidence, as in `view_poses`.
-_NEAR_NULL = 1e-3
 # Where all views together have moved by this share of the gate, their partners are searched anew.
 _SEARCH_ANEW = 0.3
-# Of a view's sampled points, the share that must find a partner in another view.
-_MINIMUM_OVERLAP = 0.04
 
 
 @dataclass(frozen=True)
@@ -95,10 +98,9 @@ def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_f
     samples = [sample_points(s, SAMPLES) for s in own.scans]
     matches = _match_last(own, poses, gate, samples)
     for _ in range(_MAXIMUM_ITERATIONS):
-        g = _sums(matches, len(poses))
+        g = sum_matches(matches, len(poses))
         step = _last_step(g)
-        to_centre = frames.make(np.eye(3), -g.centre)
-        poses[last] = frames.inverse(to_centre) @ frames.exp(step) @ to_centre @ poses[last]
+        poses[last] = frames.moved_about(g.centre, step, poses[last])
         gate = min(gate, max(next_gate(Overlaps([], matches, g, gate), own), 0.6 * gate))
         matches = _match_last(own, poses, gate, samples)
         if np.linalg.norm(step * g.displacement_factors) < _CONVERGED * g.scale and gate <= 1.01 * fit.gate:
@@ -151,23 +153,18 @@ def _match_last(capture: Capture, poses: Array, gate: float, samples: Sequence[I
     """Return the correspondences of the last view with every other one that it overlaps."""
     last = len(poses) - 1
     pairs = [pair for pair in near_pairs(capture.scans, poses, gate) if pair[1] == last]
-    least = _MINIMUM_OVERLAP * len(samples[last])
+    least = MINIMUM_OVERLAP * len(samples[last])
     found = [m for m in match_pairs(capture.scans, poses, pairs, gate, samples) if len(m.residual) > least]
     if not found:
         raise NoResultError(f"{capture.scans[last].name}: it shares no surface with the other views")
     return found
 
 
-def _sums(matches: Sequence[Match], views: int) -> Gram:
-    centre = np.mean([m.middle.mean(axis=0) for m in matches], axis=0)
-    return gram(matches, views, centre, robust_scale(matches))
-
-
 def _last_step(g: Gram) -> Array:
     """(6,) twist of the last view that brings it onto the others, in the directions that they show."""
     unit = g.displacement_factors
     values, vectors = np.linalg.eigh(g.matrix.sum(axis=0) / np.outer(unit, unit))
-    keep = values > _NEAR_NULL * values[-1]
+    keep = values > NEAR_NULL * values[-1]
     pull = vectors[:, keep].T @ (g.vector.sum(axis=0) / unit)
     return np.asarray(vectors[:, keep] @ (pull / values[keep]) / unit)
 
@@ -179,9 +176,8 @@ def _solve_together(capture: Capture, poses: Array, matches: list[Match], gate: 
         ends = np.cumsum([len(m.residual) for m in matches])[:-1]
         apart = np.split(signed_distances(matches, poses, points), ends)
         matches = [replace(m, residual=e) for m, e in zip(matches, apart, strict=True)]
-        g = _sums(matches, len(poses))
+        g = sum_matches(matches, len(poses))
         step = visible_step(g)
-        to_centre = frames.make(np.eye(3), -g.centre)
-        poses = frames.inverse(to_centre) @ frames.exp(step) @ to_centre @ poses
+        poses = frames.moved_about(g.centre, step, poses)
     overlaps = Overlaps([(m.v, m.w) for m in matches], matches, g, gate)
     return UnconstrainedPoses(poses, np.zeros((len(poses), 6)), overlaps)

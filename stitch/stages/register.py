@@ -50,10 +50,10 @@ def register_targets(rows: TargetRows, variances: Array, poses: Array) -> tuple[
     covariance = rows.mixed_model(rows.hand_eye).covariance(variances)[:V]
     pushed = np.linalg.solve(covariance, -rows.residual[:V, :, None])
     twist = (scatter @ rows.lever.transpose(0, 2, 1) @ pushed)[..., 0]
-    moved = frames.inverse(to_centre) @ frames.exp(twist) @ to_centre @ poses
+    moved = frames.moved_about(rows.centre, twist, poses)
     left = rows.residual.copy()
     left[:V] += np.einsum("vmi,vi->vm", rows.lever, twist)
-    return np.asarray(moved), rows.distances(left)
+    return moved, rows.distances(left)
 
 
 _MAXIMUM_ITERATIONS = 25

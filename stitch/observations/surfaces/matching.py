@@ -177,7 +177,7 @@ def _partners_by_view(every: NeighbourQueries, w: int, parts: Sequence[QueryPart
 
 # Queries that decide whether two views overlap, and the share that must find a partner.
 _PROBES = 250
-_MINIMUM_OVERLAP = 0.04
+MINIMUM_OVERLAP = 0.04
 
 
 def overlapping_pairs(
@@ -198,7 +198,7 @@ def overlapping_pairs(
             return []
         _, points, normals = every.gather(parts)
         agree = np.split(every.search(w, points, normals, gate)[2], np.cumsum(every.counts(parts))[:-1])
-        return [v for (v, _), own in zip(parts, agree, strict=True) if np.mean(own) >= _MINIMUM_OVERLAP]
+        return [v for (v, _), own in zip(parts, agree, strict=True) if np.mean(own) >= MINIMUM_OVERLAP]
 
     def met(pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
         """Of pairs (asking, asked) those that meet."""

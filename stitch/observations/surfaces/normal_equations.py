@@ -33,7 +33,7 @@ _PAIR_FIELDS = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_s
 # little they have comes from the noise of the normals. Gap seen on real parts: 3e-4 (noise on a
 # sphere and a cone) against 5e-3 (their weakest true directions). Labelled points have no such bias: what they
 # see is known by their sigma, as long as the lever is not noise itself: a three-hundredth of the part's.
-_NEAR_NULL = 1e-3
+NEAR_NULL = 1e-3
 _NULL = 1e-5
 
 
@@ -84,7 +84,7 @@ class Gram:
         """What overlaps and common targets see of the views' twists; eigenvectors of thousands of rows, found once."""
         scale = np.tile(1 / self.displacement_factors, self.views)
         values, vectors = np.linalg.eigh(assemble(self, ~self.labelled)[0] * scale[:, None] * scale)
-        keep = values > _NEAR_NULL * values[-1]
+        keep = values > NEAR_NULL * values[-1]
         values, seen = values[keep], vectors[:, keep]
         if not self.labelled.any():
             return VisibleDirections(values, seen, scale, seen)
@@ -148,6 +148,12 @@ def gram(
     sums = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     pairs = np.array([(m.v, m.w) for m in matches])
     return Gram(views=views, pairs=pairs, scale=scale, centre=centre, labelled=np.zeros(len(pairs), bool), **sums)
+
+
+def sum_matches(matches: Sequence[Match], views: int) -> Gram:
+    """Accumulate the pairs about the middle of their correspondences, at their own robust scale."""
+    centre = np.mean([m.middle.mean(axis=0) for m in matches], axis=0)
+    return gram(matches, views, centre, robust_scale(matches))
 
 
 def _pair_sums(m: Match, centre: Array, scale: float, weight: Array | None) -> dict[str, Any]:
@@ -327,8 +333,7 @@ def collect_overlaps(
             f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "
             "and scanner.pose, or leave scanner.pose out to have it searched"
         )
-    centre = np.mean([m.middle.mean(axis=0) for m in matches], axis=0)
-    surfaces = gram(matches, len(capture.scans), centre, robust_scale(matches))
+    surfaces = sum_matches(matches, len(capture.scans))
     targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
     return Overlaps(pairs, matches, append_targets(surfaces, targets, capture.noise_factor), gate, targets, probed)
 

@@ -27,8 +27,7 @@ def take_step(poses: Array, g: Gram, step: Array, last: LastStep) -> tuple[Array
     unit = g.displacement_factors
     asked = (step * unit).ravel()
     taken = asked if last is None else anderson_step(asked, *last)
-    to_centre = frames.make(np.eye(3), -g.centre)
-    return frames.inverse(to_centre) @ frames.exp(taken.reshape(-1, 6) / unit) @ to_centre @ poses, (asked, taken)
+    return frames.moved_about(g.centre, taken.reshape(-1, 6) / unit, poses), (asked, taken)
 
 
 def has_converged(g: Gram, step: Array, share: float) -> bool:
