@@ -8,8 +8,7 @@ from batch_sessions import ROOT
 
 _TIMES = 5
 _MAIN = "from stitch.cli.main import main\ntry:\n    main({})\nexcept SystemExit:\n    pass\n"
-_ACTIONS = "stitch.cli.actions"
-_ALL = f"import {_ACTIONS}.run_sessions, {_ACTIONS}.changed_run, {_ACTIONS}.watched_cells, viz.review.served_review\n"
+_ALL = "import stitch.cli.run, stitch.cli.change, stitch.cli.watch_command, viz.review.review_command\n"
 # What is loaded now, and what would be if it were not put off.
 _COMMANDS = {
     "stitch --version": ("--version", ""),
