@@ -14,8 +14,7 @@ _SECONDS_A_DAY = 86_400
 _CODE = """
 import os, resource, sys
 from pathlib import Path
-from stitch.batch.run_batch import Job
-from stitch.batch.run_batch import run_session
+from stitch.batch.run_batch import BatchJob, run_session
 from stitch.system.threads import share_cores
 
 def spent():
@@ -26,7 +25,8 @@ recording, places = sys.argv[1] == "True", [Path(place) for place in sys.argv[2:
 cpu = []
 for i, place in enumerate(places * 3):
     begun = spent()
-    row = run_session(Job(place, place.parent / f"run-{place.name}", str(i), True, recording, at_once=os.cpu_count()))
+    run = place.parent / f"run-{place.name}"
+    row = run_session(BatchJob(place, run, str(i), True, recording, at_once=os.cpu_count()))
     assert row.error is None, row.error
     cpu.append(spent() - begun)
 print(min(cpu[1:]), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)
