@@ -1,5 +1,6 @@
 """Why, in a recording: the course of an effect as a drawing of its own, and the arms of the cell in its colours."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -33,9 +34,11 @@ def log_course(recording: rr.RecordingStream, course: dict[str, Any], names: lis
     factor, unit = (1e3, "mrad") if course["value_unit"] == "rad" else (um, "µm")
     at, measured, sigma, predicted = (np.array(course[key]) for key in ("at", "measured", "sigma", "predicted"))
     measured, sigma, predicted = measured * factor, sigma * factor, predicted * factor
-    x, to_y = _scales(at, measured, sigma, predicted)
+    law = np.array(course.get("law", [])) * np.array([[1.0], [factor]]) if course.get("law") else np.zeros((2, 0))
+    to_x, to_y = _scales(np.append(at, law[0]), measured, sigma, np.append(predicted, law[1]))
+    x = to_x(at)
     order = np.argsort(x, kind="stable")
-    line = np.column_stack([x, to_y(predicted)])[order]
+    line = np.column_stack([to_x(law[0]), to_y(law[1])] if law.size else [x[order], to_y(predicted[order])])
     recording.log(f"{WHERE}/line", rr.LineStrips2D([line], colors=[_LINE], radii=rr.Radius.ui_points(1.5)), static=True)
     ends = np.stack([np.column_stack([x, to_y(measured + s * 2 * sigma)]) for s in (-1, 1)], axis=1)
     recording.log(
@@ -63,17 +66,22 @@ def log_course(recording: rr.RecordingStream, course: dict[str, Any], names: lis
         recording.log("robot/arm", rr.LineStrips3D.from_fields(colors=colours), static=True)
 
 
-def _scales(at: Array, measured: Array, sigma: Array, predicted: Array) -> tuple[Array, Any]:
-    """(D,) places along the drawing, and how values become heights."""
-    x = _LEFT + _WIDE * (at - at.min()) / (float(np.ptp(at)) or 1.0)
+_Scale = Callable[[Array], Array]
+
+
+def _scales(at: Array, measured: Array, sigma: Array, predicted: Array) -> tuple[_Scale, _Scale]:
+    """Return how numbers become places along the drawing, and how values become heights."""
     low = min(float((measured - 2 * sigma).min()), float(predicted.min()), 0.0)
     high = max(float((measured + 2 * sigma).max()), float(predicted.max()), 0.0)
     size = (high - low) or 1.0
 
+    def to_x(places: Array) -> Array:
+        return _LEFT + _WIDE * (places - at.min()) / (float(np.ptp(at)) or 1.0)
+
     def to_y(values: Array) -> Array:
         return _HIGH * (high - values) / size
 
-    return x, to_y
+    return to_x, to_y
 
 
 def _label(recording: rr.RecordingStream, name: str, places: Any, texts: list[str]) -> None:

@@ -1,6 +1,7 @@
 """Add diagnosis and comparison to a run folder: the screen and the evidence of its page, a tab of its recording."""
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +41,11 @@ def write_diagnosis(found: Diagnosis, state: Run, folder: Path) -> None:
     data = script_json({key: screen[key] for key in ("now", "why", "candidates", "places")} | shown)
     parts = {
         "finding": f'<p class="verdict">{_words(screen["headline"])}</p>\n'
-        f'<p class="evidence">{_words(screen["proof"])}</p>',
+        f'<p class="evidence">{_words(screen["proof"])}</p>\n'
+        f'<p class="evidence"><b>How sure:</b> {_words(screen["certainty"])}</p>',
         "doubts": render("doubts.html.j2", doubts=screen["doubts"]),
         "missing": render("missing.html.j2", **_bars(found, screen, unit)),
-        "next": _next(found),
+        "next": _next(found, folder.absolute().name),
         "screen": f'<script type="application/json" id="screen-data">{data}</script>',
         "diagnosis": _evidence(found, unit),
         "uncertainty": f'<p class="soft">{uncertainty_scope(found.verdict)}</p>',
@@ -101,10 +103,10 @@ def _in_um(value: float, unit: str) -> str:
     return f"{um:,.0f}" if um >= 10 else f"{um:.2g}"
 
 
-def _next(found: Diagnosis) -> str:
-    why, command = suggested_command(found, "RUN").rsplit(": ", 1)
-    why = "Type, with RUN the folder of this page" if why == "Next" else f"{why.removeprefix('Next, ').capitalize()}"
-    return f'<div class="card next"><h2>Next</h2><p>{_words(why)}:</p><p><code>{escape(command)}</code></p></div>'
+def _next(found: Diagnosis, run: str) -> str:
+    why, command = suggested_command(found, shlex.quote(run)).rsplit(": ", 1)
+    said = "Type, where the folder of this page stands" if why == "Next" else why.removeprefix("Next, ").capitalize()
+    return f'<div class="card next"><h2>Next</h2><p>{_words(said)}:</p><p><code>{escape(command)}</code></p></div>'
 
 
 def _evidence(found: Diagnosis, unit: str) -> str:

@@ -6,7 +6,7 @@ The line is what the effect predicts; a dot is the line and what the whole model
 off the line are what the effect does not explain. Effects of points are read along the rays, in bins of points.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -46,6 +46,8 @@ class EffectCourse:
     measured: Array  # (D,)
     sigma: Array  # (D,) standard deviation of a dot, by the scatter about the line
     predicted: Array  # (D,)
+    # The law between the dots, (2, G): places and values; empty where the dots alone are known.
+    law: Array = field(default_factory=lambda: np.zeros((2, 0)))
 
 
 def course_of_candidate(linear: LinearModel, scored: Score) -> EffectCourse | None:
@@ -137,7 +139,28 @@ def _course_of_views(
     motion = _motion(linear, term, form, values)
     axis = _lives_on(linear.measurement.views, term, motion.joint)
     # Where the part sat at first is nobody's error.
-    return _along_motion(linear, motion, explained, len(values), axis, from_first=term.effect.place == "part")
+    course = _along_motion(linear, motion, explained, len(values), axis, from_first=term.effect.place == "part")
+    if course is None or motion.joint is None or not course.follows.startswith("angle"):
+        return course
+    return replace(course, law=_over_a_turn(linear.measurement.views, form.at(values), motion.joint))
+
+
+def _over_a_turn(views: Views, fitted: Term, joint: int) -> Array:
+    """Return the law of a joint over its whole turn (2, G), ° and rad: over the angles seen alone, a gear that runs
+    out of true looks like a slope. Empty where the law takes more than this joint's angle, or does not vary.
+    """
+    turn = np.radians(np.linspace(-180, 180, 121))
+    asked = np.concatenate([turn, views.joints[:, joint]])
+    others_still = np.tile(views.joints[0], (len(asked), 1))
+    others_still[:, joint] = asked
+    law = _joint_laws(replace(views.only([0] * len(asked)), joints=others_still), fitted)[:, joint]
+    over_turn, seen = law[: len(turn)], law[len(turn) :]
+    alone = np.allclose(seen, _joint_laws(views, fitted)[:, joint], rtol=1e-6, atol=1e-12)
+    return (
+        np.stack([np.degrees(turn), over_turn])
+        if alone and np.ptp(over_turn) > 1e-6 * np.abs(over_turn).max()
+        else np.zeros((2, 0))
+    )
 
 
 def _along_motion(
@@ -149,7 +172,7 @@ def _along_motion(
     *,
     from_first: bool = False,
 ) -> EffectCourse | None:
-    """Every view along its unit motion: the line, and beside it what the model with the effect leaves.
+    """Return every view along its unit motion: the line, and beside it what the model with the effect leaves.
 
     Args:
         explained: response of the whole model with the effect.

@@ -21,7 +21,9 @@ from stitch.diagnosis.effect_course import (
     course_of_dependence,
 )
 from stitch.diagnosis.residual_structure import predicted_distances
+from stitch.diagnosis.sentences import odds_text
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
+from stitch.diagnosis.unnamed_time_laws import reportable
 from stitch.frames import Array
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.units import angle_text, covariate_text, length_text
@@ -71,9 +73,11 @@ def _fields(found: Diagnosis) -> CandidateFields | None:
 
 
 def compared(found: Diagnosis) -> list[CandidateEffect]:
-    """Return the candidate effects that a screen compares: those that are named first."""
+    """Return the candidate effects that a screen compares: those that are named first, none that would do harm."""
     worth = [c for c in found.candidates if c.ranked.score.observable and c.ranked.score.fitted]
-    return sorted(worth, key=lambda c: c.name not in found.effects)[:_BEST]
+    named = found.effects
+    helping = [c for c in worth if c.name in named or c.cross_validation is None or c.cross_validation.heldout < 1]
+    return sorted(helping, key=lambda c: named.index(c.name) if c.name in named else len(named))[:_BEST]
 
 
 # The screen as a dictionary.
@@ -102,6 +106,7 @@ def _screen(found: Diagnosis, descriptions: dict[str, str]) -> dict[str, Any]:
     return {
         "headline": _headline(found, why, descriptions),
         "proof": _proof(found, why),
+        "certainty": certainty(found),
         "now": {"heldout": found.heldout_rms} | _on_part(None if fields is None else fields.present),
         "noise": found.noise_floor,
         "why": None if why is None else _course(why),
@@ -151,6 +156,7 @@ def _course(course: EffectCourse) -> dict[str, Any]:
         "measured": _rounded(course.measured),
         "sigma": _rounded(course.sigma),
         "predicted": _rounded(course.predicted),
+        "law": [_rounded(row) for row in course.law],
     }
 
 
@@ -237,6 +243,44 @@ def _proof(found: Diagnosis, why: EffectCourse | None) -> str:
         f"{size}Adding it should take the error on views left out from {now} to {then}; the scanner's noise alone "
         f"would leave {noise}."
     )
+
+
+def certainty(found: Diagnosis) -> str:
+    """Return how sure the finding is: what chance alone would do, and what the other effects would explain."""
+    odds = f"the odds that it is more than chance are {odds_text(found.log_odds_over_nothing)}"
+    match found.verdict:
+        case "missing_effect" | "cannot_tell" if not found.certain:
+            return f"Not very sure: {odds}."
+        case "missing_effect":
+            named = next(c.ranked for c in found.candidates if c.name == found.effects[0])
+            share = "more than 99%" if named.posterior > 0.99 else f"{named.posterior:.0%}"
+            held = f"Of {named.tests} known effects tried, it holds {share} of the evidence."
+            return f"{chance_text(named.adjusted)} {held}"
+        case "cannot_tell":
+            return chance_text(min(c.ranked.adjusted for c in found.candidates if c.name in found.effects))
+        case "unknown_effect":
+            clear = [x.p_value for x in found.depends_on if x.p_value < CLEAR_DEPENDENCE]
+            said = reportable(found.repeating_errors, found.implausible)
+            if clear:
+                return chance_text(min(clear))
+            if said:
+                factor = max(error.log_bayes_factor for error in said)
+                return f"The odds that these errors repeat, and are no scatter, are {odds_text(factor)}."
+            return "Neither chance nor a known effect explains it; the cause has no name."
+    likeliest = next((c.ranked for c in found.candidates if c.ranked.score.observable), None)
+    if likeliest is None:
+        return "No known effect can be tested with these views."
+    nearest = f"Of {likeliest.tests} known effects tried, {likeliest.name} comes nearest."
+    return f"{nearest} {chance_text(likeliest.adjusted)}"
+
+
+def chance_text(p: float) -> str:
+    """Return how often chance alone would show as much, as a sentence."""
+    if p < 1e-6:
+        often = "less than one of a million sessions"
+    else:
+        often = f"one of {float(f'{1 / p:.2g}'):,.0f} sessions" if p < 0.01 else f"{p:.0%} of such sessions"
+    return f"Chance alone would show as much in {often} (p = {p:.1g})."
 
 
 def _size(why: EffectCourse, unit: str) -> str:

@@ -39,6 +39,12 @@ def test_a_gear_shows_its_sine_over_the_joints_angle(cell: FreedBlade):
     off = (course.measured - law) / course.sigma
     # What a constant of the joint does the hand-eye does nearly as well.
     assert np.std(off) < 2.5 and np.corrcoef(course.measured, law)[0, 1] > 0.8
+    # Drawn over the whole turn, it is one wave of one turn, and passes through the line at the views.
+    angles, wave = np.radians(course.law[0]), course.law[1]
+    assert np.ptp(angles) == pytest.approx(2 * np.pi)
+    once = np.column_stack([np.sin(angles), np.cos(angles)])
+    np.testing.assert_allclose(once @ np.linalg.lstsq(once, wave, rcond=None)[0], wave, atol=1e-9)
+    np.testing.assert_allclose(np.interp(course.at, course.law[0], wave), course.predicted, atol=2e-6)
 
 
 def test_a_slip_is_a_step_of_its_size_in_the_order_of_views(cell: FreedBlade):
@@ -53,3 +59,4 @@ def test_a_slip_is_a_step_of_its_size_in_the_order_of_views(cell: FreedBlade):
     assert after.mean() - before.mean() == pytest.approx(np.linalg.norm(moved[3:]), rel=0.15)
     np.testing.assert_allclose(course.predicted[:8], 0, atol=1e-3)
     assert np.abs(course.measured - course.predicted).max() < 4 * course.sigma.max()
+    assert course.law.size == 0

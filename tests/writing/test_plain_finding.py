@@ -7,6 +7,7 @@ import pytest
 
 import stitch.pipeline as stepwise
 import stitch.writing.diagnosis_document as plain
+import stitch.writing.finding_screen as finding_screen
 from bench.docs.page_blocks import refused
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.validation import CrossValidation
@@ -173,3 +174,44 @@ def test_an_error_that_should_rise_is_no_gain(inside, poses, said):
     )
     told = plain_finding(found, "mm")
     assert said in told and ("reduce the error" in told) == (inside < 1)
+
+
+def _found(verdict: str, p_value: float, *, certain: bool = True, heldout: float = 0.5) -> SimpleNamespace:
+    ranked = SimpleNamespace(
+        name="play", adjusted=p_value, posterior=0.97, tests=21, score=SimpleNamespace(observable=True, fitted=True)
+    )
+    candidate = SimpleNamespace(name="play", ranked=ranked, cross_validation=SimpleNamespace(heldout=heldout))
+    return SimpleNamespace(
+        verdict=verdict,
+        effects=("play",) if verdict == "missing_effect" else (),
+        candidates=(candidate,),
+        certain=certain,
+        log_odds_over_nothing=np.log(3),
+        depends_on=(SimpleNamespace(p_value=p_value),),
+        repeating_errors=(),
+        implausible=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (_found("missing_effect", 1e-46), "less than one of a million sessions (p = 1e-46). Of 21 known effects tried"),
+        (_found("missing_effect", 1e-3), "one of 1,000 sessions (p = 0.001). Of 21 known effects tried, it holds 97%"),
+        (
+            _found("missing_effect", 1e-3, certain=False),
+            "Not very sure: the odds that it is more than chance are 3 to 1",
+        ),
+        (_found("unknown_effect", 2e-4), "one of 5,000 sessions (p = 0.0002)."),
+        (_found("unknown_effect", 0.5), "the cause has no name"),
+        (_found("adequate", 0.4), "play comes nearest. Chance alone would show as much in 40% of such sessions"),
+    ],
+)
+def test_the_screen_says_how_sure_it_is(found, said):
+    assert said in finding_screen.certainty(found)
+
+
+@pytest.mark.parametrize(("heldout", "shown"), [(0.5, 1), (1.1, 0)])
+def test_an_effect_that_makes_views_left_out_worse_is_offered_only_where_it_is_named(heldout, shown):
+    assert len(finding_screen.compared(_found("adequate", 0.4, heldout=heldout))) == shown
+    assert len(finding_screen.compared(_found("missing_effect", 0.4, heldout=heldout))) == 1

@@ -81,6 +81,7 @@ def told_diagnosis(document: dict[str, Any], um: float) -> dict[str, Any]:
     return {
         "headline": screen.get("headline", ""),
         "proof": screen.get("proof", ""),
+        "certainty": screen.get("certainty", ""),
         "why": screen.get("why"),
         "courses": {row["effect"]: row["why"] for row in screen.get("candidates", [])},
         "verdict": document["verdict"],

@@ -138,6 +138,7 @@ function coursePlot(course, names, um) {
   const inOrder = course.follows === "view order", seconds = course.unit === "s";
   const span = seconds ? Math.max(...course.at) : 0, [per, named] = span > 7200 ? [3600, "h"] : span > 120 ? [60, "min"] : [1, "s"];
   const x = course.at.map(a => seconds ? a / per : a), scaled = values => values.map(v => v * factor);
+  const law = course.law && course.law[0].length ? { x: course.law[0], y: scaled(course.law[1]) } : null;
   const [measured, sigma, predicted] = [course.measured, course.sigma, course.predicted].map(scaled);
   const label = inOrder ? "views in their order" : course.follows.replace(/_c$/, " (°C)").replaceAll("_", " ") + (seconds ? ` (${named})` : course.unit ? ` (${course.unit})` : "");
   const named_ = course.views.map(v => names ? names[v] : String(v)), most = Math.max(...predicted.map(Math.abs));
@@ -149,7 +150,7 @@ function coursePlot(course, names, um) {
     spec: {
       x: { label, names: inOrder && course.views.length === (names || []).length ? named_ : undefined }, y: { label: unit },
       shaded: jumps ? { from: (x[first - 1] + x[first]) / 2, said: `from ${named_[first]} on` } : undefined,
-      series: [{ kind: "line", x, y: predicted, step: jumps, tint: "predicted" }, { kind: "dots", x, y: measured, sigma, names: course.views.length > 0, said, tint: "dot" }],
+      series: [{ kind: "line", ...(law || { x, y: predicted }), step: jumps, tint: "predicted" }, { kind: "dots", x, y: measured, sigma, names: course.views.length > 0, said, tint: "dot" }],
     },
   };
 }

@@ -31,7 +31,7 @@ async function draw() {
   at("name").textContent = `Review of ${state.name}`;
   const found = state.diagnosis && state.diagnosis.headline ? state.diagnosis : null;
   at("sentence").textContent = unbroken(found ? found.headline : state.sentence);
-  at("evidence").textContent = unbroken(found ? found.proof : state.evidence === state.sentence ? "" : state.evidence);
+  at("evidence").textContent = unbroken(found ? `${found.proof} ${found.certainty}` : state.evidence === state.sentence ? "" : state.evidence);
   await show(state);
   showNumbers(state);
   showPlots(state);
