@@ -149,7 +149,69 @@ def _independent_links(torques: Array, links: Sequence[int]) -> list[int]:
 
 def session_notes(session: Session) -> list[str]:
     """A sentence each; `check` and `run` say the same."""
-    return [note for note in (payload_note(session), gaps_note(session)) if note]
+    return [note for note in (payload_note(session), gaps_note(session), sensor_note(session)) if note]
+
+
+def sensor_note(session: Session) -> str:
+    """Return what the sensor of labelled points is taken for, where session.toml does not state it; else nothing."""
+    shown = [view.sighting.points for view in session.views if view.sighting is not None]
+    if session.scanner.kind is not None or session.has_clouds or not shown:
+        return ""
+    if sensor_kind(session) == "tracker":
+        return "The sensor is taken for a tracker, since its points are given in the robot's base."
+    if not _all_ahead(shown):
+        return "The sensor is taken for one without a lens, since it shows points beside or behind itself."
+    return (
+        "The sensor's kind is not stated, so errors of a scanner are tried too; "
+        'to leave them out, write kind = "tracker" under [scanner] in session.toml.'
+    )
+
+
+# Share of the points' own spread within which points on the flange stand still in it, if sensor and base are one frame.
+_SAME_FRAME = 0.05
+
+
+def sensor_kind(session: Session) -> SensorKind | None:
+    """Return the kind as stated, or a tracker where its points are given in the robot's base; None if unknown.
+
+    No scanner stands inside the robot. Points on the flange stand still in its frame if the sensor's frame is the base.
+    """
+    if session.scanner.kind is not None or session.mount != "eye_to_hand":
+        return session.scanner.kind
+    seen = [(view.T_base_flange, view.sighting) for view in session.views if view.sighting is not None]
+    if not seen:
+        return None
+    names = np.concatenate([sighting.targets for _, sighting in seen])
+    in_base = [sighting.points for _, sighting in seen]
+    on_flange = [frames.transform(frames.inverse(T), sighting.points) for T, sighting in seen]
+    of = np.unique(names, return_inverse=True)[1]
+    strays, spread = (_variance_within(np.concatenate(points), of) for points in (on_flange, in_base))
+    return "tracker" if strays < _SAME_FRAME**2 * spread else None
+
+
+def _variance_within(points: Array, group: Indices) -> float:
+    """Return the variance of points (N, 3) about the mean of their group (N,)."""
+    count = np.bincount(group)[:, None]
+    mean = np.stack([np.bincount(group, x) for x in points.T], axis=1) / count
+    return float(np.mean((points - mean[group]) ** 2))
+
+
+# Cosine of the angle from the axis beyond which no lens shows anything that measures, 75°.
+_WIDEST = 0.26
+# Points of a view that say where a sensor looks.
+_ENOUGH = 1000
+
+
+def _all_ahead(point_sets: Sequence[Array]) -> bool:
+    """True if a lens may have seen all points, sensor frame: none beside it or behind."""
+    some = [points[:: 1 + len(points) // _ENOUGH] for points in point_sets]
+    if not some:
+        return True
+    shown = np.concatenate(some)
+    ahead = shown[:, 2] / np.maximum(np.linalg.norm(shown, axis=1), 1e-300)
+    # A stray point in a hundred says nothing.
+    least, most = np.quantile(ahead, [0.01, 0.99])
+    return bool(least > _WIDEST or most < -_WIDEST)
 
 
 # What effects may know of the views: all of them at once (`Views`), or one with its points (`ScanView`).
@@ -322,10 +384,6 @@ def _median_range(session: Session) -> float:
 
 # Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.
 MIN_COSINE = 0.1
-# Cosine of the angle from the axis beyond which no lens shows anything that measures, 75°.
-_WIDEST = 0.26
-# Points of a view that say where a sensor looks.
-_ENOUGH = 1000
 
 
 @dataclass(frozen=True)
@@ -340,7 +398,7 @@ class Measurement:
     scan_views: tuple[ScanView, ...]
     length_unit: str
     target_views: tuple[ScanView, ...] = ()  # the same as `scan_views` for labelled points
-    sensor: SensorKind | None = None  # as the session states it
+    sensor: SensorKind | None = None  # as the session states it, or as its points show
 
     @property
     def mount(self) -> Mount:
@@ -358,14 +416,7 @@ class Measurement:
         shows points where no lens looks, beside it or behind."""
         if self.sensor is not None:
             return self.sensor not in ("tracker", "probe")
-        some = [points[:: 1 + len(points) // _ENOUGH] for points in self.capture.point_sets]
-        if not some:
-            return True
-        shown = np.concatenate(some)
-        ahead = shown[:, 2] / np.maximum(np.linalg.norm(shown, axis=1), 1e-300)
-        # A stray point in a hundred says nothing.
-        least, most = np.quantile(ahead, [0.01, 0.99])
-        return bool(least > _WIDEST or most < -_WIDEST)
+        return _all_ahead(self.capture.point_sets)
 
     @property
     def has_surfaces(self) -> bool:
@@ -421,7 +472,7 @@ def measurement_of(session: Session, capture: Capture) -> Measurement:
         scan_views=tuple(scan_views),
         length_unit=session.length_unit,
         target_views=tuple(target_views),
-        sensor=session.scanner.kind,
+        sensor=sensor_kind(session),
     )
 
 

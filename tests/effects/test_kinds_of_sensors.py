@@ -9,7 +9,8 @@ from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.effects.contract import EFFECTS, missing_need, require_available
 from stitch.errors import InputError
 from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
+from stitch.measurement.measurement import measurement_of, sensor_kind, sensor_note
+from stitch.measurement.session import Sighting
 
 SENSOR = {name for name, e in EFFECTS.items() if e.place == "sensor" and e.tier == "physical"}
 
@@ -48,3 +49,25 @@ def test_what_shows_points_beside_and_behind_itself_has_no_lens():
     assert not measurement_of(session, prepare_capture(session)).has_optics
     session = replace(session, scanner=replace(session.scanner, kind="camera"))
     assert measurement_of(session, prepare_capture(session)).has_optics
+
+
+@pytest.mark.parametrize(("away", "taken"), [(0.0, "tracker"), (10.0, "tracker"), (1500.0, None)])
+def test_a_tracker_that_speaks_in_the_robots_base_is_no_scanner(away, taken):
+    """Points on the flange that stand still in it are given in the base; a scanner stands at some distance."""
+    session, *_ = labelled_cell(3, views=30)
+    ball = np.array([30.0, -40.0, 150.0])
+    seen = [
+        replace(
+            view,
+            sighting=Sighting(
+                ("ball",),
+                (view.T_base_flange[:3, :3] @ ball + view.T_base_flange[:3, 3])[None] + [away, 0, 0],
+                np.array([0.01]),
+            ),
+        )
+        for view in session.views
+    ]
+    session = replace(session, views=tuple(seen), scanner=replace(session.scanner, kind=None))
+    assert sensor_kind(session) == taken
+    assert ("taken for a tracker" in sensor_note(session)) == (taken is not None)
+    assert sensor_note(replace(session, scanner=replace(session.scanner, kind="line"))) == ""
