@@ -67,16 +67,17 @@ def calibrate_sphere(session: Session, radius_free: bool = False) -> SphereCalib
     _require_radius(session, np.median(own) if own else radius, float(np.std(own)) if own else 0.0)
     require_motion(motions_from_first(G))
     start, how = find_sphere_start(G, views, session.scanner.T_mount)
+    enough = len(views) >= _VIEWS_FOR_RADIUS
+    free = fit_sphere(G, views, start.T_mount, radius, True) if radius_free or enough else None
+    # A wrong radius may be what makes two hand-eyes fit alike.
+    if free is not None and not radius_free:
+        _require_radius(session, free.radius, float(np.sqrt(free.covariance[9, 9])))
     if start.runner_up < _CLEAR * start.rms:
         raise NoResultError(
             f"two hand-eyes fit these scans alike (rms {start.rms:.3g}, {start.runner_up:.3g} {session.length_unit}); "
-            f"give scanner.pose in session.toml or the column {SIDE_COLUMN} in views.csv, or turn the wrist more"
+            f"to fix: give scanner.pose in session.toml, the column {SIDE_COLUMN} in views.csv, or turn the wrist more"
         )
-    fit = fit_sphere(G, views, start.T_mount, radius, radius_free)
-    enough = len(views) >= _VIEWS_FOR_RADIUS
-    free = fit if radius_free else (fit_sphere(G, views, start.T_mount, radius, True) if enough else None)
-    if free is not None and not radius_free:
-        _require_radius(session, free.radius, float(np.sqrt(free.covariance[9, 9])))
+    fit = free if radius_free and free is not None else fit_sphere(G, views, start.T_mount, radius)
     return SphereCalibration(
         fit=fit,
         free=free,

@@ -203,6 +203,8 @@ def linearise_sphere(
 
 # Mean square over the numbers of a view, in sigmas: beyond it a view counts less (a view in 150 by chance).
 _OUTLYING = 4.0
+# Views whose 21 numbers leave as many as the fit has unknowns, and a few more.
+_FEWEST_TRUSTED = 7
 
 
 def view_covariances(
@@ -223,9 +225,18 @@ def view_covariances(
 
 
 def find_shares(e: Sequence[Array], whole: Sequence[Array]) -> Array:
-    """Shares (V,) that views with residuals e (k + 1,) may have, `whole` their covariances at share 1."""
+    """Shares (V,) that views with residuals e (k + 1,) may have, `whole` their covariances at share 1.
+
+    Two thirds of the views count in full, however far off they are: where more seem wrong, the state is.
+    """
     square = np.array([r @ np.linalg.solve(V, r) / len(r) for r, V in zip(e, whole, strict=True)])
-    return np.asarray(np.minimum(1.0, _OUTLYING / np.maximum(square, 1e-12)) ** 2)
+    limit = max(_OUTLYING, np.sort(square)[trusted_views(len(square)) - 1])
+    return np.asarray(np.minimum(1.0, limit / np.maximum(square, 1e-12)) ** 2)
+
+
+def trusted_views(views: int) -> int:
+    """Return how many of the views are taken to be right: two thirds, and no fewer than fix a hand-eye clearly."""
+    return max(min(views, _FEWEST_TRUSTED), -(-2 * views // 3))
 
 
 def find_scatter(
@@ -351,15 +362,20 @@ def global_start(G: Array, views: Sequence[SphereView], coarse: Array | None = N
 
 
 def _solve_sides(G: Array, views: Sequence[SphereView], R: Array) -> SphereStart:
-    """Translation and centre by linear least squares, then the sides, a few times, for one rotation."""
-    signs = np.array([v.side for v in views])
-    design = np.concatenate([-G[:, :3, :3], np.broadcast_to(np.eye(3), (len(G), 3, 3))], axis=2).reshape(-1, 6)
-    inverse = np.linalg.pinv(design, rcond=1e-6)
-    T, rms = np.eye(4), np.inf
+    """Translation and centre by linear least squares, then the sides, a few times, for one rotation.
+
+    The views that fit best are fitted again each time: least trimmed squares by concentration steps (Rousseeuw & Van
+    Driessen 2006, Data Min. Knowl. Discov. 12:29).
+    """
+    signs, trusted = np.array([v.side for v in views]), trusted_views(len(views))
+    design = np.concatenate([-G[:, :3, :3], np.broadcast_to(np.eye(3), (len(G), 3, 3))], axis=2)
+    T, rms, best = np.eye(4), np.inf, np.arange(len(views))
     for _ in range(4):
         y = (G[:, :3, :3] @ (centres(views, signs) @ R.T)[..., None])[..., 0] + G[:, :3, 3]
-        x = inverse @ y.ravel()
-        rms = float(np.sqrt(np.mean((y.ravel() - design @ x) ** 2)))
+        x = np.linalg.pinv(design[best].reshape(-1, 6), rcond=1e-6) @ y[best].ravel()
+        square = np.mean((y - design @ x) ** 2, axis=1)
+        best = np.argsort(square, kind="stable")[:trusted]
+        rms = float(np.sqrt(np.mean(square[best])))
         T = frames.make(R, x[:3])
         signs = choose_sides(G, views, T, x[3:])
     return SphereStart(T, signs, rms, np.inf)
@@ -374,19 +390,24 @@ def choose_sides(G: Array, views: Sequence[SphereView], T_mount: Array, centre: 
 
 
 def refine_start(G: Array, views: Sequence[SphereView], start: SphereStart) -> SphereStart:
-    """Hand-eye and centre together from the centres with the sides as they stand, then the sides anew."""
-    q = centres(views, start.signs)
+    """Hand-eye and centre together from the centres with the sides as they stand, then the sides anew.
+
+    Only the views that fit best so far are asked.
+    """
+    q, trusted = centres(views, start.signs), trusted_views(len(views))
     soft = np.array([np.eye(3) - (1 - _offset_weight(v)) * np.outer(v.normal, v.normal) for v in views])
 
-    def residual(x: Array) -> Array:
+    def off(x: Array) -> Array:
         T = G @ start.T_mount @ frames.exp(x[:6])
-        return np.asarray((soft @ (q - frames.transform(frames.inverse(T), x[None, 6:])[:, 0])[..., None]).ravel())
+        return np.asarray((soft @ (q - frames.transform(frames.inverse(T), x[None, 6:])[:, 0])[..., None])[..., 0])
 
-    place = (frames.transform(G @ start.T_mount, q[:, None])[:, 0]).mean(axis=0)
-    fit = least_squares(residual, np.concatenate([np.zeros(6), place]), x_scale="jac", max_nfev=30)
+    place = np.median(frames.transform(G @ start.T_mount, q[:, None])[:, 0], axis=0)
+    begin = np.concatenate([np.zeros(6), place])
+    best = np.argsort(np.sum(off(begin) ** 2, axis=1), kind="stable")[:trusted]
+    fit = least_squares(lambda x: off(x)[best].ravel(), begin, x_scale="jac", max_nfev=30)
     T = start.T_mount @ frames.exp(fit.x[:6])
     signs = choose_sides(G, views, T, fit.x[6:])
-    return SphereStart(T, signs, float(np.sqrt(np.mean(fit.fun**2))), np.inf)
+    return SphereStart(T, signs, float(np.sqrt(np.mean(np.sort(np.mean(off(fit.x) ** 2, axis=1))[:trusted]))), np.inf)
 
 
 def _offset_weight(view: SphereView) -> float:

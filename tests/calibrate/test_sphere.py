@@ -9,7 +9,15 @@ import pytest
 from data_synth.fixtures.sphere_scans import RADIUS, SphereCell, area_scan, sphere_cell, write_spheres
 from stitch import frames
 from stitch.calibrate.sphere import calibrate_sphere, sphere_document
-from stitch.calibrate.sphere_fit import arc_normal, centres, fit_sphere, global_start, solve_decoupled, sphere_view
+from stitch.calibrate.sphere_fit import (
+    arc_normal,
+    centres,
+    find_shares,
+    fit_sphere,
+    global_start,
+    solve_decoupled,
+    sphere_view,
+)
 from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
 from stitch.reading.session_folder import load_session
@@ -140,6 +148,25 @@ def test_a_wrong_pose_is_named_and_hardly_counts(kind, tmp_path):
         assert [note.split()[1] for note in notes] == ["v5"] and "contradicts" in notes[0]
         assert np.abs(twist(cell, result.fit.T_mount) / np.sqrt(np.diag(result.fit.covariance))[:6]).max() < 4
         assert np.linalg.norm(twist(cell, result.fit.T_mount)[3:]) < 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["line", "area"])
+def test_three_wrong_poses_of_ten_do_not_turn_the_right_views_off(kind):
+    for seed in range(40, 43):
+        rng, cell = np.random.default_rng(seed), sphere_cell(seed, kind, poses=8)
+        wrong = rng.choice(10, 3, replace=False)
+        cell.G[wrong, :3, 3] += rng.normal(0, 8, (3, 3))
+        fit = fit_sphere(cell.G, views_of(cell), global_start(cell.G, views_of(cell)).T_mount, RADIUS)
+        assert np.delete(fit.shares, wrong).min() > 0.1
+        assert np.abs(twist(cell, fit.T_mount) / np.sqrt(np.diag(fit.covariance))[:6]).max() < 4
+
+
+@pytest.mark.parametrize(("views", "least"), [(5, 5), (7, 7), (9, 7), (12, 8), (30, 20)])
+def test_two_thirds_of_the_views_count_in_full_from_wherever_the_search_starts(views, least):
+    rng = np.random.default_rng(1)
+    shares = find_shares(list(rng.normal(0, 500, (views, 3))), [np.eye(3)] * views)
+    assert np.sum(shares == 1) == least
 
 
 def test_sides_given_by_the_session_lead_to_the_decoupled_start(tmp_path):
