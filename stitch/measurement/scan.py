@@ -22,12 +22,13 @@ def box_corners(box: Array) -> Array:
     return np.array(np.meshgrid(*box.T)).reshape(3, 8).T
 
 
-# Neighbours of the local plane: enough to average the noise, few enough to follow a fillet.
-_PLANE_NEIGHBOURS = 16
-# The quadric of the noise estimate has six coefficients; 16 neighbours leave ten degrees of freedom, and
-# stay within one curve of the surface where a thin part is scanned in coarse steps.
-_QUADRIC_NEIGHBOURS = 16
+# Neighbours of a point's local plane: enough to average the noise, few enough to follow a fillet. To the quadric of the
+# noise estimate, of six coefficients, they leave ten degrees of freedom, and stay within one curve of the surface where
+# a thin part is scanned in coarse steps.
+_NEIGHBOURS = 16
 _NOISE_SAMPLES = 1500
+# Points whose neighbourhoods are worked on at a time: as many as stay in a core's cache.
+_IN_CACHE = 2048
 # Beyond 75° between ray and normal, range cameras smear; beyond 0.35 of the neighbourhood's
 # radius, the centroid has left the point: the surface ends here.
 GRAZING_COSINE = np.cos(np.radians(75.0))
@@ -73,12 +74,10 @@ def prepare_scan(name: str, points: Array, picked: Indices | None = None, eye: A
     points = np.ascontiguousarray(points, float)
     tree = KDTree(points, leafsize=16)
     own = points if picked is None or len(picked) == len(points) else points[picked]
-    neighbours = min(_PLANE_NEIGHBOURS, len(points))
+    neighbours = min(_NEIGHBOURS, len(points))
     distance, index = tree.query(own, k=neighbours)
-    around = points[index]
-    centroid = around.mean(axis=1)
     radius = distance[:, -1]
-    normals, variation = _fit_planes(around - centroid[:, None])
+    centroid, normals, variation = fit_planes(points, index)
     eye = np.zeros(3) if eye is None else eye
     cosine = np.einsum("ij,ij->i", normals, rays_to(own, eye))
     normals *= -np.sign(cosine)[:, None]
@@ -88,7 +87,7 @@ def prepare_scan(name: str, points: Array, picked: Indices | None = None, eye: A
     usable &= variation < _CREASE_VARIATION
     # Across an edge no quadric fits: there the surface would count as noise.
     smooth = usable if usable.any() else np.ones_like(usable)
-    noise = _estimate_noise(points, own[smooth], normals[smooth], tree)
+    noise = _estimate_noise(points, own[smooth], normals[smooth], index[smooth])
     spacing = scanned_spacing = float(np.median(distance[:, 1]))
     if len(own) < len(points):
         tree = KDTree(own, leafsize=16)
@@ -138,25 +137,60 @@ def _estimate_spacing(points: Array, tree: Any) -> float:
     return float(np.median(distance[:, 1]))
 
 
-def _fit_planes(centred: Array) -> tuple[Array, Array]:
-    """Normals (N, 3) and surface variation (N,) of neighbourhoods (N, k, 3) about their centroid."""
-    covariance = np.matmul(centred.transpose(0, 2, 1), centred)
-    values, vectors = np.linalg.eigh(covariance)
-    return np.ascontiguousarray(vectors[:, :, 0]), values[:, 0] / np.maximum(values.sum(axis=1), 1e-300)
+def fit_planes(points: Array, index: Indices) -> tuple[Array, Array, Array]:
+    """Centroids (N, 3), unit normals (N, 3) and surface variation (N,) of neighbourhoods, rows (N, k) of points."""
+    centroid, normals, variation = np.empty((len(index), 3)), np.empty((len(index), 3)), np.empty(len(index))
+    columns = np.ascontiguousarray(points.T)
+    for start in range(0, len(index), _IN_CACHE):
+        at = slice(start, start + _IN_CACHE)
+        around = np.array([column[index[at]] for column in columns])
+        centroid[at] = around.mean(axis=2).T
+        centred = around - centroid[at].T[:, :, None]
+        normals[at], variation[at] = _weakest_directions(np.einsum("ink,jnk->ijn", centred, centred))
+    return centroid, normals, variation
 
 
-def _estimate_noise(points: Array, own: Array, normals: Array, tree: Any) -> float:
-    """1-sigma of the points across a local quadric: median over neighbourhoods of some of `own` in `points`.
+# Share of the largest eigenvalue's square by which a plane stands out from a line; below it digits are lost.
+_CLEARLY_PLANE = 1e-3
+
+
+def _weakest_directions(C: Array) -> tuple[Array, Array]:
+    """Eigenvectors (N, 3) of the smallest eigenvalues of covariances (3, 3, N), and their share (N,) of the traces.
+
+    The eigenvalues are the roots of a cubic, by its angle (Smith 1961); all rows of C − λ lie across the eigenvector.
+    """
+    scaled = C / np.maximum(np.trace(C), 1e-300)
+    mean, one = np.trace(scaled) / 3, np.eye(3)[:, :, None]
+    off = scaled - one * mean
+    p = np.maximum(np.sqrt((off**2).sum(axis=(0, 1)) / 6), 1e-100)
+    det = (off[0] * np.cross(off[1], off[2], axis=0)).sum(axis=0)
+    angle = np.arccos(np.clip(det / (2 * p**3), -1.0, 1.0)) / 3
+    smallest, largest = (mean + 2 * p * np.cos(angle + turn) for turn in (2 * np.pi / 3, 0.0))
+    left = scaled - one * smallest
+    across = np.array([np.cross(left[i], left[j], axis=0) for i, j in ((0, 1), (1, 2), (2, 0))])
+    square = (across**2).sum(axis=1)
+    best = square.argmax(axis=0)
+    every = np.arange(len(best))
+    length = np.sqrt(square[best, every])
+    normals = across[best, :, every] / np.maximum(length, 1e-300)[:, None]
+    unclear = np.flatnonzero(length <= _CLEARLY_PLANE * largest**2)
+    if len(unclear):
+        values, vectors = np.linalg.eigh(scaled[:, :, unclear].transpose(2, 0, 1))
+        normals[unclear], smallest[unclear] = vectors[:, :, 0], values[:, 0]
+    return normals, smallest
+
+
+def _estimate_noise(points: Array, own: Array, normals: Array, index: Indices) -> float:
+    """1-sigma of the points across a local quadric: median over some of the neighbourhoods of `own`.
 
     A plane would count curvature as noise. White noise only: an error that is smooth over the
     neighbourhood moves the quadric with it and is not seen.
     """
-    count = min(_QUADRIC_NEIGHBOURS, len(points))
+    count = index.shape[1]
     if count <= 8:
         return float("nan")
     centre = even_indices(len(own), _NOISE_SAMPLES)
-    _, index = tree.query(own[centre], k=count)
-    local = points[index] - own[centre][:, None]
+    local = points[index[centre]] - own[centre][:, None]
     n = normals[centre]
     helper = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
     a = np.cross(n, helper)

@@ -12,7 +12,7 @@ from stitch.effects.contract import missing_need
 from stitch.errors import InputError
 from stitch.measurement.capture import distinct_points, prepare_capture
 from stitch.measurement.measurement import measurement_of
-from stitch.measurement.scan import prepare_scan
+from stitch.measurement.scan import fit_planes, prepare_scan
 from stitch.measurement.session import Cloud, Scanner
 
 
@@ -27,6 +27,23 @@ def test_normals_and_noise_of_a_sphere():
     assert inner.mean() > 0.5
     assert np.median(np.einsum("ij,ij->i", scan.normals, direction)[inner]) > 0.995
     assert scan.noise == pytest.approx(0.03, rel=0.04)
+
+
+@pytest.mark.parametrize("widths", [(1, 1, 1e-3), (1, 1e-2, 1e-6), (1, 1e-7, 1e-7), (1, 1, 1), (1, 0, 0), (0, 0, 0)])
+def test_planes_are_those_of_the_eigenvectors(widths):
+    """Of planes, ridges, lines, balls and single points, against LAPACK: the direction, where there is one."""
+    rng = np.random.default_rng(1)
+    turns = np.linalg.qr(rng.normal(size=(50, 3, 3)))[0]
+    points = (400 + (rng.normal(size=(50, 16, 3)) * widths) @ turns).reshape(-1, 3)
+    around = points.reshape(50, 16, 3)
+    centroid, normals, variation = fit_planes(points, np.arange(len(points)).reshape(50, 16))
+    centred = around - around.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(centred.transpose(0, 2, 1) @ centred)
+    assert np.allclose(centroid, around.mean(axis=1), rtol=1e-14)
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-12)
+    assert np.allclose(variation, values[:, 0] / np.maximum(values.sum(axis=1), 1e-300), atol=1e-12)
+    clear = values[:, 1] - values[:, 0] > 1e-6 * values[:, 2]
+    assert np.allclose(np.abs(np.einsum("ni,ni->n", normals, vectors[:, :, 0]))[clear], 1, atol=1e-12)
 
 
 def test_an_origin_amid_what_is_measured_is_not_where_the_scanner_looks_from():
