@@ -1,7 +1,7 @@
 """What overlaps and targets say about the pose of every view, as one linear model of visible directions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -45,6 +45,8 @@ class ViewModel:
     lever: float  # length_unit: rotations about `centre` count as displacements at this distance
     usual: Array | None = None  # (n, n) covariance of what effects of the library may do
     errors: PoseErrors | None = None  # of the n numbers, beside white scatter, in sizes that the views show
+    # What was fitted, by the bytes of the further columns: tests ask for the same means again and again.
+    _fits: dict[bytes, VarianceFit] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def with_usual(self, twists: Array) -> "ViewModel":
         """Return the model of an arm that may have effects: twists (6V, P) of the views, rad and length_unit."""
@@ -113,8 +115,15 @@ class ViewModel:
         return hand_eye_mixed_model(self.reduced)
 
     def fit(self, further: Array | None = None) -> VarianceFit:
-        """Fit the scatter of the poses (rotation², translation², noise factor) with further columns in the mean."""
-        return fit_variances(self.mixed(further), both_starts=self.errors is not None)
+        """Fit the scatter of the poses (rotation², translation², noise factor) with further columns in the mean.
+
+        A view more or less in the mean moves the scatter little: every search begins where the last one ended.
+        """
+        key = b"" if further is None else further.tobytes()
+        if key not in self._fits:
+            last = list(self._fits.values())[-1].variances if self._fits else None
+            self._fits[key] = fit_variances(self.mixed(further), start=last, both_starts=self.errors is not None)
+        return self._fits[key]
 
     def deviance(self, further: Array | None = None) -> float:
         """Return −2 log of the full likelihood of z with further columns in the mean, comparable between means."""
