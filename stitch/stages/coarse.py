@@ -8,7 +8,7 @@ between all views that ought to meet. Objects without features (sphere, cone, pl
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
@@ -26,7 +26,8 @@ from stitch.measurement.capture import Capture, part_size
 from stitch.measurement.scan import Scan, subsample
 from stitch.observations.observability import hidden_translations
 from stitch.observations.surfaces.matching import NeighbourQueries, neighbour_queries, sample_points
-from stitch.stages.correct import icp_hand_eye, next_gates
+from stitch.observations.surfaces.normal_equations import Overlaps, collect_overlaps, common_samples
+from stitch.stages.correct import COARSE_SAMPLES, icp_hand_eye, next_gates
 from stitch.system.process import steps
 from stitch.system.threads import parallel
 
@@ -285,6 +286,21 @@ class CoarseHandEye:
     gate: float  # length_unit: first distance between partners for the correction
     source: str
     candidates: tuple[HandEyeCandidate, ...]
+    _met: dict[int, tuple[Capture, Overlaps]] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def overlaps(self, capture: Capture) -> Overlaps:
+        """What a few points of each view meet under it. The stage is told of it, and the correction begins with it.
+
+        Raises:
+            NoResultError: no two views overlap.
+        """
+        # The second who asks takes it along: nobody asks a third time.
+        own, found = self._met.pop(id(capture), (None, None))
+        if found is None or own is not capture:
+            samples = common_samples(capture.scans, COARSE_SAMPLES)
+            found = collect_overlaps(capture, capture.poses(self.T_mount), self.gate, samples)
+            self._met[id(capture)] = capture, found
+        return found
 
     @property
     def is_ambiguous(self) -> bool:

@@ -56,8 +56,10 @@ class Correction:
     given: bool = False  # the model is that of another run, nothing was fitted
 
 
-# Queries per view, at most, while the gate closes; the final normal equations take FINE_SAMPLES.
+# Queries per view, at most, while the gate closes; the final normal equations take FINE_SAMPLES. While partners may lie
+# farther away than so many spacings, a quarter of them do: what is missing is not points, but the right partners.
 COARSE_SAMPLES = 600
+_WIDE_SAMPLES, _WIDE_SPACINGS = 150, 4.0
 _MAXIMUM_ITERATIONS = 40
 # A step that moves the part by less than this share of the robust sigma changes nothing.
 _CONVERGED = 2e-3
@@ -86,6 +88,7 @@ def icp_hand_eye(
     T_mount: Array,
     gates: Sequence[float],
     *,
+    first: Sequence[Overlaps] | None = None,
     samples: int = COARSE_SAMPLES,
     maximum: int = _MAXIMUM_ITERATIONS,
     recorder: Recorder | None = None,
@@ -95,17 +98,26 @@ def icp_hand_eye(
     Args:
         T_mount: (4, 4) start, T_mount_scanner.
         gates: first distance between partners per capture, length_unit.
+        first: overlaps per capture under the start, if they are at hand.
 
     Returns:
         T_mount (4, 4), the last overlaps per capture and the rms per iteration.
     """
     recorder = recorder or SilentRecorder()
-    picked = [common_samples(capture.scans, samples) for capture in captures]
+    few, many = (
+        [common_samples(capture.scans, own) for capture in captures] for own in (min(samples, _WIDE_SAMPLES), samples)
+    )
     gates, history, part = list(gates), [], seen_part(captures)
     before: Sequence[Overlaps | None] = [None] * len(captures)
+    closing = True
     for index in range(maximum):
-        every = zip(captures, gates, picked, before, strict=True)
-        before = overlaps = [collect_overlaps(c, c.poses(T_mount), gate, own, last) for c, gate, own, last in every]
+        wide = closing and all(gate > _WIDE_SPACINGS * c.spacing for c, gate in zip(captures, gates, strict=True))
+        every = zip(captures, gates, few if wide else many, before, strict=True)
+        if first is not None and index == 0:
+            overlaps = list(first)
+        else:
+            overlaps = [collect_overlaps(c, c.poses(T_mount), gate, own, last) for c, gate, own, last in every]
+        before = overlaps
         history.append(pooled_rms(overlaps))
         recorder.iteration("correct", index, captures[0].poses(T_mount), history[-1], gates[0])
         xi, moved = common_step(captures, overlaps, T_mount, visible_twists(captures, T_mount, part))
@@ -113,7 +125,10 @@ def icp_hand_eye(
         tighter = [min(g, next_gate(o, c)) for g, o, c in zip(gates, overlaps, captures, strict=True)]
         settled = all(new > 0.9 * old for new, old in zip(tighter, gates, strict=True))
         if moved < _CONVERGED and settled:
-            break
+            if not wide:
+                break
+            # Surfaces that agree no better than a few spacings keep the gate wide.
+            closing = False
         gates = next_gates(captures, overlaps)
     return T_mount, overlaps, history
 
@@ -136,6 +151,7 @@ def correct(
     recorder: Recorder | None = None,
     scanner_errors: ScannerErrors | None = None,
     pose_error_prior: PoseErrorPrior | None = None,
+    met: Sequence[Overlaps] | None = None,
 ) -> Correction:
     """Correct one hand-eye from all overlapping pairs of all captures of a rig.
 
@@ -145,11 +161,12 @@ def correct(
         gate: first distance between partners, length_unit: the coarse error at the part.
         scanner_errors: errors of the scanner that all views have in common; they widen the covariance.
         pose_error_prior: how poses may err beside white scatter; None: they do not.
+        met: overlaps per capture under the coarse hand-eye, if they are at hand.
 
     Raises:
         NoResultError: no two views of a capture overlap.
     """
-    T_mount, overlaps, history = icp_hand_eye(captures, T_mount, [gate] * len(captures), recorder=recorder)
+    T_mount, overlaps, history = icp_hand_eye(captures, T_mount, [gate] * len(captures), first=met, recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
     announce("correct: what every view tells of its pose")
     freed = tuple(unconstrained_poses(c, c.poses(T_mount), gate) for c, gate in zip(captures, gates, strict=True))

@@ -13,7 +13,6 @@ from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
-from stitch.observations.surfaces.normal_equations import collect_overlaps, common_samples
 from stitch.observations.surfaces.scanner_errors import rig_field_scatters
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
@@ -21,7 +20,7 @@ from stitch.observations.targets.target_model import TargetModelFit
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import Fit, LedgerStep, StageResult
 from stitch.stages.coarse import REUSED, STATED, CoarseHandEye, find_coarse_hand_eye, use_given_hand_eye
-from stitch.stages.correct import COARSE_SAMPLES, Correction, apply_given_hand_eye, correct
+from stitch.stages.correct import Correction, apply_given_hand_eye, correct
 from stitch.stages.register import METHODS
 from stitch.stages.register_and_fuse import FittedRig, InitialModel, finish_surfaces
 from stitch.stages.sentences import coarse_note, mixed_notes, warnings
@@ -51,8 +50,7 @@ def _initial_hand_eye(
 
 def initial_stage(measurement: Measurement, start: CoarseHandEye, seconds: float, recorder: Recorder) -> StageResult:
     """How well the views of one session meet under the coarse hand-eye."""
-    own, poses = measurement.capture, measurement.capture.poses(start.T_mount)
-    g = collect_overlaps(own, poses, start.gate, common_samples(own.scans, COARSE_SAMPLES)).gram
+    g, poses = start.overlaps(measurement.capture).gram, measurement.capture.poses(start.T_mount)
     stage = StageResult("coarse", g.rms, int(g.count.sum()), len(start.candidates), seconds, coarse_note(start))
     recorder.stage(stage, poses)
     return stage
@@ -74,7 +72,8 @@ def fit(
         def pose_error_prior(unconstrained: Sequence[UnconstrainedPoses], T_mount: Array) -> PoseErrors:
             return prior_pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in unconstrained])
 
-        first = correct(captures, starts[0].T_mount, starts[0].gate, recorder, repeating, pose_error_prior)
+        met = [starts[0].overlaps(capture) for capture in captures]
+        first = correct(captures, starts[0].T_mount, starts[0].gate, recorder, repeating, pose_error_prior, met)
         if initial_model is None:
             return first
         gates = [overlaps.gate for overlaps in first.overlaps]
