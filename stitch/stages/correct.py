@@ -61,8 +61,9 @@ class Correction:
 COARSE_SAMPLES = 600
 _WIDE_SAMPLES, _WIDE_SPACINGS = 150, 4.0
 _MAXIMUM_ITERATIONS = 40
-# A step that moves the part by less than this share of the robust sigma changes nothing.
-_CONVERGED = 2e-3
+# A step that moves the part by less than this share of the robust sigma changes nothing: views that are freed from
+# there tell what is left. After one below the second share the gate closes at once to what the distances ask for.
+_CONVERGED, _AT_REST = 1e-2, 0.1
 
 
 def common_step(
@@ -129,7 +130,7 @@ def icp_hand_eye(
                 break
             # Surfaces that agree no better than a few spacings keep the gate wide.
             closing = False
-        gates = next_gates(captures, overlaps)
+        gates = tighter if moved < _AT_REST else next_gates(captures, overlaps)
     return T_mount, overlaps, history
 
 

@@ -26,11 +26,12 @@ from stitch.observations.surfaces.normal_equations import (
     Overlaps,
     append_targets,
     assemble,
+    carry_overlaps,
     collect_overlaps,
     gram,
     next_gate,
 )
-from stitch.observations.surfaces.view_poses import LastStep, has_converged, take_step
+from stitch.observations.surfaces.view_poses import LastStep, has_converged, is_last_step, take_step
 from stitch.observations.targets.rows import TargetRows
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.stages.correspondence_weights import OffsetSums, dpwvm_weights, plane_weights, with_offsets
@@ -148,7 +149,13 @@ def register(
             best = Registration(poses, overlaps, (), offsets=equations.offsets)
         elif progress.stalled >= _PATIENCE:
             break
+        before, ends = poses, tighter > 0.9 * gate and is_last_step(g, step, last, _CONVERGED)
         poses, last = take_step(poses, g, step, last)
+        if ends:
+            overlaps = carry_overlaps(capture, overlaps, before, poses)
+            history.append(overlaps.gram.rms)
+            recorder.iteration("register", index + 1, poses, history[-1], gate)
+            return Registration(poses, overlaps, tuple(history), offsets=equations.offsets)
         gate = tighter
         overlaps = collect_overlaps(capture, poses, gate, picked, overlaps)
     return replace(best, history=tuple(history), note=progress.note(len(history)))

@@ -338,6 +338,27 @@ def collect_overlaps(
     return Overlaps(pairs, matches, append_targets(surfaces, targets, capture.noise_factor), gate, targets, probed)
 
 
+def carry_overlaps(capture: Capture, before: Overlaps, start: Array, poses: Array) -> Overlaps:
+    """The same correspondences after views have moved by so little that their partners stay: e + B(δ_v − δ_w).
+
+    Args:
+        start: (V, 4, 4) T_reference_scanner under which they were matched.
+        poses: (V, 4, 4) where the views are now.
+    """
+    centre = before.gram.centre
+    to_centre = frames.make(np.eye(3), -centre)
+    twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ start))
+
+    def moved(m: Match) -> Match:
+        turn, shift = np.split(twists[m.v] - twists[m.w], 2)
+        return replace(m, residual=m.residual + np.cross(m.middle - centre, m.normal) @ turn + m.normal @ shift)
+
+    matches = [moved(m) for m in before.matches]
+    targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
+    g = append_targets(sum_matches(matches, len(capture.scans)), targets, capture.noise_factor)
+    return replace(before, matches=matches, gram=g, targets=targets)
+
+
 def _pairs_still_valid(before: Overlaps, poses: Array, gate: float) -> bool:
     """Whether no view has moved, and the gate has not opened, by enough to make other pairs overlap."""
     assert before.probed is not None

@@ -13,7 +13,7 @@ from stitch import frames
 from stitch.frames import Array, Mask
 from stitch.measurement.capture import Capture
 from stitch.observations.surfaces.matching import sample_points
-from stitch.observations.surfaces.normal_equations import Gram, Overlaps, collect_overlaps, next_gate
+from stitch.observations.surfaces.normal_equations import Gram, Overlaps, carry_overlaps, collect_overlaps, next_gate
 from stitch.statistics.least_squares import anderson_step
 
 # Views moved by one step of an iteration after another.
@@ -33,6 +33,17 @@ def take_step(poses: Array, g: Gram, step: Array, last: LastStep) -> tuple[Array
 def has_converged(g: Gram, step: Array, share: float) -> bool:
     """True if a step (V, 6) moves the views by less than a share of the robust sigma, rms."""
     return bool(np.sqrt(np.mean(step[:, 3:] ** 2)) < share * g.scale)
+
+
+def is_last_step(g: Gram, step: Array, last: LastStep, share: float) -> bool:
+    """True if this step (V, 6) leaves another that converges, as the ratio of the last two foretells.
+
+    Then nothing is to be learnt from new partners: the step is taken, and those at hand are carried along.
+    """
+    if last is None:
+        return False
+    ratio = np.linalg.norm(step * g.displacement_factors) / np.linalg.norm(last[0])
+    return has_converged(g, ratio * step, share)
 
 
 # What the sensor's own noise would leave in the overlaps if every pose were perfect.
@@ -96,7 +107,11 @@ def unconstrained_poses(capture: Capture, model_poses: Array, gate: float) -> Un
         step = visible_step(overlaps.gram)
         if has_converged(overlaps.gram, step, _CONVERGED):
             break
+        start, ends = poses, is_last_step(overlaps.gram, step, last, _CONVERGED)
         poses, last = take_step(poses, overlaps.gram, step, last)
+        if ends:
+            overlaps = carry_overlaps(capture, overlaps, start, poses)
+            break
         gate = min(gate, next_gate(overlaps, capture))
         overlaps = collect_overlaps(capture, poses, gate, picked, overlaps)
     return UnconstrainedPoses(poses, np.zeros((len(poses), 6)), overlaps).relative_to(model_poses)
