@@ -202,7 +202,8 @@ def independent(base: Array, further: Array, sizes: Array, threshold: float) -> 
         further: (N, P) whitened columns per unit of their parameters.
         sizes: (P,) plausible sizes of the parameters.
     """
-    rest = project_out(base, further * sizes)
+    # Pivoting among the rows of a first factor chooses the same; on all N rows scipy reserves N² numbers for it.
+    rest = np.linalg.qr(project_out(base, further * sizes), mode="r")
     R, order = qr(rest, mode="r", pivoting=True)
     clear = np.abs(np.diag(R)) >= threshold
     chosen = np.zeros(further.shape[1], bool)
