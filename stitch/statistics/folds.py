@@ -100,8 +100,13 @@ def _pose_offsets(T_reference_mount: Array, lever: float) -> Array:
 
 def _regions(T_reference_mount: Array, lever: float, groups: int) -> list[Indices]:
     twists = _pose_offsets(T_reference_mount, lever)
+    # Poses that repeat count once, in the order of their first visit: of fewer places than groups k-means would find
+    # none to begin the last group with.
+    _, first, pose = np.unique(twists, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
     with warnings.catch_warnings():
         # An empty group is no harm: it is left out by the callers.
         warnings.simplefilter("ignore", UserWarning)
-        _, label = kmeans2(twists, groups, minit="++", seed=0)
-    return [np.flatnonzero(label == k) for k in range(groups)]
+        _, label = kmeans2(twists[first[order]], min(groups, len(first)), minit="++", seed=0)
+    of_view = label[np.argsort(order)][pose]
+    return [np.flatnonzero(of_view == k) for k in range(groups)]

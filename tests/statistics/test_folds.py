@@ -1,5 +1,7 @@
 """Folds of cross-validation: which views are left out together."""
 
+import warnings
+
 import numpy as np
 
 from stitch.statistics.folds import grouped_folds, halves_of, joint_ends
@@ -24,6 +26,16 @@ def test_folds_leave_out_neighbours():
     assert sorted(np.concatenate(folds[:5])) == list(range(20))
     assert all(np.ptp(f) == 3 for f in folds[:5])  # four in a row by time
     assert all(len(set(T[f, 0, 3])) == 1 for f in folds[5:])  # one place each by pose
+
+
+def test_poses_that_repeat_stay_together_and_nothing_is_printed():
+    """Three stops, each visited seven times: fewer places than groups."""
+    T = np.tile(np.eye(4), (21, 1, 1))
+    T[:, 0, 3] = np.repeat([0.0, 300.0, 700.0], 7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        folds = grouped_folds(T, 100.0)
+    assert [sorted(f) for f in sorted(folds[5:], key=min)] == [[*range(7)], [*range(7, 14)], [*range(14, 21)]]
 
 
 def test_halves_share_no_view_and_leave_out_none():
