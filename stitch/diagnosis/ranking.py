@@ -113,5 +113,6 @@ def conditioned_on_effects(
     """The evidence beside some effects."""
     if not chosen:
         return linear
+    chosen = sorted(chosen, key=lambda r: r.name)
     columns = np.hstack([r.score.form.columns for r in chosen])
     return linear.conditioned_on(columns, np.concatenate([r.score.sizes for r in chosen]), near)

@@ -24,7 +24,7 @@ from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.observations.linear_model import LinearModel
 from stitch.stages.results import linearise
 from stitch.statistics.distributions import chi2_limit, f_tail
-from stitch.statistics.parameter_selection import log_evidence, log_mixture
+from stitch.statistics.parameter_selection import log_evidence_at_scales, log_mixture
 from stitch.statistics.reml import at_variances, fit_variances
 from stitch.statistics.variance_posterior import satterthwaite
 from stitch.system.threads import parallel
@@ -114,9 +114,8 @@ def gain_at_null(linear: LinearModel, form: Form, white: Array) -> Gain:
     white = white * form.sizes
     told, b = white.T @ white, white.T @ linear.white_residual
     shares = regime_of(linear).scales
-    scales = np.array(list(shares))
-    found = log_evidence(scales[:, None, None] ** 2 * told, scales[:, None] * b)
-    return Gain(log_mixture(found, shares), float(scales[(found + np.log(list(shares.values()))).argmax()]))
+    found = log_evidence_at_scales(told, b, shares)
+    return Gain(log_mixture(found, shares), list(shares)[int((found + np.log(list(shares.values()))).argmax())])
 
 
 def _wald(theta: Array, covariance: Array, sizes: Array) -> tuple[int, float]:

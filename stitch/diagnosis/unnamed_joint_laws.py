@@ -62,8 +62,9 @@ from stitch.statistics.reml import MixedModel, VarianceFit, at_variances, fit_va
 # Smooth processes by which a joint or the flange may err, as columns of the channel with unit coefficients: the
 # leading eigenvectors of their covariance between views.
 
-# Of so many processes what takes longest is kept: those of a session with six or seven joints.
-_KEPT = 64
+# Of so many processes the courses are kept: those of a session with six or seven joints. Of thousands of poses each
+# takes a megabyte or two.
+_KEPT = 40
 
 
 @dataclass(frozen=True)
@@ -117,17 +118,16 @@ def wandering_flange(linear: LinearModel) -> SmoothProcess:
 
 def _smooth_courses(angles: Array, reach: float = REACH) -> Array:
     """(V, R) smooth courses over some angles (V, a), without what is alike in all views: that has a name."""
-    knots = angles[_knots(len(angles))]
-    leading = _leading_courses_cached(np.ascontiguousarray(knots).tobytes(), len(knots), reach)
-    shapes = rbf_joints(angles, knots, reach) @ leading
-    return np.asarray(shapes - shapes.mean(axis=0))
+    return _smooth_courses_cached(np.ascontiguousarray(angles).tobytes(), len(angles), reach)
 
 
 @lru_cache(maxsize=_KEPT)
-def _leading_courses_cached(angles: bytes, views: int, reach: float) -> Array:
-    """(K, R) of the knots whose angles these are: the same in every diagnosis of a session."""
-    knots = np.frombuffer(angles).reshape(views, -1)
-    return _leading_courses(rbf_joints(knots, knots, reach), limits.PROCESS_COLUMNS)
+def _smooth_courses_cached(angles: bytes, views: int, reach: float) -> Array:
+    """(V, R) of the views whose angles these are: the same in every diagnosis of a session."""
+    every = np.frombuffer(angles).reshape(views, -1)
+    among_knots = rbf_joints(every, every[_knots(views)], reach)
+    shapes = among_knots @ _leading_courses(among_knots[_knots(views)], limits.PROCESS_COLUMNS)
+    return np.asarray(shapes - shapes.mean(axis=0))
 
 
 def _knots(views: int) -> Indices:

@@ -40,6 +40,8 @@ from stitch.statistics.variance_posterior import Satterthwaite, satterthwaite
 WHITE_COMPONENTS = ("white rotation", "white translation", "sensor noise")
 # A component that is as good as absent, as a share of the variance that it usually has.
 _NEGLIGIBLE_SHARE = 1e-2
+# Models beside further columns that are kept: those of one round of a selection; of thousands of poses 40 MB each.
+_REMEMBERED = 12
 # Among more numbers a search takes a second: one from the likeliest start must do.
 _SINGLE_START_SIZE = 250
 
@@ -364,13 +366,26 @@ class LinearModel(ErrorModel):
         Args:
             near: one that leaves about as much scatter, from which the search for it begins.
         """
-        mixed = replace(self.mixed, A=np.concatenate([self.mixed.A, self.in_blocks(columns)], axis=2))
-        design = np.hstack([self.design, self.observation.expand(columns)])
-        own = np.append(self.sizes, sizes), np.append(self.values, np.zeros(len(sizes)))
-        out = replace(self, design=design, sizes=own[0], values=own[1], mixed=mixed, full_model=None)
-        if self.pose_errors is None:
-            return replace(out, null=fit_variances(mixed, start=(near or self).null.variances))
-        return out.refit()
+        key = hash(columns.tobytes()), hash(sizes.tobytes())
+        found = self._conditioned.get(key)
+        if found is None:
+            mixed = replace(self.mixed, A=np.concatenate([self.mixed.A, self.in_blocks(columns)], axis=2))
+            design = np.hstack([self.design, self.observation.expand(columns)])
+            own = np.append(self.sizes, sizes), np.append(self.values, np.zeros(len(sizes)))
+            found = replace(self, design=design, sizes=own[0], values=own[1], mixed=mixed, full_model=None)
+            if self.pose_errors is None:
+                found = replace(found, null=fit_variances(mixed, start=(near or self).null.variances))
+            else:
+                found = found.refit()
+            if len(self._conditioned) >= _REMEMBERED:
+                self._conditioned.clear()
+            self._conditioned[key] = found
+        return found
+
+    @cached_property
+    def _conditioned(self) -> dict[tuple[int, int], "LinearModel"]:
+        """What `conditioned_on` has found last: effects are asked beside the same others several times."""
+        return {}
 
     def trial(
         self, response: Array, points: PointSums | None = None, prior: CoefficientPrior | None = None

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, qr
+from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.special import ndtri
 
 from stitch.frames import Array, Indices, Mask
@@ -31,6 +32,11 @@ def anderson_step(step: Array, last_step: Array, last_taken: Array) -> Array:
     square = float(change @ change)
     share = 0.0 if square == 0 else float(np.clip(-(change @ step) / square, _NEAREST, _FARTHEST))
     return np.asarray(step + share * (last_taken + change))
+
+
+# Where every column of a unit diagonal has more than this share of its root beside those before it, a Cholesky factor
+# is as good as eigenvectors, and takes a tenth of the time.
+CLEARLY_KNOWN = 1e-3
 
 
 def equilibrated(matrix: Array) -> tuple[Array, Array]:
@@ -108,25 +114,40 @@ class BlockLeastSquares:
             out = np.asarray(left_out, np.int64)
             M = M - _product(self.weighted[out], self.X[out])
             b = b - _product(self.weighted[out], self.z[out][..., None])[:, 0]
-        return np.asarray(self._inverse(M) @ (b + self.prior_vector))
+        scaled = self._scaled(M)
+        root, failed = dpotrf(scaled, lower=1, clean=0)
+        if not failed and np.diag(root).min() > CLEARLY_KNOWN:
+            return np.asarray(dpotrs(root, (b + self.prior_vector) * self._unit, lower=1)[0] * self._unit)
+        return np.asarray(self._pseudo_inverse(scaled) @ (b + self.prior_vector))
 
     def estimates_covariance(self) -> Array:
         """(k, k) of the estimates under the blocks' full covariance."""
         spread = np.einsum("bmk,bmn,bnl->kl", self.weighted, self.covariance, self.weighted, optimize=True)
-        inverse = self._inverse(self.information)
+        inverse = self._inverse
         return np.asarray(inverse @ (spread + np.diag(self.precision)) @ inverse)
 
     def shift_by_errors(self, errors: Array) -> Array:
         """(k, q) how far errors (B, m, q) of the blocks, which nobody models, move the estimates."""
         pulls = np.einsum("bmk,bmq->kq", self.weighted, errors)
-        return np.asarray(self._inverse(self.information) @ pulls)
+        return np.asarray(self._inverse @ pulls)
 
-    def _inverse(self, information: Array) -> Array:
-        """(k, k) of the information with the prior's; what nothing shows is zero in it."""
-        unit = equilibrated(self.information + np.diag(self.precision))[1]
-        units = np.outer(unit, unit)
-        scaled = (information + np.diag(self.precision)) * units
-        return np.asarray(np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) * units)
+    @cached_property
+    def _unit(self) -> Array:
+        """(k,) units in which all blocks leave a unit diagonal."""
+        return equilibrated(self.information + np.diag(self.precision))[1]
+
+    def _scaled(self, information: Array) -> Array:
+        """(k, k) information with the prior's, in those units."""
+        return np.asarray((information + np.diag(self.precision)) * np.outer(self._unit, self._unit))
+
+    def _pseudo_inverse(self, scaled: Array) -> Array:
+        """(k, k) of the information; what nothing shows is zero in it."""
+        return np.asarray(np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) * np.outer(self._unit, self._unit))
+
+    @cached_property
+    def _inverse(self) -> Array:
+        """(k, k) with all blocks."""
+        return self._pseudo_inverse(self._scaled(self.information))
 
     def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
         """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""

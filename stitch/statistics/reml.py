@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from scipy.special import betainc, betaln, expit
 
 from stitch.frames import Array, Mask
-from stitch.statistics.least_squares import equilibrated
+from stitch.statistics.least_squares import CLEARLY_KNOWN, equilibrated
 
 # A covariance in blocks: its inverse, its factor and its determinant.
 
@@ -154,9 +154,8 @@ def usual_variances(z: Array, components: Array) -> Array:
 
 # Blocks that are held against the components at a time: as many as stay in a core's cache.
 _IN_CACHE = 256
-# Of the mean's information, columns of unit diagonal: directions below the first share tell nothing. Where every
-# column has more than the second of its root beside those before it there are none, and no eigenvectors are sought.
-_KNOWN, _CLEARLY_KNOWN = 1e-12, 1e-3
+# Of the mean's information, columns of unit diagonal: directions below this share tell nothing.
+_KNOWN = 1e-12
 
 
 @dataclass(frozen=True)
@@ -268,7 +267,7 @@ def _root_of_inverse(M: Array) -> tuple[Array, float]:
     """R (k, r) with R Rᵀ = M⁻¹ for M (k, k) of unit diagonal, and log det M; both without directions that nothing
     tells of."""
     L, failed = dpotrf(M, lower=1, clean=1)
-    if not failed and len(L) and np.diag(L).min() > _CLEARLY_KNOWN:
+    if not failed and len(L) and np.diag(L).min() > CLEARLY_KNOWN:
         return np.asarray(dtrtri(L, lower=1)[0].T), 2 * float(np.log(np.diag(L)).sum())
     values, vectors = np.linalg.eigh(M)
     keep = values > _KNOWN
@@ -341,8 +340,6 @@ _SCORINGS, _LEAP, _HALVINGS, _CONVERGED, _MANY_BLOCKS = 20, 2.0, 4, 1e-3, 50
 # Deviance gained by a step that is the last one: another would gain a fiftieth of it at the most, as
 # seen in the fits of 600 labelled poses; where a prior bends the slope it would gain more.
 _LAST = 0.2
-# Change of a variance, as a share of it, beyond which little of it would be left.
-_NEARLY_NONE = -0.8
 
 
 def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> tuple[Array, Likelihood] | None:
@@ -386,8 +383,8 @@ def _scoring_step(curvature: Array, slope: Array, weak: Array) -> Array:
     seen: there the likelihood curves, in the logarithm, by its slope.
     """
     share = -np.linalg.solve(curvature, slope)
-    if share.min() > _NEARLY_NONE:
-        return np.asarray(np.log1p(share))
+    if share.min() > -1:
+        return np.asarray(np.maximum(np.log1p(share), -_LEAP))
     step = -np.linalg.solve(curvature + np.diag(weak), slope)
     return np.asarray(step * min(1.0, _LEAP / float(np.abs(step).max())))
 

@@ -3,10 +3,15 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binomtest
+from scipy.stats import binomtest, multivariate_normal
 
 from stitch.statistics.least_squares import independent
-from stitch.statistics.parameter_selection import WhitenedData, omitted_rms, select_supported
+from stitch.statistics.parameter_selection import (
+    WhitenedData,
+    log_evidence_at_scales,
+    omitted_rms,
+    select_supported,
+)
 
 
 @settings(max_examples=25, deadline=None)
@@ -21,6 +26,16 @@ def test_units_do_not_decide_what_is_visible(seed, exponent):
     chosen = independent(base, columns, sizes, 0.3)
     assert np.array_equal(chosen, independent(base, columns / unit, sizes * unit, 0.3))
     assert chosen.sum() == 5  # of two that say the same, one
+
+
+def test_evidence_is_the_density_of_what_was_seen():
+    """Of unit white noise and amplitudes of a normal prior, over that of the noise alone."""
+    rng = np.random.default_rng(0)
+    G, z = rng.standard_normal((7, 3)), rng.standard_normal(7)
+    found = log_evidence_at_scales(G.T @ G, G.T @ z, {0.3: 0.5, 30.0: 0.5})
+    alone = multivariate_normal(np.zeros(7)).logpdf(z)
+    expected = [multivariate_normal(np.zeros(7), np.eye(7) + s**2 * G @ G.T).logpdf(z) - alone for s in (0.3, 30.0)]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_of_an_effect_only_the_joint_that_is_off_is_fitted():
