@@ -154,10 +154,10 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
 
 
 def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int) -> tuple[list[Ranked], dict[str, str]]:
-    """Effects beside each other of which the first two, those that are told, help on views left out; and what is idle.
+    """Effects beside each other that all help on views left out; and what is idle, the weakest first.
 
-    What would be dropped again as soon as it is in the model is not named: of hundreds of poses an effect is seen that
-    moves hardly anything, and that anything else may do as well.
+    What would be dropped again as soon as it is in the model is neither named nor added: of hundreds of poses an effect
+    is seen that moves hardly anything, and that anything else may do as well.
 
     Args:
         tests: candidates among which they were chosen.
@@ -166,7 +166,7 @@ def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int)
     while True:
         objections = (
             (r, cross_validate(conditioned_without(linear, chosen, r), r.score).rejection_reason(r.name))
-            for r in chosen[:2]
+            for r in reversed(chosen)
         )
         first = next(((r, why) for r, why in objections if why is not None), None)
         if first is None:

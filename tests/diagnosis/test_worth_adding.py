@@ -24,11 +24,11 @@ def ranked(name: str) -> Ranked:
     [
         ({"part_sag": 0.999, "backlash": 0.9}, ["backlash"], ["part_sag"]),
         ({"part_sag": 0.9, "backlash": 0.999}, ["part_sag"], ["backlash"]),
-        ({"part_sag": 0.9, "backlash": 0.9, "settling": 0.999}, ["part_sag", "backlash", "settling"], []),
-        ({"part_sag": 0.999, "backlash": 0.995}, [], ["part_sag", "backlash"]),
+        ({"part_sag": 0.9, "backlash": 0.9, "settling": 0.999}, ["part_sag", "backlash"], ["settling"]),
+        ({"part_sag": 0.999, "backlash": 0.995}, [], ["backlash", "part_sag"]),
     ],
 )
-def test_what_is_told_helps_and_what_is_idle_is_said(monkeypatch, left, named, idle):
+def test_what_is_missing_helps_and_what_is_idle_is_said(monkeypatch, left, named, idle):
     monkeypatch.setattr(
         stepwise_selection,
         "conditioned_without",
@@ -49,7 +49,8 @@ def test_what_is_told_helps_and_what_is_idle_is_said(monkeypatch, left, named, i
     monkeypatch.setattr(stepwise_selection, "is_certain", lambda r: True)
     kept, why = stepwise_selection.keep_worth_adding(None, [ranked(name) for name in left], 20)
     assert [r.name for r in kept] == named and list(why) == idle
-    assert asked[0] == ("part_sag", [name for name in left if name != "part_sag"])  # beside all that are missing
+    weakest = list(left)[-1]
+    assert asked[0] == (weakest, list(left)[:-1])  # beside all that are missing
     assert all("hardly helps on views left out" in text for text in why.values())
     # What stays was scored beside what went: it is asked again.
     assert {name for name, _ in scored} >= (set(named) if idle else set())
