@@ -78,6 +78,7 @@ def _diagnose(state: Run) -> Diagnosis:
         missing=missing,
         linear=linear,
         notes=evidence.notes,
+        coincidence=evidence.coincidence,
         scatter_limit=limit,
         implausible=evidence.implausible_scatter,
         repeating_errors=unnamed,

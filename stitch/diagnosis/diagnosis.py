@@ -82,6 +82,7 @@ class Diagnosis:
     scanner_error: FieldError | None = None  # errors that are smooth over that field, where they are part of the answer
     # Of the session as a whole, as sentences: what is found may be no more than their mark.
     doubts: tuple[str, ...] = ()
+    coincidence: str = ""  # of `Evidence`
     together: tuple[str, ...] = ()  # effects that are missing beside each other, the one that is named first
     tried: dict[str, str] = field(default_factory=dict)  # effects that were fitted in this run and dropped, and why
 

@@ -20,6 +20,7 @@ from stitch.diagnosis.ranking import (
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import ScatterLimit, implausible, score
 from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
+from stitch.diagnosis.time_and_place import with_turning_joints
 from stitch.diagnosis.unnamed_time_laws import (
     find_repeating_errors,
     least_log_bayes_factor,
@@ -187,7 +188,7 @@ def gather_evidence(linear: LinearModel, candidates: Sequence[Candidate], limit:
     """
     evidence = select(linear, candidates, limit)
     evidence = challenge(linear, candidates, replace(evidence, left_out=cross_validate_named(linear, evidence)))
-    return with_equal_rivals(linear, evidence)
+    return with_turning_joints(linear.measurement.views, with_equal_rivals(linear, evidence))
 
 
 def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:

@@ -83,6 +83,8 @@ def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
 
 def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:
     yield f"Something {_is_missing(d)}: {' or '.join(d.effects)}. These views cannot tell which."
+    if d.coincidence:
+        yield f"{d.coincidence}. To tell, drive a few of these poses again from the first side."
     yield _odds_over_chance(d)
     yield _residual_sentence(d, length_unit)
 

@@ -38,6 +38,7 @@ class Evidence:
     left_out: Mapping[str, CrossValidation] = field(default_factory=dict)
     overlap_misfit: float = 0.0  # rms that no motion of the views removes, where it exceeds the noise; length_unit
     notes: tuple[str, ...] = ()  # effects that explain much and are not named, and why
+    coincidence: str = ""  # why a jump in time cannot be told from an error of a joint that turns back
 
     @cached_property
     def verdict(self) -> Verdict:

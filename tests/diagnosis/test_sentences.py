@@ -22,6 +22,7 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "depends_on": (),
         "implausible": False,
         "repeating_errors": (),
+        "coincidence": "",
         "overlap_misfit": 0.0,
         "follows_field": False,
         "scanner_error": None,
