@@ -48,8 +48,8 @@ def log_evidence(information: Array, vector: Array, precision: Array | None = No
 
 def log_evidence_at_scales(information: Array, vector: Array, scales: dict[float, float]) -> Array:
     """(s,) the same for a normal prior of unit size times each of the scales."""
-    out, k = np.empty(len(scales)), len(vector)
-    for i, scale in enumerate(scales):
+    out, k = np.zeros(len(scales)), len(vector)
+    for i, scale in enumerate(scales if k else ()):
         both = scale**2 * information
         both.flat[:: k + 1] += 1.0
         root, _ = dpotrf(both, lower=1, clean=0)

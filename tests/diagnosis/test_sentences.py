@@ -22,7 +22,6 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "depends_on": (),
         "implausible": False,
         "repeating_errors": (),
-        "coincidence": "",
         "overlap_misfit": 0.0,
         "follows_field": False,
         "scanner_error": None,
@@ -51,6 +50,7 @@ def said_at(odds: float, verdict: str, *effects: str, score=NOT_FITTED) -> str:
         rotation=0.0,
         translation=0.0,
         log_odds_over_nothing=np.log(odds),
+        coincidence="",
     )
     found.certain = Diagnosis.certain.fget(found)
     return diagnosis_sentence(found, "mm", None)
