@@ -78,7 +78,7 @@ def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
         linear.trial(X, None, prior),
         linear.trial(X[:, :a], None, CoefficientPrior(prior.precision[:a], prior.mean[:a])),
     )
-    squares = [[t.squares(t.solve(end.views))[end.views] for t in trials] for end in ends]
+    squares = [[t.squares(t.solve(end.views), end.views) for t in trials] for end in ends]
     shares = [mean_square_share(with_it, without) for with_it, without in squares]
     worst = max(range(len(ends)), key=lambda k: (shares[k][0] - 1) / max(shares[k][1], 1e-300))
     total = mean_square_share(*np.array([[own.sum() for own in row] for row in squares]).T)
@@ -193,7 +193,7 @@ def _squares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, A
         touched = linear.observation.affected_squares(fold)
         without = [t.solve(fold) for t in (believed, present)]
         pairs = list(zip((trial, present), without, strict=True))
-        squares.append([t.squares(x)[touched].sum() for t, x in pairs])
+        squares.append([t.squares(x, touched).sum() for t, x in pairs])
         scatter.append([t.scatter(fold, x) for t, x in pairs])
     return trial, np.array(squares).reshape(-1, 2).T, np.array(scatter).reshape(-1, 2).T
 

@@ -225,8 +225,8 @@ class LinearTrial(Protocol):
         """(k,) coefficients by least squares, without some views."""
         ...
 
-    def squares(self, coefficients: Array) -> Array:
-        """(units,) sums of squares of what remains, in the terms of residual_rms."""
+    def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
+        """(units,) sums of squares of what remains, in the terms of residual_rms; of all units or of some."""
         ...
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:

@@ -137,14 +137,15 @@ class RowTrial:
         """Coefficients (k,) without some views."""
         return self.blocks.solve(left_out)
 
-    def squares(self, coefficients: Array) -> Array:
-        """(V,) sums of the squares of a view's distances."""
-        return np.asarray(np.sum(self._rest(coefficients) ** 2 * self.rows.distances_used, axis=1))
+    def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
+        """(V,) sums of the squares of a view's distances, of all views or of some."""
+        units = np.arange(len(self.rows.lever)) if units is None else units
+        return np.asarray(np.sum(self._rest(coefficients, units) ** 2 * self.rows.distances_used[units], axis=1))
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
         """Of the left-out views' distances, in units of the sensor's noise: each is seen as it is."""
         own = self.rows.distances_used[left_out]
-        rest = self._rest(coefficients)[left_out]
+        rest = self._rest(coefficients, left_out)
         return float(np.sum(rest[own] ** 2 / self.rows.noise[left_out][own]))
 
     def influential_views(self, coefficients: Array) -> Indices:
@@ -154,8 +155,9 @@ class RowTrial:
         sizes = np.linalg.norm(moves[: len(self.rows.lever)], axis=1)
         return np.asarray(np.argsort(-sizes, kind="stable")[:_CARRIERS], np.int64)
 
-    def _rest(self, coefficients: Array) -> Array:
-        return np.asarray((self.rows.residual + self.X @ coefficients)[: len(self.rows.lever)])
+    def _rest(self, coefficients: Array, views: Indices | Mask) -> Array:
+        V = len(self.rows.lever)
+        return np.asarray(self.rows.residual[:V][views] + self.X[:V][views] @ coefficients)
 
 
 @dataclass(frozen=True)

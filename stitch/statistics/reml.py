@@ -340,6 +340,9 @@ _SCORINGS, _LEAP, _HALVINGS, _CONVERGED, _MANY_BLOCKS = 20, 2.0, 4, 1e-3, 50
 # Deviance gained by a step that is the last one: another would gain a fiftieth of it at the most, as
 # seen in the fits of 600 labelled poses; where a prior bends the slope it would gain more.
 _LAST = 0.2
+# Change of a variance, as a share of it, beyond which little of it would be left; and the curvature in its logarithm of
+# one that is known to a tenth.
+_NEARLY_NONE, _WELL_KNOWN = -0.8, 200.0
 
 
 def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> tuple[Array, Likelihood] | None:
@@ -379,11 +382,12 @@ def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> tuple[Arr
 def _scoring_step(curvature: Array, slope: Array, weak: Array) -> Array:
     """(c,) in the log variances.
 
-    In the variances themselves scoring is exact where one of them decides. One that it would make negative is hardly
-    seen: there the likelihood curves, in the logarithm, by its slope.
+    In the variances themselves scoring is exact where one of them decides. One of which little would be left and that
+    is hardly known, or that would be negative, is hardly seen: there the likelihood curves, in the logarithm, by its
+    slope.
     """
     share = -np.linalg.solve(curvature, slope)
-    if share.min() > -1:
+    if (share > np.where(np.diag(curvature) > _WELL_KNOWN, -1.0, _NEARLY_NONE)).all():
         return np.asarray(np.maximum(np.log1p(share), -_LEAP))
     step = -np.linalg.solve(curvature + np.diag(weak), slope)
     return np.asarray(step * min(1.0, _LEAP / float(np.abs(step).max())))

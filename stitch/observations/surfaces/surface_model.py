@@ -56,8 +56,13 @@ class SurfaceTrial:
             white = np.hstack([white, np.vstack([free, np.zeros((len(z) - len(free), free.shape[1]))])])
         return fit_columns(white, z)[: self.X.shape[1]]
 
-    def squares(self, coefficients: Array) -> Array:
-        """(pairs,) Σ w e² after the model moved; point effects change e itself and do not move the views."""
+    def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
+        """(pairs,) Σ w e² after the model moved, of all pairs or of some."""
+        every = self._squares_of_pairs(coefficients)
+        return every if units is None else every[units]
+
+    def _squares_of_pairs(self, coefficients: Array) -> Array:
+        """Point effects change e itself and do not move the views."""
         g, points = self.unconstrained.overlaps.gram, self.points
         if not isinstance(points, PointGram):
             return pair_squares(g, self._moved(self.X, coefficients))
