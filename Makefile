@@ -11,6 +11,13 @@ BASE := $(shell for p in python3 python3.13 python3.12 python3.11; do $$p $(SERV
 # What only the system can bring is installed where that asks nobody: for root, with apt.
 ROOT_APT := test "$$(id -u)" = 0 && command -v apt-get >/dev/null && apt-get update -q
 PIP := $(PYTHON) -m pip --quiet --disable-pip-version-check
+# Open3D has no wheel for a Linux whose C library is older than 2.35, or another: there it is left out of what is pinned.
+OLD_LINUX := import os, sys; sys.exit(not (sys.platform == "linux" and \
+	[int(n) for n in (os.confstr("CS_GNU_LIBC_VERSION") or "no 0.0").split()[1].split(".")] < [2, 35]))
+PINNED := $(VENV)/constraints.txt
+PIN := { $(PYTHON) -c '$(OLD_LINUX)' && sed '/^open3d/,/[^\]$$/d' constraints.txt || cat constraints.txt; } >$(PINNED)
+# What Open3D lacks of the system: packages to standard output, a sentence to standard error.
+LACKING := $(PYTHON) -m stitch.system.open3d_library
 
 export RERUN_ANALYTICS ?= off
 
@@ -20,11 +27,12 @@ install: $(STAMP)
 
 # A .venv that an interrupted or failed attempt left behind is made anew.
 $(STAMP): pyproject.toml constraints.txt
-	@echo "setting up $(VENV): 1.6 GB of packages, the first time some minutes" >&2
+	@echo "setting up $(VENV): 2 GB of packages, the first time some minutes" >&2
 ifdef UV
 	@$(PYTHON) $(SERVES) || uv venv --quiet --clear --python "$(or $(BASE),$(RANGE))" $(VENV) || \
 		{ echo "stitch needs Python 3.11, 3.12 or 3.13: none was found" >&2; exit 2; }
-	uv pip install --quiet --compile-bytecode --python $(PYTHON) --require-hashes -r constraints.txt
+	@$(PIN)
+	uv pip install --quiet --compile-bytecode --python $(PYTHON) --require-hashes -r $(PINNED)
 	uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e .
 else
 	@test -n "$(BASE)" || { echo "stitch needs Python 3.11, 3.12 or 3.13: none is on the path; on Debian 12 or \
@@ -32,9 +40,13 @@ else
 	@$(BASE) -c 'import ensurepip' 2>/dev/null || { $(ROOT_APT) && apt-get install -y -q $(BASE)-venv; } || \
 		{ echo "$(BASE) has no venv module: apt-get install $(BASE)-venv" >&2; exit 2; }
 	@{ $(PYTHON) $(SERVES) && $(PIP) --version >/dev/null 2>&1; } || $(BASE) -m venv --clear $(VENV)
-	$(PIP) install --require-hashes -r constraints.txt
+	@$(PIN)
+	$(PIP) install --require-hashes -r $(PINNED)
 	$(PIP) install --no-deps --no-build-isolation -e .
 endif
+	@lacking=$$($(LACKING) 2>/dev/null); test -z "$$lacking" || { $(ROOT_APT) && \
+		DEBIAN_FRONTEND=noninteractive apt-get install -y -q --no-install-recommends $$lacking; } >/dev/null 2>&1 || true
+	@$(LACKING) >/dev/null
 	@touch $@
 
 demo: install

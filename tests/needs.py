@@ -9,3 +9,12 @@ def needs(name, extra):
         f"{name} is not installed, and without it nothing reads or writes such files: pip install 'stitch[{extra}]'"
     )
     return pytest.importorskip(name, reason=reason)
+
+
+def needs_open3d():
+    """Open3D as a user imports it, or a skip that says what it lacks here."""
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        pytest.skip(f"Open3D cannot be imported ({error}): its geometries are tried where it can")
+    return open3d

@@ -23,6 +23,7 @@ from stitch.reading.session_folder import content_hash, measured_files
 from stitch.runs import run as runs
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import FusedCloud, StageResult
+from stitch.system.open3d_library import import_open3d
 from stitch.units import METRES
 from stitch.writing import run_folder
 from stitch.writing.fit_report import fit_report
@@ -135,9 +136,9 @@ class Stitched:
             tensor: of Open3D's tensors, with `residual` and `count` (N, 1) beside.
 
         Raises:
-            InputError: open3d is not installed.
+            InputError: Open3D is not installed, or lacks a library of the system.
         """
-        o3d = _package("open3d")
+        o3d = import_open3d("to_open3d")
         if not tensor:
             cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(self.points, np.float64)))
             cloud.normals = o3d.utility.Vector3dVector(np.array(self.normals, np.float64))
@@ -383,10 +384,3 @@ def _save_session_of_run(session: Session, folder: Path) -> Path:
 def _entry_point(group: str) -> Callable[[runs.Run], Any] | None:
     """Return what another package offers under an entry-point group; None where there is none."""
     return next((entry.load() for entry in entry_points(group=group)), None)
-
-
-def _package(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise InputError(f"to_{name}: {name} cannot be imported ({error}); to fix: pip install {name}") from None

@@ -9,6 +9,7 @@ from stitch.api.arrays import cloud_of, poses_of, sighting_of
 from stitch.errors import InputError
 from stitch.measurement.session import Cloud
 from stitch.reading.clouds import read_cloud
+from tests.needs import needs_open3d
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(60, 3)) + np.array([0, 0, 500.0])
@@ -23,10 +24,7 @@ POSES[:, :3, :3], POSES[:, :3, 3] = ROTATIONS.as_matrix(), SHIFTS
 @pytest.fixture(scope="module")
 def o3d():
     """Open3D, where it can be imported."""
-    try:
-        return pytest.importorskip("open3d", reason="open3d is not installed: its clouds are tried where it is")
-    except (ImportError, OSError) as error:
-        pytest.skip(f"open3d cannot be imported: {error}")
+    return needs_open3d()
 
 
 def coloured(cloud):

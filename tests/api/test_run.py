@@ -23,6 +23,7 @@ from stitch.reading.clouds import read_cloud
 from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json
 from tests.api.same import same_folder, taken
+from tests.needs import needs_open3d
 
 
 def test_the_hand_eye_as_an_object(found):
@@ -73,10 +74,7 @@ def test_the_stitched_cloud_for_trimesh(found):
 
 
 def test_the_stitched_cloud_for_open3d_and_back(found):
-    try:
-        pytest.importorskip("open3d", reason="open3d is not installed: its clouds are tried where it is")
-    except OSError as error:
-        pytest.skip(f"open3d cannot be imported: {error}")
+    needs_open3d()
     legacy = found.stitched.to_open3d()
     assert np.array_equal(np.asarray(legacy.points), found.stitched.points) and legacy.has_normals()
     tensor = found.stitched.to_open3d(tensor=True)
