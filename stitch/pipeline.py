@@ -3,7 +3,7 @@
 The steps stand in `stages`: `surface_steps` for clouds, `target_steps` for labelled points alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -24,7 +24,7 @@ from stitch.integrity.model_transfer import (
 )
 from stitch.integrity.view_screening import ScreenedFit, fit_screened_views, session_warnings
 from stitch.measurement.capture import part_size, prepare_capture
-from stitch.measurement.measurement import measurement_of, with_part_origin
+from stitch.measurement.measurement import Measurement, measurement_of, with_part_origin
 from stitch.measurement.session import Session
 from stitch.model.model_toml import ModelFile, arm_model, convert_unit
 from stitch.planning.next_view import propose_measurements
@@ -102,7 +102,7 @@ def run_rig(
             fit = partial(steps.apply, file=model)
         else:
             fit = partial(steps.fit, starts=begun, initial_model=with_arm(arm), recorder=recorders[0])
-        found = fit_screened_views(sessions, measurements, fit, keep)
+        found = fit_screened_views(sessions, measurements, partial(_told_fit, fit, sessions, recorders), keep)
         end = FitSummary(begun, found.fitted, clock.lap(), model.effects_file if model else None, register)
         if model and not sessions[0].has_clouds:
             found = check_model_transfer(found, partial(_fit_own_model, steps, found, with_arm(arm_model(model))))
@@ -115,6 +115,20 @@ def run_rig(
             here = check_arm_transfer(lambda other: again(initial_model=with_arm(other)), arm, found.fitted)
             end = _note_arm_transfer(end, here, sessions[0].length_unit)
         return _assemble_runs(sessions, found, end, before, recorders, keep)
+
+
+def _told_fit(
+    fit: Callable[[Sequence[Session], Sequence[Measurement]], FittedRig],
+    whole: Sequence[Session],
+    recorders: Sequence[Recorder],
+    sessions: Sequence[Session],
+    measurements: Sequence[Measurement],
+) -> FittedRig:
+    """Fit the views that are left, and tell the recorders where these are fewer."""
+    for before, session, recorder in zip(whole, sessions, recorders, strict=True):
+        if len(session.views) < len(before.views):
+            recorder.start(session)
+    return fit(sessions, measurements)
 
 
 def _note_arm_transfer(end: FitSummary, here: ArmTransfer, length_unit: str) -> FitSummary:
@@ -147,8 +161,6 @@ def _assemble_runs(
     """Return one run per session, with its own notes."""
     runs = []
     for i, (session, own) in enumerate(zip(found.sessions, found.screenings, strict=True)):
-        if len(session.views) < len(sessions[i].views):
-            recorders[i].start(session)
         left_out = tuple(sorted(own.left_out, key=lambda item: sessions[i].names.index(item.view)))
         out, kept = ((), left_out) if keep else (left_out, ())
         last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links)

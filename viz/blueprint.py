@@ -59,14 +59,18 @@ def eye_for(points: Array, axes: Array, up: Array, aspect: float) -> rrb.EyeCont
 os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 
-# Width over height, in an ordinary window, of a picture of the part and of that of the cell.
-_OF_PART, _OF_CELL = 0.68, 1.5
+# Width over height, in an ordinary window, of a picture of the part, of all scans and of the cell.
+_OF_PART, _OF_CLOUDS, _OF_CELL = 0.68, 1.0, 1.5
 _GROUND = [24, 27, 31]
 _COS, _SIN = np.cos(np.radians(35.0)), np.sin(np.radians(35.0))
 
 
-def model_blueprint(scene: ModelScene, camera: Camera) -> rrb.Blueprint:
-    """Before and after, and why | the model step by step | what is missing | the cell."""
+def model_blueprint(scene: ModelScene, camera: Camera, raw: Array) -> rrb.Blueprint:
+    """Before and after, and why | the model step by step | every iteration | what is missing | the cell.
+
+    Args:
+        raw: (N, 3) places that the raw scans take, reference frame.
+    """
     before, after = shown_steps(scene.history)
     unit = "" if len(scene.history.models) > 1 else " (single views moved)"
     parts = rrb.Horizontal(
@@ -101,12 +105,13 @@ def model_blueprint(scene: ModelScene, camera: Camera) -> rrb.Blueprint:
         name="The model, step by step",
     )
     time = rrb.TimePanel(state="collapsed", timeline="model", play_state="paused", fps=FRAMES)
-    tabs = rrb.Tabs(compare, steps, _diagnosis(), _cell(scene.cell), active_tab=0)
+    everything = eye_for(np.concatenate([scene.surface.vertices, raw]), camera.axes, camera.up, _OF_CLOUDS)
+    tabs = rrb.Tabs(compare, steps, _moments(everything), _diagnosis(), _cell(scene.cell), active_tab=0)
     return rrb.Blueprint(tabs, time, collapse_panels=True)
 
 
 def target_blueprint(cell: Array) -> rrb.Blueprint:
-    """Targets, what was found and why | what is missing | the cell (points, (N, 3))."""
+    """Targets, what was found and why | every iteration | what is missing | the cell (points, (N, 3))."""
     targets = rrb.Horizontal(
         rrb.Spatial3DView(
             origin="targets", name="Targets by the rms of their views; sticks magnified", line_grid=False
@@ -120,8 +125,33 @@ def target_blueprint(cell: Array) -> rrb.Blueprint:
         column_shares=[3, 2],
     )
     result = rrb.Vertical(targets, _why(), row_shares=[5, 2], name="Targets")
-    tabs = rrb.Tabs(result, _diagnosis(), _cell(cell), active_tab=0)
-    return rrb.Blueprint(tabs, collapse_panels=True)
+    time = rrb.TimePanel(state="collapsed", timeline="iteration", play_state="paused", fps=1.0)
+    tabs = rrb.Tabs(result, _moments(None), _diagnosis(), _cell(cell), active_tab=0)
+    return rrb.Blueprint(tabs, time, collapse_panels=True)
+
+
+def _moments(eye: rrb.EyeControls3D | None) -> rrb.Horizontal:
+    """The scans as every iteration has them | what is said of it, and the rms of all."""
+    clouds = rrb.Spatial3DView(
+        origin="/",
+        contents=["views/**", "fused"],
+        name="Every scan where the run had it (timeline iteration), and as they come (timeline view)",
+        eye_controls=eye,
+        background=_GROUND,
+        line_grid=False,
+    )
+    said = rrb.Vertical(
+        rrb.TextDocumentView(origin="moment", name="Here"),
+        rrb.TimeSeriesView(
+            origin="rms",
+            name="rms, powers of ten of a µm: 1 is 10 µm, 2 is 100 µm",
+            # The rms falls: there the plot is empty.
+            plot_legend=rrb.Corner2D.RightTop,
+        ),
+        rrb.TextDocumentView(origin="moments", name="All stages and iterations"),
+        row_shares=[3, 3, 4],
+    )
+    return rrb.Horizontal(clouds, said, column_shares=[3, 2], name="Every iteration")
 
 
 def _part(origin: str, name: str, scene: ModelScene, camera: Camera) -> rrb.Spatial3DView:

@@ -103,11 +103,12 @@ _BAR = (244, 114, 43)
 _NAMED = 0.02
 
 
-def log_model(recording: rr.RecordingStream, run: Run, scene: ModelScene, up: Array) -> None:
+def log_model(recording: rr.RecordingStream, run: Run, scene: ModelScene, up: Array, reached: dict[int, int]) -> None:
     """Everything that stands still, and all frames of the timeline.
 
     Args:
         up: (3,) of the picture, reference frame.
+        reached: by step, where the timeline `iteration` has it.
     """
     for name in ("now", "before", "after"):
         _log_part(recording, f"part/{name}", scene)
@@ -126,8 +127,10 @@ def log_model(recording: rr.RecordingStream, run: Run, scene: ModelScene, up: Ar
     recording.log("bars/first", rr.BarChart(first, color=GREY), static=True)
     for frame in range(0, FRAMES * (len(scene.history.steps) - 1) + 1, _BETWEEN):
         recording.set_time("model", sequence=frame)
+        if frame % FRAMES == 0 and frame // FRAMES in reached:
+            recording.set_time("iteration", sequence=reached[frame // FRAMES])
         _log_frame(recording, scene, frame / FRAMES, places)
-    recording.reset_time()
+        recording.reset_time()
 
 
 def one_above_the_other(views: Sequence[Array], up: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The Rerun recording of a run: the model's history on the timeline `model`, why, and the cell."""
+"""The Rerun recording of a run: its stages and iterations, the model's history, why, and the cell."""
 
 import os
 from pathlib import Path
@@ -8,14 +8,16 @@ import rerun as rr
 
 from stitch.comparison.disagreement_field import ModelHistory, effect_changes, model_history
 from stitch.comparison.run_verdict import run_headline
-from stitch.runs.recorder import SilentRecorder
-from stitch.runs.run import Run
+from stitch.frames import Array
+from stitch.measurement.session import Session
+from stitch.runs.run import Run, StageResult
 from stitch.units import MICROMETRES, length_text
 from stitch.writing.diagnosis_document import effect_in_words
 from viz.blueprint import log_colour_bar, model_blueprint, target_blueprint
 from viz.colours import robust_limit, unsigned_colours
 from viz.course_recording import log_no_course
 from viz.diagnosis_recording import NOT_YET
+from viz.iteration_timeline import Moments, log_moments, steps_reached
 from viz.model_timeline import log_model, model_scene
 from viz.part_surface import camera_for, part_surface
 from viz.robot_scene import log_robot
@@ -52,11 +54,24 @@ def run_markdown(run: Run, history: ModelHistory | None) -> str:
 os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 
-class RerunRecorder(SilentRecorder):
+class RerunRecorder:
     """A `stitch.runs.recorder.Recorder` that writes one .rrd file when the run has ended."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._moments = Moments()
+
+    def start(self, session: Session) -> None:
+        """Keep the views that count from here on."""
+        self._moments.start(session)
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """Keep where an iteration has the views."""
+        self._moments.iteration(stage, index, poses, rms, gate)
+
+    def stage(self, result: StageResult, poses: Array) -> None:
+        """Keep where a stage has them when it ends."""
+        self._moments.stage(result, poses)
 
     def finish(self, run: Run) -> None:
         """Log the run and close the file."""
@@ -68,6 +83,8 @@ class RerunRecorder(SilentRecorder):
             rec.log(place, words(NOT_YET), static=True)
         log_no_course(rec, NOT_YET)
         cell = log_robot(rec, run)
+        moments = self._moments.with_models(run, history)
+        raw = log_moments(rec, run, moments, self._moments.whole or run.session)
         if history is None:
             _log_targets(rec, run)
             rec.send_blueprint(target_blueprint(cell))
@@ -75,10 +92,10 @@ class RerunRecorder(SilentRecorder):
             surface = part_surface(run.fused, history.patches)
             camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
             scene = model_scene(run, history, surface, cell)
-            log_model(rec, run, scene, camera.up)
+            log_model(rec, run, scene, camera.up, steps_reached(moments))
             full = scene.limit * um
             log_colour_bar(rec, "colours/field", ["0", f"{full / 2:.3g}", f"{full:.3g} µm"], "seen by one view only")
-            rec.send_blueprint(model_blueprint(scene, camera))
+            rec.send_blueprint(model_blueprint(scene, camera, raw))
         file.write()
 
 

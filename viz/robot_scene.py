@@ -8,6 +8,7 @@ import rerun as rr
 from stitch import frames
 from stitch.frames import Array
 from stitch.measurement.robot import LinkMesh, Robot, link_frames
+from stitch.measurement.scan import even_indices
 from stitch.runs.run import Run
 from viz.colours import view_colours
 from viz.run_numbers import shown_points
@@ -56,10 +57,12 @@ def _read(own: LinkMesh) -> "trimesh.Trimesh | None":
 
 
 # Of lines, in pixels.
-_THIN = rr.Radius.ui_points(1.0)
+_THIN, _THICK, _DOT = rr.Radius.ui_points(1.0), rr.Radius.ui_points(3.0), rr.Radius.ui_points(6.0)
 _GREY, _PART, _SCANNER = (110, 110, 110), (190, 195, 200), (230, 159, 0)
 _SEEN = 0.98  # share of the points that lie within the drawn field of the scanner
 _POINTS = 20_000
+# Views at which the arm is shown alone.
+_VIEWS = 400
 # Of the field, where the scanner stood at the other views: as large as it is they would hide the part.
 _SMALL = 0.15
 
@@ -77,7 +80,8 @@ def log_robot(recording: rr.RecordingStream, run: Run) -> Array:
     corners = _frustum(run)
     in_hand = run.session.mount == "eye_in_hand"
     T_base_scanner = flange @ run.T_mount if in_hand else run.T_mount[None]
-    seen = [arm]
+    _log_reached(recording, arm, names)
+    seen = [arm.reshape(-1, 3)]
     for v, (name, T, colour) in enumerate(zip(names, T_base_scanner, colours, strict=False)):
         lines = [frames.transform(T, strip if v == 0 else _SMALL * strip) for strip in corners]
         seen.append(np.concatenate(lines))
@@ -113,14 +117,25 @@ def _log_names(recording: rr.RecordingStream, places: dict[str, Array]) -> None:
     recording.log("robot/names", named, static=True)
 
 
+def _log_reached(recording: rr.RecordingStream, arm: Array, names: list[str]) -> None:
+    """Where each view has the arm (V, P, 3), or its flange alone, on the timeline `view`."""
+    for v in even_indices(len(names), _VIEWS):
+        recording.set_time("view", sequence=v)
+        shown = rr.LineStrips3D([arm[v]], colors=[_SCANNER], radii=_THICK, labels=[names[v]], show_labels=True)
+        if arm.shape[1] == 1:
+            shown = rr.Points3D(arm[v], colors=[_SCANNER], radii=_DOT, labels=[names[v]], show_labels=True)
+        recording.log("robot/reached", shown)
+    recording.reset_time()
+
+
 def _log_arm(recording: rr.RecordingStream, run: Run, flange: Array) -> Array:
+    """Log the arm at all views, and return its joints (V, P, 3), or its flange alone where no joints are known."""
     robot, joints = run.session.robot, run.session.joints
     if robot is None or joints is None:
-        shown = flange[:, :3, 3]
+        chains = flange[:, None, :3, 3]
         recording.log("robot/path", rr.LineStrips3D([flange[:, :3, 3]], colors=[_GREY], radii=_THIN), static=True)
     else:
         chains = link_frames(robot, joints)[..., :3, 3]
-        shown = chains.reshape(-1, 3)
         log_meshes(recording, robot, joints[0])
         recording.log("robot/arm", rr.LineStrips3D(chains, colors=[_GREY], radii=_THIN), static=True)
         recording.log(
@@ -131,7 +146,7 @@ def _log_arm(recording: rr.RecordingStream, run: Run, flange: Array) -> Array:
         rr.Points3D(flange[:, :3, 3], colors=view_colours(len(flange)), radii=rr.Radius.ui_points(2.5)),
         static=True,
     )
-    return np.asarray(shown)
+    return np.asarray(chains)
 
 
 def _frustum(run: Run) -> list[Array]:

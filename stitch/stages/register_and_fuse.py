@@ -62,9 +62,10 @@ def finish_surfaces(
     note = register_note(registration, session)
     registered = _overlap_stage("register", registration.overlaps, len(registration.history), clock.lap(), note)
     registered = replace(registered, method=method.name)
+    recorder.stage(registered, registration.poses)
     fused = fuse_every_point(RegisteredSession(session, measurement, model, own, registration.poses))
     last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap())
-    recorder.stage(registered, registration.poses)
+    recorder.stage(last, registration.poses)
     floor = noise_floor(own, registration.overlaps, session.scanner.noise)
     found = Fit(
         stages=(before, corrected, registered, last),

@@ -1,0 +1,103 @@
+"""The timelines `iteration` and `view`: every stage and iteration, every scan once, moved as the run moved it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch.pipeline import run
+from viz.iteration_timeline import Moment, log_moments
+from viz.recording import RerunRecorder
+from viz.rrd_file import RecordingFile
+
+
+def rows(path, entity, column):
+    """(times by timeline, value) of every row of an entity that has the column."""
+    out = []
+    for chunk in RrdReader(str(path)).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == entity and column in batch.schema.names:
+            lines = {
+                name: batch.column(name).to_pylist()
+                for name in ("iteration", "model", "view")
+                if name in batch.schema.names
+            }
+            values = batch.column(column).to_pylist()
+            out += [({name: times[i] for name, times in lines.items()}, value) for i, value in enumerate(values)]
+    return out
+
+
+def titles(path):
+    """Headings of the timeline `iteration`, in its order."""
+    told = [
+        (times["iteration"], text[0])
+        for times, text in rows(path, "/moment", "TextDocument:text")
+        if "iteration" in times
+    ]
+    return [text.splitlines()[0].removeprefix("## ") for _, text in sorted(told)]
+
+
+def pose_at(path, name, iteration):
+    """T_reference_scanner (4, 4) of a view at a place of the timeline; Rerun's matrices go column by column."""
+    T = np.eye(4)
+    for column, put in (("Transform3D:mat3x3", np.s_[:3, :3]), ("Transform3D:translation", np.s_[:3, 3])):
+        found = [v[0] for times, v in rows(path, f"/views/{name}", column) if times.get("iteration") == iteration]
+        T[put] = np.reshape(found[0], (3, 3)).T if column.endswith("mat3x3") else found[0]
+    return T
+
+
+def test_every_stage_and_every_iteration_is_there(recorded):
+    result, path = recorded
+    # The last of `correct` is the rms after its last step.
+    corrected, registered = len(result.convergence["correct"]) - 1, len(result.convergence["register"])
+    assert titles(path) == [
+        "raw scans",
+        "coarse",
+        *(f"correct, iteration {k + 1}" for k in range(corrected)),
+        "correct ended",
+        *(f"register, iteration {k + 1}" for k in range(registered)),
+        "register ended",
+        "fuse",
+    ]
+
+
+def test_every_scan_is_there_once_and_moves_as_the_run_moved_it(recorded):
+    result, path = recorded
+    reached = titles(path)
+    for v, view in enumerate(result.session.views):
+        clouds = rows(path, f"/views/{view.name}", "Points3D:positions")
+        assert len(clouds) == 1
+        times, points = clouds[0]
+        assert times == {"iteration": 0, "model": 0, "view": v}
+        assert len(points) == min(len(view.cloud.points), 10_000)
+        for title, pose in (("correct ended", result.poses_model[v]), ("register ended", result.poses[v])):
+            assert pose_at(path, view.name, reached.index(title)) == pytest.approx(pose, abs=1e-4)
+
+
+def test_a_view_that_is_left_out_stays_until_then(recorded, tmp_path):
+    result, _ = recorded
+    whole = replace(result.session, views=(*result.session.views, replace(result.session.views[0], name="stray")))
+    places = np.concatenate([result.poses, result.poses[:1]])
+    moments = [
+        Moment("correct", f"correct, iteration {k}", tuple(whole.names[: 6 - k // 2]), places[: 6 - k // 2])
+        for k in range(4)
+    ]
+    file = RecordingFile("stitch", tmp_path / "left-out.rrd")
+    log_moments(file.stream, result, moments, whole)
+    file.write()
+    path = tmp_path / "left-out.rrd"
+    assert [times for times, _ in rows(path, "/views/stray", "Clear:is_recursive")] == [{"iteration": 2}]
+    assert [times for times, _ in rows(path, "/views/stray", "Points3D:positions")] == [{"iteration": 0}]
+    assert not rows(path, "/views/v000", "Clear:is_recursive")
+
+
+def test_labelled_points_move_too(tmp_path):
+    session = labelled_cell(3, views=12)[0]
+    result = run(session, recorder=RerunRecorder(tmp_path / "t.rrd"))
+    reached = titles(tmp_path / "t.rrd")
+    assert reached[:3] == ["raw scans", "coarse", "fit, iteration 1"]
+    assert reached[-2:] == ["correct ended", "register ended"]
+    last = pose_at(tmp_path / "t.rrd", session.names[3], len(reached) - 1)
+    assert last == pytest.approx(result.poses[3], abs=1e-3)
