@@ -3,16 +3,13 @@
 The steps stand in `stages`: `surface_steps` for clouds, `target_steps` for labelled points alone.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING
 
-from stitch.diagnosis.diagnose import diagnose_state
-from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.diagnosis.score import start_with_effects
-from stitch.diagnosis.stepwise_selection import find_effect_to_drop
-from stitch.diagnosis.thresholds import FAINT_SIGMAS
-from stitch.diagnosis.validation import group_helps, group_share
 from stitch.effects.contract import find_effect, require_available
 from stitch.errors import InputError
 from stitch.integrity.deep_check import refuse_explained_mistake
@@ -27,7 +24,6 @@ from stitch.measurement.capture import part_size, prepare_capture
 from stitch.measurement.measurement import Measurement, measurement_of, with_part_origin
 from stitch.measurement.session import Session
 from stitch.model.model_toml import ModelFile, arm_model, convert_unit
-from stitch.planning.next_view import propose_measurements
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.runs.run import Run, StageResult
 from stitch.stages.coarse import COARSE_GATE, CoarseHandEye
@@ -36,7 +32,11 @@ from stitch.stages.register_and_fuse import FittedRig, InitialModel, Pipeline
 from stitch.stages.results import FitSummary, assemble_run, pipeline_for
 from stitch.stages.rig import require_effects, require_measured_once, require_same_rig
 from stitch.system.threads import Clock, library_threads_off
-from stitch.writing.diagnosis_document import plain_finding
+
+if TYPE_CHECKING:
+    from stitch.diagnosis.diagnosis import Diagnosis
+
+# A run loads nothing of the diagnosis.
 
 
 def run(
@@ -96,7 +96,11 @@ def run_rig(
         clock.lap()
 
         def with_arm(arm: ModelFile | None) -> InitialModel | None:
-            return partial(start_with_effects, sessions[0], effects, arm) if effects or arm else None
+            if not effects and not arm:
+                return None
+            from stitch.diagnosis.score import start_with_effects
+
+            return partial(start_with_effects, sessions[0], effects, arm)
 
         if model:
             fit = partial(steps.apply, file=model)
@@ -205,6 +209,8 @@ def change(state: Run, effects: Sequence[str], recorder: Recorder | None = None)
         InputError: an effect that is not known, or that the session cannot have.
         NoResultError: no two views overlap.
     """
+    from stitch.diagnosis.score import start_with_effects
+
     recorder = recorder or SilentRecorder()
     with library_threads_off():
         clock, steps = Clock(), pipeline_for(state.session)
@@ -241,6 +247,9 @@ def diagnose(run: Run) -> Diagnosis:
     Raises:
         NoResultError: no two views overlap.
     """
+    from stitch.diagnosis.diagnose import diagnose_state
+    from stitch.planning.next_view import propose_measurements
+
     found = diagnose_state(run)
     return replace(found, next=propose_measurements(found))
 
@@ -287,6 +296,8 @@ def _add_found(state: Run, found: Diagnosis, at_most: int, given: set[str]) -> t
     Args:
         given: effects that stay in any case.
     """
+    from stitch.diagnosis.thresholds import FAINT_SIGMAS
+
     names = [name for name in found.together if name not in state.tried][:at_most]
     validations = {c.name: c.cross_validation for c in found.candidates}
     while names:
@@ -312,6 +323,8 @@ def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:
 
     The run is None where the diagnosis names no such group, or where the group does not help on views left out.
     """
+    from stitch.diagnosis.validation import group_helps, group_share
+
     found = diagnose(state)
     if found.verdict != "cannot_tell":
         return (
@@ -340,6 +353,8 @@ def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:
 
 def _finding_and_evidence(found: Diagnosis) -> list[str]:
     """Return the plain finding and the evidence, as `stitch diagnose` prints them."""
+    from stitch.writing.diagnosis_document import plain_finding
+
     return [plain_finding(found, found.linear.measurement.length_unit), found.sentence]
 
 
@@ -348,6 +363,8 @@ def _drop_unneeded(result: Run, given: set[str]) -> tuple[Run, list[str]]:
 
     Of labelled points alone: scans are matched anew for every effect that is asked.
     """
+    from stitch.diagnosis.stepwise_selection import find_effect_to_drop
+
     lines: list[str] = []
     while not result.session.has_clouds and len(added := set(result.effects) - given) > 1:
         idle = find_effect_to_drop(result, added)

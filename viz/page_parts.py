@@ -18,7 +18,6 @@ from stitch.reading.session_folder import session_hash
 from stitch.runs.run import Run
 from stitch.system.files import whole_file
 from stitch.units import MICROMETRES, length_text
-from stitch.writing.diagnosis_document import effect_in_words
 
 # Numbers and their units stay on one line.
 
@@ -76,10 +75,19 @@ def identity(run: Run) -> list[Row]:
         page_written(),
         ("Arm", ("not stated" if session.robot is None else session.robot.name or "without a name") + joints),
         ("Scanner", scanner + stated),
-        ("Model", ", ".join(["hand-eye", *map(effect_in_words, run.effects)])),
+        ("Model", ", ".join(["hand-eye", *_effects_in_words(run)])),
         versions(),
         ("SHA-256 of the session", session_hash(session)),
     ]
+
+
+def _effects_in_words(run: Run) -> list[str]:
+    """Of a run without effects nothing of a diagnosis is loaded."""
+    if not run.effects:
+        return []
+    from stitch.writing.diagnosis_document import effect_in_words
+
+    return [effect_in_words(name) for name in run.effects]
 
 
 def page_written() -> Row:

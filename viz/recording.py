@@ -12,7 +12,6 @@ from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.runs.run import Run, StageResult
 from stitch.units import MICROMETRES, length_text
-from stitch.writing.diagnosis_document import effect_in_words
 from viz.blueprint import log_colour_bar, model_blueprint, target_blueprint
 from viz.colours import robust_limit, unsigned_colours
 from viz.course_recording import log_no_course
@@ -33,6 +32,8 @@ def run_markdown(run: Run, history: ModelHistory | None) -> str:
     for doubt in run.doubts:
         lines += [doubt, ""]
     if run.effects:
+        from stitch.writing.diagnosis_document import effect_in_words
+
         lines += [f"In the model: {', '.join(map(effect_in_words, run.effects))}.", ""]
     lines += [run.verdict, ""]
     if history is not None:

@@ -7,7 +7,6 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 from stitch import frames
 from stitch.frames import Array, Indices
@@ -107,6 +106,8 @@ def _regions(T_reference_mount: Array, lever: float, groups: int) -> list[Indice
     with warnings.catch_warnings():
         # An empty group is no harm: it is left out by the callers.
         warnings.simplefilter("ignore", UserWarning)
+        from scipy.cluster.vq import kmeans2
+
         _, label = kmeans2(twists[first[order]], min(groups, len(first)), minit="++", seed=0)
     of_view = label[np.argsort(order)][pose]
     return [np.flatnonzero(of_view == k) for k in range(groups)]

@@ -10,8 +10,6 @@ from threading import Thread
 from typing import Any, TypeVar
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from plyfile import PlyData, PlyElement
 
 from stitch.errors import InputError
@@ -65,6 +63,8 @@ def write_cloud(cloud: FusedCloud, path: Path) -> None:
 
 def write_residuals(run: Run, path: Path) -> None:
     """Write the table of residuals as Parquet."""
+    import pyarrow.parquet as pq
+
     pq.write_table(residual_table(run), path, compression="zstd")
 
 
@@ -74,6 +74,8 @@ def residual_table(run: Run) -> Any:
     `time_s` is NaN where nobody states it; a covariate that is called like another column becomes `covariate_NAME`.
     What the clouds state of every point stands there as well, of the partner's point as `partner_NAME`.
     """
+    import pyarrow as pa
+
     session = _without_reserved_covariates(run.session)
     of_views = {key for view in session.views for key in view.covariates}
     of_points = {key for view in session.views if view.cloud is not None for key in view.cloud.scalars}

@@ -27,6 +27,13 @@ def test_dear_libraries_are_loaded_when_they_are_needed(module, also_without):
     assert not loaded(f"import {module}") & (DEAR | also_without)
 
 
+def test_a_run_loads_nothing_of_the_diagnosis():
+    """Nor of plans, pictures and meshes: all that it needs from the first file to the page."""
+    modules = loaded("import stitch.cli.run, stitch.pipeline, stitch.writing.run_folder, viz.run_page")
+    assert "stitch.stages.register" in modules
+    assert not modules & (DEAR | {"stitch.diagnosis", "stitch.planning", "stitch.explanation", "scipy.cluster"})
+
+
 @pytest.mark.parametrize("line", ["--version", "--help"])
 def test_the_list_of_commands_loads_no_mathematics(line):
     code = f"from stitch.cli.main import main\ntry:\n    main({line.split()})\nexcept SystemExit:\n    pass"
