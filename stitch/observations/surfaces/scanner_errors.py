@@ -50,7 +50,7 @@ def sum_smooth_errors(
     standoff = float(np.median(np.concatenate([np.linalg.norm(s.points - s.eye, axis=1) for s in capture.scans])))
 
     def corrections(away: Array, cosine: Array) -> Array:
-        own = _smooth_corrections(away, cosine, half)
+        own = smooth_corrections(away, cosine, half)
         return np.concatenate([own, _shared_shapes(away, half, standoff)]) if per_view else own
 
     def of_points(v: int, index: Indices) -> Array:
@@ -79,7 +79,7 @@ def half_field(measurement: Measurement) -> Array:
     return np.asarray(np.maximum(np.quantile(slopes, _FIELD_QUANTILE, axis=0), 1e-6))
 
 
-def _smooth_corrections(away: Array, cosine: Array, half: Array) -> Array:
+def smooth_corrections(away: Array, cosine: Array, half: Array) -> Array:
     """(COARSE + 1, N, 3) what undoes smooth errors along the rays (N, 3) from the scanner's eye, per unit.
 
     Legendre products over the field, of unit rms together, and the slope with incidence.
@@ -183,6 +183,15 @@ class SmoothErrorLikelihood:
         start = np.full(len(self.design), np.log(USUAL_SHARE))
         bounds = [tuple(np.log(SHARE_BOUNDS))] * len(start)
         return np.asarray(np.exp(minimize(deviance, start, jac=True, method="L-BFGS-B", bounds=bounds).x))
+
+    def share_spread(self, shares: Array) -> Array:
+        """(C,) standard deviations of the logarithms of `map_shares`, from the curvature of their posterior there."""
+        logs, step = np.log(shares), 1e-3 * np.eye(len(shares))
+        slopes = [self._deviance(logs + s)[1] - self._deviance(logs - s)[1] for s in step]
+        curvature = np.array(slopes) / 4e-3 + np.eye(len(shares)) / _SHARE_SPREAD**2
+        # Where the likelihood bends the other way the prior alone counts.
+        values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
+        return np.asarray(np.sqrt((vectors**2) @ (1 / np.maximum(values, _SHARE_SPREAD**-2.0))))
 
     def ml_shares(self, most: Sequence[float]) -> tuple[Array, float]:
         """Shares (C,) without a prior, at most so large, and −2 log likelihood."""

@@ -1,0 +1,137 @@
+"""Where the points of a run are, and how far they may lie from where they truly are: sources, each a sum of modes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array, Indices
+from stitch.measurement.capture import Capture
+from stitch.measurement.measurement import Measurement
+from stitch.model.forward import PointSlopes
+from stitch.observations.surfaces.scanner_errors import smooth_corrections
+
+
+@dataclass(frozen=True)
+class ErrorSource:
+    """m independent modes of unit variance; lengths in length_unit, angles in rad."""
+
+    name: str
+    views: Array  # (6V, m) left twists about `PlaceErrors.centre` by which the registered views err
+    parameters: Array  # (P, m) errors of parameters of effects that change points
+    field: Array  # (K, m) smooth errors of the scanner
+    degrees: float  # of freedom with which its size is known
+
+
+@dataclass(frozen=True)
+class RunPoints:
+    """N usable points of all registered views, without the effects in use; reference frame."""
+
+    points: Array  # (N, 3)
+    normals: Array  # (N, 3) unit, towards the scanner
+    view: Indices  # (N,)
+    index: Indices  # (N,) in its scan
+
+    def take(self, keep: Indices) -> "RunPoints":
+        """The points of some indices."""
+        return RunPoints(self.points[keep], self.normals[keep], self.view[keep], self.index[keep])
+
+
+@dataclass(frozen=True)
+class Responses:
+    """What q numbers answer to errors of the places, per unit of each."""
+
+    views: Array  # (q, 6V) to left twists of the views
+    parameters: Array  # (q, P)
+    field: Array  # (q, K)
+    noise: Array  # (q, q) covariance by the noise of their own points
+
+    def loadings(self, source: ErrorSource) -> Array:
+        """(q, m) what each mode of a source does to the numbers."""
+        return np.asarray(self.views @ source.views + self.parameters @ source.parameters + self.field @ source.field)
+
+    def combined(self, slopes: Array) -> "Responses":
+        """The same of numbers with slopes (p, q) in these."""
+        return Responses(
+            slopes @ self.views, slopes @ self.parameters, slopes @ self.field, slopes @ self.noise @ slopes.T
+        )
+
+
+@dataclass(frozen=True)
+class PlaceErrors:
+    """Where the points of a run are, and all that may be wrong about it."""
+
+    measurement: Measurement
+    capture: Capture  # without the effects in use
+    poses: Array  # (V, 4, 4) T_reference_scanner, registered
+    centre: Array  # (3,) reference frame
+    sources: tuple[ErrorSource, ...]
+    slopes: PointSlopes | None  # of the P parameters that change points
+    half: Array  # (2,) of the scanner's field
+
+    @property
+    def points(self) -> RunPoints:
+        """All usable points."""
+        scans = self.capture.scans
+        kept = [np.flatnonzero(scan.usable) for scan in scans]
+        return RunPoints(
+            np.vstack([frames.transform(T, s.points[k]) for s, T, k in zip(scans, self.poses, kept, strict=True)]),
+            np.vstack([frames.rotate(T, s.normals[k]) for s, T, k in zip(scans, self.poses, kept, strict=True)]),
+            np.repeat(np.arange(len(scans)), [len(k) for k in kept]),
+            np.concatenate(kept).astype(np.int64),
+        )
+
+    def responses(self, at: RunPoints, gradient: Array) -> "Responses":
+        """What numbers with these slopes (q, N, 3) in the points, reference frame, answer to errors of the places."""
+        views = np.zeros((len(gradient), len(self.poses), 6))
+        field, parameters = np.zeros((len(gradient), self.modes_of_field)), np.zeros((len(gradient), self.parameters))
+        noise = np.zeros((len(gradient), len(gradient)))
+        for v in np.unique(at.view):
+            own = np.flatnonzero(at.view == v)
+            g = gradient[:, own]
+            views[:, v, :3] = np.cross(at.points[own] - self.centre, g).sum(axis=1)
+            views[:, v, 3:] = g.sum(axis=1)
+            index, seen = at.index[own], frames.rotate(frames.inverse(self.poses[v]), g)
+            field += np.einsum("qni,kni->qk", seen, self.field_modes(v, index))
+            if self.slopes is not None:
+                parameters += np.einsum("qni,kni->qk", seen, self.slopes.at(v, self.poses[v], index))
+            scan = self.capture.scans[v]
+            along = scan.noise * np.einsum("qni,ni->qn", seen, scan.normals[index])
+            noise += along @ along.T
+        return Responses(views.reshape(len(gradient), -1), parameters, field, noise)
+
+    def point_modes(self, at: RunPoints) -> tuple[Array, Array]:
+        """Return by how much points move per unit of the parameters and smooth errors (P + K, N, 3), and the noise of
+        each along its normal (N, 3), reference frame."""
+        shapes = np.zeros((self.parameters + self.modes_of_field, len(at.points), 3))
+        noise = np.zeros_like(at.points)
+        for v in np.unique(at.view):
+            own = np.flatnonzero(at.view == v)
+            index = at.index[own]
+            seen = self.field_modes(v, index)
+            if self.slopes is not None:
+                seen = np.concatenate([self.slopes.at(v, self.poses[v], index), seen])
+            shapes[:, own] = frames.rotate(self.poses[v], seen)
+            noise[own] = self.capture.scans[v].noise * at.normals[own]
+        return shapes, noise
+
+    def moved(self, at: RunPoints, twists: Array, points: Array) -> Array:
+        """Return points (N, 3) of some views, moved with their views by left twists (6V,) about the centre."""
+        moved = frames.moved_about(self.centre, twists.reshape(-1, 6), np.broadcast_to(np.eye(4), self.poses.shape))
+        return np.asarray(np.einsum("nij,nj->ni", moved[at.view, :3, :3], points) + moved[at.view, :3, 3])
+
+    @property
+    def modes_of_field(self) -> int:
+        """K."""
+        return len(self.sources[0].field)
+
+    @property
+    def parameters(self) -> int:
+        """P."""
+        return len(self.sources[0].parameters)
+
+    def field_modes(self, v: int, index: Indices) -> Array:
+        """(K, N, 3) by which points of view v lie off per unit of each smooth error, scanner frame."""
+        scan = self.capture.scans[v]
+        cosine = self.measurement.scan_views[v].cosine[index]
+        return -smooth_corrections(scan.points[index] - scan.eye, cosine, self.half)
