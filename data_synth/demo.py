@@ -16,6 +16,7 @@ HIDDEN = ("joint_compliance", "joint_offset", "backlash", "range_scale", "lens_d
 def demo(
     folder: Annotated[Path, typer.Argument(help="Where session and run are written.")] = Path("runs/demo"),
     seed: Annotated[int, typer.Option(help="Another seed, another cell and another hidden effect.")] = 0,
+    verify: Annotated[bool, typer.Option("--verify", help="Instead: a sphere plate and a part, verified.")] = False,
 ) -> None:
     """Scan a blade in a cell with a hidden effect, stitch it, find the effect, add it, and watch the error fall.
 
@@ -23,7 +24,11 @@ def demo(
     Examples:
       stitch demo
       stitch demo elsewhere --seed 4
+      stitch demo plate --verify
     """
+    if verify:
+        _demo_verify(folder, seed)
+        return
     # Imported here so that --help stays fast.
     import numpy as np
 
@@ -55,3 +60,27 @@ def demo(
     reveal(folder / "run", truth_path(session))
     show_files(folder / "run", ("stitched.ply", "recording.rrd", "report.html"))
     say(f"Next: stitch review {shlex.quote(str(folder / 'run'))}")
+
+
+def _demo_verify(folder: Path, seed: int) -> None:
+    """Fit a cell on a part, measure the part with U, and verify the fit by a calibrated sphere plate."""
+    from data_synth.verified_cell import write_verified_cell
+    from stitch.cli.measure import measure
+    from stitch.cli.run import run
+    from stitch.cli.terminal import headlines_only, say, show_files
+    from stitch.cli.verify import verify as verify_run
+
+    if folder.exists() and not (folder / "artefact.truth.json").is_file():
+        raise InputError(f"{folder}: exists and is no demo of a verification; to fix: name another folder")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    made = write_verified_cell(folder, seed)
+    say(f"Scanned a part on one day, the sphere plate that verifies the cell on another → {folder}")
+    with headlines_only():
+        say("stitch run: hand-eye from the part", bold=True)
+        run([made["part"]], folder / "run", recording=False)
+    say("stitch measure: features of the part with U", bold=True)
+    measure(folder / "run", folder / "part.toml")
+    say("stitch verify: an artefact that no fit has seen", bold=True)
+    verify_run(folder / "run", made["artefact"], output=folder / "certificate")
+    show_files(folder / "certificate", ("certificate.json", "certificate.html"))

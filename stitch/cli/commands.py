@@ -30,6 +30,8 @@ _OWN_COMMANDS = {
     "note": "stitch.cli.note:note",
     "next": "stitch.cli.diagnose:next_measurement",
     "plan": "stitch.cli.plan:plan_views",
+    "measure": "stitch.cli.measure:measure",
+    "verify": "stitch.cli.verify:verify",
     "explain": "stitch.cli.explain:explain_run",
     "effects": "stitch.cli.effects:effects",
     "report": "stitch.cli.report:report",

@@ -179,7 +179,7 @@ def _sources(run: Run, chain: _ErrorChain) -> Iterator[ErrorSource]:
 def _smooth_errors(run: Run, chain: _ErrorChain) -> tuple[Array, Array, Array]:
     """Twists (6V, K) that the overlaps show for unit smooth errors, their sizes (K,), and degrees of freedom (K,).
 
-    A size whose logarithm is known to s has the mean square exp(2 s²) times its likeliest one, and ½/s² degrees of
+    Sizes are those that the covariance of the hand-eye counts. One whose logarithm is known to s has ½/s² degrees of
     freedom (JCGM 100, G.4.2).
     """
     sums, noise = sum_smooth_errors(run.measurement, chain.freed)
@@ -190,7 +190,7 @@ def _smooth_errors(run: Run, chain: _ErrorChain) -> tuple[Array, Array, Array]:
     shares = likelihood.map_shares
     spread = likelihood.share_spread(shares)
     of_mode = np.append(np.zeros(twists.shape[1] - 1, int), 1)  # all over the field have one size, incidence its own
-    return twists, (noise * shares * np.exp(spread**2))[of_mode], (0.5 / spread**2)[of_mode]
+    return twists, (noise * shares)[of_mode], (0.5 / spread**2)[of_mode]
 
 
 def _pose_modes(run: Run, chain: _ErrorChain) -> Iterator[_Modes]:

@@ -11,6 +11,9 @@ from stitch.measurement.measurement import Measurement
 from stitch.model.forward import PointSlopes
 from stitch.observations.surfaces.scanner_errors import smooth_corrections
 
+# What is seen at more than 60° errs most with incidence, and other views see it better.
+_LEAST_COSINE = 0.5
+
 
 @dataclass(frozen=True)
 class ErrorSource:
@@ -71,9 +74,9 @@ class PlaceErrors:
 
     @property
     def points(self) -> RunPoints:
-        """All usable points."""
+        """All usable points that the scanner does not see at a slant."""
         scans = self.capture.scans
-        kept = [np.flatnonzero(scan.usable) for scan in scans]
+        kept = [np.flatnonzero(scan.usable.astype(bool) & (scan.confidence > _LEAST_COSINE)) for scan in scans]
         return RunPoints(
             np.vstack([frames.transform(T, s.points[k]) for s, T, k in zip(scans, self.poses, kept, strict=True)]),
             np.vstack([frames.rotate(T, s.normals[k]) for s, T, k in zip(scans, self.poses, kept, strict=True)]),
