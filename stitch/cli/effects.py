@@ -80,7 +80,8 @@ def _show_effect(effect: Effect) -> None:
 
     kinds = {
         "number": "",
-        "offset": ", x, y, z, or zero",
+        "vector": ", x, y, z",
+        "offset": ", {}, or zero",
         "joint": ", one a joint",
         "torque": ", one a gravity torque",
         "twist": ", a twist: rx … tz",
@@ -89,7 +90,7 @@ def _show_effect(effect: Effect) -> None:
     for key, spec in effect.specs.items():
         shift = f" and {spec.typical_shift:g} {spec.unit_shift}" if spec.kind == "twist" else ""
         sizes = f"plausible {spec.typical:g}{shift}, doubtful beyond {spec.limit:g}"
-        lines.append(f"  {key}: {spec.unit}{kinds[spec.kind]}; {sizes}")
+        lines.append(f"  {key}: {spec.unit}{kinds[spec.kind].format(', '.join(spec.axes))}; {sizes}")
     if effect.needs:
         lines.append(f"  needs {', '.join(effect.needs)}")
     if effect.prefers:

@@ -214,7 +214,8 @@ def _motion(linear: LinearModel, term: Term, form: Form, values: Array) -> _Moti
     if term.effect.place == "mount":
         constant = Effect("constant", "mount", {"xi": twist("", 1e-3, 1.0)}, _constant, (), (), "empirical")
         own = Term(constant, parameters_in(linear.measurement, constant))
-        along = fitted.values[: len(own.parameters)]
+        twists = fitted.effect.function(linear.measurement.views, **fitted.arguments)
+        along = (twists - twists.mean(axis=0))[np.argmax(np.sum(response**2, axis=1))]
         columns = _displacements(linear, linear.responses([own])[0].columns @ along[:, None])[..., 0]
         return _Motion("the scanner's mount", unit, _unit_rows(columns), response)
     direction = np.linalg.svd(response - response.mean(axis=0), full_matrices=False)[2][0]

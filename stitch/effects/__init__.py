@@ -15,6 +15,7 @@ from stitch.effects.contract import (
     per_joint,
     per_torque,
     twist,
+    vector,
 )
 
 __all__ = [
@@ -30,4 +31,5 @@ __all__ = [
     "per_joint",
     "per_torque",
     "twist",
+    "vector",
 ]

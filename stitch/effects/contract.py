@@ -29,7 +29,7 @@ EVERY_VIEW = (-1.0,)
 class Spec:
     """How an argument of the function becomes parameters."""
 
-    kind: str  # number | offset | joint | torque | twist
+    kind: str  # number | vector | offset | joint | torque | twist
     unit: str
     typical: float
     limit: float
@@ -37,6 +37,7 @@ class Spec:
     unit_shift: str = ""  # of a twist's translation
     typical_shift: float = 0.0
     limit_shift: float = 0.0
+    axes: Sequence[str] = "xyz"  # of a vector or an offset: what follows its name
 
 
 def number(unit: str, typical: float, limit: float, grid: Sequence[float] = ()) -> Spec:
@@ -44,9 +45,15 @@ def number(unit: str, typical: float, limit: float, grid: Sequence[float] = ()) 
     return Spec("number", unit, typical, limit, tuple(grid))
 
 
-def offset(unit: str, typical: float, limit: float) -> Spec:
-    """A vector (3,) in the reference frame, cx, cy, cz for c; it may be zero where the effect's others are not."""
-    return Spec("offset", unit, typical, limit)
+def vector(unit: str, typical: float, limit: float) -> Spec:
+    """A vector (3,): cx, cy, cz for c."""
+    return Spec("vector", unit, typical, limit)
+
+
+def offset(unit: str, typical: float, limit: float, axes: Sequence[str] = "xyz") -> Spec:
+    """An array, a vector cx, cy, cz for c unless `axes` says otherwise; it may be zero where the effect's others are
+    not."""
+    return Spec("offset", unit, typical, limit, axes=tuple(axes))
 
 
 def event() -> Spec:
@@ -190,8 +197,8 @@ def _parameter_names(key: str, spec: Spec, joints: int, torques: Sequence[str]) 
     match spec.kind:
         case "number":
             return [key]
-        case "offset":
-            return [key + axis for axis in "xyz"]
+        case "vector" | "offset":
+            return [key + axis for axis in spec.axes]
         case "joint":
             return [f"{key}{i + 1}" for i in range(joints)]
         case "torque":
@@ -258,7 +265,7 @@ def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]
 
 def without_offset(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
     """Indices of all parameters but an offset; empty for an effect without one."""
-    offsets = [f"{key}{axis}" for key, spec in effect.specs.items() if spec.kind == "offset" for axis in "xyz"]
+    offsets = [f"{key}{axis}" for key, spec in effect.specs.items() if spec.kind == "offset" for axis in spec.axes]
     return [[i for i, p in enumerate(parameters) if p.name not in offsets]] if offsets else []
 
 
@@ -281,6 +288,8 @@ _WHERE_FROM = {
     "intensity": "an intensity for every point",
     "optics": "a sensor with optics that has all points ahead of it (kind area, line or camera under [scanner])",
     "surfaces": "a sensor that scans surfaces (kind area or line under [scanner])",
+    "gravity_at_mount": "a scanner that the robot turns against gravity",
+    "gravity_at_part": "a part that the robot turns against gravity",
 }
 
 

@@ -1,4 +1,5 @@
-"""The library of physical effects, in the order of the chain of frames: arm, mount, part, scanner.
+"""The library of physical effects, in the order of the chain of frames: arm, mount, part, scanner; then what holds
+scanner or part against gravity.
 
 Candidates are tried and listed in this order.
 """
@@ -7,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stitch.effects.contract import effect, event, number, offset, per_joint, per_torque, twist
+from stitch.effects.contract import effect, event, number, offset, per_joint, per_torque, twist, vector
 from stitch.frames import Array
 from stitch.measurement.measurement import ScanView, Views
 from stitch.measurement.robot import Links
@@ -184,3 +185,38 @@ def lens_distortion(points: Array, view: ScanView, k1: float) -> Array:
 def scanner_thermal_scale(points: Array, view: ScanView, k: float) -> Array:
     """x = (1+k(T−T₀)) x*, T = scanner_temperature_c"""
     return points * (1 + k * view.since_first("scanner_temperature_c"))
+
+
+# Effects of what holds scanner or part and gives way under its weight, as it is turned against gravity.
+
+# A steel bracket of 30 N bends by 0.1 to 0.5 mrad and 0.02 to 0.1 mm; a sheet of metal is five times as soft.
+_SHIFT, _TILT = number("mm", typical=0.05, limit=2.0), vector("rad", typical=2e-4, limit=0.01)
+_UNEVEN = offset("rad", typical=1e-4, limit=0.01, axes=("xx", "yy", "xy", "xz", "yz"))
+
+
+@effect("mount", needs=("gravity_at_mount",), s=_SHIFT, w=_TILT, a=_UNEVEN)
+def mount_droop(views: Views, s: float, w: Array, a: Array) -> Array:
+    """M moves by s·g and tilts by w×g + A·g, g the direction of gravity in the flange's frame less its z
+
+    A is symmetric without a trace: a bracket that is stiffer about one axis than about another has one.
+    """
+    return views.at_scanner(_droop(views.gravity_at_mount, s, w, a))
+
+
+@effect("part", needs=("gravity_at_part",), s=_SHIFT, w=_TILT, a=_UNEVEN)
+def fixture_droop(views: Views, s: float, w: Array, a: Array) -> Array:
+    """the part moves by s·g and tilts by w×g + A·g, g the direction of gravity in the flange's frame less its z"""
+    return _droop(views.gravity_at_part, s, w, a)
+
+
+def _droop(gravity: Array, s: float, w: Array, a: Array) -> Array:
+    """(V, 6) twists about the flange's origin by gravity (V, 3), both in its frame.
+
+    What an elastic fixture does under a weight is linear in the direction of gravity. Its rotation is K·(d×g), K
+    symmetric and d the lever of the weight, which has no trace; its shift is mostly along g. Where the flange looks
+    down there is none: so the hand-eye is that of a pose that cells measure in.
+    """
+    xx, yy, xy, xz, yz = a
+    symmetric = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, -xx - yy]])
+    turned = gravity - [0.0, 0.0, 1.0]
+    return np.hstack([np.cross(w, turned) + turned @ symmetric, s * turned])

@@ -21,7 +21,7 @@ from stitch.system.process import time_limit
 
 # Is what a user's file says of an effect, and what its function returns, what the chain can use?
 
-_KINDS = ("number", "offset", "joint", "torque", "twist")
+_KINDS = ("number", "vector", "offset", "joint", "torque", "twist")
 
 
 def require_effect(effect: Effect, where: str) -> None:
@@ -33,7 +33,7 @@ def require_effect(effect: Effect, where: str) -> None:
     for key, spec in effect.specs.items():
         if not isinstance(spec, Spec) or spec.kind not in _KINDS:
             raise InputError(
-                f"{where}: {key} is {spec!r}; to fix: write number(…), offset(…), per_joint(…), twist(…) …"
+                f"{where}: {key} is {spec!r}; to fix: write number(…), vector(…), per_joint(…), twist(…) …"
             )
         sizes = {"typical": spec.typical, "limit": spec.limit}
         if spec.kind == "twist":

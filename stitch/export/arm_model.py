@@ -12,7 +12,15 @@ from stitch.export.hand_eye_formats import xml_comment
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import build_capture
-from stitch.measurement.measurement import PAYLOAD, Measurement, Views, no_torques, torques_of, views_of
+from stitch.measurement.measurement import (
+    PAYLOAD,
+    Measurement,
+    Views,
+    gravity_of,
+    no_torques,
+    torques_of,
+    views_of,
+)
 from stitch.measurement.robot import Robot
 from stitch.measurement.session import Session
 from stitch.model.forward import perturbed_frames
@@ -98,7 +106,7 @@ def arm_from(session: Session, file: ModelFile) -> ArmModel:
 
 def _measurement(arm: ArmModel, joints: Array, previous: Array, approach: Array) -> Measurement:
     """Return targets of a program as views: at rest, at no stated time and temperature."""
-    count = len(joints)
+    count, T_base_flange = len(joints), kinematics.forward(arm.robot, joints)
     payload = None if arm.payload is None else np.full(count, arm.payload)
     views = Views(
         count=count,
@@ -114,8 +122,11 @@ def _measurement(arm: ArmModel, joints: Array, previous: Array, approach: Array)
         first={},
         number=np.arange(count),
         path=joints,
+        T_base_flange=T_base_flange,
+        gravity=gravity_of(arm.robot),
+        eye_to_hand=False,
     )
-    return _arm_measurement(arm.session, arm.robot, kinematics.forward(arm.robot, joints), views, arm.length_unit)
+    return _arm_measurement(arm.session, arm.robot, T_base_flange, views, arm.length_unit)
 
 
 def _arm_measurement(name: str, robot: Robot, T_base_flange: Array, views: Views, length_unit: str) -> Measurement:

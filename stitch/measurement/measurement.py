@@ -47,6 +47,7 @@ PAYLOAD = "payload_kg"  # column: what the flange carries, at the centre of mass
 # Joint angles that show which torques of an arm differ.
 _ANYWHERE = 100
 STILL = 1e-3  # N·m of 1 kg: an axis that gravity does not bend
+TURNED = 0.02  # rad by which gravity turns at the least: of what holds still it is a part of the hand-eye
 
 
 @dataclass(frozen=True)
@@ -233,7 +234,33 @@ class Views:
     first: dict[str, float]  # the covariates at the session's first view
     number: Indices  # (V,) of the view in its session, from 0
     path: Array  # (W, n) joints of all views of the session, by their number
-    names: tuple[str, ...] = ()  # of those
+    T_base_flange: Array  # (V, 4, 4) reported
+    gravity: Array  # (3,) unit vector, base frame
+    eye_to_hand: bool
+    names: tuple[str, ...] = ()  # of the session's views
+    T_mount: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) hand-eye, coarse
+
+    @cached_property
+    def gravity_at_mount(self) -> Array:
+        """(V, 3) unit vector in the mount frame: of the flange where it carries the scanner, else of the base."""
+        return self._gravity_in_base if self.eye_to_hand else self._gravity_in_flange
+
+    @cached_property
+    def gravity_at_part(self) -> Array:
+        """(V, 3) unit vector in the reference frame: of the flange where it carries the part, else of the base."""
+        return self._gravity_in_flange if self.eye_to_hand else self._gravity_in_base
+
+    @property
+    def _gravity_in_flange(self) -> Array:
+        return np.asarray(frames.rotate(frames.inverse(self.T_base_flange), self.gravity[None])[:, 0])
+
+    @property
+    def _gravity_in_base(self) -> Array:
+        return np.tile(self.gravity, (self.count, 1))
+
+    def at_scanner(self, twists: Array) -> Array:
+        """(V, 6) twists of the mount frame about its origin, as an effect of the mount returns them."""
+        return np.asarray(twists @ frames.adjoint(frames.inverse(self.T_mount)).T)
 
     def sag(self, c: Array) -> Array:
         """(V, n) joint angles of the compliances c (m,) under the gravity torques."""
@@ -265,7 +292,8 @@ class Views:
 
     def only(self, keep: Sequence[int]) -> "Views":
         """Some of the views; their numbers, the rows before them and the first values stay those of the session."""
-        of_views = {name: getattr(self, name)[keep] for name in ("time", "joints", "previous", "approach", "number")}
+        rows = ("time", "joints", "previous", "approach", "number", "T_base_flange")
+        of_views = {name: getattr(self, name)[keep] for name in rows}
         return replace(
             self,
             count=len(keep),
@@ -276,12 +304,14 @@ class Views:
         )
 
     def has(self, need: str) -> bool:
-        """True if joints, time, torque, velocity or a covariate is known for every view."""
+        """True if joints, time, torque, velocity or a covariate is known for every view, or if gravity turns."""
         known = {
             "joints": self.joints.shape[1] > 0,
             "torque": len(self.torques.names) > 0,
             "velocity": self.velocity is not None,
             "time": bool(np.isfinite(self.time).all()) and self.count > 1 and float(np.ptp(self.time)) > 0,
+            "gravity_at_mount": float(np.ptp(self.gravity_at_mount, axis=0).max()) > TURNED,
+            "gravity_at_part": float(np.ptp(self.gravity_at_part, axis=0).max()) > TURNED,
         }
         return bool(known.get(need, need in self.covariates))
 
@@ -294,7 +324,6 @@ class ScanView:
     views: Views
     cosine: Array  # (N,) of incidence, 0 … 1
     intensity: Array | None  # (N,) standardised over the session
-    gravity: Array  # (3,) unit vector in the reference frame
     size: float  # of the part: lengths of shape effects may be counted in it
     origin: Array = field(default_factory=lambda: np.zeros(3))  # (3,) about which the part grows, reference frame
     eye: Array = field(default_factory=lambda: np.zeros(3))  # (3,) from where the scanner looks, its own frame
@@ -316,6 +345,11 @@ class ScanView:
     def since_first(self, covariate: str) -> float:
         """A covariate of this view less its value at the first one."""
         return float(self.views.since_first(covariate)[self.index])
+
+    @property
+    def gravity(self) -> Array:
+        """(3,) unit vector in the reference frame."""
+        return np.asarray(self.views.gravity_at_part[self.index])
 
     @property
     def hours(self) -> float:
@@ -357,6 +391,9 @@ def views_of(session: Session) -> Views:
         first=first,
         number=np.arange(count),
         path=joints,
+        T_base_flange=np.array([row.T_base_flange for row in rows]),
+        gravity=gravity_of(session.robot),
+        eye_to_hand=session.mount == "eye_to_hand",
         names=tuple(session.names),
     )
 
@@ -447,12 +484,9 @@ class Measurement:
 def measurement_of(session: Session, capture: Capture) -> Measurement:
     """Collect a session and its prepared scans."""
     views = views_of(session)
-    eye_to_hand = session.mount == "eye_to_hand"
-    T_base_flange = np.array([view.T_base_flange for view in session.views])
-    down = downwards(session.robot, T_base_flange, eye_to_hand)
     intensity = _intensities(session)
     size = float(np.median([np.ptp(points, axis=0).max() for points in capture.point_sets])) or 1.0
-    like = [ScanView(v, views, np.zeros(0), intensity[v], gravity=down[v], size=size) for v in range(views.count)]
+    like = [ScanView(v, views, np.zeros(0), intensity[v], size=size) for v in range(views.count)]
     scan_views = [
         replace(like[v], cosine=np.maximum(scan.confidence, MIN_COSINE), eye=scan.eye)
         for v, scan in enumerate(capture.scans)
@@ -465,8 +499,8 @@ def measurement_of(session: Session, capture: Capture) -> Measurement:
         target_views = [replace(view, cosine=straight, intensity=usual) for view in like]
     return Measurement(
         capture=capture,
-        T_base_flange=T_base_flange,
-        eye_to_hand=eye_to_hand,
+        T_base_flange=views.T_base_flange,
+        eye_to_hand=views.eye_to_hand,
         robot=session.robot,
         views=views,
         scan_views=tuple(scan_views),
@@ -476,29 +510,28 @@ def measurement_of(session: Session, capture: Capture) -> Measurement:
     )
 
 
-def downwards(robot: Robot | None, T_base_flange: Array, eye_to_hand: bool) -> Array:
-    """(V, 3) unit vector of gravity in the reference frame."""
-    gravity = np.array([0.0, 0.0, -1.0])
-    if robot is not None and np.linalg.norm(robot.gravity) > 0:
-        gravity = robot.gravity / np.linalg.norm(robot.gravity)
-    if not eye_to_hand:
-        return np.tile(gravity, (len(T_base_flange), 1))
-    return np.asarray(frames.rotate(frames.inverse(T_base_flange), gravity[None])[:, 0])
+def gravity_of(robot: Robot | None) -> Array:
+    """(3,) unit vector, base frame: as the robot's table states it, else downwards."""
+    if robot is None or not np.linalg.norm(robot.gravity) > 0:
+        return np.array([0.0, 0.0, -1.0])
+    return np.asarray(robot.gravity / np.linalg.norm(robot.gravity))
 
 
 def with_part_origin(measurement: Measurement, T_mount: Array) -> Measurement:
-    """The measurement with the origin about which a part grows; a coarse hand-eye is enough.
+    """The measurement with the origin about which a part grows, and the place of the scanner on its mount; a coarse
+    hand-eye is enough.
 
-    On the flange that is the flange, which holds it; in the cell it is the middle of what the views show.
+    On the flange that origin is the flange, which holds the part; in the cell it is the middle of what the views show.
     """
-    if measurement.eye_to_hand:
-        return measurement
-    views = zip(measurement.capture.poses(T_mount), measurement.capture.visible_points, strict=True)
-    origin = np.mean([frames.transform(T, points).mean(axis=0) for T, points in views if len(points)], axis=0)
+    views, origin = replace(measurement.views, T_mount=T_mount), np.zeros(3)
+    if not measurement.eye_to_hand:
+        seen = zip(measurement.capture.poses(T_mount), measurement.capture.visible_points, strict=True)
+        origin = np.mean([frames.transform(T, points).mean(axis=0) for T, points in seen if len(points)], axis=0)
     scan_views, target_views = (
-        tuple(replace(v, origin=origin) for v in w) for w in (measurement.scan_views, measurement.target_views)
+        tuple(replace(v, views=views, origin=origin) for v in own)
+        for own in (measurement.scan_views, measurement.target_views)
     )
-    return replace(measurement, scan_views=scan_views, target_views=target_views)
+    return replace(measurement, views=views, scan_views=scan_views, target_views=target_views)
 
 
 def intensity_scale(session: Session) -> tuple[float, float] | None:

@@ -8,7 +8,7 @@ import numpy as np
 from stitch import frames
 from stitch.frames import Array, Indices
 from stitch.measurement.capture import Sightings, build_capture
-from stitch.measurement.measurement import PAYLOAD, Measurement, Torques, Views, downwards, torques_of
+from stitch.measurement.measurement import PAYLOAD, Measurement, Torques, Views, torques_of
 from stitch.measurement.robot import Robot, forward
 from stitch.measurement.session import Session, View
 from stitch.model.model import Model, Term
@@ -59,6 +59,7 @@ def candidate_measurement(measurement: Measurement, joints: Array) -> Measuremen
     pause = float(np.median(np.diff(views.time))) if views.has("time") and views.count > 1 else 0.0
     # They would be taken at rest.
     velocity = None if views.velocity is None else np.zeros_like(joints)
+    T_base_flange = forward(measurement.robot, joints)
     candidate = replace(
         views,
         count=count,
@@ -70,8 +71,8 @@ def candidate_measurement(measurement: Measurement, joints: Array) -> Measuremen
         torques=torques,
         covariates={name: np.full(count, values[-1]) for name, values in views.covariates.items()},
         number=np.full(count, views.number[-1] + 1),
+        T_base_flange=T_base_flange,
     )
-    T_base_flange = forward(measurement.robot, joints)
     return replace(measurement, views=candidate, T_base_flange=T_base_flange, scan_views=())
 
 
@@ -181,9 +182,8 @@ def _all_seen(measurement: Measurement, seen: TargetRows, landmarks: Landmarks, 
         sigma_rotation = np.full(K, np.median(before.sigma_rotation))
         rotation = back[:, :3, :3] @ landmarks.orientation
         sightings = replace(sightings, rotation=rotation, sigma_rotation=sigma_rotation)
-    down = downwards(measurement.robot, measurement.T_base_flange, measurement.eye_to_hand)
     first = measurement.target_views[0]
     usual = None if first.intensity is None else np.zeros(len(known))
     like = replace(first, views=measurement.views, cosine=np.ones(len(known)), intensity=usual)
-    views = tuple(replace(like, index=v, gravity=down[v]) for v in range(K))
+    views = tuple(replace(like, index=v) for v in range(K))
     return replace(measurement, capture=replace(bare, sightings=sightings), target_views=views)
