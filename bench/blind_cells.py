@@ -25,7 +25,7 @@ from stitch.observations.linear_model import LinearModel
 from stitch.runs.run import Run
 
 # Evidence counts in views: a few thousand points a view show what millions would.
-_PIXELS = {"blade": 110, "blade-table": 110, "drill-plate": 80}
+_PIXELS = {"blade": 110, "blade-table": 110, "drill-plate": 80, "spheres": 80}
 _USER = Path(__file__).parents[1] / "examples" / "effects"
 # Laws without a counterpart in the library, and what a user would write for them.
 OUTSIDE = {"third_harmonic": "third_harmonic", "knock": "knock", "covariate_bias": "humidity_bias"}

@@ -83,7 +83,8 @@ def _lacking(hidden: dict[str, Any], fitted: dict[str, Any]) -> list[str]:
     return [
         f"{effect}.{name} (true {value:.3g})"
         for effect, parameters in hidden.items()
-        if effect in fitted
+        # A law that is written in other numbers than its effect, as a beam's is, has none in common with it.
+        if effect in fitted and not parameters.keys().isdisjoint(fitted[effect])
         for name, value in parameters.items()
         if value and not fitted[effect].get(name, {"value": 0.0})["value"]
     ]

@@ -25,6 +25,8 @@ class Moment:
     covariates: dict[str, float]
     start: dict[str, float]  # covariates of the first view
     gravity_part: Array  # (3,) unit vector in the part frame
+    gravity_reference: Array  # (3,) in the frame that holds the part: flange or base
+    gravity_mount: Array  # (3,) in the frame that holds the scanner
     standoff: float
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from data_synth.laws import bodies, joints, points
+from data_synth.laws import bodies, brackets, joints, points
 from data_synth.moment import Moment
 
 Array = NDArray[np.float64]
@@ -53,6 +53,8 @@ LAWS: dict[str, Law] = {
     "part_growth": Law("surface", points.draw("g", 2.3e-5), bodies.part_growth),
     "part_sag": Law("surface", points.draw("kappa", 3e-6), bodies.part_sag),
     "part_slip": Law("part", bodies.draw_slip(4e-4, 0.1), bodies.part_slip),
+    "mount_droop": Law("mount", brackets.draw, brackets.mount_droop),
+    "fixture_droop": Law("part", brackets.draw, brackets.fixture_droop),
     "third_harmonic": Law("joints", joints.draw_wave(2.5e-4), joints.wave(3)),
     "knock": Law("mount", bodies.draw_slip(4e-4, 0.1), bodies.knock),
     "covariate_bias": Law("points", points.draw("k", 0.012), points.covariate_bias),

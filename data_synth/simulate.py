@@ -123,8 +123,8 @@ def moments_of(scene: Scene, plan: Plan, times: Array, covariates: dict[str, Arr
     out = []
     for v, q in enumerate(plan.joints):
         gravity = kinematics.GRAVITY / np.linalg.norm(kinematics.GRAVITY)
-        if scene.mount == "eye_to_hand":
-            gravity = kinematics.flange(scene.arm, q)[:3, :3].T @ gravity
+        in_flange = kinematics.flange(scene.arm, q)[:3, :3].T @ gravity
+        reference, mount = (in_flange, gravity) if scene.mount == "eye_to_hand" else (gravity, in_flange)
         out.append(
             Moment(
                 index=v,
@@ -137,7 +137,9 @@ def moments_of(scene: Scene, plan: Plan, times: Array, covariates: dict[str, Arr
                 torque=plan.torque[v],
                 covariates={name: float(values[v]) for name, values in covariates.items()},
                 start=start,
-                gravity_part=scene.T_reference_part[:3, :3].T @ gravity,
+                gravity_part=scene.T_reference_part[:3, :3].T @ reference,
+                gravity_reference=reference,
+                gravity_mount=mount,
                 standoff=scene.scanner.standoff,
             )
         )

@@ -49,6 +49,8 @@ ARTEFACTS = {
     "backlash": "repeat three views approached from the other side of every joint",
     "settling": "repeat three views after waiting five seconds before the scan",
     "robot_thermal_growth": "repeat the first views once the arm is warm",
+    "mount_droop": "repeat a view with the flange turned by 180° about its axis",
+    "fixture_droop": "repeat a view with the part hanging the other way",
     "fixture_drift": "clamp the part anew and repeat the first views at the end",
     "part_growth": "repeat a view of the part at another temperature, with the cell unchanged",
     "part_sag": "repeat two views with the part hanging the other way",

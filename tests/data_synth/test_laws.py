@@ -10,6 +10,7 @@ from data_synth.fixtures.arm_sources import plain_product
 from data_synth.fixtures.part_distance import EXACT, off_part
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.laws import points as point_laws
+from data_synth.laws.brackets import GEOMETRY
 from data_synth.moment import Plan
 from data_synth.scanner import Cloud
 from stitch import frames
@@ -26,8 +27,8 @@ def test_the_amplitude_scales_what_is_drawn(name):
     once, twice = (nature.LAWS[name].draw(a, plan, np.random.default_rng(4)) for a in (1.0, 2.0))
     assert set(once) == set(twice) and once
     for parameter, value in once.items():
-        # Times and views say when, not how much.
-        factor = 1.0 if parameter in ("T_c", "v") else 2.0
+        # Times and views say when, places where, not how much.
+        factor = 1.0 if parameter in ("T_c", "v", *GEOMETRY) else 2.0
         assert twice[parameter] == pytest.approx(factor * value, rel=1e-12)
 
 
@@ -40,7 +41,7 @@ def test_joints_are_those_that_the_cell_can_show():
 
 
 def test_laws_have_the_names_and_places_of_the_contract():
-    places = {"points": 8, "joints": 8, "arm": 2, "mount": 3, "part": 2, "surface": 2}
+    places = {"points": 8, "joints": 8, "arm": 2, "mount": 4, "part": 3, "surface": 2}
     assert {place: sum(law.place == place for law in nature.LAWS.values()) for place in places} == places
     assert set(nature.SMALL) <= set(nature.LAWS)
 

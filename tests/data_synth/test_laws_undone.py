@@ -38,6 +38,20 @@ def twist(p: dict[str, float], share: float = 1.0) -> np.ndarray:
     return frames.exp(share * np.array([p[k] for k in TWIST]))
 
 
+def beam(p: dict[str, float], down: np.ndarray) -> np.ndarray:
+    """(4, 4) displacement of what sits at the end of a uniform beam: force F at the end gives the slope L²/2EI and the
+    deflection L³/3EI, a moment there L/EI and L²/2EI."""
+    end, load, weak = (np.array([p[f"{name}_{axis}"] for axis in "xyz"]) for name in ("end", "load", "weak"))
+    length = np.linalg.norm(end)
+    z = end / length
+    axes = np.column_stack([weak, np.cross(z, weak), z])
+    soft = axes @ np.diag([p["bend_weak"], p["bend_strong"], p["twist"]]) @ axes.T
+    force, moment = soft @ np.cross(z, down), soft @ np.cross(load, down)
+    slope = length**2 / 2 * force + length * moment
+    moved = np.cross(length**3 / 3 * force + length**2 / 2 * moment, z)
+    return frames.exp(np.concatenate([slope, moved - np.cross(slope, end)]))
+
+
 def undone(name: str | None, measured: Measured, v: int) -> np.ndarray:
     """Points of one view in the part frame, by the formulas of EFFECTS.md backwards."""
     p = measured.hidden.get(name, {})
@@ -101,11 +115,17 @@ def undone(name: str | None, measured: Measured, v: int) -> np.ndarray:
     elif name == "knock" and v >= p["v"]:
         mount = mount @ twist(p)
     T_flange = plain_product(arm, q)
+    down = GRAVITY / np.linalg.norm(GRAVITY)
+    in_flange = np.linalg.inv(plain_product(scene.arm, measured.plan.joints[v]))[:3, :3] @ down
+    if name == "mount_droop":
+        mount = beam(p, down if scene.mount == "eye_to_hand" else in_flange) @ mount
     T = (np.linalg.inv(T_flange) if scene.mount == "eye_to_hand" else T_flange) @ mount
     # part
     T_part = scene.T_reference_part
     if name == "fixture_drift":
         T_part = twist(p, t / HOUR) @ T_part
+    elif name == "fixture_droop":
+        T_part = beam(p, in_flange if scene.mount == "eye_to_hand" else down) @ T_part
     elif name == "part_slip" and v >= p["v"]:
         T_part = twist(p) @ T_part
     T_part_scanner = np.linalg.inv(T_part) @ T
@@ -122,10 +142,7 @@ def undone(name: str | None, measured: Measured, v: int) -> np.ndarray:
     if name == "part_growth":
         y = y / (1 + p["g"] * warmer["part_temperature_c"])
     elif name == "part_sag":
-        down = GRAVITY / np.linalg.norm(GRAVITY)
-        if scene.mount == "eye_to_hand":
-            down = np.linalg.inv(plain_product(scene.arm, measured.plan.joints[v]))[:3, :3] @ down
-        down = scene.T_reference_part[:3, :3].T @ down
+        down = scene.T_reference_part[:3, :3].T @ (in_flange if scene.mount == "eye_to_hand" else down)
         h = y[:, 2]
         for _ in range(3):  # h is the height before sagging
             h = (y - p["kappa"] * h[:, None] ** 2 * down)[:, 2]
@@ -171,7 +188,7 @@ def test_undone_by_its_formula_the_cloud_lies_on_the_part(name):
     check_on_part(name, "blade", chord() if name == "part_sag" else EXACT)
 
 
-@pytest.mark.parametrize("name", ["joint_compliance", "mount_drift", "fixture_drift", "part_sag"])
+@pytest.mark.parametrize("name", ["joint_compliance", "mount_drift", "mount_droop", "fixture_drift", "part_sag"])
 def test_the_same_with_the_scanner_on_the_arm(name):
     check_on_part(name, "blade-table", chord() if name == "part_sag" else EXACT)
 

@@ -10,7 +10,7 @@ from stitch import frames
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need, parameters_in
 from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
+from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.model.forward import PointSlopes, perturbed_frames, pose_derivatives
 from stitch.model.model import Model, Term, term_of
 
@@ -20,17 +20,22 @@ def chain_for(measured):
     return measurement_of(session, prepare_capture(session))
 
 
-@pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.place in ("robot", "links", "mount", "part")])
-def test_twists_are_the_derivative_of_the_poses(still_cells, name):
+MOVING = [n for n, e in EFFECTS.items() if e.place in ("robot", "links", "mount", "part")]
+
+
+@pytest.mark.parametrize(
+    ("name", "mount"), [*((n, "eye_to_hand") for n in MOVING if n != "mount_droop"), ("mount_droop", "eye_in_hand")]
+)
+def test_twists_are_the_derivative_of_the_poses(still_cells, name, mount):
     """Central differences of half the size about the same place, by another route: a point carried along."""
-    measurement = chain_for(still_cells["eye_to_hand"])
+    measurement = with_part_origin(chain_for(still_cells[mount]), still_cells[mount].T_mount)
     effect = EFFECTS[name]
     if missing_need(measurement, effect):
         pytest.skip(f"needs {missing_need(measurement, effect)}")
     parameters = parameters_in(measurement, effect)
     # A twist that is zero hides its time constant: begin where it is not.
     values = np.array([p.grid[0] if p.grid else 0.3 * p.typical for p in parameters])
-    T = still_cells["eye_to_hand"].T_mount
+    T = still_cells[mount].T_mount
     centre = np.array([5.0, -3.0, 80.0])
     (slopes,) = pose_derivatives(measurement, Model(T), [term_of(measurement, effect).at(values)], centre)
     point = np.array([10.0, 20.0, 120.0])
