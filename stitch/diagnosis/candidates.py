@@ -14,6 +14,7 @@ from stitch.effects.contract import (
     missing_need,
     one_by_one,
     parameters_in,
+    stands_still,
     without_offset,
 )
 from stitch.effects.empirical import empirical_effects
@@ -85,7 +86,7 @@ class Candidate:
 def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Candidate], dict[str, tuple[str, ...]]]:
     """Physical, user and (if asked for) empirical effects that are not in the model, and what unavailable ones lack."""
     used = linear.model.effects
-    library = [e for e in EFFECTS.values() if e.name not in used]
+    library = [e for e in EFFECTS.values() if e.name not in used and not stands_still(linear.measurement, e)]
     missing = {e.name: lacks for e in library if (lacks := missing_need(linear.measurement, e))}
     effects = [e for e in library if e.name not in missing]
     shapes = empirical_effects(linear.measurement.views) if empirical else []

@@ -317,7 +317,11 @@ def challenge(linear: LinearModel, candidates: Sequence[Candidate], evidence: Ev
 
 
 def with_equal_rivals(linear: LinearModel, evidence: Evidence) -> Evidence:
-    """Add to a single name the contenders that predict views left out as well: these views cannot tell which it is."""
+    """Add to a single name the contenders that predict views left out as well: these views cannot tell which it is.
+
+    One that predicts them clearly better and stands every other test takes the place of the name: a Bayes factor
+    charges for plausible sizes that may be wrong, as a user's are, and what was not seen does not.
+    """
     if evidence.verdict != "missing_effect" or evidence.second is not None:
         return evidence
     named = evidence.named[0]
@@ -327,8 +331,15 @@ def with_equal_rivals(linear: LinearModel, evidence: Evidence) -> Evidence:
         if r.name != named.name and is_contender(r) and not any(r.name in note for note in evidence.notes)
     }
     own = {name: cross_validate(linear, r.score) for name, r in rivals.items()}
-    as_good = [rivals[name] for name, found in own.items() if found.as_good_as(evidence.left_out[named.name])]
-    return replace(evidence, explanation=(named, *as_good), left_out=dict(evidence.left_out) | own)
+    left_out = dict(evidence.left_out) | own
+    ahead = (name for name, found in own.items() if found.better_than(left_out[named.name]))
+    better = min(ahead, key=lambda name: own[name].heldout, default=named.name)
+    if better != named.name and not _rejection_reason(
+        rivals[better], own[better], validate_in_halves(rivals[better].score)
+    ):
+        rivals, named = rivals | {named.name: named}, rivals[better]
+    as_good = [r for name, r in rivals.items() if r is not named and left_out[name].as_good_as(left_out[named.name])]
+    return replace(evidence, explanation=(named, *as_good), left_out=left_out)
 
 
 def cross_validate_named(linear: LinearModel, evidence: Evidence) -> dict[str, CrossValidation]:

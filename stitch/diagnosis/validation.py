@@ -122,6 +122,12 @@ class CrossValidation:
         shares = [mean_square_share(np.array(own), np.array(theirs)) for own, theirs in pairs]
         return all(share <= 1 + sigma for share, sigma in shares)
 
+    def better_than(self, other: "CrossValidation") -> bool:
+        """True if another candidate predicts both points and poses of views left out worse, beyond the uncertainty."""
+        pairs = zip(self.fold_squares, other.fold_squares, strict=True)
+        shares = [mean_square_share(np.array(own), np.array(theirs)) for own, theirs in pairs]
+        return all(share < 1 - sigma for share, sigma in shares)
+
     @property
     def helps(self) -> bool:
         """True if views left out are predicted better, by more than folds differ."""

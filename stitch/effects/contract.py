@@ -341,6 +341,11 @@ def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
     return tuple(missing)
 
 
+def stands_still(measurement: Measurement, effect: Effect) -> bool:
+    """True for an effect of what hangs at the flange where that does not: of the part, or of the scanner."""
+    return ("gravity_at_mount" if measurement.eye_to_hand else "gravity_at_part") in effect.needs
+
+
 def require_available(measurement: Measurement, effect: Effect) -> None:
     """Refuse an effect that a session cannot have.
 

@@ -196,7 +196,7 @@ _UNEVEN = offset("rad", typical=1e-4, limit=0.01, axes=("xx", "yy", "xy", "xz", 
 
 @effect("mount", needs=("gravity_at_mount",), s=_SHIFT, w=_TILT, a=_UNEVEN)
 def mount_droop(views: Views, s: float, w: Array, a: Array) -> Array:
-    """M moves by s·g and tilts by w×g + A·g, g the direction of gravity in the flange's frame less its z
+    """M tilts by w×g + A·g and moves by s·(g_x, g_y, 0), g the direction of gravity less z, flange frame
 
     A is symmetric without a trace: a bracket that is stiffer about one axis than about another has one.
     """
@@ -205,7 +205,7 @@ def mount_droop(views: Views, s: float, w: Array, a: Array) -> Array:
 
 @effect("part", needs=("gravity_at_part",), s=_SHIFT, w=_TILT, a=_UNEVEN)
 def fixture_droop(views: Views, s: float, w: Array, a: Array) -> Array:
-    """the part moves by s·g and tilts by w×g + A·g, g the direction of gravity in the flange's frame less its z"""
+    """the part tilts by w×g + A·g and moves by s·(g_x, g_y, 0), g the direction of gravity less z, flange frame"""
     return _droop(views.gravity_at_part, s, w, a)
 
 
@@ -213,10 +213,11 @@ def _droop(gravity: Array, s: float, w: Array, a: Array) -> Array:
     """(V, 6) twists about the flange's origin by gravity (V, 3), both in its frame.
 
     What an elastic fixture does under a weight is linear in the direction of gravity. Its rotation is K·(d×g), K
-    symmetric and d the lever of the weight, which has no trace; its shift is mostly along g. Where the flange looks
-    down there is none: so the hand-eye is that of a pose that cells measure in.
+    symmetric and d the lever of the weight, which has no trace. Of its shift only what differs between directions is
+    seen: down by the same in all views moves all they see. Where the flange looks down there is none: so the hand-eye
+    is that of a pose that cells measure in.
     """
     xx, yy, xy, xz, yz = a
     symmetric = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, -xx - yy]])
     turned = gravity - [0.0, 0.0, 1.0]
-    return np.hstack([np.cross(w, turned) + turned @ symmetric, s * turned])
+    return np.hstack([np.cross(w, turned) + turned @ symmetric, s * turned * [1.0, 1.0, 0.0]])

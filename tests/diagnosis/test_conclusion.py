@@ -24,7 +24,7 @@ def ranked(name, beside=None, adjusted=1e-6):
 FIRST, SECOND = ranked("range_nonlinearity"), ranked("lens_distortion")
 ALONE = Evidence((FIRST, SECOND), (), alarm=True, explanation=(FIRST,))
 PAIR = replace(ALONE, further=SECOND)
-SAME, WORSE = (1.02, 0.97, 1.05, 0.98), (1.9, 2.1, 2.0, 2.2)
+SAME, WORSE, BETTER = (1.02, 0.97, 1.05, 0.98), (1.9, 2.1, 2.0, 2.2), (0.5, 0.6, 0.55, 0.5)
 SMOOTH = SimpleNamespace(gain=50.0, over_noise=False)
 
 
@@ -99,3 +99,20 @@ def test_what_predicts_views_left_out_as_well_is_not_told_from_the_name(monkeypa
     assert found.named == ((FIRST, SECOND) if rivals else (FIRST,))
     # Where both are missing, each was asked beside the other.
     assert gathering.with_equal_rivals(None, replace(PAIR, left_out=named)).named == (FIRST,)
+
+
+@pytest.mark.parametrize(
+    ("squares", "stands", "named"),
+    [
+        ((BETTER, BETTER), True, (SECOND,)),
+        ((BETTER, SAME), True, (FIRST, SECOND)),  # points alone may be the scanner's noise
+        ((BETTER, BETTER), False, (FIRST, SECOND)),
+    ],
+)
+def test_what_predicts_views_left_out_clearly_better_is_named_though_another_is_likelier(
+    monkeypatch, squares, stands, named
+):
+    rival = replace(HELPS, fold_squares=squares, steadiness=0.9 if stands else 0.1)
+    monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: rival)
+    left_out = {FIRST.name: replace(HELPS, fold_squares=((1.0,) * 4, (1.0,) * 4))}
+    assert gathering.with_equal_rivals(None, replace(ALONE, left_out=left_out)).named == named

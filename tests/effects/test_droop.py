@@ -44,7 +44,7 @@ def test_a_weight_beside_the_axis_tilts_what_holds_it_towards_gravity(still_cell
     T = still_cells[mount].T_mount
     for v, T_base_flange in enumerate(measurement.T_base_flange):
         turned = T_base_flange[:3, :3].T @ [0, 0, -1.0] - [0, 0, 1.0]
-        drooped = frames.exp(np.append(np.cross(lever, turned), shift * turned))
+        drooped = frames.exp(np.append(np.cross(lever, turned), shift * turned * [1, 1, 0]))
         expected = T_base_flange @ drooped @ T
         if mount == "eye_to_hand":
             expected = np.linalg.inv(drooped) @ np.linalg.inv(T_base_flange) @ T
