@@ -6,6 +6,7 @@ The steps stand in `stages`: `surface_steps` for clouds, `target_steps` for labe
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -20,7 +21,7 @@ from stitch.integrity.model_transfer import (
     find_disagreeing_sessions,
 )
 from stitch.integrity.view_screening import ScreenedFit, fit_screened_views, session_warnings
-from stitch.measurement.capture import part_size, prepare_capture
+from stitch.measurement.capture import Capture, part_size, prepare_capture
 from stitch.measurement.measurement import Measurement, measurement_of, with_part_origin
 from stitch.measurement.session import Session
 from stitch.model.model_toml import ModelFile, arm_model, convert_unit
@@ -71,8 +72,13 @@ def run_rig(
     keep: bool = False,
     arm: ModelFile | None = None,
     register: str = DEFAULT,
+    captures: Sequence[Future[Capture]] | None = None,
 ) -> list[Run]:
-    """Stitch several sessions of one rig with one common hand-eye and common effects; one run per session."""
+    """Stitch several sessions of one rig with one common hand-eye and common effects; one run per session.
+
+    Args:
+        captures: what `prepare_capture` makes of the sessions, where that has begun already.
+    """
     method_named(register)
     require_same_rig(sessions, model)
     recorders = recorders or [SilentRecorder() for _ in sessions]
@@ -80,7 +86,8 @@ def run_rig(
         clock, steps = Clock(), pipeline_for(sessions[0])
         for session, recorder in zip(sessions, recorders, strict=True):
             recorder.start(session)
-        measurements = [measurement_of(session, prepare_capture(session)) for session in sessions]
+        prepared = (own.result() for own in captures) if captures else map(prepare_capture, sessions)
+        measurements = [measurement_of(session, own) for session, own in zip(sessions, prepared, strict=True)]
         effects = list(dict.fromkeys(effects))
         model = convert_unit(model, sessions[0].length_unit) if model else None
         arm = convert_unit(arm, sessions[0].length_unit) if arm else None

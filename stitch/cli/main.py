@@ -63,6 +63,9 @@ def _options(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; errors of the input or the computation end in one line and their exit code."""
+    # Before a library is loaded that has threads of its own: one that comes later would fight ours for the cores.
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     speak_any_terminal()
     process.may_end_process()
     try:

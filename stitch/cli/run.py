@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,6 +28,7 @@ from stitch.errors import InputError
 
 if TYPE_CHECKING:
     from stitch.api.live import LiveSession
+    from stitch.measurement.capture import Capture
     from stitch.measurement.session import Session
     from stitch.model.model_toml import ModelFile
     from stitch.runs.run import Run
@@ -90,25 +92,20 @@ def run(
       stitch run fuselage --memory 4GB
       stitch run blade-19 --follow
     """
-    from stitch.effects.contract import find_effect
-    from stitch.effects.user_file import load as load_effects
-    from stitch.pipeline import run_rig
-    from stitch.stages.register import DEFAULT, method_named
-    from stitch.writing.json_file import to_json
-    from stitch.writing.result_document import result_document
-    from stitch.writing.run_folder import new_folder, preload_entry_points
-
-    require_tolerance(tolerance)
-    if effects_file:
-        load_effects(effects_file)
     named = [name for name in split_names(effects) if name]
-    for name in named:
-        find_effect(name)
-    method = method_named(register or DEFAULT).name
+    _require_known(tolerance, named, effects_file, register)
     paths = sessions or [_current_session()]
     if follow or views is not None:
         _follow(paths, follow, views)
     loaded = _load_sessions(paths, memory)
+    # A second of libraries is still to be loaded, which takes one core.
+    captures = _begin_to_prepare(loaded)
+    from stitch.pipeline import run_rig
+    from stitch.stages.register import DEFAULT
+    from stitch.writing.json_file import to_json
+    from stitch.writing.result_document import result_document
+    from stitch.writing.run_folder import new_folder, preload_entry_points
+
     name = "+".join(session.name for session in loaded)
     target = output or Path("runs" if sessions else "../runs") / name
     model, kept, own_effects = _given_models(hand_eye, arm, named, effects_file, trust)
@@ -116,7 +113,7 @@ def run(
     with show_activity(f"{name}: reading the scans"), new_folder(target, paths, force) as scratch:
         folders = _run_folders(scratch, loaded)
         recorders = [recorder_for(folder, recording) for folder in folders]
-        runs = run_rig(loaded, model, recorders, named, keep, kept, method)
+        runs = run_rig(loaded, model, recorders, named, keep, kept, register or DEFAULT, captures)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
         _write_runs(runs, folders, scratch, mesh, tolerance)
     if as_json:
@@ -124,6 +121,36 @@ def run(
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
         _show_runs(runs, target, tolerance)
+
+
+def _require_known(
+    tolerance: float | None, effects: list[str], effects_file: Path | None, register: str | None
+) -> None:
+    """Refuse what cannot be meant before anything is read; load only what was asked for."""
+    require_tolerance(tolerance)
+    if effects_file:
+        from stitch.effects.user_file import load as load_effects
+
+        load_effects(effects_file)
+    if effects:
+        from stitch.effects.contract import find_effect
+
+        for name in effects:
+            find_effect(name)
+    if register is not None:
+        from stitch.stages.register import method_named
+
+        method_named(register)
+
+
+def _begin_to_prepare(sessions: list[Session]) -> list[Future[Capture]]:
+    """Return what `prepare_capture` will find of each session, in a thread that has begun with it."""
+    from stitch.measurement.capture import prepare_capture
+
+    beside = ThreadPoolExecutor(1)
+    captures = [beside.submit(prepare_capture, session) for session in sessions]
+    beside.shutdown(wait=False)
+    return captures
 
 
 def _follow(sessions: list[Path], follow: bool, views: int | None) -> None:
