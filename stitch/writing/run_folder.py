@@ -65,7 +65,10 @@ def write_residuals(run: Run, path: Path) -> None:
     """Write the table of residuals as Parquet."""
     import pyarrow.parquet as pq
 
-    pq.write_table(residual_table(run), path, compression="zstd")
+    table = residual_table(run)
+    # Of numbers that never repeat a dictionary takes four times as long as they do, and more room.
+    repeated = [name for name in table.column_names if name not in (*_PLACE, "residual", "heldout")]
+    pq.write_table(table, path, compression="zstd", use_dictionary=repeated)
 
 
 def residual_table(run: Run) -> Any:
@@ -84,11 +87,21 @@ def residual_table(run: Run) -> Any:
         parts.append(residual_columns(run.targets, session))
     # Beside clouds, labelled points have the columns of these.
     common = [key for key in (parts or [{}])[0] if all(key in part for part in parts)]
-    columns = {key: np.concatenate([part[key] for part in parts]) for key in common}
-    arrays = {
-        key: pa.array(c).dictionary_encode() if c.dtype.kind == "U" else pa.array(c) for key, c in columns.items()
-    }
-    return pa.table(arrays)
+    columns = {key: [part[key] for part in parts] for key in common}
+    return pa.table({key: _joined(pa, own) for key, own in columns.items()})
+
+
+def _joined(pa: Any, parts: Sequence[Array]) -> Any:
+    """One column of parts; of names that are the same all over a part each is encoded once."""
+    if not parts or parts[0].dtype.kind != "U":
+        return pa.array(np.concatenate(parts))
+    encoded = [
+        pa.array(own).dictionary_encode()
+        if own.strides[0]
+        else pa.DictionaryArray.from_arrays(np.zeros(len(own), np.int32), own[:1])
+        for own in parts
+    ]
+    return pa.chunked_array(encoded).unify_dictionaries().combine_chunks()
 
 
 def _without_reserved_covariates(session: Session) -> Session:
@@ -108,7 +121,9 @@ def _columns(session: Session, m: Match, of_views: Iterable[str], of_points: Ite
     """Columns of one pair of views, a row per correspondence."""
     size = len(m.residual)
     own, time = session.views[m.v].covariates, session.views[m.v].time_s
-    out = {name: np.repeat(session.views[v].name, size) for name, v in (("view", m.v), ("partner", m.w))}
+    out = {
+        name: np.broadcast_to(np.array(session.views[v].name), size) for name, v in (("view", m.v), ("partner", m.w))
+    }
     out |= dict(zip(_PLACE, (*m.middle.T, *m.normal.T), strict=True))
     out |= {"residual": m.residual, "time_s": np.full(size, np.nan if time is None else time)}
     out |= {key: np.full(size, own.get(key, np.nan)) for key in sorted(of_views)}
