@@ -93,16 +93,17 @@ class PartSurface:
         return np.where(seen, (np.nan_to_num(own) * weight).sum(axis=1) / np.where(seen, total, 1.0), np.nan)
 
 
-def part_surface(fused: FusedCloud, patches: Patches) -> PartSurface:
-    """The fused cloud as a mesh of what a screen can show."""
-    points, normals = _thinned(fused)
-    triangles = np.zeros((0, 3), np.int64)
-    try:
-        mesh = _without_overhang(mesh_of(points, normals), points)
-        points, triangles = _level_edges(*_whole_pieces(mesh))
-        normals = vertex_normals(points, triangles)
-    except NoResultError:
-        pass
+class PartShape(NamedTuple):
+    """N vertices with unit normals, reference frame; without triangles where the points span no surface."""
+
+    vertices: Array  # (N, 3)
+    normals: Array  # (N, 3)
+    triangles: Indices  # (T, 3)
+
+
+def part_surface(fused: FusedCloud, patches: Patches, shape: PartShape | None = None) -> PartSurface:
+    """The fused cloud as a mesh of what a screen can show, with the patches about it; `shape` if it is at hand."""
+    points, normals, triangles = part_shape(fused) if shape is None else shape
     count = min(4 * _NEAREST, len(patches.points))
     distance, index = KDTree(np.ascontiguousarray(patches.points)).query(points, k=count)
     distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1).astype(np.int64)
@@ -112,6 +113,19 @@ def part_surface(fused: FusedCloud, patches: Patches) -> PartSurface:
     best = np.argsort(-weight, axis=1)[:, :_NEAREST]
     index, weight = (np.take_along_axis(x, best, axis=1) for x in (index, weight))
     return PartSurface(points, normals, triangles, patch=index, weight=weight / weight.sum(axis=1, keepdims=True))
+
+
+def part_shape(fused: FusedCloud) -> PartShape:
+    """The fused cloud as a mesh."""
+    points, normals = _thinned(fused)
+    triangles = np.zeros((0, 3), np.int64)
+    try:
+        mesh = _without_overhang(mesh_of(points, normals), points)
+        points, triangles = _level_edges(*_whole_pieces(mesh))
+        normals = vertex_normals(points, triangles)
+    except NoResultError:
+        pass
+    return PartShape(points, normals, triangles)
 
 
 def _whole_pieces(mesh: TriangleMesh) -> tuple[Array, Indices]:

@@ -1,5 +1,6 @@
 """The page of a run: one file, report.html, that needs nothing beside it."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from stitch.units import MICROMETRES, value_uncertainty_text
 from viz import captions
 from viz.page_parts import Head, Subject, Tile, identity, script_json, write_page
 from viz.part_data import part_data
-from viz.part_surface import camera_for, part_surface
+from viz.part_surface import PartShape, camera_for, part_shape, part_surface
 from viz.run_numbers import shown_points, view_shifts
 from viz.target_scene import target_scene
 
@@ -148,8 +149,11 @@ def write_report(run: Run, path: Path, tolerance: float | None = None) -> None:
     Args:
         tolerance: within which the views have to agree on the part, length_unit.
     """
-    history = model_history(run)
-    write_page(path, "report.html.j2", _head(run, history, tolerance), **_content(run, history, tolerance))
+    with ThreadPoolExecutor(1) as beside:
+        begun = None if run.registered is None else beside.submit(part_shape, run.fused)
+        history = model_history(run)
+        shape = None if begun is None else begun.result()
+    write_page(path, "report.html.j2", _head(run, history, tolerance), **_content(run, history, tolerance, shape))
 
 
 def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> Head:
@@ -169,7 +173,9 @@ def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> He
     )
 
 
-def _content(run: Run, history: ModelHistory | None, tolerance: float | None) -> dict[str, object]:
+def _content(
+    run: Run, history: ModelHistory | None, tolerance: float | None, shape: PartShape | None
+) -> dict[str, object]:
     um = MICROMETRES[run.session.length_unit]
     return {
         "run": run,
@@ -177,7 +183,7 @@ def _content(run: Run, history: ModelHistory | None, tolerance: float | None) ->
         "doubts": run.doubts,
         "tolerance": None if tolerance is None else tolerance * um,
         "tiles": run_tiles(run, history),
-        "part": shown_part(run, history),
+        "part": shown_part(run, history, shape),
         "surfaces": history is not None,
         "views": view_rows(run, history),
         "hand_eye": hand_eye_rows(run),
@@ -206,14 +212,18 @@ def run_tiles(run: Run, history: ModelHistory | None) -> list[Tile]:
     return tiles
 
 
-def shown_part(run: Run, history: ModelHistory | None) -> dict[str, Any] | None:
-    """Return what the viewer of a page shows: the part, or the labelled points; None where there is neither."""
-    return _targets(run) if history is None else _part(run, history)
+def shown_part(run: Run, history: ModelHistory | None, shape: PartShape | None = None) -> dict[str, Any] | None:
+    """Return what the viewer of a page shows: the part, or the labelled points; None where there is neither.
+
+    Args:
+        shape: of the part, if it is at hand.
+    """
+    return _targets(run) if history is None else _part(run, history, shape)
 
 
-def _part(run: Run, history: ModelHistory) -> dict[str, Any]:
+def _part(run: Run, history: ModelHistory, shape: PartShape | None) -> dict[str, Any]:
     """Data of the viewer, and its words."""
-    surface = part_surface(run.fused, history.patches)
+    surface = part_surface(run.fused, history.patches, shape)
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
     data = part_data(surface, camera, history, run.session.names, run.session.length_unit)
     return {

@@ -22,7 +22,7 @@ from stitch.cli.options import (
     require_tolerance,
     split_names,
 )
-from stitch.cli.progress import recorder_for, show_activity
+from stitch.cli.progress import live_line, recorder_for, show_activity
 from stitch.cli.terminal import emit, in_full, say, show_block, show_files, show_next
 from stitch.errors import InputError
 
@@ -115,12 +115,16 @@ def run(
         recorders = [recorder_for(folder, recording) for folder in folders]
         runs = run_rig(loaded, model, recorders, named, keep, kept, register or DEFAULT, captures)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
-        _write_runs(runs, folders, scratch, mesh, tolerance)
+        with ThreadPoolExecutor(1) as beside:
+            written = beside.submit(_write_runs, runs, folders, scratch, mesh, tolerance)
+            if not as_json:
+                _show_runs(runs, tolerance)
+            written.result()
     if as_json:
         documents = [result_document(result) for result in runs]
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
-        _show_runs(runs, target, tolerance)
+        _show_written(_run_folders(target, loaded))
 
 
 def _require_known(
@@ -296,12 +300,16 @@ def _write_runs(runs: list[Run], folders: list[Path], scratch: Path, mesh: bool,
         write_model(model_of(runs[0]), scratch / "model.toml")
 
 
-def _show_runs(runs: list[Run], target: Path, tolerance: float | None) -> None:
-    """Print a report for each run, their files, and the next command; clouds of one rig have one hand-eye."""
+def _show_runs(runs: list[Run], tolerance: float | None) -> None:
+    """Print a report for each run; clouds of one rig have one hand-eye."""
+    live_line().stop()
     each = not runs[0].session.has_clouds
     for result in runs:
         show_report(result, tolerance, with_hand_eye=each or result is runs[-1])
-    folders = _run_folders(target, [result.session for result in runs])
+
+
+def _show_written(folders: list[Path]) -> None:
+    """Print the files of the runs, and the next command."""
     for folder in folders if in_full() else ():
         show_files(folder, ("stitched.ply", "mesh.ply", "recording.rrd", "report.html"))
     show_next(f"Next: stitch diagnose {shlex.quote(str(folders[0]))}")

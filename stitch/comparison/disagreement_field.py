@@ -8,6 +8,7 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from threading import Lock
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -246,6 +247,7 @@ class ModelHistory:
 
 # The history of the run that was asked for last: files, page, recording and terminal ask for it one after another.
 _last_history: tuple[weakref.ref[Run], ModelHistory | None] | None = None
+_one_at_a_time = Lock()
 
 
 def model_history(run: Run) -> ModelHistory | None:
@@ -254,9 +256,10 @@ def model_history(run: Run) -> ModelHistory | None:
     Steps whose effects are not known any more are left out.
     """
     global _last_history
-    if _last_history is None or _last_history[0]() is not run:
-        _last_history = weakref.ref(run), _build_history(run)
-    return _last_history[1]
+    with _one_at_a_time:
+        if _last_history is None or _last_history[0]() is not run:
+            _last_history = weakref.ref(run), _build_history(run)
+        return _last_history[1]
 
 
 def _build_history(run: Run) -> ModelHistory | None:

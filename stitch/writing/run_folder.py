@@ -202,14 +202,17 @@ def write_with_page(run: Run, folder: Path, tolerance: float | None = None) -> N
     Args:
         tolerance: within which the views have to agree on the part, length_unit.
     """
-    write_model(model_of(run), folder / "model.toml")
-    write_json(result_document(run), folder / "result.json")
-    write_json(ledger(run), folder / "ledger.json")
-    # The page is drawn while the points are written.
-    with ThreadPoolExecutor(1) as beside:
-        written = beside.submit(_write_points, run, folder)
-        call_entry_points("stitch.reports", run, folder / "report.html", tolerance)
-        written.result()
+    # The page, which takes longest, is made while all else is written.
+    with ThreadPoolExecutor(2) as beside:
+        begun = [
+            beside.submit(call_entry_points, "stitch.reports", run, folder / "report.html", tolerance),
+            beside.submit(_write_points, run, folder),
+        ]
+        write_model(model_of(run), folder / "model.toml")
+        write_json(result_document(run), folder / "result.json")
+        write_json(ledger(run), folder / "ledger.json")
+        for written in begun:
+            written.result()
 
 
 def _write_points(run: Run, folder: Path) -> None:
