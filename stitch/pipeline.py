@@ -267,7 +267,8 @@ def suggest(state: Run, at_most: int) -> tuple[Run | None, list[str], Diagnosis]
     The run is None where nothing is named. What was found together is added together, and what does not hold its place
     beside the rest goes again. An effect stays if it lowers the error on views left out beyond its uncertainty
     (`CrossValidation.fit_rejection_reason`); one that was dropped in this run is not tried again. What is less likely
-    than nothing being missing is not added. What was in the model before stays.
+    than nothing being missing is not added. What was in the model before stays; what was added gives way to other
+    effects that together do better.
     """
     lines, given, left = list[str](), set(state.model.effects), at_most
     result: Run | None = None
@@ -292,6 +293,9 @@ def suggest(state: Run, at_most: int) -> tuple[Run | None, list[str], Diagnosis]
         if not set(result.effects) - set(state.effects):
             return before, lines, replace(found, tried=result.tried)
         left -= min(len(set(result.effects) - set(state.effects)), left)
+        if set(state.effects) - given:
+            result, told = _exchange_added(result, given)
+            lines += told
         state = result
         # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
         del found
@@ -323,6 +327,26 @@ def _add_found(state: Run, found: Diagnosis, at_most: int, given: set[str]) -> t
         # Together they do not earn their place: the one that is named is asked alone.
         names = names[:1]
     return state, []
+
+
+def _exchange_added(state: Run, given: set[str]) -> tuple[Run, list[str]]:
+    """Return the run with others in place of effects that were added in several rounds, where these do better, and
+    what happened: what was found first may hold the parameters of what would have come later.
+
+    Of labelled points alone, as where effects are dropped.
+    """
+    from stitch.diagnosis.stepwise_selection import find_better_effects
+    from stitch.diagnosis.thresholds import HELDOUT_FALL
+
+    added = [name for name in state.effects if name not in given]
+    names = [] if state.session.has_clouds else find_better_effects(state, added)
+    if not names:
+        return state, []
+    tried = change(state, [*(name for name in state.effects if name in given), *names])
+    if tried.heldout_rms >= HELDOUT_FALL * state.heldout_or_fit_rms:
+        return state, []
+    gone = " and ".join(name for name in added if name not in names)
+    return tried, [f"{' and '.join(names)} do better together: views left out are predicted better without {gone}."]
 
 
 def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:

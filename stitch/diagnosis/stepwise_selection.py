@@ -4,7 +4,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from stitch.diagnosis.candidates import Candidate, candidate_as_fitted
+from stitch.diagnosis.candidates import Candidate, candidate_as_fitted, candidates_of
+from stitch.diagnosis.exchanged_sets import exchanged_set, is_better_set
 from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, conditioned_without, is_certain, rank, rank_one
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import promising, score
@@ -117,6 +118,7 @@ class ForwardSelection:
     effects: tuple[Ranked, ...]
     explained: float  # log posterior of what was found one by one
     refused: dict[str, str]  # effects that explain much and are not among them, and why
+    gone: frozenset[str]  # those of them that gave way to one that is likelier to hold beyond
 
 
 def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> ForwardSelection:
@@ -124,13 +126,51 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
 
     One effect alone may explain more than each of two that are there, because it imitates a part of both. So
     effects are added one by one as long as one can be named beside those before; then each must hold its
-    place beside all the others. Of those that err beyond the measured poses the one that errs most is left out, and
-    the search goes on: what it imitated others may explain. At last one that errs at some end gives way to another that
-    does the same and is likelier to hold beyond.
+    place beside all the others. What was found first may still stand in the way of others that together do more: they
+    take its place where they also predict views left out better (`exchanged_set`).
     """
-    every, gone = [c for c in candidates if not c.empirical], set[str]()
-    candidates, unseen = every, set[str]()
-    chosen, refused = _add_effects(linear, candidates, [best]), dict[str, str]()
+    every = [c for c in candidates if not c.empirical]
+    found = _hold_beside_each_other(linear, every, _add_effects(linear, every, [best]))
+    while (other := _better_selection(linear, every, found)) is not None:
+        found = other
+    return found
+
+
+def find_better_effects(state: Run, added: Collection[str]) -> list[str]:
+    """Effects that together do better than those that were added to a model, some of which they do without; else none.
+
+    Args:
+        added: effects of the model that may go.
+    """
+    terms = [term for term in state.model.terms if term.name not in added]
+    linear = linearise(state.session, state.measurement, state.model.with_terms(terms), state.gate)
+    every = [c for c in candidates_of(linear, empirical=False)[0] if c.name not in state.tried]
+    chosen = tuple(rank_one(linear, c, len(every)) for c in every if c.name in added)
+    found = _better_selection(linear, every, ForwardSelection(chosen, 0.0, {}, frozenset()))
+    return [] if found is None else [r.name for r in found.effects]
+
+
+def _better_selection(
+    linear: LinearModel, every: Sequence[Candidate], found: ForwardSelection
+) -> ForwardSelection | None:
+    """Other effects that hold their place, and together do better; None where there are none."""
+    instead = exchanged_set(linear, [c for c in every if c.name not in found.gone], found.effects)
+    if not instead:
+        return None
+    other = _hold_beside_each_other(linear, every, [rank_one(linear, c, len(every)) for c in instead])
+    return other if is_better_set(linear, other.effects, found.effects) else None
+
+
+def _hold_beside_each_other(
+    linear: LinearModel, every: Sequence[Candidate], chosen: Sequence[Ranked]
+) -> ForwardSelection:
+    """Effects of those chosen that hold their place, with others that then can be named.
+
+    Of those that err beyond the measured poses the one that errs most is left out, and the search goes on: what it
+    imitated others may explain. At last one that errs at some end gives way to another that does the same and is
+    likelier to hold beyond.
+    """
+    candidates, gone, unseen, refused = list(every), set[str](), set[str](), dict[str, str]()
     explained = sum(r.log_posterior for r in chosen)
     while True:
         chosen, beyond = _eliminate_backward(linear, chosen, len(candidates))
@@ -148,7 +188,8 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
         else:
             if len(unseen) > 1:
                 refused |= dict.fromkeys(unseen, untested_ends_reason(sorted(unseen)))
-            return ForwardSelection(tuple(sorted(chosen, key=lambda r: -r.log_posterior)), explained, refused)
+            likeliest_first = tuple(sorted(chosen, key=lambda r: -r.log_posterior))
+            return ForwardSelection(likeliest_first, explained, refused, frozenset(gone))
         candidates = [c for c in candidates if c.name != name]
         chosen = _add_effects(linear, candidates, [*(r for r in chosen if r.name != name), *instead])
 

@@ -110,7 +110,7 @@ def select_supported(
 
     every = list(range(len(groups)))
     # Two joints may explain together what neither does alone: adding one by one never meets them, leaving out does.
-    ways = (_backward_elimination(gain, _forward_selection(gain, every)), _backward_elimination(gain, every))
+    ways = (eliminate_backward(gain, select_forward(gain, every)), eliminate_backward(gain, every))
     chosen = max(ways, key=gain)
     seen = np.linalg.norm(G, axis=0) >= 1 / UNSEEN
     for effect in dict.fromkeys(effects):
@@ -172,10 +172,12 @@ def _marginal_information(whitened: WhitenedData, sizes: Array, fitted: Mask) ->
     return told, pull
 
 
-def _forward_selection(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:
-    """From nothing: the group that gains most is added until none gains enough."""
-    chosen: list[int] = []
-    while left := [k for k in groups if k not in chosen]:
+def select_forward(
+    gain: Callable[[Sequence[int]], float], groups: Sequence[int], begin: Sequence[int] = (), most: int | None = None
+) -> list[int]:
+    """From nothing, or from some: the group that gains most is added until none gains enough."""
+    chosen = list(begin)
+    while (left := [k for k in groups if k not in chosen]) and (most is None or len(chosen) < most):
         best = max(left, key=lambda k: gain([*chosen, k]))
         if gain([*chosen, best]) - gain(chosen) < _LOG_BAYES_FACTOR:
             break
@@ -183,7 +185,7 @@ def _forward_selection(gain: Callable[[Sequence[int]], float], groups: Sequence[
     return chosen
 
 
-def _backward_elimination(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:
+def eliminate_backward(gain: Callable[[Sequence[int]], float], groups: Sequence[int]) -> list[int]:
     """The group that is missed least is left out until all that remain gain enough beside each other."""
     chosen = list(groups)
     while chosen:
