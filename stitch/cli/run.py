@@ -25,6 +25,7 @@ from stitch.cli.options import (
 from stitch.cli.progress import live_line, recorder_for, show_activity
 from stitch.cli.terminal import emit, in_full, say, show_block, show_files, show_next
 from stitch.errors import InputError
+from stitch.system.process import end_at_once
 
 if TYPE_CHECKING:
     from stitch.api.live import LiveSession
@@ -125,6 +126,7 @@ def run(
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
         _show_written(_run_folders(target, loaded))
+    end_at_once()
 
 
 def _require_known(

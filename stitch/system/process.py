@@ -72,6 +72,7 @@ _GRACE = 3.0  # seconds from the interruption to the end of the process
 _STEP = 0.25
 _running: dict[int, _Call] = {}  # by thread
 _ends_process = False
+_ends_at_once = False
 _watch: threading.Thread | None = None
 
 
@@ -86,6 +87,17 @@ def may_end_process() -> None:
     """A call that cannot be interrupted ends the process: right for a command, not for a program that uses stitch."""
     global _ends_process
     _ends_process = True
+
+
+def end_at_once() -> None:
+    """A command that has written and closed all its files: the process may end without giving its memory back."""
+    global _ends_at_once
+    _ends_at_once = True
+
+
+def ends_at_once() -> bool:
+    """True after a command has said so."""
+    return _ends_at_once
 
 
 def running_over() -> bool:
