@@ -69,7 +69,7 @@ def place_errors(run: Run) -> PlaceErrors:
     if not run.measurement.capture.scans or run.registered is None:
         raise InputError(f"{run.session.name}: has no clouds, so no surface; to fix: name a run of scans")
     with library_threads_off():
-        chain = _error_chain(run)
+        chain = error_chain(run)
         terms = [term for term in run.terms if moves_points([term])]
         return PlaceErrors(
             measurement=run.measurement,
@@ -83,7 +83,7 @@ def place_errors(run: Run) -> PlaceErrors:
 
 
 @dataclass(frozen=True)
-class _ErrorChain:
+class ErrorChain:
     """The linear maps of the module's head; twists (6V,) about the centre of `freed`, F fitted parameters."""
 
     capture: Capture
@@ -111,7 +111,8 @@ class _ErrorChain:
         return np.asarray(self.to_views @ x), x
 
 
-def _error_chain(run: Run) -> _ErrorChain:
+def error_chain(run: Run) -> ErrorChain:
+    """Return the linear maps by which errors reach the registered views of a run."""
     measurement, model = run.measurement, run.model
     own = corrected_capture(measurement, model)
     freed = unconstrained_poses(own, own.poses(model.T_mount), run.gate)
@@ -128,7 +129,7 @@ def _error_chain(run: Run) -> _ErrorChain:
         [hand_eye_jacobian(found.parts[0].hand_eye_frames, g.centre), columns[:, fitted] * ~of_points[fitted]]
     )
     by_points = np.column_stack([np.zeros((len(columns), 6)), columns[:, fitted] * of_points[fitted]])
-    return _ErrorChain(
+    return ErrorChain(
         capture=own,
         freed=freed,
         solution=found,
@@ -162,7 +163,7 @@ def _follow_overlaps(run: Run, own: Capture, found: HandEyeSolution, centre: Arr
 _Modes = tuple[str, tuple[Array, Array], float, int | None]
 
 
-def _sources(run: Run, chain: _ErrorChain) -> Iterator[ErrorSource]:
+def _sources(run: Run, chain: ErrorChain) -> Iterator[ErrorSource]:
     twists, sizes, degrees = _smooth_errors(run, chain)
     smooth = [
         (SCANNER, chain.of_overlaps(twists[:, [k]] * size), known, k)
@@ -176,7 +177,7 @@ def _sources(run: Run, chain: _ErrorChain) -> Iterator[ErrorSource]:
         yield ErrorSource(name, views, parameters[chain.of_points], field, known)
 
 
-def _smooth_errors(run: Run, chain: _ErrorChain) -> tuple[Array, Array, Array]:
+def _smooth_errors(run: Run, chain: ErrorChain) -> tuple[Array, Array, Array]:
     """Twists (6V, K) that the overlaps show for unit smooth errors, their sizes (K,), and degrees of freedom (K,).
 
     Sizes are those that the covariance of the hand-eye counts. One whose logarithm is known to s has ½/s² degrees of
@@ -193,7 +194,7 @@ def _smooth_errors(run: Run, chain: _ErrorChain) -> tuple[Array, Array, Array]:
     return twists, (noise * shares)[of_mode], (0.5 / spread**2)[of_mode]
 
 
-def _pose_modes(run: Run, chain: _ErrorChain) -> Iterator[_Modes]:
+def _pose_modes(run: Run, chain: ErrorChain) -> Iterator[_Modes]:
     """Errors of the poses and the noise of the overlaps, as large as the views show them."""
     found, g = chain.solution, chain.freed.overlaps.gram
     errors = prior_pose_errors([run.measurement], run.model, [g.centre]).repeating_only()
@@ -213,7 +214,7 @@ def _pose_modes(run: Run, chain: _ErrorChain) -> Iterator[_Modes]:
         yield names.get(name, ARM), chain.of_poses(sigma[k] * _root(component)), float(known[k]), None
 
 
-def _model_modes(run: Run, chain: _ErrorChain) -> Iterator[_Modes]:
+def _model_modes(run: Run, chain: ErrorChain) -> Iterator[_Modes]:
     """Errors of a model that other views fitted, or of what these did not show."""
     kept = chain.columns @ kept_root(run.terms, run.model.effects_covariance)
     if kept.any():
