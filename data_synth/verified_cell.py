@@ -21,19 +21,20 @@ U_PLATE, U_CMM = 0.002, 0.004
 _TOUCHED = ((-60.0, 0.0), (60.0, 30.0), (0.0, -60.0), (50.0, -50.0), (-30.0, 65.0))
 
 
-def plate_scene() -> Scene:
-    """The scene of the sphere plate without labelled points."""
+def plate_scene(rays: int | None = None) -> Scene:
+    """The scene of the sphere plate without labelled points, with as many rays a row and column if stated."""
     scene = load_scene("spheres")
     part = replace(scene.part, labelled=False, parameters={"radius": PLATE.radius})
-    return replace(scene, part=part)
+    scanner = scene.scanner if rays is None else replace(scene.scanner, columns=rays, rows=rays)
+    return replace(scene, part=part, scanner=scanner)
 
 
-def write_verified_cell(folder: Path, seed: int) -> dict[str, Path]:
+def write_verified_cell(folder: Path, seed: int, views: int | None = None, rays: int | None = None) -> dict[str, Path]:
     """Write a session to fit on and, of another day, one of the artefact with artefact.toml; return their folders."""
-    scene = plate_scene()
+    scene = plate_scene(rays)
     out = {}
     for day, name in enumerate(("part", "artefact")):
-        measured = simulate(scene, {}, seed, day=day)
+        measured = simulate(scene, {}, seed, views, day=day)
         out[name] = folder / name
         write_session(out[name], measured, name)
         write_truth(folder / f"{name}.truth.json", measured, seed)

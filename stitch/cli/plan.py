@@ -34,7 +34,11 @@ _Split = Annotated[
 _Halve = Annotated[bool, typer.Option("--halve", help="Views that halve the hand-eye's uncertainty.")]
 _Feature = Annotated[
     str | None,
-    typer.Option("--for", metavar="FEATURE", help="Where U counts: x,y,z in the frame of the stitched cloud."),
+    typer.Option(
+        "--for",
+        metavar="FEATURE",
+        help="Where U counts: x,y,z in the stitched cloud's frame, or a feature measured in RUN.",
+    ),
 ]
 _Part = Annotated[
     Path | None, typer.Option("--part", metavar="MESH", help="The part: a mesh, or a cloud with normals.")
@@ -81,7 +85,7 @@ def plan_views(
     from stitch.writing.session_files import whole_folder, write_table
 
     _require_plan_options(views, size, field, output)
-    wanted = _plan_request(views, split, halve, feature)
+    wanted = _plan_request(views, split, halve, _place_of(folder, feature))
     stated = {"part": part, "size": size, "field": field, "start": start}
     with show_activity("planning: reading the cell"):
         session, planned = (
@@ -112,6 +116,15 @@ def _require_plan_options(views: int | None, size: float | None, field: float | 
         raise InputError(f"--field {field:g}: to fix: give the full angle in degrees, between 0 and 150")
     if output is not None and output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise InputError(f"{output}: there is such a folder; to fix: name another, or move it away")
+
+
+def _place_of(folder: Path, feature: str | None) -> str | None:
+    """Return the place of a feature that `stitch measure` found in a run, as x,y,z; numbers as they are."""
+    from stitch.reading.text_files import read_json_object
+
+    numbers = read_json_object(folder / "features.json").get("numbers", [])
+    places = {n["feature"]: n["at"] for n in numbers if n.get("at")}
+    return feature if feature not in places else ",".join(map(str, places[feature]))
 
 
 def _plan_request(views: int | None, split: tuple[str, str] | None, halve: bool, feature: str | None) -> PlanRequest:

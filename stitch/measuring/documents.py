@@ -32,6 +32,7 @@ def _number(n: Number, ratio: float | None) -> dict[str, Any]:
     return {
         "feature": n.feature.name,
         "kind": n.feature.kind,
+        "at": None if n.feature.kind == "distance" else n.feature.at.tolist(),
         "quantity": n.quantity,
         "unit": n.unit,
         "value": n.value,
