@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.labelled_arm import flange, joints_of, labelled_cell
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.laws.brackets import GEOMETRY, end_twist
 from stitch import frames
@@ -15,6 +16,7 @@ from stitch.diagnosis.ranking import is_certain, rank_all
 from stitch.diagnosis.thresholds import ODDS
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need
+from stitch.effects.user_file import load
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.model.forward import perturbed_frames
@@ -93,3 +95,42 @@ def test_a_bracket_of_nature_is_told_from_an_arm_that_errs():
     first, second, *_ = rank_all(linear, asked)[0]
     assert first.name == "mount_droop" and is_certain(first)
     assert first.log_posterior > second.log_posterior + ODDS
+
+
+@pytest.mark.parametrize(("mount", "effect"), [("eye_in_hand", "mount_droop"), ("eye_to_hand", "fixture_droop")])
+def test_labelled_points_show_how_far_a_bracket_tilts(mount, effect):
+    lever, sideways = np.array([2e-4, -3e-4, 4e-4]), 0.15
+    joints = joints_of(np.random.default_rng(5), 30)
+    turned = np.array([flange(q)[:3, :3].T @ [0, 0, -1.0] for q in joints]) - [0, 0, 1.0]
+    moved = np.hstack([np.cross(lever, turned), sideways * turned * [1, 1, 0]])
+    session, T_mount, _ = labelled_cell(5, 30, mount, errors=(np.zeros((30, 6)), moved))
+    found = run(session, effects=[effect])
+    fitted = {p.name: p for p in found.terms[0].parameters}
+    true = dict(zip(("s", "wx", "wy", "wz"), [sideways, *lever], strict=True))
+    for name, value in true.items():
+        assert abs(fitted[name].value - value) < 4 * fitted[name].sigma < 1.2 * abs(value)
+    error = frames.log(frames.inverse(found.T_mount) @ T_mount)
+    assert error @ np.linalg.solve(found.mount_covariance, error) < 22.5  # 99.9 % of χ²(6)
+
+
+def test_a_users_effect_of_the_mount_knows_gravity_and_the_flanges_pose(tmp_path, still_cells):
+    (tmp_path / "own.py").write_text(
+        "import numpy as np\n"
+        "from stitch.effects import effect, twist\n\n"
+        '@effect("mount", needs=["gravity_at_mount"], xi=twist("", 3e-4, 0.1))\n'
+        "def rubber_mount(views, xi):\n"
+        '    """M·exp(ξ·g_y³)"""\n'
+        "    gravity = np.array([T[:3, :3].T @ [0, 0, -1.0] for T in views.T_base_flange])\n"
+        "    assert np.allclose(gravity, views.gravity_at_mount)\n"
+        "    return views.at_scanner(np.outer(gravity[:, 1] ** 3, xi))\n"
+    )
+    xi, T = np.array([1e-4, 0, 2e-4, 0.1, 0, 0]), still_cells["eye_in_hand"].T_mount
+    (name,) = load(tmp_path / "own.py")
+    try:
+        measurement = chain_for(still_cells["eye_in_hand"])
+        left, right = perturbed_frames(measurement, [term_of(measurement, EFFECTS[name]).at(xi)])
+    finally:
+        del EFFECTS[name]
+    for v, T_base_flange in enumerate(measurement.T_base_flange):
+        bent = frames.exp(xi * (T_base_flange[:3, :3].T @ [0, 0, -1.0])[1] ** 3)
+        np.testing.assert_allclose(left[v] @ T @ right[v], T_base_flange @ bent @ T, atol=1e-9)
