@@ -245,7 +245,7 @@ def _number(length: float, unit: str) -> str:
 def _log_rms(rec: rr.RecordingStream, run: Run, moments: Sequence[Moment]) -> None:
     """The rms of each kind of moment, and that of every view, as series."""
     by_stage = {stage: [(i, m.rms) for i, m in enumerate(moments) if m.stage == stage] for stage in _stages(moments)}
-    of_views = {"single view": list(enumerate(run.view_rms.tolist()))}
+    of_views = {"view": list(enumerate(run.view_rms.tolist()))}
     for timeline, every in (("iteration", by_stage), ("view", of_views)):
         for name, series in every.items():
             known = np.array([(at, rms) for at, rms in series if rms > 0])

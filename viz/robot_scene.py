@@ -121,10 +121,9 @@ def _log_reached(recording: rr.RecordingStream, arm: Array, names: list[str]) ->
     """Where each view has the arm (V, P, 3), or its flange alone, on the timeline `view`."""
     for v in even_indices(len(names), _VIEWS):
         recording.set_time("view", sequence=v)
-        shown = rr.LineStrips3D([arm[v]], colors=[_SCANNER], radii=_THICK, labels=[names[v]], show_labels=True)
-        if arm.shape[1] == 1:
-            shown = rr.Points3D(arm[v], colors=[_SCANNER], radii=_DOT, labels=[names[v]], show_labels=True)
-        recording.log("robot/reached", shown)
+        recording.log("robot/reached", rr.LineStrips3D([arm[v]], colors=[_SCANNER], radii=_THICK))
+        end = rr.Points3D(arm[v, -1:], colors=[_SCANNER], radii=_DOT, labels=[names[v]], show_labels=True)
+        recording.log("robot/reached/flange", end)
     recording.reset_time()
 
 
