@@ -9,6 +9,7 @@ from collections.abc import Iterator, MutableMapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -78,11 +79,31 @@ def _load_command(entry: EntryPoint) -> Any:
     found = entry.load()
     if not isinstance(found, typer.Typer):
         alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-        alone.command(entry.name)(stdout_for_results(found) if entry.value in _OWN_COMMANDS.values() else found)
+        alone.command(entry.name, cls=Command)(
+            stdout_for_results(found) if entry.value in _OWN_COMMANDS.values() else found
+        )
         found = alone
     command = typer.main.get_command(found)
     command.name = entry.name
     return command
+
+
+class Command(TyperCommand):
+    """A command of which an option with brackets about its values, as --mesh [watertight|light], may stand alone."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:
+        """Give an option that stands alone the value `open`: what follows it is not its own."""
+        values = {
+            name: tuple(told[1:-1].split("|"))
+            for option in self.params
+            if (told := option.metavar or "").startswith("[") and option.param_type_name == "option"
+            for name in option.opts
+        }
+        return super().parse_args(ctx, [_with_value(arg, after, values) for arg, after in pairwise([*args, ""])])
+
+
+def _with_value(argument: str, after: str, values: dict[str, tuple[str, ...]]) -> str:
+    return f"{argument}=open" if after not in values.get(argument, (after,)) else argument
 
 
 class CommandGroup(TyperGroup):

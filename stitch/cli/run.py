@@ -56,7 +56,14 @@ _Register = Annotated[
     typer.Option("--register", metavar="METHOD", help="How single views are registered: dpwvm (usual) or gicp."),
 ]
 _Recording = Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")]
-_Mesh = Annotated[bool, typer.Option("--mesh", help="Also write mesh.ply.")]
+_Mesh = Annotated[
+    str | None,
+    typer.Option(
+        "--mesh",
+        metavar="[watertight|light]",
+        help="Also write mesh.ply: open where nobody looked, closed (watertight), or a tenth of it (light).",
+    ),
+]
 _Follow = Annotated[bool, typer.Option("--follow", help="Judge each view as it arrives in the folder, then run.")]
 _Views = Annotated[int | None, typer.Option("--views", min=1, help="With --follow: run after so many views.")]
 
@@ -73,7 +80,7 @@ def run(
     keep: _Keep = False,
     register: _Register = None,
     recording: _Recording = True,
-    mesh: _Mesh = False,
+    mesh: _Mesh = None,
     follow: _Follow = False,
     views: _Views = None,
     tolerance: Tolerance = None,
@@ -89,10 +96,12 @@ def run(
       stitch run blade-17 -o found --effects joint_offset,backlash
       stitch run monday tuesday -o both
       stitch run blade-18 --hand-eye found --mesh
+      stitch run blade-18 --mesh watertight
       stitch run other-scanner --arm found
       stitch run fuselage --memory 4GB
       stitch run blade-19 --follow
     """
+    _require_mesh_kind(mesh)
     named = [name for name in split_names(effects) if name]
     _require_known(tolerance, named, effects_file, register)
     paths = sessions or [_current_session()]
@@ -120,12 +129,12 @@ def run(
             written = beside.submit(_write_runs, runs, folders, scratch, mesh, tolerance)
             if not as_json:
                 _show_runs(runs, tolerance)
-            written.result()
+            fits = written.result()
     if as_json:
         documents = [result_document(result) for result in runs]
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
-        _show_written(_run_folders(target, loaded))
+        _show_written(_run_folders(target, loaded), fits)
     end_at_once()
 
 
@@ -157,6 +166,19 @@ def _begin_to_prepare(sessions: list[Session]) -> list[Future[Capture]]:
     captures = [beside.submit(prepare_capture, session) for session in sessions]
     beside.shutdown(wait=False)
     return captures
+
+
+def _require_mesh_kind(kind: str | None) -> None:
+    """Refuse a kind of mesh that is not known, and before the work begins one for which Open3D is missing."""
+    if kind is None:
+        return
+    from stitch.system.open3d_library import import_open3d
+    from stitch.writing.mesh import KINDS, OPEN
+
+    if kind not in KINDS:
+        raise InputError(f"--mesh {kind}: to fix: --mesh alone, or one of {', '.join(KINDS)}")
+    if kind != OPEN:
+        import_open3d(f"--mesh {kind}")
 
 
 def _follow(sessions: list[Path], follow: bool, views: int | None) -> None:
@@ -287,19 +309,28 @@ def _run_folders(target: Path, sessions: list[Session]) -> list[Path]:
     return [target] if len(sessions) == 1 else [target / session.name for session in sessions]
 
 
-def _write_runs(runs: list[Run], folders: list[Path], scratch: Path, mesh: bool, tolerance: float | None) -> None:
+def _write_runs(
+    runs: list[Run], folders: list[Path], scratch: Path, mesh: str | None, tolerance: float | None
+) -> list[str]:
+    """Write what was found, and return how each mesh lies to its cloud, in words."""
     from stitch.model.model_toml import write_model
-    from stitch.writing.mesh import write_mesh
     from stitch.writing.result_document import model_of
     from stitch.writing.run_folder import write_with_page
 
+    fits = []
     for result, folder in zip(runs, folders, strict=True):
         folder.mkdir(exist_ok=True)
         write_with_page(result, folder, tolerance)
         if mesh:
-            write_mesh(result.fused, folder / "mesh.ply")
+            from stitch.writing.mesh import write_mesh
+            from stitch.writing.open3d_mesh import make_mesh
+
+            surface, fit = make_mesh(result.fused, mesh)
+            write_mesh(surface, folder / "mesh.ply")
+            fits.append(fit.sentence(result.session.length_unit))
     if len(runs) > 1:
         write_model(model_of(runs[0]), scratch / "model.toml")
+    return fits
 
 
 def _show_runs(runs: list[Run], tolerance: float | None) -> None:
@@ -310,8 +341,10 @@ def _show_runs(runs: list[Run], tolerance: float | None) -> None:
         show_report(result, tolerance, with_hand_eye=each or result is runs[-1])
 
 
-def _show_written(folders: list[Path]) -> None:
-    """Print the files of the runs, and the next command."""
+def _show_written(folders: list[Path], fits: list[str]) -> None:
+    """Print how the meshes lie to their clouds, the files of the runs, and the next command."""
+    for fit in fits:
+        say(fit)
     for folder in folders if in_full() else ():
         show_files(folder, ("stitched.ply", "mesh.ply", "recording.rrd", "report.html"))
     show_next(f"Next: stitch diagnose {shlex.quote(str(folders[0]))}")

@@ -11,7 +11,6 @@ from pykdtree.kdtree import KDTree
 
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
-from stitch.runs.run import FusedCloud
 from stitch.system.threads import parallel
 
 # A cell's edge is one spacing of the points: finer, and cells on the surface have no point beside them; coarser, and
@@ -24,7 +23,9 @@ _REACH = 2.5
 # The mesh reaches at most so many cells beyond the last points.
 _OVERHANG = 2.0
 _BLOCK = 20_000
-_NO_SURFACE = "no mesh: the fused points span no surface; run without --mesh"
+# Ends where the points do; closed; with a tenth of the triangles. Open3D makes the latter two.
+OPEN, WATERTIGHT, LIGHT = KINDS = ("open", "watertight", "light")
+NO_SURFACE = "no mesh: the fused points span no surface; run without --mesh"
 # In the order in which libigl counts the corners of a cell.
 _CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
 
@@ -37,13 +38,8 @@ class TriangleMesh:
     triangles: Indices  # (T, 3)
 
 
-def write_mesh(cloud: FusedCloud, path: Path) -> None:
-    """Write the mesh of the fused points as binary PLY; reference frame, length_unit.
-
-    Raises:
-        NoResultError: the points span no surface.
-    """
-    mesh = mesh_of(cloud.points, cloud.normals)
+def write_mesh(mesh: TriangleMesh, path: Path) -> None:
+    """Write a mesh as binary PLY."""
     vertices = np.empty(len(mesh.vertices), [(axis, "<f8") for axis in "xyz"])
     for axis, column in zip("xyz", mesh.vertices.T, strict=True):
         vertices[axis] = column
@@ -63,9 +59,9 @@ def mesh_of(points: Array, normals: Array) -> TriangleMesh:
         NoResultError: the points span no surface.
     """
     if len(points) < _NEIGHBOURS:
-        raise NoResultError(_NO_SURFACE)
+        raise NoResultError(NO_SURFACE)
     tree = KDTree(np.ascontiguousarray(points, float))
-    size = max(_spacing(points, tree), _CELL_SHARE * float(np.ptp(points, axis=0).max()))
+    size = max(spacing(points, tree), _CELL_SHARE * float(np.ptp(points, axis=0).max()))
     places, cells = _cells_about(points, size)
     heights, nearest = _heights(places, points, normals, tree, size)
     cells = cells[(nearest < _REACH * size)[cells].all(axis=1)]
@@ -74,13 +70,13 @@ def mesh_of(points: Array, normals: Array) -> TriangleMesh:
     gap, _ = tree.query(vertices, k=1)
     triangles = triangles[(gap < _OVERHANG * size)[triangles].all(axis=1)]
     if not len(triangles):
-        raise NoResultError(_NO_SURFACE)
+        raise NoResultError(NO_SURFACE)
     kept, triangles = np.unique(triangles, return_inverse=True)
     return TriangleMesh(vertices[kept], triangles.reshape(-1, 3))
 
 
-def _spacing(points: Array, tree: Any) -> float:
-    """Edge of the square that one point has for itself: the disc to the 8th neighbour holds 8 of them."""
+def spacing(points: Array, tree: Any) -> float:
+    """Return the edge of the square that one point has for itself: the disc to the 8th neighbour holds 8 of them."""
     distance, _ = tree.query(points[:: max(1, len(points) // _BLOCK)], k=9)
     return float(np.median(distance[:, -1]) * np.sqrt(np.pi / 8))
 

@@ -2,10 +2,12 @@
 
 import json
 import re
+import sys
 
 import pytest
+import typer
 
-from stitch.cli.main import main
+from stitch.cli.main import build, main
 
 
 def test_check_reads_all_and_reports_each(session, capsys):
@@ -68,3 +70,33 @@ def test_memory_that_is_no_size_or_too_little_is_refused(session, tmp_path, caps
     assert ended.value.code == 2
     assert re.search(said, capsys.readouterr().err)
     assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "sessions", "kind"),
+    [
+        ("--mesh blade-17", ["blade-17"], "open"),
+        ("blade-17 --mesh", ["blade-17"], "open"),
+        ("--mesh watertight blade-17", ["blade-17"], "watertight"),
+        ("blade-17 --mesh light --json", ["blade-17"], "light"),
+        ("blade-17 --mesh=light", ["blade-17"], "light"),
+        ("watertight", ["watertight"], None),
+    ],
+)
+def test_a_mesh_may_be_of_a_kind_and_takes_no_session_for_one(words, sessions, kind):
+    command = typer.main.get_command(build()).commands["run"]
+    context = command.make_context("run", words.split())
+    assert [str(path) for path in context.params["sessions"]] == sessions and context.params["mesh"] == kind
+
+
+def test_a_mesh_for_which_open3d_is_missing_is_refused_before_the_work(session, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("stitch.pipeline.run_rig", lambda *_: pytest.fail("computed first"))
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(session), "-o", str(tmp_path / "run"), "--mesh", "watertight"])
+    assert ended.value.code == 2
+    assert "stitch: --mesh watertight: Open3D is not installed; to fix: pip install open3d" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(session), "-o", str(tmp_path / "run"), "--mesh=smooth"])
+    assert ended.value.code == 2 and "--mesh smooth: to fix" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -5,7 +5,6 @@ import pytest
 import trimesh
 
 from stitch.errors import NoResultError
-from stitch.runs.run import FusedCloud
 from stitch.writing.mesh import mesh_of, write_mesh
 
 RADIUS = 50.0
@@ -63,8 +62,9 @@ def test_both_sides_of_a_sheet_two_spacings_thick():
 
 def test_the_file_holds_the_mesh(tmp_path):
     n = ball(3000)
-    write_mesh(FusedCloud(RADIUS * n, n, np.zeros(3000), np.ones(3000, int)), tmp_path / "mesh.ply")
-    read, mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False), mesh_of(RADIUS * n, n)
+    mesh = mesh_of(RADIUS * n, n)
+    write_mesh(mesh, tmp_path / "mesh.ply")
+    read = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
     assert np.array_equal(read.vertices, mesh.vertices) and np.array_equal(read.faces, mesh.triangles)
 
 
