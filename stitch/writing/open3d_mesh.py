@@ -134,7 +134,8 @@ def _rim(triangles: Indices) -> Indices:
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     count = int(triangles.max(initial=0)) + 1
     there, back = edges @ [count, 1], edges[:, ::-1] @ [count, 1]
-    return edges[~np.isin(there, back)]
+    rim: Indices = edges[~np.isin(there, back)]
+    return rim
 
 
 def _without_pinches(triangles: Indices) -> Indices:
