@@ -308,6 +308,8 @@ class PoseErrors:
     joint_processes: dict[str, SmoothErrors] = field(default_factory=dict)
     # (2,) variances, rad² and length_unit², by which a unit of joint scatter turns and moves the flange along an axis.
     flange_per_joint: Array = field(default_factory=lambda: np.zeros(2))
+    # σ that white scatter of the flange usually has, rad and length_unit; None: not known.
+    scatter: tuple[float, float] | None = None
 
     @property
     def arm_components(self) -> Mask:
@@ -317,9 +319,8 @@ class PoseErrors:
     @property
     def prior(self) -> FurtherPrior:
         """What is believed of their sizes; every arm scatters by its joints, all else may be absent."""
-        return FurtherPrior(
-            self.scales, np.where(self._independent, ALWAYS_PRESENT, MAY_BE_ABSENT), self.arm_components
-        )
+        shapes = np.where(self._independent, ALWAYS_PRESENT, MAY_BE_ABSENT)
+        return FurtherPrior(self.scales, shapes, self.arm_components, self.scatter)
 
     @property
     def _independent(self) -> Mask:
@@ -417,4 +418,5 @@ def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres
         found |= {name: (process_covariance(half, same.astype(float)), 1.0) for name, half in halves.items()}
     components = np.array([c for c, _ in found.values()])
     scales = np.array([s for _, s in found.values()])
-    return PoseErrors(tuple(found), components, scales, members, of_one_joint, by_joints)
+    rotation, translation = usual_twist(measurements[0].length_unit)[[0, 3]].tolist()
+    return PoseErrors(tuple(found), components, scales, members, of_one_joint, by_joints, (rotation, translation))

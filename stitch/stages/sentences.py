@@ -47,6 +47,8 @@ def unfitted(effect: str) -> str:
 _NEAR_FLOOR = 1.1
 # Sigmas that were widened by more than this factor on the variance are worth a note.
 _WIDENED = 2.5
+# Of fewer degrees of freedom what is usual for arms counts as much as what the views show: seven views leave 30.
+_FEW_DEGREES = 30
 _LISTED = 12
 
 
@@ -131,6 +133,11 @@ def warnings(start: CoarseHandEye, found: HandEyeFit) -> tuple[str, ...]:
         notes.append(
             f"Two different hand-eyes fit almost equally well (ratio {start.runner_up_ratio:.2f}); to fix: "
             "state scanner.pose in session.toml, or add views with other orientations."
+        )
+    if found.degrees is not None and found.degrees < _FEW_DEGREES:
+        notes.append(
+            f"U of the hand-eye rests on {found.degrees} degrees of freedom, and on how much arms usually err; to fix: "
+            "add views."
         )
     if found.inflation > _WIDENED:
         notes.append(

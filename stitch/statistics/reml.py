@@ -84,19 +84,20 @@ USUAL_NOISE_FACTOR, FACTOR_SPREAD = 2.0, 1.5
 
 @dataclass(frozen=True)
 class FurtherPrior:
-    """What is believed of components beside scatter and noise."""
+    """What is believed of components beside scatter and noise, and of the size of scatter."""
 
     scales: Array  # (f,) that their σ usually has
-    shapes: Array  # (f,) of the density near zero: MAY_BE_ABSENT or THERE
+    shapes: Array  # (f,) of the density near zero: MAY_BE_ABSENT or ALWAYS_PRESENT
     common_factor: Mask  # (f,) those that are large or small together
+    scatter: tuple[float, float] | None = None  # that σ of rotation and translation usually has; None: not known
 
     def select(self, keep: Mask) -> Self:
         """Of some components alone (f,)."""
         return replace(self, scales=self.scales[keep], shapes=self.shapes[keep], common_factor=self.common_factor[keep])
 
-    def scaled(self, factor: float) -> Self:
-        """Where all are usually so many times as large."""
-        return replace(self, scales=factor * self.scales)
+    def at_factor(self, factor: float) -> Self:
+        """Where all are usually so many times as large, and none is absent: no arm in use errs in one way alone."""
+        return replace(self, scales=factor * self.scales, shapes=np.full(len(self.shapes), ALWAYS_PRESENT))
 
 
 def log_prior(log_variances: Array, further: FurtherPrior | None) -> tuple[float, Array]:
@@ -115,9 +116,12 @@ def log_density(component: int, log_variances: Array, further: FurtherPrior | No
     """(g,) of one component at log variances (g,) in equal steps, up to a constant; its first stands for all below."""
     if component == NOISE:
         return np.asarray(-0.5 * ((log_variances - np.log(USUAL_NOISE_FACTOR)) / FACTOR_SPREAD) ** 2)
-    if component < NOISE or further is None:
+    if further is None or (component < NOISE and further.scatter is None):
         return 0.5 * log_variances
-    scale, a = (float(own[component - NOISE - 1]) for own in (further.scales, further.shapes))
+    if component < NOISE and further.scatter is not None:
+        scale, a = further.scatter[component], ALWAYS_PRESENT
+    else:
+        scale, a = (float(own[component - NOISE - 1]) for own in (further.scales, further.shapes))
     over = log_variances - 2 * np.log(scale)
     out = 0.5 * a * over - 0.5 * (1 + a) * np.log1p(np.exp(over))
     # Half a step of its own, and all that is below it: a beta distribution of x/(1 + x).

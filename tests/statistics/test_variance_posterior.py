@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal
+from scipy.stats import halfcauchy, multivariate_normal
 
-from stitch.statistics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior, MixedModel, fit_variances
+from stitch.statistics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior, MixedModel, fit_variances, log_density
 from stitch.statistics.variance_posterior import mean_variances
 
 N, SCALE = 40, 0.5
@@ -30,15 +30,17 @@ def on_a_grid(mixed: MixedModel) -> np.ndarray:
     """The same by brute force, down to where nearly nothing lies below: flat prior of the mean, densities of scipy, priors of the variances written out."""
     noise, group = np.meshgrid(np.linspace(-1.0, 3.0, 25), np.arange(-100, 7, 0.5), indexing="ij")
     logs, ones = [], np.ones(N)
+    kin, (shape,) = mixed.further.common_factor[0], mixed.further.shapes
+    # An arm that is known to a factor errs in all its ways, and half of all arms by more than three usual sizes.
+    factors, shape = (np.linspace(np.log(0.01), np.log(30), 60), 1.0) if kin else (np.zeros(1), shape)
+    of_factor = halfcauchy(scale=3).logpdf(np.exp(factors)) + factors if kin else np.zeros(1)
     for a, b in zip(noise.ravel(), group.ravel(), strict=True):
         V = np.exp(a) * mixed.components[2, 0] + np.exp(b) * mixed.components[3, 0]
         weights = np.linalg.solve(V, ones)
         mean = float(weights @ mixed.z[0] / weights.sum())
         likelihood = multivariate_normal(mean * ones, V).logpdf(mixed.z[0]) - 0.5 * np.log(weights.sum())
-        factors = np.linspace(np.log(0.01), np.log(30), 60) if mixed.further.common_factor[0] else np.zeros(1)
         over = b - 2 * np.log(SCALE) - 2 * factors
-        (shape,) = mixed.further.shapes
-        further = logsumexp(0.5 * shape * over - 0.5 * (1 + shape) * np.log1p(np.exp(over)))
+        further = logsumexp(of_factor + 0.5 * shape * over - 0.5 * (1 + shape) * np.log1p(np.exp(over)))
         prior = further - 0.5 * ((a - np.log(2)) / 1.5) ** 2
         logs.append(likelihood + prior)
     w = np.exp(np.array(logs) - max(logs))
@@ -80,3 +82,18 @@ def test_a_mean_that_explains_all_numbers_leaves_the_maximum():
     mixed = MixedModel(mixed.z[:, :2], np.eye(2)[None], mixed.components[:, :, :2, :2], further=mixed.further)
     fit = fit_variances(mixed)
     assert mean_variances(mixed, fit) == pytest.approx(fit.variances)
+
+
+def test_scatter_is_half_cauchy_about_what_arms_repeat_to():
+    """Its density per log variance against scipy's, the lowest size with all that is below it."""
+    prior = FurtherPrior(np.zeros(0), np.zeros(0), np.zeros(0, bool), (2e-5, 0.02))
+    logs = np.arange(-14.0, 4.0, 0.25)
+    for component, usual in enumerate((2e-5, 0.02)):
+        there = 2 * np.log(usual) + logs
+        sigma = np.exp(0.5 * there)
+        expected = halfcauchy(scale=usual).logpdf(sigma) + np.log(sigma / 2)
+        found = log_density(component, there, prior)
+        assert np.ptp((found - expected)[1:]) == pytest.approx(0, abs=1e-9)
+        assert np.exp(found[0] - found[1]) * np.exp(expected[1]) * 0.25 == pytest.approx(
+            halfcauchy(scale=usual).cdf(np.exp(0.5 * (there[0] + 0.125))), rel=0.02
+        )

@@ -343,6 +343,9 @@ class HandEyeFit:
     # Shares of what may be wrong in the variance of its rotation and of its position; each adds up to 1.
     rotation_shares: dict[str, float] = field(default_factory=dict)
     position_shares: dict[str, float] = field(default_factory=dict)
+    # Degrees of freedom on which the covariance rests: numbers that are seen beyond hand-eye and effects; None: it is
+    # another run's.
+    degrees: int | None = None
     values: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of the effects
     values_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (P, P)
 
@@ -385,6 +388,7 @@ def fit_hand_eye(
         inflation=float(max(1.0, np.exp(log_ratio / len(covariance)))),
         repeatability=found.scatter,
         heldout_ratio=_heldout_ratio(found.parts, found.scatter, (found.prior, found.prior_vector), found.x),
+        degrees=len(found.rig.z) - mean_basis(found.rig.columns).shape[1],
         rotation_shares=_source_shares(sources, slice(0, 3)),
         position_shares=_source_shares(sources, slice(3, 6)),
         values=found.values + found.x[6:],
