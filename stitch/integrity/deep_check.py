@@ -21,7 +21,7 @@ from stitch.integrity.conventions import (
 )
 from stitch.integrity.hypotheses import known_unit_ratio
 from stitch.integrity.pairing import explain_misplaced
-from stitch.integrity.pose_tests import length_problem
+from stitch.integrity.pose_tests import FEWEST_DEGREES, length_problem
 from stitch.integrity.problems import SessionProblem, displacement_text, likeliest_text, list_views, names_of_views
 from stitch.integrity.rounding import Rounding, find_rounding
 from stitch.integrity.scan_faults import find_occluder, find_static_background
@@ -109,20 +109,27 @@ def background_problems(session: Session, own: Capture, T_mount: Array, found: S
 
 
 # So many views leave too few degrees of freedom for their scatter to accuse one of them.
-_FEW = {3: "three", 4: "four", 5: "five"}
+_FEW_VIEWS = 5
+_NUMBERS = {2: "two", 3: "three", 4: "four", 5: "five"}
 # Chance that poses which repeat as those of arms do are said to disagree.
 _FEW_VIEWS_CHANCE = 1e-4
 
 
 def check_few_views(session: Session, found: Snooping) -> str | None:
-    """Return a warning of three to five views whose poses disagree by more than arms repeat; None where they do not.
+    """Return a warning of few views whose poses disagree by more than arms repeat, or that nothing can be tested by.
 
-    They show two to four motions: that something is wrong, but not which scan, row or effect.
+    They show few motions: that something is wrong, but not which scan, row or effect. None where poses agree, or where
+    the views are enough for each to be tested by the others.
     """
-    count = _FEW.get(len(session.views))
-    if count is None or found.left_out or found.suspected:
+    views, unit = len(session.views), session.length_unit
+    count, degrees = _NUMBERS.get(views, str(views)), found.blunder_search.null_projector.degrees
+    if (views > _FEW_VIEWS and degrees >= FEWEST_DEGREES) or found.left_out or found.suspected:
         return None
-    unit = session.length_unit
+    if degrees < 1:
+        return (
+            f"No test says whether these {count} views belong together, since one hand-eye brings any together; "
+            "to fix: add views."
+        )
     rotation, translation = usual_twist(unit)[[0, 3]]
     if _global_model_test(found, np.array([rotation**2, translation**2, 1.0])):
         return None

@@ -102,6 +102,8 @@ FAMILY_WISE = 0.01
 _MAX_BLUNDER_SHARE = 1 / 3
 # Masking shows within a few steps; a search that has found nothing by then ends.
 _MASKING_DEPTH = 3
+# Fewer degrees of freedom tell no view from the scatter of the others.
+FEWEST_DEGREES = 12
 # The most deviant views, tested under the scatter of the others alone.
 _LEAVE_ONE_OUT_COUNT = 3
 
@@ -140,7 +142,7 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
         under = projector(model, fit, columns)
         states.append((fit, columns, under))
         rest = [v for v in range(model.count) if v not in excluded and v not in [b.view for b in freed]]
-        if len(freed) >= most or len(freed) >= significant + _MASKING_DEPTH or under.degrees < 12:
+        if len(freed) >= most or len(freed) >= significant + _MASKING_DEPTH or under.degrees < FEWEST_DEGREES:
             break
         tests = {v: test_alternative(under, model.views[v]) for v in rest}
         likely = sorted(rest, key=lambda v: tests[v].rank)[:_LEAVE_ONE_OUT_COUNT]

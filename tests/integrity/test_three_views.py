@@ -1,12 +1,14 @@
 """Three views, or four, cannot tell which of them is off, but that something is."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
+from stitch.integrity.deep_check import check_few_views
 from stitch.measurement.session import Cloud
 from stitch.pipeline import run
 
@@ -36,3 +38,11 @@ def test_four_views_of_which_one_is_off_by_less_than_a_millimetre_are_doubted():
     moved = replace(off, cloud=Cloud(off.cloud.points + np.array([0.0, 0.36, 0.2])))
     found = run(replace(good, views=(first, moved, *rest)))
     assert found.left_out or found.doubts[0].startswith("Four poses contradict their scans by")
+
+
+def test_views_that_nothing_can_be_tested_by_say_so():
+    """As many numbers as one hand-eye takes up: flat parts of which every overlap shows three."""
+    search = SimpleNamespace(null_projector=SimpleNamespace(degrees=0))
+    found = SimpleNamespace(left_out=(), suspected=(), blunder_search=search)
+    session = SimpleNamespace(views=range(3), length_unit="mm")
+    assert check_few_views(session, found).startswith("No test says whether these three views belong together")
