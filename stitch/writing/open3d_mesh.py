@@ -154,7 +154,7 @@ def _large_parts(triangles: Indices) -> Indices:
         raise NoResultError(NO_SURFACE)
     part = _connected(triangles[:, [0, 1, 1, 2]].reshape(-1, 2), int(triangles.max()) + 1)[triangles[:, 0]]
     sizes = np.bincount(part)
-    return triangles[(sizes >= _PART_SHARE * sizes.max())[part]]
+    return np.asarray(triangles[(sizes >= _PART_SHARE * sizes.max())[part]])
 
 
 def _capped(vertices: Array, triangles: Indices) -> TriangleMesh:
