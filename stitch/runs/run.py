@@ -76,6 +76,24 @@ class FusedCloud:
 
 
 @dataclass(frozen=True)
+class Unsupported:
+    """How many scanned points are not in the stitched cloud, of how many."""
+
+    points: int = 0
+    alone: int = 0  # on no surface of their own view or of others
+    looked_through: int = 0  # other views look past them
+
+    def __add__(self, other: "Unsupported") -> "Unsupported":
+        alone, through = self.alone + other.alone, self.looked_through + other.looked_through
+        return Unsupported(self.points + other.points, alone, through)
+
+    @property
+    def share(self) -> float:
+        """Of all points."""
+        return (self.alone + self.looked_through) / max(self.points, 1)
+
+
+@dataclass(frozen=True)
 class ExcludedView:
     """A view that is not fused, and why."""
 
@@ -135,6 +153,7 @@ class Fit:
     unobservable: tuple[str, ...] = ()  # plain words, one per unobservable direction
     unknown: tuple[str, ...] = ()  # of x, y, z, rx, ry, rz of the hand-eye: what those directions leave open
     notes: tuple[str, ...] = ()
+    unsupported: Unsupported = field(default_factory=Unsupported)
 
 
 @dataclass(frozen=True)

@@ -1,57 +1,48 @@
-"""Fuse registered views into one cloud: overlap averaged by weight on a grid of the scans' spacing."""
+"""Fuse registered views into one cloud: overlap averaged by weight on a grid of the scans' spacing.
 
-from collections.abc import Sequence
+What a view shows in a cell is a voxel of it. A point counts where it is supported (`support.py`).
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from pykdtree.kdtree import KDTree
 
 from stitch import frames
-from stitch.frames import Array, Indices
+from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import MIN_COSINE, Measurement, intensity_scale
 from stitch.measurement.scan import Scan, box_corners
-from stitch.measurement.session import Session
+from stitch.measurement.session import Session, WholeCloud
 from stitch.model.forward import moves_points, point_correction
 from stitch.model.model import Model
-from stitch.runs.run import FusedCloud
+from stitch.runs.run import FusedCloud, Unsupported
+from stitch.stages.support import (
+    PlacedPoints,
+    cell_numbers,
+    edge_credit,
+    find_support,
+    number_groups,
+    pack_cells,
+    weighted_sums,
+)
 from stitch.system.threads import map_parts, parallel
 
 # Points seen at a grazing angle weigh little and edges less, but a place only they saw stays.
 _EDGE_WEIGHT = 0.05
 
 
-@dataclass(frozen=True)
-class PlacedPoints:
-    """Points of registered views in the reference frame."""
-
-    points: Array  # (N, 3)
-    normals: Array  # (N, 3)
-    weight: Array  # (N,)
-    view: Indices  # (N,)
-
-
 def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedCloud:
-    """Average all views in cells of `cell` (default: the scans' spacing), in the reference frame.
+    """Average all points of all views in cells of `cell` (default: the scans' spacing), in the reference frame.
 
     Returns:
         Points, normals, `residual` = rms distance of the views' surfaces from the fused one along
         its normal (NaN where one view only), and the number of views per point.
     """
-    return fuse_points(concatenate_points(_place_scans(capture.scans, poses)), cell or capture.spacing)
-
-
-def fuse_points(points_of_views: PlacedPoints, cell: float, axis: int = 0) -> FusedCloud:
-    """The same of placed points, in the order of cells along `axis`; the grid is the reference frame's own."""
-    cells = _GridCells(points_of_views, cell, axis)
-    points, normals = cells.mean()
-    view_cell, offset, view_weight = cells.view_means(points, normals)
-    count = np.bincount(view_cell, minlength=len(points))
-    square = np.bincount(view_cell, view_weight * offset**2, len(points))
-    total = np.bincount(view_cell, view_weight, len(points))
-    residual = np.where(count > 1, np.sqrt(square / total), np.nan)
-    return FusedCloud(points, normals, residual, count.astype(np.int32))
+    return _fuse_points(place_scans(capture.scans, poses), cell or capture.spacing)
 
 
 def point_weights(confidence: Array, usable: Array) -> Array:
@@ -59,67 +50,73 @@ def point_weights(confidence: Array, usable: Array) -> Array:
     return np.asarray(confidence**2 * np.where(usable, 1.0, _EDGE_WEIGHT))
 
 
-def concatenate_points(parts: Sequence[PlacedPoints]) -> PlacedPoints:
-    """The points of several views, one view after the other."""
-    names = [f.name for f in fields(PlacedPoints)]
-    return PlacedPoints(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+def place_scans(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
+    """The points of all scans in the reference frame, one view after the other."""
+    placed = [_place_scan(scan, T, v) for v, (scan, T) in enumerate(zip(scans, poses, strict=True))]
+    return PlacedPoints(*(np.concatenate([getattr(p, f.name) for p in placed]) for f in fields(PlacedPoints)))
 
 
-def place_points(T: Array, view: int, points: Array, normals: Array, weight: Array) -> PlacedPoints:
-    """Points (N, 3) of one view with normals and weights, scanner frame, by its T_reference_scanner (4, 4)."""
-    return PlacedPoints(frames.transform(T, points), frames.rotate(T, normals), weight, np.full(len(points), view))
+def _place_scan(scan: Scan, T: Array, v: int) -> PlacedPoints:
+    points, normals = frames.transform(T, scan.points), frames.rotate(T, scan.normals)
+    weight = point_weights(scan.confidence, scan.usable)
+    return PlacedPoints(points, normals, weight, np.full(len(points), v), np.asarray(scan.usable, bool))
 
 
-def _place_scans(scans: Sequence[Scan], poses: Array) -> list[PlacedPoints]:
-    return [
-        place_points(T, v, s.points, s.normals, point_weights(s.confidence, s.usable))
-        for v, (s, T) in enumerate(zip(scans, poses, strict=True))
-    ]
+def _fuse_points(placed: PlacedPoints, size: float) -> FusedCloud:
+    return _fuse_voxels(_voxels(placed, cell_numbers(placed.points, size)))
 
 
-class _GridCells:
-    """Placed points with the grid cell of each."""
+@dataclass(frozen=True)
+class _Voxels:
+    """What views show in cells of the grid, one row for a view in a cell; a view's rows stand in the order of cells."""
 
-    def __init__(self, placed: PlacedPoints, size: float, axis: int = 0) -> None:
-        self.placed = placed
-        self.views = int(placed.view.max()) + 1
-        index = np.floor(placed.points / size).astype(np.int64)
-        index -= index.min(axis=0)
-        order = [axis, *(i for i in range(3) if i != axis)]
-        shape = index.max(axis=0) + 1
-        key = np.ravel_multi_index(tuple(index.T[order]), tuple(shape[order]))
-        _, self.cell = np.unique(key, return_inverse=True)
-        self.cells = int(self.cell.max()) + 1
+    cell: Indices  # (G,)
+    weight: Array  # (G,)
+    points: Array  # (G, 3) weighted mean
+    normals: Array  # (G, 3) weighted mean, shorter than 1
 
-    def mean(self) -> tuple[Array, Array]:
-        """Weighted mean points and unit normals (C, 3)."""
-        weight = np.bincount(self.cell, self.placed.weight, self.cells)
-        points = self._sum(self.cell, self.placed.points, self.cells) / weight[:, None]
-        normals = self._sum(self.cell, self.placed.normals, self.cells)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return points, normals / np.maximum(length, 1e-12)
 
-    def view_means(self, points: Array, normals: Array) -> tuple[Indices, Array, Array]:
-        """Per (cell, view): its cell, the mean offset along the cell's normal, and its weight."""
-        offset = np.einsum("ij,ij->i", self.placed.points - points[self.cell], normals[self.cell])
-        key, group = np.unique(self.cell * self.views + self.placed.view, return_inverse=True)
-        weight: Array = np.asarray(np.bincount(group, self.placed.weight, len(key)), float)
-        mean: Array = np.bincount(group, self.placed.weight * offset, len(key)) / weight
-        return np.asarray(key // self.views, np.int64), mean, weight
+def _voxels(placed: PlacedPoints, cells: Indices) -> _Voxels:
+    """The voxels of points of any views, given the cell of each (N,)."""
+    different, at = number_groups(cells)
+    views = int(placed.view.max(initial=0)) + 1
+    keys, at = number_groups(at * views + placed.view)
+    weight: Array = np.asarray(np.bincount(at, placed.weight), float)
+    mean, normal = (
+        weighted_sums(at, placed.weight, values) / weight[:, None] for values in (placed.points, placed.normals)
+    )
+    return _Voxels(different[keys // views], weight, mean, normal)
 
-    def _sum(self, group: Indices, values: Array, size: int) -> Array:
-        return np.stack([np.bincount(group, self.placed.weight * values[:, i], size) for i in range(3)], axis=1)
+
+def _fuse_voxels(voxels: _Voxels) -> FusedCloud:
+    """The mean surface in every cell, in the order of cells, and how far those of the views lie from it."""
+    _, at = number_groups(voxels.cell)
+    weight = np.bincount(at, voxels.weight)
+    points = weighted_sums(at, voxels.weight, voxels.points) / weight[:, None]
+    normals = weighted_sums(at, voxels.weight, voxels.normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    offset = np.einsum("ij,ij->i", voxels.points - points[at], normals[at])
+    count = np.bincount(at)
+    square = np.bincount(at, voxels.weight * offset**2)
+    residual = np.where(count > 1, np.sqrt(square / weight), np.nan)
+    return FusedCloud(points, normals, residual, count.astype(np.int32))
 
 
 # Fuse scans of which memory holds only some points: every point read once more, slab by slab of the part.
 #
-# The slabs end where cells of the grid end, so that what comes out does not depend on how many there are. A point takes
-# normal and edge from the nearest one in memory, whose surface was that of all points.
+# The slabs end where cells of the grid end, so that what comes out does not depend on how many there are. A voxel takes
+# normal, edge and support from the nearest point in memory, whose surface was that of all points.
 
 # Points of a slab; as many slabs are at work as there are cores, at some 200 bytes a point.
 _SLAB = 2_500_000
 # Effects of scanner and part move a point by less than this share of the view's size.
 _MAX_MOVE = 0.02
+# One point in memory is looked up for a block of voxels; so many blocks lie between two points in memory.
+_BLOCKS = 1.5
+# A voxel on the surface of the nearest point in memory lies within so many spacings of it.
+_WITHIN = 2.5
+# It lies off its plane by less than so many sigmas and this share of the distance, more where little is junk.
+_SIGMAS, _OFF_PLANE = 4.0, 0.15
 
 
 @dataclass(frozen=True)
@@ -138,8 +135,8 @@ class RegisteredSession:
         return intensity_scale(self.session)
 
 
-def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> FusedCloud:
-    """Fuse all points that were scanned, those in memory and those in files.
+def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[FusedCloud, Unsupported]:
+    """Fuse all supported points that were scanned, those in memory and those in files; return what was dropped as well.
 
     Args:
         slab: points that are fused at a time; with more of them the result is held in files without a name.
@@ -149,72 +146,157 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> FusedC
     """
     session, own, poses = registered.session, registered.own, registered.poses
     cell = float(np.median([scan.scanned_spacing for scan in own.scans]))
+    placed = place_scans(own.scans, poses)
+    support = find_support(own.scans, poses, placed, own.spacing)
     if all(view.cloud is None or view.cloud.whole is None for view in session.views):
-        return fuse(own, poses, cell)
-    ends, axis = _slabs(registered, cell, slab)
+        dropped = Unsupported(len(support.kept), int(support.alone.sum()), int(support.looked_through.sum()))
+        return _fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell), dropped
+    block = max(1, int(own.spacing / (_BLOCKS * cell)))
+    ends, axis = _slabs(registered, block * cell, slab)
+    split = np.cumsum([len(scan.points) for scan in own.scans])[:-1]
+    parts = zip(np.split(support.alone, split), np.split(support.looked_through, split), support.junk, strict=True)
+    views = [_ViewInSlabs(registered, v, (cell, block, axis), *part) for v, part in enumerate(parts)]
+    dropped = Unsupported()
 
-    def of_slab(bounds: tuple[float, float]) -> FusedCloud | None:
-        low, high = (cell * number for number in bounds)
-        every = concatenate_points([_points_in_slab(registered, v, axis, low, high) for v in range(len(own.scans))])
-        return fuse_points(every, cell, axis) if len(every.points) else None
+    def of_slab(bounds: tuple[float, float]) -> tuple[FusedCloud | None, Unsupported]:
+        low, high = (block * number for number in bounds)
+        found, dropped = zip(*(view.voxels(low, high) for view in views), strict=True)
+        voxels = _Voxels(*(np.concatenate([getattr(f, field.name) for f in found]) for field in fields(_Voxels)))
+        return _fuse_voxels(voxels) if len(voxels.cell) else None, sum(dropped, Unsupported())
 
-    clouds = parallel(of_slab, pairwise(ends), "fusing slabs")
-    found = (cloud for cloud in clouds if cloud is not None)
-    return next(found) if len(ends) == 2 else FusedCloud(**map_parts(vars(cloud) for cloud in found))
+    def clouds() -> Iterator[FusedCloud]:
+        nonlocal dropped
+        for cloud, of_one in parallel(of_slab, pairwise(ends), "fusing slabs"):
+            dropped += of_one
+            if cloud is not None:
+                yield cloud
+
+    cloud = next(clouds()) if len(ends) == 2 else FusedCloud(**map_parts(vars(cloud) for cloud in clouds()))
+    return cloud, dropped
 
 
-def _slabs(registered: RegisteredSession, cell: float, slab: int) -> tuple[list[float], int]:
-    """Numbers of cells at which slabs end along the part's longest axis, and that axis."""
+def _slabs(registered: RegisteredSession, step: float, slab: int) -> tuple[list[float], int]:
+    """Numbers of steps at which slabs end along the part's longest axis, and that axis."""
     own, poses = registered.own, registered.poses
     shown = [frames.transform(T, scan.points) for scan, T in zip(own.scans, poses, strict=True)]
     low, high = (f([f(p, axis=0) for p in shown], axis=0) for f in (np.min, np.max))
     axis = int(np.argmax(high - low))
-    first = np.floor(low[axis] / cell)
+    first = np.floor(low[axis] / step)
     share = [1.0 if v.cloud is None else v.cloud.count / len(v.cloud.points) for v in registered.session.views]
-    length = int(np.floor(high[axis] / cell) - first) + 1
+    length = int(np.floor(high[axis] / step) - first) + 1
     along = np.zeros(length)
     for points, per_point in zip(shown, share, strict=True):
-        along += per_point * np.bincount((np.floor(points[:, axis] / cell) - first).astype(np.int64), minlength=length)
+        along += per_point * np.bincount((np.floor(points[:, axis] / step) - first).astype(np.int64), minlength=length)
     number = np.floor((np.cumsum(along) - along / 2) / slab)
     ends = first + np.flatnonzero(np.diff(number) > 0) + 1
     return [-np.inf, *ends.tolist(), np.inf], axis
 
 
-def _points_in_slab(registered: RegisteredSession, v: int, axis: int, low: float, high: float) -> PlacedPoints:
-    """Points of view v between two planes of the reference frame, with the view's number."""
-    T, cloud, scan = registered.poses[v], registered.session.views[v].cloud, registered.own.scans[v]
-    whole = None if cloud is None else cloud.whole
-    if whole is None:
-        points, normals, weight = scan.points, scan.normals, point_weights(scan.confidence, scan.usable)
-    else:
-        ends = frames.transform(T, box_corners(whole.box))[:, axis]
-        margin = _MAX_MOVE * float(np.ptp(whole.box, axis=0).max())
+class _ViewInSlabs:
+    """One view, and what it shows between two planes of the reference frame."""
+
+    def __init__(
+        self,
+        registered: RegisteredSession,
+        v: int,
+        grid: tuple[float, int, int],
+        alone: Mask,
+        through: Mask,
+        junk: float,
+    ) -> None:
+        """Take what slabs ask again and again.
+
+        Args:
+            grid: edge of a cell, cells along a block, and the axis of the slabs.
+            alone: points in memory on no surface.
+            through: those past which other views look.
+            junk: share of the points that stand alone.
+        """
+        self.registered, self.v, (self.cell, self.block, self.axis) = registered, v, grid
+        self.scan, self.T = registered.own.scans[v], registered.poses[v]
+        cloud = registered.session.views[v].cloud
+        self.whole = None if cloud is None else cloud.whole
+        self.moves = moves_points(registered.model.terms)
+        self.placed, self.kept, self.through = _place_scan(self.scan, self.T, v), ~(alone | through), through
+        self.surface = np.flatnonzero(~alone) if not alone.all() else np.arange(len(alone))
+        some = len(self.surface) < len(alone)
+        self.tree = KDTree(self.scan.points[self.surface], leafsize=16) if some else self.scan.tree
+        self.off_plane = _OFF_PLANE * (1 + edge_credit(junk))
+
+    def voxels(self, low: float, high: float) -> tuple[_Voxels, Unsupported]:
+        """Voxels whose number of cells along the axis lies in a range, and how many points support nothing."""
+        if self.whole is None:
+            cells = self._cells(self.placed.points.T)
+            inside = (cells[self.axis] >= low) & (cells[self.axis] < high)
+            keep = inside & self.kept
+            dropped = Unsupported(
+                *(int(np.sum(m & inside)) for m in (inside, ~self.kept & ~self.through, self.through))
+            )
+            return _voxels(self.placed.take(keep), pack_cells([c[keep] for c in cells], self.axis)), dropped
+        placed = self._points_near(self.whole, (low - 1) * self.cell, (high + 1) * self.cell)
+        cells = self._cells(placed)
+        inside = (cells[self.axis] >= low) & (cells[self.axis] < high)
+        if not inside.all():
+            placed, cells = [p[inside] for p in placed], [c[inside] for c in cells]
+        different, at = number_groups(pack_cells(cells, self.axis))
+        count = np.bincount(at, minlength=len(different))
+        mean = np.stack([np.bincount(at, p, len(different)) for p in placed], axis=1) / count[:, None]
+        nearest = self._nearest(mean, count)
+        away = mean - self.placed.points[nearest]
+        far = np.einsum("ij,ij->i", away, away)
+        off = np.abs(np.einsum("ij,ij->i", away, self.placed.normals[nearest]))
+        alone = far > _WITHIN**2 * self.scan.area[nearest]
+        alone |= self.scan.usable[nearest] & (off > _SIGMAS * self.scan.noise + self.off_plane * np.sqrt(far))
+        through = self.through[nearest] & ~alone
+        keep = ~(alone | through)
+        weight = (count * self.placed.weight[nearest])[keep]
+        found = _Voxels(different[keep], weight, mean[keep], self.placed.normals[nearest[keep]])
+        return found, Unsupported(len(at), int(count[alone].sum()), int(count[through].sum()))
+
+    def _cells(self, columns: Iterable[Array]) -> list[Indices]:
+        return [np.floor(column / self.cell).astype(np.int64) for column in columns]
+
+    def _points_near(self, whole: WholeCloud, low: float, high: float) -> list[Array]:
+        """Columns x, y, z of all points between two heights along the axis, reference frame, without the effects."""
+        ends = frames.transform(self.T, box_corners(whole.box))[:, self.axis]
+        margin = _MAX_MOVE * float(np.ptp(whole.box, axis=0).max()) if self.moves else 0.0
         if ends.max() + margin < low or ends.min() - margin > high:
-            return place_points(T, v, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+            return [np.zeros(0)] * 3
         every = whole.read()
-        height = frames.transform(T, every.points)[:, axis]
+        height = _along(self.T, every.points, self.axis)
         near = np.flatnonzero((height >= low - margin) & (height < high + margin))
-        points, normals, weight = _corrected_points(registered, v, every.points[near], every.scalars, near)
-    height = frames.transform(T, points)[:, axis]
-    keep = (height >= low) & (height < high)
-    return place_points(T, v, points[keep], normals[keep], weight[keep])
+        points = every.points[near]
+        if self.moves:
+            points = _corrected_points(self.registered, self.v, points, every.scalars, near)
+        return [_along(self.T, points, i) for i in range(3)]
+
+    def _nearest(self, mean: Array, count: Indices) -> Indices:
+        """(G,) the point in memory that is nearest to the block in which a voxel lies."""
+        cells = [c // self.block for c in self._cells(mean.T)]
+        different, at = number_groups(pack_cells(cells, self.axis))
+        middle = weighted_sums(at, count.astype(float), mean) / np.bincount(at, count, len(different))[:, None]
+        _, index = self.tree.query(frames.transform(frames.inverse(self.T), middle), k=1)
+        return np.asarray(self.surface[index][at])
+
+
+def _along(T: Array, points: Array, axis: int) -> Array:
+    """(N,) one coordinate of points (N, 3) under T."""
+    # A product of matrices this narrow takes ten times as long.
+    (x, y, z), (a, b, c, t) = points.T, T[axis]
+    return np.asarray(x * a + y * b + z * c + t)
 
 
 def _corrected_points(
     registered: RegisteredSession, v: int, points: Array, scalars: dict[str, Array], index: Indices
-) -> tuple[Array, Array, Array]:
-    """Points (N, 3) of view v, scanner frame, without the effects in use; their normals (N, 3) and weights (N,)."""
-    scan = registered.measurement.capture.scans[v]
+) -> Array:
+    """Points (N, 3) of view v, scanner frame, without the effects in use."""
+    scan, terms = registered.measurement.capture.scans[v], registered.model.terms
     _, nearest = scan.tree.query(points, k=1)
-    normals = scan.normals[nearest]
-    confidence = np.abs(np.einsum("ij,ij->i", normals, scan.rays(points)))
-    terms = registered.model.terms
-    if moves_points(terms):
-        scale = registered.intensity_scale
-        view = replace(
-            registered.measurement.scan_views[v],
-            cosine=np.maximum(confidence, MIN_COSINE),
-            intensity=None if scale is None else (scalars["intensity"][index] - scale[0]) / scale[1],
-        )
-        points = points + point_correction(terms, points, view, registered.own.poses(registered.model.T_mount)[v])
-    return points, normals, point_weights(confidence, scan.usable[nearest])
+    cosine = np.abs(np.einsum("ij,ij->i", scan.normals[nearest], scan.rays(points)))
+    scale = registered.intensity_scale
+    view = replace(
+        registered.measurement.scan_views[v],
+        cosine=np.maximum(cosine, MIN_COSINE),
+        intensity=None if scale is None else (scalars["intensity"][index] - scale[0]) / scale[1],
+    )
+    return points + point_correction(terms, points, view, registered.own.poses(registered.model.T_mount)[v])

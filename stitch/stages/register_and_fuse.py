@@ -24,7 +24,7 @@ from stitch.stages.coarse import CoarseHandEye
 from stitch.stages.correct import Correction
 from stitch.stages.fuse import RegisteredSession, fuse_every_point
 from stitch.stages.register import Method, register, register_targets
-from stitch.stages.sentences import correct_note, register_note, surface_sentence, target_sentence
+from stitch.stages.sentences import correct_note, register_note, support_note, surface_sentence, target_sentence
 from stitch.stages.target_fit import FittedSession
 from stitch.statistics.distributions import MAD_TO_SIGMA
 from stitch.system.threads import Clock, release_mapped
@@ -63,8 +63,9 @@ def finish_surfaces(
     registered = _overlap_stage("register", registration.overlaps, len(registration.history), clock.lap(), note)
     registered = replace(registered, method=method.name)
     recorder.stage(registered, registration.poses)
-    fused = fuse_every_point(RegisteredSession(session, measurement, model, own, registration.poses))
-    last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap())
+    fused, unsupported = fuse_every_point(RegisteredSession(session, measurement, model, own, registration.poses))
+    dropped = support_note(unsupported)
+    last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap(), dropped)
     recorder.stage(last, registration.poses)
     floor = noise_floor(own, registration.overlaps, session.scanner.noise)
     found = Fit(
@@ -74,6 +75,7 @@ def finish_surfaces(
         corrections=_twists(poses_model, registration.poses),
         view_rms=per_view_rms(registration.overlaps, len(own.scans)),
         fused=fused,
+        unsupported=unsupported,
         repeatability=scatter,
         verdict=surface_sentence(corrected.rms, registered.rms, floor, scatter, session.length_unit, model.effects),
         convergence={"correct": list(correction.history), "register": list(registration.history)},

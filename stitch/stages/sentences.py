@@ -8,7 +8,7 @@ from stitch.measurement.session import Session
 from stitch.observations.surfaces.hand_eye_fit import HandEyeFit, Repeatability
 from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_model import TargetModelFit
-from stitch.runs.run import ExcludedView
+from stitch.runs.run import ExcludedView, Unsupported
 from stitch.stages.coarse import CoarseHandEye
 from stitch.stages.register import Registration
 from stitch.units import angle_text, length_text
@@ -83,6 +83,16 @@ def register_note(found: Registration, session: Session) -> str:
         apart = length_text(abs(size), session.length_unit)
         lines.append(f"{session.names[v]} lies as a whole {side} the other views, by {apart}")
     return "; ".join([*lines, *([found.note] if found.note else [])])
+
+
+def support_note(dropped: Unsupported) -> str:
+    """Return how many scanned points are not in the stitched cloud, and why; empty where all are."""
+    if not dropped.share:
+        return ""
+    return (
+        f"{dropped.alone + dropped.looked_through:,} of {dropped.points:,} points ({dropped.share:.2%}) are not in the "
+        f"cloud: {dropped.alone:,} lie on no surface, past {dropped.looked_through:,} other views look"
+    )
 
 
 def target_sentence(found: TargetModelFit, registered: float, scatter: Repeatability, length_unit: str) -> str:

@@ -26,7 +26,7 @@ from stitch.observations.targets.target_model import TargetModelFit
 from stitch.reading.clouds import require_room
 from stitch.reading.session_folder import load_session
 from stitch.reading.text_files import read_text, shortened
-from stitch.runs.run import ExcludedView, Fit, FusedCloud, LedgerStep, Note, Run, StageResult, ViewLinks
+from stitch.runs.run import ExcludedView, Fit, FusedCloud, LedgerStep, Note, Run, StageResult, Unsupported, ViewLinks
 from stitch.stages.correct import converged_overlaps, gate_of_model
 from stitch.stages.target_fit import evaluate_targets
 from stitch.system.threads import library_threads_off
@@ -73,6 +73,11 @@ RESULT = _object_schema(
         {"parameters": _list_schema(_TEXT), "matrix": _list_schema(_list_schema(_NUMBER))}
     ),
     cloud_noise_factor=_NUMBER,
+    unsupported_points={
+        "type": "object",
+        "properties": dict.fromkeys(("points", "alone", "looked_through"), _COUNT),
+        "additionalProperties": False,
+    },
     hand_eye_unknown=_list_schema(_TEXT),
     left_out=_list_schema(_object_schema({"view": _TEXT, "why": _TEXT})),
     linkage=_object_schema(
@@ -356,6 +361,7 @@ def _restore_fit(folder: Path, document: dict[str, Any], run: Run) -> Fit:
         convergence={stage: [_number(x) for x in course] for stage, course in document["convergence"].items()},
         notes=tuple(document["notes"]),
         targets=targets,
+        unsupported=Unsupported(**document.get("unsupported_points", {})),
     )
 
 

@@ -8,6 +8,9 @@ from stitch.model.model import hand_eye_lines
 from stitch.runs.run import Run
 from stitch.units import angle_text, length_text, uncertainty_text
 
+# Scanners leave a few points in the air beside edges, which is no news.
+_WORTH_A_LINE = 0.005
+
 
 def fit_report(run: Run, at_part: tuple[float, float]) -> str:
     """Return the block, as lmfit's fit_report has it: a heading in double brackets, and its lines.
@@ -59,7 +62,14 @@ def report_rows(run: Run) -> list[tuple[str, str]]:
         ("sensor's noise alone", noise),
         scatter,
         *((name, text) for name, text in parameters.items() if text),
+        *([("points left out of the cloud", _unsupported(run))] if run.fit.unsupported.share > _WORTH_A_LINE else []),
     ]
+
+
+def _unsupported(run: Run) -> str:
+    dropped = run.fit.unsupported
+    alone, through = (n / dropped.points for n in (dropped.alone, dropped.looked_through))
+    return f"{dropped.share:.1%} ({alone:.1%} on no surface, {through:.1%} where other views look past)"
 
 
 def _part(heading: str, lines: Sequence[str]) -> list[str]:

@@ -20,8 +20,8 @@ _CELL_SHARE = 1 / 512
 _NEIGHBOURS = 16
 # A cell with a corner farther than so many cells from all points holds no surface: the mesh ends where the points do.
 _REACH = 2.5
-# The mesh reaches at most so many cells beyond the last points.
-_OVERHANG = 2.0
+# The mesh reaches at most so many cells beyond the last points: holes between points are narrower.
+_OVERHANG = 1.0
 _BLOCK = 20_000
 # Ends where the points do; closed; with a tenth of the triangles. Open3D makes the latter two.
 OPEN, WATERTIGHT, LIGHT = KINDS = ("open", "watertight", "light")

@@ -153,6 +153,7 @@ def result_document(run: Run) -> dict[str, Any]:
         "views": _views(run),
         "left_out": [{"view": item.view, "why": item.why} for item in run.left_out],
         "linkage": _linkage(run),
+        "unsupported_points": asdict(run.fit.unsupported),
         "targets": target_rows(run.targets),
         **labelled_facts(run),
         "convergence": run.convergence,

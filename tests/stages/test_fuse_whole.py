@@ -38,7 +38,7 @@ def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect):
     assert all(len(scan.points) == 1500 for scan in light.own.scans)
     cell = float(np.median([scan.scanned_spacing for scan in light.own.scans]))
     expected = fuse(whole.own, whole.poses, cell)
-    found = fuse_every_point(light, slab=4000)
+    found, _ = fuse_every_point(light, slab=4000)
     if effect == "intensity_bias":  # mean and spread of the points in memory are not quite those of all
         assert len(found.points) == pytest.approx(len(expected.points), rel=2e-3)
         return
@@ -51,7 +51,7 @@ def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect):
 def test_the_number_of_slabs_does_not_matter(blade_capture):
     measured, _ = blade_capture
     light = registered(thin_session(session_of(measured), 2000)[0], measured)
-    one, many = (fuse_every_point(light, slab=slab) for slab in (10**9, 1500))
+    one, many = (fuse_every_point(light, slab=slab)[0] for slab in (10**9, 1500))
     for name in ("points", "normals", "residual", "count"):
         assert np.array_equal(getattr(one, name), getattr(many, name), equal_nan=True)
     assert isinstance(many.points, np.memmap) and not isinstance(one.points, np.memmap)

@@ -1,0 +1,125 @@
+"""Which places views look through: they measured a surface behind them, or nothing where they ought to have.
+
+A range image per view, all over the same field of the scanner: a stereographic map of the rays, whose bins hold the
+nearest surface. What stands before the nearest of nine bins stands where the view saw past.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch import frames
+from stitch.frames import Array, Indices, Mask
+from stitch.measurement.scan import Scan
+
+# Edge of a bin in spacings between rays: few bins of a surface stay empty.
+_BIN = 1.5
+# Bins of nine that show a surface, where it counts as seen and closed.
+_CLOSED = 6
+# A surface is steep: along 80° it goes so many bins deep across one. What lies deeper in one ray lies behind another.
+_STEEPEST = 6.0
+# A view of which more lies behind its own surfaces did not look from its eye, as several scans in one file.
+_MOST_BEHIND = 0.1
+# A surface that faces a view within 60° is seen by it.
+_FACING = 0.5
+
+
+@dataclass(frozen=True)
+class RangeImages:
+    """The field of a scanner in bins, and what each view saw in it."""
+
+    axes: Array  # (3, 3) rows: across, up, and the middle of the field, scanner frame
+    low: Array  # (2,) corner of the field on the map
+    bin: float
+    nearest: Array  # (V, H, W) range of the nearest surface in nine bins, −inf where there is no closed one
+    empty: Mask  # (V, H, W): nothing in nine bins
+    field: Mask  # (H, W): two views or more measured something
+    reach: tuple[float, float]  # ranges that were measured
+    trusted: Mask  # (V,): looked from one eye
+
+    def views_through(self, scan: Scan, T: Array, v: int, points: Array, normals: Array, margin: float) -> Indices:
+        """(N,) 1 where view v looks past places (N, 3) with normals, 2 where it ought to have seen one; else 0.
+
+        Args:
+            T: (4, 4) T_reference_scanner of the view; points and normals are in the reference frame.
+            margin: by which a surface lies behind a place, length_unit.
+        """
+        found = np.zeros(len(points), np.int64)
+        if not self.trusted[v]:
+            return found
+        away = frames.transform(frames.inverse(T), points) - scan.eye
+        far = np.linalg.norm(away, axis=1)
+        bins = np.floor((_on_map(away / far[:, None], self.axes) - self.low) / self.bin).astype(np.int64)
+        inside = np.flatnonzero(((bins >= 0) & (bins < self.field.shape)).all(axis=1))
+        i, j = bins[inside].T
+        behind = self.nearest[v, i, j] > far[inside] + margin
+        facing = np.einsum("ij,ij->i", normals[inside] @ T[:3, :3], away[inside]) < -_FACING * far[inside]
+        measurable = (far[inside] > self.reach[0]) & (far[inside] < self.reach[1])
+        found[inside] = np.where(
+            behind, 1, np.where(self.empty[v, i, j] & self.field[i, j] & facing & measurable, 2, 0)
+        )
+        return found
+
+
+def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> RangeImages:
+    """Return the range images of all views, of the points that are kept of each.
+
+    Args:
+        cell: the smallest edge of a bin at the middle range, length_unit.
+    """
+    away = [scan.points[keep] - scan.eye for scan, keep in zip(scans, kept, strict=True)]
+    ranges = [np.linalg.norm(a, axis=1) for a in away]
+    rays = [a / r[:, None] for a, r in zip(away, ranges, strict=True)]
+    axes = _axes_about(np.sum([d.mean(axis=0) for d in rays], axis=0))
+    maps = [_on_map(d, axes) for d in rays]
+    # On the map lengths are half the angles, in the middle of the field.
+    angle = np.sqrt(np.median([solid_angle(scan) for scan in scans]))
+    size = max(_BIN * angle, cell / float(np.median(np.concatenate(ranges)))) / 2
+    low = np.min([m.min(axis=0) for m in maps], axis=0) - 2 * size
+    shape = tuple(((np.max([m.max(axis=0) for m in maps], axis=0) - low) / size).astype(int) + 3)
+    nearest, empty, trusted = [], [], []
+    seen = np.zeros(shape, np.int64)
+    for m, far in zip(maps, ranges, strict=True):
+        i, j = ((m - low) / size).astype(np.int64).T
+        image, order = np.full(shape, np.inf), np.argsort(-far)
+        image[i[order], j[order]] = far[order]
+        seen += np.isfinite(image)
+        least, filled = _of_nine_bins(image)
+        nearest.append(np.where(np.isfinite(image) & (filled >= _CLOSED), least, -np.inf))
+        empty.append(filled == 0)
+        trusted.append(np.mean(far > image[i, j] + 2 * _STEEPEST * size * far) < _MOST_BEHIND)
+    limits = np.array([np.quantile(far, (0.01, 0.99)) for far in ranges])
+    reach = float(limits[:, 0].min()), float(limits[:, 1].max())
+    return RangeImages(axes, low, size, np.array(nearest), np.array(empty), seen >= 2, reach, np.array(trusted))
+
+
+def solid_angle(scan: Scan) -> float:
+    """Median solid angle, seen from the eye, that a point on a smooth surface has for itself."""
+    smooth = scan.usable if scan.usable.any() else np.ones_like(scan.usable)
+    away = scan.points[smooth] - scan.eye
+    return float(np.median((scan.area * scan.confidence)[smooth] / np.einsum("ij,ij->i", away, away)))
+
+
+def _axes_about(middle: Array) -> Array:
+    ahead = middle / max(float(np.linalg.norm(middle)), 1e-300)
+    across = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(ahead, across), ahead])
+
+
+def _on_map(rays: Array, axes: Array) -> Array:
+    """(N, 2) stereographic map of unit rays (N, 3); what lies behind the scanner lies far off."""
+    x = rays @ axes.T
+    return np.asarray(x[:, :2] / np.maximum(1 + x[:, 2:], 1e-3))
+
+
+def _of_nine_bins(image: Array) -> tuple[Array, Indices]:
+    """Least value (H, W) of a bin and its eight neighbours, and how many of them hold one."""
+    padded = np.pad(image, 1, constant_values=np.inf)
+    shifted = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
+    least, filled = np.full(image.shape, np.inf), np.zeros(image.shape, np.int64)
+    for i, j in np.ndindex(3, 3):
+        least = np.minimum(least, shifted[:, :, i, j])
+        filled += np.isfinite(shifted[:, :, i, j])
+    return np.asarray(least), filled
