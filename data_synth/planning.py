@@ -17,6 +17,7 @@ from stitch.errors import NoResultError
 
 Array = NDArray[np.float64]
 _ATTEMPTS = 40
+_SOUGHT = 0.6  # rad, 1-sigma of every joint about home
 _PROBE = 24  # rays per side for the line of sight
 
 
@@ -31,7 +32,9 @@ def plan_views(scene: Scene, mesh: trimesh.Trimesh, views: int, rng: np.random.G
         for _attempt in range(_ATTEMPTS):
             T_part_scanner = _pose(scene.plan, scene.scanner, mesh, view, rng)
             x = _station(scene, T_part_scanner)
-            found = kinematics.inverse(scene.arm, _flange(scene, T_part_scanner, x), q)
+            # A path is driven without a jump: only its first view may be sought from elsewhere.
+            begin = q if joints or scene.plan.kind != "path" else q + _SOUGHT * rng.standard_normal(q.shape)
+            found = kinematics.inverse(scene.arm, _flange(scene, T_part_scanner, x), begin)
             if found is not None and _sees(mesh, T_part_scanner, scene):
                 break
         else:
@@ -44,6 +47,8 @@ def plan_views(scene: Scene, mesh: trimesh.Trimesh, views: int, rng: np.random.G
         joints.append(q)
         rail.append(x)
     angles = np.array(joints)
+    if scene.plan.kind == "path":
+        velocity = list(np.gradient(angles, 1 / scene.plan.rate, axis=0))
     torque = kinematics.gravity_torques(scene.arm, angles)
     return Plan(angles, torque, np.array(velocity), scene.arm, scene.useful), np.array(rail)
 
@@ -71,6 +76,12 @@ def _pose(plan: ViewPlan, scanner: Scanner, mesh: trimesh.Trimesh, view: int, rn
         cell = np.array([column - (plan.columns - 1) / 2, row - (-(-plan.views // plan.columns) - 1) / 2])
         target = target + across[:, :2] @ (cell * plan.step)
     tilts = Rotation.from_euler("xyz", [*rng.uniform(-tilt, tilt, 2), rng.uniform(-roll, roll)])
+    if plan.kind == "path":
+        # Once around, swaying: smooth, with turns about every axis.
+        phase = 2 * np.pi * view / plan.views
+        target = middle + across[:, :2] @ (aim * np.array([np.sin(2 * phase), np.cos(3 * phase)]))
+        distance = scanner.standoff * (1 + plan.distance * np.sin(2 * phase))
+        tilts = Rotation.from_euler("xyz", [tilt * np.sin(phase), tilt * np.cos(phase), roll * np.sin(2 * phase)])
     R = across @ tilts.as_matrix()
     return frames.make(R, target - R[:, 2] * distance)
 

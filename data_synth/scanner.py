@@ -30,6 +30,7 @@ class Scanner:
     intensity_noise: float = 0.02  # relative
     sweep: float = 120.0  # length of a sweep of a line scanner, along y
     speed: float = 100.0  # mm/s of that sweep
+    exposure: float = 0.0  # s from the first row of an area scanner to the last, while it moves; 0 takes all at once
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Cloud:
     points: Array
     intensity: Array
     incidence: Array = field(repr=False)  # cosine, for nature only: no scanner knows it
-    time: Array | None = None  # s after the view's time, line scanners only
+    time: Array | None = None  # s after the view's time, of scanners that move meanwhile
 
 
 def half_field(scanner: Scanner) -> Array:
@@ -65,6 +66,7 @@ def field_map(scanner: Scanner, rng: np.random.Generator) -> Array:
 
 
 def profile_times(scanner: Scanner) -> Array:
-    """(rows,) s from the middle of a line scanner's sweep to each profile."""
+    """(rows,) s from the middle of a sweep, or of an area scan that takes a while, to each row."""
     middle = (scanner.rows - 1) / 2
-    return np.asarray((np.arange(scanner.rows) - middle) * scanner.sweep / scanner.rows / scanner.speed)
+    whole = scanner.sweep / scanner.speed if scanner.kind == "line" else scanner.exposure
+    return np.asarray((np.arange(scanner.rows) - middle) * whole / scanner.rows)

@@ -41,9 +41,9 @@ def cast(mesh: trimesh.Trimesh, T_part_scanner: Array, directions: Array) -> tup
 def scan(
     mesh: trimesh.Trimesh, T_part_scanner: Array, scanner: Scanner, field_weights: Array, rng: np.random.Generator
 ) -> Cloud:
-    """One view: T_part_scanner (4, 4), or (K, 4, 4) for the K profiles of a line scanner.
+    """One view: T_part_scanner (4, 4), or (K, 4, 4) for the K rows of a scanner that moves meanwhile.
 
-    Points of a line scanner are given in the frame of their own profile.
+    Points of such a scanner are given in the frame of their own row.
     """
     # Block by block: a hundred numbers a ray would fill the memory where a view has millions.
     blocks = _blocks(scanner)
@@ -67,7 +67,7 @@ def scan(
     intensity = bright * cos * (scanner.standoff / r) ** 2
     intensity *= 1 + scanner.intensity_noise * rng.standard_normal(len(r))
     points = d * (r / np.linalg.norm(d, axis=1))[:, None]
-    time = profile_times(scanner)[np.nonzero(seen)[0]] if scanner.kind == "line" else None
+    time = profile_times(scanner)[np.nonzero(seen)[0]] if T_part_scanner.ndim == 3 else None
     return Cloud(points, intensity, cos, time)
 
 
@@ -79,10 +79,12 @@ def _blocks(scanner: Scanner) -> list[slice]:
 def _aim(scanner: Scanner, T_part_scanner: Array, rows: slice) -> tuple[Array, Array]:
     """Directions of some rows, and the pose that they share (4, 4) or one for each."""
     directions = rays(scanner, rows)
-    if scanner.kind == "area":
+    if T_part_scanner.ndim == 2:
         return directions, T_part_scanner
     poses = T_part_scanner[rows]
-    return np.tile(directions, (len(poses), 1)), np.repeat(poses, len(directions), axis=0)
+    if scanner.kind == "line":
+        directions = np.tile(directions, (len(poses), 1))
+    return directions, np.repeat(poses, scanner.columns, axis=0)
 
 
 def _albedo(distance: Array, directions: Array, T_part_scanner: Array) -> Array:

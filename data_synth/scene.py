@@ -17,7 +17,7 @@ from stitch.errors import InputError
 
 Array = NDArray[np.float64]
 SCENES = Path(__file__).parent / "scenes"
-_KINDS = {"scanner": ("area", "line"), "plan": ("turntable", "orbit", "raster", "sweep")}
+_KINDS = {"scanner": ("area", "line"), "plan": ("turntable", "orbit", "raster", "sweep", "path")}
 
 
 @dataclass(frozen=True)
@@ -38,17 +38,18 @@ class PartPlace:
 class ViewPlan:
     """How the scanner looks at the part. Angles in degrees, lengths in mm."""
 
-    kind: str = "turntable"  # turntable | orbit | raster | sweep
+    kind: str = "turntable"  # turntable | orbit | raster | sweep | path
     views: int = 18
     turn: float = 20.0  # turntable: about the part's z from view to view
     tilt: float = 25.0  # largest tilt of the part or of the view direction
     roll: float = 15.0  # largest turn about the view direction
     aim: float = 15.0  # largest offset of the point looked at
     distance: float = 0.1  # largest relative change of the standoff
-    towards: tuple[float, float, float] = (0.0, 0.0, 1.0)  # orbit, raster, sweep: from the part to the scanner
-    up: tuple[float, float, float] = (0.0, 1.0, 0.0)  # orbit, raster, sweep: image rows run against it
+    towards: tuple[float, float, float] = (0.0, 0.0, 1.0)  # all but turntable: from the part to the scanner
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0)  # all but turntable: image rows run against it
     step: tuple[float, float] = (180.0, 180.0)  # raster: between stations
     columns: int = 4  # raster: stations in a row
+    rate: float = 5.0  # path: views per second, while the scanner moves on
     minimum_seen: float = 0.02  # share of the rays that must hit
 
 

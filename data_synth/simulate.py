@@ -150,6 +150,8 @@ def _climate(scene: Scene, views: int, rng: np.random.Generator) -> tuple[Array,
     """Times (s) and what the cell's thermometers say: a rise with a time constant, a slow wander."""
     times = np.sort(np.cumsum(rng.uniform(0.6, 1.4, views)))
     times = (times - times[0]) * scene.climate.minutes * 60 / max(times[-1] - times[0], 1e-9)
+    if scene.plan.kind == "path":
+        times = np.arange(views) / scene.plan.rate
     hours = times / 3600
     whole = max(hours[-1], 1e-9)
 

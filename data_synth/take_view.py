@@ -65,7 +65,8 @@ def take_view(cell: Cell, moment: Moment, rail: float, rng: np.random.Generator)
         profiles = scan(surface, to_part @ poses, scene.scanner, cell.field_weights, rng)
         cloud = _assemble(cell, moment, along, laws.act("points", moment, profiles))
     else:
-        ideal = scan(surface, to_part @ T_reference_scanner, scene.scanner, cell.field_weights, rng)
+        poses = scanner_at(q_true + _sweep(scene, moment)) if scene.scanner.exposure else T_reference_scanner
+        ideal = scan(surface, to_part @ poses, scene.scanner, cell.field_weights, rng)
         cloud = laws.act("points", moment, ideal)
     labelled = _labelled(cell, moment, frames.inverse(T_reference_scanner) @ T_reference_part, rng)
     return Taken(cloud, T_reference_scanner, labelled)
@@ -85,7 +86,7 @@ def _labelled(cell: Cell, moment: Moment, T_scanner_part: Array, rng: np.random.
 
 
 def _sweep(scene: Scene, moment: Moment) -> Array:
-    """(K, n) joint angles of the profiles less those of the view."""
+    """(K, n) joint angles of the rows less those of the view."""
     return np.asarray(profile_times(scene.scanner)[:, None] * moment.velocity)
 
 

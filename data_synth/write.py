@@ -39,7 +39,7 @@ def write_session(out: Path, measured: Measured, name: str) -> None:
 
 
 def cloud_file(cloud: scanner.Cloud) -> Cloud:
-    """One scan as its file holds it: intensity and, where a line was swept, times; nature's incidence stays hidden."""
+    """One scan as its file holds it: intensity and, where the scanner moved, times; nature's incidence stays hidden."""
     times = {} if cloud.time is None else {"time": cloud.time}
     return Cloud(cloud.points, scalars={"intensity": cloud.intensity, **times})
 
@@ -79,6 +79,8 @@ def _tables(measured: Measured) -> dict[str, dict[str, Any]]:
             "optical_axis": "+z",
         }
     }
+    if scene.scanner.exposure:
+        tables["scanner"]["moving"] = True
     if not scene.rail:
         tables["robot"] = robot_table(scene.arm)
     if scene.part.shape == "sphere":

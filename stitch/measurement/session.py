@@ -121,6 +121,7 @@ class Scanner:
     standoff: float | None
     optical_axis: Array  # (3,) unit vector in the scanner frame
     kind: SensorKind | None = None  # None: nobody says; whatever a sensor may have can be asked for
+    moving: bool = False  # points lie in the scanner's frame at their own time, not at that of the view
 
     def eye(self, points: Array) -> Array:
         """(3,) from where it looks at points (N, 3), scanner frame: the origin, if that is not amid what it measures.

@@ -15,6 +15,7 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.capture import MAX_POINTS, distinct_points, points_within, thin_cloud
+from stitch.measurement.moving_scanner import stand_still
 from stitch.measurement.robot import Robot
 from stitch.measurement.session import (
     Cloud,
@@ -204,7 +205,7 @@ SESSION_FORMAT = "stitch-session/1"
 
 _KEYS = {
     "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part"},
-    "scanner": {"pose", "noise", "standoff", "optical_axis", "kind", "within"},
+    "scanner": {"pose", "noise", "standoff", "optical_axis", "kind", "within", "moving"},
     "robot": {"name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity", "repeatability"},
     "sphere": {"radius"},
     "part": {"cad", "cad_unit"},
@@ -347,7 +348,10 @@ def read_scanner(file: Path, table: dict[str, Any]) -> Scanner:
         T_mount = _read_pose(file, table["pose"])
     noise, standoff = (positive_number(file, table, "scanner", key) for key in ("noise", "standoff"))
     kind = table_choice(file, table, "kind", get_args(SensorKind)) if "kind" in table else None
-    return Scanner(T_mount, noise, standoff, _AXES[axis], cast(SensorKind | None, kind))
+    moving = table.get("moving", False)
+    if not isinstance(moving, bool):
+        raise InputError(f"{file}: scanner.moving is {shortened(moving)}; use true or false")
+    return Scanner(T_mount, noise, standoff, _AXES[axis], cast(SensorKind | None, kind), moving)
 
 
 def read_crop_box(file: Path, table: dict[str, Any]) -> Array | None:
@@ -555,6 +559,8 @@ def load_session(
     rows = [row for row in rows if only is None or row.name == only]
     cloud_unit = table_choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
     scanner = read_scanner(file, document.get("scanner", {}))
+    # A scan that is moved point by point cannot be read once more from its file.
+    at_most = None if scanner.moving else at_most
     views = _read_session_views(path, document, rows, scanner, scans=scans, at_most=at_most, memory=memory)
     cad, cad_unit = cad_file(file, document.get("part", {}))
     session = Session(
@@ -573,7 +579,8 @@ def load_session(
     )
     if scans:
         check_scale(session, cloud_unit)
-    return session
+    # One view alone says nothing of how the robot moved.
+    return stand_still(session) if scanner.moving and scans and only is None else session
 
 
 def _read_sightings(path: Path, known: list[str]) -> dict[str, Sighting]:

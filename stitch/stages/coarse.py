@@ -20,10 +20,11 @@ from stitch import frames
 from stitch.closed_form import feature_matching
 from stitch.closed_form.feature_matching import FeaturedSurface
 from stitch.closed_form.hand_eye import AXXB_SOLVERS
+from stitch.closed_form.odometry import is_stream, motions_between, scan_odometry, turned_pairs
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.measurement.capture import Capture, part_size
-from stitch.measurement.scan import Scan, subsample
+from stitch.measurement.scan import Scan, even_indices, subsample
 from stitch.observations.observability import hidden_translations
 from stitch.observations.surfaces.matching import NeighbourQueries, neighbour_queries, sample_points
 from stitch.observations.surfaces.normal_equations import Overlaps, collect_overlaps, common_samples
@@ -147,8 +148,8 @@ def same_hand_eye(captures: Sequence[Capture], size: float, T_a: Array, T_b: Arr
 
 # Relative scanner motions from the scans alone, and hand-eyes from them (AX = XB).
 #
-# Neighbouring views are registered by features (FPFH, RANSAC; Rusu et al. 2009) and, as an ordered
-# sequence, by KISS-ICP (Vizzo et al. 2023). The motions are matched with the robot's by five solvers.
+# Neighbouring views are registered by features (FPFH, RANSAC; Rusu et al. 2009); a stream of scans in small steps
+# by KISS-ICP's odometry (Vizzo et al. 2023). The motions are matched with the robot's by five solvers.
 # Single motions may be wrong: a motion counts only if its rotation angle agrees with the robot's,
 # which holds for any hand-eye.
 
@@ -185,8 +186,7 @@ def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
 
 def robot_motions(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
     """A (M, 4, 4) with A·X = X·B, B the motion that maps view w's scanner frame into view v's."""
-    T = capture.T_reference_mount
-    return np.array([frames.inverse(T[v]) @ T[w] for v, w in pairs]).reshape(-1, 4, 4)
+    return motions_between(capture.T_reference_mount, pairs)
 
 
 def consistent_motions(A: Array, B: Array) -> tuple[Array, Array]:
@@ -231,38 +231,12 @@ def _even_grid_size(points: Array) -> float:
 
 
 def sequence_motions(capture: Capture) -> tuple[Array, Array]:
-    """(A, B), each (M, 4, 4): motions between consecutive views by KISS-ICP, made for a sequence in small steps."""
-    from kiss_icp.config import KISSConfig
-    from kiss_icp.mapping import get_voxel_hash_map
-    from kiss_icp.registration import get_registration
-
-    pairs = [(v, v + 1) for v in range(len(capture.scans) - 1)]
-    # KISS-ICP's defaults count in metres; a part's size plays the street's role of 100 m.
-    size = 2 * float(np.sqrt(capture.scans[0].points.var(axis=0).sum()))
-    config = KISSConfig()
-    # Its sums over several threads have no fixed order, so their last digits would change from run to run.
-    config.registration.max_num_threads = 1
-    # Started from the centroids it is there within some ten steps, or nowhere.
-    config.registration.max_num_iterations = 60
-    config.mapping.voxel_size = 0.02 * size
-    config.data.max_range = 1e6
-    B = []
-    for v, w in pairs:
-        voxel_map = get_voxel_hash_map(config)
-        voxel_map.add_points(_thin_points(capture.scans[v].points))
-        start = np.eye(4)
-        start[:3, 3] = capture.scans[v].points.mean(axis=0) - capture.scans[w].points.mean(axis=0)
-        B.append(
-            get_registration(config).align_points_to_map(
-                _thin_points(capture.scans[w].points), voxel_map, start, 0.2 * size, (0.03 * size) ** 2
-            )
-        )
-    return robot_motions(capture, pairs), np.array(B).reshape(-1, 4, 4)
-
-
-def _thin_points(points: Array) -> Array:
-    step = max(1, len(points) // _POINTS)
-    return np.ascontiguousarray(points[::step])
+    """(A, B), each (M, 4, 4): motions of a stream of scans by its odometry; none of separate views."""
+    scans = [scan.points[even_indices(len(scan.points), _POINTS)] for scan in capture.scans]
+    if not is_stream(capture.T_reference_mount, scans):
+        return np.zeros((0, 4, 4)), np.zeros((0, 4, 4))
+    pairs = turned_pairs(capture.T_reference_mount)
+    return robot_motions(capture, pairs), motions_between(scan_odometry(scans), pairs)
 
 
 _SEARCH_POINTS = 2000

@@ -12,10 +12,9 @@ import pytest
 SEARCH = """
     import numpy as np
     from data_synth.fixtures.blade_cells import captured_blade
-    from stitch.stages.coarse import coarse
-    from stitch.stages.coarse import feature_motions, sequence_motions
+    from stitch.stages.coarse import feature_motions, find_coarse_hand_eye, sequence_motions
     _, capture = captured_blade(2, views=3, pixels=40)
-    found = coarse([capture])
+    found = find_coarse_hand_eye([capture])
     T = np.stack([found.T_mount, *feature_motions(capture)[1], *sequence_motions(capture)[1]])
     print(found.source, " ".join(x.hex() for x in T.ravel().tolist()), sep="|")
 """
