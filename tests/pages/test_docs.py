@@ -27,6 +27,8 @@ OTHERS = {
     "my-cell.toml",
     "job.toml",
     "stand.toml",
+    "FEATURES.toml",
+    "artefact.toml",
 }
 # Words that the glossary replaces.
 PRIVATE = re.compile(r"\bsuspects?\b|look-?alikes?|\bmend(s|ed)?\b|\bgross errors?\b", re.IGNORECASE)
