@@ -346,7 +346,7 @@ def _exchange_added(state: Run, given: set[str]) -> tuple[Run, list[str]]:
     if tried.heldout_rms >= HELDOUT_FALL * state.heldout_or_fit_rms:
         return state, []
     gone = " and ".join(name for name in added if name not in names)
-    return tried, [f"{' and '.join(names)} do better together: views left out are predicted better without {gone}."]
+    return tried, [f"{' and '.join(names)}: views left out are predicted better than with {gone}, which went."]
 
 
 def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:

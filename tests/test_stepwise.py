@@ -94,6 +94,16 @@ def test_the_uncertainty_of_the_error_on_views_left_out_is_that_between_folds(fi
     assert judged.heldout_sigma == pytest.approx(jackknife, rel=0.3)
 
 
+def test_what_was_added_first_gives_way_to_what_does_more_together(first):
+    """Gears that run out imitate wrong zeros over these ranges, worse than the zeros themselves."""
+    stuck = stepwise.change(first, ["gear_eccentricity", "gear_harmonic"])
+    result, told = stepwise._exchange_added(stuck, given=set())
+    assert result.effects == ["joint_offset"] and result.heldout_rms < stuck.heldout_rms
+    gone = "gear_eccentricity and gear_harmonic"
+    assert told == [f"joint_offset: views left out are predicted better than with {gone}, which went."]
+    assert stepwise._exchange_added(result, given=set()) == (result, [])
+
+
 def test_what_was_tried_and_dropped_is_remembered_and_not_proposed_again(monkeypatch, tmp_path):
     session, *_ = labelled_cell(1, views=24, offset=OFFSET)
     first = run(load_session(write_labelled(tmp_path / "session", session)))

@@ -118,7 +118,6 @@ class ForwardSelection:
     effects: tuple[Ranked, ...]
     explained: float  # log posterior of what was found one by one
     refused: dict[str, str]  # effects that explain much and are not among them, and why
-    gone: frozenset[str]  # those of them that gave way to one that is likelier to hold beyond
 
 
 def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> ForwardSelection:
@@ -146,15 +145,18 @@ def find_better_effects(state: Run, added: Collection[str]) -> list[str]:
     linear = linearise(state.session, state.measurement, state.model.with_terms(terms), state.gate)
     every = [c for c in candidates_of(linear, empirical=False)[0] if c.name not in state.tried]
     chosen = tuple(rank_one(linear, c, len(every)) for c in every if c.name in added)
-    found = _better_selection(linear, every, ForwardSelection(chosen, 0.0, {}, frozenset()))
+    found = _better_selection(linear, every, ForwardSelection(chosen, 0.0, {}))
     return [] if found is None else [r.name for r in found.effects]
 
 
 def _better_selection(
     linear: LinearModel, every: Sequence[Candidate], found: ForwardSelection
 ) -> ForwardSelection | None:
-    """Other effects that hold their place, and together do better; None where there are none."""
-    instead = exchanged_set(linear, [c for c in every if c.name not in found.gone], found.effects)
+    """Other effects that hold their place, and together do better; None where there are none.
+
+    What was refused, as it errs beyond the measured poses, is not tried again.
+    """
+    instead = exchanged_set(linear, [c for c in every if c.name not in found.refused], found.effects)
     if not instead:
         return None
     other = _hold_beside_each_other(linear, every, [rank_one(linear, c, len(every)) for c in instead])
@@ -189,7 +191,7 @@ def _hold_beside_each_other(
             if len(unseen) > 1:
                 refused |= dict.fromkeys(unseen, untested_ends_reason(sorted(unseen)))
             likeliest_first = tuple(sorted(chosen, key=lambda r: -r.log_posterior))
-            return ForwardSelection(likeliest_first, explained, refused, frozenset(gone))
+            return ForwardSelection(likeliest_first, explained, refused)
         candidates = [c for c in candidates if c.name != name]
         chosen = _add_effects(linear, candidates, [*(r for r in chosen if r.name != name), *instead])
 
