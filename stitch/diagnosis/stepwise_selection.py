@@ -129,7 +129,7 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
     take its place where they also predict views left out better (`exchanged_set`).
     """
     every = [c for c in candidates if not c.empirical]
-    found = _hold_beside_each_other(linear, every, _add_effects(linear, every, [best]))
+    found = _stable_selection(linear, every, _add_effects(linear, every, [best]))
     while (other := _better_selection(linear, every, found)) is not None:
         found = other
     return found
@@ -159,11 +159,11 @@ def _better_selection(
     instead = exchanged_set(linear, [c for c in every if c.name not in found.refused], found.effects)
     if not instead:
         return None
-    other = _hold_beside_each_other(linear, every, [rank_one(linear, c, len(every)) for c in instead])
+    other = _stable_selection(linear, every, [rank_one(linear, c, len(every)) for c in instead])
     return other if is_better_set(linear, other.effects, found.effects) else None
 
 
-def _hold_beside_each_other(
+def _stable_selection(
     linear: LinearModel, every: Sequence[Candidate], chosen: Sequence[Ranked]
 ) -> ForwardSelection:
     """Effects of those chosen that hold their place, with others that then can be named.
