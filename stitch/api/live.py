@@ -28,8 +28,7 @@ from stitch.measurement.session import Scanner, View
 from stitch.model.model import Model
 from stitch.observations.observability import unknown_numbers
 from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
-from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD
-from stitch.observations.surfaces.scanner_errors import rig_field_scatters
+from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.planning.expected_model import displacement
 from stitch.runs.recorder import Recorder, SilentRecorder
@@ -327,7 +326,7 @@ class LiveSession:
     ) -> tuple[PoseErrors, dict[str, list[Array]]]:
         measurement = measurement_of(self._session_of(self._members), capture)
         errors = prior_pose_errors([measurement], Model(T_mount), [freed.overlaps.gram.centre])
-        return errors, {SCANNER_FIELD: rig_field_scatters([measurement], [freed])}
+        return errors, rig_scanner_errors([measurement], [freed])
 
     def _show(self, recording: LiveRecording) -> None:
         """Show the last view; with the first hand-eye all before it once more, in their places."""

@@ -17,7 +17,6 @@ from stitch.model.model import Model
 from stitch.observations.observability import seen_part, visible_twists
 from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.hand_eye_fit import (
-    SCANNER_FIELD,
     HandEyeFit,
     Repeatability,
     capture_repeatability,
@@ -139,8 +138,8 @@ def next_gates(captures: Sequence[Capture], overlaps: Sequence[Overlaps]) -> lis
     return [max(min(o.gate, next_gate(o, c)), 0.6 * o.gate) for c, o in zip(captures, overlaps, strict=True)]
 
 
-# From freed views per capture to the twists (6V, K) of each by the scanner's errors that all views repeat.
-ScannerErrors = Callable[[Sequence[UnconstrainedPoses]], list[Array]]
+# From freed views per capture to the twists (6V, K) of each by the scanner's errors that all views repeat, by source.
+ScannerErrors = Callable[[Sequence[UnconstrainedPoses]], dict[str, list[Array]]]
 # From freed views per capture and a hand-eye to how their poses may err.
 PoseErrorPrior = Callable[[Sequence[UnconstrainedPoses], Array], PoseErrors]
 
@@ -175,7 +174,7 @@ def correct(
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
     captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
     freed = _update_unconstrained(captures, freed, gates, T_first)
-    common = None if scanner_errors is None else {SCANNER_FIELD: scanner_errors(freed)}
+    common = None if scanner_errors is None else scanner_errors(freed)
     errors = None if pose_error_prior is None else pose_error_prior(freed, T_first)
     announce("correct: how certain the hand-eye is")
     hand_eye = fit_hand_eye(captures, freed, T_first, scanner_errors=common, errors=errors)

@@ -33,6 +33,7 @@ SOURCES = {
     "stop rotation": "rotation errors shared by all scans from one pose",
     "stop translation": "position errors shared by all scans from one pose",
     "scanner field": "a scanner error that repeats in every view",
+    "scanner scale": "a wrong scale of the scanner or of all arm lengths",
     ANOTHER_ARM: "the arm model of another run",
     "unseen": "directions that these views do not constrain",
 }

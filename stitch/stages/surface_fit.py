@@ -22,7 +22,7 @@ from stitch.model.model import (
 from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
 from stitch.observations.surfaces.effect_columns import view_columns
 from stitch.observations.surfaces.hand_eye_fit import (
-    SCANNER_FIELD,
+    SCANNER_SCALE,
     FittedEffects,
     HandEyeFit,
     fit_hand_eye,
@@ -37,13 +37,16 @@ from stitch.observations.surfaces.normal_equations import (
     pair_squares,
     pooled_rms,
 )
-from stitch.observations.surfaces.scanner_errors import rig_field_scatters
+from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.runs.recorder import Recorder
 from stitch.stages.correct import Correction
 from stitch.stages.fit import WEAK, fitted_parameters, iterate
 from stitch.stages.sentences import ANOTHER_ARM, unfitted
 from stitch.statistics.parameter_selection import WhitenedData, omitted_rms
+
+# The effect that is the scanner's scale.
+_SCALE = "range_scale"
 
 # One step of the fit to overlapping surfaces: generalised least squares over freed views about a model.
 
@@ -54,7 +57,8 @@ class ParameterChoice:
 
     fitted: Mask  # (P,)
     omitted: Array  # (P,) rms that parameters at zero may well have
-    scanner_field: list[Array]  # per session (6V, K) twists by the scanner's errors that all views repeat
+    # By source, per session (6V, K) twists by the scanner's errors that all views repeat.
+    scanner_errors: dict[str, list[Array]]
 
 
 @dataclass(frozen=True)
@@ -92,11 +96,13 @@ class LinearisedSurfaces:
     def choose(self, before: ParameterChoice | None) -> ParameterChoice:
         """The parameters that the views ask for, those of before first."""
         # What the scanner repeats hardly changes with the last micrometres.
-        field = rig_field_scatters(self.measurements, self.unconstrained)
+        repeated = rig_scanner_errors(self.measurements, self.unconstrained)
+        if _SCALE in [term.name for term in self.model.terms]:
+            del repeated[SCANNER_SCALE]
         fitted = np.zeros(len(self.values), bool) if before is None else before.fitted
         fitted = fitted_parameters(self.model.terms, fitted, self._whitened)
         omitted = omitted_rms(self._whitened(fitted), self.sizes, fitted, self._of_effect)
-        return ParameterChoice(fitted, np.where(self._held, 0.0, omitted), field)
+        return ParameterChoice(fitted, np.where(self._held, 0.0, omitted), repeated)
 
     def solve(self, choice: ParameterChoice) -> SurfaceFitStep:
         """The step, as the iteration of the fit asks for it."""
@@ -141,7 +147,7 @@ class LinearisedSurfaces:
         omitted = [choice.omitted * (self._of_effect == k) for k in range(len(terms))]
         own = {unfitted(term.name): sizes for term, sizes in zip(terms, omitted, strict=True) if sizes.any()}
         return {
-            SCANNER_FIELD: choice.scanner_field,
+            **choice.scanner_errors,
             **{source: [c[:, sizes > 0] * sizes[sizes > 0] for c in self.columns] for source, sizes in own.items()},
             ANOTHER_ARM: [c @ kept for c in self.columns],
         }

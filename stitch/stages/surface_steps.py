@@ -13,7 +13,7 @@ from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
-from stitch.observations.surfaces.scanner_errors import rig_field_scatters
+from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.observations.targets.target_model import TargetModelFit
@@ -66,7 +66,7 @@ def fit(
     """The hand-eye from the scans; with effects, both."""
 
     def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
-        repeating = partial(rig_field_scatters, measurements)
+        repeating = partial(rig_scanner_errors, measurements)
         captures = [m.capture for m in measurements]
 
         def pose_error_prior(unconstrained: Sequence[UnconstrainedPoses], T_mount: Array) -> PoseErrors:

@@ -22,7 +22,13 @@ from stitch.observations.pose_errors import PoseErrors, white_scatter_only
 from stitch.observations.surfaces.normal_equations import Gram, pair_squares
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.statistics.folds import grouped_folds
-from stitch.statistics.least_squares import GeneralisedFit, column_space, generalised_fit, summed_squares
+from stitch.statistics.least_squares import (
+    GeneralisedFit,
+    column_space,
+    generalised_fit,
+    project_out,
+    summed_squares,
+)
 from stitch.statistics.parameter_selection import WhitenedData
 from stitch.statistics.reml import MixedModel, fit_variances
 from stitch.statistics.variance_posterior import mean_variances
@@ -326,7 +332,7 @@ def weak_prior(
 
 
 # Errors of the scanner that all views repeat, by their name among the sources of the hand-eye's variance.
-SCANNER_FIELD = "scanner field"
+SCANNER_FIELD, SCANNER_SCALE = "scanner field", "scanner scale"
 # White scatter of more numbers is known well enough to take its maximum.
 _PLUG_IN = 300
 
@@ -408,11 +414,28 @@ def _variance_sources(
     components = zip(names, mean, mixed.components[:, 0], strict=True)
     sources = {name: size * weighed.gain @ C @ weighed.gain.T for name, size, C in components}
     for name, twists in scanner_errors.items():
-        repeated = weighed.gain @ rig.reduce(twists)
+        errors_seen = rig.reduce(twists)
+        repeated = weighed.gain @ errors_seen
+        if name == SCANNER_SCALE:
+            scatter = np.einsum("c,cij->ij", mean, mixed.components[:, 0])
+            repeated = repeated @ _posterior_root(rig, scatter, errors_seen)
         sources[name] = repeated @ repeated.T
     # The rest is what the prior leaves where nothing is seen.
     sources["unseen"] = weighed.covariance @ found.prior @ weighed.covariance
     return sources
+
+
+def _posterior_root(rig: RigModel, scatter: Array, errors: Array) -> Array:
+    """(K, K) square root of what the views leave of errors (N, K) of unit size: their variance with their mean squared.
+
+    Long ways of the flange show how long the scanner's millimetre is, short ones do not.
+    """
+    white = np.linalg.solve(np.linalg.cholesky(scatter), np.column_stack([rig.columns, errors, rig.z]))
+    free = project_out(white[:, : rig.columns.shape[1]], white[:, rig.columns.shape[1] :])
+    own, seen = free[:, :-1], free[:, -1]
+    variance = np.linalg.inv(np.eye(errors.shape[1]) + own.T @ own)
+    likeliest = variance @ (own.T @ seen)
+    return np.asarray(np.linalg.cholesky(variance + np.outer(likeliest, likeliest)))
 
 
 def _source_shares(sources: dict[str, Array], axes: slice) -> dict[str, float]:

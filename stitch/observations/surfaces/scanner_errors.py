@@ -8,11 +8,13 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.optimize import minimize
 
+from stitch.effects.contract import EFFECTS, missing_need
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.forward import PointSlopes
 from stitch.model.model import Model, Term
 from stitch.observations.surfaces.effect_columns import PointGram, apparent_twists, stream_point_sums
+from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD, SCANNER_SCALE
 from stitch.observations.surfaces.normal_equations import Gram, Overlaps
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, solve_view_sums, visible_step
 from stitch.statistics.distributions import chi2_tail, tukey
@@ -354,6 +356,35 @@ def shared_error_likelihood(
 def rig_field_scatters(measurements: Sequence[Measurement], unconstrained: Sequence[UnconstrainedPoses]) -> list[Array]:
     """The same for every session of a rig, as large as each shows it."""
     return [field_scatter(measurement, f, None) for measurement, f in zip(measurements, unconstrained, strict=True)]
+
+
+# One standard deviation of a scanner's scale. Data sheets state length errors of 0.05 to 0.1 mm over half a metre
+# (sphere spacing, VDI/VDE 2634) at the temperature of calibration; a few degrees more make as much.
+SCALE_SIGMA = 2e-4
+_SCALE = "range_scale"
+
+
+def rig_scanner_errors(
+    measurements: Sequence[Measurement], unconstrained: Sequence[UnconstrainedPoses]
+) -> dict[str, list[Array]]:
+    """By source, per session of a rig twists (6V, K) of the views by one standard deviation of errors that all views
+    of all sessions have in common."""
+    return {
+        SCANNER_FIELD: rig_field_scatters(measurements, unconstrained),
+        SCANNER_SCALE: [scale_scatter(m, f) for m, f in zip(measurements, unconstrained, strict=True)],
+    }
+
+
+def scale_scatter(measurement: Measurement, unconstrained: UnconstrainedPoses) -> Array:
+    """(6V, 1) twists that the views show for one standard deviation of the scanner's scale; none of a tracker.
+
+    Scans that are all too large by the same share still fit each other, each moved along the way from the part to its
+    scanner: so no overlap shows the scale, but the ways of the arm do. An arm whose lengths are all too short looks so.
+    """
+    if missing_need(measurement, EFFECTS[_SCALE]):
+        return np.zeros((6 * len(unconstrained.poses), 1))
+    away = unconstrained.poses[:, :3, 3] - unconstrained.overlaps.gram.centre
+    return np.asarray(SCALE_SIGMA * np.hstack([np.zeros_like(away), away]).reshape(-1, 1))
 
 
 # A map of the smooth error that a scanner makes in every view alike: what the overlaps tell of it, place by place.
