@@ -13,6 +13,7 @@ from stitch.diagnosis.unnamed_time_laws import ROTATION_PART, TRANSLATION_PART, 
 from stitch.observations.surfaces.scanner_errors import FieldError
 from stitch.units import angle_text, duration_text, format_amount, length_text, rounded
 
+_SCALE = "range_scale"
 # Curves of joints that are told in words; the page draws one more.
 _MAX_CURVES = 2
 
@@ -63,6 +64,9 @@ def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] 
     if pair:
         yield f"{pair[1].name} seems to be missing too ({fitted_amounts(pair[1])})."
         yield "Both sizes hold for a model with both effects."
+    if _SCALE in (candidate.name, pair[1].name if pair else ""):
+        # Scans, hand-eye and ways of the arm, all longer by the same share, fit each other as before.
+        yield "These views cannot tell it from arm lengths that are all off by the same share; a known length can."
     yield _implausible_sizes(ranked)
 
 

@@ -86,6 +86,11 @@ def test_a_name_less_than_twenty_to_one_over_chance_may_be_missing(odds, said):
     assert said in told and ("more than chance are 4 to 1." in told) == (odds < 20)
 
 
+@pytest.mark.parametrize(("effect", "said"), [("range_scale", True), ("settling", False)])
+def test_a_scale_of_the_scanner_may_be_one_of_the_arm(effect, said):
+    assert ("arm lengths that are all off by the same share" in said_at(25.0, "missing_effect", effect)) == said
+
+
 def test_what_is_larger_than_anybody_would_expect_is_asked_about():
     """No size forbids a name: a number in a table may be wrong."""
     free = [SimpleNamespace(name=name, limit=5.0, unit="mm") for name in ("da1", "da2")]
