@@ -163,9 +163,7 @@ def _better_selection(
     return other if is_better_set(linear, other.effects, found.effects) else None
 
 
-def _stable_selection(
-    linear: LinearModel, every: Sequence[Candidate], chosen: Sequence[Ranked]
-) -> ForwardSelection:
+def _stable_selection(linear: LinearModel, every: Sequence[Candidate], chosen: Sequence[Ranked]) -> ForwardSelection:
     """Effects of those chosen that hold their place, with others that then can be named.
 
     Of those that err beyond the measured poses the one that errs most is left out, and the search goes on: what it

@@ -6,6 +6,7 @@ generalised least-squares step weighs the views by the robot's own scatter (`han
 """
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from stitch.observations.surfaces.hand_eye_fit import (
     capture_repeatability,
     fit_hand_eye,
     hand_eye_jacobian,
+    solve_hand_eye,
     step_hand_eye,
 )
 from stitch.observations.surfaces.matching import sample_points
@@ -174,14 +176,23 @@ def correct(
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
     captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
     freed = _update_unconstrained(captures, freed, gates, T_first)
-    common = None if scanner_errors is None else scanner_errors(freed)
-    errors = None if pose_error_prior is None else pose_error_prior(freed, T_first)
+    solved = solve_hand_eye(captures, freed, T_first)
+
+    def final_overlaps() -> tuple[Overlaps, ...]:
+        return tuple(
+            collect_overlaps(c, c.poses(solved.T_mount), gate, [sample_points(s, FINE_SAMPLES) for s in c.scans])
+            for c, gate in zip(captures, gates, strict=True)
+        )
+
     announce("correct: how certain the hand-eye is")
-    hand_eye = fit_hand_eye(captures, freed, T_first, scanner_errors=common, errors=errors)
-    final = tuple(
-        collect_overlaps(c, c.poses(hand_eye.T_mount), gate, [sample_points(s, FINE_SAMPLES) for s in c.scans])
-        for c, gate in zip(captures, gates, strict=True)
-    )
+    # Where the hand-eye is says least squares at once; how certain it is takes half a second of one core.
+    with ThreadPoolExecutor(2) as beside:
+        field = None if scanner_errors is None else beside.submit(scanner_errors, freed)
+        overlaps_there = beside.submit(final_overlaps)
+        errors = None if pose_error_prior is None else pose_error_prior(freed, T_first)
+        common = None if field is None else field.result()
+        hand_eye = fit_hand_eye(captures, freed, T_first, scanner_errors=common, errors=errors, solved=solved)
+        final = overlaps_there.result()
     return Correction(
         model=Model(hand_eye.T_mount, (), hand_eye.covariance),
         hand_eye=hand_eye,

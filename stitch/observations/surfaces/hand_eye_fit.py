@@ -261,6 +261,7 @@ class HandEyeSolution:
     x: Array
     values: Array  # (P,) of the effects at which it was made
     hidden: Array  # (6, m) twists of the hand-eye that the motions do not show, one sigma of the weak prior each
+    T_mount: Array  # (4, 4) where it leads
 
 
 def solve_hand_eye(
@@ -287,6 +288,7 @@ def solve_hand_eye(
     held[:6, :6] += _HELD * prior[:6, :6] @ hidden @ hidden.T @ prior[:6, :6]
     pull = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
     weighed = rig.fit_gls(scatter, held)
+    x = weighed.solve(rig.z, pull)
     return HandEyeSolution(
         parts=parts,
         rig=rig,
@@ -294,9 +296,10 @@ def solve_hand_eye(
         prior=held,
         prior_vector=pull,
         gls=weighed,
-        x=weighed.solve(rig.z, pull),
+        x=x,
         values=columns.values,
         hidden=hidden,
+        T_mount=T_mount @ frames.exp(x[:6]),
     )
 
 
@@ -312,7 +315,7 @@ def step_hand_eye(
 ) -> tuple[Array, tuple[Repeatability, ...]]:
     """T_mount (4, 4) as `fit_hand_eye` finds it, without its statistics, and how the poses scatter per capture."""
     found = solve_hand_eye(captures, unconstrained, T_mount)
-    return T_mount @ frames.exp(found.x[:6]), found.scatter
+    return found.T_mount, found.scatter
 
 
 def weak_prior(
@@ -368,6 +371,7 @@ def fit_hand_eye(
     columns: FittedEffects | None = None,
     scanner_errors: Mapping[str, Sequence[Array]] | None = None,
     errors: PoseErrors | None = None,
+    solved: HandEyeSolution | None = None,
 ) -> HandEyeFit:
     """Generalised least squares over the pose channels of all captures; covariance under all errors of the poses.
 
@@ -379,8 +383,9 @@ def fit_hand_eye(
             errors that all views and captures have in common; they widen the covariance and change nothing else.
         errors: how the poses may err beside white scatter; None: they do not. What joints do anew is not counted: on
             average the scatter of the flange that views show holds it already.
+        solved: what `solve_hand_eye` finds of the same, if it is at hand.
     """
-    found = solve_hand_eye(captures, unconstrained, T_mount, columns)
+    found = solved or solve_hand_eye(captures, unconstrained, T_mount, columns)
     errors = errors or white_scatter_only(sum(len(f.poses) for f in unconstrained))
     sources = _variance_sources(found, errors.repeating_only(), scanner_errors or {})
     covariance = np.sum(list(sources.values()), axis=0)
@@ -389,7 +394,7 @@ def fit_hand_eye(
     sources["unseen"][:6, :6] += found.hidden @ found.hidden.T
     covariance[:6, :6] += found.hidden @ found.hidden.T
     return HandEyeFit(
-        T_mount=T_mount @ frames.exp(found.x[:6]),
+        T_mount=found.T_mount,
         covariance=covariance[:6, :6],
         inflation=float(max(1.0, np.exp(log_ratio / len(covariance)))),
         repeatability=found.scatter,
