@@ -40,8 +40,9 @@ from stitch.statistics.variance_posterior import Satterthwaite, satterthwaite
 WHITE_COMPONENTS = ("white rotation", "white translation", "sensor noise")
 # A component that is as good as absent, as a share of the variance that it usually has.
 _NEGLIGIBLE_SHARE = 1e-2
-# Models beside further columns that are kept: those of one round of a selection; of thousands of poses 40 MB each.
-_REMEMBERED = 12
+# Models beside further columns that are kept: those of one round of a selection, but of so many numbers in all at most:
+# 2,773 poses of a probe take 40 MB each.
+_REMEMBERED, _REMEMBERED_NUMBERS = 12, 200_000
 # Among more numbers a search takes a second: one from the likeliest start must do.
 _SINGLE_START_SIZE = 250
 
@@ -377,7 +378,7 @@ class LinearModel(ErrorModel):
                 found = replace(found, null=fit_variances(mixed, start=(near or self).null.variances))
             else:
                 found = found.refit()
-            if len(self._conditioned) >= _REMEMBERED:
+            if len(self._conditioned) >= min(_REMEMBERED, _REMEMBERED_NUMBERS // self.mixed.size):
                 self._conditioned.clear()
             self._conditioned[key] = found
         return found
