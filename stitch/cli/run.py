@@ -123,7 +123,7 @@ def run(
     with show_activity(f"{name}: reading the scans"), new_folder(target, paths, force) as scratch:
         folders = _run_folders(scratch, loaded)
         recorders = [recorder_for(folder, recording) for folder in folders]
-        runs = run_rig(loaded, model, recorders, named, keep, kept, register or DEFAULT, captures)
+        runs = run_rig(loaded, model, recorders, named, keep, arm=kept, register=register or DEFAULT, captures=captures)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
         with ThreadPoolExecutor(1) as beside:
             written = beside.submit(_write_runs, runs, folders, scratch, mesh, tolerance)

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch import frames
 from stitch.observations.surfaces.hand_eye_fit import capture_repeatability, hand_eye_jacobian
-from stitch.observations.surfaces.matching import match_pairs, overlapping_pairs, sample_points
-from stitch.observations.surfaces.normal_equations import assemble, collect_overlaps, gram, pair_squares
+from stitch.observations.surfaces.matching import match_pairs, overlapping_pairs, sample_points, signed_distances
+from stitch.observations.surfaces.normal_equations import assemble, carry_overlaps, collect_overlaps, gram, pair_squares
 from stitch.observations.surfaces.view_poses import unconstrained_poses
 
 
@@ -52,6 +52,22 @@ def test_views_that_face_away_do_not_overlap(blade_capture):
     far = capture.poses(measured.T_mount).copy()
     far[2, :3, 3] += 1e4
     assert all(2 not in pair for pair in overlapping_pairs(capture.scans, far, 2.0))
+
+
+def test_partners_carried_along_have_the_distances_of_the_new_poses(blade_capture, overlaps):
+    """Against the points themselves, placed anew: what is left is of second order; a common motion changes nothing."""
+    measured, capture = blade_capture
+    poses = capture.poses(measured.T_mount)
+    twists = 1e-3 * np.random.default_rng(3).normal(size=(len(poses), 6)) * [0.01, 0.01, 0.01, 1, 1, 1]
+    moved = frames.moved_about(overlaps.gram.centre, twists, poses)
+    carried = carry_overlaps(capture, overlaps, poses, moved)
+    exact = signed_distances(overlaps.matches, moved, [s.points for s in capture.scans])
+    before, after = (np.concatenate([m.residual for m in o.matches]) for o in (overlaps, carried))
+    assert np.abs(exact - before).max() > 1e-3
+    assert np.abs(exact - after).max() < 0.02 * np.abs(exact - before).max()
+    common = frames.moved_about(overlaps.gram.centre, np.tile(twists[0], (len(poses), 1)), poses)
+    still = carry_overlaps(capture, overlaps, poses, common)
+    assert np.allclose(np.concatenate([m.residual for m in still.matches]), before, atol=1e-9)
 
 
 def test_pairs_serve_again_until_something_has_moved(blade_capture, overlaps):
