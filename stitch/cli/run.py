@@ -284,19 +284,20 @@ def _given_models(
     hand_eye: Path | None, arm: Path | None, effects: list[str], effects_file: Path | None, trust: bool
 ) -> tuple[ModelFile | None, ModelFile | None, str | None]:
     """Return the model that is used as it is, the arm that is kept, and the file of the user's own effects, if any."""
-    from stitch.model.model_toml import keep_arm_effects
-    from stitch.stored.stored_run import trusted_model
-
     if hand_eye and (effects or arm):
         raise InputError(
             f"{'--arm' if arm else '--effects'} and --hand-eye: a model that is used as it is brings its own effects; "
             "to fix: name one of the two"
         )
     own = str(effects_file.resolve()) if effects_file else None
+    if hand_eye is None and arm is None:
+        return None, None, own
+    from stitch.model.model_toml import keep_arm_effects
+    from stitch.stored.stored_run import trusted_model
+
     if hand_eye:
         return trusted_model(hand_eye, effects_file, trust)[0], None, own
-    if arm is None:
-        return None, None, own
+    assert arm is not None
     stated, file = trusted_model(arm, effects_file, trust)
     kept = keep_arm_effects(stated)
     if twice := set(effects) & set(kept.effects):

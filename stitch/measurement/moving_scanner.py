@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from stitch import frames
@@ -82,6 +81,9 @@ class _RobotPath:
 
     def __init__(self, times: Array, T_reference_mount: Array) -> None:
         self.times = times
+        # Few sessions have a scanner that moves: the others do not wait for it.
+        from scipy.interpolate import CubicSpline
+
         self._place = CubicSpline(times, T_reference_mount[:, :3, 3])
         self._turn = RotationSpline(times, Rotation.from_matrix(T_reference_mount[:, :3, :3]))
 

@@ -31,7 +31,9 @@ def test_a_run_loads_nothing_of_the_diagnosis():
     """Nor of plans, pictures and meshes: all that it needs from the first file to the page."""
     modules = loaded("import stitch.cli.run, stitch.pipeline, stitch.writing.run_folder, viz.run_page")
     assert "stitch.stages.register" in modules
-    assert not modules & (DEAR | {"stitch.diagnosis", "stitch.planning", "stitch.explanation", "scipy.cluster"})
+    assert not modules & (
+        DEAR | {"stitch.diagnosis", "stitch.planning", "stitch.explanation", "scipy.cluster", "scipy.interpolate"}
+    )
 
 
 @pytest.mark.parametrize("line", ["--version", "--help"])
