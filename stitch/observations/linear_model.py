@@ -378,7 +378,7 @@ class LinearModel(ErrorModel):
                 found = replace(found, null=fit_variances(mixed, start=(near or self).null.variances))
             else:
                 found = found.refit()
-            if len(self._conditioned) >= min(_REMEMBERED, _REMEMBERED_NUMBERS // self.mixed.size):
+            if len(self._conditioned) >= min(_REMEMBERED, _REMEMBERED_NUMBERS // max(self.mixed.size, 1)):
                 self._conditioned.clear()
             self._conditioned[key] = found
         return found
