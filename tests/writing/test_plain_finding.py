@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import stitch.diagnosis.validation as validation
 import stitch.pipeline as stepwise
 import stitch.writing.diagnosis_document as plain
 import stitch.writing.finding_screen as finding_screen
@@ -47,7 +48,7 @@ def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve)
 @pytest.mark.parametrize("share", [0.949, 0.951])
 def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
     """Neither before it was asked for nor, again, right after: `stitch add --group` judges by the same number."""
-    for module in (plain, stepwise):
+    for module in (plain, validation):
         monkeypatch.setattr(module, "group_share", lambda linear, group: (share, 0.05))
     cause = SimpleNamespace(name="play", ranked=SimpleNamespace(score=None))
     found = SimpleNamespace(
