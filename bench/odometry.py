@@ -1,4 +1,4 @@
-"""Motions and hand-eye from the odometry of ordered scans: python -m bench.odometry [--seeds N].
+"""Motions and hand-eye from the odometry of ordered scans: python -m bench.odometry [--seeds N] [--motions].
 
 A stream of a scanner that never stops (`moving-scan`), with and without its de-skew, beside separate views of the same
 arm (`blade-table`). A step is right where it places the middle of the scan within 3 % of the part's size and
@@ -60,13 +60,19 @@ def row(name: str, measured: Measured, times: list[Array] | None) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--views", type=int, help="of the stream; default is the scene's")
+    parser.add_argument("--motions", action="store_true", help="without the whole runs")
+    given = parser.parse_args()
     print("| scans | taken for a stream | right motions | hand-eye from the odometry off by |\n|---|---|---:|---:|")
-    for seed in range(parser.parse_args().seeds):
-        stream, views = (simulate(load_scene(name), {}, seed) for name in ("moving-scan", "blade-table"))
+    for seed in range(given.seeds):
+        stream, views = (
+            simulate(load_scene(name), {}, seed, count)
+            for name, count in (("moving-scan", given.views), ("blade-table", None))
+        )
         row(f"stream {seed}, de-skewed", stream, [cloud.time for cloud in stream.clouds if cloud.time is not None])
         row(f"stream {seed}, as it is", stream, None)
         row(f"separate views {seed}", views, None)
-        for name, measured in (("stream", stream), ("separate views", views)):
+        for name, measured in () if given.motions else (("stream", stream), ("separate views", views)):
             with tempfile.TemporaryDirectory() as folder:
                 write_session(Path(folder) / "s", measured, name)
                 found = run(load_session(Path(folder) / "s"))
