@@ -20,6 +20,7 @@ from stitch.pipeline import diagnose, run
 from stitch.runs.run import Note
 from stitch.units import length_text
 from stitch.writing.result_document import result_document
+from tests.viz.test_steps_told import told_at
 from viz.colours import UNSEEN, signed_colours
 from viz.course_recording import log_course
 from viz.diagnosis_recording import log_diagnosis
@@ -121,7 +122,8 @@ def test_titles_and_words_say_what_the_result_says(recorded):
     eye = eyes(path)
     assert set(eye[before]) == {f"EyeControls3D:{what}" for what in ("position", "look_target", "eye_up")}
     assert eye[before] == eye[after]
-    last = columns(path, "TextDocument:text")["/now"][0]
+    said = told_at(path)
+    last = said[max(said)]
     assert unbroken(titles(stated[-1:])[0].partition(": ")[2]) in last
 
 
