@@ -27,7 +27,7 @@ install: $(STAMP)
 
 # A .venv that an interrupted or failed attempt left behind is made anew.
 $(STAMP): pyproject.toml constraints.txt
-	@echo "setting up $(VENV): 2 GB of packages, the first time some minutes" >&2
+	@echo "setting up $(VENV): 2.3 GB of packages, the first time some minutes" >&2
 ifdef UV
 	@$(PYTHON) $(SERVES) || uv venv --quiet --clear --python "$(or $(BASE),$(RANGE))" $(VENV) || \
 		{ echo "stitch needs Python 3.11, 3.12 or 3.13: none was found" >&2; exit 2; }

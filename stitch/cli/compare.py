@@ -5,14 +5,18 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.progress import show_activity
 from stitch.cli.terminal import emit, say, show_block, show_files, show_next, show_table
+from stitch.errors import InputError
 
 if TYPE_CHECKING:
     from stitch.comparison.displaced_views import FollowedCovariate
+    from stitch.comparison.open3d_witness import Witness
     from stitch.comparison.residual_tables import ResidualTable, ResidualTables
     from stitch.runs.run import Run
 
@@ -20,9 +24,16 @@ _SCOPE = "This look shows what the error follows, one covariate at a time. The c
 _WORST_ROWS = 5
 _LISTED_TABLES = 4
 
+_WITNESSES = ("open3d",)
+_With = Annotated[
+    str | None,
+    typer.Option("--with", metavar="PROGRAM", help="Another program registers the same scans: open3d."),
+]
+
 
 def compare_run(
     run: RunFolder,
+    program: _With = None,
     effects_file: EffectsFile = None,
     trust: Trust = False,
     as_json: Json = False,
@@ -35,7 +46,11 @@ def compare_run(
     Examples:
       stitch compare runs/blade-17
       stitch compare runs/blade-17 --json
+      stitch compare runs/blade-17 --with open3d
     """
+    if program is not None:
+        _compare_with(program, run, effects_file, trust=trust, as_json=as_json)
+        return
     from stitch.comparison.residual_tables import comparison_document
     from stitch.stored.stored_run import load_run
     from stitch.writing.json_file import to_json
@@ -48,6 +63,45 @@ def compare_run(
         emit(to_json(comparison_document(found)))
     else:
         show_comparison(found, state, run)
+
+
+def _compare_with(program: str, run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
+    """Let another program register the scans of a run, write witness.json with a picture, and print what differs."""
+    from stitch.comparison.open3d_witness import open3d_witness
+    from stitch.stored.stored_run import load_run
+    from stitch.system.open3d_library import import_open3d
+    from stitch.writing.json_file import to_json, write_json
+    from stitch.writing.run_folder import call_entry_points, lock_run_folder
+
+    if program not in _WITNESSES:
+        raise InputError(f"--with {program}: to fix: {' or '.join(_WITNESSES)}")
+    import_open3d(f"--with {program}")
+    with lock_run_folder(run), show_activity("comparing: reading the scans"):
+        state = load_run(run, effects_file, trust=trust)
+        with show_activity("comparing: Open3D registers the scans"):
+            witness = open3d_witness(state)
+        write_json(witness.document(), run / "witness.json")
+        call_entry_points("stitch.witness_pictures", witness, state, run)
+    if as_json:
+        emit(to_json(witness.document()))
+    else:
+        _show_witness(witness, state.session.length_unit, run)
+
+
+def _show_witness(witness: Witness, length_unit: str, run: Path) -> None:
+    from stitch.units import angle_text, length_text
+
+    for sentence in witness.sentences(length_unit):
+        say(sentence)
+    show_table(
+        "Open3D's pose of each view beside this run's",
+        ("view", "shift", "turn"),
+        [
+            (name, length_text(float(shift), length_unit), angle_text(float(turn)))
+            for name, shift, turn in zip(witness.views, witness.shift, witness.turn, strict=True)
+        ],
+    )
+    show_files(run, ("witness.json", "witness.png"))
 
 
 def write_comparison(state: Run, run: Path) -> ResidualTables:

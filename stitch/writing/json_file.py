@@ -32,6 +32,8 @@ FILES = {
     "two-runs.html",
     "two-runs.pdf",
     "compare.json",
+    "witness.json",
+    "witness.png",
     "diagnosis.json",
     "diagnosis.rrd",
     "robot.toml",
