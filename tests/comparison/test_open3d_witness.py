@@ -54,7 +54,9 @@ def test_a_view_that_the_run_has_elsewhere_is_the_one_that_differs(run, witness)
 
 def test_the_command_writes_and_says_it(run, witness, tmp_path, capsys):
     folder = run.save(tmp_path / "run", recording=False)
-    main(["compare", str(folder), "--with", "open3d"])
+    with pytest.raises(SystemExit) as ended:
+        main(["compare", str(folder), "--with", "open3d"])
+    assert not ended.value.code
     told = " ".join(capsys.readouterr().err.split())
     assert "registered the same scans by" in told and "From its cloud to this one: half within" in told
     document = json.loads((folder / "witness.json").read_text())
