@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 import stitch
 from bench.docs.notebook_page import NOTEBOOK, NOTEBOOKS, cells, notebook_page, printed_in, run_cells
 from bench.docs.page_examples import differences
+from tests.needs import needs_open3d
 
 
 def code_of(file):
@@ -16,6 +17,8 @@ def code_of(file):
 @pytest.mark.slow
 @pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
 def test_the_notebook_prints_what_it_shows(file):
+    if file != NOTEBOOK:
+        needs_open3d()
     done = run_cells(file)
     for (text, _), cell in zip(done, code_of(file), strict=True):
         assert not differences(text, printed_in(cell)), "to fix: python -m bench.docs.notebook_page"
