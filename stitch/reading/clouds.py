@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stitch.errors import InputError
-from stitch.frames import Array, Mask
+from stitch.frames import Array
 from stitch.measurement.session import Cloud
 from stitch.reading.csv_files import is_number
 from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image, read_depth_columns
@@ -365,36 +365,43 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
     return Cloud(points if scale == 1.0 else points * scale, normals, scalars)
 
 
-# Points that a code for "nothing measured" is looked for among, the share of them that one has, and how far from the
-# others it lies, in their own extents.
-_CODE_SAMPLE, _CODE_SHARE, _CODE_AWAY = 4000, 0.005, 2.0
+# How often a code for "nothing measured" stands, how far it lies from the others, in their own extents, and how many of
+# these are looked at: of so many different numbers at least, and of this share of the points.
+_CODE_TIMES, _CODE_AWAY, _CODE_SAMPLE, _CODE_VALUES, _CODE_REST = 3, 2.0, 4000, 20, 0.02
 
 
 def _without_codes(columns: dict[str, Array]) -> dict[str, Array]:
     """Return the columns without points that are a code, as -99999 three times or z = -32.768.
 
-    A code is one value of a coordinate in a share of the points, to the last digit, far outside of what the rest spans.
+    A code is the least or largest value of a coordinate, the same to the last digit in several points, be it a few of
+    them or most, and far outside of what the rest spans.
     """
-    sample = slice(None, None, -(-len(columns["x"]) // _CODE_SAMPLE) or 1)
-    away: Mask | None = None
+    coded = np.zeros(len(columns["x"]), bool)
     for axis in "zxy":
-        values = np.asarray(columns[axis])[sample]
-        found, counts = np.unique(values, return_counts=True)
-        often = found[(counts >= max(_CODE_SHARE * len(values), 2)) & np.isfinite(found)]
-        rest = values[~np.isin(values, often) & np.isfinite(values)]
-        if not len(often) or len(rest) < len(values) / 2:
-            continue
-        low, high = np.percentile(rest, (1, 99))
-        span = max(high - low, 1e-9 * max(abs(low), abs(high)))
-        codes = often[(often < low - _CODE_AWAY * span) | (often > high + _CODE_AWAY * span)]
-        if len(codes):
-            coded = np.isin(columns[axis], codes)
-            away = coded if away is None else away | coded
-    if away is None:
-        return columns
-    for name in list(columns):
-        columns[name] = columns[name][~away] if len(columns[name]) == len(away) else columns[name]
+        values = np.asarray(columns[axis])
+        while (code := _code(values[~coded] if coded.any() else values)) is not None:
+            coded |= values == code
+    if coded.any():
+        for name in list(columns):
+            columns[name] = columns[name][~coded] if len(columns[name]) == len(coded) else columns[name]
     return columns
+
+
+def _code(values: Array) -> float | None:
+    """The value (N,) that stands for nothing measured, if one does."""
+    for extreme in (np.fmin.reduce(values), np.fmax.reduce(values)) if len(values) else ():
+        # Whole scans are looked at, and hardly any has a code: first what costs least.
+        if not np.isfinite(extreme) or np.count_nonzero(values == extreme) < _CODE_TIMES:
+            continue
+        rest = values[(values != extreme) & np.isfinite(values)]
+        if len(rest) < _CODE_REST * len(values):
+            continue
+        sample = rest[:: -(-len(rest) // _CODE_SAMPLE)]
+        low, high = np.percentile(sample, (1, 99))
+        away = max(low - extreme, extreme - high)
+        if away > _CODE_AWAY * (high - low) > 0 and len(np.unique(sample)) >= _CODE_VALUES:
+            return float(extreme)
+    return None
 
 
 def read_ply(path: Path) -> dict[str, Array]:

@@ -111,10 +111,9 @@ def _fuse_voxels(voxels: _Voxels) -> FusedCloud:
 _SLAB = 2_500_000
 # Effects of scanner and part move a point by less than this share of the view's size.
 _MAX_MOVE = 0.02
-# One point in memory is looked up for a block of voxels; so many blocks lie between two points in memory.
-_BLOCKS = 1.5
-# A voxel on the surface of the nearest point in memory lies within so many spacings of it.
-_WITHIN = 2.5
+# A voxel on the surface of the nearest point in memory lies within so many times the edge of the square that this one
+# has for itself: those in memory may stand in rows, as far apart as half of this.
+_WITHIN = 4.0
 # It lies off its plane by less than so many sigmas and this share of the distance, more where little is junk.
 _SIGMAS, _OFF_PLANE = 4.0, 0.15
 
@@ -146,12 +145,16 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     """
     session, own, poses = registered.session, registered.own, registered.poses
     cell = float(np.median([scan.scanned_spacing for scan in own.scans]))
+    whole = any(view.cloud is not None and view.cloud.whole is not None for view in session.views)
+    # Points in memory may stand in rows: not their spacing says what place one has, but its surface.
+    place = float(np.sqrt(np.median([np.median(scan.area) for scan in own.scans]))) if whole else own.spacing
     placed = place_scans(own.scans, poses)
-    support = find_support(own.scans, poses, placed, own.spacing)
-    if all(view.cloud is None or view.cloud.whole is None for view in session.views):
+    support = find_support(own.scans, poses, placed, place)
+    if not whole:
         dropped = Unsupported(len(support.kept), int(support.alone.sum()), int(support.looked_through.sum()))
         return _fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell), dropped
-    block = max(1, int(own.spacing / (_BLOCKS * cell)))
+    # One point in memory is looked up for a block of voxels, which is no larger than the place of such a point.
+    block = max(1, int(place / cell))
     ends, axis = _slabs(registered, block * cell, slab)
     split = np.cumsum([len(scan.points) for scan in own.scans])[:-1]
     parts = zip(np.split(support.alone, split), np.split(support.looked_through, split), support.junk, strict=True)

@@ -8,7 +8,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from stitch.errors import InputError
-from stitch.reading.clouds import read_cloud
+from stitch.reading.clouds import cloud_of_columns, read_cloud
 
 POINTS = np.random.default_rng(0).normal(size=(500, 3)) * 100
 
@@ -151,3 +151,25 @@ def test_what_git_lfs_has_not_fetched_says_how_to_fetch_it(name, tmp_path):
     (tmp_path / name).write_text(pointer)
     with pytest.raises(InputError, match="git lfs pull"):
         read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "code", [(-99999, -99999, -99999), (np.nan, np.nan, -32.768), (0.0, 0.0, -32.768), (9999, 0, 0)]
+)
+@pytest.mark.parametrize("times", [3, 100, 9000])
+def test_a_code_for_nothing_measured_is_no_point(code, times):
+    """A few of the pixels or most of them; what was measured stays, in its order."""
+    points = np.random.default_rng(0).uniform([-0.1, -0.1, 0.4], [0.1, 0.1, 0.5], (1000, 3))
+    at = np.sort(np.random.default_rng(1).integers(0, 1000, times))
+    code = np.nan_to_num(code, nan=0.05)
+    columns = dict(zip("xyz", np.insert(points, at, code, axis=0).T, strict=True))
+    columns["intensity"] = np.insert(points[:, 2], at, 0.0)
+    cloud = cloud_of_columns("scan", columns)
+    assert np.array_equal(cloud.points, points) and np.array_equal(cloud.scalars["intensity"], points[:, 2])
+
+
+def test_what_is_flat_or_stepped_or_quantised_is_no_code():
+    x, y = (g.ravel() for g in np.meshgrid(*[np.arange(40) * 0.5] * 2))
+    for z in (np.full(1600, 500.0), np.where(x > 15, 500.0, 100.0), np.round(300 + 0.3 * x)):
+        cloud = cloud_of_columns("scan", {"x": x.copy(), "y": y.copy(), "z": z.copy()})
+        assert np.array_equal(cloud.points[:, 2], z)
