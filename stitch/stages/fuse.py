@@ -42,7 +42,7 @@ def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedClou
         Points, normals, `residual` = rms distance of the views' surfaces from the fused one along
         its normal (NaN where one view only), and the number of views per point.
     """
-    return _fuse_points(place_scans(capture.scans, poses), cell or capture.spacing)
+    return fuse_points(place_scans(capture.scans, poses), cell or capture.spacing)
 
 
 def point_weights(confidence: Array, usable: Array) -> Array:
@@ -51,7 +51,7 @@ def point_weights(confidence: Array, usable: Array) -> Array:
 
 
 def place_scans(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
-    """The points of all scans in the reference frame, one view after the other."""
+    """All points of all scans in the reference frame, one view after the other."""
     placed = [_place_scan(scan, T, v) for v, (scan, T) in enumerate(zip(scans, poses, strict=True))]
     return PlacedPoints(*(np.concatenate([getattr(p, f.name) for p in placed]) for f in fields(PlacedPoints)))
 
@@ -62,7 +62,8 @@ def _place_scan(scan: Scan, T: Array, v: int) -> PlacedPoints:
     return PlacedPoints(points, normals, weight, np.full(len(points), v), np.asarray(scan.usable, bool))
 
 
-def _fuse_points(placed: PlacedPoints, size: float) -> FusedCloud:
+def fuse_points(placed: PlacedPoints, size: float) -> FusedCloud:
+    """The same of placed points, in cells of `size`; the grid is the reference frame's own."""
     return _fuse_voxels(_voxels(placed, cell_numbers(placed.points, size)))
 
 
@@ -152,7 +153,7 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     support = find_support(own.scans, poses, placed, place)
     if not whole:
         dropped = Unsupported(len(support.kept), int(support.alone.sum()), int(support.looked_through.sum()))
-        return _fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell), dropped
+        return fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell), dropped
     # One point in memory is looked up for a block of voxels, which is no larger than the place of such a point.
     block = max(1, int(place / cell))
     ends, axis = _slabs(registered, block * cell, slab)
