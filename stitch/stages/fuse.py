@@ -154,6 +154,7 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     if not whole:
         dropped = Unsupported(len(support.kept), int(support.alone.sum()), int(support.looked_through.sum()))
         return fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell), dropped
+    del placed  # of every view: memory is for the slabs
     # One point in memory is looked up for a block of voxels, which is no larger than the place of such a point.
     block = max(1, int(place / cell))
     ends, axis = _slabs(registered, block * cell, slab)
