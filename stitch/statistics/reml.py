@@ -95,9 +95,9 @@ class FurtherPrior:
         """Of some components alone (f,)."""
         return replace(self, scales=self.scales[keep], shapes=self.shapes[keep], common_factor=self.common_factor[keep])
 
-    def at_factor(self, factor: float) -> Self:
-        """Where all are usually so many times as large, and none is absent: no arm in use errs in one way alone."""
-        return replace(self, scales=factor * self.scales, shapes=np.full(len(self.shapes), ALWAYS_PRESENT))
+    def scaled(self, factor: float) -> Self:
+        """Where all are usually so many times as large."""
+        return replace(self, scales=factor * self.scales)
 
 
 def log_prior(log_variances: Array, further: FurtherPrior | None) -> tuple[float, Array]:

@@ -149,7 +149,7 @@ def _densities(mixed: MixedModel, grids: Sequence[Array]) -> list[Array]:
     """Per component (1, g) what is believed of its variance, or (F, g) at every factor on what is usual."""
     out = []
     for i, (grid, shared) in enumerate(zip(grids, _common_factor_mask(mixed), strict=True)):
-        priors = [mixed.further.at_factor(f) for f in _FACTORS] if shared and mixed.further else [mixed.further]
+        priors = [mixed.further.scaled(f) for f in _FACTORS] if shared and mixed.further else [mixed.further]
         out.append(np.array([log_density(i, np.log(grid), prior) for prior in priors]))
     return out
 

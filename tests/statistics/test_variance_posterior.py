@@ -31,8 +31,8 @@ def on_a_grid(mixed: MixedModel) -> np.ndarray:
     noise, group = np.meshgrid(np.linspace(-1.0, 3.0, 25), np.arange(-100, 7, 0.5), indexing="ij")
     logs, ones = [], np.ones(N)
     kin, (shape,) = mixed.further.common_factor[0], mixed.further.shapes
-    # An arm that is known to a factor errs in all its ways, and half of all arms by more than three usual sizes.
-    factors, shape = (np.linspace(np.log(0.01), np.log(30), 60), 1.0) if kin else (np.zeros(1), shape)
+    # Of arms that are known to a factor half err by more than three usual sizes.
+    factors = np.linspace(np.log(0.01), np.log(30), 60) if kin else np.zeros(1)
     of_factor = halfcauchy(scale=3).logpdf(np.exp(factors)) + factors if kin else np.zeros(1)
     for a, b in zip(noise.ravel(), group.ravel(), strict=True):
         V = np.exp(a) * mixed.components[2, 0] + np.exp(b) * mixed.components[3, 0]
