@@ -112,7 +112,9 @@ def _show_numbers(found: MeasuredFeatures, checked: MonteCarlo | None) -> None:
     from stitch.measuring.error_sources import NOT_INCLUDED
 
     title = f"Numbers with U (k = 2), {found.length_unit} and rad"
-    rows = [(n.name, f"{n.value:.5g}", _digits(n.value - n.nominal), _digits(n.U), _told(n)) for n in found.numbers]
+    rows = [
+        (n.name, f"{n.value:.5g}", _digits(n.value - n.nominal), _digits(n.U), _budget_text(n)) for n in found.numbers
+    ]
     show_table(title, ("number", "value", "off nominal", "U", "most of U"), rows, words=("number", "most of U"))
     if checked is not None:
         low, high = float(checked.ratio.min()), float(checked.ratio.max())
@@ -124,7 +126,7 @@ def _digits(x: float) -> str:
     return f"{x:.2g}"
 
 
-def _told(n: Number) -> str:
+def _budget_text(n: Number) -> str:
     """The largest sources of a number, and whether it keeps its tolerance."""
     largest = [f"{source} {100 * share:.0f} %" for source, share in list(n.shares.items())[:_SOURCES] if share > 0.05]
     verdict = {True: "; conforms", False: "; does not conform", None: "; U reaches over a limit" if n.limits else ""}

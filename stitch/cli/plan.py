@@ -85,7 +85,7 @@ def plan_views(
     from stitch.writing.session_files import whole_folder, write_table
 
     _require_plan_options(views, size, field, output)
-    wanted = _plan_request(views, split, halve, _place_of(folder, feature))
+    wanted = _plan_request(views, split, halve, place_of(folder, feature))
     stated = {"part": part, "size": size, "field": field, "start": start}
     with show_activity("planning: reading the cell"):
         session, planned = (
@@ -118,7 +118,7 @@ def _require_plan_options(views: int | None, size: float | None, field: float | 
         raise InputError(f"{output}: there is such a folder; to fix: name another, or move it away")
 
 
-def _place_of(folder: Path, feature: str | None) -> str | None:
+def place_of(folder: Path, feature: str | None) -> str | None:
     """Return the place of a feature that `stitch measure` found in a run, as x,y,z; numbers as they are."""
     from stitch.reading.text_files import read_json_object
 

@@ -158,7 +158,7 @@ def stack_responses(parts: Sequence[Responses]) -> Responses:
 
 
 @dataclass(frozen=True)
-class NumberTable:
+class FeatureNumbers:
     """Q numbers of features and distances, and how they follow from the numbers of the fits."""
 
     names: tuple[tuple[Feature, str], ...]
@@ -167,7 +167,7 @@ class NumberTable:
     slopes: Array  # (Q, B) in the B numbers of all fits
 
 
-def number_table(features: Sequence[Feature], fits: Sequence[FittedFeature]) -> NumberTable:
+def number_table(features: Sequence[Feature], fits: Sequence[FittedFeature]) -> FeatureNumbers:
     """Return all numbers in the order of the features."""
     start = dict(zip([f.feature.name for f in fits], np.cumsum([0, *(len(f.values) for f in fits)]), strict=False))
     by_name, width = {fit.feature.name: fit for fit in fits}, sum(len(fit.values) for fit in fits)
@@ -189,7 +189,7 @@ def number_table(features: Sequence[Feature], fits: Sequence[FittedFeature]) -> 
             values += fit.values.tolist()
             nominal += _nominal_values(feature).tolist()
         slopes.append(row)
-    return NumberTable(tuple(names), np.array(values), np.array(nominal), np.vstack(slopes))
+    return FeatureNumbers(tuple(names), np.array(values), np.array(nominal), np.vstack(slopes))
 
 
 def _nominal_values(feature: Feature) -> Array:
@@ -226,7 +226,7 @@ def _distance_slopes(a: FittedFeature, b: FittedFeature) -> tuple[float, Array, 
     return distance, sign * (b.feature.R @ [-su, -sv, 1.0]) @ a.position_slopes, -sign * np.array([1.0, x, y])
 
 
-def _stated_loadings(stated: Contribution, table: NumberTable) -> Array:
+def _stated_loadings(stated: Contribution, table: FeatureNumbers) -> Array:
     """(Q, ·) what a stated contribution does to the numbers: a relative one to all lengths together."""
     lengths = np.array([quantity in ("distance", "diameter") for _, quantity in table.names])
     own = np.array([stated.length * (not quantity.startswith("slope")) for _, quantity in table.names])

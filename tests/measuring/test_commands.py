@@ -12,8 +12,10 @@ from typer.testing import CliRunner
 
 from data_synth.verified_cell import write_verified_cell
 from stitch.cli.main import build
+from stitch.cli.plan import place_of
 from stitch.errors import InputError
 from stitch.measuring.feature_file import read_features
+from viz.features_page import write_certificate, write_features
 
 
 def _stitch(*arguments):
@@ -43,6 +45,11 @@ def test_measure_writes_numbers_budgets_and_a_dfq_file(cell):
     rows = list(csv.DictReader((cell / "run" / "features.csv").open()))
     by_source = [float(rows[0][key]) for key in rows[0] if key.startswith("u: ")]
     assert np.sqrt(np.sum(np.square(by_source))) == pytest.approx(float(rows[0]["u"]), rel=1e-6)
+    write_features(document, cell / "page.html")
+    page = (cell / "page.html").read_text(encoding="utf-8")
+    assert "point 1.deviation" in page and "conforms" in page and document["not_included"][0] in page
+    assert place_of(cell / "run", "point 2") == ",".join(map(str, numbers["point 2.deviation"]["at"]))
+    assert place_of(cell / "run", "1,2,3") == "1,2,3"
     dfq = (cell / "part.dfq").read_text("utf-8-sig")
     assert f"K0100 {len(numbers)}" in dfq and "K2110/1 -0.1" in dfq
 
@@ -57,6 +64,8 @@ def test_verify_passes_a_good_cell_and_fails_a_wrong_artefact(cell):
     done = _stitch("verify", cell / "run", cell / "artefact", "-o", cell / "good")
     assert done.exit_code == 0, done.output
     good = json.loads((cell / "good" / "certificate.json").read_text())
+    write_certificate(good, cell / "certificate.html")
+    assert good["sentence"] in (cell / "certificate.html").read_text(encoding="utf-8").replace("\u00a0", " ")
     assert good["passed"] and good["agreeing"] >= 13 and len(good["numbers"]) == 15
     document = tomllib.loads((cell / "artefact" / "artefact.toml").read_text())
     for row in document["feature"]:
