@@ -26,12 +26,11 @@ from stitch.observations.surfaces.normal_equations import (
     Overlaps,
     append_targets,
     assemble,
-    carry_overlaps,
     collect_overlaps,
     gram,
     next_gate,
 )
-from stitch.observations.surfaces.view_poses import LastStep, has_converged, is_last_step, take_step
+from stitch.observations.surfaces.view_poses import LastStep, has_converged, take_step
 from stitch.observations.targets.rows import TargetRows
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.stages.correspondence_weights import OffsetSums, dpwvm_weights, plane_weights, with_offsets
@@ -149,14 +148,7 @@ def register(
             best = Registration(poses, overlaps, (), offsets=equations.offsets)
         elif progress.stalled >= _PATIENCE:
             break
-        foretold = progress.steady and tighter > 0.9 * gate and is_last_step(g, step, last, _CONVERGED)
-        before = poses
         poses, last = take_step(poses, g, step, last)
-        if foretold:
-            overlaps = carry_overlaps(capture, overlaps, before, poses)
-            history.append(overlaps.gram.rms)
-            recorder.iteration("register", index + 1, poses, history[-1], gate)
-            return Registration(poses, overlaps, tuple(history), offsets=equations.offsets)
         gate = tighter
         overlaps = collect_overlaps(capture, poses, gate, picked, overlaps)
     return replace(best, history=tuple(history), note=progress.note(len(history)))
@@ -166,19 +158,17 @@ class _Progress:
     """Whether the rms or the step still falls, and for how many iterations neither has."""
 
     def __init__(self) -> None:
-        self.rms = self.step = self.gate = self.last = np.inf
+        self.rms = self.step = self.gate = np.inf
         self.stalled = 0
-        self.steady = True  # every step is smaller than the one before
 
     def made(self, g: Gram, step: Array, gate: float) -> bool:
         """Return True if one of both fell below all before; under a tighter gate they begin anew."""
         size = float(np.sqrt(np.mean(step[:, 3:] ** 2)))
         if gate < 0.9 * self.gate:
-            self.rms, self.step, self.gate, self.last, self.steady = np.inf, np.inf, gate, np.inf, True
+            self.rms, self.step, self.gate = np.inf, np.inf, gate
         falls = g.rms < (1 - _FALLS) * self.rms or size < (1 - _FALLS) * self.step
         self.rms, self.step = min(self.rms, g.rms), min(self.step, size)
         self.stalled = 0 if falls else self.stalled + 1
-        self.steady, self.last = self.steady and size < self.last, size
         return falls
 
     def note(self, iterations: int) -> str:

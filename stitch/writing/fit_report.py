@@ -1,6 +1,7 @@
 """A run as one block of text: what was found, how well, what is in the model and what is not."""
 
 from collections.abc import Sequence
+from textwrap import wrap
 
 from stitch.comparison.disagreement_field import effect_changes, model_history
 from stitch.comparison.run_verdict import run_verdict
@@ -10,6 +11,9 @@ from stitch.units import angle_text, length_text, uncertainty_text
 
 # Scanners leave a few points in the air beside edges, which is no news.
 _WORTH_A_LINE = 0.005
+
+# Characters of a line of the report.
+_WIDTH = 100
 
 
 def fit_report(run: Run, at_part: tuple[float, float]) -> str:
@@ -73,7 +77,10 @@ def _unsupported(run: Run) -> str:
 
 
 def _part(heading: str, lines: Sequence[str]) -> list[str]:
-    return [f"[[{heading}]]", *(f"  {line}" for line in lines)] if lines else []
+    if not lines:
+        return []
+    wrapped = (wrap(line, _WIDTH, initial_indent="  ", subsequent_indent="    ") for line in lines)
+    return [f"[[{heading}]]", *(row for rows in wrapped for row in rows)]
 
 
 def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
