@@ -61,7 +61,7 @@ def run(
         InputError: the model belongs to another mount, or the session cannot have an effect as the model has it.
         NoResultError: no hand-eye was found, or the views do not overlap.
     """
-    return run_rig([session], model, [recorder or SilentRecorder()], effects, keep, arm, register)[0]
+    return run_rig([session], model, [recorder or SilentRecorder()], effects, keep, arm, register=register)[0]
 
 
 def run_rig(
@@ -71,6 +71,7 @@ def run_rig(
     effects: Sequence[str] = (),
     keep: bool = False,
     arm: ModelFile | None = None,
+    *,
     register: str = DEFAULT,
     captures: Sequence[Future[Capture]] | None = None,
 ) -> list[Run]:
@@ -113,7 +114,7 @@ def run_rig(
             fit = partial(steps.apply, file=model)
         else:
             fit = partial(steps.fit, starts=begun, initial_model=with_arm(arm), recorder=recorders[0])
-        found = fit_screened_views(sessions, measurements, partial(_told_fit, fit, sessions, recorders), keep)
+        found = fit_screened_views(sessions, measurements, partial(_fit_and_report, fit, sessions, recorders), keep)
         end = FitSummary(begun, found.fitted, clock.lap(), model.effects_file if model else None, register)
         if model and not sessions[0].has_clouds:
             found = check_model_transfer(found, partial(_fit_own_model, steps, found, with_arm(arm_model(model))))
@@ -128,7 +129,7 @@ def run_rig(
         return _assemble_runs(sessions, found, end, before, recorders, keep)
 
 
-def _told_fit(
+def _fit_and_report(
     fit: Callable[[Sequence[Session], Sequence[Measurement]], FittedRig],
     whole: Sequence[Session],
     recorders: Sequence[Recorder],

@@ -70,7 +70,7 @@ def run(
         >>> run.hand_eye.pose.shape
         (4, 4)
     """
-    return run_rig([session], model, None if recorder is None else [recorder], effects, keep, arm, register)[0]
+    return run_rig([session], model, None if recorder is None else [recorder], effects, keep, arm, register=register)[0]
 
 
 def run_rig(
@@ -104,7 +104,7 @@ def run_rig(
     replays = [ReplayRecorder(other) for other in others]
     stated = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, runs.Run) else arm
     fitted = None if model is None else _model(model)
-    found = pipeline.run_rig(sessions, fitted, replays, _names(effects), keep, stated, register)
+    found = pipeline.run_rig(sessions, fitted, replays, _names(effects), keep, stated, register=register)
     return [public_run(*own) for own in zip(found, map(public_session, sessions), replays, strict=True)]
 
 

@@ -90,7 +90,7 @@ def _require_measure_options(features: Path | None, trials: int, dfq: Path | Non
 def _write_point_sigmas(state: Run, folder: Path) -> int:
     """Write the column `sigma` of stitched.ply and return the number of its points."""
     from stitch.measuring.error_sources import place_errors
-    from stitch.measuring.point_sigma import point_sigmas, write_sigmas
+    from stitch.measuring.place_errors import point_sigmas, write_sigmas
 
     sigma = point_sigmas(place_errors(state), state.fused)
     write_sigmas(folder / "stitched.ply", sigma)

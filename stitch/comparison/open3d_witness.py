@@ -97,7 +97,7 @@ def open3d_witness(run: Run) -> Witness:
     clouds = [points[:: max(1, len(points) // _POINTS)] for points in clouds]
     with _one_thread(o3d):
         poses, pairs = _registered(o3d, clouds, run.poses_model, _spacing(clouds))
-        normals = [np.asarray(cloud.normals) for cloud in _shown(o3d, clouds)]
+        normals = [np.asarray(cloud.normals) for cloud in _with_normals(o3d, clouds)]
     poses = _common_motion(clouds, poses, run.poses) @ poses
     difference = frames.inverse(run.poses) @ poses
     middles = np.array([points.mean(axis=0) for points in clouds])
@@ -142,7 +142,7 @@ def _spacing(clouds: list[Array]) -> float:
     return float(np.median(far) * np.sqrt(np.pi / 8))
 
 
-def _shown(o3d: Any, clouds: list[Array]) -> list[Any]:
+def _with_normals(o3d: Any, clouds: list[Array]) -> list[Any]:
     """Return Open3D's clouds with normals towards the scanner."""
     shown = []
     for points in clouds:
@@ -156,7 +156,7 @@ def _shown(o3d: Any, clouds: list[Array]) -> list[Any]:
 def _registered(o3d: Any, clouds: list[Array], start: Array, spacing: float) -> tuple[Array, int]:
     """Return T_reference_scanner (V, 4, 4) and the number of pairs that were registered."""
     registration = o3d.pipelines.registration
-    shown = _shown(o3d, clouds)
+    shown = _with_normals(o3d, clouds)
     graph = registration.PoseGraph()
     graph.nodes.extend([registration.PoseGraphNode(T) for T in start])
     for i, j in _one_sided(clouds, start):

@@ -88,7 +88,7 @@ def find_support(scans: Sequence[Scan], poses: Array, placed: PlacedPoints, cell
         placed: the points of the scans by these poses, one view after the other.
         cell: edge of the cells in which views meet, length_unit.
     """
-    settled, scatter = _settled(placed, cell)
+    settled, scatter = _points_on_surface(placed, cell)
     parts = np.split(settled, np.cumsum([len(scan.points) for scan in scans])[:-1])
     tests = list(parallel(lambda item: _held_by_own_view(*item), zip(scans, parts, strict=True)))
     held = np.concatenate([test[0] for test in tests])
@@ -134,7 +134,7 @@ def edge_credit(junk: float) -> float:
     return float(max(np.log10(_JUNK / max(junk, 1e-9)), _LEAST_CREDIT))
 
 
-def _settled(placed: PlacedPoints, cell: float) -> tuple[Mask, float]:
+def _points_on_surface(placed: PlacedPoints, cell: float) -> tuple[Mask, float]:
     """Points in whose cell another view shows the same surface (N,), and the scatter of views across it."""
     views = int(placed.view.max()) + 1
     _, at = number_groups(cell_numbers(placed.points, cell))

@@ -13,7 +13,7 @@ from stitch.measuring.budget import OWN_NOISE, evaluate, fit_features, monte_car
 from stitch.measuring.error_sources import SCANNER, error_chain, place_errors
 from stitch.measuring.feature_file import Contribution, FeatureList
 from stitch.measuring.features import Feature
-from stitch.measuring.point_sigma import point_sigmas
+from stitch.measuring.place_errors import point_sigmas
 from stitch.pipeline import run
 
 PLATE = SpherePlate(radius=28.0)
