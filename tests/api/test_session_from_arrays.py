@@ -83,7 +83,9 @@ def mistaken(poses, mistake):
     return T
 
 
-@pytest.mark.parametrize("mistake", ["euler", "inverse", "reversed", "quaternion"])
+@pytest.mark.parametrize(
+    "mistake", ["euler", *(pytest.param(m, marks=pytest.mark.slow) for m in ("inverse", "reversed", "quaternion"))]
+)
 def test_a_wrong_convention_is_refused_with_the_sentence_of_a_deep_check(arrays, loaded, mistake):
     clouds, poses = arrays
     T = mistaken(poses, mistake)

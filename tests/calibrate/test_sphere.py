@@ -31,6 +31,7 @@ def twist(cell, T):
     return frames.log(frames.inverse(T) @ cell.T_mount)
 
 
+@pytest.mark.slow
 def test_real_laser_lines(shared_data):
     """Against two independent solutions of the same data, (−149.94, 714.56, 482.43) and (−149.86, 714.42, 483.40)."""
     session = load_session(shared_data / "fanuc-line-sphere")

@@ -1,6 +1,7 @@
 """Drilling: every step against truth or a closed form, and the whole experiment against the published errors."""
 
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -353,6 +354,14 @@ def test_pictures_of_holes_give_the_drives_of_their_pixels(tmp_path, capsys):
         assert cell.errors(seen["hole"], T)[0] < 0.30
 
 
+@pytest.fixture(scope="module")
+def pictured_job(tmp_path_factory):
+    folder, cell = tmp_path_factory.mktemp("drilling"), DrillingCell(1)
+    write_job(folder, cell)
+    write_pictures(folder, cell)
+    return folder
+
+
 @pytest.mark.parametrize(
     "name, content, part",
     [
@@ -362,11 +371,9 @@ def test_pictures_of_holes_give_the_drives_of_their_pixels(tmp_path, capsys):
         ("103.png", "blank", "103.png: no hole is found"),
     ],
 )
-def test_bad_pictures_are_named(tmp_path, name, content, part):
+def test_bad_pictures_are_named(tmp_path, pictured_job, name, content, part):
     cv2 = pytest.importorskip("cv2")
-    cell = DrillingCell(1)
-    write_job(tmp_path, cell)
-    write_pictures(tmp_path, cell)
+    shutil.copytree(pictured_job, tmp_path, dirs_exist_ok=True)
     (tmp_path / name).unlink()
     if content == "blank":
         cv2.imwrite(str(tmp_path / name), np.full((400, 400), 200, np.uint8))

@@ -47,7 +47,7 @@ def test_a_joint_is_told_where_all_of_them_together_explain_no_more(cell):
     assert [law.joint for law in significant_laws(linear)] == [5]
 
 
-@pytest.mark.parametrize("size", [0.3, 1.0])
+@pytest.mark.parametrize("size", [0.3, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_no_joint_is_told_where_all_are_off(cell, size):
     for seed in range(4):
         arm = draw_arm(cell.measured.plan.arm.joints, size, np.random.default_rng(seed))

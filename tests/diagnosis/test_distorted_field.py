@@ -34,8 +34,8 @@ def tilted(points):
 @pytest.mark.parametrize(
     "seen",
     [
-        pytest.param(lambda points: points * [1, 1, 1.01], id="longer"),
-        pytest.param(lambda points: points + 0.01 * points[:, [1]] * [1, 0, 0], id="askew"),
+        pytest.param(lambda points: points * [1, 1, 1.01], id="longer", marks=pytest.mark.slow),
+        pytest.param(lambda points: points + 0.01 * points[:, [1]] * [1, 0, 0], id="askew", marks=pytest.mark.slow),
         pytest.param(tilted, id="tilted"),
     ],
 )
@@ -51,6 +51,7 @@ def test_a_good_scanner_is_not_accused(measured):
     assert not found.follows_field and not found.overlap_misfit
 
 
+@pytest.mark.slow
 def test_a_seam_in_the_field_is_not_adequate(measured):
     """One half of the field is off by ±0.3 mm along the ray, which no effect of the library and no pose can do."""
 

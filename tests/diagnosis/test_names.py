@@ -81,6 +81,7 @@ def test_a_joint_that_follows_no_known_law_gets_no_name_but_its_number(cell, law
     assert find_repeating_errors(linear)[0].words == f"follow the joints, joint {joint} above all"
 
 
+@pytest.mark.slow
 def test_friction_is_neither_play_nor_settling(cell):
     """A joint that follows its last reversals as dry friction on a spring does; play and settling of it keep their
     names."""
@@ -163,6 +164,7 @@ def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
     assert 5 < by_hand < law.log_bayes_factor + 0.02
 
 
+@pytest.mark.slow
 def test_joints_that_scatter_are_scatter(cell):
     """Every joint anew in every view: no law of any joint, nothing that repeats, and the flange scatters as it did."""
     arm, q = cell.measured.plan.arm, cell.measured.plan.joints

@@ -48,7 +48,9 @@ def verdict_of(linear):
     return gather_evidence(linear, candidates, ScatterLimit(*IMPLAUSIBLE))
 
 
-@pytest.mark.parametrize("period", [4.0, 5.5, 8.0])
+@pytest.mark.parametrize(
+    "period", [4.0, pytest.param(5.5, marks=pytest.mark.slow), pytest.param(8.0, marks=pytest.mark.slow)]
+)
 def test_a_flange_that_swings_is_said_to_with_its_period(cell, period):
     swing = np.sin(2 * np.pi * np.arange(VIEWS) / period + 1.0)
     linear = linear_of(cell, swing[:, None] * DIRECTION)

@@ -40,6 +40,7 @@ def test_what_no_library_has_gets_no_name(which):
         assert [u.words for u in found.repeating_errors] == [f"follow the joints, joint {joint} above all"]
 
 
+@pytest.mark.slow
 def test_joints_that_scatter_do_not_repeat():
     """Every joint anew at every pose, 40 µrad beside a steady flange: scatter, and as large as it was drawn."""
     for seed in range(4):

@@ -21,6 +21,7 @@ def cell():
     return freed_blade(6, VIEWS)
 
 
+@pytest.mark.slow
 def test_a_flange_that_swings_gets_the_formula_of_a_swing(cell, tmp_path):
     seconds = cell.measurement.views.time
     period = seconds[-1] / 3.5
@@ -47,6 +48,7 @@ def test_a_joint_that_swings_in_time_gets_the_formula_of_a_swing(cell):
     assert float(re.search(r"t/([0-9.]+) h", found.formula)[1]) == pytest.approx(period / 3600, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_gear_with_friction_gets_the_formula_of_what_stays_behind(cell):
     joints = cell.measured.plan.joints
     driven, play, stays = joints[:, 2], 0.25 * np.ptp(joints[:, 2]), [joints[0, 2]]
@@ -59,5 +61,6 @@ def test_a_gear_with_friction_gets_the_formula_of_what_stays_behind(cell):
     assert found.found and "behind q3" in found.formula, found.why
 
 
+@pytest.mark.slow
 def test_scatter_gets_no_formula(cell):
     assert not explain(cell.seen(cell.measured.T_base_flange)).found

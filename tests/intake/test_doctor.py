@@ -56,6 +56,7 @@ def test_order_direction_unit_and_mount_are_told_by_four_small_scans(still_cells
     )
 
 
+@pytest.mark.slow
 def test_scans_that_lie_in_one_frame_already_are_refused(tmp_path):
     """Moved into the base by the true hand-eye, as the scanner's software does where it knows it."""
     measured = measured_blade(3, views=7, mount="eye_in_hand", pixels=40)

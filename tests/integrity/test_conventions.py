@@ -91,7 +91,9 @@ def test_half_of_the_motions_are_no_proof_and_tell_the_likeliest(cell, mistake):
     assert proven_hypotheses(found) == () and likeliest_hypotheses(found)[0].hypothesis.kind in kinds
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize(
+    "share", [0.0, pytest.param(0.5, marks=pytest.mark.slow), pytest.param(1.0, marks=pytest.mark.slow)]
+)
 def test_right_poses_have_no_likelier_ones(cell, share):
     """Whether half of the motions agree with them, or none."""
     session, T_mount = cell

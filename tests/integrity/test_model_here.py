@@ -42,6 +42,7 @@ def cell():
     return model_of(run(first)), then
 
 
+@pytest.mark.slow
 def test_what_holds_is_not_doubted():
     """Of 12 cells one at the most: a hundredth is doubted by chance."""
     doubted = 0

@@ -47,6 +47,7 @@ def cut(session, box):
     return replace(session, views=tuple(views))
 
 
+@pytest.mark.slow
 def test_check_deep_says_of_a_wall_what_a_run_says(measured):
     session, _ = before_wall(session_of(measured), 40.0, 25.0)
     (found,) = deep_check(session)

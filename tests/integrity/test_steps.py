@@ -140,6 +140,7 @@ def knocked(session, start, xi):
     return replace(session, views=tuple(views))
 
 
+@pytest.mark.slow
 def test_a_knock_of_the_scanner_is_said_in_the_first_line(good):
     """4.5 mm half way: every view fits its neighbours once it is moved, and one hand-eye holds for neither half."""
     found = run(knocked(good, 6, [0, 0, 0, 2.7, 0, 3.6]))

@@ -85,7 +85,7 @@ def both(drawn: FieldMap, law: Law) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return error, truth, drawn.sigma[seen]
 
 
-@pytest.mark.parametrize("law", [tilted, wavy])
+@pytest.mark.parametrize("law", [pytest.param(tilted, marks=pytest.mark.slow), wavy])
 def test_the_map_is_the_error_that_was_put_in(law: Law):
     """Sign, place and size; as far off as its sigma says."""
     shown, _ = found(along(law))
@@ -96,6 +96,7 @@ def test_the_map_is_the_error_that_was_put_in(law: Law):
     assert np.all(sigma > 0) and shown.map.uncertainty < 0.5 * shown.map.rms
 
 
+@pytest.mark.slow
 def test_a_scanner_that_looks_against_its_z_has_the_same_map_turned():
     ahead, back = (found(along(tilted), backwards)[0].map for backwards in (False, True))
     np.testing.assert_allclose(back.x, -ahead.x[::-1], atol=1e-9)
@@ -103,6 +104,7 @@ def test_a_scanner_that_looks_against_its_z_has_the_same_map_turned():
     np.testing.assert_allclose(back.error[:, ::-1][seen], ahead.error[seen], atol=0.1 * ahead.rms)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [along(nothing), askew])
 def test_no_map_of_what_is_no_error_along_the_ray(change):
     assert found(change)[0].map is None

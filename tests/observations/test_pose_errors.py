@@ -117,6 +117,7 @@ def test_an_arm_of_one_and_the_same_pose_repeats_what_it_does(cell):
         assert np.abs(difference @ C @ difference.T).max() <= 1e-9 * np.abs(C).max()
 
 
+@pytest.mark.slow
 def test_sigmas_hold_on_arms_that_are_a_little_wrong_everywhere(cell):
     """Six arms with every joint and link wrong: χ² of the hand-eye within 99.9 % of 36 numbers; alone it is not."""
     measured, measurement, freed = cell

@@ -36,7 +36,12 @@ def chi_squares(share: float) -> tuple[list[float], list[float]]:
 
 
 @pytest.mark.parametrize(
-    ("share", "unusual", "over_noise"), [(0.2, False, False), (0.9, True, False), (4.0, True, True)]
+    ("share", "unusual", "over_noise"),
+    [
+        pytest.param(0.2, False, False, marks=pytest.mark.slow),
+        (0.9, True, False),
+        pytest.param(4.0, True, True, marks=pytest.mark.slow),
+    ],
 )
 def test_what_repeats_is_told_with_its_size(share, unusual, over_noise):
     """A usual scanner, one that errs by nearly its noise, and one by four times that: none too much is said of any."""

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
@@ -27,6 +28,7 @@ def test_every_component_has_words():
     assert len(set(SOURCES.values())) == len(SOURCES) and not set(SOURCES) & set(SOURCES.values())
 
 
+@pytest.mark.slow
 def test_joints_that_look_like_the_hand_eye_are_named_for_it():
     """Of a wrong zero of the last joint nothing is seen: rotation and position may come from it, not from the scanner."""
     session = session_of(simulated(clean("blade-table", rays=60), {"joint_offset": 1.0}, 2, 10))

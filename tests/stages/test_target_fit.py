@@ -39,6 +39,7 @@ def test_hand_eye_and_targets_with_their_sigmas(mount):
     assert np.sum(z) < 67.99  # 99.9 % point of χ² with 36
 
 
+@pytest.mark.slow
 def test_targets_that_a_model_does_not_know_have_sigmas_of_their_own():
     """The model's hand-eye is used as it is: its error, the scatter and the noise are what moves a new target."""
     spread, squares = np.diag([1e-5] * 3 + [0.02] * 3), []

@@ -51,11 +51,11 @@ def on_a_grid(mixed: MixedModel) -> np.ndarray:
     ("size", "kin", "shape"),
     [
         (0.0, False, MAY_BE_ABSENT),
-        (2.0, False, MAY_BE_ABSENT),
-        (0.0, True, MAY_BE_ABSENT),
+        pytest.param(2.0, False, MAY_BE_ABSENT, marks=pytest.mark.slow),
+        pytest.param(0.0, True, MAY_BE_ABSENT, marks=pytest.mark.slow),
         (0.5, True, MAY_BE_ABSENT),
-        (2.0, True, MAY_BE_ABSENT),
-        (0.0, False, ALWAYS_PRESENT),
+        pytest.param(2.0, True, MAY_BE_ABSENT, marks=pytest.mark.slow),
+        pytest.param(0.0, False, ALWAYS_PRESENT, marks=pytest.mark.slow),
         (0.5, False, ALWAYS_PRESENT),
     ],
 )
