@@ -34,11 +34,17 @@ class Hidden:
 CASES = (
     Hidden("joint_compliance", 3, "robot"),
     Hidden("gear_eccentricity", 4, "robot"),
+    Hidden("backlash", 2, "robot"),
+    Hidden("joint_offset", 4, "robot", "blade-table"),
     Hidden("third_harmonic", 4, "robot, a law of no library"),
     Hidden("mount_drift", 2, "mount"),
     Hidden("mount_warmup", 2, "mount", "blade-table"),
+    Hidden("mount_droop", 2, "mount", "blade-table"),
     Hidden("part_slip", 2, "part"),
+    Hidden("fixture_drift", 2, "part"),
+    Hidden("fixture_droop", 2, "part"),
     Hidden("range_nonlinearity", 3, "scanner"),
+    Hidden("lens_distortion", 3, "scanner"),
 )
 
 

@@ -137,12 +137,21 @@ def _course_of_views(
         explained: response of the whole model with the effect.
     """
     motion = _motion(linear, term, form, values)
-    axis = _lives_on(linear.measurement.views, term, motion.joint)
+    views = linear.measurement.views
+    weight = next((n for n in ("gravity_at_mount", "gravity_at_part") if n in term.effect.needs), None)
+    axis = _along_gravity(getattr(views, weight), motion) if weight else _lives_on(views, term, motion.joint)
     # Where the part sat at first is nobody's error.
     course = _along_motion(linear, motion, explained, len(values), axis, from_first=term.effect.place == "part")
     if course is None or motion.joint is None or not course.follows.startswith("angle"):
         return course
-    return replace(course, law=_over_a_turn(linear.measurement.views, form.at(values), motion.joint))
+    return replace(course, law=_over_a_turn(views, form.at(values), motion.joint))
+
+
+def _along_gravity(gravity: Array, motion: _Motion) -> tuple[str, str, Array]:
+    """What gives way under its weight lives on the pull of gravity (V, 3) along the direction that moves it most."""
+    line = np.sum(motion.columns * motion.response, axis=1) / np.maximum(np.sum(motion.columns**2, axis=1), 1e-300)
+    slope = np.linalg.lstsq(np.column_stack([gravity, np.ones(len(line))]), line, rcond=1e-6)[0][:3]
+    return "pull of gravity where it gives way most", "g", gravity @ slope / max(float(np.linalg.norm(slope)), 1e-300)
 
 
 def _over_a_turn(views: Views, fitted: Term, joint: int) -> Array:

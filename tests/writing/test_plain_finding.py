@@ -177,15 +177,21 @@ def test_an_error_that_should_rise_is_no_gain(inside, poses, said):
     assert said in told and ("reduce the error" in told) == (inside < 1)
 
 
-def _found(verdict: str, p_value: float, *, certain: bool = True, heldout: float = 0.5) -> SimpleNamespace:
-    ranked = SimpleNamespace(
-        name="play", adjusted=p_value, posterior=0.97, tests=21, score=SimpleNamespace(observable=True, fitted=True)
+def _found(
+    verdict: str, p_value: float, *, certain: bool = True, heldout: float = 0.5, posterior: float = 0.97
+) -> SimpleNamespace:
+    """A diagnosis of one effect that helps, and another that holds 3 % where both hold all."""
+    ranked, other = (
+        SimpleNamespace(
+            name="play", adjusted=p_value, posterior=share, tests=21, score=SimpleNamespace(observable=seen, fitted=True)
+        )
+        for share, seen in ((posterior, True), (posterior * 3 / 97, False))
     )
     candidate = SimpleNamespace(name="play", ranked=ranked, cross_validation=SimpleNamespace(heldout=heldout))
     return SimpleNamespace(
         verdict=verdict,
         effects=("play",) if verdict == "missing_effect" else (),
-        candidates=(candidate,),
+        candidates=(candidate, SimpleNamespace(name="sag", ranked=other, cross_validation=None)),
         certain=certain,
         log_odds_over_nothing=np.log(3),
         depends_on=(SimpleNamespace(p_value=p_value),),
@@ -199,6 +205,10 @@ def _found(verdict: str, p_value: float, *, certain: bool = True, heldout: float
     [
         (_found("missing_effect", 1e-46), "less than one of a million sessions (p = 1e-46). Of 21 known effects tried"),
         (_found("missing_effect", 1e-3), "one of 1,000 sessions (p = 0.001). Of 21 known effects tried, it holds 97%"),
+        (
+            _found("missing_effect", 1e-3, posterior=0.22),
+            "it holds 97% of the evidence. A curve without a physical cause would explain as much.",
+        ),
         (
             _found("missing_effect", 1e-3, certain=False),
             "Not very sure: the odds that it is more than chance are 3 to 1",

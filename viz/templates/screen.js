@@ -22,7 +22,7 @@ function showScreen(root, part, found, um) {
   function pair() {
     if (shown) return [
       { title: "Now", values: mapped(found.now.field), mean: found.now.mean * um },
-      { title: `With ${shown.effect} (predicted)`, values: mapped(shown.field), mean: shown.mean * um }];
+      { title: `${found.verdict === "unknown_effect" ? "Nearest known effect" : "With"} ${shown.effect} (predicted)`, values: mapped(shown.field), mean: shown.mean * um }];
     const { begin, end } = part, from = end > begin ? end - 1 : Math.max(0, begin - 1);
     return [from, end].map(k => ({ title: k === end ? `Now${end > begin ? `, ${part.steps[k].name}` : ""}` : `Before: ${part.steps[k].name}`, values: own[k], mean: part.steps[k].mean }));
   }
@@ -98,7 +98,7 @@ function showScreen(root, part, found, um) {
       xyPlot(place, { x: { label: "views in their order", names: part.names }, y: { label: "µm" }, series: [{ kind: "dots", x: seen.map(s => s[0]), y: seen.map(s => s[1]), names: true, said: seen.map(s => said[s[0]]), tint: "dot" }] }, 230, i => chooseView(i < 0 ? -1 : seen[i][0]));
       return;
     }
-    const plot = coursePlot(course, part && part.names, um);
+    const plot = coursePlot(course, part && part.names, um, !asked && found.verdict === "unknown_effect" ? "their course" : "what the effect predicts");
     title.textContent = plot.title;
     xyPlot(place, { ...plot.spec, pressed: course.views.indexOf(view) }, 230, i => chooseView(i < 0 ? -1 : course.views[i] ?? -1));
   }
@@ -133,7 +133,7 @@ function fromTo(a, b) {
 }
 
 // The plot of one course of diagnosis.json.
-function coursePlot(course, names, um) {
+function coursePlot(course, names, um, line = "what the effect predicts") {
   const mrad = course.value_unit === "rad", factor = mrad ? 1e3 : um, unit = mrad ? "mrad" : "µm";
   const inOrder = course.follows === "view order", seconds = course.unit === "s";
   const span = seconds ? Math.max(...course.at) : 0, [per, named] = span > 7200 ? [3600, "h"] : span > 120 ? [60, "min"] : [1, "s"];
@@ -146,7 +146,7 @@ function coursePlot(course, names, um) {
   const jumps = inOrder && first > 0 && predicted.slice(first).every(p => Math.abs(p) > most / 2);
   const said = measured.map((m, i) => `${course.views.length ? `${named_[i]}, ` : ""}${shortNumber(x[i])}: measured ${shortNumber(m)} ± ${shortNumber(2 * sigma[i])} ${unit}, predicted ${shortNumber(predicted[i])} ${unit}`);
   return {
-    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are" : "is"} off (${unit}). Dots: measured ± 2σ. Line: ${course.of.endsWith("views") ? "means" : "what the effect predicts"}`,
+    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are" : "is"} off (${unit}). Dots: measured ± 2σ. Line: ${course.of.endsWith("views") ? "means" : line}`,
     spec: {
       x: { label, names: inOrder && course.views.length === (names || []).length ? named_ : undefined }, y: { label: unit },
       shaded: jumps ? { from: (x[first - 1] + x[first]) / 2, said: `from ${named_[first]} on` } : undefined,
