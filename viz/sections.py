@@ -19,6 +19,7 @@ from stitch.writing.diagnosis_document import (
     effect_description,
     largest_error_sources,
     plain_finding,
+    remedy_at_machine,
     suggested_command,
 )
 from stitch.writing.finding_screen import CandidateFields, candidate_fields
@@ -88,9 +89,9 @@ def _bars(found: Diagnosis, screen: dict[str, Any], unit: str) -> dict[str, Any]
         for row in rows
     ]
     tried = sum(c.ranked.score.observable for c in found.candidates)
-    title = "Tried beside the model" if found.verdict == "adequate" else "What is missing?"
+    titles = {"adequate": "Tried beside the model", "unknown_effect": "No known effect explains it"}
     return {
-        "title": title,
+        "title": titles.get(found.verdict, "What is missing?"),
         "bars": bars,
         "noise": length_text(screen["noise"], unit, 2),
         "others": tried - len(screen["candidates"]),
@@ -106,7 +107,10 @@ def _in_um(value: float, unit: str) -> str:
 def _next(found: Diagnosis, run: str) -> str:
     why, command = suggested_command(found, shlex.quote(run)).rsplit(": ", 1)
     said = "Type, where the folder of this page stands" if why == "Next" else why.removeprefix("Next, ").capitalize()
-    return f'<div class="card next"><h2>Next</h2><p>{_words(said)}:</p><p><code>{escape(command)}</code></p></div>'
+    does = "It adds the effect and fits the same scans anew." if command.startswith("stitch add") else ""
+    after = "".join(f"<p>{_words(text)}</p>" for text in (does, remedy_at_machine(found)) if text)
+    typed = f"<p>{_words(said)}:</p><p><code>{escape(command)}</code></p>"
+    return f'<div class="card next"><h2>Next</h2>{typed}{after}</div>'
 
 
 def _evidence(found: Diagnosis, unit: str) -> str:

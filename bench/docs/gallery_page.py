@@ -125,17 +125,23 @@ Recordings are not kept in the project; `python -m bench.docs.gallery --keep FOL
 
 ## Hidden effects and their laws
 
-One law of nature is hidden in a blade cell; the screen names it, and its plot shows the law: torque, angle, time, the
-order of views. Made by `python -m bench.docs.hidden_effects`.
+One law of nature is hidden in a blade cell; the screen names it, and its plot shows the law: torque, angle,
+time, gravity, the order of views. Made by `python -m bench.docs.hidden_effects`.
 
 | hidden | screen |
 |---|---|
 | joint_compliance: joints give way under load | ![compliance](gallery/joint_compliance.webp) |
 | gear_eccentricity: a gear runs out of true | ![eccentricity](gallery/gear_eccentricity.webp) |
+| backlash: a joint has play | ![backlash](gallery/backlash.webp) |
+| joint_offset: a joint counts its angle from a wrong zero | ![offset](gallery/joint_offset.webp) |
 | mount_drift: the scanner's mount creeps | ![drift](gallery/mount_drift.webp) |
 | mount_warmup: the mount moves while it warms up | ![warm-up](gallery/mount_warmup.webp) |
+| mount_droop: the mount gives way under its weight | ![droop](gallery/mount_droop.webp) |
 | part_slip: the part slips between two views | ![slip](gallery/part_slip.webp) |
-| range_nonlinearity: the scanner is off away from its working distance | ![range](gallery/range_nonlinearity.webp) |
+| fixture_drift: the part's fixture creeps | ![creep](gallery/fixture_drift.webp) |
+| fixture_droop: the fixture gives way under the part's weight | ![fixture](gallery/fixture_droop.webp) |
+| range_nonlinearity: the scanner errs off its working distance | ![range](gallery/range_nonlinearity.webp) |
+| lens_distortion: the scanner's lens distorts | ![lens](gallery/lens_distortion.webp) |
 | third_harmonic: a law that the library does not know | ![no name](gallery/third_harmonic.webp) |
 """
 

@@ -17,7 +17,7 @@ from bench.docs.report_pictures import shot
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "gallery"
 _CALL = (sys.executable, "-P", "-c", "from stitch.cli.main import main; main()")
-_SIZE, _WIDE, _QUALITY = (1400, 1040), 1100, 60
+_SIZE, _WIDE, _QUALITY = (1400, 1100), 1100, 60
 
 
 @dataclass(frozen=True)

@@ -64,13 +64,48 @@ _WORDS = {
     "part_growth": "the part grows with its warmth",
     "part_sag": "the part bends under its own weight",
     "range_scale": "the scanner measures all distances too long or too short by one factor",
-    "range_nonlinearity": "the scanner is off away from its working distance",
+    "range_nonlinearity": "the scanner errs nearer or farther than its working distance",
     "incidence_bias": "the scanner is off where it looks along the surface",
     "intensity_bias": "the scanner is off on dark or shiny places",
     "field_curvature": "the scanner sees a flat surface bent",
     "lens_distortion": "the scanner's lens distorts",
     "scanner_thermal_scale": "the scanner's scale changes with its warmth",
 }
+
+
+# What ends an effect at the machine; these scans are saved by adding it to the model.
+_AT_THE_MACHINE = {
+    "latency": "stop the arm for every scan, or trigger both together",
+    "joint_offset": "set the zero of the joint anew, or write the corrected arm back into the controller",
+    "link_geometry": "write the corrected arm back into the controller",
+    "joint_compliance": "state the payload in the controller, or keep the effect in the model",
+    "gear_eccentricity": "keep the effect in the model: it belongs to the gear",
+    "gear_harmonic": "keep the effect in the model: it belongs to the gear",
+    "backlash": "approach every pose from the same side, or have the joint's gear adjusted",
+    "settling": "wait longer at each pose before the scan",
+    "robot_thermal_growth": "warm the arm up before scanning",
+    "mount_drift": "fasten the scanner's mount",
+    "mount_warmup": "let the scanner warm up before scanning",
+    "mount_droop": "stiffen the scanner's mount",
+    "fixture_drift": "fasten the part's fixture",
+    "fixture_droop": "stiffen the part's fixture",
+    "part_slip": "clamp the part firmly",
+    "part_growth": "let the part reach the temperature of the room",
+    "part_sag": "support the part where it bends",
+    "range_scale": "have the scanner calibrated",
+    "range_nonlinearity": "scan at the working distance, or have the scanner calibrated",
+    "incidence_bias": "look at every surface more squarely",
+    "intensity_bias": "coat dark and shiny places",
+    "field_curvature": "have the scanner calibrated, or use the middle of its field",
+    "lens_distortion": "have the scanner calibrated, or use the middle of its field",
+    "scanner_thermal_scale": "let the scanner warm up before scanning",
+}
+
+
+def remedy_at_machine(found: Diagnosis) -> str:
+    """Return what would end the effect that is named, as a sentence; empty where none is, or only perhaps."""
+    named = found.effects[0] if found.verdict == "missing_effect" and found.certain else ""
+    return f"At the machine: {_AT_THE_MACHINE[named]}." if named in _AT_THE_MACHINE else ""
 
 
 def effect_description(name: str) -> str:

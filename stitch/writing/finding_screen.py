@@ -74,11 +74,13 @@ def _fields(found: Diagnosis) -> CandidateFields | None:
 
 
 def compared(found: Diagnosis) -> list[CandidateEffect]:
-    """Return the candidate effects that a screen compares: those that are named first, none that helps next to nothing."""
+    """Return the candidate effects that a screen compares, those that are named first, then those that help most."""
     worth = [c for c in found.candidates if c.ranked.score.observable and c.ranked.score.fitted]
     named = found.effects
     helping = [c for c in worth if c.name in named or (c.cross_validation and c.cross_validation.heldout < _HELPS)]
-    return sorted(helping, key=lambda c: named.index(c.name) if c.name in named else len(named))[:_BEST]
+    left = {c.name: c.cross_validation.heldout if c.cross_validation else 0.0 for c in helping}
+    helping.sort(key=lambda c: (named.index(c.name) if c.name in named else len(named), left[c.name]))
+    return helping[:_BEST]
 
 
 # The screen as a dictionary.
@@ -293,4 +295,6 @@ def _size(why: EffectCourse, unit: str) -> str:
     if why.follows == "view order" and len(why.views):
         away = int(np.sum(np.abs(why.predicted) > largest / 2))
         return f"{away} of {len(why.views)} views sit {size} away from the others."
-    return f"{why.of.capitalize()} is off by up to {size}."
+    follows = _plain_covariate(why.follows).partition(":")[0]
+    goes_with = "" if follows == "view order" else f"; it goes with {follows}"
+    return f"{why.of.capitalize()} is off by up to {size}{goes_with}."

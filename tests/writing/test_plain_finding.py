@@ -183,7 +183,11 @@ def _found(
     """A diagnosis of one effect that helps, and another that holds 3 % where both hold all."""
     ranked, other = (
         SimpleNamespace(
-            name="play", adjusted=p_value, posterior=share, tests=21, score=SimpleNamespace(observable=seen, fitted=True)
+            name="play",
+            adjusted=p_value,
+            posterior=share,
+            tests=21,
+            score=SimpleNamespace(observable=seen, fitted=True),
         )
         for share, seen in ((posterior, True), (posterior * 3 / 97, False))
     )

@@ -44,11 +44,13 @@ function showScreen(root, part, found, um) {
   // Places with their numbers on both parts: at first the worst, the best and one between that are in sight.
   let tags = [];
   function firstTags() {
-    const values = pair()[0].values, front = views[0].front().filter(([k]) => Number.isFinite(values[k])).sort((a, b) => values[a[0]] - values[b[0]]);
+    const values = pair()[0].values, all = views[0].front().filter(([k]) => Number.isFinite(values[k])), drawn = numbers.onVertices(values);
+    // Where the colour, which is a mean of patches, is that of the number.
+    const alike = all.filter(([k, , , i]) => Math.abs(drawn[i] - values[k]) < 0.15 * values[k]), front = (alike.length > 9 ? alike : all).sort((a, b) => values[a[0]] - values[b[0]]);
     for (const wanted of [1, 0, 0.5]) {
       const order = front.map((f, i) => [Math.abs(i / front.length - wanted), f]).sort((a, b) => a[0] - b[0]);
       const free = order.find(([, f]) => tags.every(t => Math.hypot(f[1] - t.x, f[2] - t.y) > 0.22));
-      if (free) tags.push({ patch: free[1][0], x: free[1][1], y: free[1][2] });
+      if (free) tags.push({ patch: free[1][0], x: free[1][1], y: free[1][2], vertex: free[1][3] });
     }
   }
   views.forEach(v => v.picked = patch => {
@@ -82,7 +84,9 @@ function showScreen(root, part, found, um) {
     if (allowed && allowed <= full) svg.append(svgNode("line", { class: "allowed", x1: left - 4, x2: wide, y1: Y(allowed), y2: Y(allowed) }), svgNode("text", { class: "axis", x: wide, y: Y(allowed) - 4, "text-anchor": "end" }, `${shortNumber(allowed)} µm`));
     svg.append(svgNode("text", { x: left, y: high - 4 }, "grey: left · blue: right"));
     place.replaceChildren(svg);
-    const within = both.map(({ values }) => { const seen = values.filter(Number.isFinite); return Math.round(100 * seen.filter(v => v <= allowed).length / Math.max(seen.length, 1)); });
+    // As the light judges: with two standard errors, and no more of it than there is.
+    const errors = part.sigma ? Float32Array.from(part.sigma).filter(Number.isFinite).sort() : [], least = allowed - 2 * (errors[errors.length >> 1] || 0);
+    const within = both.map(({ values }) => { const seen = values.filter(Number.isFinite); return Math.floor(100 * seen.filter(v => v <= least).length / Math.max(seen.length, 1)); });
     const told = at("within");
     if (told) told.textContent = allowed ? `Within ${shortLength(allowed)}: ${within[0]} % → ${within[1]} %` : "";
   }
@@ -140,7 +144,7 @@ function coursePlot(course, names, um, line = "what the effect predicts") {
   const x = course.at.map(a => seconds ? a / per : a), scaled = values => values.map(v => v * factor);
   const law = course.law && course.law[0].length ? { x: course.law[0], y: scaled(course.law[1]) } : null;
   const [measured, sigma, predicted] = [course.measured, course.sigma, course.predicted].map(scaled);
-  const label = inOrder ? "views in their order" : course.follows.replace(/_c$/, " (°C)").replaceAll("_", " ") + (seconds ? ` (${named})` : course.unit ? ` (${course.unit})` : "");
+  const label = inOrder ? "views in their order" : course.follows.replace(/^j(\d+)(_deg| \(°\))$/, "angle of joint $1 (°)").replace(/_c$/, " (°C)").replaceAll("_", " ") + (seconds ? ` (${named})` : course.unit ? ` (${course.unit})` : "");
   const named_ = course.views.map(v => names ? names[v] : String(v)), most = Math.max(...predicted.map(Math.abs));
   const first = inOrder ? predicted.findIndex(p => Math.abs(p) > most / 2) : -1;
   const jumps = inOrder && first > 0 && predicted.slice(first).every(p => Math.abs(p) > most / 2);
@@ -216,8 +220,8 @@ function partStage(card, data, index) {
     // Patches in sight with where they stand in the picture.
     front: () => {
       const out = new Map();
-      for (let i = 0; i < count; i += 3) if (depthOf(i) > 0.4 && !out.has(near[3 * i])) out.set(near[3 * i], project(i));
-      return [...out].map(([k, [x, y]]) => [k, x, y]);
+      for (let i = 0; i < count; i += 3) if (depthOf(i) > 0.4 && !out.has(near[3 * i])) out.set(near[3 * i], [...project(i).slice(0, 2), i]);
+      return [...out].map(([k, [x, y, i]]) => [k, x, y, i]);
     },
   });
 }
