@@ -66,10 +66,13 @@ __all__ = list(MODULES)
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        # Read when it is asked for: it takes a third of the whole import.
+        return import_module("importlib.metadata").version("stitch")
     if name not in MODULES:
         raise AttributeError(f"module 'stitch' has no attribute {name!r}")
     return getattr(import_module(MODULES[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *MODULES})
+    return sorted({*globals(), *MODULES, "__version__"})

@@ -71,7 +71,8 @@ def _columns(item: Any, where: str) -> Columns:
         return _points(np.asarray(item.vertices), where) | (_colours(colours, where) if _any(colours) else {})
     array = np.asarray(item)
     if array.dtype.names is not None:
-        return {name: array[name].ravel() for name in array.dtype.names if array[name].ndim == array.ndim}
+        columns = {name: array[name].ravel() for name in array.dtype.names if array[name].ndim == array.ndim}
+        return measured_pixels(columns)
     return _points(array, where)
 
 
