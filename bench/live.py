@@ -1,8 +1,9 @@
 """Live sessions: simulated knocks of the scanner, and five measured objects. Tables of docs/python.md.
 
-`python -m bench.live [--cells 20] [--seed 0] [--write]`: each cell is a blade of 14 views on an ordinary arm. Before
-one view the scanner is knocked by 0.4 mm and 1 mrad in a direction drawn anew; the scans from there on show it. Is the
-knock named at the first view after it? Also: false alarms before it, and processor seconds a view.
+`python -m bench.live [objects] [knocks] [--cells 20] [--seed 0] [--write]`. A cell is a blade of 14 views on an
+ordinary arm. Before one view the scanner is knocked by 0.4 mm and 1 mrad in a direction drawn anew; the scans from
+there on show it. Is the knock named at the first view after it? Also: false alarms before it, and processor seconds a
+view.
 
 RegHEC's objects, nine views each, whose hand-eye is searched: are arrays what the folder is, to the last bit; how far
 does the end of view by view lie from the folder's run; what was said of the views, and in how many seconds.
@@ -117,22 +118,19 @@ def objects(folder: Path) -> str:
 def main() -> None:
     """Print the tables, and write them into the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("tables", nargs="*", default=["objects", "knocks"], help="both, unless named")
     parser.add_argument("--cells", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--write", action="store_true", help="put the tables into docs/python.md")
     options = parser.parse_args()
-    tables = {
-        "knocks": knocks(range(options.seed, options.seed + options.cells)),
-        "objects": objects(SHARED / "reghec"),
-    }
-    text = PAGE.read_text(encoding="utf-8")
-    for name, table in tables.items():
+    seeds = range(options.seed, options.seed + options.cells)
+    for name in options.tables:
+        table = objects(SHARED / "reghec") if name == "objects" else knocks(seeds)
         print(f"\n{table}")
-        before, rest = text.split(f"<!-- {name}: begin -->\n")
-        _, after = rest.split(f"<!-- {name}: end -->")
-        text = f"{before}<!-- {name}: begin -->\n{table}\n<!-- {name}: end -->{after}"
-    if options.write:
-        PAGE.write_text(text, encoding="utf-8")
+        if options.write:
+            before, rest = PAGE.read_text(encoding="utf-8").split(f"<!-- {name}: begin -->\n")
+            _, after = rest.split(f"<!-- {name}: end -->")
+            PAGE.write_text(f"{before}<!-- {name}: begin -->\n{table}\n<!-- {name}: end -->{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import inspect
 import re
 import subprocess
 import sys
+import tomllib
 from contextlib import chdir
 from importlib import import_module, util
 from pathlib import Path
@@ -39,6 +40,11 @@ def test_one_table_gives_the_names_the_directory_and_the_types():
     assert set(stitch.__all__) <= set(dir(stitch))
     assert imported_for_type_checkers() == set(stitch.MODULES.items())
     assert all(util.find_spec(module) for module in stitch.MODULES.values())
+
+
+def test_the_version_is_that_of_the_project():
+    project = tomllib.loads((Path(stitch.__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    assert stitch.__version__ == project["project"]["version"] and "__version__" in dir(stitch)
 
 
 def test_another_name_is_an_attribute_error():

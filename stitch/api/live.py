@@ -52,7 +52,12 @@ _IN_A_ROW = 2
 
 @dataclass(frozen=True)
 class LiveView:
-    """What is said of one view as it comes."""
+    """What is said of one view as it comes; `print` writes it as one line.
+
+    Example:
+        >>> print(live.said[-1])
+        v004: fits. ... % of it was seen before, U falls by ... %. U ... mm, ... mrad.
+    """
 
     name: str
     verdict: Verdict
@@ -71,7 +76,12 @@ class LiveView:
 
 @dataclass(frozen=True)
 class ProposedPose:
-    """A pose of the flange that would show more of the hand-eye; whether the arm can take it is not asked."""
+    """A pose of the flange that would show more of the hand-eye; whether the arm can take it is not asked.
+
+    Example:
+        >>> print(live.next_pose())
+        Next: view v... turned by ...° about (...) of the base, U 0... mm.
+    """
 
     T_base_flange: Array  # (4, 4) length_unit
     like: str  # the view from which it is turned
@@ -103,11 +113,8 @@ class LiveSession:
         ...     said = live.add_view(cloud, pose)
         >>> said.name, said.verdict in ("fits", "adds_nothing")
         ('v004', True)
-        >>> said.hand_eye.frame
-        'flange'
-        >>> run = live.finish()
-        >>> len(run.views)
-        5
+        >>> live.hand_eye.frame, len(live.said)
+        ('flange', 5)
     """
 
     def __init__(self, session: Session, recording: LiveRecording | None = None, cloud_unit: str | None = None) -> None:
@@ -147,6 +154,7 @@ class LiveSession:
             >>> live.add_view(clouds[0], poses[0]).verdict
             'waiting'
         """
+        began = time.perf_counter()
         own = self.session
         name = name or f"v{len(own.views):03d}"
         if name in own.names:
@@ -165,15 +173,22 @@ class LiveSession:
             name=own.name,
             check=False,
         )
-        return self.take(replace(one.views[0], approach=None))
+        return self._take(replace(one.views[0], approach=None), began)
 
     def take(self, view: View) -> LiveView:
         """Take in a view that was read before, as of a session folder, and say whether it belongs.
 
         Raises:
             InputError: an earlier time than that of the view before; poses of another convention than stated.
+
+        Example:
+            >>> live = stitch.live(mount="eye_in_hand")
+            >>> live.take(session.views[0]).verdict
+            'waiting'
         """
-        began = time.perf_counter()
+        return self._take(view, time.perf_counter())
+
+    def _take(self, view: View, began: float) -> LiveView:
         before = self.session
         try:
             with library_threads_off():
@@ -202,6 +217,11 @@ class LiveSession:
 
         Poses are those of the views, turned about the middle of what they see by 15 to 45°. Every view counts as much
         as the ones before did on average.
+
+        Example:
+            >>> proposed = live.next_pose()
+            >>> proposed.T_base_flange.shape, proposed.U_mm < live.hand_eye.U.mm
+            ((4, 4), True)
         """
         known = self.hand_eye
         return None if self._fit is None or known is None else _next_pose(self._fit, self._views(), known)
@@ -215,6 +235,10 @@ class LiveSession:
 
         Raises:
             InputError, NoResultError: as of `stitch.run`.
+
+        Example:
+            >>> len(live.finish().views)
+            5
         """
         return run(self.session, recorder=recorder, **options)
 

@@ -40,7 +40,16 @@ class AtPart(NamedTuple):
 
 @dataclass(frozen=True)
 class FittedHandEye:
-    """The hand-eye of a run: where the scanner sits on what carries it."""
+    """The hand-eye of a run: where the scanner sits on what carries it.
+
+    As an array it is its pose.
+
+    Example:
+        >>> run.hand_eye
+        FittedHandEye(T_flange_scanner at (...) mm, U at the part 0... mm and 0... mrad)
+        >>> bool((np.asarray(run.hand_eye) == run.T_mount).all())
+        True
+    """
 
     pose: Array  # (4, 4) T_frame_scanner, length_unit
     covariance: Array  # (6, 6) of pose·exp(ξ), scanner frame, rotation first; rad and length_unit
@@ -98,7 +107,14 @@ def fitted_hand_eye(
 
 @dataclass(frozen=True)
 class Stitched:
-    """The stitched cloud in the reference frame: the flange (eye_to_hand) or the base (eye_in_hand)."""
+    """The stitched cloud in the reference frame: the flange (eye_to_hand) or the base (eye_in_hand).
+
+    Example:
+        >>> run.stitched
+        Stitched(... points in the frame of the base, mm)
+        >>> run.stitched.points.shape == run.stitched.normals.shape == (len(run.stitched), 3)
+        True
+    """
 
     fused: FusedCloud
     frame: str  # "flange" or "base"
@@ -137,6 +153,11 @@ class Stitched:
 
         Raises:
             InputError: Open3D is not installed, or lacks a library of the system.
+
+        Example:
+            >>> cloud = run.stitched.to_open3d()
+            >>> cloud.has_normals(), len(cloud.points) == len(run.stitched)
+            (True, True)
         """
         o3d = import_open3d("to_open3d")
         if not tensor:
@@ -155,6 +176,11 @@ class Stitched:
         """Return a trimesh.PointCloud with colours by residual; lengths in length_unit.
 
         Its metadata holds `normals` (N, 3), `residual` (N,) and `count` (N,).
+
+        Example:
+            >>> cloud = run.stitched.to_trimesh()
+            >>> sorted(cloud.metadata)
+            ['count', 'normals', 'residual']
         """
         import trimesh
 
@@ -171,7 +197,13 @@ class Stitched:
 
 @dataclass(frozen=True)
 class RunView:
-    """One view as the run puts it."""
+    """One view as the run puts it.
+
+    Example:
+        >>> view = run.views[0]
+        >>> view.name, view.pose.shape, view.correction.shape
+        ('v000', (4, 4), (6,))
+    """
 
     name: str
     pose: Array  # (4, 4) T_reference_scanner after register, length_unit
@@ -293,6 +325,10 @@ class Run(runs.Run):
 
         Raises:
             InputError: no package that draws is installed.
+
+        Example:
+            >>> type(run.plot()).__name__
+            'Figure'
         """
         draw = _entry_point("stitch.run_plots")
         if draw is None:

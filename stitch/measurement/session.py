@@ -186,7 +186,12 @@ class Session:
         return [view.name for view in self.views]
 
     def without(self, names: Collection[str]) -> "Session":
-        """The session less some views."""
+        """Return the session less some views.
+
+        Example:
+            >>> session.without(["v000"]).names
+            ['v001', 'v002', 'v003', 'v004']
+        """
         return replace(self, views=tuple(view for view in self.views if view.name not in names))
 
     @property

@@ -281,15 +281,30 @@ class Model:
         return [term.name for term in self.terms]
 
     def with_terms(self, terms: Sequence[Term]) -> "Model":
-        """The model with other effects in use."""
+        """Return the model with other effects in use.
+
+        Example:
+            >>> better.effects, better.model.with_terms(()).effects
+            (['range_scale'], [])
+        """
         return replace(self, terms=tuple(terms))
 
     def without(self, name: str) -> "Model":
-        """The model without one effect."""
+        """Return the model without one effect.
+
+        Example:
+            >>> better.model.without("range_scale").effects
+            []
+        """
         return self.with_terms([term for term in self.terms if term.name != name])
 
     def with_term(self, term: Term) -> "Model":
-        """The model with a term in place of its own of the same effect, as the last."""
+        """Return the model with a term in place of its own of the same effect, as the last.
+
+        Example:
+            >>> run.model.with_term(better.model.terms[0]).effects
+            ['range_scale']
+        """
         return self.with_terms([*self.without(term.name).terms, term])
 
     def __repr__(self) -> str:

@@ -190,7 +190,12 @@ class Run:
         return self.source if isinstance(self.source, Fit) else self.source(self)
 
     def with_fit(self, **changes: Any) -> Self:
-        """Return the run with other values of some fields of `fit`."""
+        """Return the run with other values of some fields of `fit`.
+
+        Example:
+            >>> run.with_fit(notes=("Scanned twice.",)).notes
+            ('Scanned twice.',)
+        """
         return replace(self, source=replace(self.fit, **changes))
 
     @property
@@ -223,66 +228,82 @@ class Run:
 
     @property
     def stages(self) -> tuple[StageResult, ...]:
+        """Rows of the stage table: coarse, correct, register, fuse."""
         return self.fit.stages
 
     @property
     def poses_model(self) -> Array:
+        """(V, 4, 4) T_reference_scanner of robot, hand-eye and effects alone, length_unit."""
         return self.fit.poses_model
 
     @property
     def poses(self) -> Array:
+        """(V, 4, 4) T_reference_scanner after register, length_unit."""
         return self.fit.poses
 
     @property
     def corrections(self) -> Array:
+        """(V, 6) twists in the reference frame, poses = exp(corrections)·poses_model; rad and length_unit."""
         return self.fit.corrections
 
     @property
     def view_rms(self) -> Array:
+        """(V,) rms of each view's distances from the others, length_unit; NaN for one without partners."""
         return self.fit.view_rms
 
     @property
     def fused(self) -> FusedCloud:
+        """The stitched cloud as arrays, reference frame, length_unit."""
         return self.fit.fused
 
     @property
     def repeatability(self) -> Repeatability:
+        """Of the flange's poses, as the overlaps show it; rad and length_unit."""
         return self.fit.repeatability
 
     @property
     def overlaps(self) -> Overlaps | None:
+        """Correspondences under the model, before register moves single views; None of labelled points alone."""
         return self.fit.overlaps
 
     @property
     def registered(self) -> Overlaps | None:
+        """Correspondences found anew after register; None of labelled points alone."""
         return self.fit.registered
 
     @property
     def targets(self) -> TargetModelFit | None:
+        """What the labelled points say; None where there are none."""
         return self.fit.targets
 
     @property
     def outliers(self) -> tuple[Outlier, ...]:
+        """Labelled points that do not count."""
         return self.fit.outliers
 
     @property
     def unobservable(self) -> tuple[str, ...]:
+        """Directions of the hand-eye that the views do not show, in plain words."""
         return self.fit.unobservable
 
     @property
     def unknown(self) -> tuple[str, ...]:
+        """Of x, y, z, rx, ry, rz of the hand-eye, what those directions leave open."""
         return self.fit.unknown
 
     @property
     def verdict(self) -> str:
+        """One plain sentence."""
         return self.fit.verdict
 
     @property
     def convergence(self) -> dict[str, list[float]]:
+        """Stage to rms of each of its iterations, length_unit."""
         return self.fit.convergence
 
     @property
     def notes(self) -> tuple[str, ...]:
+        """Sentences for people."""
         return self.fit.notes
 
     def __repr__(self) -> str:

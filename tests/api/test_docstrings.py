@@ -1,23 +1,41 @@
-"""Every public name says shapes, units, frames and errors, and its example is run."""
+"""Every public name, and every method of what people hold, says shapes, units, frames and errors; its example is run."""
 
+import ast
 import doctest
+import inspect
+import re
 from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import stitch
+from stitch.api import live, run, session
 from stitch.measurement.session import Cloud
+from tests.needs import needs_open3d
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-METHODS = ("Session.from_arrays", "Session.save", "Run.save")
+HELD = (session.Session, run.Run, run.FittedHandEye, run.Stitched, run.RunView, stitch.Model)
+HELD += (live.LiveSession, live.LiveView, live.ProposedPose)
+# How a method begins that returns what it did.
+VERBS = {"Return", "Write", "Take", "Run"}
+ERRORS = {"InputError", "NoResultError"}
 
 
-def docstring(name):
-    """Of a public name, or of a method of one."""
-    owner, _, method = name.partition(".")
-    found = getattr(stitch, owner)
-    return (getattr(found, method) if method else found).__doc__
+def members(kind):
+    """Public members of a class, own and inherited, by the name under which people call them."""
+    names = [name for name in dir(kind) if not name.startswith("_")]
+    return {f"{kind.__name__}.{name}": inspect.getattr_static(kind, name) for name in names}
+
+
+MEMBERS = {name: member for kind in HELD for name, member in members(kind).items()}
+METHODS = {name: getattr(m, "__func__", m) for name, m in MEMBERS.items() if callable(getattr(m, "__func__", m))}
+PROPERTIES = {name: m for name, m in MEMBERS.items() if isinstance(m, property | cached_property)}
+CLASSES = {kind.__name__: kind for kind in HELD}
+FUNCTIONS = {name: getattr(stitch, name) for name in stitch.__all__ if inspect.isfunction(getattr(stitch, name))}
+NAMES = {name: getattr(stitch, name) for name in stitch.__all__} | CLASSES | METHODS
 
 
 def moved(view):
@@ -29,6 +47,9 @@ def moved(view):
 def names_of_examples(arrays, cell_folder, loaded, found):
     """What the examples call as a person would, but for the folder to write into."""
     clouds, poses = arrays
+    grown = stitch.live(mount="eye_in_hand")
+    for cloud, pose in zip(clouds, poses, strict=True):
+        grown.add_view(cloud, pose)
     return {
         "stitch": stitch,
         "np": np,
@@ -40,22 +61,67 @@ def names_of_examples(arrays, cell_folder, loaded, found):
         "session_folder": cell_folder,
         "run": found,
         "better": stitch.add(found, "range_scale"),
+        "live": grown,
     }
 
 
-@pytest.mark.parametrize("name", [*stitch.__all__, *METHODS])
+@pytest.mark.parametrize("name", NAMES)
 def test_the_example_gives_what_it_says(name, names_of_examples, tmp_path):
-    text = docstring(name)
+    if "open3d" in name:
+        needs_open3d()
     globs = names_of_examples | {"folder": tmp_path}
-    example = doctest.DocTestParser().get_doctest(text, globs, name, None, None)
+    example = doctest.DocTestParser().get_doctest(inspect.getdoc(NAMES[name]), globs, name, None, None)
     assert example.examples, f"{name} has no example"
     said = []
     doctest.DocTestRunner(optionflags=FLAGS).run(example, out=said.append)
     assert not said, "".join(said)
 
 
-@pytest.mark.parametrize("name", [n for n in stitch.__all__ if n[0].islower()] + ["Session.from_arrays"])
+@pytest.mark.parametrize("name", [*FUNCTIONS, "Session.from_arrays"])
 def test_a_function_says_what_it_raises_and_in_which_units(name):
-    text = docstring(name)
+    text = NAMES[name].__doc__
     assert "Raises:" in text and "Example:" in text
     assert any(word in text for word in ("(4, 4)", "(V,", "(N, 3)", "length_unit", "rad", "mm")), name
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_begins_with_what_it_does_and_says_what_it_raises(name):
+    text = inspect.getdoc(METHODS[name])
+    assert text.split()[0] in VERBS
+    assert "Raises:" in text or not refuses(METHODS[name].__name__)
+
+
+@pytest.mark.parametrize("name", PROPERTIES)
+def test_a_property_says_what_it_is_and_what_it_raises(name):
+    text = PROPERTIES[name].__doc__
+    assert text and re.match(r"[A-Z(`]", text)
+    assert "Raises:" in text or not refuses(name.split(".")[1])
+
+
+def calls_and_refusals():
+    """Of every function of the rooms that people call: names that it calls, and whether it raises itself."""
+    root = Path(stitch.__file__).parent
+    files = [*(root / "api").glob("*.py"), root / "system" / "open3d_library.py"]
+    trees = [ast.parse(file.read_text(encoding="utf-8")) for file in files]
+    out = {}
+    for node in (node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+        inside = list(ast.walk(node))
+        called = {ast.unparse(n.func).split(".")[-1] for n in inside if isinstance(n, ast.Call)}
+        raised = any(isinstance(n, ast.Raise) and n.exc and ast.unparse(n.exc).split("(")[0] in ERRORS for n in inside)
+        # Of several of one name all count.
+        before, refused = out.get(node.name, (set(), False))
+        out[node.name] = before | called, refused or raised
+    return out
+
+
+CALLS = calls_and_refusals()
+
+
+def refuses(name, above=()):
+    """True if a function, or one that it calls there, raises InputError or NoResultError."""
+    called, raised = CALLS.get(name, ((), False))
+    return raised or any(refuses(other, (*above, name)) for other in called if other not in (*above, name))
+
+
+def test_a_refusal_is_seen_through_the_functions_between():
+    assert refuses("save") and refuses("to_open3d") and refuses("add_view") and not refuses("to_trimesh")
