@@ -3,7 +3,6 @@
 import html
 import json
 import re
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -78,12 +77,6 @@ def test_the_stitched_cloud_for_open3d_and_back(found):
     assert np.array_equal(np.asarray(legacy.points), found.stitched.points) and legacy.has_normals()
     tensor = found.stitched.to_open3d(tensor=True)
     assert tensor.point["residual"].shape[0] == len(found.stitched)
-
-
-def test_a_package_that_is_missing_is_named(found, monkeypatch):
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(InputError, match="to fix: pip install open3d"):
-        found.stitched.to_open3d()
 
 
 def test_the_report_has_every_part_once(found):
