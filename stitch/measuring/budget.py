@@ -237,6 +237,7 @@ def _stated_loadings(stated: Contribution, table: FeatureNumbers) -> Array:
 
 # Points of a feature that a trial fits; what views share does not average out among them.
 _TRIAL_POINTS = 300
+_TRIAL_BLOCK = 200
 
 
 @dataclass(frozen=True)
@@ -289,11 +290,12 @@ def _refits(
     totals = [
         np.sum([getattr(s, name) @ drawn for s, drawn in modes], axis=0).T for name in ("views", "parameters", "field")
     ]
-    twists, parameters, field = totals
+    twists, own = totals[0], np.hstack(totals[1:])
     shapes, noise = places.point_modes(fit.at)
     out = np.empty((trials, len(fit.values)))
-    for m in range(trials):
-        own = np.concatenate([parameters[m], field[m]])
-        moved = fit.at.points + np.einsum("k,kni->ni", own, shapes) + noise * rng.standard_normal((len(noise), 1))
-        out[m] = fit.refit(places.moved(fit.at, twists[m], moved))
+    for start in range(0, trials, _TRIAL_BLOCK):
+        block = slice(start, min(start + _TRIAL_BLOCK, trials))
+        moved = fit.at.points + np.tensordot(own[block], shapes, axes=1)
+        moved += noise * rng.standard_normal((*moved.shape[:2], 1))
+        out[block] = [fit.refit(points) for points in places.moved(fit.at, twists[block], moved)]
     return out

@@ -33,6 +33,8 @@ _MOST_POINTS = 20_000
 # Normals of points and of the feature may part by 45°; residuals beyond 4 robust sigmas are no part of it.
 _SAME_NORMAL, _OUTLYING = np.cos(np.radians(45.0)), 4.0
 _FEWEST = 12
+# Of Gauss and Newton from a fit to the same points moved a little: each leaves a thousandth of what is missing.
+_STEPS = 3
 
 
 @dataclass(frozen=True)
@@ -94,8 +96,12 @@ class FittedFeature:
 
     def refit(self, points: Array) -> Array:
         """Return the values (q,) where the points that count lie at (N, 3)."""
-        surface = _surface_of(self.feature, self.at)
-        return _values(self.feature, _solve(surface, (points - self.feature.at) @ self.feature.R, self.parameters))
+        surface, local = _surface_of(self.feature, self.at), (points - self.feature.at) @ self.feature.R
+        theta = self.parameters
+        for _ in range(_STEPS):
+            residual, J, _ = surface(theta, local)
+            theta = theta - np.linalg.solve(J.T @ J, J.T @ residual)
+        return _values(self.feature, theta)
 
     def thinned(self, most: int) -> "FittedFeature":
         """The same fitted to at most so many of its points."""

@@ -17,7 +17,7 @@ from stitch.runs.run import FusedCloud
 from stitch.system.files import whole_file
 
 # What is seen at more than 60° errs most with incidence, and other views see it better.
-_LEAST_COSINE = 0.5
+LEAST_COSINE = 0.5
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class PlaceErrors:
     def points(self) -> RunPoints:
         """All usable points that the scanner does not see at a slant."""
         scans = self.capture.scans
-        kept = [np.flatnonzero(scan.usable.astype(bool) & (scan.confidence > _LEAST_COSINE)) for scan in scans]
+        kept = [np.flatnonzero(scan.usable.astype(bool) & (scan.confidence > LEAST_COSINE)) for scan in scans]
         return RunPoints(
             np.vstack([frames.transform(T, s.points[k]) for s, T, k in zip(scans, self.poses, kept, strict=True)]),
             np.vstack([frames.rotate(T, s.normals[k]) for s, T, k in zip(scans, self.poses, kept, strict=True)]),
@@ -124,9 +124,14 @@ class PlaceErrors:
         return shapes, noise
 
     def moved(self, at: RunPoints, twists: Array, points: Array) -> Array:
-        """Return points (N, 3) of some views, moved with their views by left twists (6V,) about the centre."""
-        moved = frames.moved_about(self.centre, twists.reshape(-1, 6), np.broadcast_to(np.eye(4), self.poses.shape))
-        return np.asarray(np.einsum("nij,nj->ni", moved[at.view, :3, :3], points) + moved[at.view, :3, 3])
+        """Return points (M, N, 3) of some views, moved with their views by left twists (M, 6V) about the centre."""
+        views, index = np.unique(at.view, return_inverse=True)
+        T = frames.moved_about(self.centre, twists.reshape(len(twists), -1, 6)[:, views], np.eye(4))
+        out = np.empty_like(points)
+        for v in range(len(views)):
+            own = index == v
+            out[:, own] = points[:, own] @ T[:, v, :3, :3].transpose(0, 2, 1) + T[:, None, v, :3, 3]
+        return out
 
     @property
     def modes_of_field(self) -> int:

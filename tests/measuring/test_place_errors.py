@@ -113,6 +113,13 @@ def test_shares_add_up_and_the_largest_source_is_named(cell):
             assert next(iter(found.numbers[1].shares)) == name
 
 
+def test_a_scanner_without_smooth_errors_is_not_charged_with_large_ones(cell):
+    _, places, _ = cell
+    *field, incidence = [source.field.max() for source in places.sources if source.name == SCANNER]
+    # Usual is 0.3 of the noise; its logarithm scatters by 0.7, so that one sigma more is 0.6.
+    assert max(field) < 0.3 * 0.02 and incidence < 0.6 * 0.02
+
+
 def test_a_distance_is_better_known_than_its_ends(cell):
     _, places, wanted = cell
     found = evaluate(places, wanted, fit_features(places.points, wanted.features))
