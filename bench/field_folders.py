@@ -310,7 +310,7 @@ def run_drawn(scratch: Path, seed: int, only: str | None) -> list[list[str]]:
     """Sixty drawn kinds; where one is refused, what the refusal asks for is done to the letter."""
     rows, known = [], campaigns(scratch, seed)
     for name, kind in draw_kinds(seed).items():
-        if only is not None and only not in name:
+        if only is not None and not re.search(only, name):
             continue
         campaign = known["turntable" if kind.turntable else "still" if name.startswith("still") else "arm"]
         folder, out = scratch / name.replace(" ", "-"), scratch / f"{name}-session"

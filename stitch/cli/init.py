@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -43,6 +44,12 @@ _Orientation = Annotated[
     typer.Option("--orientation", help="Of all poses, for a table of x, y, z alone: 180,0,0 or qx,qy,qz,qw."),
 ]
 _Mount = Annotated[str | None, typer.Option("--mount", help="eye_in_hand or eye_to_hand.")]
+_Within = Annotated[
+    str | None,
+    typer.Option(
+        "--within", help="Box that counts, in the clouds' frame and unit: its lowest and highest corner, x,y,z,x,y,z."
+    ),
+]
 _Inverse = Annotated[
     bool | None, typer.Option("--inverse/--no-inverse", help="The poses are T_flange_base, or are not.")
 ]
@@ -69,6 +76,7 @@ def init(
     cloud_unit: _CloudUnit = None,
     mount: _Mount = None,
     orientation: _Orientation = None,
+    within: _Within = None,
     inverse: _Inverse = None,
     board: BoardOption = None,
     ball: BallOption = None,
@@ -106,6 +114,7 @@ def init(
         cloud_unit=cloud_unit,
         mount=mount,
         orientation=_numbers("--orientation", orientation),
+        within=_numbers("--within", within),
         targets=parse_target_options(board, ball),
     )
     _init_from_scans(folder, output or folder, stated, yes, force, as_json)
@@ -138,6 +147,8 @@ def _init_from_scans(folder: Path, out: Path, stated: StatedFolder, yes: bool, f
         first = _judge_folder(scans, stated)
         if not yes:
             first = _ask_uncertain(scans, out, first, stated)
+        elif stated.rotation is None:
+            _require_fit(scans, first)
         write_draft(out, first, force=force, unpacked=scans != folder)
     command = "run" if first.sphere_mm is None else "calibrate sphere"
     _report_session(out, len(first.pairing.used), first.guesses, as_json, command)
@@ -151,6 +162,39 @@ def _judge_folder(folder: Path, stated: StatedFolder) -> FirstSession:
         first = first_session(folder, stated)
     _print_guesses(first.guesses)
     return first
+
+
+# Where so many of the scanner's motions close, a reading is worth a guess.
+_WORTH_A_GUESS = 0.5
+
+
+def _require_fit(folder: Path, first: FirstSession) -> None:
+    """Refuse poses that contradict the scans under every reading, with the mistake that explains it.
+
+    Raises:
+        InputError: what the deep check finds wrong for certain.
+    """
+    from stitch.errors import NoResultError
+    from stitch.intake.session_draft import write_draft
+    from stitch.integrity.deep_check import deep_check
+    from stitch.reading.session_folder import load_session
+
+    choice = first.choice
+    if choice.determined or first.sphere_mm is not None or (choice.best.closed or 0.0) >= _WORTH_A_GUESS:
+        return
+    with TemporaryDirectory() as draft, show_activity("no reading fits clearly: trying the usual mistakes"):
+        write_draft(Path(draft), first)
+        session = load_session(Path(draft))
+        try:
+            certain = [p for p in deep_check(session) if p.certain]
+            # What is wrong with all views comes before what is wrong with one.
+            found = [
+                p.line(session.names) for p in sorted(certain, key=lambda p: 0 < len(p.views) < len(session.views))
+            ]
+        except NoResultError as error:
+            found = [str(error)]
+    if found:
+        raise InputError(f"{folder}: no session was written, as no reading of the poses fits the scans. {found[0]}")
 
 
 def _ask_uncertain(folder: Path, out: Path, first: FirstSession, stated: StatedFolder) -> FirstSession:

@@ -87,13 +87,13 @@ def write_ply(cloud: ColouredCloud, path: Path) -> None:
     fused = cloud.fused
     numbers = ("x", "y", "z", "nx", "ny", "nz", "residual")
     layout = [(name, "<f4") for name in numbers] + [(name, "u1") for name in ("red", "green", "blue")]
-    vertex = np.empty(len(fused.points), [*layout, ("count", "<u2")])
+    vertex = np.empty(len(fused.points), [*layout, ("views", "<u2")])
     columns = np.column_stack([fused.points, fused.normals, fused.residual])
     for name, column in zip(numbers, columns.T, strict=True):
         vertex[name] = column
     for name, column in zip(("red", "green", "blue"), cloud.colours.T, strict=True):
         vertex[name] = column
-    vertex["count"] = fused.count
+    vertex["views"] = fused.count
     PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
 
 

@@ -31,6 +31,7 @@ from stitch.integrity.conventions import (
     surface_misfit,
 )
 from stitch.integrity.hypotheses import Hypothesis
+from stitch.integrity.scan_faults import find_standing_scene
 from stitch.measurement.capture import Capture
 from stitch.measurement.session import Mount
 from stitch.system.process import steps
@@ -390,6 +391,27 @@ def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool 
 
 
 # Scans that lie in one frame already: moved there by the scanner's software, so that no pose is left to tell.
+
+
+def require_no_background(folder: Path, capture: Capture, scale: float) -> None:
+    """Refuse scans that mostly show what stands still before the scanner, where a box parts it from the rest.
+
+    Args:
+        capture: the scans, mm.
+        scale: unit of the clouds, mm.
+
+    Raises:
+        InputError: with the box that holds the part alone.
+    """
+    found = find_standing_scene(capture.scans)
+    if found is None:
+        return
+    share, box = found
+    corners = ",".join(f"{x / scale:.4g}" for x in box.ravel())
+    raise InputError(
+        f"{folder}: {share:.0%} of what the scans show stands still before the scanner: a table, a wall; to fix: state "
+        f"--within {corners}"
+    )
 
 
 def require_own_frames(folder: Path, motions: Callable[[], RelativeScans], decided: ConventionChoice) -> None:

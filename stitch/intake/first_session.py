@@ -23,6 +23,7 @@ from stitch.intake.convention_choice import (
     choose_convention,
     choose_mounting,
     fitted_scale,
+    require_no_background,
     require_own_frames,
     weigh_doubts,
 )
@@ -35,12 +36,13 @@ from stitch.intake.readings import (
     all_readings,
     candidate_units,
     doubted_readings,
+    mixed_readings,
     require_known_word,
     with_joints_of,
 )
 from stitch.intake.scan_targets import TargetSearch, find_folder_targets, target_motions
 from stitch.intake.stops import rows_with_scans
-from stitch.integrity.conventions import register_scan_pairs
+from stitch.integrity.conventions import RelativeScans, register_scan_pairs
 from stitch.measurement.capture import Capture, thin_session
 from stitch.measurement.session import Cloud, Scanner, Session, Sighting, View
 from stitch.reading.clouds import read_cloud
@@ -61,6 +63,9 @@ class StatedFolder(StatedTable):
     cloud_unit: str | None = None
     mount: str | None = None
     orientation: tuple[float, ...] = ()  # of all poses, where the table has x, y, z alone
+    within: tuple[
+        float, ...
+    ] = ()  # lowest and highest corner of the box that counts, scanner frame, unit of the clouds
     targets: TargetSearch = field(default_factory=TargetSearch)  # boards and balls in the scans
 
     def __post_init__(self) -> None:
@@ -68,6 +73,13 @@ class StatedFolder(StatedTable):
         super().__post_init__()
         require_known_word("--cloud-unit", self.cloud_unit, CLOUD_UNITS)
         require_known_word("--mount", self.mount, _MOUNTS)
+        if self.within and (len(self.within) != 6 or not (self.box[0] < self.box[1]).all()):
+            raise InputError("--within: to fix: state the lowest and the highest corner, x,y,z,x,y,z, of a box")
+
+    @property
+    def box(self) -> Array:
+        """The corners (2, 3) of the box that counts; (0, 3) where everything does."""
+        return np.array(self.within, float).reshape(-1, 3)
 
     @property
     def carries(self) -> bool | None:
@@ -106,7 +118,7 @@ def score_words(score: ConventionScore) -> str:
     if not score.meets:
         return "no two views meet"
     motions = "" if score.closed is None else f", {100 * score.closed:.0f} % of the scanner's motions close"
-    return f"views {score.misfit:.2f} mm apart{motions}"
+    return f"a rough fit leaves {score.misfit:.2f} mm{motions}"
 
 
 def _files_guess(files: FolderFiles, raw: RawPoses) -> Guess:
@@ -148,7 +160,8 @@ def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
     if stated.rotation:
         return Guess("rotation", best.words, "stated with --rotation", True, "--rotation")
     if decided.overruled:
-        reason = f"the scans contradict {decided.overruled}, as the columns are named; {score_words(decided.best)}"
+        named = ", as the columns are named" * best.layout.named
+        reason = f"the scans contradict {decided.overruled}{named}; {score_words(decided.best)}"
         return Guess("rotation", best.words, reason, decided.determined, "--rotation")
     if best.layout.convention is not None:
         sure = best.layout.sure or (decided.determined and not decided.only_believed)
@@ -213,6 +226,7 @@ class FirstSession:
     optical_axis: str
     sightings: tuple[Sighting, ...] = ()  # mm, of every cloud, where targets are looked for
     sphere_mm: float | None = None  # radius, where the clouds are profiles of a sphere
+    box: Array = field(default_factory=lambda: np.empty((0, 3)))  # corners, of the box that counts, unit of the clouds
 
     @property
     def pairing(self) -> Pairing:
@@ -228,7 +242,7 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     """
     found = find_folder_files(folder, stated.poses)
     raw = _read_table(found, stated)
-    clouds, kept, lost = _read_clouds(found.clouds)
+    clouds, kept, lost = _read_clouds(found.clouds, stated.box)
     pairs = [pairing.of(kept, raw.without_pose) for pairing in pairings(found.clouds, raw.labels, raw.numbers)]
     found = replace(found, clouds=tuple(found.clouds[i] for i in kept))
     points = [c.points for c in clouds]
@@ -238,20 +252,58 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     if all(_is_profile(cloud) for cloud in points):
         way = all_interpretations(ways_to_read, pairs, units, (True,))[0]
         return _profiles_of_a_sphere(found, raw, clouds, way, stated)
-    capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
     seen, of_targets = find_folder_targets(found, points, CLOUD_UNITS[own_units[0]], stated.targets)
-    motions = cache(lambda: register_scan_pairs(capture))
     shown = target_motions(seen) if seen else None
+    capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
+    decided = _decide(
+        found, raw, ways_to_read, (capture, CLOUD_UNITS[own_units[0]] / MM), (pairs, units), stated, shown
+    )
+    axis, axis_guess = guess_optical_axis(clouds)
+    settled = choose_mounting(decided, stated.mount, stated.inverse)
+    told = session_guesses(found, raw, decided, points, own_units, stated)
+    beside = (*of_targets, *_codes_guess(clouds), *_left_out_guess(found, decided, lost))
+    guesses = (*told, settled.guess, axis_guess, *beside)
+    return FirstSession(found, raw, own_units[0], decided, settled, guesses, axis, sightings=seen, box=stated.box)
+
+
+def _decide(
+    found: FolderFiles,
+    raw: RawPoses,
+    ways_to_read: Sequence[Reading],
+    scans: tuple[Capture, float],
+    open_: tuple[Sequence[Pairing], Sequence[str]],
+    stated: StatedFolder,
+    shown: RelativeScans | None,
+) -> ConventionChoice:
+    """Let the scans choose among the readings, and among those that the names of columns deny.
+
+    Args:
+        scans: made light, mm, and the unit of their files in mm.
+        open_: pairings and units of length that are possible.
+        shown: motions that targets show.
+
+    Raises:
+        InputError: scans that stand still, lie in one frame or have another scale.
+    """
+    (capture, mm), (pairs, units) = scans, open_
+
+    @cache
+    def motions() -> RelativeScans:
+        # They are dear: what stands still before the scanner is told before.
+        require_no_background(found.folder, capture, mm)
+        return register_scan_pairs(capture)
 
     def choose(among: Sequence[Reading]) -> ConventionChoice:
         return choose_convention(capture, motions, among, pairs, units, stated.carries, shown)
 
     decided = choose(ways_to_read)
-    require_own_frames(folder, motions, decided)
+    require_own_frames(found.folder, motions, decided)
     if not decided.determined:
         require_scale(found, fitted_scale(motions(), decided), stated)
     layout = decided.best.interpretation.reading.layout
     doubted = [] if layout.turntable else doubted_readings(raw, found.urdf, stated)
+    if not decided.determined:
+        doubted += mixed_readings(raw, stated)
     if doubted and not decided.determined:
         decided = weigh_doubts(decided, choose(doubted))
     elif doubted and not (layout.sure or stated.rotation):
@@ -259,11 +311,7 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     if not decided.determined and found.clouds[0].suffix.lower() in DEPTH_SUFFIXES:
         # Where counts are far too large or small the motions close less well.
         require_scale(found, fitted_scale(motions(), decided, (10.0, 0.1)), stated)
-    axis, axis_guess = guess_optical_axis(clouds)
-    settled = choose_mounting(decided, stated.mount, stated.inverse)
-    told = session_guesses(found, raw, decided, points, own_units, stated)
-    guesses = (*told, settled.guess, axis_guess, *of_targets, *_left_out_guess(found, decided, lost))
-    return FirstSession(found, raw, own_units[0], decided, settled, guesses, axis, sightings=seen)
+    return decided
 
 
 # Of the width of a profile: how far its points lie from a plane through the scanner.
@@ -310,7 +358,7 @@ def _read_table(found: FolderFiles, stated: StatedFolder) -> RawPoses:
     return rows_with_scans(raw, found.clouds, found.urdf, stated)
 
 
-def _read_clouds(files: Sequence[Path]) -> tuple[list[Cloud], list[int], list[str]]:
+def _read_clouds(files: Sequence[Path], box: Array) -> tuple[list[Cloud], list[int], list[str]]:
     """Return the clouds that show something, their numbers among the files, and why the others do not.
 
     Raises:
@@ -320,6 +368,7 @@ def _read_clouds(files: Sequence[Path]) -> tuple[list[Cloud], list[int], list[st
     for i, file in enumerate(steps("clouds", files)):
         try:
             cloud = read_cloud(file)
+            cloud = cloud.within(box) if len(box) else cloud
             if len(cloud.points) < _FEWEST:
                 raise InputError(f"{file}: {len(cloud.points)} points show no surface; to fix: take the scan out")
         except InputError as error:
@@ -330,6 +379,16 @@ def _read_clouds(files: Sequence[Path]) -> tuple[list[Cloud], list[int], list[st
     if lost and (len(clouds) < _FEWEST or len(lost) > len(clouds)):
         raise lost[0]
     return clouds, kept, [str(error).split("; ")[0] for error in lost]
+
+
+def _codes_guess(clouds: Sequence[Cloud]) -> tuple[Guess, ...]:
+    """Return what share of the points was read as a code for nothing measured."""
+    coded = sum(cloud.coded for cloud in clouds)
+    if not coded:
+        return ()
+    share = coded / (coded + sum(cloud.count for cloud in clouds))
+    codes = ", ".join(f"{code:g}" for code in sorted({code for cloud in clouds for code in cloud.codes}))
+    return (Guess("codes", codes, f"{share:.1%} of the points hold it: nothing was measured there", True, "clouds"),)
 
 
 def _left_out_guess(files: FolderFiles, decided: ConventionChoice, lost: Sequence[str]) -> tuple[Guess, ...]:

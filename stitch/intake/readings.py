@@ -194,6 +194,20 @@ def doubted_readings(raw: RawPoses, urdf: Path | None, stated: StatedTable) -> l
     return out
 
 
+def mixed_readings(raw: RawPoses, stated: StatedTable) -> Iterator[Reading]:
+    """Yield angles of which one column is in radians and the others are in degrees, where their sizes allow that.
+
+    They count where the scans tell no other reading.
+    """
+    for layout in possible_layouts(raw) if stated.angle_unit is None else ():
+        size = np.abs(layout.rotation).max(axis=0, initial=0.0)
+        for k in np.flatnonzero(size <= _RADIANS) if len(size) == 3 and size.max() > _RADIANS else ():
+            rotation = np.array(layout.rotation)
+            rotation[:, k] = np.degrees(rotation[:, k])
+            for reading in readings(replace(layout, rotation=rotation), stated.rotation, "deg"):
+                yield replace(reading, variant=f"but its {('first', 'second', 'third')[k]} angle in radians")
+
+
 # Readings of an unknown order that are tried with every linear axis; columns that can be one, and that are none.
 _USUAL_AXIS = 5
 _NO_AXIS = re.compile(

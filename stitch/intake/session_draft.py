@@ -16,7 +16,7 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.first_session import FirstSession
 from stitch.intake.folder_files import Guess
-from stitch.intake.layouts import MM, POSE_UNITS, covariate_columns
+from stitch.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, covariate_columns
 from stitch.intake.readings import JOINT_ANGLES, arm_from_urdf
 from stitch.intake.scan_targets import points_columns
 from stitch.reading.session_folder import SESSION_FORMAT
@@ -95,6 +95,9 @@ def toml_text(folder: Path, first: FirstSession) -> str:
     lines += ["", *_comment(told["cloud_unit"]), f'cloud_unit = "{first.cloud_unit}"']
     lines += ["", *_comment(told["mount"]), f'mount = "{first.mounting.mount}"']
     lines += ["", "[scanner]", *_comment(told["optical_axis"]), f'optical_axis = "{first.optical_axis}"']
+    if len(first.box):
+        corners = (first.box * CLOUD_UNITS[first.cloud_unit] / METRES[unit]).tolist()
+        lines += ["", "# stated with --within: what lies beyond stands still before the scanner", f"within = {corners}"]
     if first.sphere_mm is not None:
         lines += ["", "[sphere]", f"radius = {first.sphere_mm * MM / METRES[unit]:.9g}"]
     reading = first.choice.best.interpretation.reading

@@ -180,6 +180,41 @@ def find_static_background(
     )
 
 
+# A point stands still if so many of the other scans have it, within so many spacings and sigmas of their surface; it moves
+# if so few have it. A scene stands still if most points do.
+_STANDS, _MOVES, _BESIDE, _ACROSS = 0.6, 0.3, 2.0, 4.0
+_MOSTLY, _SEEN_TO_MOVE, _SELDOM = 0.5, 20, 0.25
+
+
+def find_standing_scene(scans: Sequence[Scan]) -> tuple[float, Array] | None:
+    """Return the share of points that stand still before the scanner, and the corners (2, 3) of a box without them.
+
+    Nothing of poses is asked. None where less than half stands still, or no side of a box parts it from what moves.
+    """
+    probes = [scan.points[sample_points(scan, _BACKGROUND_PROBES)] for scan in scans]
+    chosen = np.unique(np.linspace(0, len(scans) - 1, min(len(scans), _BACKGROUND_VIEWS_COMPARED)).round().astype(int))
+    found = []
+    for v, own in enumerate(probes):
+        hits = []
+        for scan in (scans[w] for w in chosen if w != v):
+            distance, index = scan.tree.query(own)
+            across = np.abs(np.einsum("ij,ij->i", own - scan.points[index], scan.normals[index]))
+            hits.append((distance < _BESIDE * scan.spacing) & (across < _ACROSS * scan.noise))
+        found.append(np.mean(hits, axis=0))
+    seen, every = np.concatenate(found), np.concatenate(probes)
+    still, moving = every[seen >= _STANDS], every[seen < _MOVES]
+    if len(still) < _MOSTLY * len(every) or len(moving) < _SEEN_TO_MOVE:
+        return None
+    # Of what stands still some is seen seldom: at the rim, and in the shadow of the part.
+    moving, still = (
+        np.clip(points, *np.quantile(points, (cut, 1 - cut), axis=0))
+        for points, cut in ((moving, _SELDOM), (still, _SELDOM / 10))
+    )
+    size = float(np.linalg.norm(np.ptp(moving, axis=0)))
+    box = _box_beyond_part(moving, still, _bounding_box(every), size)
+    return None if box is None else (len(still) / len(every), box)
+
+
 def _bounding_box(points: Array) -> Array:
     return np.array([points.min(axis=0), points.max(axis=0)])
 

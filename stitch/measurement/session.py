@@ -24,6 +24,8 @@ class Cloud:
     normals: Array | None = None  # (N, 3) if the file has them
     scalars: dict[str, Array] = field(default_factory=dict)  # name -> (N,), e.g. intensity, time
     whole: "WholeCloud | None" = None  # None: these are all points that were scanned
+    codes: tuple[float, ...] = ()  # that stood for nothing measured
+    coded: int = 0  # points of the file that held one of them, and are none of these
 
     @property
     def count(self) -> int:

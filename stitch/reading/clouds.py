@@ -341,7 +341,9 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
     missing = [axis for axis in "xyz" if axis not in columns]
     if missing:
         raise InputError(f"{where}: no column {', '.join(missing)}; a cloud needs x, y, z")
-    columns = _without_codes(columns)
+    held = len(columns["x"])
+    columns, codes = _without_codes(columns)
+    coded = held - len(columns["x"])
     points = np.column_stack([columns.pop(axis) for axis in "xyz"]).astype(np.float64, copy=False)
     if not len(points):
         raise InputError(f"{where}: no points; leave this view out of views.csv or scan it again")
@@ -362,7 +364,7 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
             normals = np.column_stack([columns.pop(name) for name in names]).astype(np.float64)[seen]
     scalars = {name: np.asarray(column, np.float64)[seen] for name, column in columns.items() if column.ndim == 1}
     points = points if seen.all() else points[seen]
-    return Cloud(points if scale == 1.0 else points * scale, normals, scalars)
+    return Cloud(points if scale == 1.0 else points * scale, normals, scalars, codes=codes, coded=coded)
 
 
 # How often a code for "nothing measured" stands, how far it lies from the others, in their own extents, and how many of
@@ -370,21 +372,22 @@ def cloud_of_columns(where: Path | str, columns: dict[str, Array], scale: float 
 _CODE_TIMES, _CODE_AWAY, _CODE_SAMPLE, _CODE_VALUES, _CODE_REST = 3, 2.0, 4000, 20, 0.02
 
 
-def _without_codes(columns: dict[str, Array]) -> dict[str, Array]:
-    """Return the columns without points that are a code, as -99999 three times or z = -32.768.
+def _without_codes(columns: dict[str, Array]) -> tuple[dict[str, Array], tuple[float, ...]]:
+    """Return the columns without points that are a code, as -99999 three times or z = -32.768, and the codes.
 
     A code is the least or largest value of a coordinate, the same to the last digit in several points, be it a few of
     them or most, and far outside of what the rest spans.
     """
-    coded = np.zeros(len(columns["x"]), bool)
+    coded, codes = np.zeros(len(columns["x"]), bool), set[float]()
     for axis in "zxy":
         values = np.asarray(columns[axis])
         while (code := _code(values[~coded] if coded.any() else values)) is not None:
             coded |= values == code
+            codes.add(code)
     if coded.any():
         for name in list(columns):
             columns[name] = columns[name][~coded] if len(columns[name]) == len(coded) else columns[name]
-    return columns
+    return columns, tuple(sorted(codes))
 
 
 def _code(values: Array) -> float | None:

@@ -409,7 +409,9 @@ def fused_cloud(path: Path) -> FusedCloud:
     vertex = PlyData.read(str(path))["vertex"]
     columns: Array = np.column_stack([vertex[name] for name in ("x", "y", "z", "nx", "ny", "nz", "residual")])
     columns = columns.astype(np.float64)
-    return FusedCloud(columns[:, :3], columns[:, 3:6], columns[:, 6], np.asarray(vertex["count"]))
+    # Earlier versions called it count.
+    views = vertex["views" if "views" in vertex else "count"]
+    return FusedCloud(columns[:, :3], columns[:, 3:6], columns[:, 6], np.asarray(views))
 
 
 def _number(value: float | None) -> float:

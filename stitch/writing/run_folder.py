@@ -43,9 +43,12 @@ _RESERVED_COLUMNS = {"view", "partner", *_PLACE, "residual", "heldout", "time_s"
 
 
 def write_cloud(cloud: FusedCloud, path: Path) -> None:
-    """Binary PLY with normals, `residual` and `count`; of a cloud in a file never more than a part is in memory."""
+    """Binary PLY with normals, `residual` and `views`, how many support a point.
+
+    Of a cloud in a file never more than a part is in memory.
+    """
     names = ("x", "y", "z", "nx", "ny", "nz", "residual")
-    layout = np.dtype([(name, "<f4") for name in names] + [("count", "<u2")])
+    layout = np.dtype([(name, "<f4") for name in names] + [("views", "<u2")])
     header = PlyData([PlyElement.describe(np.empty(0, layout), "vertex")], byte_order="<").header
     with path.open("wb") as out:
         out.write(header.replace("vertex 0", f"vertex {len(cloud.points)}").encode() + b"\n")
@@ -55,7 +58,7 @@ def write_cloud(cloud: FusedCloud, path: Path) -> None:
             vertex = np.empty(len(columns), layout)
             for name, column in zip(names, columns.T, strict=True):
                 vertex[name] = column
-            vertex["count"] = cloud.count[part]
+            vertex["views"] = cloud.count[part]
             vertex.tofile(out)
             for values in vars(cloud).values():
                 release_mapped(values)

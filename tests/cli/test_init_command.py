@@ -3,6 +3,7 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 
 from data_synth.fixtures.raw_folders import Convention, raw_folder
@@ -53,6 +54,27 @@ def test_what_is_stated_is_taken(raw, session, tmp_path, capsys):
     assert code == 0 and load_session(tmp_path / "made").mount == "eye_in_hand"
     comment = (tmp_path / "made" / "session.toml").read_text(encoding="utf-8")
     assert "--force, with the flag" in comment and "(--rotation" in " ".join(comment.split())
+
+
+def test_a_box_leaves_out_what_stands_still_before_the_scanner(raw, session, tmp_path, capsys):
+    clouds = [view.cloud.points for view in load_session(session).views]
+    low, high = (np.quantile(np.concatenate(clouds), share, axis=0) for share in (0.1, 0.9))
+    box = f"--within={','.join(f'{x:.6f}' for x in (*low, *high))}"
+    code, _, err = ended(capsys, "init", raw, *STATED, "--no-inverse", "--yes", box, "-o", tmp_path / "made")
+    assert code == 0, err
+    for view, points in zip(load_session(tmp_path / "made").views, clouds, strict=True):
+        assert view.cloud.count == ((points > low) & (points < high)).all(axis=1).sum() < len(points)
+    code, _, err = ended(capsys, "init", raw, "--within", "1,1,1,0,0,0")
+    assert code == 2 and "the lowest and the highest corner" in err
+
+
+@pytest.mark.slow
+def test_poses_that_fit_no_scans_make_no_session(raw, capsys):
+    table = raw / "RobotPoses.dat"
+    table.write_text("".join(f"0.{i},0.3,-0.{i},100,200,{300 + i}\n" for i in range(3)))
+    code, _, err = ended(capsys, "init", raw, "--yes")
+    assert code == 2 and "no session was written" in err and "Next" not in err
+    assert not (raw / "session.toml").exists()
 
 
 @pytest.mark.slow

@@ -5,7 +5,8 @@ import pytest
 
 from stitch.errors import InputError
 from stitch.intake.layouts import ColumnLayout
-from stitch.intake.readings import readings, rotation_conventions
+from stitch.intake.raw_poses import RawPoses
+from stitch.intake.readings import StatedTable, mixed_readings, readings, rotation_conventions
 
 
 def turn(axis, angle):
@@ -51,3 +52,15 @@ def test_degrees_where_numbers_exceed_a_turn_in_radians():
 def test_a_convention_that_the_columns_cannot_have_is_refused():
     with pytest.raises(InputError, match="--rotation quaternion-xyzw"):
         readings(ColumnLayout(np.zeros((2, 3)), ANGLES, None, ""), "quaternion-xyzw")
+
+
+def test_one_column_of_radians_among_degrees_is_read_so():
+    angles = np.degrees(ANGLES)
+    angles[:, 1] = ANGLES[:, 1]
+    raw = RawPoses("t", None, np.hstack([np.full((2, 3), 700.0), angles]), ((), ()), "")
+    found = [r for r in mixed_readings(raw, StatedTable()) if r.rotation == "zyx-intrinsic"]
+    expected = [turn("z", a) @ turn("y", b) @ turn("x", c) for a, b, c in ANGLES]
+    assert [r.words for r in found] == ["zyx-intrinsic, degrees, but its second angle in radians"]
+    assert np.allclose(found[0].T[:, :3, :3], expected)
+    in_degrees = RawPoses("t", None, np.hstack([np.full((2, 3), 700.0), np.full((2, 3), 50.0)]), ((), ()), "")
+    assert not list(mixed_readings(in_degrees, StatedTable()))

@@ -11,7 +11,7 @@ from stitch import frames
 from stitch.comparison.disagreement_field import model_history
 from stitch.comparison.run_verdict import run_verdict
 from stitch.integrity.deep_check import deep_check
-from stitch.integrity.scan_faults import find_static_background
+from stitch.integrity.scan_faults import find_standing_scene, find_static_background
 from stitch.measurement.capture import part_size, prepare_capture
 from stitch.measurement.scan import prepare_scan
 from stitch.measurement.session import Cloud
@@ -94,3 +94,25 @@ def test_a_disc_that_turns_about_its_axis_does_not_stand_still():
     disc = np.column_stack([GRID, 3 * np.cos(radius / 5)])[radius < 38]
     turned = frames.exp(np.array([[0, 0, 0.5 * v, 0, 0, 0] for v in range(12)]))
     assert find_static_background(scans_of(disc), turned, TOLERANCE, 80.0) is None
+
+
+def before_a_table(moved, table):
+    """Scans (moved, a shift for each) of a patch of 40 mm before a table of 80 mm, at 300 and 360 mm."""
+    rng = np.random.default_rng(5)
+    patch = np.column_stack([GRID / 2, 3 * np.cos(GRID[:, 0] / 5)])
+    flat = np.column_stack([GRID, np.full(len(GRID), 60.0)])
+    shapes = [np.concatenate([patch + shift, flat[: table * len(flat)]]) + np.array([0, 0, 300]) for shift in moved]
+    return [prepare_scan(str(v), shape + 0.02 * rng.standard_normal(shape.shape)) for v, shape in enumerate(shapes)]
+
+
+def test_a_table_that_fills_the_view_has_a_box_without_it():
+    moved = np.random.default_rng(6).uniform(-30, 30, (8, 3))
+    share, box = find_standing_scene(before_a_table(moved, 1))
+    assert 0.4 < share < 0.6
+    part = (moved[:, None] + np.array([[-20, -20, 297], [20, 20, 303]])).reshape(-1, 3)
+    assert (box[0] < part.min(axis=0)).all() and (part.max(axis=0) < box[1]).all() and box[1, 2] < 360
+
+
+def test_a_part_that_moves_has_no_standing_scene():
+    assert find_standing_scene(before_a_table(np.random.default_rng(6).uniform(-30, 30, (8, 3)), 0)) is None
+    assert find_standing_scene(before_a_table(np.zeros((8, 3)), 1)) is None

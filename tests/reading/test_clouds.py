@@ -166,6 +166,7 @@ def test_a_code_for_nothing_measured_is_no_point(code, times):
     columns["intensity"] = np.insert(points[:, 2], at, 0.0)
     cloud = cloud_of_columns("scan", columns)
     assert np.array_equal(cloud.points, points) and np.array_equal(cloud.scalars["intensity"], points[:, 2])
+    assert cloud.coded == times and set(cloud.codes) <= set(code)
 
 
 def test_what_is_flat_or_stepped_or_quantised_is_no_code():
