@@ -118,6 +118,17 @@ def rotate(T: Array, vectors: Array) -> Array:
     return np.asarray(np.asarray(vectors) @ np.swapaxes(np.asarray(T, float)[..., :3, :3], -1, -2))
 
 
+def plane_rows(arms: Array, normals: Array) -> Array:
+    """(N, 6) by how much a unit twist moves points along normals (N, 3): [arms × normals, normals]."""
+    # By columns, each in one piece: np.cross over rows of three takes twice as long.
+    out = np.empty((6, len(arms)))
+    x, y, z = np.ascontiguousarray(arms.T)
+    out[3:] = normals.T
+    a, b, c = out[3:]
+    out[0], out[1], out[2] = y * c - z * b, z * a - x * c, x * b - y * a
+    return out.T
+
+
 def from_quaternion(position: Array, quaternion: Array) -> Array:
     """Poses from positions (..., 3) and quaternions (..., 4) in the order x, y, z, w."""
     quaternion = np.asarray(quaternion, float)

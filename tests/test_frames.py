@@ -70,3 +70,11 @@ def test_stacks_equal_single_transforms(xi):
     assert np.allclose(frames.transform(frames.exp(xi), points), homogeneous[:, :3])
     assert frames.is_rigid(frames.exp(xi))
     assert not frames.is_rigid(frames.exp(xi) * 1.01)
+
+
+def test_plane_rows_are_the_derivative_of_distances_by_a_twist():
+    rng = np.random.default_rng(3)
+    points, normals, xi = rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), rng.normal(size=6)
+    ahead, back = (frames.transform(frames.exp(step * xi), points) for step in (1e-6, -1e-6))
+    slopes = np.einsum("ij,ij->i", ahead - back, normals) / 2e-6
+    np.testing.assert_allclose(frames.plane_rows(points, normals) @ xi, slopes, atol=1e-8)

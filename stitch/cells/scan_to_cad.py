@@ -370,7 +370,7 @@ def _find_correspondences(
             f"{used.sum()} points meet the CAD; to fix: check the start, the regions and the CAD's unit"
         )
     stock = allowance_columns(local, cad, prior)
-    design = np.hstack([np.cross(local - cad.centre, found.normal), found.normal, -stock])
+    design = np.hstack([frames.plane_rows(local - cad.centre, found.normal), -stock])
     return _Correspondences(local, found, used, stock, design)
 
 

@@ -110,7 +110,7 @@ def align_icp(source: FeaturedSurface, target: FeaturedSurface, T: Array, reach:
         residual = np.einsum("ij,ij->i", moved[near] - place, n)
         # Turning about the points' own centre keeps turn and shift apart.
         centre = frames.make(np.eye(3), moved[near].mean(axis=0))
-        design = np.hstack([np.cross(moved[near] - centre[:3, 3], n), n])
+        design = frames.plane_rows(moved[near] - centre[:3, 3], n)
         step = np.linalg.lstsq(design, -residual, rcond=1e-6)[0]
         T = centre @ frames.exp(step) @ frames.inverse(centre) @ T
         if np.linalg.norm(step[3:]) < 1e-6 * reach and np.linalg.norm(step[:3]) < 1e-7:

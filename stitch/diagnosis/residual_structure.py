@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stitch import frames
 from stitch.diagnosis.ranking import Ranked, rank_all
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, DEPENDENCE_BINS, ODDS
@@ -90,11 +91,8 @@ def _along_normals(matches: Sequence[Match], centre: Array, twists: Array) -> Ar
     Not by moving the views: where hand-eye and links can stand in for one another, both move far and their common
     motion alone counts.
     """
-    out = []
-    for m in matches:
-        turned, moved = np.split(twists[m.v] - twists[m.w], 2)
-        out.append(np.cross(m.middle - centre, m.normal) @ turned + m.normal @ moved)
-    return np.concatenate(out)
+    apart = [frames.plane_rows(m.middle - centre, m.normal) @ (twists[m.v] - twists[m.w]) for m in matches]
+    return np.concatenate(apart)
 
 
 # What the poses leave, by source: named effects, a course of time, smooth errors, wandering, white scatter, noise.

@@ -170,7 +170,7 @@ def point_sigmas(places: PlaceErrors, cloud: FusedCloud) -> Array:
 
 def _sigmas(places: PlaceErrors, points: Array, normals: Array, cell: float) -> Array:
     seen, nearest = _views_of(places, points, cell)
-    lever = np.concatenate([np.cross(points - places.centre, normals), normals], axis=1)
+    lever = frames.plane_rows(points - places.centre, normals)
     sets, member = np.unique(seen, axis=0, return_inverse=True)
     square = np.zeros(len(points))
     twists = [source.views.reshape(len(places.poses), 6, -1) for source in places.sources]

@@ -134,9 +134,8 @@ class OffsetSums:
         self.vector = np.zeros(views)  # Σ ±w e
         self.square = np.zeros(len(matches))  # (P,) Σ w (e − ē)²: a pair's weighted variance, times its weight
         for i, (m, w) in enumerate(zip(matches, weights, strict=True)):
-            normal, weight, first = w @ m.normal, float(w.sum()), float(w @ m.residual)
-            arm = w @ np.cross(m.middle - g.centre, m.normal)
-            row = np.concatenate([arm, normal])
+            weight, first = float(w.sum()), float(w @ m.residual)
+            row = w @ frames.plane_rows(m.middle - g.centre, m.normal)
             for a, b, sign in ((m.v, m.v, 1), (m.w, m.w, 1), (m.v, m.w, -1), (m.w, m.v, -1)):
                 self.coupling[a, :, b] += sign * row
                 self.matrix[a, b] += sign * weight

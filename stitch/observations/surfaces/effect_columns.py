@@ -73,7 +73,7 @@ def stream_point_sums(
             start, end = end, end + len(m.residual)
             change, weight = changes[start:end], m.weight * tukey(m.residual, g.scale)
             weighted = change * weight[:, None]
-            B = np.concatenate([np.cross(m.middle - g.centre, m.normal), m.normal], axis=1)
+            B = frames.plane_rows(m.middle - g.centre, m.normal)
             out.append((B.T @ weighted, weighted.T @ m.residual, weighted.T @ change))
         return out
 

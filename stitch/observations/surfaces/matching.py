@@ -54,8 +54,11 @@ class NeighbourQueries:
         distance, partner = scan.tree.query(query, k=1, distance_upper_bound=gate)
         found = np.isfinite(distance)
         partner = np.where(found, partner, 0).astype(np.int64)
-        cosine = np.einsum("ij,ij->i", frames.rotate(T, normals), scan.normals[partner])
-        return distance, partner, found & scan.usable[partner] & (cosine > _NORMAL_COSINE)
+        accept = found & scan.usable[partner]
+        near = np.flatnonzero(accept)
+        cosine = np.einsum("ij,ij->i", frames.rotate(T, normals[near]), scan.normals[partner[near]])
+        accept[near] = cosine > _NORMAL_COSINE
+        return distance, partner, accept
 
 
 def neighbour_queries(scans: Sequence[Scan], poses: Array, samples: Sequence[Indices]) -> NeighbourQueries:
@@ -162,7 +165,7 @@ def _partners_by_view(every: NeighbourQueries, w: int, parts: Sequence[QueryPart
     index, p, partner, scan, T = index[accept], p[accept], partner[accept], every.scans[w], every.poses[w]
     q = frames.transform(T, scan.points[partner])
     normal = n[accept] + frames.rotate(T, scan.normals[partner])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal /= np.sqrt(np.einsum("ij,ij->i", normal, normal))[:, None]
     middle, residual, weight = (p + q) / 2, np.einsum("ij,ij->i", p - q, normal), scan.confidence[partner]
     found = {}
     for (v, _), start, end in zip(parts, bounds[:-1], bounds[1:], strict=True):

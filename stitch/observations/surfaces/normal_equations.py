@@ -161,7 +161,7 @@ def _pair_sums(m: Match, centre: Array, scale: float, weight: Array | None) -> d
     e = m.residual
     if weight is None:
         weight = m.weight * tukey(e, scale)
-    B = np.concatenate([np.cross(m.middle - centre, m.normal), m.normal], axis=1)
+    B = frames.plane_rows(m.middle - centre, m.normal)
     weighted = B * weight[:, None]
     inside = np.abs(e) < RMS_GATE * scale
     return {
@@ -350,8 +350,8 @@ def carry_overlaps(capture: Capture, before: Overlaps, start: Array, poses: Arra
     twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ start))
 
     def moved(m: Match) -> Match:
-        turn, shift = np.split(twists[m.v] - twists[m.w], 2)
-        return replace(m, residual=m.residual + np.cross(m.middle - centre, m.normal) @ turn + m.normal @ shift)
+        change = frames.plane_rows(m.middle - centre, m.normal) @ (twists[m.v] - twists[m.w])
+        return replace(m, residual=m.residual + change)
 
     matches = [moved(m) for m in before.matches]
     targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
