@@ -35,7 +35,7 @@ from stitch.stages.rig import require_effects, require_measured_once, require_sa
 from stitch.system.threads import Clock, library_threads_off
 
 if TYPE_CHECKING:
-    from stitch.diagnosis.diagnosis import Diagnosis
+    from stitch.diagnosis.diagnosis import Diagnosis, Finding
 
 # A run loads nothing of the diagnosis.
 
@@ -262,7 +262,7 @@ def diagnose(run: Run) -> Diagnosis:
     return replace(found, next=propose_measurements(found))
 
 
-def suggest(state: Run, at_most: int) -> tuple[Run | None, list[str], Diagnosis]:
+def suggest(state: Run, at_most: int, known: Finding | None = None) -> tuple[Run | None, list[str], Diagnosis]:
     """Return the run with everything that the diagnosis names, what happened in lines, and the last diagnosis.
 
     The run is None where nothing is named. What was found together is added together, and what does not hold its place
@@ -270,29 +270,24 @@ def suggest(state: Run, at_most: int) -> tuple[Run | None, list[str], Diagnosis]
     (`CrossValidation.fit_rejection_reason`); one that was dropped in this run is not tried again. What is less likely
     than nothing being missing is not added. What was in the model before stays; what was added gives way to other
     effects that together do better.
+
+    Args:
+        known: what a diagnosis of this state has named to be added; None: it is diagnosed.
     """
     lines, given, left = list[str](), set(state.model.effects), at_most
     result: Run | None = None
     while True:
-        found = diagnose(state)
-        lines += [*_finding_and_evidence(found), *(f"{note}." for note in found.notes if note not in found.sentence)]
-        if found.verdict != "missing_effect":
-            return result, lines, found
-        name = found.effects[0]
-        if not found.likelier_than_not:
-            lines.append(f"{name} was not added: chance is more likely. To add it anyway: stitch add RUN {name}.")
-            return result, lines, found
-        if found.dropped_before is not None:
-            lines.append(f"{name} was dropped in this run before. To add it all the same: stitch add RUN {name}.")
-            return result, lines, found
-        if not left:
-            lines.append(f"Stopped after {at_most} effects; run it again to go on.")
-            return result, lines, found
-        before = result
-        result, told = _add_found(state, found, left, given)
+        found = None if known is not None and left else diagnose(state)
+        finding = known if found is None else _finding_of(found)
+        assert finding is not None
+        lines += finding.lines
+        if found is not None and (why := _reason_to_stop(found, left, at_most)) is not None:
+            return result, [*lines, *why], found
+        before, known = result, None
+        result, told = _add_found(state, finding, left, given)
         lines += told
         if not set(result.effects) - set(state.effects):
-            return before, lines, replace(found, tried=result.tried)
+            return before, lines, replace(found or diagnose(state), tried=result.tried)
         left -= min(len(set(result.effects) - set(state.effects)), left)
         if set(state.effects) - given:
             result, told = _exchange_added(result, given)
@@ -302,21 +297,40 @@ def suggest(state: Run, at_most: int) -> tuple[Run | None, list[str], Diagnosis]
         del found
 
 
-def _add_found(state: Run, found: Diagnosis, at_most: int, given: set[str]) -> tuple[Run, list[str]]:
-    """Return the run with what a diagnosis found together, as far as it earns its place, and what happened.
+def _finding_of(found: Diagnosis) -> Finding:
+    from stitch.diagnosis.diagnosis import Finding
+
+    notes = (f"{note}." for note in found.notes if note not in found.sentence)
+    validations = {c.name: c.cross_validation for c in found.candidates if c.cross_validation is not None}
+    return Finding((*_finding_and_evidence(found), *notes), found.together, validations)
+
+
+def _reason_to_stop(found: Diagnosis, left: int, at_most: int) -> list[str] | None:
+    """Return why nothing is added after a diagnosis, in lines; None where something is."""
+    if found.verdict != "missing_effect":
+        return []
+    name = found.effects[0]
+    if not found.likelier_than_not:
+        return [f"{name} was not added: chance is more likely. To add it anyway: stitch add RUN {name}."]
+    if found.dropped_before is not None:
+        return [f"{name} was dropped in this run before. To add it all the same: stitch add RUN {name}."]
+    return None if left else [f"Stopped after {at_most} effects; run it again to go on."]
+
+
+def _add_found(state: Run, found: Finding, at_most: int, given: set[str]) -> tuple[Run, list[str]]:
+    """Return the run with what was found together, as far as it earns its place, and what happened.
 
     Args:
         given: effects that stay in any case.
     """
     from stitch.diagnosis.thresholds import FAINT_SIGMAS
 
-    names = [name for name in found.together if name not in state.tried][:at_most]
-    validations = {c.name: c.cross_validation for c in found.candidates}
+    names = [name for name in found.names if name not in state.tried][:at_most]
     while names:
         tried, lines = _drop_unneeded(change(state, [*state.effects, *names]), given)
         kept = [name for name in names if name in tried.effects]
         share = (tried.heldout_rms / state.heldout_or_fit_rms) ** 2
-        validation = validations.get(names[0])
+        validation = found.validations.get(names[0])
         zero = max((t.sigmas_from_zero for t in tried.terms if t.name in kept), default=0.0) < FAINT_SIGMAS
         reason = validation.fit_rejection_reason(" and ".join(kept), share, zero=zero) if validation and kept else None
         if kept and reason is None:

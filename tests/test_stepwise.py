@@ -14,7 +14,7 @@ from stitch.effects.contract import find_effect, parameters_in
 from stitch.model.model import Term
 from stitch.pipeline import diagnose, run
 from stitch.reading.session_folder import load_session
-from stitch.stored.stored_run import load_run
+from stitch.stored.stored_run import diagnosed_state, load_run, named_before
 from stitch.writing.diagnosis_document import diagnosis_document, suggested_command
 from stitch.writing.json_file import write_json
 from stitch.writing.run_folder import write_with_page
@@ -122,6 +122,32 @@ def test_what_was_tried_and_dropped_is_remembered_and_not_proposed_again(monkeyp
     monkeypatch.setattr(stepwise, "change", lambda state, effects: pytest.fail("it is fitted again"))
     result, lines, later = stepwise.suggest(again, at_most=3)
     assert result is None and "was dropped in this run before" in lines[-1] and later.tried == found.tried
+
+
+def test_a_diagnosis_of_the_same_state_is_read_and_not_made_again(monkeypatch, tmp_path):
+    session, *_ = labelled_cell(1, views=24, offset=OFFSET)
+    folder = write_labelled(tmp_path / "session", session)
+    first = run(load_session(folder))
+    (tmp_path / "run").mkdir()
+    write_with_page(first, tmp_path / "run")
+    found, made = diagnose(first), []
+    write_json(
+        diagnosis_document(found) | {"of": diagnosed_state(first, tmp_path / "run")}, tmp_path / "run/diagnosis.json"
+    )
+    again = load_run(tmp_path / "run")
+    known = named_before(tmp_path / "run", again)
+
+    def of_what_was_added(state):
+        made.append(state.effects)
+        return replace(found, verdict="adequate", named=())
+
+    monkeypatch.setattr(stepwise, "diagnose", of_what_was_added)
+    result, lines, _ = stepwise.suggest(again, 3, known)
+    assert result.effects == ["joint_offset"] and made == [["joint_offset"]]
+    assert lines[: len(known.lines)] == [said(found), found.sentence, *(f"{note}." for note in found.notes)]
+    with open(folder / "views.csv", "a") as table:
+        table.write("\n")
+    assert named_before(tmp_path / "run", again) is None
 
 
 def said(found):

@@ -121,7 +121,7 @@ def _add_diagnosed(
     """Add what a diagnosis chooses: at most so many effects one by one, or None: a group that it cannot tell apart."""
     from stitch.cli.diagnose import write_diagnosis
     from stitch.pipeline import change, suggest, suggest_group
-    from stitch.stored.stored_run import load_run
+    from stitch.stored.stored_run import load_run, named_before
     from stitch.writing import run_folder
     from stitch.writing.diagnosis_document import plain_finding, suggested_command
 
@@ -129,7 +129,10 @@ def _add_diagnosed(
         with show_activity("diagnosing"):
             state = load_run(run, effects_file, trust=trust)
             run_folder.preload_entry_points("stitch.reports")
-            result, lines, found = suggest_group(state) if at_most is None else suggest(state, at_most)
+            if at_most is None:
+                result, lines, found = suggest_group(state)
+            else:
+                result, lines, found = suggest(state, at_most, named_before(run, state))
         for line in lines if in_full() else ():
             say(line)
         if result is not None:

@@ -92,11 +92,12 @@ def _diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple
 
 def write_diagnosis(diagnosis: Diagnosis, state: Run, run: Path) -> dict[str, object]:
     """Return the diagnosis as a document, after diagnosis.json and what other packages make of it are written."""
+    from stitch.stored.stored_run import diagnosed_state
     from stitch.writing.diagnosis_document import diagnosis_document
     from stitch.writing.json_file import write_json
     from stitch.writing.run_folder import call_entry_points
 
-    document = diagnosis_document(diagnosis)
+    document = diagnosis_document(diagnosis) | {"of": diagnosed_state(state, run)}
     with show_activity("diagnosing: drawing pictures and page"):
         write_json(document, run / "diagnosis.json")
         call_entry_points("stitch.diagnosis_reports", diagnosis, state, run)

@@ -44,6 +44,15 @@ class CandidateEffect:
 
 
 @dataclass(frozen=True)
+class Finding:
+    """What a diagnosis names, as far as adding it needs that: of one made now, or of one that lies on disk."""
+
+    lines: tuple[str, ...]  # finding, evidence and notes, in words
+    names: tuple[str, ...]  # effects that are missing beside each other, the one that is named first
+    validations: dict[str, CrossValidation]  # of candidates, by name
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """Verdict, candidate effects, what the rest depends on, what to measure next.
 

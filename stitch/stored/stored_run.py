@@ -4,8 +4,9 @@ import json
 import shlex
 from dataclasses import replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -24,13 +25,16 @@ from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, Overlaps, collect_overlaps
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.reading.clouds import require_room
-from stitch.reading.session_folder import load_session
+from stitch.reading.session_folder import UNKNOWN, content_hash, load_session, session_hash
 from stitch.reading.text_files import read_text, shortened
 from stitch.runs.run import ExcludedView, Fit, FusedCloud, LedgerStep, Note, Run, StageResult, Unsupported, ViewLinks
 from stitch.stages.correct import converged_overlaps, gate_of_model
 from stitch.stages.target_fit import evaluate_targets
 from stitch.system.threads import library_threads_off
 from stitch.writing.result_document import restore_counted_targets
+
+if TYPE_CHECKING:
+    from stitch.diagnosis.diagnosis import Finding
 
 _TEXT = {"type": "string"}
 _NUMBER = {"type": "number"}
@@ -84,7 +88,8 @@ RESULT = _object_schema(
         {}, components=_list_schema(_list_schema(_TEXT)), weak=_list_schema(_object_schema({"view": _TEXT}))
     ),
 )
-_CANDIDATES = _list_schema(_object_schema({"effect": _TEXT}, hand_eye_if_missed=_NUMBER_OR_NULL))
+_LEFT_OUT = {"type": ["object", "null"], "additionalProperties": _NUMBER}
+_CANDIDATES = _list_schema(_object_schema({"effect": _TEXT}, hand_eye_if_missed=_NUMBER_OR_NULL, left_out=_LEFT_OUT))
 _VERDICT = {"enum": ["adequate", "missing_effect", "cannot_tell", "unknown_effect"]}
 _TRIED = _list_schema(_object_schema({"effect": _TEXT, "dropped": _TEXT}))
 DIAGNOSIS = _object_schema({"verdict": _VERDICT}, candidates=_CANDIDATES, tried=_TRIED)
@@ -133,11 +138,12 @@ def read_diagnosis(folder: Path) -> dict[str, Any]:
     return dict(_read_checked(file, DIAGNOSIS)) if file.is_file() else {}
 
 
-def covariance_of_effects(path: Path) -> EffectsCovariance:
+def covariance_of_effects(path: Path, result: dict[str, Any] | None = None) -> EffectsCovariance:
     """What the result beside a model.toml says of its effects' parameters; nothing where there is none.
 
     Args:
         path: folder of a run or of a rig, or a model.toml.
+        result: its result.json, if it has been read.
 
     Raises:
         InputError: a result.json that is damaged, or a matrix of another size than its names.
@@ -145,7 +151,7 @@ def covariance_of_effects(path: Path) -> EffectsCovariance:
     folder = path if path.is_dir() else path.parent
     found = [folder / "result.json", *sorted(folder.glob("*/result.json"))]
     file = next((f for f in found if f.is_file()), None)
-    stated = read_result(file.parent).get("effects_covariance") if file else None
+    stated = (result or read_result(file.parent)).get("effects_covariance") if file else None
     if not stated:
         return EffectsCovariance()
     names, rows = tuple(stated["parameters"]), stated["matrix"]
@@ -218,18 +224,21 @@ def _refuse_constant(word: str) -> float:
 # The model of a run folder, and the Python file of effects that it names: run only where somebody allows it.
 
 
-def trusted_model(path: Path, effects_file: Path | None = None, trust: bool = False) -> tuple[ModelFile, str | None]:
+def trusted_model(
+    path: Path, effects_file: Path | None = None, trust: bool = False, result: dict[str, Any] | None = None
+) -> tuple[ModelFile, str | None]:
     """The model, and the absolute path of the file whose effects have joined the library, if any.
 
     Args:
         path: run folder, or model.toml.
         effects_file: the user's own file; takes the place of the one that the model names.
         trust: run the file that the model names.
+        result: result.json beside it, if it has been read.
 
     Raises:
         InputError: no model, a value in it that is no number, or a file of effects that nobody has allowed.
     """
-    model = replace(read_model(path), effects_covariance=covariance_of_effects(path))
+    model = replace(read_model(path), effects_covariance=covariance_of_effects(path, result))
     file = path / "model.toml" if path.is_dir() else path
     for effect, fitted in model.effects.items():
         for name, parameter in fitted.items():
@@ -262,7 +271,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
             of effects that nobody has allowed.
     """
     document, steps = read_documents(folder)
-    file, effects = trusted_model(folder, effects_file, trust)
+    file, effects = trusted_model(folder, effects_file, trust, document)
     path = Path(document["session"])
     if not path.is_dir():
         raise InputError(f"{folder}/result.json: its session {path} has gone; to fix: restore it or correct the path")
@@ -293,6 +302,34 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         tried=_dropped_before(folder),
         register_method=next((stage["method"] for stage in document["stages"] if "method" in stage), ""),
     )
+
+
+def diagnosed_state(run: Run, folder: Path) -> str:
+    """Return what a diagnosis is of: stitch's version, and hashes of the session, the result and the effects' file."""
+    file = None if run.effects_file is None else Path(run.effects_file)
+    own = content_hash(folder, [folder / "model.toml", folder / "result.json"])
+    effects = "" if file is None else content_hash(file.parent, [file])
+    return " ".join((version("stitch"), session_hash(run.session), own, effects)).strip()
+
+
+def named_before(folder: Path, run: Run) -> "Finding | None":
+    """Return the effects that the diagnosis in a run's folder names to be added; None where it names none, or is of
+    another state."""
+    from stitch.diagnosis.diagnosis import Finding
+    from stitch.diagnosis.validation import CrossValidation
+
+    try:
+        told = read_diagnosis(folder)
+        odds, state = told["log_odds_over_nothing"], diagnosed_state(run, folder)
+        if told["verdict"] != "missing_effect" or told["of"] != state or UNKNOWN in state:
+            return None
+        if told["effects"][0] in run.tried or (odds is not None and odds <= 0):
+            return None
+        notes = (f"{note}." for note in told["notes"] if note not in told["sentence"])
+        left_out = {row["effect"]: CrossValidation(**row["left_out"]) for row in told["candidates"] if row["left_out"]}
+        return Finding((told["plain"], told["sentence"], *notes), tuple(told["together"]), left_out)
+    except (InputError, LookupError, TypeError):
+        return None  # damaged, or of an earlier version: it is soon written anew
 
 
 def _dropped_before(folder: Path) -> dict[str, str]:

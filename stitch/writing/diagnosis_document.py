@@ -322,7 +322,7 @@ def _field_map(smooth: FieldError | None) -> dict[str, Any] | None:
 
 def _untested(name: str, needs: tuple[str, ...]) -> dict[str, Any]:
     """An effect that lacks what it needs."""
-    unknown = ("p_value", "rms_if_added", "heldout_rms_if_added", "minimum_detectable")
+    unknown = ("p_value", "rms_if_added", "heldout_rms_if_added", "left_out", "minimum_detectable")
     return {
         "effect": name,
         "posterior": 0.0,
@@ -332,6 +332,10 @@ def _untested(name: str, needs: tuple[str, ...]) -> dict[str, Any]:
         "needs": list(needs),
         **dict.fromkeys(unknown),
     }
+
+
+# Of a cross-validation, what its verdict on a fitted effect needs.
+_LEFT_OUT = ("inside", "heldout", "heldout_sigma", "poses", "poses_sigma", "steadiness")
 
 
 def _candidate(d: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
@@ -356,6 +360,7 @@ def _candidate(d: Diagnosis, candidate: CandidateEffect) -> dict[str, Any]:
         "parameters": parameters,
         "rms_if_added": inside,
         "heldout_rms_if_added": heldout,
+        "left_out": None if left_out is None else {name: getattr(left_out, name) for name in _LEFT_OUT},
         # Of the parameter that these views know best against its plausible size; all below.
         "minimum_detectable": detectable.get(_clearest_parameters(candidate) or ""),
         "minimum_detectable_of": _clearest_parameters(candidate),

@@ -150,7 +150,7 @@ def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch
     step, last = LedgerStep((), 0.1, 0.1, 0.1, np.eye(4)), LedgerStep((), 0.1, result.heldout_rms, 0.1, result.T_mount)
     fitted = replace(result, ledger=(step, step))
     monkeypatch.setattr(pipeline, "change", lambda s, *_: replace(result, ledger=(*s.ledger, last)))
-    monkeypatch.setattr(pipeline, "suggest", lambda state, at_most: (fitted, [], None))
+    monkeypatch.setattr(pipeline, "suggest", lambda *_: (fitted, [], None))
     monkeypatch.setattr("stitch.cli.diagnose.write_diagnosis", lambda found, state, run: {})
     monkeypatch.setattr("stitch.writing.diagnosis_document.suggested_command", lambda found, run: "")
     stitch_command("add", run, "--suggested")
@@ -161,7 +161,7 @@ def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch
 
 def test_where_nothing_is_to_be_added_the_present_result_is_printed(changing, monkeypatch, stitch_command):
     run, result = changing
-    monkeypatch.setattr(pipeline, "suggest", lambda state, at_most: (None, [], None))
+    monkeypatch.setattr(pipeline, "suggest", lambda *_: (None, [], None))
     monkeypatch.setattr("stitch.cli.diagnose.write_diagnosis", lambda found, state, run: {})
     assert json.loads(stitch_command("add", run, "--suggested", "--json")) == told(run)
     assert result.model.T_mount.tolist() == told(run)["hand_eye"]
