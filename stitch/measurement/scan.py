@@ -28,7 +28,7 @@ def box_corners(box: Array) -> Array:
 _NEIGHBOURS = 16
 _NOISE_SAMPLES = 1500
 # Points whose neighbourhoods are worked on at a time: as many as stay in a core's cache.
-_IN_CACHE = 2048
+_IN_CACHE = 4096
 # Beyond 75° between ray and normal, range cameras smear; beyond 0.35 of the neighbourhood's
 # radius, the centroid has left the point: the surface ends here.
 GRAZING_COSINE = np.cos(np.radians(75.0))
@@ -143,10 +143,16 @@ def fit_planes(points: Array, index: Indices) -> tuple[Array, Array, Array]:
     columns = np.ascontiguousarray(points.T)
     for start in range(0, len(index), _IN_CACHE):
         at = slice(start, start + _IN_CACHE)
-        around = np.array([column[index[at]] for column in columns])
-        centroid[at] = around.mean(axis=2).T
-        centred = around - centroid[at].T[:, :, None]
-        normals[at], variation[at] = _weakest_directions(np.einsum("ink,jnk->ijn", centred, centred))
+        # Neighbours first: sums over sixteen numbers in a row take twice as long.
+        rows = np.ascontiguousarray(index[at].T)
+        around = np.array([column[rows] for column in columns])
+        middle = around.mean(axis=1)
+        around -= middle[:, None]
+        C = np.empty((3, 3, rows.shape[1]))
+        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+            C[i, j] = C[j, i] = np.einsum("kn,kn->n", around[i], around[j])
+        centroid[at] = middle.T
+        normals[at], variation[at] = _weakest_directions(C)
     return centroid, normals, variation
 
 
@@ -163,11 +169,11 @@ def _weakest_directions(C: Array) -> tuple[Array, Array]:
     mean, one = np.trace(scaled) / 3, np.eye(3)[:, :, None]
     off = scaled - one * mean
     p = np.maximum(np.sqrt((off**2).sum(axis=(0, 1)) / 6), 1e-100)
-    det = (off[0] * np.cross(off[1], off[2], axis=0)).sum(axis=0)
+    det = (off[0] * _cross(off[1], off[2])).sum(axis=0)
     angle = np.arccos(np.clip(det / (2 * p**3), -1.0, 1.0)) / 3
     smallest, largest = (mean + 2 * p * np.cos(angle + turn) for turn in (2 * np.pi / 3, 0.0))
     left = scaled - one * smallest
-    across = np.array([np.cross(left[i], left[j], axis=0) for i, j in ((0, 1), (1, 2), (2, 0))])
+    across = np.array([_cross(left[i], left[j]) for i, j in ((0, 1), (1, 2), (2, 0))])
     square = (across**2).sum(axis=1)
     best = square.argmax(axis=0)
     every = np.arange(len(best))
@@ -180,6 +186,11 @@ def _weakest_directions(C: Array) -> tuple[Array, Array]:
     return normals, smallest
 
 
+def _cross(a: Array, b: Array) -> Array:
+    """(3, N) vector products of vectors (3, N)."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
 def _estimate_noise(points: Array, own: Array, normals: Array, index: Indices) -> float:
     """1-sigma of the points across a local quadric: median over some of the neighbourhoods of `own`.
 
@@ -190,20 +201,22 @@ def _estimate_noise(points: Array, own: Array, normals: Array, index: Indices) -
     if count <= 8:
         return float("nan")
     centre = even_indices(len(own), _NOISE_SAMPLES)
-    local = points[index[centre]] - own[centre][:, None]
-    n = normals[centre]
-    helper = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
-    a = np.cross(n, helper)
+    local = np.array([column[index[centre].T] for column in points.T]) - own[centre].T[:, None]
+    n = normals[centre].T
+    a = _cross(n, np.where(np.abs(n[0]) < 0.7, [[1.0], [0], [0]], [[0], [1.0], [0]]))
     # A point that is seen edge-on has no normal.
-    a /= np.maximum(np.linalg.norm(a, axis=1, keepdims=True), 1e-300)
-    b = np.cross(n, a)
-    x, y, z = (np.einsum("nki,ni->nk", local, axis) for axis in (a, b, n))
-    scale = np.maximum(np.abs(x).max(axis=1, keepdims=True), 1e-300)
+    a /= np.maximum(np.linalg.norm(a, axis=0), 1e-300)
+    x, y, rest = (np.einsum("in,ikn->kn", axis, local) for axis in (a, _cross(n, a), n))
+    scale = np.maximum(np.abs(x).max(axis=0), 1e-300)
     x, y = x / scale, y / scale
-    design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-    q, _ = np.linalg.qr(design)
-    rest = z - np.einsum("nkc,nc->nk", q, np.einsum("nkc,nk->nc", q, z))
+    basis = list[Array]()
+    # Gram and Schmidt for all neighbourhoods at once: a library's loop over them takes twice as long.
+    for column in (np.ones_like(x), x, y, x * x, x * y, y * y):
+        for before in basis:
+            column = column - np.einsum("kn,kn->n", before, column) * before
+        basis.append(column / np.maximum(np.linalg.norm(column, axis=0), 1e-300))
+        rest = rest - np.einsum("kn,kn->n", basis[-1], rest) * basis[-1]
     degrees = count - 6
-    variance = (rest**2).sum(axis=1) / degrees
+    variance = (rest**2).sum(axis=0) / degrees
     # The median of χ²/ν lies at (1 − 2/(9ν))³ of the mean (Wilson–Hilferty).
     return float(np.sqrt(np.median(variance) / (1 - 2 / (9 * degrees)) ** 3))
