@@ -11,7 +11,7 @@ import typer
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust, require_new
 from stitch.cli.terminal import emit, results_stream, say, show_table
 from stitch.errors import InputError
-from stitch.export.formats import ARM, CLOUD, HAND_EYE, LIMIT_MM
+from stitch.export import ARM, CLOUD, HAND_EYE, LIMIT_MM
 
 if TYPE_CHECKING:
     from stitch.controllers.program import Program

@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 _QUESTIONS = ("rotation", "length_unit", "cloud_unit", "mount")
 
 _Folder = Annotated[
-    Path, typer.Argument(metavar="FOLDER", help="Scans, and poses beside or below them; or a bag of ROS, MCAP.")
+    Path,
+    typer.Argument(
+        metavar="FOLDER", help="Scans, or points of a tracker, and poses beside or below them; or a bag of ROS, MCAP."
+    ),
 ]
 _Poses = Annotated[Path | None, typer.Option("--poses", help="File or folder of the poses; default: found.")]
 _Columns = Annotated[
@@ -117,7 +120,8 @@ def init(
         within=_numbers("--within", within),
         targets=parse_target_options(board, ball),
     )
-    _init_from_scans(folder, output or folder, stated, yes, force, as_json)
+    if not _init_from_points(folder, output or folder, stated, yes, force, as_json):
+        _init_from_scans(folder, output or folder, stated, yes, force, as_json)
 
 
 def _init_from_bag(
@@ -138,11 +142,11 @@ def _init_from_bag(
 
 def _init_from_scans(folder: Path, out: Path, stated: StatedFolder, yes: bool, force: bool, as_json: bool) -> None:
     """Write a session of scans; what they do not tell is asked on a terminal, or guessed with `yes`."""
-    from stitch.intake.packed_scans import one_scan_a_file
-    from stitch.intake.session_draft import require_free, write_draft
+    from stitch.intake.folder_files import one_scan_a_file
+    from stitch.intake.session_draft import draft_files, require_free, write_draft
 
     if not force:
-        require_free(out, not stated.targets.is_empty)
+        require_free(out, draft_files(not stated.targets.is_empty))
     with one_scan_a_file(folder) as scans:
         first = _judge_folder(scans, stated)
         if not yes:
@@ -152,6 +156,26 @@ def _init_from_scans(folder: Path, out: Path, stated: StatedFolder, yes: bool, f
         write_draft(out, first, force=force, unpacked=scans != folder)
     command = "run" if first.sphere_mm is None else "calibrate sphere"
     _report_session(out, len(first.pairing.used), first.guesses, as_json, command)
+
+
+def _init_from_points(folder: Path, out: Path, stated: StatedFolder, yes: bool, force: bool, as_json: bool) -> bool:
+    """Write a session of measured points; False where scans lie there, or no points.
+
+    Raises:
+        InputError: without `yes`, what the fit does not tell.
+    """
+    from stitch.intake.measured_points import measured_session, write_measured
+
+    with show_activity(f"{folder.name}: reading the tables and trying conventions"):
+        made = measured_session(folder, stated)
+    if made is None:
+        return False
+    _print_guesses(made.guesses)
+    if not yes:
+        _require_told(out, made.guesses)
+    write_measured(out, made, force=force)
+    _report_session(out, len(made.way.pairing.used), made.guesses, as_json, "run")
+    return True
 
 
 def _judge_folder(folder: Path, stated: StatedFolder) -> FirstSession:
@@ -205,12 +229,7 @@ def _ask_uncertain(folder: Path, out: Path, first: FirstSession, stated: StatedF
     """
     untold = [guess for guess in first.guesses if not guess.determined]
     if not sys.stdin.isatty():
-        if untold:
-            flags = ", ".join(dict.fromkeys(guess.flag for guess in untold))
-            what = ", ".join(guess.what for guess in untold)
-            raise InputError(
-                f"{out}: {what} cannot be told from these views; to fix: state {flags}, or guess with --yes"
-            )
+        _require_told(out, first.guesses)
         return first
     asked = [guess for guess in untold if guess.what in _QUESTIONS]
     while asked:
@@ -226,6 +245,15 @@ def _ask_uncertain(folder: Path, out: Path, first: FirstSession, stated: StatedF
     if not typer.confirm("Write the session?", default=True, err=True):
         raise InputError(f"{out}: nothing was written; to fix: state what is wrong with the flags above")
     return first
+
+
+def _require_told(out: Path, guesses: Sequence[Guess]) -> None:
+    """Refuse guesses that neither files nor measurements tell."""
+    untold = [guess for guess in guesses if not guess.determined]
+    if untold:
+        flags = ", ".join(dict.fromkeys(guess.flag for guess in untold))
+        what = ", ".join(guess.what for guess in untold)
+        raise InputError(f"{out}: {what} cannot be told from these views; to fix: state {flags}, or guess with --yes")
 
 
 def _ask_guess(guess: Guess) -> str:

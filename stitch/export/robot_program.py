@@ -11,8 +11,8 @@ from stitch import frames
 from stitch.controllers.program import Program
 from stitch.controllers.taught_points import NUMBERS, Span, TaughtPoint
 from stitch.errors import InputError, NoResultError
+from stitch.export import LIMIT_MM
 from stitch.export.arm_model import ArmModel
-from stitch.export.formats import LIMIT_MM
 from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.robot import Robot

@@ -1,10 +1,13 @@
 """What a folder holds: clouds, files of poses, a robot's description."""
 
 import re
+import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -13,10 +16,10 @@ from natsort import natsorted, ns
 from stitch.errors import InputError
 from stitch.intake.layouts import possible_layouts
 from stitch.intake.raw_poses import PROGRAMS, STRUCTURED, TABLES, is_program, read_by_its_program, read_raw_poses
-from stitch.reading.clouds import CLOUD_SUFFIXES
+from stitch.reading.clouds import CLOUD_SUFFIXES, ptx_scans
 from stitch.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
 from stitch.reading.range_image import poses_in_scans
-from stitch.reading.text_files import readable
+from stitch.reading.text_files import WORKBOOKS, import_extra, readable
 
 # Which files of a folder are scans, and which of them are the scans of its campaign.
 
@@ -99,7 +102,6 @@ class Guess:
 _DEEPEST = 3
 _LARGEST_TABLE_MB = 5.0
 _PACKED = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst")
-_WORKBOOKS = (".xlsx", ".xls", ".ods", ".numbers")
 # What this program writes itself.
 _OWN = {"views.csv", "session.toml", "points.csv", "frames.csv", "targets.csv"}
 
@@ -137,7 +139,6 @@ def find_folder_files(folder: Path, poses: Path | None = None) -> FolderFiles:
     texts = [f for f in other_clouds if f.suffix.lower() in _EITHER]
     taken = {*clouds, *(other_clouds if len(texts) > _RECORDINGS else set(other_clouds) - {*texts})}
     candidates = [f for f in files if f not in taken and _may_hold_poses(f) and not read_by_its_program(f)]
-    _require_no_workbook(folder, [poses] if poses is not None else [] if candidates else files)
     chosen: list[Path] = []
     rest: list[Path] = []
     if poses is not None:
@@ -205,7 +206,7 @@ def list_files(folder: Path, depth: int = 0) -> list[Path]:
 
 
 def _may_hold_poses(file: Path) -> bool:
-    kinds = (*STRUCTURED, *TABLES, *PROGRAMS)
+    kinds = (*STRUCTURED, *TABLES, *PROGRAMS, *WORKBOOKS)
     return file.suffix.lower() in kinds and file.stat().st_size < _LARGEST_TABLE_MB * 1e6
 
 
@@ -216,12 +217,6 @@ def _stated_pose_files(poses: Path, clouds: set[Path]) -> tuple[list[Path], list
             raise InputError(f"{poses}: no files of poses there; to fix: name the file or the folder of the poses")
         return natsorted(inside, alg=ns.IGNORECASE), []
     return [poses], []
-
-
-def _require_no_workbook(folder: Path, files: Sequence[Path]) -> None:
-    book = next((f for f in files if f.suffix.lower() in _WORKBOOKS), None)
-    if book is not None:
-        raise InputError(f"{book}: workbooks are not read; to fix: save the sheet of the poses as CSV in {folder}")
 
 
 def _choose_pose_files(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[Path], list[Path]]:
@@ -260,3 +255,62 @@ def _holds_poses(file: Path) -> bool:
 
 def _names_pose(file: Path) -> bool:
     return bool(re.search(r"pose|robot|flange|tcp|joint|trajector", file.stem.lower()))
+
+
+# Files that hold the scans of a whole campaign, E57 and Leica's PTX, as one file a scan.
+
+# Tables and descriptions that lie beside such a file are far smaller.
+_SMALL_MB = 5.0
+
+
+@contextmanager
+def one_scan_a_file(folder: Path) -> Iterator[Path]:
+    """Give the folder as it is, or, where a file holds several scans, a passing one with a file for each of them.
+
+    Raises:
+        InputError: the package that reads such files is not installed.
+    """
+    files = list_files(folder) if folder.is_dir() else []
+    packed = {file: count for file in files if (count := _scan_count(file)) > 1}
+    if not packed:
+        yield folder
+        return
+    with TemporaryDirectory() as scratch:
+        unpacked = Path(scratch) / folder.resolve().name
+        unpacked.mkdir()
+        for file in files:
+            if file in packed:
+                _unpack(file, packed[file], unpacked)
+            elif file.stat().st_size < _SMALL_MB * 1e6:
+                shutil.copyfile(file, unpacked / file.name)
+        yield unpacked
+
+
+def _scan_count(file: Path) -> int:
+    if file.suffix.lower() == ".e57":
+        return int(import_extra("pye57", file, "formats").E57(str(file)).scan_count)
+    return len(ptx_scans(file)) if file.suffix.lower() == ".ptx" else 1
+
+
+def _unpack(file: Path, count: int, folder: Path) -> None:
+    """Write each scan, with its pose, to a file of its own, numbered in their order."""
+    names = [folder / f"{file.stem}_{i:0{len(str(count - 1))}d}{file.suffix.lower()}" for i in range(count)]
+    if file.suffix.lower() == ".ptx":
+        for name, lines in zip(names, ptx_scans(file), strict=True):
+            name.write_text("\n".join(lines) + "\n", encoding="ascii", errors="replace")
+        return
+    pye57 = import_extra("pye57", file, "formats")
+    source = pye57.E57(str(file))
+    for i, name in enumerate(names):
+        header = source.get_header(i)
+        fields = set(header.point_fields)
+        columns = source.read_scan(
+            i, ignore_missing_fields=True, transform=False, intensity="intensity" in fields, colors="colorRed" in fields
+        )
+        posed = header.has_pose()
+        with pye57.E57(str(name), mode="w") as written:
+            written.write_scan_raw(
+                {field: np.asarray(column) for field, column in columns.items()},
+                rotation=np.asarray(header.rotation) if posed else None,
+                translation=np.asarray(header.translation) if posed else None,
+            )

@@ -1,6 +1,7 @@
 """Plain tables of numbers as people write them: any separator, decimal commas, with a header or none."""
 
 import csv
+import io
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -164,7 +165,7 @@ class NamedColumns:
 
 def read_names(header: Sequence[str]) -> NamedColumns:
     """What a header says."""
-    plain, units = zip(*(_bare_name(name) for name in header), strict=True)
+    plain, units = zip(*(bare_name(name) for name in header), strict=True)
     where: dict[str, int] = {}
     for i, name in enumerate(plain):
         where.setdefault(name, i)
@@ -193,7 +194,7 @@ def read_names(header: Sequence[str]) -> NamedColumns:
     )
 
 
-def _bare_name(name: str) -> tuple[str, str]:
+def bare_name(name: str) -> tuple[str, str]:
     """A name without its unit and fillers, and its unit."""
     found = _UNIT.search(name.strip())
     unit = (found[1] or found[2] or "").strip().lower() if found else ""
@@ -242,20 +243,18 @@ def _rotation_columns(where: dict[str, int], taken: set[int]) -> tuple[tuple[int
 
 
 def _joint_columns(header: Sequence[str]) -> tuple[int, ...]:
-    found: dict[int, int] = {}
+    alike: dict[str, dict[int, int]] = {}
     for i, name in enumerate(header):
         lower = name.strip().lower()
         match = _JOINT.match(lower) or re.match(r"(?:.*joints?|.*_q|q|a)[._\s\[]*(\d)\b", lower)
         if match:
-            found.setdefault(int(match[1]), i)
-    first = min(found, default=1)
-    count = len(found)
-    complete = count >= 4 and sorted(found) == list(range(first, first + count))
-    return (
-        tuple(found[k] for k in sorted(found))
-        if complete and (count >= 5 or "j" in header[found[first]].lower())
-        else ()
-    )
+            alike.setdefault(lower[: match.start(1)], {}).setdefault(int(match[1]), i)
+    for found in alike.values():
+        first, count = min(found), len(found)
+        complete = count >= 4 and sorted(found) == list(range(first, first + count))
+        if complete and (count >= 5 or "j" in header[found[first]].lower()):
+            return tuple(found[k] for k in sorted(found))
+    return ()
 
 
 def _matrix_columns(header: Sequence[str]) -> tuple[int, ...]:
@@ -298,9 +297,7 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
     if not body:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
-    separator = max(
-        _SEPARATORS, key=lambda s: sum(parse_number(c) is not None for _, line in body for c in split_cells(line, s))
-    )
+    separator = _separator_of([line for _, line in body])
     read = trimmed_rows([(i, split_cells(line, separator)) for i, line in body])
     rows = rows_below_titles(read)
     above = len(read) - len(rows)
@@ -410,3 +407,54 @@ def _text_and_number_columns(rows: Sequence[tuple[int, list[str]]]) -> tuple[lis
     width = len(rows[0][1])
     share = [sum(parse_number(row[c]) is not None for _, row in rows) / len(rows) for c in range(width)]
     return [c for c in range(width) if share[c] <= 0.5], [c for c in range(width) if share[c] > 0.5]
+
+
+# Tables of motion capture: rows of names above each other, and empty cells where nothing was seen.
+
+_HEAD_ROWS, _SPARSE = 30, 0.6
+
+
+def with_one_header(text: str) -> str:
+    """Return a table whose rows of names stand in one row, and whose empty cells of numbers are nan."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
+    body = [line for line in lines if not line.lstrip().startswith(_COMMENTS)]
+    separator = _separator_of(body[: 10 * _HEAD_ROWS])
+    if separator == " ":
+        return text
+    rows = [split_cells(line, separator) for line in body]
+    above = [i for i, row in enumerate(rows[:_HEAD_ROWS]) if 2 * _number_count(row) <= sum(map(bool, row))]
+    first = above[-1] + 1 if above else 0
+    if first >= len(rows):
+        return text
+    width = len(rows[first])
+    heads = [
+        row for row in rows[:first] if abs(len(row) - width) <= 1 and not _number_count(row) and sum(map(bool, row)) > 1
+    ]
+    heads = [[*row, ""][:width] for row in heads]
+    counted = [sum(parse_number(row[c]) is not None for row in rows[first:] if c < len(row)) for c in range(width)]
+    out = [[cell or "nan" * bool(n) for cell, n in zip(row, counted, strict=False)] for row in rows[first:]]
+    names = [[_merged_name(heads, c) for c in range(width)]] if heads else []
+    told = io.StringIO()
+    csv.writer(told, delimiter=separator, lineterminator="\n").writerows([*names, *out])
+    return "\n".join([*([] if heads else comments), told.getvalue()])
+
+
+def _merged_name(heads: list[list[str]], column: int) -> str:
+    """What stands above a column, one below the other; a name that stands over several columns counts for each."""
+    words = []
+    for k, row in enumerate(heads):
+        own = row[column]
+        spread = sum(map(bool, row)) < _SPARSE * len(row) and column > 1
+        last = k == len(heads) - 1
+        if not own and spread and not last:
+            own = next((cell for cell in row[column:1:-1] if cell), "")
+        if own and (column > 1 or last or not any(other[column] for other in heads[k + 1 :])):
+            words.append(own)
+    return " ".join(dict.fromkeys(words))
+
+
+def _separator_of(lines: Sequence[str]) -> str:
+    return max(
+        _SEPARATORS, key=lambda s: sum(parse_number(c) is not None for line in lines for c in split_cells(line, s))
+    )

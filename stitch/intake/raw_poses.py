@@ -4,6 +4,7 @@ import csv
 import json
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,9 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.intake.clock_times import ClockTimes, find_clock_column
 from stitch.intake.pose_formats import PoseRow, joint_state_rows, open3d_rows, read_pose_text
-from stitch.intake.pose_tables import NumberTable, parse_number_table
+from stitch.intake.pose_tables import NumberTable, parse_number_table, with_one_header
 from stitch.reading.range_image import poses_in_scans, times_in_scans
-from stitch.reading.text_files import read_any_text, read_text, require_file, shortened
+from stitch.reading.text_files import WORKBOOKS, read_any_text, read_text, require_file, shortened, workbook_sheets
 from stitch.reading.yaml_file import parse_yaml
 
 # Poses in JSON and YAML: lists, matrices and mappings, however deep, as rows of named numbers.
@@ -251,12 +252,28 @@ def _read_file(file: Path) -> RawPoses:
         document = documents[0] if len(documents) == 1 else documents
         rows = open3d_rows(document) or joint_state_rows(document) or nested_rows(document)
         return _from_rows(file, rows, suffix[1:].upper())
+    if suffix in WORKBOOKS:
+        return _from_workbook(file)
     text = read_any_text(file, "name a table of poses", _MAX_POSES_MB)
     found = read_pose_text(text)
     if found is not None:
         return _from_rows(file, *found)
     table = parse_number_table(file, text)
     return _matrix_blocks(table) or _raw_poses(str(file), table.header, table.numbers, table.labels, table.words)
+
+
+def _from_workbook(file: Path) -> RawPoses:
+    """Return the one sheet that holds rows of numbers."""
+    found = []
+    for name, text in workbook_sheets(file).items():
+        with suppress(InputError):
+            found.append((name, parse_number_table(file, with_one_header(text))))
+    if len(found) != 1:
+        raise InputError(
+            f"{file}: {len(found)} sheets hold rows of numbers; to fix: leave the sheet of the poses alone"
+        )
+    name, table = found[0]
+    return _raw_poses(f"{file}, sheet {name}", table.header, table.numbers, table.labels, f"sheet {name}")
 
 
 def _raw_poses(

@@ -16,7 +16,7 @@ from stitch.intake.layouts import POSE_UNITS, ColumnLayout, joint_layouts, pose_
 from stitch.intake.raw_poses import RawPoses
 from stitch.integrity.hypotheses import ORDERS
 from stitch.measurement.robot import Robot, forward
-from stitch.reading.robot_description import robot_from_urdf
+from stitch.reading.robot_description import moving_joints, poses_of_urdf, robot_from_urdf
 
 
 @dataclass(frozen=True)
@@ -249,28 +249,65 @@ def candidate_units(readings: Sequence[Reading], stated: StatedTable) -> list[st
 
 # Joint angles as poses, where a URDF lies beside them.
 
-JOINT_ANGLES = "joint angles"
+JOINT_ANGLES, _SLIDING = "joint angles", "joints that turn and slide"
 
 
-def joint_readings(layout: ColumnLayout, urdf: Path | None, angle_unit: str | None) -> list[Reading]:
+def joint_readings(layout: ColumnLayout, arm: Path | Robot | None, angle_unit: str | None) -> list[Reading]:
     """Poses of joint angles, mm, in every unit that the angles can have.
+
+    Args:
+        arm: its URDF, or the arm in mm.
 
     Raises:
         InputError: no URDF beside them, or one of another number of joints.
     """
     joints = layout.joints
     assert joints is not None
-    if urdf is None:
+    if arm is None:
         raise InputError(
             "joint angles need the robot; to fix: put the URDF into the folder, or give poses; with DH rows write "
             "session.toml by hand"
         )
-    robot, _, _ = arm_from_urdf(urdf, joints.shape[1])
+    if isinstance(arm, Path) and (sliding := _readings_of_sliding_arm(arm, layout, angle_unit or layout.angle_unit)):
+        return sliding
+    robot = arm if isinstance(arm, Robot) else arm_from_urdf(arm, joints.shape[1])[0]
     out = []
     for place, unit in enumerate(angle_units(joints, angle_unit or layout.angle_unit)):
         T: Array = forward(robot, np.radians(joints) if unit == "deg" else joints)
         out.append(Reading(T, JOINT_ANGLES, unit, replace(layout, length_unit="mm"), 100 * place))
     return out
+
+
+_SLID_MM = 20.0  # longer ways of a slide are no metres
+
+
+def _readings_of_sliding_arm(urdf: Path, layout: ColumnLayout, angle_unit: str | None) -> list[Reading]:
+    """Poses by a URDF some of whose joints slide, mm; none where all of them turn.
+
+    Effects of joints are for arms that turn, so that the joints stay beside the poses as columns.
+    """
+    joints = layout.joints
+    assert joints is not None
+    text = urdf.read_text(encoding="utf-8", errors="replace")
+    for base, flange in arm_link_pairs(urdf):
+        kinds = moving_joints(text, base, flange)
+        slides = [kind == "prismatic" for _, kind in kinds]
+        if not any(slides) or len(kinds) != joints.shape[1]:
+            continue
+        turning, sliding = joints[:, np.logical_not(slides)], joints[:, slides]
+        in_m = np.abs(sliding).max() <= _SLID_MM
+        columns = {
+            f"{name}_{'m' if in_m else 'mm'}" if slid else name: q
+            for (name, _), slid, q in zip(kinds, slides, joints.T, strict=True)
+        }
+        left = replace(layout, joints=None, length_unit="mm", rest=columns | layout.rest)
+        out = []
+        for place, angle in enumerate(angle_units(turning, angle_unit)):
+            scale = np.where(slides, 1.0 if in_m else 1e-3, 1.0 if angle == "rad" else np.pi / 180)
+            T = poses_of_urdf(text, base, flange, joints * scale)
+            out.append(Reading(T, _SLIDING, angle, left, 100 * place))
+        return out
+    return []
 
 
 # Between which links of a URDF the arm lies: the root, and what people call the flange.
@@ -284,7 +321,7 @@ def with_joints_of(raw: RawPoses, urdf: Path) -> RawPoses:
     """Return a table whose columns bear the names of a robot's joints with j1, j2 … in the arm's order."""
     text = urdf.read_text(encoding="utf-8", errors="replace")
     for base, flange in arm_link_pairs(urdf):
-        names = chain_joints(text, base, flange)
+        names = [name for name, _ in moving_joints(text, base, flange)]
         where = [_column_of_joint(name, raw.header or ()) for name in names]
         if names and None not in where and len(set(where)) == len(where):
             order = {column: f"j{i}" for i, column in enumerate(where, 1)}
@@ -306,29 +343,6 @@ def _column_of_joint(joint: str, header: Sequence[str]) -> int | None:
         and not re.search(r"vel|eff|torque|current", name.lower().replace(joint.lower(), ""))
     ]
     return found[0] if len(found) == 1 else None
-
-
-def chain_joints(urdf: str, base: str, flange: str) -> list[str]:
-    """Return the names of the turning joints from base to flange; empty where there is no such chain."""
-    try:
-        root = ElementTree.fromstring(urdf)
-    except (ElementTree.ParseError, ValueError):
-        return []
-    above = {}
-    for joint in root.findall("joint"):
-        child, parent = joint.find("child"), joint.find("parent")
-        if child is not None and parent is not None:
-            above[child.get("link")] = (joint.get("name") or "", joint.get("type"), parent.get("link"))
-    names: list[str] = []
-    link: str | None = flange
-    for _ in range(len(above) + 1):
-        if link == base:
-            return names[::-1]
-        if link not in above:
-            return []
-        name, kind, link = above[link]
-        names += [name] if kind in ("revolute", "continuous") else []
-    return []
 
 
 def arm_from_urdf(urdf: Path, joints: int) -> tuple[Robot, str, str]:

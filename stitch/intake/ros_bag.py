@@ -21,12 +21,12 @@ from stitch.intake.convention_choice import choose_convention
 from stitch.intake.first_session import capture_of, score_words
 from stitch.intake.folder_files import Guess
 from stitch.intake.layouts import ColumnLayout
-from stitch.intake.readings import Reading, arm_link_pairs, chain_joints
+from stitch.intake.readings import Reading, arm_link_pairs
 from stitch.intake.stops import AROUND, middle_of_stops, stationary_scans
 from stitch.integrity.conventions import register_scan_pairs
 from stitch.measurement.robot import forward
 from stitch.reading.clouds import read_cloud
-from stitch.reading.robot_description import robot_from_urdf
+from stitch.reading.robot_description import moving_joints, robot_from_urdf
 from stitch.reading.session_folder import SESSION_FORMAT
 from stitch.reading.text_files import import_extra, shortened
 from stitch.writing.session_files import pose_columns, whole_folder, write_table
@@ -331,7 +331,7 @@ def recorded_urdf(
     if not contents.joints or contents.urdf is None:
         lacking = "joint states" if not contents.joints else "robot_description"
         return {}, None, Guess("joints", "left out", f"the bag has no {lacking}", True, "session.toml")
-    names = chain_joints(contents.urdf, bag_frames.base, bag_frames.flange)
+    names = _turning_joints(contents.urdf, bag_frames.base, bag_frames.flange)
     angles = interpolated_joints(contents, names, times) if names else None
     if angles is None:
         reason = f"its URDF has no chain from {bag_frames.base} to {bag_frames.flange} of the joints recorded"
@@ -341,13 +341,17 @@ def recorded_urdf(
     return robot, angles, Guess("joints", ", ".join(names), "the order of the URDF in the bag", True, "session.toml")
 
 
+def _turning_joints(urdf: str, base: str, flange: str) -> list[str]:
+    return [name for name, kind in moving_joints(urdf, base, flange) if kind != "prismatic"]
+
+
 def recorded_tree(contents: BagContents) -> TransformTree:
     """What tf recorded; where it recorded no motion of the arm, the motion of the joints by their URDF."""
     tree = TransformTree(contents.edges)
     if not tree.still or not contents.joints or contents.urdf is None:
         return tree
     for base, flange in _link_pairs(contents.urdf):
-        names = chain_joints(contents.urdf, base, flange)
+        names = _turning_joints(contents.urdf, base, flange)
         rows = [(time, [q[name] for name in names]) for time, q in contents.joints if all(name in q for name in names)]
         if names and rows:
             T = _flange_poses(contents.urdf, base, flange, np.array([q for _, q in rows]))

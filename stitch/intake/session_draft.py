@@ -6,6 +6,7 @@ import os
 import re
 import shlex
 import shutil
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from stitch.frames import Array
 from stitch.intake.first_session import FirstSession
 from stitch.intake.folder_files import Guess
 from stitch.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, covariate_columns
-from stitch.intake.readings import JOINT_ANGLES, arm_from_urdf
+from stitch.intake.readings import JOINT_ANGLES, Reading, arm_from_urdf
 from stitch.intake.scan_targets import points_columns
 from stitch.reading.session_folder import SESSION_FORMAT
 from stitch.system.files import whole_file
@@ -27,20 +28,22 @@ from stitch.writing.session_files import pose_columns, write_table
 _WIDTH = 118
 
 
-def require_free(folder: Path, targets: bool = False) -> None:
-    """Refuse a folder that holds a session already.
-
-    Args:
-        targets: points.csv will be written too.
+def require_free(folder: Path, names: Iterable[str]) -> None:
+    """Refuse a folder that holds one of these files already.
 
     Raises:
         InputError: with what to do.
     """
-    for name in ("session.toml", "views.csv", *(["points.csv"] if targets else [])):
+    for name in names:
         if (folder / name).exists() or (folder / name).is_symlink():
             raise InputError(
                 f"{folder / name}: exists already; to fix: replace it with --force, or name another folder with -o"
             )
+
+
+def draft_files(targets: bool) -> tuple[str, ...]:
+    """The files that `write_draft` writes; points.csv where targets are looked for."""
+    return ("session.toml", "views.csv", *(["points.csv"] if targets else []))
 
 
 def write_draft(folder: Path, first: FirstSession, *, force: bool = False, unpacked: bool = False) -> None:
@@ -54,7 +57,7 @@ def write_draft(folder: Path, first: FirstSession, *, force: bool = False, unpac
         InputError: there is a session already.
     """
     if not force:
-        require_free(folder, bool(first.sightings))
+        require_free(folder, draft_files(bool(first.sightings)))
     folder.mkdir(parents=True, exist_ok=True)
     if unpacked:
         (folder / "clouds").mkdir(exist_ok=True)
@@ -89,12 +92,12 @@ def toml_text(folder: Path, first: FirstSession) -> str:
     lines += ["", "# What follows as a comment alone was read so into views.csv. To read it otherwise:"]
     lines += [f"# stitch init {shlex.quote(str(first.files.folder))} --force, with the flag that is named beside it."]
     for what in ("files", "pairing", "columns", "rotation"):
-        lines += ["", *_comment(told[what], with_flag=True)]
+        lines += ["", *comment_lines(told[what], with_flag=True)]
     unit = length_unit(first)
-    lines += ["", *_comment(told["length_unit"]), f'length_unit = "{unit}"']
-    lines += ["", *_comment(told["cloud_unit"]), f'cloud_unit = "{first.cloud_unit}"']
-    lines += ["", *_comment(told["mount"]), f'mount = "{first.mounting.mount}"']
-    lines += ["", "[scanner]", *_comment(told["optical_axis"]), f'optical_axis = "{first.optical_axis}"']
+    lines += ["", *comment_lines(told["length_unit"]), f'length_unit = "{unit}"']
+    lines += ["", *comment_lines(told["cloud_unit"]), f'cloud_unit = "{first.cloud_unit}"']
+    lines += ["", *comment_lines(told["mount"]), f'mount = "{first.mounting.mount}"']
+    lines += ["", "[scanner]", *comment_lines(told["optical_axis"]), f'optical_axis = "{first.optical_axis}"']
     if len(first.box):
         corners = (first.box * CLOUD_UNITS[first.cloud_unit] / METRES[unit]).tolist()
         lines += ["", "# stated with --within: what lies beyond stands still before the scanner", f"within = {corners}"]
@@ -109,7 +112,7 @@ def toml_text(folder: Path, first: FirstSession) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _comment(guess: Guess, with_flag: bool = False) -> list[str]:
+def comment_lines(guess: Guess, with_flag: bool = False) -> list[str]:
     """Return a guess in lines that begin with #."""
     flag = f" ({guess.flag})" if with_flag and guess.determined else ""
     words, lines = f"{guess.line}{flag}".split(), [""]
@@ -136,7 +139,7 @@ def views_text(folder: Path, first: FirstSession) -> str:
     }
     reading = first.choice.best.interpretation.reading
     if reading.layout.joints is not None:
-        joints = _joint_degrees(first, reading.layout.joints)[rows]
+        joints = joint_degrees(reading)[rows]
         columns |= {f"j{i + 1}_deg": [f"{q:.9g}" for q in joints[:, i]] for i in range(joints.shape[1])}
     if reading.rotation != JOINT_ANGLES:
         columns |= {
@@ -164,8 +167,10 @@ def _flange_poses(first: FirstSession, rows: list[int]) -> Array:
     return first.mounting.flange(frames.make(T[:, :3, :3], T[:, :3, 3] * scale))
 
 
-def _joint_degrees(first: FirstSession, joints: Array) -> Array:
-    reading = first.choice.best.interpretation.reading
+def joint_degrees(reading: Reading) -> Array:
+    """(V, n) of a reading that has joints."""
+    joints = reading.layout.joints
+    assert joints is not None
     in_radians = reading.angle_unit == "rad" if reading.rotation == JOINT_ANGLES else np.abs(joints).max() <= 2 * np.pi
     return np.degrees(joints) if in_radians else joints
 

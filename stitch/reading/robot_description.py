@@ -281,6 +281,30 @@ def robot_from_urdf(
     )
 
 
+_MOVING = ("revolute", "continuous", "prismatic")
+
+
+def moving_joints(urdf: str, base_link: str, flange_link: str) -> list[tuple[str, str]]:
+    """Name and kind of each joint that moves between two links of a URDF's text; none where no chain joins them."""
+    try:
+        chain = _joint_chain(ElementTree.fromstring(urdf), base_link, flange_link)
+    except (ValueError, LookupError, ElementTree.ParseError, InputError):
+        return []
+    return [(j.get("name") or "", str(j.get("type"))) for j in chain if j.get("type") in _MOVING]
+
+
+def poses_of_urdf(urdf: str, base_link: str, flange_link: str, joints: Array) -> Array:
+    """T_base_flange (V, 4, 4), mm, for joints (V, n), rad or m, that turn or slide along their axes."""
+    T, moved = np.tile(np.eye(4), (len(joints), 1, 1)), iter(joints.T)
+    for joint in _joint_chain(ElementTree.fromstring(urdf), base_link, flange_link):
+        T = T @ origin(joint, 1e3)
+        if joint.get("type") in _MOVING:
+            turn, q = _turn_to_z(joint), next(moved)
+            slides = joint.get("type") == "prismatic"
+            T = T @ turn @ (elementary("z", 0.0, 1e3 * q) if slides else elementary("z", q)) @ frames.inverse(turn)
+    return T
+
+
 def _serial_chain(root: Element, chain: list[Element], scale: float) -> tuple[Array, Array, Array, Array, Array]:
     """What stands before and behind the turn of every joint (n, 4, 4), what it moves: mass (n,), com (n, 3).
 

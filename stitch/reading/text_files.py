@@ -1,7 +1,9 @@
 """The text of a file that may be anything: missing, a pipe, a folder, without end, or no text at all."""
 
 import codecs
+import csv
 import importlib
+import io
 import json
 import tomllib
 from collections.abc import Iterator
@@ -189,6 +191,31 @@ def read_any_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
             if "\0" not in text:
                 return text
     raise InputError(f"{file}: is no text; to fix: save it as UTF-8")
+
+
+WORKBOOKS = (".xlsx", ".xlsm", ".xls", ".xlsb", ".ods")
+
+
+def workbook_sheets(file: Path) -> dict[str, str]:
+    """Return the sheets of a spreadsheet that hold something as CSV, by their names.
+
+    Raises:
+        InputError: no such file, or no workbook; the package that reads them is not installed.
+    """
+    require_file(file, "name a workbook")
+    calamine = import_extra("python_calamine", file, "formats")
+    try:
+        book = calamine.CalamineWorkbook.from_path(str(file))
+        sheets = {name: book.get_sheet_by_name(name).to_python() for name in book.sheet_names}
+    except (calamine.CalamineError, OSError, ValueError) as error:
+        raise InputError(f"{file}: no readable workbook ({reason_of(error)}); to fix: save its sheets as CSV") from None
+    out = {}
+    for name, rows in sheets.items():
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows(rows)
+        if rows:
+            out[name] = text.getvalue()
+    return out
 
 
 def _require_size(file: Path, hint: str, largest_mb: float) -> None:

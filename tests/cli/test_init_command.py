@@ -111,7 +111,6 @@ def test_a_terminal_is_asked_what_cannot_be_told(raw, capsys, monkeypatch):
         (lambda raw: (raw / "RobotPoses.dat").unlink(), (), "--poses"),
         (lambda raw: [f.unlink() for f in raw.glob("*.ply")], (), "no clouds there, only 1 .dat"),
         (lambda raw: [f.rename(f.with_suffix(".zip")) for f in raw.glob("*.ply")], (), "unpack it"),
-        (lambda raw: (raw / "RobotPoses.dat").rename(raw / "robot.xlsx"), (), "save the sheet of the poses as CSV"),
         (lambda raw: shutil.copy(raw / "RobotPoses.dat", raw / "robot.txt"), (), "several files"),
         (lambda raw: None, ("--rotation", "zyx"), "--rotation zyx: to fix: use xyz-intrinsic"),
         (lambda raw: None, ("--columns", "x,y,z"), "3 names"),

@@ -9,7 +9,7 @@ from data_synth.fixtures.field_folders import KINDS, Campaign
 from data_synth.write import write_session
 from stitch.errors import InputError
 from stitch.intake.first_session import StatedFolder, first_session
-from stitch.intake.packed_scans import one_scan_a_file
+from stitch.intake.folder_files import one_scan_a_file
 from stitch.intake.session_draft import write_draft
 from stitch.reading.session_folder import load_session
 from stitch.writing.urdf_file import to_urdf
