@@ -115,13 +115,15 @@ def tables(draws: int) -> str:
     lines = [
         f"Errors under the source's noise, {draws} draws; rotation in µrad / translation in µm.",
         "",
-        "| experiment | λ | solution | rms | median | 95 % | published, one draw | draws below that |",
+        "| experiment | λ | solution | rms | median | 95 % of draws between | published, one draw | draws below that |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for (experiment, lam), published in PUBLISHED.items():
         for name, found in draw(experiment, lam, draws).items():
-            rms, median, high = np.sqrt((found**2).mean(0)), np.median(found, 0), np.quantile(found, 0.95, 0)
-            cells = [f"{a * 1e6:.0f} / {b * 1e6:.0f}" for a, b in (rms, median, high, published)]
+            low, median, high = 1e6 * np.quantile(found, [0.025, 0.5, 0.975], axis=0)
+            rms, asked = 1e6 * np.sqrt((found**2).mean(0)), 1e6 * np.array(published)
+            cells = [f"{a:.0f} / {b:.0f}" for a, b in (rms, median, asked)]
+            cells.insert(2, " / ".join(f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True)))
             cells.append(" / ".join(f"{share:.0%}" for share in (found <= published).mean(axis=0)))
             lines.append(f"| {experiment} | {lam} | {name} | {' | '.join(cells)} |")
     lines += ["", "The source's noisy positions of experiment 1 (table 3, rounded to 0.1 mm) and its rod readings:", ""]

@@ -1,6 +1,6 @@
 """Does the sigma of `stitch fit` hold where hand-eye, robot and scanner err? The table of docs/window.md.
 
-Run: python bench/fit_sigma.py [--doors 50]
+Run: python bench/fit_sigma.py [--doors 50] [--first 4700]
 
 Half-size doors, each in another place; the hand-eye errs by its stated covariance, every view by the robot's scatter,
 all views by one smooth error of the scanner that no family of the fit holds (cosines). z is error over sigma, about the
@@ -72,8 +72,9 @@ def fitted(part: str, mesh, cad, seed: int, sources: tuple[str, ...]) -> tuple[n
     return off, found.sigma, float(off @ np.linalg.solve(found.covariance, off))
 
 
-def row(name: str, part: str, sources: tuple[str, ...], count: int, mesh, cad) -> str:
-    found = [fitted(part, mesh, cad, seed, sources) for seed in range(count)]
+def row(name: str, part: str, sources: tuple[str, ...], seeds: range, mesh, cad) -> str:
+    count = len(seeds)
+    found = [fitted(part, mesh, cad, seed, sources) for seed in seeds]
     off, sigma, squares = (np.array(column) for column in zip(*found, strict=True))
     z = off / sigma
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], count) / count)
@@ -89,7 +90,9 @@ def row(name: str, part: str, sources: tuple[str, ...], count: int, mesh, cad) -
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--doors", type=int, default=50)
-    doors = parser.parse_args().doors
+    parser.add_argument("--first", type=int, default=4700, help="the first seed")
+    given = parser.parse_args()
+    doors, first = given.doors, given.first
     door, pane = car_door.build(CarDoor(**SIZES)), car_door.build_pane(Pane(**SIZES))
     meshes = {"door": (door, cad_surface(door)), "pane": (pane, cad_surface(pane))}
     lines = [
@@ -107,7 +110,7 @@ def main() -> None:
         ("door, all of them", "door", ALL, doors),
         ("pane, all of them", "pane", ALL, 2 * few),
     ):
-        lines.append(row(name, part, sources, count, *meshes[part]))
+        lines.append(row(name, part, sources, range(first, first + count), *meshes[part]))
         print(lines[-1], flush=True)
     page = PAGE.read_text(encoding="utf-8")
     text = "\n".join(lines)

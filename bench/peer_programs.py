@@ -36,7 +36,7 @@ def of_one_side(clouds, poses):
     return [(i, j) for i, j in combinations(range(len(clouds)), 2) if looks[i] @ looks[j] > 0.5]
 
 
-def open3d_edges(clouds, poses):
+def open3d_edges(clouds, poses, distances=DISTANCES):
     """(i, j, T_i_j, information) of all pairs that meet: robust point-to-plane ICP."""
     import open3d as o3d
 
@@ -52,14 +52,14 @@ def open3d_edges(clouds, poses):
         T = np.linalg.inv(poses[i]) @ poses[j]
         if registration.evaluate_registration(shown[j], shown[i], DISTANCES[0], T).fitness < OVERLAP:
             continue
-        for distance in DISTANCES:
-            method = plane if distance == DISTANCES[-1] else wide
+        for distance in distances:
+            method = plane if distance == distances[-1] else wide
             T = registration.registration_icp(shown[j], shown[i], distance, T, method).transformation
-        information = registration.get_information_matrix_from_point_clouds(shown[j], shown[i], DISTANCES[-1], T)
+        information = registration.get_information_matrix_from_point_clouds(shown[j], shown[i], distances[-1], T)
         yield i, j, T, information
 
 
-def small_gicp_edges(clouds, poses):
+def small_gicp_edges(clouds, poses, distances=DISTANCES):
     """The same by generalised ICP."""
     import small_gicp
 
@@ -71,7 +71,7 @@ def small_gicp_edges(clouds, poses):
         _, squared = tree.batch_nearest_neighbor_search(moved, num_threads=2)
         if np.mean(np.asarray(squared) < DISTANCES[0] ** 2) < OVERLAP:
             continue
-        for distance in DISTANCES:
+        for distance in distances:
             found = small_gicp.align(target, source, tree, T, max_correspondence_distance=distance, num_threads=2)
             T = found.T_target_source
         yield i, j, T, found.H

@@ -11,6 +11,7 @@ common removed: no overlap shows it.
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,9 @@ def numbers_of(kind: str, seed: int) -> dict[str, Any]:
     return {"errors": errors, "casting": casting}
 
 
-def collected(first: int, cells: int, keep: Path | None) -> Rows:
+def collected(
+    first: int, cells: int, keep: Path | None, numbers: Callable[[str, int], dict[str, Any]] = numbers_of
+) -> Rows:
     """Numbers of every cell by kind."""
     done = {}
     if keep is not None and keep.is_file():
@@ -85,7 +88,7 @@ def collected(first: int, cells: int, keep: Path | None) -> Rows:
         for kind in KINDS:
             if (kind, seed) in done:
                 continue
-            done[kind, seed] = {"kind": kind, "seed": seed} | numbers_of(kind, seed)
+            done[kind, seed] = {"kind": kind, "seed": seed} | numbers(kind, seed)
             if keep is not None:
                 with keep.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(done[kind, seed]) + "\n")
@@ -155,6 +158,13 @@ def casting(found: Rows) -> list[str]:
     ]
 
 
+def write(lines: list[str], begin: str, end: str) -> None:
+    """Put lines into the page between two marks."""
+    text = PAGE.read_text(encoding="utf-8")
+    before, after = text.split(begin)[0], text.split(end)[1]
+    PAGE.write_text(f"{before}{begin}\n" + "\n".join(lines) + f"\n{end}{after}", encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--held-out", action="store_true")
@@ -166,9 +176,7 @@ def main() -> None:
     lines = [*table(found), "", *paired(found), "", *casting(found)]
     print("\n".join(lines))
     if options.write:
-        text = PAGE.read_text(encoding="utf-8")
-        before, after = text.split(BEGIN)[0], text.split(END)[1]
-        PAGE.write_text(f"{before}{BEGIN}\n" + "\n".join(lines) + f"\n{END}{after}", encoding="utf-8")
+        write(lines, BEGIN, END)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Both solutions of one stand, after the check that its readings belong together."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,7 @@ class BaseResult:
     projection: Projection | None
     no_projection: str | None  # why there is none
     comparisons: tuple[DistanceComparison, ...]
-    flange_rpy: dict[str, list[float]]  # α, β, γ by the points that joint angles gave
+    flange_rpy: dict[str, list[float]]  # α, β, γ by the points that joint angles or rpy gave
 
 
 def solve_stand(stand: Stand) -> BaseResult:
@@ -106,6 +107,11 @@ def base_document(result: BaseResult) -> dict[str, Any]:
         "T_base1_base2": projection.T_base1_base2.tolist(),
         "gamma_beta_alpha": [None if np.isnan(a) else float(a) for a in projection.gamma_beta_alpha],
         "offsets": projection.offsets.tolist(),
+        "likewise": {
+            plane: {"open": found} if isinstance(found, str) else {"angle": found[0], "offsets": found[1:].tolist()}
+            for plane, found in projection.likewise.items()
+        },
+        "flange_beta_alpha": None if (tilt := projection.flange_beta_alpha) is None else tilt.tolist(),
     }
     return {
         "length_unit": result.length_unit,
@@ -212,9 +218,10 @@ def _touched_points(
     if not isinstance(listed, list) or len(listed) < 2:
         raise InputError(f"{document.file}: [[{name}.points]] has fewer than two entries; to fix: add one")
     sigma = robot.table("sigma", {"point", "joint", *_CYLINDER})
-    known = {"name", "point", "joints", *_CYLINDER, *readings}
+    known = {"name", "point", "rpy", "joints", *_CYLINDER, *readings}
     entries = [checked_table(document.file, f"{name}.points[{i + 1}]", entry, known) for i, entry in enumerate(listed)]
     names = tuple(str(entry.entries.get("name", f"{name} {i + 1}")) for i, entry in enumerate(entries))
+    rpy = _stated_flange_angles(entries, by_joints="arm" in robot)
     if "arm" in robot:
         return _points_of_joints(robot, entries, names, sigma, unit=unit, to_rad=to_rad), entries
     points: list[Array] = []
@@ -239,7 +246,17 @@ def _touched_points(
             sigma.number("height", default, positive=True),
         )
         covariances.append(cylinder_covariance(np.array(joint1 * to_rad), np.array(radius), spread))
-    return TouchedPoints(names, np.array(points, float), np.array(covariances, float)), entries
+    turns = None if rpy is None else rpy * to_rad
+    return TouchedPoints(names, np.array(points, float), np.array(covariances, float), turns), entries
+
+
+def _stated_flange_angles(entries: list[JobTable], by_joints: bool) -> Array | None:
+    """α, β, γ (N, 3) as the controller shows them, in the file's unit; None where no point states them."""
+    stated = [entry for entry in entries if "rpy" in entry]
+    if stated and (by_joints or len(stated) < len(entries)):
+        raise stated[0].refusal("rpy", "state it at every point of this robot, and not beside joints")
+    form = "[α, β, γ], the flange's turn about x, y, z"
+    return np.array([entry.vectors("rpy", (3,), form) for entry in stated]) if stated else None
 
 
 def _points_of_joints(
@@ -332,6 +349,23 @@ def run_base(file: Path, wanted: Wanted) -> None:
         _print_solution(result)
 
 
+def _plane_lines(projection: Projection, unit: str) -> Iterator[str]:
+    """What the planes beside X-Y show: by our triangle, by the source's rules, by the flanges."""
+    _, beta, alpha = projection.gamma_beta_alpha
+    turns = (("X-Z", "β", beta), ("Y-Z", "α", alpha))
+    for (plane, letter, angle), offsets in zip(turns, projection.offsets[1:], strict=True):
+        own = "open, taken as level" if np.isnan(angle) else f"{fixed_digits(np.array([angle]), 6)} rad"
+        found = projection.likewise[plane]
+        told = (
+            found
+            if isinstance(found, str)
+            else f"{letter} {fixed_digits(found[:1], 6)} rad, {fixed_digits(found[1:], 5)} {unit}"
+        )
+        yield f"{plane}: {letter} {own}, {fixed_digits(offsets, 5)} {unit}; by the cosine rules of X-Y: {told}."
+    if projection.flange_beta_alpha is not None:
+        yield f"By the pins, upright in their cups: β α {fixed_digits(projection.flange_beta_alpha, 6)} rad."
+
+
 def _print_solution(result: BaseResult) -> None:
     terminal = console()
     unit, solution = result.length_unit, result.fit
@@ -354,6 +388,9 @@ def _print_solution(result: BaseResult) -> None:
         terminal.print(comparison_text(comparison, unit) + ".")
     for name, angles in result.flange_rpy.items():
         terminal.print(f"{name}: flange turned by α β γ {fixed_digits(np.array(angles), 4)} rad about x, y, z.")
+    if result.projection is not None:
+        for line in _plane_lines(result.projection, unit):
+            terminal.print(line)
     if result.no_projection:
         terminal.print(f"No projection: {result.no_projection}.")
     for row in solution.T_base1_base2:

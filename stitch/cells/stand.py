@@ -344,14 +344,16 @@ def _whiten(residuals: Array, covariance: Array) -> Array:
 # coordinates of R1, and |O1e| with |O1P1| where its triangle has the side |O1P2|. Both pairs are equal in the
 # source's experiments. The source's γ counts clockwise; `project` returns right-handed angles, so its γ is −γz.
 #
-# For X-Z and Y-Z the source says only "likewise". With the cosine rule that is 0/0 for its own experiments, where P1
-# and P2 fall on one point of the X-Z plane. Here each of these planes is solved from the vectors R1R2 that rod and
-# second robot give, which is the same triangle; an angle whose R1R2 falls on a point of its plane is taken as level.
+# For X-Z and Y-Z the source says "likewise". `Projection.likewise` has the same rules there, 0/0 in its experiments,
+# where P1 and P2 fall on one point of the X-Z plane. So T takes these planes from the vectors R1R2 that rod and second
+# robot give, which is the same triangle; an angle whose R1R2 falls on a point of its plane is taken as level.
 
 # The formulas hold for the source's arrangement only, and elsewhere give any number without a sign of it. So the
 # solution must carry R1 and R2 onto the rod's cup within this share of the rod's length: far above all noise.
 _GAP = 0.05
-# R1R2 shorter in a plane than this share of its length gives no angle there.
+# The same in a plane that T does not take, where other arrangements come near: a millimetre of the rod.
+_CLOSED = 2e-4
+# R1R2 or P1P2 shorter in a plane than this share of its length gives no angle there.
 _SHORT = 0.05
 _ARRANGEMENT = "check the rod and joint readings, and that the stand is placed as the source places it"
 
@@ -363,6 +365,9 @@ class Projection:
     T_base1_base2: Array  # (4, 4), formula 11
     gamma_beta_alpha: Array  # (3,)
     offsets: Array  # (3, 2): px1, py1; px2, pz1; py2, pz2
+    # By plane, "X-Z" and "Y-Z": β, px2, pz1 and α, py2, pz2 by the rules of the X-Y plane, or why there are none.
+    likewise: dict[str, Array | str]
+    flange_beta_alpha: Array | None  # (2,) from pins that stand upright in their cups; None without flange angles
 
 
 def project(stand: Stand) -> Projection:
@@ -374,9 +379,15 @@ def project(stand: Stand) -> Projection:
     """
     if len(stand.rail.points) != 2 or len(stand.rod.points) != 2 or np.ptp(stand.slide) > 0:
         raise NoResultError("the projection takes two points per robot and one slide; to fix: use the least squares")
-    R_base1 = frames.transform(level_stand(stand.rail.points, stand.rail_slide), stand.cups)
-    gamma, p_xy = _plane_xy(stand)
+    T_stand = level_stand(stand.rail.points, stand.rail_slide)
+    pivot, *cups = frames.transform(T_stand, np.vstack([[stand.slide[0], 0.0, 0.0], stand.cups]))
+    R_base1 = np.array(cups)
+    gamma, p_xy = _cosine_rules(stand, pivot, R_base1, stand.rod.points, (0, 1), stand.turn)
     turned = stand.rod.points @ _rotation(2, gamma).T
+    likewise = {
+        "X-Z": _likewise(stand, pivot, R_base1, turned, (2, 0)),
+        "Y-Z": _likewise(stand, pivot, R_base1, turned, (1, 2)),
+    }
     beta, p_xz = _plane(R_base1, turned, (2, 0), 1)
     turned = stand.rod.points @ (_rotation(2, gamma) @ _rotation(1, beta)).T
     alpha, p_zy = _plane(R_base1, turned, (1, 2), 0)
@@ -387,41 +398,90 @@ def project(stand: Stand) -> Projection:
     gap = float(np.linalg.norm(frames.transform(T, stand.rod.points) - R_base1, axis=1).max())
     if not gap < _GAP * stand.length.max():
         raise NoResultError(f"the projection misses the rod's cup by {gap:.3g}; to fix: {_ARRANGEMENT}")
-    return Projection(T, np.array([gamma, beta, alpha]), offsets)
+    return Projection(T, np.array([gamma, beta, alpha]), offsets, likewise, _flange_tilt(stand, gamma))
 
 
-def _plane_xy(stand: Stand) -> tuple[float, Array]:
-    """γ and (px1, py1) by formulas 5 to 10 and the cosine rules after them.
+def _likewise(stand: Stand, pivot: Array, R_base1: Array, turned: Array, axes: tuple[int, int]) -> Array | str:
+    """Angle and both offsets (3,) in X-Z or Y-Z, x or y first, or why there are none; `turned` is R after γ (2, 3)."""
+    for name, points in (("P1 and P2", stand.rail.points), ("R1 and R2", R_base1)):
+        apart = points[1] - points[0]
+        if np.linalg.norm(apart[list(axes)]) < _SHORT * np.linalg.norm(apart):
+            return f"{name} fall on one point of this plane, where the cosine rules are 0/0"
+    found = []
+    for side in (1.0, -1.0):
+        try:
+            angle, offset = _cosine_rules(stand, pivot, R_base1, turned, axes, side)
+        except NoResultError:
+            continue
+        back = turned[:, axes] @ _rotation(2, angle)[:2, :2].T + offset
+        gap = float(np.abs(back - R_base1[:, axes]).max())
+        found.append((gap, np.array([angle, *(offset[::-1] if axes == (2, 0) else offset)])))
+    gap, best = min(found, key=lambda pair: pair[0], default=(np.inf, None))
+    if best is not None and gap < _CLOSED * stand.length.max():
+        return best
+    return "the triangles do not close in this plane"
 
-    Written for the source's side: seen from above, the rod turns clockwise. The other side is its mirror image.
+
+def _flange_tilt(stand: Stand, gamma: float) -> Array | None:
+    """(2,) β and α that make the flanges' z axes of both robots parallel; None where their angles are not known."""
+    if stand.rail.rpy is None or stand.rod.rpy is None:
+        return None
+    main, second = (
+        Rotation.from_euler("ZYX", touched.rpy[:, ::-1]).as_matrix()[:, :, 2].mean(axis=0)
+        for touched in (stand.rail, stand.rod)
+        if touched.rpy is not None
+    )
+    # Both upwards; the turn about x alone changes y, then that about y the angle from z to x.
+    here, there = (axis * np.sign(axis[2]) for axis in (_rotation(2, -gamma) @ main, second))
+    reach = np.hypot(there[1], there[2])
+    alpha = np.arctan2(there[1], there[2]) - np.arcsin(np.clip(here[1] / reach, -1, 1))
+    turned = _rotation(0, float(alpha)) @ there
+    return np.array([np.arctan2(here[0], here[2]) - np.arctan2(turned[0], turned[2]), alpha])
+
+
+def _cosine_rules(
+    stand: Stand, pivot: Array, R_base1: Array, rod: Array, axes: tuple[int, int], side: float
+) -> tuple[float, Array]:
+    """Angle and offsets (2,) in the plane of `axes` by formulas 5 to 10 and the cosine rules after them.
+
+    Written for the source's side: seen against the plane's normal, the rod turns clockwise. With `side` −1 all is
+    mirrored.
+
+    Args:
+        pivot: (3,) of the rod, base 1.
+        R_base1: (2, 3) where the rod's cup stood, base 1.
+        rod: (2, 3) the same as the second robot touched it.
     """
-    mirror = np.array([1.0, stand.turn, 1.0])
-    P, R = stand.rail.points * mirror, stand.rod.points * mirror
-    # Angle of P1P2 against the X-Y plane (formula 7), and the rod's length and angle in that plane (formulas 5 to 10).
-    slope = np.arctan2(P[0, 2] - P[1, 2], np.hypot(P[0, 0] - P[1, 0], P[0, 1] - P[1, 1]))
-    RS, DE = stand.length * np.sin(stand.angle), stand.length * np.cos(stand.angle) * np.cos(slope)
-    rod, theta = np.hypot(RS, DE), np.arctan2(RS, DE)
-    P2e = (stand.slide[0] - stand.rail_slide[1]) * np.cos(slope)
+    mirror = np.array([1.0, side])
+    P, R, e, cups = (points[..., list(axes)] * mirror for points in (stand.rail.points, rod, pivot, R_base1))
+    # Formulas 5 to 10 in this plane: the rod's length, and its angle against the rail.
+    length, theta = np.linalg.norm(cups - e, axis=1), _angles_between(P[0] - P[1], cups - e)
+    P2e = float(np.linalg.norm(e - P[1]))
     Pr, Rr = np.arctan2(P[:, 1], P[:, 0]), -np.arctan2(R[:, 1], R[:, 0])
     O1P, O2R = np.hypot(P[:, 0], P[:, 1]), np.hypot(R[:, 0], R[:, 1])
     P1P2, R1R2 = _third_side(O1P[0], O1P[1], abs(Pr[0] - Pr[1])), _third_side(O2R[0], O2R[1], abs(Rr[0] - Rr[1]))
     C1, C3 = _angle(O1P[0], P1P2, O1P[1]), _angle(O2R[0], R1R2, O2R[1])
     C2, C4, C7 = np.pi - (C1 + Pr[0]), np.pi - (C3 + Rr[0]), np.pi - (C3 + abs(Rr[0] - Rr[1]))
-    C5, C6 = _angle(rod[0], R1R2, rod[1]), _angle(R1R2, rod[1], rod[0])
+    C5, C6 = _angle(length[0], R1R2, length[1]), _angle(R1R2, length[1], length[0])
     gamma_z = C2 + C4 + theta[0] - C5
-    O2e = _third_side(O2R[1], rod[1], C7 + C6)
-    C8 = _angle(O2e, rod[1], O2R[1])
+    O2e = _third_side(O2R[1], length[1], C7 + C6)
+    C8 = _angle(O2e, length[1], O2R[1])
     C13 = C1 + abs(Pr[0] - Pr[1])
     O1e = _third_side(P2e, O1P[1], C13)
     C10 = _angle(P2e, O1e, O1P[1])
-    side = np.sign(Pr[1])
-    er = side * (np.pi - (C13 + C10)) + Pr[1]
+    sign = np.sign(Pr[1])
+    er = sign * (np.pi - (C13 + C10)) + Pr[1]
     C9 = C10 + theta[1] - C8
     O1O2 = _third_side(O2e, O1e, C9)
     C11 = _angle(O1O2, O1e, O2e)
-    bearing = side * (abs(er) - C11)
-    gamma = float(np.arctan2(np.sin(-gamma_z), np.cos(-gamma_z))) * stand.turn
-    return gamma, O1O2 * np.array([np.cos(bearing), stand.turn * np.sin(bearing)])
+    bearing = sign * (abs(er) - C11)
+    gamma = float(np.arctan2(np.sin(-gamma_z), np.cos(-gamma_z))) * side
+    return gamma, O1O2 * np.array([np.cos(bearing), np.sin(bearing)]) * mirror
+
+
+def _angles_between(a: Array, b: Array) -> Array:
+    """(N,) angles of vectors b (N, 2) against a (2,), without sign."""
+    return np.abs(np.arctan2(a[0] * b[:, 1] - a[1] * b[:, 0], b @ a))
 
 
 def _third_side(a: float, b: float, between: float) -> float:
