@@ -26,7 +26,7 @@ class ToleranceVerdict(NamedTuple):
 def plain_verdict(history: ModelHistory, length_unit: str) -> str:
     """Return how far the views disagree on the part, what effects brought, and what the stitched cloud keeps."""
     models = history.models
-    told = (length_text(s.field.mean_abs, length_unit) for s in (models[0], models[-1], history.steps[-1]))
+    told = (length_text(s.field.mean_abs, length_unit, 2) for s in (models[0], models[-1], history.steps[-1]))
     before, now, left = told
     rest = f"In the stitched cloud, where each view has its own correction, {left} remain."
     changes = _added_effects([step.name for step in models[1:]])
