@@ -296,5 +296,6 @@ def _size(why: EffectCourse, unit: str) -> str:
         away = int(np.sum(np.abs(why.predicted) > largest / 2))
         return f"{away} of {len(why.views)} views sit {size} away from the others."
     follows = _plain_covariate(why.follows).partition(":")[0]
-    goes_with = "" if follows == "view order" else f"; it goes with {follows}"
+    article = "" if follows == "time" or follows.startswith("the ") else "the "
+    goes_with = "" if follows == "view order" else f"; it goes with {article}{follows}"
     return f"{why.of.capitalize()} is off by up to {size}{goes_with}."
