@@ -92,7 +92,7 @@ def support_note(dropped: Unsupported) -> str:
         return ""
     return (
         f"{dropped.alone + dropped.looked_through:,} of {dropped.points:,} points ({dropped.share:.2%}) are not in the "
-        f"cloud: {dropped.alone:,} lie on no surface, past {dropped.looked_through:,} other views look"
+        f"cloud: {dropped.alone:,} on no surface, {dropped.looked_through:,} where other views look through"
     )
 
 
