@@ -22,6 +22,7 @@ from data_synth import kinematics
 from data_synth import simulate as simulation
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import plan_for
+from data_synth.moment import Plan
 from data_synth.ordinary_arm import draw_arm
 from data_synth.scene import load_scene
 from data_synth.shapes.spheres import SpherePlate, build_plate, centres
@@ -42,18 +43,18 @@ PLATE = SpherePlate(radius=28.0)
 VIEWS, PIXELS, ARM, FIELD, INCIDENCE = 8, 130, 0.3, 0.01, 0.2
 
 
-def cell(kind: str, seed: int) -> Measured:
-    """Return a session of a sphere plate in a cell of one kind."""
+def cell(kind: str, seed: int, views: int = VIEWS, plan: Plan | None = None) -> Measured:
+    """Return a session of a sphere plate in a cell of one kind; of the views of a plan, if one is given."""
     scene = load_scene("spheres")
     scanner = replace(scene.scanner, columns=PIXELS, rows=PIXELS)
     if kind == "smooth scanner errors":
         scanner = replace(scanner, field_error=FIELD)
     part = replace(scene.part, labelled=False, parameters={"radius": PLATE.radius})
-    scene = replace(scene, scanner=scanner, plan=replace(scene.plan, views=VIEWS), part=part)
+    scene = replace(scene, scanner=scanner, plan=replace(scene.plan, views=views), part=part)
     hidden = {"effect in the model": {"joint_compliance": 1.0}, "smooth scanner errors": {"incidence_bias": INCIDENCE}}
+    plan, rail = plan_for(scene, seed) if plan is None else (plan, np.zeros(len(plan.joints)))
     if kind != "ordinary arm":
-        return simulate(scene, hidden.get(kind, {}), seed)
-    plan, rail = plan_for(scene, seed)
+        return simulate(scene, hidden.get(kind, {}), seed, planned=(plan, rail))
     arm = draw_arm(scene.arm.joints, ARM, np.random.default_rng([seed, 77]))
     q = plan.joints + arm.offset + arm.sine * np.sin(plan.joints) + arm.cosine * np.cos(plan.joints)
     wrong = replace(scene.arm, a=scene.arm.a + arm.a, d=scene.arm.d + arm.d, alpha=scene.arm.alpha + arm.alpha)

@@ -4,80 +4,103 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from stitch.system.files import whole_file
 from viz.page_parts import page_written, render, versions
 
 # Sources of a budget that a row shows by name.
 _SHOWN = 3
+_WORDS = ("error", "verdict", "what brings U")
 
 
 def write_features(document: Mapping[str, Any], path: Path) -> None:
     """Write the numbers of a run with U, and the bar of every budget."""
     rows = [
         {
-            "name": f"{n['feature']}.{n['quantity']}",
-            "cells": [f"{n['value']:.5g}", f"{n['value'] - n['nominal']:+.2g}", f"{n['U']:.2g}", _degrees(n)],
-            "words": _conformity(n),
-            "bar": [b for b in n["budget"] if b["variance_share"] > 0.005],
+            "cells": [
+                f"{n['feature']}.{n['quantity']}",
+                _rounded(n["value"], n["U"]),
+                _rounded(n["value"] - n["nominal"], n["U"], "+"),
+                _rounded(n["U"], n["U"]),
+                n["unit"],
+                _degrees(n),
+                _conformity(n),
+            ],
+            "mark": {True: "good", False: "bad", None: "check"}[n["conforms"]],
+            "budget": [b for b in n["budget"] if b["variance_share"] > 0.005],
             "told": ", ".join(f"{b['source']} {100 * b['variance_share']:.0f} %" for b in n["budget"][:_SHOWN]),
         }
         for n in document["numbers"]
     ]
-    sentence = f"{len(rows)} numbers in {document['length_unit']} and rad, each with U (k = 2)."
-    headings = ("value", "off nominal", "U", "ν")
-    _write(path, "Features", sentence, headings, rows, document["not_included"], ())
+    headings = ("feature", "value", "off nominal", "U", "unit", "ν", "verdict", "what brings U")
+    _write(
+        path,
+        title="Features",
+        sentence=f"{len(rows)} numbers, each with U (k = 2)",
+        tables=[{"name": "Numbers and their budgets", "headings": headings, "rows": rows}],
+        facts=[("Run", document["run"]), ("ν", "degrees of freedom that U rests on")],
+        outside_name="Not in U",
+        outside=document["not_included"],
+    )
 
 
 def write_certificate(document: Mapping[str, Any], path: Path) -> None:
     """Write what an artefact says of a model: passes or fails, on what conditions, until when."""
-    rows = [
+    numbers = [
         {
-            "name": n["feature"],
-            "cells": [f"{n['calibrated']:.5g}", f"{n['deviation']:+.2g}", f"{n['U']:.2g}", f"{n['E_n']:+.2f}"],
-            "words": f"{n['error']}: " + _kept(n["passes"], n["limit"]),
-            "bar": (),
-            "told": "",
+            "cells": [
+                n["feature"],
+                n["error"],
+                *(_rounded(n[key], n["U"]) for key in ("calibrated", "measured")),
+                _rounded(n["deviation"], n["U"], "+"),
+                *(_rounded(n[key], n["U"]) for key in ("U", "U_calibrated")),
+                f"{n['E_n']:+.2f}",
+                *_kept(n),
+            ],
+            "mark": "good" if n["passes"] else "bad",
         }
         for n in document["numbers"]
     ]
-    rows += [
-        {
-            "name": form["feature"],
-            "cells": ["", f"{form['form_95']:.2g}", "", ""],
-            "words": "form of 95 % of the points: " + _kept(form["passes"], form["limit"]),
-            "bar": (),
-            "told": "",
-        }
-        for form in document["forms"]
+    forms = [
+        {"cells": [f["feature"], f"{f['form_95']:.2g}", *_kept(f)], "mark": "good" if f["passes"] else "bad"}
+        for f in document["forms"]
     ]
-    facts = [
-        ("Model", document["run"]),
-        ("Artefact", document["session"]),
-        ("Valid until", document["valid_until"] or "not known: the cell's history was not named"),
-        (
-            "In the manner of",
-            ", ".join(document["in_the_manner_of"]) + "; these exclude scanners that an arm positions",
-        ),
+    unit = document["length_unit"]
+    headings = ("feature", "error", "calibrated", "measured", "deviation", "U", "U calibrated", "Eₙ")
+    limits = ("limit", "verdict")
+    tables = [
+        {"name": f"Sizes, distances and places, {unit} (k = 2)", "headings": (*headings, *limits), "rows": numbers},
+        {"name": f"Form, {unit}", "headings": ("feature", "band of 95 % of the points", *limits), "rows": forms},
     ]
-    headings = ("calibrated", "deviation", "U", "Eₙ")
-    _write(path, "Certificate", document["sentence"], headings, rows, document["conditional_on"], facts)
-
-
-def _write(
-    path: Path,
-    title: str,
-    sentence: str,
-    headings: tuple[str, ...],
-    rows: list[dict[str, Any]],
-    outside: list[str],
-    facts: Any,
-) -> None:
-    facts = [*facts, page_written(), versions()]
-    page = render(
-        "features.html.j2", title=title, sentence=sentence, headings=headings, rows=rows, outside=outside, facts=facts
+    standards = ", ".join(document["in_the_manner_of"])
+    _write(
+        path,
+        title="Certificate",
+        sentence=document["sentence"],
+        mark="light good" if document["passed"] else "light bad",
+        tables=[table for table in tables if table["rows"]],
+        facts=[
+            ("Model", document["run"]),
+            ("Artefact", document["session"]),
+            ("Valid until", document["valid_until"] or "not known: the cell's history was not named"),
+            ("In the manner of", f"{standards}; these exclude scanners that an arm positions"),
+        ],
+        outside_name="Conditional on what U does not hold",
+        outside=document["conditional_on"],
     )
+
+
+def _write(path: Path, facts: list[tuple[str, str]], **content: Any) -> None:
+    facts = [*facts, page_written(), versions()]
     with whole_file(path) as file:
-        file.write_text(page, encoding="utf-8")
+        file.write_text(render("features.html.j2", facts=facts, words=_WORDS, zip=zip, **content), encoding="utf-8")
+
+
+def _rounded(x: float, U: float, sign: str = "") -> str:
+    """A number with as many places as U has with two digits."""
+    places = int(np.clip(1 - np.floor(np.log10(max(U, 1e-12))), 0, 12))
+    return f"{x:{sign}.{places}f}"
 
 
 def _degrees(number: Mapping[str, Any]) -> str:
@@ -91,7 +114,9 @@ def _conformity(number: Mapping[str, Any]) -> str:
     return {True: "conforms", False: "does not conform", None: "U reaches over a limit"}[number["conforms"]]
 
 
-def _kept(passes: bool, limit: float | None) -> str:
+def _kept(error: Mapping[str, Any]) -> tuple[str, str]:
+    """The limit of an error, and whether it is kept."""
+    passes, limit = error["passes"], error["limit"]
     if limit is None:
-        return "no limit stated" if passes else "does not agree"
-    return f"{'within' if passes else 'beyond'} {limit:g}"
+        return "–", "agrees" if passes else "does not agree"
+    return f"{limit:g}", "within" if passes else "beyond"

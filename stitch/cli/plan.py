@@ -37,7 +37,7 @@ _Feature = Annotated[
     typer.Option(
         "--for",
         metavar="FEATURE",
-        help="Where U counts: x,y,z in the stitched cloud's frame, or a feature measured in RUN.",
+        help="Views for U of this place: x,y,z in the stitched cloud's frame, or a feature measured in RUN.",
     ),
 ]
 _Part = Annotated[
@@ -119,11 +119,12 @@ def _require_plan_options(views: int | None, size: float | None, field: float | 
 
 
 def place_of(folder: Path, feature: str | None) -> str | None:
-    """Return the place of a feature that `stitch measure` found in a run, as x,y,z; numbers as they are."""
+    """Return the place of a feature that `stitch measure` found in a run, as x,y,z, with the normal along which its
+    first number counts if it has one; numbers as they are."""
     from stitch.reading.text_files import read_json_object
 
     numbers = read_json_object(folder / "features.json").get("numbers", [])
-    places = {n["feature"]: n["at"] for n in numbers if n.get("at")}
+    places = {n["feature"]: [*n["at"], *(n.get("normal") or [])] for n in numbers if n.get("at")}
     return feature if feature not in places else ",".join(map(str, places[feature]))
 
 
@@ -135,7 +136,7 @@ def _plan_request(views: int | None, split: tuple[str, str] | None, halve: bool,
         find_effect(name)
     if split is not None and split[0] == split[1]:
         raise InputError(f"--split {split[0]} {split[1]}: to fix: name two effects")
-    at = None if feature is None else _option_numbers("--for", feature, "a place as x,y,z, as 0,20,150", 3)
+    at = None if feature is None else _option_numbers("--for", feature, "a place as x,y,z, as 0,20,150", (3, 6))
     return PlanRequest(halve=halve or split is None, split=split, split_any=not halve, views=views, feature=at)
 
 
@@ -172,14 +173,14 @@ def _cell_of_session(
     return session, cell_of_session(session, part, size, field)
 
 
-def _option_numbers(option: str, text: str, what: str, count: int | None = None) -> Array:
+def _option_numbers(option: str, text: str, what: str, counts: tuple[int, ...] = ()) -> Array:
     import numpy as np
 
     try:
         found = np.array([float(word) for word in text.split(",")])
     except ValueError:
         found = np.array([np.nan])
-    if not np.isfinite(found).all() or count not in (None, len(found)):
+    if not np.isfinite(found).all() or (counts and len(found) not in counts):
         raise InputError(f"{option} {text!r}: to fix: give {what}")
     return found
 
@@ -270,7 +271,7 @@ def _show_proposed(plan: Plan) -> None:
         return
     show_table(
         "Further views" + ("" if plan.split is None else f" (to tell {' from '.join(plan.split)})"),
-        ("view", "joints °", "travel °", "U at the part", "told apart"),
+        ("view", "joints °", "travel °", "U at the part" if plan.place_now is None else "U of the place", "told apart"),
         [
             (
                 view.name,
@@ -301,6 +302,9 @@ def _show_after(plan: Plan, now: Outlook, after: Outlook) -> None:
         f"With them U of the hand-eye at the part goes from {before} to {then}; what is left is mostly "
         f"{_source_shares(after.hand_eye)}."
     )
+    if plan.place_now is not None:
+        before, then = (length_text(U, plan.session.length_unit, 2) for U in (plan.place_now, plan.proposed[-1].U))
+        say(f"U of the place of the feature goes from {before} to {then}.")
     if plan.split is not None:
         pairs = [_find_pair(o, plan.split) for o in (now, after)]
         if pairs[0] is not None and pairs[1] is not None:

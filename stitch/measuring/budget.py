@@ -99,7 +99,7 @@ def fit_features(points: RunPoints, features: Sequence[Feature]) -> tuple[Fitted
     """
     tree = cKDTree(points.points, balanced_tree=False, compact_nodes=False)
     placed = [feature for feature in features if feature.kind != "distance"]
-    near = (np.array(sorted(tree.query_ball_point(f.at, reach_of(f))), np.int64) for f in placed)
+    near = (np.sort(np.array(tree.query_ball_point(f.at, reach_of(f)), np.int64)) for f in placed)
     return tuple(fit_feature(feature, points, index) for feature, index in zip(placed, near, strict=True))
 
 

@@ -33,6 +33,7 @@ def _number(n: Number, ratio: float | None) -> dict[str, Any]:
         "feature": n.feature.name,
         "kind": n.feature.kind,
         "at": None if n.feature.kind == "distance" else n.feature.at.tolist(),
+        "normal": n.feature.axis.tolist() if n.feature.kind in ("point", "plane", "deviation") else None,
         "quantity": n.quantity,
         "unit": n.unit,
         "value": n.value,
@@ -53,18 +54,20 @@ def _number(n: Number, ratio: float | None) -> dict[str, Any]:
 
 
 def measure_csv(found: MeasuredFeatures) -> str:
-    """Return a table with a row a number and a column a source: its standard uncertainty, in the number's unit."""
+    """Return a table with a row a number: a column a source, its standard uncertainty in the number's unit, and a
+    column a number, the covariance with that in the product of both units."""
     sources = sorted({source for n in found.numbers for source in n.shares})
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n")
     head = "feature kind quantity unit value nominal u k U degrees_of_freedom lower upper conforms points form_95"
-    write.writerow([*head.split(), *(f"u: {source}" for source in sources)])
-    for n in found.numbers:
+    write.writerow([*head.split(), *(f"u: {source}" for source in sources), *(f"cov: {n.name}" for n in found.numbers)])
+    for n, covariance in zip(found.numbers, found.covariance, strict=True):
         limits = n.limits or ("", "")
         conforms = {True: "yes", False: "no", None: "open" if n.limits else ""}[n.conforms]
         numbers = [_text(x) for x in (n.value, n.nominal, n.u, COVERAGE_FACTOR, n.U, n.degrees)]
         own = [n.feature.name, n.feature.kind, n.quantity, n.unit, *numbers, *map(_text, limits), conforms, n.points]
-        write.writerow([*own, _text(n.form), *(_text(n.u * np.sqrt(n.shares.get(s, 0.0))) for s in sources)])
+        by_source = [n.u * np.sqrt(n.shares.get(s, 0.0)) for s in sources]
+        write.writerow([*own, *map(_text, (n.form, *by_source, *covariance))])
     return out.getvalue()
 
 

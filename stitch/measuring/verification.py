@@ -94,7 +94,8 @@ class Verification:
         beyond = sum(not n.passes for n in self.numbers if n.limit is not None) + sum(not f.passes for f in self.forms)
         told = f"{self.agreeing} of {len(self.numbers)} calibrated numbers agree within U."
         if beyond:
-            return f"The artefact fails: {beyond} errors exceed their limits. {told}"
+            many = "errors exceed their limits" if beyond > 1 else "error exceeds its limit"
+            return f"The artefact fails: {beyond} {many}. {told}"
         return f"The artefact passes. {told}" if self.U_holds else f"The artefact fails: U is too small. {told}"
 
 

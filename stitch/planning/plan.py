@@ -12,7 +12,7 @@ from stitch.diagnosis.thresholds import SEPARATION_LAMBDA
 from stitch.effects.contract import find_effect, require_available
 from stitch.frames import Array
 from stitch.measurement.session import Session
-from stitch.model.model import sizes_of, term_of
+from stitch.model.model import COVERAGE_FACTOR, sizes_of, term_of
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.effect_columns import view_columns, view_responses
 from stitch.observations.surfaces.hand_eye_fit import hand_eye_jacobian
@@ -24,7 +24,6 @@ from stitch.planning.expected_model import (
     PlannedCell,
     Scatter,
     SimulatedViews,
-    displacement,
     simulate_views,
     thinned_surface,
 )
@@ -105,16 +104,18 @@ class PossibleViews:
 
 # Keeps what too few views leave open finite: a radian, and many times any part.
 _OPEN = 1e-8
+# Of a feature so small a share of U is asked for that every view counts that brings something.
+_MUCH = 0.1
 # Whatever the unit, no logarithm of a length comes near.
 _NEVER = -50.0
 
 
 @dataclass(frozen=True)
-class HalvedHandEye:
-    """The hand-eye's U at a point, down to a share of what the present views give it."""
+class KnownPlace:
+    """U of a place, down to a share of what the present views give it."""
 
     channel: TwistChannel
-    middle: Array  # (3,) scanner frame
+    lever: Array  # (n, q) of the place in the channel's parameters
     now: float  # U of the present views, length_unit; NaN where they give none
     share: float = 0.5
 
@@ -122,15 +123,21 @@ class HalvedHandEye:
         """(...) of normal matrices (..., q, q)."""
         scaled, unit = equilibrated(normal)
         inverse = np.linalg.inv(scaled + _OPEN * np.eye(normal.shape[-1]))
-        covariance = (inverse * unit[..., :, None] * unit[..., None, :])[..., :6, :6]
-        flat = covariance.reshape(-1, 6, 6)
-        return np.array([displacement(C, self.middle) for C in flat]).reshape(covariance.shape[:-2])
+        lever = self.lever * unit[..., None, :]
+        return np.asarray(COVERAGE_FACTOR * np.sqrt(np.einsum("...ia,...ab,...ib->...", lever, inverse, lever)))
 
     def progress(self, normal: Array) -> Array:
         """(...) 1 where U has come down to that share; without a present U what its logarithm falls by, never 1."""
         if not np.isfinite(self.now):
             return np.asarray(_NEVER - np.log(self.U(normal)))
         return np.asarray(np.clip(np.log(self.U(normal) / self.now) / np.log(self.share), 0.0, 1.0))
+
+
+def place_lever(place: Array, width: int, start: int = 0) -> Array:
+    """(3, width) by which parameters move a place (3,): a twist, in six columns from `start` on."""
+    lever = np.zeros((3, width))
+    lever[:, start : start + 6] = np.hstack([-frames.skew(place), np.eye(3)])
+    return lever
 
 
 @dataclass(frozen=True)
@@ -153,7 +160,7 @@ class SplitPair:
         return np.asarray(np.minimum(*both))
 
 
-Goal = HalvedHandEye | SplitPair
+Goal = KnownPlace | SplitPair
 
 
 def mean_progress(goals: Sequence[Goal], chosen: Sequence[int], others: Sequence[int]) -> Array:
@@ -258,7 +265,12 @@ class PlanRequest:
     split: tuple[str, str] | None = None  # None: the hardest pair that views can split
     split_any: bool = True
     views: int | None = None  # at the most
-    feature: Array | None = None  # (3,) reference frame
+    feature: Array | None = None  # (3,) reference frame; or (6,) with the direction that counts
+
+    @property
+    def place(self) -> Array | None:
+        """(3,) of the feature, reference frame."""
+        return None if self.feature is None else self.feature[:3]
 
 
 @dataclass(frozen=True)
@@ -269,7 +281,7 @@ class ProposedView:
     joints: Array  # (n,) rad
     T_base_flange: Array  # (4, 4)
     travel: float  # rad, the largest of all joints, from the view before
-    U: float  # of the hand-eye at the part, length_unit; NaN where the hand-eye is not asked for
+    U: float  # of the hand-eye at the part, or of the feature's place, length_unit; NaN where neither is asked for
     separated_share: float  # share of two rivals' forms that are told apart; NaN where no pair is asked for
 
 
@@ -283,6 +295,7 @@ class Plan:
     split: tuple[str, str] | None
     proposed: tuple[ProposedView, ...]
     after: Outlook | None  # None where nothing is proposed
+    place_now: float | None = None  # U of the feature's place by the present views, length_unit; None: not asked for
 
 
 def plan_further_views(session: Session, planned: PlannedCell, request: PlanRequest) -> Plan:
@@ -295,7 +308,7 @@ def plan_further_views(session: Session, planned: PlannedCell, request: PlanRequ
     with library_threads_off():
         cell, present = planned.cell, len(session.views)
         now = (
-            view_outlook(session, cell, planned.fitted_scatter, request.feature)
+            view_outlook(session, cell, planned.fitted_scatter, request.place)
             if present >= _MIN_PRESENT_VIEWS
             else None
         )
@@ -316,25 +329,42 @@ def plan_further_views(session: Session, planned: PlannedCell, request: PlanRequ
         if not chosen:
             return empty
         further = with_views(session, [joints[k] for k in chosen])
-        after = view_outlook(further, cell, told, request.feature, chances=now is None)
+        after = view_outlook(further, cell, told, request.place, chances=now is None)
         split = next((goal.names for goal in goals if isinstance(goal, SplitPair)), None)
+        place_now = next((goal.now for goal in goals if isinstance(goal, KnownPlace) and np.isfinite(goal.now)), None)
         return replace(
-            empty, split=split, proposed=_proposed_views(goals, chosen, further, after.hand_eye.U), after=after
+            empty,
+            split=split,
+            proposed=_proposed_views(goals, chosen, further, None if request.feature is not None else after.hand_eye.U),
+            after=after,
+            place_now=None if request.feature is None else place_now,
         )
 
 
 def _plan_goals(views: PossibleViews, now: Outlook | None, request: PlanRequest) -> list[Goal]:
     goals = list[Goal]()
     if request.halve or now is None:
-        channel, middle = views.channel(), views.simulated.field_middle(request.feature)
-        goal = HalvedHandEye(channel, middle, float("nan"))
-        present = float(goal.U(channel.normal(range(now.views)))) if now else float("nan")
+        goal = _place_goal(views, request)
+        present = float(goal.U(goal.channel.normal(range(now.views)))) if now else float("nan")
         goals.append(replace(goal, now=present))
     if request.split is not None:
         goals.append(_split_goal(views, request.split))
     elif request.split_any and now is not None:
         goals += _hardest_pair_goal(views, now)
     return goals
+
+
+def _place_goal(views: PossibleViews, request: PlanRequest) -> KnownPlace:
+    """The hand-eye at the middle of the field; or, of a feature, where the part lies: what all views share."""
+    channel = views.channel()
+    width = channel.columns.shape[1]
+    if request.feature is None:
+        return KnownPlace(channel, place_lever(views.simulated.field_middle(), width), float("nan"))
+    centre = views.simulated.unconstrained.overlaps.gram.centre
+    lever = place_lever(request.feature[:3] - centre, width, start=6)
+    if len(request.feature) > 3:
+        lever = request.feature[None, 3:] @ lever
+    return KnownPlace(channel, lever, float("nan"), _MUCH)
 
 
 def _split_goal(views: PossibleViews, names: tuple[str, str]) -> SplitPair:
@@ -360,7 +390,7 @@ def _proposed_views(
     """Return what the views bring one after the other.
 
     Args:
-        U_after: with all of them, of their whole scans; the search has thinner ones.
+        U_after: of the hand-eye with all of them, of their whole scans; the search has thinner ones. None: of a place.
     """
     present, out = len(further.views) - len(chosen), list[ProposedView]()
     for k, view in enumerate(further.views[present:]):
@@ -370,11 +400,11 @@ def _proposed_views(
         U, apart = float("nan"), float("nan")
         for goal in goals:
             normal = goal.channel.normal(views)
-            if isinstance(goal, HalvedHandEye):
+            if isinstance(goal, KnownPlace):
                 U = float(goal.U(normal))
             else:
                 apart = float(goal.progress(normal))
         travel = float(np.abs(view.joints - before).max())
         out.append(ProposedView(view.name, view.joints, view.T_base_flange, travel=travel, U=U, separated_share=apart))
-    scale = U_after / out[-1].U
+    scale = 1.0 if U_after is None else U_after / out[-1].U
     return tuple(replace(view, U=scale * view.U) for view in out)

@@ -45,10 +45,14 @@ def test_measure_writes_numbers_budgets_and_a_dfq_file(cell):
     rows = list(csv.DictReader((cell / "run" / "features.csv").open()))
     by_source = [float(rows[0][key]) for key in rows[0] if key.startswith("u: ")]
     assert np.sqrt(np.sum(np.square(by_source))) == pytest.approx(float(rows[0]["u"]), rel=1e-6)
+    own = float(rows[0]["cov: point 1.deviation"]), float(rows[0]["cov: point 2.deviation"])
+    assert own == pytest.approx(matrix[0, :2], rel=1e-6)
     write_features(document, cell / "page.html")
     page = (cell / "page.html").read_text(encoding="utf-8")
     assert "point 1.deviation" in page and "conforms" in page and document["not_included"][0] in page
-    assert place_of(cell / "run", "point 2") == ",".join(map(str, numbers["point 2.deviation"]["at"]))
+    assert place_of(cell / "run", "point 2") == ",".join(
+        map(str, [*numbers["point 2.deviation"]["at"], *numbers["point 2.deviation"]["normal"]])
+    )
     assert place_of(cell / "run", "1,2,3") == "1,2,3"
     dfq = (cell / "part.dfq").read_text("utf-8-sig")
     assert f"K0100 {len(numbers)}" in dfq and "K2110/1 -0.1" in dfq

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stitch.planning.information import TwistChannel, noise_of, separations
-from stitch.planning.plan import HalvedHandEye, choose_views, travel_order
+from stitch.planning.plan import KnownPlace, choose_views, place_lever, travel_order
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_what_a_view_does_not_see_is_as_good_as_unknown():
 def test_the_chosen_views_are_the_best_there_are(channel):
     """Against all pairs of ten views beside the first; and driven the short way round."""
     joints = np.random.default_rng(1).uniform(-1, 1, (10, 6))
-    goal = HalvedHandEye(channel, np.array([0.0, 0.0, 1.0]), now=1e3, share=1e-9)
+    goal = KnownPlace(channel, place_lever(np.array([0.0, 0.0, 1.0]), 9), now=1e3, share=1e-9)
     chosen = choose_views([goal], joints, present=3, most=2)
     best = min(float(goal.U(channel.normal([0, 1, 2, *pair]))) for pair in combinations(range(3, 10), 2))
     assert float(goal.U(channel.normal([0, 1, 2, *chosen]))) == pytest.approx(best, rel=0.02)
@@ -54,13 +54,15 @@ def test_the_chosen_views_are_the_best_there_are(channel):
 
 def test_no_view_is_chosen_that_is_not_needed(channel):
     joints = np.zeros((10, 6))
-    reached = float(np.min(HalvedHandEye(channel, np.zeros(3), 1.0).U(channel.with_each([0, 1, 2], range(3, 10)))))
-    goal = HalvedHandEye(channel, np.zeros(3), now=reached / 0.5 * 1.001)
+    reached = float(
+        np.min(KnownPlace(channel, place_lever(np.zeros(3), 9), 1.0).U(channel.with_each([0, 1, 2], range(3, 10))))
+    )
+    goal = KnownPlace(channel, place_lever(np.zeros(3), 9), now=reached / 0.5 * 1.001)
     assert len(choose_views([goal], joints, present=3, most=6)) == 1
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
 def test_where_there_is_no_hand_eye_yet_as_many_views_are_chosen_as_are_asked_for(channel, unit):
     """In any unit of length."""
-    goal = HalvedHandEye(channel, np.array([0.0, 0.0, unit]), now=float("nan"))
+    goal = KnownPlace(channel, place_lever(np.array([0.0, 0.0, unit]), 9), now=float("nan"))
     assert len(choose_views([goal], np.zeros((10, 6)), present=1, most=4)) == 4
