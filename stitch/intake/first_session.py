@@ -43,7 +43,7 @@ from stitch.intake.readings import (
 from stitch.intake.scan_targets import TargetSearch, find_folder_targets, target_motions
 from stitch.intake.stops import rows_with_scans
 from stitch.integrity.conventions import RelativeScans, register_scan_pairs
-from stitch.measurement.capture import Capture, thin_session
+from stitch.measurement.capture import Capture, distinct_points, thin_session
 from stitch.measurement.session import Cloud, Scanner, Session, Sighting, View
 from stitch.reading.clouds import read_cloud
 from stitch.reading.depth_image import DEPTH_SUFFIXES, find_intrinsics
@@ -367,7 +367,7 @@ def _read_clouds(files: Sequence[Path], box: Array) -> tuple[list[Cloud], list[i
     clouds, kept, lost = list[Cloud](), list[int](), list[InputError]()
     for i, file in enumerate(steps("clouds", files)):
         try:
-            cloud = read_cloud(file)
+            cloud = distinct_points(read_cloud(file))
             cloud = cloud.within(box) if len(box) else cloud
             if len(cloud.points) < _FEWEST:
                 raise InputError(f"{file}: {len(cloud.points)} points show no surface; to fix: take the scan out")
@@ -404,6 +404,7 @@ def _left_out_guess(files: FolderFiles, decided: ConventionChoice, lost: Sequenc
 
 # Factors between clouds and robot that a fitted scale is taken for, within this share.
 _ROUND, _ROUND_NEAR = (1.0, 2.0, 2.5, 4.0, 5.0, 8.0), 0.02
+_INCHES = (25.4, 1 / 25.4, 2.54, 1 / 2.54, 0.0254, 1 / 0.0254)
 # Scanners and robots agree within this share; beyond, a unit is wrong.
 _SCALE = 0.05
 
@@ -416,7 +417,7 @@ def require_scale(files: FolderFiles, scale: float | None, stated: StatedFolder)
     """
     if scale is None or abs(np.log(scale)) < _SCALE:
         return
-    powers = [digit * 10.0**power for digit in _ROUND for power in range(-6, 7)]
+    powers = [digit * 10.0**power for digit in _ROUND for power in range(-6, 7)] + [*_INCHES]
     near = min(powers, key=lambda x: abs(np.log(scale / x)))
     factor = near if abs(scale / near - 1) < _ROUND_NEAR else float(f"{scale:.4g}")
     first = files.clouds[0]

@@ -29,10 +29,13 @@ _DECIMAL = r"[+-]?\d*[.,]\d+(?:[eE][+-]?\d+)?"
 _NUMBER_BEHIND = re.compile(rf"(.*\S\s*[:=])\s+([+-]?\d[\d.,]*(?:[eE][+-]?\d+)?)|(.*[A-Za-z_].*?[:=\s])\s*({_DECIMAL})")
 _NUMBER_BEFORE = re.compile(rf"({_DECIMAL})\s*([A-Za-z°].*)")
 _BRACKETS = str.maketrans("[](){}", " " * 6)
+# Rows of a matrix as MATLAB has them: "T1 = [0.36, 0.93, 0.1; 0.2, …];".
+_ROWS = re.compile(r"\[[^\[\]]*\d\.\d[^\[\]]*;[^\[\]]*\]")
 
 
 def split_cells(line: str, separator: str) -> list[str]:
     """Cells of a line, trimmed."""
+    line = _ROWS.sub(lambda rows: re.sub("[,;] *", separator, rows[0]), line.rstrip("; ")) if ";" in line else line
     line = _POSE_OF_UR.sub("[", line).translate(_BRACKETS).strip()
     if separator == " ":
         return line.split()

@@ -22,6 +22,7 @@ from stitch.observations.surfaces.hand_eye_fit import Repeatability
 from stitch.observations.surfaces.matching import Match, sample_points
 from stitch.observations.surfaces.normal_equations import (
     FINE_SAMPLES,
+    NEAR_NULL,
     Gram,
     Overlaps,
     append_targets,
@@ -99,6 +100,22 @@ class Registration:
     history: tuple[float, ...]
     note: str = ""  # why it ended before the views stood still
     offsets: dict[int, float] = field(default_factory=dict)  # by which whole surfaces of views stand off, outwards
+
+
+def unseen_moves(found: Registration, model_poses: Array) -> Array:
+    """Return (V,) how far register moved each view along its surfaces, where no overlap shows it; length_unit.
+
+    A ball turns and a cylinder slides on itself: such moves come from the noise and from the prior.
+    """
+    g = found.overlaps.gram
+    blocks, factors = np.zeros((g.views, 6, 6)), g.displacement_factors
+    for side in g.pairs.T:
+        np.add.at(blocks, side, g.matrix / np.outer(factors, factors))
+    values, vectors = np.linalg.eigh(blocks)
+    to_centre = frames.make(np.eye(3), -g.centre)
+    moved = frames.log(to_centre @ found.poses @ frames.inverse(model_poses) @ frames.inverse(to_centre)) * factors
+    along = np.einsum("vik,vi->vk", vectors, moved - moved.mean(axis=0))
+    return np.asarray(np.linalg.norm(along * (values < NEAR_NULL * values[:, -1:]), axis=1))
 
 
 def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> Array:

@@ -23,7 +23,7 @@ from stitch.runs.run import Fit, FusedCloud, LedgerStep, StageResult
 from stitch.stages.coarse import CoarseHandEye
 from stitch.stages.correct import Correction
 from stitch.stages.fuse import RegisteredSession, fuse_every_point
-from stitch.stages.register import Method, register, register_targets
+from stitch.stages.register import Method, register, register_targets, unseen_moves
 from stitch.stages.sentences import correct_note, register_note, support_note, surface_sentence, target_sentence
 from stitch.stages.target_fit import FittedSession
 from stitch.statistics.distributions import MAD_TO_SIGMA
@@ -59,7 +59,7 @@ def finish_surfaces(
     clock.lap()
     start = correction.unconstrained[index].poses
     registration = register(own, poses_model, scatter, overlaps.gate, recorder, start, method)
-    note = register_note(registration, session)
+    note = register_note(registration, session, unseen_moves(registration, poses_model))
     registered = _overlap_stage("register", registration.overlaps, len(registration.history), clock.lap(), note)
     registered = replace(registered, method=method.name)
     recorder.stage(registered, registration.poses)

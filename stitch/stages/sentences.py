@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from stitch.frames import Array
 from stitch.measurement.session import Session
 from stitch.observations.surfaces.hand_eye_fit import HandEyeFit, Repeatability
 from stitch.observations.targets.outliers import Outlier
@@ -51,6 +52,8 @@ _WIDENED = 2.5
 # Of fewer degrees of freedom what is usual for arms counts as much as what the views show: seven views leave 30.
 _FEW_DEGREES = 30
 _LISTED = 12
+# Moves along surfaces of so many robust sigmas of the overlaps are worth a note.
+_SLID = 20.0
 
 
 def surface_sentence(
@@ -76,13 +79,20 @@ def surface_sentence(
     )
 
 
-def register_note(found: Registration, session: Session) -> str:
-    """Return which surfaces lie off as a whole, and whether register ended early; empty where neither is so."""
+def register_note(found: Registration, session: Session, unseen: Array) -> str:
+    """Return which surfaces lie off as a whole, which moves mean nothing, and whether register ended early.
+
+    Args:
+        unseen: (V,) how far views were moved where no overlap shows it, length_unit.
+    """
     lines = []
     for v, size in found.offsets.items():
         side = "outside" if size > 0 else "inside"
         apart = length_text(abs(size), session.length_unit)
         lines.append(f"{session.names[v]} lies as a whole {side} the other views, by {apart}")
+    if unseen.max(initial=0.0) > _SLID * found.overlaps.gram.scale:
+        farthest = length_text(float(unseen.max()), session.length_unit, 2)
+        lines.append(f"views slide along these surfaces unseen, here by up to {farthest}: such moves mean nothing")
     return "; ".join([*lines, *([found.note] if found.note else [])])
 
 
