@@ -89,7 +89,13 @@ def exported(run: Path) -> dict[str, str]:
         text = file.read_text(errors="replace") if file.is_file() and name not in CLOUD else ""
         said = "as stated" if "not measured" in text else "written"
         refused = (
-            "not shown" if "do not show" in done.refusal else "no arm" if "robot" in done.refusal else done.refusal
+            "not shown"
+            if "do not show" in done.refusal
+            else "no arm"
+            if "robot" in done.refusal
+            else "package"
+            if "package" in done.refusal
+            else "?"
         )
         out[name] = f"refused: {refused}" if done.code else said
     return out

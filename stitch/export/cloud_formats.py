@@ -115,7 +115,7 @@ def write_pcd(cloud: ColouredCloud, path: Path) -> None:
 
 def write_las(cloud: ColouredCloud, path: Path, packed: bool = False) -> None:
     """Write LAS 1.4, or LAZ, by laspy: colours, and residual and normals as extra dimensions; the session's unit."""
-    laspy = _package("laspy", path)
+    laspy = _package("laspy")
     las = laspy.create(point_format=7, file_version="1.4")
     middle = np.floor((cloud.fused.points.min(axis=0) + cloud.fused.points.max(axis=0)) / 2)
     farthest = max(float(np.abs(cloud.fused.points - middle).max()), 1e-6)
@@ -138,7 +138,7 @@ def write_e57(cloud: ColouredCloud, path: Path) -> None:
     columns = {f"cartesian{axis}": column.copy() for axis, column in zip("XYZ", points.T, strict=True)}
     names = ("colorRed", "colorGreen", "colorBlue")
     columns |= {name: column.copy() for name, column in zip(names, cloud.colours.T, strict=True)}
-    with _package("pye57", path).E57(str(path), mode="w") as file:
+    with _package("pye57").E57(str(path), mode="w") as file:
         file.write_scan_raw(columns)
 
 
@@ -169,8 +169,8 @@ CLOUD_FORMATS: dict[str, tuple[Callable[[ColouredCloud, Path], None], str]] = {
 }
 
 
-def _package(name: str, path: Path) -> Any:
+def _package(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise InputError(f"{path}: needs the package {name}; to fix: pip install 'stitch[formats]'") from None
+        raise InputError(f"this format needs the package {name}; to fix: pip install 'stitch[formats]'") from None

@@ -35,7 +35,8 @@ _ROWS = re.compile(r"\[[^\[\]]*\d\.\d[^\[\]]*;[^\[\]]*\]")
 
 def split_cells(line: str, separator: str) -> list[str]:
     """Cells of a line, trimmed."""
-    line = _ROWS.sub(lambda rows: re.sub("[,;] *", separator, rows[0]), line.rstrip("; ")) if ";" in line else line
+    if ";" in line and _ROWS.search(line):
+        line = _ROWS.sub(lambda rows: re.sub("[,;] *", separator, rows[0]), line.rstrip("; "))
     line = _POSE_OF_UR.sub("[", line).translate(_BRACKETS).strip()
     if separator == " ":
         return line.split()
@@ -268,7 +269,9 @@ def _matrix_columns(header: Sequence[str]) -> tuple[int, ...]:
     return tuple(named) if len(named) in (12, 16) else ()
 
 
-_SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
+_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas", " ": "spaces"}
+# Lines that are drawn, as below the header of a table in Markdown.
+_RULE = re.compile(r"[-|:+=\s]*(?:-{3}|={3})[-|:+=\s]*")
 _COMMENTS = ("#", "%", "//")
 _MAX_TABLE_MB = 50
 
@@ -296,7 +299,8 @@ def read_number_table(file: Path) -> NumberTable:
 
 def parse_number_table(file: Path, content: str) -> NumberTable:
     """The same of a text that was read from a file."""
-    kept = [(i, line.strip()) for i, line in enumerate(content.splitlines(), 1) if line.strip()]
+    lines = [(i, line.strip()) for i, line in enumerate(content.splitlines(), 1)]
+    kept = [(i, line) for i, line in lines if line and not _RULE.fullmatch(line)]
     body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
     if not body:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")

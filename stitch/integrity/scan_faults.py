@@ -180,8 +180,8 @@ def find_static_background(
     )
 
 
-# A point stands still if so many of the other scans have it, within so many spacings and sigmas of their surface; it moves
-# if so few have it. A scene stands still if most points do.
+# A point stands still if so many of the other scans have it, within so many spacings and sigmas of their surface; it
+# moves if so few have it. A scene stands still if most points do.
 _STANDS, _MOVES, _BESIDE, _ACROSS = 0.6, 0.3, 2.0, 4.0
 _MOSTLY, _SEEN_TO_MOVE, _SELDOM = 0.5, 20, 0.25
 

@@ -18,7 +18,7 @@ def written(row, separator, comma):
 @pytest.mark.parametrize("header", [None, "x y z rx ry rz", "# x y z rx ry rz"])
 @pytest.mark.parametrize(
     ("separator", "comma"),
-    [(",", False), (", ", False), (";", False), (";", True), ("\t", True), ("   ", False), (" ", True)],
+    [(",", False), (", ", False), (";", False), (";", True), ("\t", True), ("   ", False), (" ", True), (" | ", True)],
 )
 def test_any_separator_decimal_mark_and_header(tmp_path, separator, comma, header, end):
     lines = [written(row, separator, comma) + separator.strip() * bool(end) for row in ROWS]
@@ -29,6 +29,17 @@ def test_any_separator_decimal_mark_and_header(tmp_path, separator, comma, heade
     table = read_number_table(tmp_path / "t.txt")
     assert np.array_equal(table.numbers, ROWS)
     assert table.header == (("x", "y", "z", "rx", "ry", "rz") if header else None)
+
+
+def test_a_table_in_markdown_and_matrices_in_one_row(tmp_path):
+    (tmp_path / "t.md").write_text("| scan | x | y |\n|:---|---:|---:|\n| a.ply | 1.5 | -2 |\n| b.ply | 2.5 | 3 |\n")
+    table = read_number_table(tmp_path / "t.md")
+    assert table.header == ("x", "y") and table.numbers.tolist() == [[1.5, -2], [2.5, 3]]
+    assert [row[-1] for row in table.labels] == ["a.ply", "b.ply"]
+    rows = "[1.5, 2.5, 3.5, 4.5; 0, 1.5, 0, 9; 0.5, 0, 1, -7; 0, 0, 0, 1]"
+    (tmp_path / "t.txt").write_text(f"T0 = {rows};\nT1 = {rows};\n")
+    expected = [1.5, 2.5, 3.5, 4.5, 0, 1.5, 0, 9, 0.5, 0, 1, -7, 0, 0, 0, 1]
+    assert read_number_table(tmp_path / "t.txt").numbers.tolist() == [expected] * 2
 
 
 def test_brackets_comments_degree_signs_and_names_of_views(tmp_path):
