@@ -31,8 +31,8 @@ X = frames.make(Rotation.from_rotvec([0.08, -0.12, 0.75]).as_matrix(), np.array(
 OFF = frames.exp(np.array([0.003, -0.003, 0.0025, 2.0, -1.5, 1.5]))
 VIEWS, AWAY, HALF, NOISE = 10, 400.0, 70.0, 0.02
 NUMBERS = ("x", "y", "z", "rx", "ry", "rz")
-# U is for a coverage of 95 %; of a dozen numbers one in two cells lies beyond it, none beyond twice.
-BEYOND = 2.0
+# Why an export is refused, by its words.
+REFUSED = {"do not show": "not shown", "robot": "no arm", "needs the package": "its package is not installed"}
 
 
 def flange_poses(kind: str, rng: np.random.Generator, robot: Robot) -> tuple[Array, Array | None]:
@@ -88,15 +88,7 @@ def exported(run: Path) -> dict[str, str]:
         done = command("export", str(run), "--to", name, "-o", str(file))
         text = file.read_text(errors="replace") if file.is_file() and name not in CLOUD else ""
         said = "as stated" if "not measured" in text else "written"
-        refused = (
-            "not shown"
-            if "do not show" in done.refusal
-            else "no arm"
-            if "robot" in done.refusal
-            else "package"
-            if "package" in done.refusal
-            else "?"
-        )
+        refused = next((why for words, why in REFUSED.items() if words in done.refusal), done.refusal)
         out[name] = f"refused: {refused}" if done.code else said
     return out
 
