@@ -5,9 +5,10 @@ broadcast over leading axes and compute in float64. Formulas: Barfoot, *State Es
 Robotics* (2017), chapter 7, reordered to rotation first.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 # Positions in other arrays.
@@ -64,7 +65,7 @@ def log(T: Array) -> Array:
     """Logarithm of transforms (..., 4, 4) -> twists (..., 6); rotation angle in [0, π]."""
     T = np.asarray(T, float)
     R = T[..., :3, :3]
-    rotation = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
+    rotation = rotations(R).as_rotvec().reshape(*R.shape[:-2], 3)
     angle = np.linalg.norm(rotation, axis=-1)
     first, second = _left_jacobian_terms(angle)
     hat = skew(rotation)
@@ -131,16 +132,29 @@ def plane_rows(arms: Array, normals: Array) -> Array:
 
 def from_quaternion(position: Array, quaternion: Array) -> Array:
     """Poses from positions (..., 3) and quaternions (..., 4) in the order x, y, z, w."""
-    quaternion = np.asarray(quaternion, float)
-    R = Rotation.from_quat(quaternion.reshape(-1, 4)).as_matrix()
-    return make(R.reshape(*quaternion.shape[:-1], 3, 3), position)
+    x, y, z, w = np.moveaxis(np.asarray(quaternion, float), -1, 0)
+    length = np.sqrt(x * x + y * y + z * z + w * w)
+    x, y, z, w = x / length, y / length, z / length, w / length
+    rows = [
+        [x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), -x * x - y * y + z * z + w * w],
+    ]
+    return make(np.moveaxis(np.array(rows), (0, 1), (-2, -1)), position)
 
 
 def to_quaternion(T: Array) -> Array:
     """Quaternions (..., 4) in the order x, y, z, w, with w ≥ 0."""
     R = np.asarray(T, float)[..., :3, :3]
-    quaternion = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(canonical=True)
+    quaternion = rotations(R).as_quat(canonical=True)
     return np.asarray(quaternion.reshape(*R.shape[:-2], 4))
+
+
+def rotations(R: Array) -> Any:
+    """Rotations of scipy from matrices (..., 3, 3); a third of a second to load, in which scans are read already."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(R.reshape(-1, 3, 3))
 
 
 def nearest_rotation(matrix: Array) -> Array:
@@ -164,7 +178,9 @@ def is_rigid(T: Array, tolerance: float = 1e-5) -> bool:
 
 def angle_between(T_a: Array, T_b: Array) -> Array:
     """(...,) rotation angle (rad) between transforms (..., 4, 4)."""
-    return np.asarray(np.linalg.norm(log(inverse(T_a) @ T_b)[..., :3], axis=-1))
+    R = np.swapaxes(np.asarray(T_a, float)[..., :3, :3], -1, -2) @ np.asarray(T_b, float)[..., :3, :3]
+    twice_sine = np.linalg.norm([R[..., i, j] - R[..., j, i] for i, j in ((0, 1), (1, 2), (2, 0))], axis=0)
+    return np.asarray(np.arctan2(twice_sine, np.trace(R, axis1=-2, axis2=-1) - 1))
 
 
 def right_jacobian_inverse(rotation: Array) -> Array:

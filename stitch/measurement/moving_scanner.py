@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from stitch import frames
 from stitch.closed_form.hand_eye import park_martin
@@ -83,8 +82,9 @@ class _RobotPath:
         self.times = times
         # Few sessions have a scanner that moves: the others do not wait for it.
         from scipy.interpolate import CubicSpline
+        from scipy.spatial.transform import Rotation, RotationSpline
 
-        self._place = CubicSpline(times, T_reference_mount[:, :3, 3])
+        self._place, self._by_vector = CubicSpline(times, T_reference_mount[:, :3, 3]), Rotation.from_rotvec
         self._turn = RotationSpline(times, Rotation.from_matrix(T_reference_mount[:, :3, :3]))
 
     def at(self, times: Array) -> Array:
@@ -92,7 +92,7 @@ class _RobotPath:
         within = np.clip(times, self.times[0], self.times[-1])
         T = np.tile(np.eye(4), (len(times), 1, 1))
         rate, late = self._turn(within, 1), times - within
-        T[:, :3, :3] = (self._turn(within) * Rotation.from_rotvec(rate * late[:, None])).as_matrix()
+        T[:, :3, :3] = (self._turn(within) * self._by_vector(rate * late[:, None])).as_matrix()
         T[:, :3, 3] = self._place(within) + self._place(within, 1) * late[:, None]
         return T
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.errors import InputError
@@ -88,7 +87,7 @@ def _ptx(file: Path) -> Array:
         lines = [line.split() for _, line in zip(range(_PTX_MATRIX.stop), stream, strict=False)]
     T = np.array(lines[_PTX_MATRIX], float).T
     # Seven digits of a rotation are not quite one.
-    return frames.make(Rotation.from_matrix(T[:3, :3]).as_matrix(), T[:3, 3])
+    return frames.make(frames.rotations(T[:3, :3]).as_matrix()[0], T[:3, 3])
 
 
 def _pcd(file: Path) -> Array | None:
@@ -98,7 +97,7 @@ def _pcd(file: Path) -> Array | None:
     if told is None or len(told) != 7:
         return None
     x, y, z, w, *axis = (float(word) for word in told)
-    return frames.make(Rotation.from_quat([*axis, w]).as_matrix(), np.array([x, y, z]))
+    return frames.from_quaternion(np.array([x, y, z]), np.array([*axis, w]))
 
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stitch import frames
 from stitch.errors import InputError
@@ -160,6 +159,8 @@ def origin(owner: Element, scale: float, where: str = "") -> Array:
     """
     where = where or f"joint {owner.get('name')}"
     element = owner.find("origin")
+    from scipy.spatial.transform import Rotation
+
     xyz, rpy = (attribute_numbers(element, key, "0 0 0", where) for key in ("xyz", "rpy"))
     return frames.make(Rotation.from_euler("xyz", rpy).as_matrix(), xyz * scale)
 

@@ -36,6 +36,10 @@ def test_a_run_loads_nothing_of_the_diagnosis():
     )
 
 
+def test_scans_are_read_and_prepared_while_scipy_is_loaded():
+    assert "scipy" not in loaded("import stitch.reading.session_folder, stitch.measurement.capture")
+
+
 @pytest.mark.parametrize("line", ["--version", "--help"])
 def test_the_list_of_commands_loads_no_mathematics(line):
     code = f"from stitch.cli.main import main\ntry:\n    main({line.split()})\nexcept SystemExit:\n    pass"
