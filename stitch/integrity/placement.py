@@ -24,6 +24,7 @@ from stitch.observations.surfaces.matching import near_pairs, sample_points
 from stitch.observations.surfaces.normal_equations import Overlaps
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.statistics.distributions import binomial_tail
+from stitch.system.threads import parallel
 
 # The same side of a part: normals within 45°; at the same place: within two spacings along the surface.
 _SAME_SIDE, _SPACINGS = np.cos(np.radians(45.0)), 2.0
@@ -129,17 +130,19 @@ def _point_visibility(
     for v, w in near_pairs(scans, poses, reach):
         near[v].append(w)
         near[w].append(v)
-    out = []
-    for v, scan in enumerate(scans):
-        index, turns = sample_points(scan, _CONTRADICTION_PROBES), -(-len(near[v]) // _VIEWS_COMPARED)
+
+    def of_view(v: int) -> dict[int, PointVisibility]:
+        scan, turns = scans[v], -(-len(near[v]) // _VIEWS_COMPARED)
+        index = sample_points(scan, _CONTRADICTION_PROBES)
         shown = {w: np.zeros(len(index), np.int8) for w in near[v]}
         for k, w in enumerate(near[v]):
             asked, T_w_v = slice(k % turns, None, turns), frames.inverse(poses[w]) @ poses[v]
             points = frames.transform(T_w_v, scan.points[index[asked]])
             normals = frames.rotate(T_w_v, scan.normals[index[asked]])
             shown[w][asked] = classify_visibility(scans[w], points, normals, (tolerance, reach))
-        out.append(shown)
-    return out
+        return shown
+
+    return list(parallel(of_view, range(len(scans))))
 
 
 # Two views are linked if most of their correspondences close within the robust gate. A pair that only lies near, with
