@@ -96,7 +96,10 @@ def _fuse_voxels(voxels: _Voxels) -> FusedCloud:
     points = weighted_sums(at, voxels.weight, voxels.points) / weight[:, None]
     normals = weighted_sums(at, voxels.weight, voxels.normals)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    offset = np.einsum("ij,ij->i", voxels.points - points[at], normals[at])
+    offset = np.zeros(len(at))
+    # One axis after the other, as rows of three take several times the memory of what they come to.
+    for p, m, n in zip(voxels.points.T, points.T, normals.T, strict=True):
+        offset += (p - m[at]) * n[at]
     count = np.bincount(at)
     square = np.bincount(at, voxels.weight * offset**2)
     residual = np.where(count > 1, np.sqrt(square / weight), np.nan)
@@ -165,9 +168,14 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
 
     def of_slab(bounds: tuple[float, float]) -> tuple[FusedCloud | None, Unsupported]:
         low, high = (block * number for number in bounds)
-        found, dropped = zip(*(view.voxels(low, high) for view in views), strict=True)
+        found, dropped = list[_Voxels](), Unsupported()
+        for view in views:
+            own, of_view = view.voxels(low, high)
+            found.append(own)
+            dropped += of_view
         voxels = _Voxels(*(np.concatenate([getattr(f, field.name) for f in found]) for field in fields(_Voxels)))
-        return _fuse_voxels(voxels) if len(voxels.cell) else None, sum(dropped, Unsupported())
+        found.clear()
+        return _fuse_voxels(voxels) if len(voxels.cell) else None, dropped
 
     def clouds() -> Iterator[FusedCloud]:
         nonlocal dropped
@@ -222,7 +230,7 @@ class _ViewInSlabs:
         cloud = registered.session.views[v].cloud
         self.whole = None if cloud is None else cloud.whole
         self.moves = moves_points(registered.model.terms)
-        self.placed, self.kept, self.through = _place_scan(self.scan, self.T, v), ~(alone | through), through
+        self.kept, self.through = ~(alone | through), through
         self.surface = np.flatnonzero(~alone) if not alone.all() else np.arange(len(alone))
         some = len(self.surface) < len(alone)
         self.tree = KDTree(self.scan.points[self.surface], leafsize=16) if some else self.scan.tree
@@ -231,31 +239,37 @@ class _ViewInSlabs:
     def voxels(self, low: float, high: float) -> tuple[_Voxels, Unsupported]:
         """Voxels whose number of cells along the axis lies in a range, and how many points support nothing."""
         if self.whole is None:
-            cells = self._cells(self.placed.points.T)
+            in_memory = _place_scan(self.scan, self.T, self.v)
+            cells = self._cells(in_memory.points.T)
             inside = (cells[self.axis] >= low) & (cells[self.axis] < high)
             keep = inside & self.kept
             dropped = Unsupported(
                 *(int(np.sum(m & inside)) for m in (inside, ~self.kept & ~self.through, self.through))
             )
-            return _voxels(self.placed.take(keep), pack_cells([c[keep] for c in cells], self.axis)), dropped
+            return _voxels(in_memory.take(keep), pack_cells([c[keep] for c in cells], self.axis)), dropped
         placed = self._points_near(self.whole, (low - 1) * self.cell, (high + 1) * self.cell)
         cells = self._cells(placed)
         inside = (cells[self.axis] >= low) & (cells[self.axis] < high)
         if not inside.all():
             placed, cells = [p[inside] for p in placed], [c[inside] for c in cells]
+        if not len(placed[0]):
+            return _Voxels(cells[0], np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))), Unsupported()
+        # Placed anew for every slab: kept of hundreds of views they are half a gigabyte.
+        in_memory = _place_scan(self.scan, self.T, self.v)
         different, at = number_groups(pack_cells(cells, self.axis))
         count = np.bincount(at, minlength=len(different))
         mean = np.stack([np.bincount(at, p, len(different)) for p in placed], axis=1) / count[:, None]
         nearest = self._nearest(mean, count)
-        away = mean - self.placed.points[nearest]
-        far = np.einsum("ij,ij->i", away, away)
-        off = np.abs(np.einsum("ij,ij->i", away, self.placed.normals[nearest]))
+        normal = in_memory.normals[nearest]
+        away = mean - in_memory.points[nearest]
+        far, off = np.einsum("ij,ij->i", away, away), np.abs(np.einsum("ij,ij->i", away, normal))
+        del away
         alone = far > _WITHIN**2 * self.scan.area[nearest]
         alone |= self.scan.usable[nearest] & (off > _SIGMAS * self.scan.noise + self.off_plane * np.sqrt(far))
         through = self.through[nearest] & ~alone
         keep = ~(alone | through)
-        weight = (count * self.placed.weight[nearest])[keep]
-        found = _Voxels(different[keep], weight, mean[keep], self.placed.normals[nearest[keep]])
+        weight = (count * in_memory.weight[nearest])[keep]
+        found = _Voxels(different[keep], weight, mean[keep], normal[keep])
         return found, Unsupported(len(at), int(count[alone].sum()), int(count[through].sum()))
 
     def _cells(self, columns: Iterable[Array]) -> list[Indices]:

@@ -68,11 +68,16 @@ def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> Ra
     Args:
         cell: the smallest edge of a bin at the middle range, length_unit.
     """
-    away = [scan.points[keep] - scan.eye for scan, keep in zip(scans, kept, strict=True)]
-    ranges = [np.linalg.norm(a, axis=1) for a in away]
-    rays = [a / r[:, None] for a, r in zip(away, ranges, strict=True)]
-    axes = _axes_about(np.sum([d.mean(axis=0) for d in rays], axis=0))
-    maps = [_on_map(d, axes) for d in rays]
+
+    def rays(scan: Scan, keep: Mask) -> tuple[Array, Array]:
+        away = scan.points[keep] - scan.eye
+        far = np.linalg.norm(away, axis=1)
+        return far, away / far[:, None]
+
+    # The rays of one view at a time: those of hundreds are hundreds of megabytes.
+    middles, ranges = zip(*((d.mean(axis=0), far) for far, d in map(rays, scans, kept)), strict=True)
+    axes = _axes_about(np.sum(middles, axis=0))
+    maps = [_on_map(rays(scan, keep)[1], axes) for scan, keep in zip(scans, kept, strict=True)]
     # On the map lengths are half the angles, in the middle of the field.
     angle = np.sqrt(np.median([solid_angle(scan) for scan in scans]))
     size = max(_BIN * angle, cell / float(np.median(np.concatenate(ranges)))) / 2

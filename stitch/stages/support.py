@@ -12,7 +12,7 @@ import numpy as np
 from pykdtree.kdtree import KDTree
 
 from stitch.frames import Array, Indices, Mask
-from stitch.measurement.scan import Scan, bounding_box
+from stitch.measurement.scan import Scan
 from stitch.stages.look_through import range_images, solid_angle
 from stitch.statistics.distributions import MAD_TO_SIGMA
 from stitch.system.threads import parallel
@@ -119,9 +119,13 @@ def number_groups(key: Indices) -> tuple[Indices, Indices]:
     ordered = key[order]
     new = np.ones(len(key), bool)
     new[1:] = ordered[1:] != ordered[:-1]
+    different = ordered[new]
+    del ordered
+    number = np.cumsum(new)
+    number -= 1
     at = np.empty(len(key), np.int64)
-    at[order] = np.cumsum(new) - 1
-    return ordered[new], at
+    at[order] = number
+    return different, at
 
 
 def weighted_sums(group: Indices, weight: Array, values: Array) -> Array:
@@ -142,8 +146,14 @@ def _points_on_surface(placed: PlacedPoints, cell: float) -> tuple[Mask, float]:
     mean, normal = (weighted_sums(at, placed.weight, values) for values in (placed.points, placed.normals))
     mean /= weight[:, None]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    off = np.abs(np.einsum("ij,ij->i", placed.points - mean[at], normal[at]))
-    alike = np.einsum("ij,ij->i", placed.normals, normal[at]) > _ALIKE
+    off, cosine = np.zeros(len(at)), np.zeros(len(at))
+    # One axis after the other: of hundreds of views, rows of three are hundreds of megabytes.
+    for p, n, m, across in zip(placed.points.T, placed.normals.T, mean.T, normal.T, strict=True):
+        own = across[at]
+        off += (p - m[at]) * own
+        cosine += n * own
+    off, alike = np.abs(off), cosine > _ALIKE
+    del cosine, mean, normal
     groups, group = number_groups(at * views + placed.view)
     seen = np.bincount(groups // views, minlength=len(weight))
     several = placed.usable & (seen > 1)[at]
@@ -255,9 +265,9 @@ def _in_loose_body(points: Array, every: Indices, settled: Mask, contradicted: M
         return loose
     from scipy.ndimage import label
 
-    low, high = bounding_box(points[every])
-    step = max(_GAP * cell, float((high - low).max()) / _STEPS)
-    at = tuple(((points[every] - low) / step).astype(np.int64).T)
+    columns = [column[every] for column in points.T]
+    step = max(_GAP * cell, *(float(np.ptp(column)) / _STEPS for column in columns))
+    at = tuple(((column - column.min()) / step).astype(np.int32) for column in columns)
     grid = np.zeros([int(i.max()) + 1 for i in at], bool)
     grid[at] = True
     body = label(grid, np.ones((3, 3, 3)))[0][at]
