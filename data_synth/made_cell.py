@@ -3,6 +3,7 @@
 import json
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -93,9 +94,9 @@ def _sphere_lines(folder: Path, seed: int) -> Truth:
     return {"hand_eye": cell.T_mount, "centre": cell.centre}
 
 
-def _window_line(folder: Path, seed: int) -> Truth:
+def _window_line(folder: Path, seed: int, sweeps: bool = False) -> Truth:
     """The window is set where the true places say, with the robot's own errors, and the seam is scanned."""
-    line = WindowLine(seed)
+    line = WindowLine(seed, sweeps=sweeps)
     window_line_job.write_line(folder, line)
     truth = {
         "hand_eye": line.T_flange_scanner,
@@ -116,19 +117,18 @@ def _two_sessions(folder: Path, seed: int) -> Truth:
     return {name: truth_of(measured) for name, measured in days.items()}
 
 
+_LINE = (
+    "stitch calibrate sphere FOLDER/sphere -o FOLDER/hand-eye.json",
+    "stitch fit FOLDER/window.toml -o FOLDER/found-window",
+    "stitch fit FOLDER/body.toml -o FOLDER/found-body",
+    "stitch seam FOLDER/seam.toml -o seam.csv",
+)
 CELLS = {
     "drilling": Made(_drilling, ("stitch drill FOLDER/job.toml --report page.html",)),
     "panel-robots": Made(_panel, ("stitch panel FOLDER/job.toml -o commands",)),
     "two-bases": Made(_two_bases, ("stitch base FOLDER/stand.toml",)),
     "sphere-lines": Made(_sphere_lines, ("stitch calibrate sphere FOLDER/sphere -o hand-eye.json",)),
-    "window-line": Made(
-        _window_line,
-        (
-            "stitch calibrate sphere FOLDER/sphere -o FOLDER/hand-eye.json",
-            "stitch fit FOLDER/window.toml -o FOLDER/found-window",
-            "stitch fit FOLDER/body.toml -o FOLDER/found-body",
-            "stitch seam FOLDER/seam.toml -o seam.csv",
-        ),
-    ),
+    "window-line": Made(_window_line, _LINE),
+    "window-sweeps": Made(partial(_window_line, sweeps=True), _LINE),
     "two-sessions": Made(_two_sessions, ("stitch run FOLDER/first FOLDER/second",)),
 }

@@ -5,14 +5,14 @@ controller reports is where it was sent; where it went differs by the robot's an
 Lengths in mm, cell frame: x along the rail, z up; the outer sides of window and body look to +y.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_synth.scanner import Cloud
+from data_synth.scanner import Cloud, Scanner, profile_times
 from data_synth.scanning import scan
 from data_synth.shapes import car_door, spheres
 from data_synth.shapes.car_door import CarDoor, Pane
@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 RADIUS = 30.0  # of the calibration sphere
 RAIL, STOP = 4000.0, 500.0  # length, and distance between the carriage's stops
 _STANDOFF, _WIDE, _NARROW = 500.0, 30.0, 10.0  # of the scanner; narrow is the middle of its chip, undivided
+_SWEEP_SECONDS = 2.0
 _SPHERE = np.array([0.0, 0.0, 900.0])
 
 
@@ -46,9 +47,10 @@ EXACT = Errors(0.005, 0.0, 0.0, 0.0)
 class Scans:
     """What one program of scans brought home."""
 
-    T_cell_flange: Array  # (V, 4, 4) reported, the rail's travel in it
+    T_cell_flange: Array  # (V, 4, 4) reported, the rail's travel in it; of a sweep in its middle
     rail: Array  # (V,) the carriage's stop
     clouds: list[Cloud]
+    velocity: Array | None = None  # (V, 3) mm/s of the flange while it sweeps, cell frame
 
 
 @dataclass
@@ -63,6 +65,7 @@ class WindowLine:
     rays: int = 130  # rows and columns that the scanner reports
     grids: tuple[tuple[int, int], tuple[int, int]] = ((4, 2), (4, 3))  # overview of window and body, along x and z
     edges: int = 10  # scans along each edge
+    sweeps: bool = False  # a line scanner that the robot sweeps without turning, instead of an area scanner that stands
     weld: Weld | None = None  # a bulge that welding left in the body; its CAD has none
     rng: np.random.Generator = field(init=False)
 
@@ -94,15 +97,18 @@ class WindowLine:
         on = T_cell_part @ self.T_window_tool
         return np.array([on @ frames.make(np.eye(3), [0.0, 0.0, -200.0]), on])
 
-    def scan_sphere(self, poses: int = 16) -> Scans:
+    def scan_sphere(self) -> Scans:
         """One stop of the carriage, the wrist turned all ways."""
+        poses = 48 if self.sweeps else 16  # a line shows a third of what an area does
         tilts = self.rng.uniform(-1, 1, (poses, 3)) * np.radians([40.0, 40.0, 100.0])
         aims = np.column_stack([self.rng.uniform(-25, 25, (poses, 2)), self.rng.uniform(-520, -430, poses)])
+        if self.sweeps:  # one line each, beside the sphere's middle
+            aims[:, 1] = self.rng.uniform(0.2, 0.6, poses) * RADIUS
         ahead = looking_at(np.zeros(3), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 0.0)
         R = ahead[:3, :3] @ Rotation.from_euler("xyz", tilts).as_matrix()
         T_sphere_scanner = frames.make(R, np.einsum("vij,vj->vi", R, aims))
         mesh, T = spheres.build(spheres.Sphere(radius=RADIUS)), frames.make(np.eye(3), _SPHERE)
-        return self._scan(mesh, T, T, T_sphere_scanner, self.sphere_errors)
+        return self._scan(mesh, T, T, T_sphere_scanner, self.sphere_errors, lines=1)
 
     def scan_window(self) -> Scans:
         """The window in its rack: an overview, then its edges."""
@@ -148,13 +154,33 @@ class WindowLine:
         T_part_scanner: Array,
         errors: Errors,
         field_of_view: float = _WIDE,
+        lines: int | None = None,
     ) -> Scans:
         """Go where the program says for a part at its nominal place (4, 4); see it where it truly is."""
         reported = T_nominal @ T_part_scanner @ frames.inverse(self.T_flange_scanner_nominal)
         true, rail = self._drive(reported, errors)
         scanner = area_scanner(self.rays, field_of_view, _STANDOFF, depth=640.0, noise=errors.noise)
         seen = frames.inverse(T_true) @ true @ self.T_flange_scanner
+        if self.sweeps:
+            return self._sweep(
+                mesh, T_true, reported, true, rail, replace(scanner, kind="line", rows=lines or self.rays)
+            )
         return Scans(reported, rail, [scan(mesh, T, scanner, NO_FIELD, self.rng) for T in seen])
+
+    def _sweep(
+        self, mesh: trimesh.Trimesh, T_true: Array, reported: Array, true: Array, rail: Array, scanner: Scanner
+    ) -> Scans:
+        """The robot moves along the y axis that the drawing gives the scanner; no line is put to another yet."""
+        length = 2 * _STANDOFF * np.tan(np.radians(scanner.field_of_view / 2))
+        scanner = replace(scanner, sweep=length, speed=length / _SWEEP_SECONDS)
+        velocity = scanner.speed * (reported @ self.T_flange_scanner_nominal)[:, :3, 1]
+        clouds = []
+        for T, v in zip(true, velocity, strict=True):
+            rows = np.tile(T, (scanner.rows, 1, 1))
+            rows[:, :3, 3] += profile_times(scanner)[:, None] * v
+            seen = frames.inverse(T_true) @ rows @ self.T_flange_scanner
+            clouds.append(scan(mesh, seen, scanner, NO_FIELD, self.rng))
+        return Scans(reported, rail, clouds, velocity)
 
     def _drive(self, T_cell_flange: Array, errors: Errors) -> tuple[Array, Array]:
         """Where the flange (V, 4, 4) truly goes, and the carriage's stops (V,)."""

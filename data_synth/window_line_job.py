@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from data_synth.window_job import pose_table, write_path, write_stations
 from data_synth.window_line import RADIUS, Scans, WindowLine
@@ -42,8 +43,9 @@ def write_line(folder: Path, line: WindowLine) -> None:
     write_scans(folder / "body", line.scan_body(), line)
     line.window_mesh.export(folder / "window.stl")
     line.body_cad.export(folder / "body.stl")
-    write_path(folder / "grip.csv", line.grip_path())
-    write_path(folder / "place.csv", line.place_path())
+    for name, path in (("grip", line.grip_path()), ("place", line.place_path())):
+        write_path(folder / f"{name}.csv", path)
+        (folder / f"{name}.src").write_text(_program(name, path), encoding="utf-8")
     write_stations(folder / "stations.csv", *line.stations())
     for part, path, T in (
         ("window", "grip", line.T_cell_window_nominal),
@@ -52,6 +54,14 @@ def write_line(folder: Path, line: WindowLine) -> None:
         text = _FIT.format(part=part, path=path, nominal=pose_table(T))
         (folder / f"{part}.toml").write_text(text, encoding="utf-8")
     (folder / "seam.toml").write_text(_SEAM.format(sigma=np.sqrt(2) * line.errors.shift), encoding="utf-8")
+
+
+def _program(name: str, T_cell_tool: Array) -> str:
+    """The same path as a program of a KUKA, its poses in the cell's frame: x, y, z and A, B, C about z, y', x''."""
+    turns = Rotation.from_matrix(T_cell_tool[:, :3, :3]).as_euler("ZYX", degrees=True)
+    rows = np.round(np.hstack([T_cell_tool[:, :3, 3], turns]), 5) + 0.0
+    moves = ["LIN {" + ",".join(f"{k} {v:.5f}" for k, v in zip("XYZABC", row, strict=True)) + "}" for row in rows]
+    return "\n".join([f"DEF {name} ()", *moves, "END", ""])
 
 
 def write_seam(folder: Path, line: WindowLine) -> None:
@@ -68,12 +78,19 @@ def write_scans(folder: Path, scans: Scans, line: WindowLine, sphere: bool = Fal
     }
     if sphere:
         tables["sphere"] = {"radius": RADIUS}
+    # Of the sphere each view is one line at the pose itself.
+    moves = (
+        ()
+        if scans.velocity is None or sphere
+        else zip(("sweep_x", "sweep_y", "sweep_z"), scans.velocity.T, strict=True)
+    )
+    sweeps = dict(moves)
     session = SessionFiles(
         name=folder.name,
         length_unit="mm",
         mount="eye_in_hand",
         tables=tables,
-        views={"view": names, "cloud": files, **pose_columns(scans.T_cell_flange), "rail_mm": scans.rail},
+        views={"view": names, "cloud": files, **pose_columns(scans.T_cell_flange), "rail_mm": scans.rail, **sweeps},
         clouds={file: cloud_file(cloud) for file, cloud in zip(files, scans.clouds, strict=True)},
     )
     write_session(folder, session)

@@ -13,6 +13,7 @@ from stitch.cells.job_files import POSE_COLUMNS, JobTable, poses_from_columns, r
 from stitch.errors import InputError
 from stitch.frames import Array, Indices
 from stitch.measurement.scan import Scan, prepare_scan
+from stitch.measurement.session import Session
 from stitch.reading.clouds import read_cloud
 from stitch.reading.session_folder import load_session
 from stitch.units import METRES
@@ -30,6 +31,7 @@ class PlacedScans:
     T_base_flange: Array  # (V, 4, 4) reported
     T_flange_scanner: Array  # (4, 4)
     length_unit: str = "mm"  # as a session states it; a table of scans does not
+    carried: tuple[Array, ...] = ()  # (N, 3) each: how far the flange had moved when a sweep saw each point, base frame
     errors: "PlacingErrors | None" = None  # None: nobody says how the places may err
 
     @property
@@ -49,18 +51,12 @@ class JoinedScans:
     spacing: float
     noise: float  # 1-sigma across the surface, from the scans themselves
     view: Indices  # (N,) the scan that a point comes from
+    carried: Array | float = 0.0  # (N, 3) how far a sweep had moved the flange then, base frame
 
     def take(self, keep: NDArray[np.bool_] | Indices) -> "JoinedScans":
         """The points of a mask or of indices."""
-        return JoinedScans(
-            self.points[keep],
-            self.normals[keep],
-            self.usable[keep],
-            self.area[keep],
-            self.spacing,
-            self.noise,
-            self.view[keep],
-        )
+        names = ("points", "normals", "usable", "area", "view", "carried")
+        return replace(self, **{n: v[keep] for n in names if isinstance(v := getattr(self, n), np.ndarray)})
 
 
 def join_scans(scans: Sequence[Scan], T_base_scanner: Array) -> JoinedScans:
@@ -80,7 +76,8 @@ def join_scans(scans: Sequence[Scan], T_base_scanner: Array) -> JoinedScans:
 def assemble_scans(placed: PlacedScans) -> JoinedScans:
     """Normals, edges and noise of each scan, then one cloud."""
     pairs = zip(placed.names, placed.clouds, strict=True)
-    return join_scans([prepare_scan(name, points) for name, points in pairs], placed.T_base_scanner)
+    joined = join_scans([prepare_scan(name, points) for name, points in pairs], placed.T_base_scanner)
+    return replace(joined, carried=np.vstack(placed.carried)) if placed.carried else joined
 
 
 def read_scan_table(file: Path) -> PlacedScans:
@@ -107,6 +104,8 @@ def read_scan_table(file: Path) -> PlacedScans:
 def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
     """Scans of a session (scanner on the flange) placed by its reported poses and a hand-eye from a JSON file.
 
+    With the columns of SWEEP in views.csv each scan is a sweep: points lie in the scanner's frame at their own time.
+
     Raises:
         InputError: session or hand-eye is missing or malformed, or they do not belong together.
     """
@@ -121,10 +120,40 @@ def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
             raise InputError(
                 f"{folder / 'views.csv'}: view {view.name} has too few points; to fix: scan again or drop its row"
             )
-        clouds.append(view.cloud.points)
+        clouds.append(view.cloud)
     poses = np.array([view.T_base_flange for view in session.views])
     T_flange_scanner, errors = read_hand_eye(hand_eye, session.length_unit, poses)
-    return PlacedScans(tuple(session.names), tuple(clouds), poses, T_flange_scanner, session.length_unit, errors)
+    carried = _sweeps(session)
+    points = [cloud.points for cloud in clouds]
+    if carried:
+        back = (poses @ T_flange_scanner)[:, :3, :3]
+        points = [own + moved @ R for own, moved, R in zip(points, carried, back, strict=True)]
+    names, unit = tuple(session.names), session.length_unit
+    return PlacedScans(names, tuple(points), poses, T_flange_scanner, unit, carried, errors)
+
+
+# Columns of views.csv: the flange's velocity in the base (length_unit/s) while a line scanner sweeps without turning.
+SWEEP = ("sweep_x", "sweep_y", "sweep_z")
+
+
+def _sweeps(session: Session) -> tuple[Array, ...]:
+    """How far the flange had moved when each point was seen, (N, 3) a view; empty where no view is a sweep.
+
+    Raises:
+        InputError: a sweep whose points have no time.
+    """
+    if not all(name in session.views[0].covariates for name in SWEEP):
+        return ()
+    out = []
+    for view in session.views:
+        times = {} if view.cloud is None else view.cloud.scalars
+        if "time" not in times:
+            raise InputError(
+                f"{session.path / 'views.csv'}: view {view.name} is a sweep, and the points of its cloud have no time; "
+                "to fix: write the scalar time, s after the pose of the view, or leave out sweep_x, sweep_y, sweep_z"
+            )
+        out.append(times["time"][:, None] * np.array([view.covariates[name] for name in SWEEP]))
+    return tuple(out)
 
 
 def read_hand_eye(file: Path, length_unit: str, T_base_flange: Array) -> tuple[Array, "PlacingErrors"]:
@@ -185,25 +214,26 @@ class PlacingErrors:
 
     def modes(self, scan: JoinedScans, source: str) -> Iterator[tuple[Indices, Array]]:
         """Modes of one of SOURCES: which points move (M,), and by how much in the base frame (M, 3)."""
-        everything = np.arange(len(scan.points))
+        # Where a sweep's points would lie had the flange not moved: what errs, errs about the flange then.
+        everything, still = np.arange(len(scan.points)), scan.points - scan.carried
         if source == "hand_eye":
             T = self.T_base_flange @ self.T_flange_scanner
             values, vectors = np.linalg.eigh(self.hand_eye)
             for xi in (vectors * np.sqrt(np.maximum(values, 0.0))).T:
                 if xi.any():
-                    yield everything, _moved(T[scan.view], scan.points, xi)
+                    yield everything, _moved(T[scan.view], still, xi)
         elif source == "robot":
             for view in np.unique(scan.view):
                 own = np.flatnonzero(scan.view == view)
                 for xi in np.diag(np.repeat([self.rotation, self.translation], 3)):
                     if xi.any():
-                        yield own, _moved(self.T_base_flange[view], scan.points[own], xi)
+                        yield own, _moved(self.T_base_flange[view], still[own], xi)
         elif self.scanner:
             yield from ((everything, self.scanner * mode) for mode in self._field_modes(scan))
 
     def _field_modes(self, scan: JoinedScans) -> Iterator[Array]:
         T = (self.T_base_flange @ self.T_flange_scanner)[scan.view]
-        ray = scan.points - T[:, :3, 3]
+        ray = scan.points - scan.carried - T[:, :3, 3]
         seen = np.einsum("nji,nj->ni", T[:, :3, :3], ray)
         image = seen[:, :2] / seen[:, 2:]
         # From −1 to 1 over what was scanned of the field.

@@ -291,7 +291,14 @@ def _fit_part(job: FitJob, scan: JoinedScans) -> FittedPart:
 
 def fit_document(job: FitJob, parts: list[FittedPart]) -> dict[str, Any]:
     """Plain data for JSON; length_unit of the CAD, degrees."""
-    return {"format": "stitch-fit-result/1", "noise": job.scan.noise, "parts": [_part_document(p) for p in parts]}
+    nominal = job.T_base_part_nominal
+    return {
+        "format": "stitch-fit-result/1",
+        "length_unit": job.length_unit,
+        "noise": job.scan.noise,
+        "T_base_part_nominal": None if nominal is None else nominal.tolist(),
+        "parts": [_part_document(p) for p in parts],
+    }
 
 
 def _part_document(part: FittedPart) -> dict[str, Any]:

@@ -49,6 +49,8 @@ _J3 = Annotated[
     str | None, typer.Option("--j3", help="Of a FANUC program: own, or j2+j3 where the session's joint 3 is that.")
 ]
 
+_Part = Annotated[int, typer.Option("--part", metavar="N", help="Of a fit with several parts: the one to follow.")]
+
 
 def export_run(
     run: RunFolder,
@@ -62,11 +64,14 @@ def export_run(
     limit: _Limit = LIMIT_MM,
     near: _Near = None,
     j3: _J3 = None,
+    part: _Part = 1,
     effects_file: EffectsFile = None,
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
     """Write what a run found for other programs, or a compensated copy of a robot program.
+
+    RUN may be what `stitch fit -o` wrote: then a program follows the part to where it was found.
 
     \b
     Examples:
@@ -74,6 +79,7 @@ def export_run(
       stitch export runs/blade-17 --to kuka -o scanner.txt
       stitch export runs/blade-17 --to glb -o blade.glb
       stitch export runs/blade-17 --program scan.src -o compensated.src --frame 0,0,0,0,0,0 --tool 0,0,150,0,0,0
+      stitch export found-body --program place.src -o corrected.src --frame 0,0,0,0,0,0
     """
     from stitch.export.arm_model import ARM_FORMATS, arm_of_run
     from stitch.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_of_run, ros_launch
@@ -83,7 +89,9 @@ def export_run(
     require_new(output)
     if program is None and to not in (*HAND_EYE, *ARM, *CLOUD):
         raise InputError(f"--to {to}: to fix: one of {_KINDS}")
-    if program is not None:
+    if program is not None and (run / "fit.json").is_file():
+        _export_moved_program(program, run / "fit.json", output, frame, part=part, as_json=as_json)
+    elif program is not None:
         arm = arm_of_run(run, effects_file, trust)
         _export_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
     elif to in ARM_FORMATS:
@@ -139,25 +147,70 @@ def _export_program(
 ) -> None:
     """Write a compensated copy of a robot program, and print the table of its moves."""
     from stitch.controllers.program import read_program
-    from stitch.controllers.taught_points import program_bytes
     from stitch.export.robot_program import compensated_program
-    from stitch.system.files import whole_file
     from stitch.writing.json_file import to_json
 
-    if output is None:
-        raise InputError(f"{file}: no output file; to fix: name the copy with -o FILE")
     if not 0 < limit < float("inf"):
         raise InputError(f"--limit {limit:g}: to fix: give a length above zero, in mm")
     program = read_program(file, frame, tool)
     copy = compensated_program(program, arm, limit, _nearby_joints(near, arm), _is_j3_coupled(program, j3))
+    places = _write_program(program, copy.texts, output)
+    if as_json:
+        emit(to_json(_program_document(copy, places, limit)))
+    else:
+        _show_moves(copy, places)
+
+
+def _export_moved_program(
+    file: Path, fit: Path, output: Path | None, frame: str | None, *, part: int, as_json: bool
+) -> None:
+    """Write a copy of a program that follows a part to where `stitch fit` found it; print the table of its moves."""
+    from stitch.controllers.program import read_program
+    from stitch.export.robot_program import moved_program, part_motion
+    from stitch.units import angle_text, length_text
+    from stitch.writing.json_file import to_json
+
+    T_base = part_motion(fit, part)
+    copy = moved_program(read_program(file, frame, any_tool=True), T_base)
+    places = _write_program(copy.program, copy.texts, output)
+    rows = copy.rows()
+    if as_json:
+        told = {"format": "stitch-program/1", "program": str(file), "controller": copy.program.controller}
+        emit(to_json(told | {"targets": rows, "files": [str(place) for place in places]}))
+        return
+    say(f"{len(rows)} targets follow the part to where it was found.", bold=True)
+    show_table(
+        f"{file.name}: targets moved",
+        ("target", "line", "moved", "turned"),
+        [
+            (
+                row["target"],
+                str(row["line"]),
+                length_text(row["moved_mm"], "mm", 4),
+                angle_text(row["moved_mrad"] / 1e3),
+            )
+            for row in rows[:_LISTED_TARGETS]
+        ],
+    )
+    if copy.program.unread:
+        lines = ", ".join(map(str, copy.program.unread))
+        say(f"Not moved, since these motions are not read (arcs, registers, computed targets): lines {lines}.")
+    for place in places:
+        say(f"  {place}")
+
+
+def _write_program(program: Program, texts: dict[Path, str], output: Path | None) -> list[Path]:
+    """Write a program's texts to where the copy goes, all or none."""
+    from stitch.controllers.taught_points import program_bytes
+    from stitch.system.files import whole_file
+
+    if output is None:
+        raise InputError(f"{program.file}: no output file; to fix: name the copy with -o FILE")
     places = _output_files(program, output)
     with ExitStack() as stack:
-        for source, text in copy.texts.items():
+        for source, text in texts.items():
             stack.enter_context(whole_file(places[source])).write_bytes(program_bytes(text))
-    if as_json:
-        emit(to_json(_program_document(copy, list(places.values()), limit)))
-    else:
-        _show_moves(copy, list(places.values()))
+    return list(places.values())
 
 
 def _nearby_joints(near: str | None, arm: ArmModel) -> Array | None:

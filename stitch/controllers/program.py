@@ -96,12 +96,13 @@ class Program:
     unread: tuple[int, ...] = ()  # lines of motions whose targets are not read: they stay too
 
 
-def read_program(file: Path, frame: str | None = None, tool: str | None = None) -> Program:
+def read_program(file: Path, frame: str | None = None, tool: str | None = None, any_tool: bool = False) -> Program:
     """Read a program whose points are to be moved.
 
     Args:
         frame: T_base_frame in which the points were taught, numbers as the controller shows them.
         tool: T_flange_tool in force when they were taught, likewise.
+        any_tool: nobody has to state it, since only the tool's own poses count.
 
     Raises:
         InputError: unknown or broken file, points of different frames, poses of an unknown frame or tool, an external
@@ -121,7 +122,9 @@ def read_program(file: Path, frame: str | None = None, tool: str | None = None) 
         raise NoResultError(f"{file}: no taught points found; to fix: export the program with its positions")
     # A script of a UR has its poses in the base.
     needed = {"tool": tool} if reader is universal_robots else {"frame": frame, "tool": tool}
-    _require_known_poses(file, points, [f"--{name}" for name in needed if needed[name] is None])
+    _require_known_poses(
+        file, points, [f"--{name}" for name in needed if needed[name] is None and not (any_tool and name == "tool")]
+    )
     files = dict.fromkeys(p.file for p in points if p.file is not None)
     texts = {file: text} | {path: program_text(path) for path in files}
     times = Counter(p.name for p in every)

@@ -1,5 +1,6 @@
 """A compensated copy of a robot program: what moves, by how much, and whether it is to be believed."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.robot import Robot
 from stitch.model.model import COVERAGE_FACTOR, Term, values_of, with_parameter_values
+from stitch.units import METRES
 
 # A radian weighs as much as this length, m: about the reach of an arm, so that both parts of a twist count alike.
 LEVER = 1.0
@@ -230,6 +232,69 @@ def _require_agreement(program: Program, arm: ArmModel, point: TaughtPoint, T_jo
             f"{program.file} line {point.line}: joints and pose of {point.name} are {off * 1e3:.0f} mm apart; to fix: "
             "check --tool, --frame, and that the session's [robot] is this arm"
         )
+
+
+# A program moved along with a part that `stitch fit` found beside its nominal place.
+
+
+@dataclass(frozen=True)
+class MovedProgram:
+    """The copy, and how far the tool moves at each target."""
+
+    program: Program
+    moves: Array  # (K, 4, 4) mm, T_meant_commanded of the tool
+    texts: dict[Path, str]
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row a target: how far it moves and turns."""
+        sizes = _move_sizes(frames.log(self.moves), 1.0)
+        return [
+            {"target": point.name, "line": point.line, "moved_mm": float(mm), "moved_mrad": float(mrad)}
+            for point, (mm, mrad) in zip(self.program.points, sizes, strict=True)
+        ]
+
+
+def part_motion(file: Path, part: int = 1) -> Array:
+    """Return T (4, 4) in mm that takes the nominal place of a part to the found one, base frame, from a fit.json.
+
+    Raises:
+        InputError: the file is no fit.json, has no such part, or its job stated no nominal place or no length unit.
+    """
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+        nominal, unit = document["T_base_part_nominal"], document["length_unit"]
+        found = [np.array(own["T_base_part"], float).reshape(4, 4) for own in document["parts"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(f"{file}: is no fit.json of this version; to fix: run stitch fit again with -o") from None
+    if nominal is None or unit not in METRES:
+        missing = "[nominal], the place for which the program was taught" if nominal is None else 'length_unit = "mm"'
+        raise InputError(f"{file}: the job of this fit states no {missing}; to fix: state it, and run stitch fit again")
+    if not 1 <= part <= len(found):
+        raise InputError(f"{file}: has {len(found)} parts, no part {part}; to fix: name one of them with --part")
+    T = found[part - 1] @ frames.inverse(np.array(nominal))
+    return _scaled_pose(T, METRES[unit] * 1e3)
+
+
+def moved_program(program: Program, T_base: Array) -> MovedProgram:
+    """Return the copy whose targets stand to the moved part as the program's own do to the nominal one.
+
+    Args:
+        T_base: (4, 4) mm, motion of the part in the base frame.
+
+    Raises:
+        InputError: a target with joint angles, which say nothing of its place without the arm.
+    """
+    moves = []
+    for point in program.points:
+        if point.T_frame_tool is None or point.joints is not None:
+            raise InputError(
+                f"{program.file} line {point.line}: {point.name} is taught by joint angles, which do not say where it "
+                "lies; to fix: teach it as a pose"
+            )
+        meant = program.T_base_frame @ point.T_frame_tool
+        moves.append(frames.inverse(meant) @ T_base @ meant)
+    turns = np.zeros((len(moves), 1))
+    return MovedProgram(program, np.array(moves), compensated_texts(program, np.array(moves), turns))
 
 
 # Decimals of positions, of rotations and of joint angles: what each controller stores, so that a moved target is not

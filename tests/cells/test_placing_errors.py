@@ -18,14 +18,18 @@ from stitch.cells.placed_scans import (
     JoinedScans,
     PlacedScans,
     PlacingErrors,
+    assemble_scans,
     join_scans,
     read_hand_eye,
+    read_placed_session,
     stated_errors,
 )
 from stitch.cells.scan_to_cad import fit_cad
 from stitch.cells.seam import Limits, Station, measure_seam
 from stitch.errors import InputError
 from stitch.measurement.scan import prepare_scan
+from stitch.measurement.session import Cloud
+from stitch.writing.session_files import SessionFiles, pose_columns, write_session
 
 DOOR = {"length": 600.0, "height": 520.0, "belt": 300.0, "window_frame": 34.0}
 X = frames.make(np.eye(3), [0.0, 130.0, 90.0])  # T_flange_scanner
@@ -65,6 +69,48 @@ def test_modes_move_points_as_frames_do(pane):
     truly = join_scans(scans, T_base_flange @ X).points - scan.points
     assert len(modes) == 3 * len(scans) and not truly[scan.view != 1].any()
     assert np.abs(moved - truly[own]).max() < 1e-3 * np.abs(moved).max()
+
+
+def sweeps(folder, columns=("sweep_x", "sweep_y", "sweep_z"), time=True):
+    """Two sweeps over a plane; returns the session, its hand-eye, and where each sweep's points lie in the base."""
+    rng = np.random.default_rng(3)
+    T_flange_scanner = X @ frames.exp(np.array([0.3, -0.2, 0.1, 0, 0, 0]))
+    poses = np.array([frames.exp(np.append(rng.normal(0, 0.5, 3), rng.normal(0, 300, 3))) for _ in range(2)])
+    velocity, clouds, places = rng.normal(0, 60, (2, 3)), {}, []
+    for k, T in enumerate(poses):
+        place, t = np.column_stack([rng.uniform(0, 100, (80, 2)), np.zeros(80)]), rng.uniform(-1, 1, 80)
+        scanner = np.array([frames.make(np.eye(3), v) @ T @ T_flange_scanner for v in t[:, None] * velocity[k]])
+        seen = np.array([frames.transform(frames.inverse(A), p) for A, p in zip(scanner, place, strict=True)])
+        clouds[f"v{k}.ply"] = Cloud(seen, scalars={"time": t} if time else {})
+        places.append(place)
+    views = {"view": ["v0", "v1"], "cloud": list(clouds), **pose_columns(poses)}
+    views |= dict(zip(columns, velocity.T, strict=True))
+    write_session(folder / "s", SessionFiles("s", "mm", "eye_in_hand", views, clouds=clouds, scalar="<f8"))
+    (folder / "x.json").write_text(json.dumps({"hand_eye": T_flange_scanner.tolist(), "length_unit": "mm"}))
+    return read_placed_session(folder / "s", folder / "x.json"), velocity, places
+
+
+def test_sweeps_are_put_together_by_the_flange_s_motion(tmp_path):
+    placed, _, places = sweeps(tmp_path)
+    for T, cloud, place in zip(placed.T_base_scanner, placed.clouds, places, strict=True):
+        assert np.abs(frames.transform(T, cloud) - place).max() < 1e-3  # clouds hold seven digits
+
+
+def test_errors_of_a_sweep_turn_about_the_flange_where_it_was(tmp_path):
+    placed, _, _ = sweeps(tmp_path)
+    scan = assemble_scans(placed)
+    errors = PlacingErrors(placed.T_base_flange, placed.T_flange_scanner, np.outer(XI, XI))
+    moved = list(errors.modes(scan, "hand_eye"))[-1][1]
+    T = placed.T_base_scanner[scan.view]
+    local = np.einsum("nji,nj->ni", T[:, :3, :3], scan.points - np.vstack(placed.carried) - T[:, :3, 3])
+    truly = frames.transform(T @ frames.exp(XI), local[:, None])[:, 0] + np.vstack(placed.carried) - scan.points
+    sign = np.sign((truly * moved).sum())
+    assert np.abs(sign * moved - truly).max() < 1e-3 * np.abs(truly).max()
+
+
+def test_a_sweep_without_times_is_refused(tmp_path):
+    with pytest.raises(InputError, match="view v0 is a sweep, and the points of its cloud have no time; to fix"):
+        sweeps(tmp_path, time=False)
 
 
 def test_scanner_error_has_its_rms_along_the_ray(pane):

@@ -2,9 +2,11 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from data_synth.window_line import EXACT, Errors, WindowLine
 from data_synth.window_line_job import write_line, write_seam
@@ -30,8 +32,6 @@ def run(*arguments):
 
 def path_end(file):
     """The last pose of a path: x, y, z and turns about z, y', x'' in degrees."""
-    from scipy.spatial.transform import Rotation
-
     row = list(csv.DictReader(file.open()))[-1]
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler(
@@ -45,14 +45,16 @@ def furthest(T, true, mesh):
     return np.linalg.norm(frames.transform(T, mesh.vertices) - frames.transform(true, mesh.vertices), axis=1).max()
 
 
-@pytest.fixture(scope="module")
-def placed(tmp_path_factory):
+@pytest.fixture(scope="module", params=[False, True], ids=["area", "sweeps"])
+def placed(tmp_path_factory, request):
     """Scanner noise while sphere and parts are scanned; robot and rail exact, so that the limits are the scanner's."""
     folder = tmp_path_factory.mktemp("line")
     scanner_alone = Errors(noise=0.05, turn=0.0, shift=0.0, rail=0.0)
     # Rays as in the full line: at fewer, the pane's flanks of 4 mm are not seen and nothing holds it in its plane.
     grids = (2, 1), (2, 2)
-    line = WindowLine(3, scanner_alone, scanner_alone, EXACT, DOOR, grids=grids, edges=7, weld=WELD)
+    line = WindowLine(
+        3, scanner_alone, scanner_alone, EXACT, DOOR, grids=grids, edges=7, weld=WELD, sweeps=request.param
+    )
     write_line(folder, line)
     in_rack = line.T_cell_window
     run("calibrate", "sphere", folder / "sphere", "-o", folder / "hand-eye.json")
@@ -72,6 +74,27 @@ def test_parts_are_found_and_the_window_goes_where_the_drawing_puts_it(placed):
     assert furthest(np.linalg.inv(line.T_cell_body) @ line.T_cell_window, np.eye(4), line.window_mesh) < 0.05
     # The programmed places are millimetres off: without the found frames the window would miss.
     assert furthest(line.T_cell_body_nominal, line.T_cell_body, line.body_mesh) > 2.0
+
+
+def test_programs_follow_the_parts_as_the_paths_do(placed):
+    folder, _, _ = placed
+    for part, name in (("window", "grip"), ("body", "place")):
+        copy = folder / f"{name}-there.src"
+        if not copy.exists():
+            run(
+                "export",
+                folder / f"found-{part}",
+                "--program",
+                folder / f"{name}.src",
+                "-o",
+                copy,
+                "--frame",
+                "0,0,0,0,0,0",
+            )
+        told = [float(x) for x in re.findall(r"[XYZABC] (-?[0-9.]+)", copy.read_text().splitlines()[-2])]
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.from_euler("ZYX", told[3:], degrees=True).as_matrix(), told[:3]
+        assert np.abs(T - path_end(folder / f"found-{part}" / "path.csv")).max() < 2e-4
 
 
 def test_welding_bulge_shows_in_the_map(placed):
@@ -105,10 +128,10 @@ def test_seam_is_that_of_the_meshes(placed):
         (
             'hand_eye = "hand-eye.json"',
             'hand_eye = "none.json"',
-            "none.json: not found; `stitch calibrate sphere SESSION -o none.json` writes one",
+            "none.json: not found; to fix: write it with `stitch calibrate sphere SESSION -o none.json`",
         ),
-        ('hand_eye = "hand-eye.json"', "", "session needs hand_eye"),
-        ('session = "window"', 'session = "window"\nscans = "grip.csv"', "say where the scans are"),
+        ('hand_eye = "hand-eye.json"', "", "session has no hand_eye; to fix: name the file"),
+        ('session = "window"', 'session = "window"\nscans = "grip.csv"', "no scans; to fix: give scans"),
         ('session = "window"', 'scans = "grip.csv"', "hand_eye goes with session"),
     ],
 )
