@@ -1,6 +1,6 @@
 """Does the sigma of `stitch fit` hold where hand-eye, robot and scanner err? The table of docs/window.md.
 
-Run: python bench/fit_sigma.py [--doors 50] [--first 4700]
+Run: python bench/fit_sigma.py [--doors 50] [--first 4700] [--keep FILE]
 
 Half-size doors, each in another place; the hand-eye errs by its stated covariance, every view by the robot's scatter,
 all views by one smooth error of the scanner that no family of the fit holds (cosines). z is error over sigma, about the
@@ -24,6 +24,7 @@ from stitch import frames
 from stitch.cells.cad import cad_surface
 from stitch.cells.placed_scans import PlacingErrors, join_scans
 from stitch.cells.scan_to_cad import fit_cad
+from stitch.errors import NoResultError
 from stitch.measurement.scan import prepare_scan
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "window.md"
@@ -73,8 +74,14 @@ def fitted(part: str, mesh, cad, seed: int, sources: tuple[str, ...]) -> tuple[n
 
 
 def row(name: str, part: str, sources: tuple[str, ...], seeds: range, mesh, cad) -> str:
-    count = len(seeds)
-    found = [fitted(part, mesh, cad, seed, sources) for seed in seeds]
+    found, refused = [], 0
+    for seed in seeds:
+        try:
+            found.append(fitted(part, mesh, cad, seed, sources))
+        except NoResultError:
+            refused += 1
+    count = len(found)
+    name += f" ({refused} refused)" if refused else ""
     off, sigma, squares = (np.array(column) for column in zip(*found, strict=True))
     z = off / sigma
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], count) / count)
@@ -91,7 +98,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--doors", type=int, default=50)
     parser.add_argument("--first", type=int, default=4700, help="the first seed")
+    parser.add_argument("--keep", type=Path, help="rows that are done; goes on from there")
     given = parser.parse_args()
+    kept = given.keep.read_text(encoding="utf-8").splitlines() if given.keep and given.keep.is_file() else []
     doors, first = given.doors, given.first
     door, pane = car_door.build(CarDoor(**SIZES)), car_door.build_pane(Pane(**SIZES))
     meshes = {"door": (door, cad_surface(door)), "pane": (pane, cad_surface(pane))}
@@ -110,8 +119,12 @@ def main() -> None:
         ("door, all of them", "door", ALL, doors),
         ("pane, all of them", "pane", ALL, 2 * few),
     ):
-        lines.append(row(name, part, sources, range(first, first + count), *meshes[part]))
+        done = next((line for line in kept if line.startswith(f"| {name} ")), None)
+        lines.append(done or row(name, part, sources, range(first, first + count), *meshes[part]))
         print(lines[-1], flush=True)
+        if given.keep and done is None:
+            with given.keep.open("a", encoding="utf-8") as file:
+                file.write(f"{lines[-1]}\n")
     page = PAGE.read_text(encoding="utf-8")
     text = "\n".join(lines)
     PAGE.write_text(page.split(BEGIN)[0] + BEGIN + "\n" + text + "\n" + END + page.split(END)[1], encoding="utf-8")

@@ -15,7 +15,7 @@ from data_synth.base_stand import TwoBases
 from data_synth.drilling_cell import DrillingCell, Sizes
 from data_synth.fixtures.sphere_scans import sphere_cell, write_spheres
 from data_synth.made_session import truth_path
-from data_synth.panel_cell import NAMES, PanelCell
+from data_synth.panel_cell import NAMES
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from data_synth.window_line import WindowLine
@@ -67,17 +67,13 @@ def _drilling(folder: Path, seed: int) -> Truth:
 
 
 def _panel(folder: Path, seed: int) -> Truth:
-    """One leg of one robot is half a millimetre longer than its controller believes."""
-    rng = np.random.default_rng([seed, 9])
-    offsets = np.zeros((len(NAMES), 6))
-    robot, leg = int(rng.integers(len(NAMES))), int(rng.integers(6))
-    offsets[robot, leg] = float(rng.choice([-0.5, 0.5]))
-    cell = PanelCell(seed, leg_offsets=offsets)
+    cell = panel_job.cell_with_a_leg_off(seed)
     panel_job.write_cell(folder, cell)
+    robot, leg = np.unravel_index(np.abs(cell.leg_offsets).argmax(), cell.leg_offsets.shape)
     return {
         "T_world_base": cell.T_world_base,
         "T_world_panel": cell.pose,
-        "hidden": {"robot": NAMES[robot], "leg": leg + 1, "offset": offsets[robot, leg]},
+        "hidden": {"robot": NAMES[robot], "leg": int(leg) + 1, "offset": cell.leg_offsets[robot, leg]},
     }
 
 
@@ -125,7 +121,14 @@ _LINE = (
 )
 CELLS = {
     "drilling": Made(_drilling, ("stitch drill FOLDER/job.toml --report page.html",)),
-    "panel-robots": Made(_panel, ("stitch panel FOLDER/job.toml -o commands",)),
+    "panel-robots": Made(
+        _panel,
+        (
+            "stitch panel FOLDER/job.toml -o commands",
+            "stitch panel FOLDER/job.toml -o moves "
+            '--drive "python -m data_synth.panel_job FOLDER moves/shape_move.csv"',
+        ),
+    ),
     "two-bases": Made(_two_bases, ("stitch base FOLDER/stand.toml",)),
     "sphere-lines": Made(_sphere_lines, ("stitch calibrate sphere FOLDER/sphere -o hand-eye.json",)),
     "window-line": Made(_window_line, _LINE),

@@ -1,10 +1,18 @@
-"""A panel cell's measurements as the files that `stitch panel` reads."""
+"""A panel cell's measurements as the files that `stitch panel` reads.
 
+As a program it stands for the machines: `python -m data_synth.panel_job FOLDER MOVES` lets the robots of a cell that
+`stitch synth panel-robots FOLDER` wrote go where the table MOVES says, and measures anew.
+"""
+
+import csv
+import json
+import sys
 from pathlib import Path
 
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from data_synth import hexapod
 from data_synth.csv_rows import POSE, pose_numbers, write_rows
@@ -26,6 +34,7 @@ _POSE = [(x, a) for x in (-1400.0, -470.0, 470.0, 1400.0) for a in (-0.31, 0.0, 
 _CONTROL = [(-1310.0, -0.03), (-1310.0, 0.03), (-830.0, 0.0)]
 _COLUMN = 0.2197  # angle between neighbouring clamps of that layout
 SKIN = 3.0
+_FILES = {key: f"{key}.csv" for key in ("calibration", "flanges", "targets", "control", "forces")}
 _COMMENT = """# Lengths in mm; poses are x, y, z and a, b, c in degrees about z, y', x''.
 # robots: row by row as the layout counts its clamps, each row from one long edge of the panel to the other.
 # target: where the panel's frame shall stand in the world; z out of the panel, x along its axis.
@@ -79,13 +88,49 @@ def stand_at_target(cell: PanelCell) -> Array:
     return np.asarray(frames.inverse(cell.T_world_base) @ cell.target @ places @ frames.inverse(T_flange_clamp))
 
 
+def cell_with_a_leg_off(seed: int) -> PanelCell:
+    """One leg of one robot is half a millimetre longer or shorter than its controller believes."""
+    rng = np.random.default_rng([seed, 9])
+    offsets = np.zeros((len(NAMES), 6))
+    robot, leg = int(rng.integers(len(NAMES))), int(rng.integers(6))
+    offsets[robot, leg] = float(rng.choice([-0.5, 0.5]))
+    return PanelCell(seed, leg_offsets=offsets)
+
+
 def write_cell(folder: Path, cell: PanelCell, poses: int = 40) -> None:
     """Calibrate the robots, lay the panel on, measure it, and write the job with all its tables."""
-    files = {key: f"{key}.csv" for key in ("calibration", "flanges", "targets", "control", "forces")}
+    commands, seen, stand = calibrated_and_laid(cell, poses)
+    write_calibration(folder / _FILES["calibration"], commands, seen)
+    write_readings(folder, cell, stand)
+    write_job(folder / "job.toml", cell, _FILES)
+
+
+def calibrated_and_laid(cell: PanelCell, poses: int = 40) -> tuple[Array, Array, Array]:
+    """Poses of the calibration (M, 6, 4, 4), what was seen there, and where the robots stand with the panel on them."""
     stand, commands = stand_at_target(cell), calibration_poses(poses, cell.seed)
-    write_calibration(folder / files["calibration"], commands, calibration(cell, commands))
+    seen = calibration(cell, commands)
     cell.drive(stand)
     cell.lay()
+    return commands, seen, stand
+
+
+def drive_and_measure(folder: Path, moves: Path, seed: int) -> None:
+    """Robots of the cell in FOLDER go where a table says, under force control, and its readings are written anew."""
+    cell = cell_with_a_leg_off(seed)
+    calibrated_and_laid(cell)
+    with moves.open(newline="", encoding="utf-8") as stream:
+        rows = {row["robot"]: [float(row[key]) for key in POSE.split()] for row in csv.DictReader(stream)}
+    numbers = np.array([rows[name] for name in NAMES])
+    stand = frames.make(Rotation.from_euler("ZYX", numbers[:, 3:], degrees=True).as_matrix(), numbers[:, :3])
+    # Elastic and without friction: how the panel lies follows from where it was laid and where its clamps are now.
+    cell.rng, cell.compliant = np.random.default_rng([seed, *moves.read_bytes()[-8:]]), True
+    cell.drive(stand)
+    write_readings(folder, cell, stand)
+
+
+def write_readings(folder: Path, cell: PanelCell, stand: Array) -> None:
+    """Where the robots believe they stand (6, 4, 4), and what tracker and force sensors show there."""
+    files = _FILES
     write_flanges(folder / files["flanges"], stand)
     targets, (control, clamp) = pose_targets(), control_points()
     names = [f"T{i + 1}" for i in range(len(targets))]
@@ -93,7 +138,6 @@ def write_cell(folder: Path, cell: PanelCell, poses: int = 40) -> None:
     names = [f"SC{c + 1}.{i % 3 + 1}" for i, c in enumerate(clamp)]
     write_points(folder / files["control"], names, control, cell.track(control), [NAMES[c] for c in clamp])
     write_forces(folder / files["forces"], cell.forces())
-    write_job(folder / "job.toml", cell, files)
 
 
 def write_calibration(file: Path, commands: Array, seen: Array) -> None:
@@ -140,3 +184,9 @@ def write_job(file: Path, cell: PanelCell, files: dict[str, str]) -> None:
         "files": files,
     }
     file.write_text(_COMMENT + tomli_w.dumps(document), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    cell_folder, table = map(Path, sys.argv[1:])
+    known = json.loads(cell_folder.with_name(f"{cell_folder.name}.truth.json").read_text(encoding="utf-8"))
+    drive_and_measure(cell_folder, table, known["seed"])

@@ -65,6 +65,14 @@ def panel(
     recording: RecordingOption = None,
     report: ReportOption = None,
     session: SessionOption = None,
+    drive: Annotated[
+        str | None,
+        typer.Option(
+            "--drive",
+            metavar="COMMAND",
+            help="Moves the robots and measures anew, until the shape is within tolerance.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Robots and tracker in one model; where to send the robots for the panel's place, pose and shape.
@@ -72,11 +80,12 @@ def panel(
     \b
     Examples:
       stitch panel job.toml --report page.html
+      stitch panel job.toml -o moves --drive "./drive-and-measure moves/shape_move.csv"
     """
     from stitch.cells.job_files import Wanted
     from stitch.cells.panel import run_panel
 
-    run_panel(file, Wanted(output, recording, report, session, as_json))
+    run_panel(file, drive, Wanted(output, recording, report, session, as_json))
 
 
 def fit(

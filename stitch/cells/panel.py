@@ -1,6 +1,9 @@
 """A panel job from its readings to the commands of all robots."""
 
 import json
+import shlex
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -289,6 +292,8 @@ def _file_paths(entries: JobTable) -> dict[str, Path]:
     return {key: entries.path(key) for key in entries.entries}
 
 
+# A panel that follows its clamps needs one or two.
+_MOST_CORRECTIONS = 10
 # The source moves 100 mm and turns 2°.
 _DISTANCES = np.linspace(0.0, 100.0, 11)
 _ANGLES = np.radians(np.linspace(0.0, 2.0, 11))
@@ -578,10 +583,66 @@ def _robot_session(readings: ReflectorReadings, model: RobotModel, legs: Legs | 
 # What `stitch panel` does: a job solved, shown, drawn, as a folder of commands and as sessions.
 
 
-def run_panel(file: Path, wanted: Wanted) -> None:
+def control_shape(file: Path, drive: str, folder: Path) -> tuple[PanelJob, PanelResult, list[float]]:
+    """Correct until all control points are within the tolerance.
+
+    The first move takes the panel to its target; from then on its shape is judged there.
+
+    Returns:
+        The last job, its result, and the largest deviation before each correction and at the end, mm.
+
+    Args:
+        drive: a program with its arguments. It sends the robots to shape_move.csv in `folder` and writes the job's
+            flanges, targets, control points and forces anew.
+
+    Raises:
+        InputError: the job has no control points.
+        NoResultError: the program fails, a clamp pulls harder than it may, or ten corrections are not enough.
+    """
+    largest: list[float] = []
+    while True:
+        job = read_panel_job(file)
+        # A pose taken anew from targets on a panel that bends would move it again and again.
+        job = replace(job, targets=None) if largest else job
+        result = solve_panel_job(job)
+        if result.shape_largest is None:
+            raise InputError(f"{file}: files.control is missing; to fix: name the table of the shape's control points")
+        write_folder(job, result, folder)
+        largest.append(float(result.shape_largest.max()))
+        if largest[-1] <= job.tolerance:
+            return job, result, largest
+        if len(largest) > _MOST_CORRECTIONS:
+            raise NoResultError(
+                f"the shape is still {largest[-1]:.2f} mm off after {_MOST_CORRECTIONS} corrections, "
+                f"{job.tolerance:g} mm are allowed; to fix: look at the forces, and which clamp a point belongs to"
+            )
+        _call_machines(drive)
+
+
+def _call_machines(drive: str) -> None:
+    try:
+        done = subprocess.run(shlex.split(drive), check=False, capture_output=True, text=True)
+    except (OSError, ValueError) as error:
+        raise InputError(f"--drive {drive}: {error}; to fix: write a program and its arguments") from None
+    print(done.stdout, end="", file=sys.stderr)
+    if done.returncode:
+        told = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise NoResultError(
+            f"--drive {drive}: exit code {done.returncode}, {told}. The robots stand where it left them; to fix: see "
+            "its message, then call again"
+        )
+
+
+def run_panel(file: Path, drive: str | None, wanted: Wanted) -> None:
     """Solve a job and hand out what was asked for; `InputError` and `NoResultError` end it."""
-    job = read_panel_job(file)
-    result = solve_panel_job(job)
+    largest: list[float] = []
+    if drive is None:
+        job = read_panel_job(file)
+        result = solve_panel_job(job)
+    elif wanted.output is None:
+        raise InputError("--drive: no folder for the moves; to fix: name one with -o")
+    else:
+        job, result, largest = control_shape(file, drive, wanted.output)
     written = []
     if wanted.output is not None:
         written = write_folder(job, result, wanted.output) + write_pictures("panel", wanted.output, job, result)
@@ -589,11 +650,15 @@ def run_panel(file: Path, wanted: Wanted) -> None:
         write_sessions(wanted.session, robot_sessions(job, result))
     write_recording_and_page("panel", wanted.recording, wanted.report, job, result)
     if wanted.as_json:
-        print(json.dumps(panel_document(job, result), indent=1))
+        steps = {"corrections": {"largest_deviation": largest}} if largest else {}
+        print(json.dumps(panel_document(job, result) | steps, indent=1))
         return
     terminal = console()
     _print_model(terminal, result)
     _print_moves(terminal, job, result)
+    if largest:
+        told = " → ".join(f"{size:.2f}" for size in largest)
+        terminal.print(f"Shape control: {len(largest) - 1} corrections, largest deviation {told} mm.")
     for name in written:
         print(f"{wanted.output}/{name}")
 

@@ -2,6 +2,8 @@
 
 import json
 import math
+import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -381,3 +383,65 @@ def test_limits_without_forces_are_refused(tmp_path):
     (tmp_path / "job.toml").write_text("\n".join([*lines, "[limits]", "force_N = 5.0"]))
     with pytest.raises(InputError, match=r"\[limits\] goes with files\.forces; to fix"):
         read_panel_job(tmp_path / "job.toml")
+
+
+# Stands for the machines: the panel is then exactly where its drawing puts it.
+OBEDIENT = """
+import csv, sys, tomllib
+import numpy as np
+from scipy.spatial.transform import Rotation
+target = tomllib.load(open("job.toml", "rb"))["target"]
+R = Rotation.from_euler("ZYX", [target[k] for k in ("a_deg", "b_deg", "c_deg")], degrees=True)
+rows = list(csv.DictReader(open("control.csv")))
+for row in rows:
+    seen = R.apply([float(row[k]) for k in "xyz"]) + [target[k] for k in "xyz"]
+    row |= dict(zip(("seen_x", "seen_y", "seen_z"), seen + float(sys.argv[2])))
+with open("control.csv", "w", newline="") as stream:
+    writer = csv.DictWriter(stream, rows[0])
+    writer.writeheader()
+    writer.writerows(rows)
+assert len(list(csv.DictReader(open(sys.argv[1])))) == 6
+"""
+
+
+@pytest.fixture
+def driven(tmp_path, monkeypatch):
+    shutil.copytree(EXAMPLE, tmp_path / "job")
+    monkeypatch.chdir(tmp_path / "job")
+    (tmp_path / "job" / "machine.py").write_text(OBEDIENT)
+
+    def call(program):
+        with pytest.raises(SystemExit) as stop:
+            main(["panel", "job.toml", "-o", "moves", "--json", "--drive", program])
+        return stop.value.code
+
+    return call
+
+
+def test_shape_is_corrected_until_it_is_within_the_tolerance(driven, capsys):
+    assert driven(f"{sys.executable} machine.py moves/shape_move.csv 0") == 0
+    before, after = json.loads(capsys.readouterr().out)["corrections"]["largest_deviation"]
+    assert before > 1.0 and after < 1e-6
+
+
+def test_a_machine_that_fails_ends_it(driven, capsys):
+    assert driven(f"{sys.executable} -c 1/0") == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "exit code 1, ZeroDivisionError: division by zero. The robots stand where it left them; to fix: " in said
+
+
+@pytest.mark.slow
+def test_a_panel_that_does_not_follow_ends_it(driven, capsys):
+    assert driven(f"{sys.executable} machine.py moves/shape_move.csv 1") == 1
+    assert "the shape is still 1.73 mm off after 10 corrections, 0.6 mm are" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+@pytest.mark.slow
+def test_a_simulated_panel_gets_its_shape_by_one_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    main_code(["synth", "panel-robots", "cell", "--seed", "3"])
+    machine = f"{sys.executable} -m data_synth.panel_job cell moves/shape_move.csv"
+    main_code(["panel", "cell/job.toml", "-o", "moves", "--drive", machine])
+    assert "Shape control: 1 corrections" in capsys.readouterr().out
