@@ -1,4 +1,4 @@
-"""Motions and hand-eye from the odometry of ordered scans: python -m bench.odometry [--seeds N] [--motions].
+"""Motions and hand-eye from the odometry of ordered scans: python -m bench.odometry [--seeds N] [--write].
 
 A stream of a scanner that never stops (`moving-scan`), with and without its de-skew, beside separate views of the same
 arm (`blade-table`). A step is right where it places the middle of the scan within 3 % of the part's size and
@@ -6,6 +6,7 @@ within a quarter of how far it moved. The hand-eye is off by what it moves a poi
 """
 
 import argparse
+import json
 import tempfile
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from stitch.frames import Array
 from stitch.pipeline import run
 from stitch.reading.session_folder import load_session
 
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "session.md"
+BEGIN, END = "<!-- odometry: begin -->", "<!-- odometry: end -->"
 _SAME, _OF_MOTION = 0.03, 0.25
 
 
@@ -42,43 +45,85 @@ def hand_eye_error(measured: Measured, T_mount: Array) -> float:
     return float(np.linalg.norm(((T_mount - measured.T_mount) @ point)[:3]))
 
 
-def row(name: str, measured: Measured, times: list[Array] | None) -> None:
-    """Print one line of the table: shares, and the hand-eye from the odometry."""
+def of_odometry(measured: Measured, times: list[Array] | None) -> dict[str, float]:
+    """Right steps, of how many, whether the scans count as a stream, and how far the hand-eye is off, mm."""
     scans = [cloud.points for cloud in measured.clouds]
     odometry = scan_odometry(scans, times, 1 / measured.scene.plan.rate)
     right, of = right_steps(measured, odometry)
     pairs = turned_pairs(measured.T_base_flange)
     try:
         T_mount = park_martin(motions_between(measured.T_base_flange, pairs), motions_between(odometry, pairs))
-        off = f"{hand_eye_error(measured, T_mount):.2f} mm"
+        off = hand_eye_error(measured, T_mount)
     except NoResultError:
-        off = "–"
-    stream = "yes" if is_stream(measured.T_base_flange, scans) else "no"
-    print(f"| {name} | {stream} | {right} of {of} ({100 * right / of:.0f} %) | {off} |", flush=True)
+        off = float("nan")
+    return {"right": right, "of": of, "stream": is_stream(measured.T_base_flange, scans), "off": off}
+
+
+def of_run(measured: Measured) -> dict[str, float]:
+    """How far the hand-eye of a whole run is off, mm."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_session(Path(folder) / "s", measured, "s")
+        return {"off": hand_eye_error(measured, run(load_session(Path(folder) / "s")).T_mount)}
+
+
+def of_seed(seed: int, views: int) -> dict[str, dict[str, float]]:
+    """Every row's numbers for one seed."""
+    stream, separate = (
+        simulate(load_scene(name), {}, seed, n) for name, n in (("moving-scan", views), ("blade-table", None))
+    )
+    times = [cloud.time for cloud in stream.clouds if cloud.time is not None]
+    return {
+        "`moving-scan`, odometry, de-skewed": of_odometry(stream, times),
+        "`moving-scan`, odometry, as it is": of_odometry(stream, None),
+        "`moving-scan`, the whole run": of_run(stream),
+        "`blade-table`, separate views, odometry": of_odometry(separate, None),
+        "`blade-table`, the whole run": of_run(separate),
+    }
+
+
+def table(seeds: list[dict[str, dict[str, float]]], first: int) -> list[str]:
+    """Steps of all seeds together; of the hand-eyes the middle and the range."""
+    lines = [
+        f"{len(seeds)} seeds from {first} on. A motion from scan to scan is right within 3 % of the part's size and "
+        "within a quarter of itself; the hand-eye is off by what it displaces a point at the working distance (median, "
+        "range).",
+        "",
+        "| scans | taken for a stream | right motions | hand-eye off by (mm) |",
+        "|---|---|---:|---:|",
+    ]
+    for name in seeds[0]:
+        rows = [seed[name] for seed in seeds]
+        off = np.array([row["off"] for row in rows])
+        right, of = (sum(row.get(key, 0) for row in rows) for key in ("right", "of"))
+        share = f"{right:.0f} of {of:.0f} ({100 * right / of:.0f} %)" if of else ""
+        streams = f"{sum(row['stream'] for row in rows)} of {len(rows)}" if of else ""
+        lines.append(f"| {name} | {streams} | {share} | {np.median(off):.2f} ({off.min():.2f} … {off.max():.2f}) |")
+    return lines
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--views", type=int, help="of the stream; default is the scene's")
-    parser.add_argument("--motions", action="store_true", help="without the whole runs")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first", type=int, default=4900)
+    parser.add_argument("--views", type=int, default=40, help="of the stream")
+    parser.add_argument("--keep", type=Path, help="seeds that are done; goes on from there")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/session.md")
     given = parser.parse_args()
-    print("| scans | taken for a stream | right motions | hand-eye from the odometry off by |\n|---|---|---:|---:|")
-    for seed in range(given.seeds):
-        stream, views = (
-            simulate(load_scene(name), {}, seed, count)
-            for name, count in (("moving-scan", given.views), ("blade-table", None))
-        )
-        row(f"stream {seed}, de-skewed", stream, [cloud.time for cloud in stream.clouds if cloud.time is not None])
-        row(f"stream {seed}, as it is", stream, None)
-        row(f"separate views {seed}", views, None)
-        for name, measured in () if given.motions else (("stream", stream), ("separate views", views)):
-            with tempfile.TemporaryDirectory() as folder:
-                write_session(Path(folder) / "s", measured, name)
-                found = run(load_session(Path(folder) / "s"))
-            print(
-                f"| {name} {seed}, the whole run | | | {hand_eye_error(measured, found.T_mount):.2f} mm |", flush=True
-            )
+    done = (
+        [json.loads(line) for line in given.keep.read_text().splitlines()]
+        if given.keep and given.keep.is_file()
+        else []
+    )
+    for seed in range(given.first + len(done), given.first + given.seeds):
+        done.append(of_seed(seed, given.views))
+        if given.keep:
+            with given.keep.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(done[-1]) + "\n")
+    lines = table(done, given.first)
+    print("\n".join(lines))
+    if given.write:
+        head, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
+        PAGE.write_text("\n".join([head + BEGIN, *lines, END]) + rest.partition(END)[2], encoding="utf-8")
 
 
 if __name__ == "__main__":

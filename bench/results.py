@@ -1,14 +1,16 @@
-"""The first table of docs/results.md: every row of the five sources and of the main line, each run by its command.
+"""The first tables of docs/results.md: every row of the five sources and of the main line, each run by its command.
 
-Run: python bench/results.py
+Run: python bench/results.py [--only 001 …]
 
 Commands of `stitch` run in an empty folder, on the simulator's cells and on examples/. Rows of many cells belong to
 the scripts that are named; their figures are read from the pages that these scripts write.
 """
 
+import argparse
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -38,9 +40,10 @@ class Room:
     def run(self, command: str) -> str:
         """What a command prints, standard output first."""
         if command not in self.printed:
-            call = [str(Path(sys.executable).parent / "stitch"), *command.split()[1:]]
-            environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "200"}
-            done = subprocess.run(call, cwd=self.folder, env=environment, check=False, capture_output=True, text=True)
+            programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+            environment = {**os.environ, "PATH": programs, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
+            call, here = shlex.split(command), ROOT if "pytest" in command else self.folder
+            done = subprocess.run(call, cwd=here, env=environment, check=False, capture_output=True, text=True)
             self.printed[command] = done.stdout or done.stderr
             print(f"{done.returncode} {command}", file=sys.stderr)
         return self.printed[command]
@@ -114,7 +117,7 @@ HIDDEN = (
     "stitch add hidden-run --suggested",
 )
 LINE = (
-    "stitch synth window-line line --seed 3",
+    "stitch synth window-sweeps line --seed 3",
     "stitch calibrate sphere line/sphere -o line/hand-eye.json",
     "stitch fit line/window.toml -o line/found-window",
     "stitch fit line/body.toml -o line/found-body",
@@ -122,6 +125,10 @@ LINE = (
 )
 DRILL = ("stitch synth drilling drilling --seed 3", "stitch drill drilling/job.toml --json")
 PANEL = ("stitch synth panel-robots panel --seed 3", "stitch panel panel/job.toml --json")
+SHAPED = (
+    "stitch panel panel/job.toml -o moves --json --drive 'python -m data_synth.panel_job panel moves/shape_move.csv'"
+)
+PLACE = "stitch export line/found-body --program line/place.src -o line/there.src --frame 0,0,0,0,0,0 --json"
 
 
 # Source 003: window and body.
@@ -141,6 +148,11 @@ def fitted(part: str) -> Callable[[Room], str]:
     return reached
 
 
+def program(room: Room) -> str:
+    moved = [target["moved_mm"] for target in room.json(PLACE)["targets"]]
+    return f"{len(moved)} targets moved by up to {max(moved):.2f} mm, to the found body"
+
+
 def seam(room: Room) -> str:
     stations = room.json(LINE[-1])
     flush, gap = (np.array([s[key] for s in stations]) for key in ("flush", "gap"))
@@ -148,11 +160,15 @@ def seam(room: Room) -> str:
     return f"{good} of {len(stations)} good; flush {np.abs(flush).max():.2f}, gap {gap.min():.2f} to {gap.max():.2f} mm"
 
 
+def each_gap(room: Room) -> str:
+    return ", ".join(f"D{s['station']} {s['gap']:.2f}" for s in room.json(LINE[-1])) + " mm"
+
+
 # Source 001: base to base.
 
 
-def base_of_experiment_1(room: Room) -> str:
-    found = room.json("stitch base examples/base_to_base.toml --json")
+def base_of_experiment_1(room: Room, job: str = "base_to_base") -> str:
+    found = room.json(f"stitch base examples/{job}.toml --json")
     truth = frames.exp(np.array([0, 0, -np.pi / 2, 0, 0, 0]))
     truth[:3, 3] = [4.0, -1.0, 1.0]
     parts = []
@@ -160,6 +176,17 @@ def base_of_experiment_1(room: Room) -> str:
         angle, shift = off(T, truth)
         parts.append(f"{name} {angle:.5f} rad, {shift:.5f} m")
     return "; ".join(parts)
+
+
+def other_planes(room: Room) -> str:
+    found = room.json("stitch base examples/base_to_base_rpy.toml --json")["projection"]
+    _, (px, pz), (py, pz2) = found["offsets"]
+    beta, alpha = found["flange_beta_alpha"]
+    open_planes = sum("open" in plane for plane in found["likewise"].values())
+    return (
+        f"px {px:.4f}, pz {pz:.4f}; py {py:.4f}, pz {pz2:.4f}; the cosine rules are 0/0 in {open_planes} of 2 planes; "
+        f"by the flanges β {beta:.5f}, α {alpha:.5f}"
+    )
 
 
 def flange_of_p1(room: Room) -> str:
@@ -186,6 +213,11 @@ def panel_leg(room: Room) -> str:
     found = {f"{name}{leg['leg']}": leg["offset"] for name, leg in legs.items() if leg["found"]}
     told = ", ".join(f"{name} {size:+.2f} mm" for name, size in found.items()) or "none"
     return f"hidden {hidden['robot']}{hidden['leg']} {hidden['offset']:+.2f} mm; found {told}"
+
+
+def panel_shape(room: Room) -> str:
+    largest = room.json(SHAPED)["corrections"]["largest_deviation"]
+    return f"{' → '.join(f'{size:.2f}' for size in largest)} mm in {len(largest) - 1} corrections"
 
 
 # Source 000: drilling.
@@ -231,6 +263,27 @@ def drill_camera(room: Room) -> str:
     return "; ".join(f"{name} {named.get(name, 0):.3g}, hidden {size:.3g}" for name, size in truth.items())
 
 
+# What the user named by name.
+
+
+def recording(room: Room) -> str:
+    told = room.run("rerun rrd verify blade-run/recording.rrd").strip().splitlines()[-1]
+    return f"{(room.folder / 'blade-run/recording.rrd').stat().st_size / 1e6:.1f} MB; {told}"
+
+
+def batch(room: Room) -> str:
+    room.run(BATCH)
+    runs = list(room.folder.glob("runs/*/result.json"))
+    return f"{len(runs)} of 2 sessions have a run"
+
+
+def mesh_tests(room: Room) -> str:
+    return re.search(r"[^\n]*(passed|skipped|failed)[^\n]* in", room.run(MESHES) + " in").group(0).removesuffix(" in")
+
+
+BATCH = "stitch batch blade hidden -o runs --json --no-recording"
+MESHES = "python -m pytest -n 0 -q -m '' tests/data_synth/test_real_meshes.py"
+
 SYSTEMS: dict[str, tuple[Row, ...]] = {
     "Main line: scans, hand-eye, what is missing": (
         Row("each stage's distance between surfaces", BLADE, "steps are visible with the coarse hand-eye", blade_steps),
@@ -243,14 +296,27 @@ SYSTEMS: dict[str, tuple[Row, ...]] = {
             "DPWVM against GICP, error of the view poses",
             ("python bench/register_weights.py",),
             "DPWVM named without a formula",
-            lambda _: "see [register](register.md)",
+            lambda _: of_page("register.md", r"\| DPWVM-style \|(?:[^|]*\|){5}([^|]*)\|") + " cell by cell",
+        ),
+        Row(
+            "the same with stock on one view",
+            ("python bench/register_weights.py",),
+            "–",
+            lambda _: (
+                of_page("register.md", r"\| DPWVM-style \|(?:[^|]*\|){4}([^|]*)\|")
+                + " µm, GICP "
+                + of_page("register.md", r"\| GICP inside Tukey \|(?:[^|]*\|){4}([^|]*)\|")
+                + " µm"
+            ),
         ),
     ),
     "003: window and car body": (
         Row("hand-eye from a sphere", LINE[:2], "X 926.866, Y 652.648, Z 934.441 mm; no truth", sphere_hand_eye),
         Row("body onto its CAD", (*LINE[:2], LINE[3]), "fit error 1.052", fitted("body")),
         Row("window onto its CAD", LINE[:3], "fit error 0.573", fitted("window")),
+        Row("path corrected for the found body, as the robot's program", (*LINE[:2], LINE[3], PLACE), "–", program),
         Row("flush and gap at eight places", LINE, "flush 0 ± 1.5, gap 16 ± 2 mm", seam),
+        Row("table 1: bond gap at D1 to D8", LINE, "figures lost; all within 16 ± 2 mm", each_gap),
         Row(
             "the whole line, 5 cells: window set against its design place",
             ("python bench/window_line.py",),
@@ -278,10 +344,32 @@ SYSTEMS: dict[str, tuple[Row, ...]] = {
             base_of_experiment_2,
         ),
         Row(
-            "experiment 1, λ = 0.5, 1000 draws: rms in µrad / µm",
-            ("python bench/base_to_base.py",),
-            "170 / 220, one draw",
-            lambda _: of_page("base-to-base.md", r"\| 1 \| 0.5 \| least squares \|([^|]*)\|"),
+            "experiment 1 with flange angles, table 3 at λ = 0.5",
+            ("stitch base examples/base_to_base_rpy.toml",),
+            "0.00017 rad, 0.00022 m",
+            lambda room: base_of_experiment_1(room, "base_to_base_rpy"),
+        ),
+        Row(
+            "table 4 at λ = 0.5: X-Z and Y-Z planes",
+            ("stitch base examples/base_to_base_rpy.toml",),
+            "px 4.0000, pz 1.0002, β 0.0001; py −1.0000, pz 1.0001, α 0.0001",
+            other_planes,
+        ),
+        *(
+            Row(
+                f"experiment {n}, λ = 0.5, 1000 draws, {what}: rms; 95 % between, µrad / µm",
+                ("python bench/base_to_base.py",),
+                f"{published}, one draw",
+                lambda _, n=n, what=what: (
+                    of_page("base-to-base.md", rf"\| {n} \| 0.5 \| {what} \|((?:[^|]*\|){{3}})")
+                    .replace("|", ";", 1)
+                    .split(";")[0]
+                    + "; "
+                    + of_page("base-to-base.md", rf"\| {n} \| 0.5 \| {what} \|(?:[^|]*\|){{2}}([^|]*)\|")
+                ),
+            )
+            for n, published in ((1, "170 / 220"), (2, "540 / 360"))
+            for what in ("projection", "least squares")
         ),
     ),
     "002: fuselage panel": (
@@ -293,6 +381,7 @@ SYSTEMS: dict[str, tuple[Row, ...]] = {
             "0.047, 0.069, 0.036 mm; 0.008°",
             lambda _: of_page("panel.md", r"\| after, largest \|((?:[^|]*\|){3})").replace(" |", ",").strip(" ,|"),
         ),
+        Row("shape, one command", (*PANEL[:1], SHAPED), "≤ 0.6 mm", panel_shape),
         Row(
             "shape, 10 cells, largest deviation after one correction",
             ("python bench/panel.py",),
@@ -304,6 +393,7 @@ SYSTEMS: dict[str, tuple[Row, ...]] = {
         Row("plate against the flange", DRILL, "h 186.61 mm, 186.60 measured; parallel within 0.11 mm", plate),
         Row("reference holes by the drawing", DRILL, "–", drill_before),
         Row("table 4: by the drawing, 3D", DRILL, "2.28 to 2.85 mm, mean 2.55", trials("drawing", "distance", "mm")),
+        Row("table 4: 2D", DRILL, "0.61 to 2.00 mm, mean 1.32", trials("drawing", "in_plane", "mm")),
         Row("table 4: direction", DRILL, "2.09 to 3.93°, mean 3.30", trials("drawing", "tilt_deg", "°")),
         Row("table 6: corrected and levelled, 2D", DRILL, "0.03 to 0.15 mm", trials("levelled", "in_plane", "mm")),
         Row("table 7: a pin went in", DRILL, "≤ 0.30 mm, ≤ 0.21°", pin),
@@ -319,11 +409,39 @@ SYSTEMS: dict[str, tuple[Row, ...]] = {
 }
 
 
-def lines(room: Room) -> list[str]:
-    """The table, a block of rows for each system."""
-    out = []
+SYSTEMS["Named programs and libraries"] = (
+    Row(
+        "KISS-ICP on a scanner that never stops: right motions",
+        ("python -m bench.odometry --write",),
+        "–",
+        lambda _: of_page("session.md", r"odometry, de-skewed \|[^|]*\|([^|]*)\|"),
+    ),
+    Row(
+        "hand-eye from it, and from the runs of the same scans and of separate views / mm",
+        ("python -m bench.odometry --write",),
+        "–",
+        lambda _: ", ".join(
+            of_page("session.md", rf"\| `{name} \|[^|]*\|[^|]*\|([^|]*)\|")
+            for name in (
+                "moving-scan`, odometry, de-skewed",
+                "moving-scan`, the whole run",
+                "blade-table`, the whole run",
+            )
+        ),
+    ),
+    Row("Rerun: every stage and iteration", (*BLADE, "rerun rrd verify blade-run/recording.rrd"), "–", recording),
+    Row("real meshes, watertight and broken, from scan to fit", (MESHES,), "–", mesh_tests),
+    Row("many sessions by one command", (BLADE[0], HIDDEN[0], BATCH), "–", batch),
+)
+
+
+def lines(room: Room, only: list[str]) -> dict[str, list[str]]:
+    """The tables, a block of rows for each system whose name begins with one of `only`."""
+    blocks = {}
     for system, rows in SYSTEMS.items():
-        out += [f"### {system}", "", "| what | command | published | reached |", "|---|---|---|---|"]
+        if only and not system.startswith(tuple(only)):
+            continue
+        out = [f"### {system}", "", "| what | command | published | reached |", "|---|---|---|---|"]
         for row in rows:
             for command in row.commands:
                 if command.startswith("stitch"):
@@ -332,15 +450,20 @@ def lines(room: Room) -> list[str]:
         prepared = [c for row in rows for c in row.commands[:-1]]
         if prepared:
             out += ["", "Before these commands:", "", "```sh", *dict.fromkeys(prepared), "```"]
-        out.append("")
-    return out
+        blocks[system] = [*out, ""]
+    return blocks
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="*", default=[], help="how names of systems begin; the other tables stay")
     with tempfile.TemporaryDirectory() as folder:
-        table = lines(Room(Path(folder)))
+        blocks = lines(Room(Path(folder)), parser.parse_args().only)
     page = PAGE.read_text(encoding="utf-8")
     head, tail = page.split(BEGIN)[0], page.split(END)[1]
+    told = re.split(r"^### ", page.split(BEGIN)[1].split(END)[0], flags=re.MULTILINE)[1:]
+    kept = {block.split("\n")[0]: [*f"### {block}".rstrip("\n").split("\n"), ""] for block in told}
+    table = [line for system in SYSTEMS for line in blocks.get(system, kept.get(system, []))]
     PAGE.write_text("\n".join([head + BEGIN, "", *table]) + END + tail, encoding="utf-8")
 
 
