@@ -12,7 +12,7 @@ import argparse
 import json
 import time
 from collections import defaultdict
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from stitch.measuring.budget import MeasuredFeatures, measure_features, monte_ca
 from stitch.measuring.error_sources import place_errors
 from stitch.measuring.feature_file import FeatureList
 from stitch.measuring.features import Feature
+from stitch.measuring.place_errors import PlaceErrors
 from stitch.pipeline import run
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "measure.md"
@@ -40,22 +41,35 @@ BEGIN, END = "<!-- coverage: begin -->", "<!-- coverage: end -->"
 KINDS = ("clean", "effect in the model", "ordinary arm", "smooth scanner errors")
 GROUPS = {"point": "points", "plane": "planes", "sphere": "spheres", "distance": "distances"}
 PLATE = SpherePlate(radius=28.0)
-VIEWS, PIXELS, ARM, FIELD, INCIDENCE = 8, 130, 0.3, 0.01, 0.2
+VIEWS, PIXELS, INCIDENCE = 8, 130, 0.2
 
 
-def cell(kind: str, seed: int, views: int = VIEWS, plan: Plan | None = None) -> Measured:
+@dataclass(frozen=True)
+class Sizes:
+    """How large things are in a cell; lengths in mm."""
+
+    arm: float = 0.3  # of an ordinary arm, in plausible sizes
+    field: float = 0.01  # of a scanner with smooth errors, rms
+    drift: float = 0.0  # of the mount, in sizes of the simulator
+    repeatability: tuple[float, float] = (15e-6, 0.01)  # of the flange, rad and mm
+
+
+def cell(kind: str, seed: int, views: int = VIEWS, plan: Plan | None = None, sizes: Sizes = Sizes()) -> Measured:
     """Return a session of a sphere plate in a cell of one kind; of the views of a plan, if one is given."""
     scene = load_scene("spheres")
     scanner = replace(scene.scanner, columns=PIXELS, rows=PIXELS)
+    hidden = {"mount_drift": sizes.drift} if sizes.drift else {}
     if kind == "smooth scanner errors":
-        scanner = replace(scanner, field_error=FIELD)
+        scanner, hidden["incidence_bias"] = replace(scanner, field_error=sizes.field), INCIDENCE
+    if kind == "effect in the model":
+        hidden["joint_compliance"] = 1.0
     part = replace(scene.part, labelled=False, parameters={"radius": PLATE.radius})
     scene = replace(scene, scanner=scanner, plan=replace(scene.plan, views=views), part=part)
-    hidden = {"effect in the model": {"joint_compliance": 1.0}, "smooth scanner errors": {"incidence_bias": INCIDENCE}}
+    scene = replace(scene, repeatability=sizes.repeatability)
     plan, rail = plan_for(scene, seed) if plan is None else (plan, np.zeros(len(plan.joints)))
     if kind != "ordinary arm":
-        return simulate(scene, hidden.get(kind, {}), seed, planned=(plan, rail))
-    arm = draw_arm(scene.arm.joints, ARM, np.random.default_rng([seed, 77]))
+        return simulate(scene, hidden, seed, planned=(plan, rail))
+    arm = draw_arm(scene.arm.joints, sizes.arm, np.random.default_rng([seed, 77]))
     q = plan.joints + arm.offset + arm.sine * np.sin(plan.joints) + arm.cosine * np.cos(plan.joints)
     wrong = replace(scene.arm, a=scene.arm.a + arm.a, d=scene.arm.d + arm.d, alpha=scene.arm.alpha + arm.alpha)
     measured = simulate(replace(scene, arm=wrong), {}, seed, planned=(replace(plan, joints=q), rail))
@@ -87,14 +101,16 @@ def features_of(measured: Measured) -> tuple[FeatureList, Array]:
     return FeatureList(tuple(wanted)), np.array(truth)
 
 
-def measured_cell(kind: str, seed: int) -> tuple[MeasuredFeatures, Array, list[Array]]:
+def measured_cell(
+    kind: str, seed: int, sizes: Sizes = Sizes()
+) -> tuple[MeasuredFeatures, Array, tuple[PlaceErrors, FeatureList]]:
     """Return the numbers of a cell, their errors, and what Monte Carlo takes."""
-    measured = cell(kind, seed)
+    measured = cell(kind, seed, sizes=sizes)
     state = run(session_of(measured), effects=("joint_compliance",) if kind == "effect in the model" else ())
     wanted, truth = features_of(measured)
     places = place_errors(state)
     found = measure_features(places, wanted)
-    return found, np.array([n.value for n in found.numbers]) - truth, [places, wanted]
+    return found, np.array([n.value for n in found.numbers]) - truth, (places, wanted)
 
 
 def main() -> None:

@@ -1,9 +1,10 @@
-"""Do views that `stitch plan --for` proposes make a feature better known than random ones? The table of docs/measure.md.
+"""Do views that `stitch plan --for` proposes make a feature better known than random ones? A table of docs/measure.md.
 
 Run: python -m bench.plan_feature [--cells 12] [--first-seed 600]
 
-Cells of three kinds (`feature_coverage.py`) have four views of a sphere plate, of which a point is measured. Four further
-views are proposed for that point; as many are drawn from all that see the part. Both are simulated, stitched and measured.
+Cells of three kinds (`feature_coverage.py`) have four views of a sphere plate, of which a point is measured. Four
+further views are proposed for that point; as many are drawn from all that see the part. Both are simulated, stitched
+and measured.
 """
 
 import argparse
@@ -74,11 +75,8 @@ def main() -> None:
         now, proposed, drawn = (1e3 * U for U in rows[-1])
         lines.append(f"| {kind} | {now:.0f} | {proposed:.0f} | {drawn:.0f} | {drawn / proposed:.2f} |")
         print(lines[-1], flush=True)
-    ratio = np.array([drawn / proposed for _, proposed, drawn in rows])
-    lines += [
-        "",
-        f"Median of {len(rows)} cells {np.median(ratio):.2f}, middle half {np.quantile(ratio, 0.25):.2f} to {np.quantile(ratio, 0.75):.2f}.",
-    ]
+    low, median, high = np.quantile([drawn / proposed for _, proposed, drawn in rows], [0.25, 0.5, 0.75])
+    lines += ["", f"Median of {len(rows)} cells {median:.2f}, middle half {low:.2f} to {high:.2f}."]
     page = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(page.split(BEGIN)[0] + BEGIN + "\n" + "\n".join(lines) + "\n" + END + page.split(END)[1])
 

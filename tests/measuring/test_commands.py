@@ -15,6 +15,7 @@ from stitch.cli.main import build
 from stitch.cli.plan import place_of
 from stitch.errors import InputError
 from stitch.measuring.feature_file import read_features
+from tests.in_browser import WAYS, require_for_everybody
 from viz.features_page import write_certificate, write_features
 
 
@@ -78,6 +79,14 @@ def test_verify_passes_a_good_cell_and_fails_a_wrong_artefact(cell):
     wrong = _stitch("verify", cell / "run", cell / "artefact", "--features", cell / "wrong.toml", "-o", cell / "bad")
     assert wrong.exit_code == 3
     assert not json.loads((cell / "bad" / "certificate.json").read_text())["passed"]
+
+
+@pytest.mark.slow  # a browser
+@pytest.mark.parametrize("way", WAYS)
+def test_the_certificate_is_readable_by_everybody(cell, browser, way):
+    _stitch("verify", cell / "run", cell / "artefact", "-o", cell / "good")
+    write_certificate(json.loads((cell / "good" / "certificate.json").read_text()), cell / "certificate.html")
+    require_for_everybody(browser, cell / "certificate.html", way)
 
 
 def test_the_session_of_the_fit_verifies_nothing(cell):

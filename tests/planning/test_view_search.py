@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from stitch import frames
 from stitch.planning.information import TwistChannel, noise_of, separations
 from stitch.planning.plan import KnownPlace, choose_views, place_lever, travel_order
 
@@ -50,6 +51,13 @@ def test_the_chosen_views_are_the_best_there_are(channel):
     best = min(float(goal.U(channel.normal([0, 1, 2, *pair]))) for pair in combinations(range(3, 10), 2))
     assert float(goal.U(channel.normal([0, 1, 2, *chosen]))) == pytest.approx(best, rel=0.02)
     assert travel_order(np.array([[0.0], [5.0], [1.0], [3.0]]), 0, [1, 2, 3]) == [2, 3, 1]
+
+
+def test_the_lever_of_a_place_is_what_a_twist_moves_it_by():
+    place, twist = np.array([40.0, -25.0, 300.0]), 1e-6 * np.array([3.0, -1.0, 2.0, 500.0, 100.0, -300.0])
+    moved = frames.transform(frames.exp(twist), place[None])[0] - place
+    np.testing.assert_allclose(place_lever(place, 15, 6)[:, 6:12] @ twist, moved, rtol=1e-4)
+    assert not place_lever(place, 15, 6)[:, [*range(6), *range(12, 15)]].any()
 
 
 def test_no_view_is_chosen_that_is_not_needed(channel):
