@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import beta
 
 from data_synth import kinematics
 from data_synth import simulate as simulation
@@ -140,7 +141,7 @@ def main() -> None:
 
 
 def write_table(cells: list[dict[str, Any]]) -> None:
-    """Print the table of all cells and write it into the page."""
+    """Print the table of all cells and write it into the page, if any counts for coverage."""
     rows, covered = defaultdict(list), [cell for cell in cells if "numbers" in cell]
     for cell in covered:
         for group, name, U, error in cell["numbers"]:
@@ -158,25 +159,42 @@ def write_table(cells: list[dict[str, Any]]) -> None:
 def table(rows: dict[tuple[str, str], list[tuple[int, str, float, float]]]) -> list[str]:
     """Return the lines of the table."""
     out = [
-        "| cells | feature | numbers | error ≤ U | U over twice the true spread | largest error / U |",
-        "|---|---|---|---|---|---|",
+        "| cells | feature | numbers | error ≤ U | 95 % interval | U over twice the true spread | largest error / U |",
+        "|---|---|---|---|---|---|---|",
     ]
     for kind in (*KINDS, "all"):
         for group in GROUPS.values():
             own = [row for (k, g), more in rows.items() if g == group and kind in (k, "all") for row in more]
             if not own:
                 continue
-            error, U = np.array([row[2] for row in own]), np.array([row[3] for row in own])
-            spread = 1 / np.sqrt(np.mean((2 * error / U) ** 2))
+            share = np.array([abs(error) / U for _, _, error, U in own])
+            low, high = covered_interval(np.array([row[0] for row in own]), share <= 1)
             out.append(
-                f"| {kind} | {group} | {len(own)} | {100 * np.mean(np.abs(error) <= U):.1f} % | {spread:.2f} | "
-                f"{np.max(np.abs(error) / U):.2f} |"
+                f"| {kind} | {group} | {len(own)} | {100 * np.mean(share <= 1):.1f} % | {low:.0f} to {high:.0f} % | "
+                f"{0.5 / np.sqrt(np.mean(share**2)):.2f} | {share.max():.2f} |"
             )
     return out
 
 
+def covered_interval(seeds: Array, covered: Array) -> Array:
+    """(2,) bounds in per cent: Clopper and Pearson's of as many free numbers as the scatter of the cells allows.
+
+    Numbers of one cell err together, by its hand-eye.
+    """
+    of_cell = np.array([covered[seeds == seed].mean() for seed in np.unique(seeds)])
+    count, p = float(len(of_cell)), covered.mean()
+    if of_cell.var() > 0:
+        count = min(p * (1 - p) * (count - 1) / of_cell.var(), len(covered))
+    within, beyond = count * p, count * (1 - p)
+    low = beta.ppf(0.025, within, beyond + 1) if within else 0.0
+    high = beta.ppf(0.975, within + 1, beyond) if beyond else 1.0
+    return 100 * np.array([low, high])
+
+
 def trials_line(cells: list[dict[str, Any]]) -> str:
     """Return the sentence on Monte Carlo."""
+    if not cells:
+        return "Monte Carlo was not run."
     every = np.concatenate([cell["ratios"] for cell in cells])
     return (
         f"Monte Carlo ({cells[0]['trials']:,} trials) over propagation, {len(every)} numbers of {len(cells)} cells: "

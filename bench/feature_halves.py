@@ -1,9 +1,11 @@
 """Do two halves of the views of real scans agree within U? The second table of docs/measure.md.
 
-Run: python bench/feature_halves.py PATH_OF_REGHEC_SESSIONS
+Run: python bench/feature_halves.py PATH_OF_REGHEC_SESSIONS PATH_OF_A_SPHERE_SESSION
 
 Every object is stitched twice, from disjoint halves of its views, each with a hand-eye of its own. Patches that both
 halves see, and the distances between them, are measured in both. E_n is the difference over the root of both U².
+
+The sphere's diameter is fitted to laser lines of the other session, with the hand-eye, against the one that it states.
 """
 
 import sys
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stitch.calibrate.sphere import calibrate_sphere
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.measuring.budget import fit_features, measure_features
@@ -27,7 +30,7 @@ OBJECTS = ("cone", "david", "rubik", "sphere", "gripperopen")
 PATCHES, RADIUS = 12, 4.0  # mm
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, lines_of_a_sphere: Path) -> None:
     lines = [
         "| object | points | E_n ≤ 1 | distances | E_n ≤ 1 | U of a distance, median (µm) |",
         "|---|---|---|---|---|---|",
@@ -43,6 +46,7 @@ def main(folder: Path) -> None:
         lines.append(f"| {name} | {counts[0]} | {counts[1]} | {counts[2]} | {counts[3]} | {1e3 * U:.0f} |")
         print(lines[-1], flush=True)
     lines.append(f"| all | {totals[0]} | {totals[1]} | {totals[2]} | {totals[3]} | |")
+    lines += ["", _sphere_sentence(lines_of_a_sphere)]
     page = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(page.split(BEGIN)[0] + BEGIN + "\n" + "\n".join(lines) + "\n" + END + page.split(END)[1])
 
@@ -60,6 +64,17 @@ def _object(folder: Path) -> tuple[Array, float]:
     first, rest = np.abs(E_n[: len(names)]), np.abs(E_n[len(names) :])
     counts = np.array([len(first), (first <= 1).sum(), len(rest), (rest <= 1).sum()])
     return counts, float(np.median([n.U for n in one[len(names) :]]))
+
+
+def _sphere_sentence(folder: Path) -> str:
+    session = load_session(folder)
+    fit = calibrate_sphere(session).free
+    diameter, U, stated = 2 * fit.radius, 4 * np.sqrt(fit.covariance[9, 9]), 2 * (session.sphere_radius or np.nan)
+    return (
+        f"A real sphere of {stated:g} mm under {len(session.views)} laser lines of a FANUC arm: its diameter is "
+        f"{diameter:.2f} mm with U = {U:.2f} mm, E_n = {abs(diameter - stated) / U:.2f} (`stitch calibrate sphere "
+        "--radius-free`). The lines pass near its equator and hardly turn, which U says."
+    )
 
 
 def _common_patches(one: PlaceErrors, other: PlaceErrors) -> list[Feature]:
@@ -82,4 +97,4 @@ def _common_patches(one: PlaceErrors, other: PlaceErrors) -> list[Feature]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
