@@ -385,7 +385,7 @@ def _hardest_pair_goal(views: PossibleViews, now: Outlook) -> list[Goal]:
 
 
 def _proposed_views(
-    goals: Sequence[Goal], chosen: Sequence[int], further: Session, U_after: float
+    goals: Sequence[Goal], chosen: Sequence[int], further: Session, U_after: float | None
 ) -> tuple[ProposedView, ...]:
     """Return what the views bring one after the other.
 
