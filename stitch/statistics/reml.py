@@ -47,7 +47,9 @@ def _invert_single(V: Array) -> InverseCovariance:
         return InverseCovariance(V[None], V[None], np.inf)
     half, _ = dtrtri(L, lower=1)
     lower, _ = dlauum(half, lower=1)
-    inverse = np.tril(lower) + np.tril(lower, -1).T
+    # Above the diagonal all are zero.
+    inverse = lower + lower.T
+    np.fill_diagonal(inverse, np.diag(lower))
     return InverseCovariance(inverse[None], half[None], 2 * float(np.log(np.diag(L)).sum()))
 
 
