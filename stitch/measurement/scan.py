@@ -203,7 +203,7 @@ def _estimate_noise(points: Array, own: Array, normals: Array, index: Indices) -
     centre = even_indices(len(own), _NOISE_SAMPLES)
     local = np.array([column[index[centre].T] for column in points.T]) - own[centre].T[:, None]
     n = normals[centre].T
-    a = _cross(n, np.where(np.abs(n[0]) < 0.7, [[1.0], [0], [0]], [[0], [1.0], [0]]))
+    a = _cross(n, np.where(np.abs(n[0]) < 0.7, [[1.0], [0.0], [0.0]], [[0.0], [1.0], [0.0]]))
     # A point that is seen edge-on has no normal.
     a /= np.maximum(np.linalg.norm(a, axis=0), 1e-300)
     x, y, rest = (np.einsum("in,ikn->kn", axis, local) for axis in (a, _cross(n, a), n))
