@@ -11,17 +11,19 @@ import numpy as np
 import tomli_w
 
 from stitch import frames
+from stitch.effects.contract import EFFECTS
 from stitch.errors import InputError, NoResultError
-from stitch.frames import Array
+from stitch.frames import Array, Mask
 from stitch.measurement.robot import Robot, elementary, forward
 from stitch.measurement.session import Session, StatedRepeatability, View
-from stitch.model.model import Term, stack_parameters
+from stitch.model.model import Model, Term, sizes_of, stack_parameters, term_of, with_parameter_values
 from stitch.pipeline import run
 from stitch.planning.candidate_views import candidate_measurement, candidate_rows, nearby
 from stitch.reading.robot_description import robot_from_dh, robot_from_urdf
 from stitch.reading.session_tables import has_reported_poses
 from stitch.runs.run import Run
-from stitch.statistics.least_squares import significantly_smaller
+from stitch.statistics.least_squares import equilibrated, significantly_smaller
+from stitch.statistics.reml import fit_variances, whitener
 from stitch.units import length_text
 from stitch.writing.result_document import result_document
 from stitch.writing.urdf_file import to_urdf
@@ -173,25 +175,30 @@ def poses_to_add(run: Run) -> Array:
 # An arm as a table of links: fitted for what such a table can hold, and proved by reading it back.
 #
 # Offsets and links of a model are right beside its compliance and its gears, which no table holds; without these they
-# may leave more than the nominal arm does. So the table is fitted alone. The proof: fitted without a part of the views,
-# it is written and read back, and that part is run with it and with the nominal arm, base and tool fitted anew for
-# either.
+# may leave more than the nominal arm does. So the table is fitted alone: all offsets and links, each with a prior of
+# what makers' tolerances are. How far they are trusted is told by whole ends of the joints' ranges that are left out,
+# since what imitates a gear where it was measured errs elsewhere. The proof: fitted without such an end, it is written
+# and read back, and that end is run with it and with the nominal arm, base and tool fitted anew for either.
 
-# What a table can hold, alone and together.
-_CHOICES = (("joint_offset",), ("link_geometry",), ("joint_offset", "link_geometry"))
-# Parts of the views that are left out in turn, each of blocks of neighbours in time from all over the session.
-_PARTS, _BLOCKS = 4, 16
+# Sizes of the prior that are tried, in plausible sizes of each parameter.
+_TRUST = tuple(2.0**k for k in range(-6, 3))
+# Of the views, how many an end holds; joints that turn less than this, rad, have none. The table is proved at ends of
+# the joints that turn farthest.
+_END, _STILL, _ENDS_PROVED = 1 / 3, 0.05, 6
 _CHANCE = 0.01  # that a table which is no better than the nominal arm is said to be
+_FEWEST_VIEWS, _NUMBERS_EACH = 12, 3
+_UNSEEN = 1e-9  # of the largest eigenvalue: what these views do not show of hand-eye and targets
 
 
 @dataclass(frozen=True)
 class LinkTable:
-    """The arm that is written, and what proves it; rms of targets in views that took no part, length_unit."""
+    """The arm that is written, and what proves it; rms of targets in ranges that took no part, length_unit."""
 
     robot: Robot
     effects: tuple[str, ...]  # in it; none: the nominal arm
     heldout_rms: float = np.nan
     nominal_rms: float = np.nan
+    ranges: Array | None = None  # (n, 2) rad, of the joints that the proof covers
 
     def sentence(self, unit: str) -> str:
         """What the table is worth."""
@@ -200,65 +207,141 @@ class LinkTable:
         here, nominal = length_text(self.heldout_rms, unit), length_text(self.nominal_rms, unit)
         if not self.effects:
             return (
-                f"No table of links is better than the nominal one: read back, the best leaves {here} in views left "
-                f"out, the nominal {nominal}; it is that of the nominal arm."
+                f"No table of links is better than the nominal one: read back, the best leaves {here} at ends of the "
+                f"joints' ranges that were left out, the nominal {nominal}; it is that of the nominal arm."
             )
-        return f"Fitted for the table alone and read back, it leaves {here} in views left out, the nominal {nominal}."
+        return (
+            f"Fitted for the table alone and read back, it leaves {here} at ends of the joints' ranges that were left "
+            f"out, the nominal {nominal}."
+        )
+
+    @property
+    def range_sentence(self) -> str:
+        """For which joint angles it is proved; empty for the nominal arm."""
+        if not self.effects or self.ranges is None:
+            return ""
+        each = [f"j{i + 1} {a:.0f} … {b:.0f}°" for i, (a, b) in enumerate(np.degrees(self.ranges))]
+        return f"Proved for {', '.join(each)}; beyond, nothing was measured."
 
 
 def link_table(session: Session) -> LinkTable:
-    """The table that leaves least in views that took no part in it; the nominal one where none leaves clearly less.
+    """The table that the ends of the joints' ranges trust; the nominal one where none leaves clearly less.
 
     Raises:
         InputError: the session has no robot with joints.
     """
-    nominal = session.robot
-    if nominal is None:
-        raise InputError(f"{session.path}: no [robot]; a table of its links needs one")
-    left = {choice: rms for choice in _CHOICES if np.isfinite(rms := _heldout_rms(session, choice))}
-    plain = _heldout_squares(session, ())
-    best = min(left, key=lambda choice: left[choice]) if left else ()
-    judged = _heldout_squares(session, best)
+    nominal, joints = session.robot, session.joints
+    if nominal is None or joints is None:
+        raise InputError(f"{session.path}: no [robot] with joint angles; a table of its links needs them")
+    try:
+        seen = _observe_links(session)
+    except (InputError, NoResultError):
+        return LinkTable(nominal, ())
+    ends = _ends(seen.joints)
+    if len(seen.joints) < _FEWEST_VIEWS or not ends:
+        return LinkTable(nominal, ())
+    trust = min((0.0, *_TRUST), key=lambda scale: sum(seen.left_at(end, scale) for end in ends))
+    widest = np.argsort(-np.ptp(seen.joints, axis=0))[: _ENDS_PROVED // 2]
+    proof = [(end, seen.table(nominal, trust, ~end)) for end in _ends(seen.joints, widest.tolist())]
+    judged = _judge(session, seen.names, proof)
+    plain = _judge(session, seen.names, [(end, None) for end, _ in proof])
     if judged is None or plain is None:
         return LinkTable(nominal, ())
     here, before = (float(np.sqrt(np.nanmean(squares))) for squares in (judged, plain))
-    if not best or not significantly_smaller(judged, plain, _CHANCE / len(left)):
+    if not trust or not significantly_smaller(judged, plain, _CHANCE):
         return LinkTable(nominal, (), here, before)
-    return LinkTable(with_geometry(nominal, run(session, effects=best).terms), best, here, before)
+    ranges = np.stack([seen.joints.min(axis=0), seen.joints.max(axis=0)], axis=1)
+    robot = seen.table(nominal, trust, np.ones(len(seen.joints), bool))
+    return LinkTable(robot, tuple(term.name for term in seen.terms), here, before, ranges)
 
 
-def _heldout_rms(session: Session, effects: Sequence[str]) -> float:
-    """What they leave in views left out; NaN where the session cannot have them."""
+def _ends(joints: Array, of: Sequence[int] | None = None) -> list[Mask]:
+    """(V,) views at each end of the range of each joint that turns, or of some joints."""
+    turning = np.flatnonzero(np.ptp(joints, axis=0) > _STILL) if of is None else of
+    low, high = np.quantile(joints, [_END, 1 - _END], axis=0)
+    return [mask for k in turning for mask in (joints[:, k] <= low[k], joints[:, k] >= high[k])]
+
+
+@dataclass(frozen=True)
+class _SeenLinks:
+    """What V views that show targets tell of offsets and links about the nominal arm, whitened."""
+
+    names: tuple[str, ...]
+    joints: Array  # (V, n) rad
+    terms: tuple[Term, ...]
+    unknowns: int  # of hand-eye and targets
+    products: Array  # (V, k, k) of every view's columns: theirs, P parameters' in plausible sizes, what is left
+
+    def _without_base(self, views: Mask) -> Array:
+        """(P + 1, P + 1) products of parameters and rest, hand-eye and targets fitted anew to these views."""
+        whole, unit = equilibrated(self.products[views].sum(axis=0))
+        a = self.unknowns
+        rest = whole[a:, a:] - whole[a:, :a] @ np.linalg.pinv(whole[:a, :a], _UNSEEN, hermitian=True) @ whole[:a, a:]
+        return np.asarray(rest / np.outer(unit[a:], unit[a:]))
+
+    def fit(self, views: Mask, scale: float) -> Array:
+        """(P,) in plausible sizes, with a prior of so many of them."""
+        rest = self._without_base(views)
+        if not scale:
+            return np.zeros(len(rest) - 1)
+        return np.asarray(np.linalg.solve(rest[:-1, :-1] + np.eye(len(rest) - 1) / scale**2, rest[:-1, -1]))
+
+    def left_at(self, end: Mask, scale: float) -> float:
+        """The sum of squares there under what the other views tell."""
+        step = np.append(-self.fit(~end, scale), 1.0)
+        return float(step @ self._without_base(end) @ step)
+
+    def table(self, nominal: Robot, scale: float, views: Mask) -> Robot:
+        """The arm that some views tell of."""
+        values = self.fit(views, scale) * sizes_of(self.terms)
+        return with_geometry(nominal, with_parameter_values(self.terms, values))
+
+
+def _observe_links(session: Session) -> _SeenLinks:
+    """Linearise the targets of a session about its nominal arm."""
+    found = run(session)
+    if found.targets is None or found.session.joints is None:
+        raise InputError(f"{session.path}: no labelled points or no joint angles; a calibration needs both")
+    rows, measurement = found.targets.rows, found.measurement
+    terms = tuple(term_of(measurement, EFFECTS[name]) for name in GEOMETRY if name in EFFECTS)
+    columns = np.concatenate(rows.effect_columns(measurement, Model(rows.T_mount), terms), axis=2) * sizes_of(terms)
+    base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
+    every = rows.mixed_model(np.concatenate([base, columns], axis=2))
+    # Of few numbers all columns together leave no scatter to be seen.
+    enough = every.size > _NUMBERS_EACH * every.A.shape[2]
+    variances = fit_variances(every, both_starts=True).variances if enough else found.targets.variances
+    half = whitener(rows.mixed_model(base), variances)
+    V = len(rows.lever)
+    shown = np.flatnonzero(rows.used.any(axis=1)[:V])
+    white = (half @ np.concatenate([base, columns, every.z[..., None]], axis=2))[shown]
+    names = tuple(found.session.names[v] for v in shown)
+    products = white.transpose(0, 2, 1) @ white
+    return _SeenLinks(names, found.session.joints[shown], terms, base.shape[2], products)
+
+
+def _judge(session: Session, names: Sequence[str], proof: Sequence[tuple[Mask, Robot | None]]) -> Array | None:
+    """(V,) mean squares of the targets' distances in views that took no part, with each arm as its file says it; NaN
+    where a view was never left out. None where a part is too little for it.
+
+    Args:
+        proof: (V,) views that are judged, and the arm; None: the nominal one.
+    """
+    number = {name: k for k, name in enumerate(names)}
+    total, count = np.zeros((2, len(names)))
     try:
-        return run(session, effects=effects).heldout_rms
-    except (InputError, NoResultError):
-        return float("nan")
-
-
-def _heldout_squares(session: Session, effects: Sequence[str]) -> Array | None:
-    """(V,) mean squares of the targets' distances in every view, with the table of the other parts; NaN where none was
-    seen. None where a part is too little for it."""
-    count = len(session.views)
-    part = np.arange(count) * min(_BLOCKS, count) // count % _PARTS
-    squares = np.full(count, np.nan)
-    number = {view.name: k for k, view in enumerate(session.views)}
-    try:
-        for k in range(_PARTS):
-            table = _read_back(_fit_table(_session_of_views(session, part != k), effects), session.length_unit)
-            judged = run(_with_reported_arm(_session_of_views(session, part == k), table))
-            squares[[number[view.name] for view in judged.session.views]] = judged.view_rms**2
+        for end, robot in proof:
+            left_out = {name for name, out in zip(names, end, strict=True) if out}
+            part = session.without([view.name for view in session.views if view.name not in left_out])
+            if robot is not None:
+                part = _with_reported_arm(part, _read_back(robot, session.length_unit))
+            judged = run(part)
+            at = [number[view.name] for view in judged.session.views]
+            total[at] += judged.view_rms**2
+            count[at] += 1
     except (InputError, NoResultError):
         return None
-    return squares
-
-
-def _session_of_views(session: Session, keep: Array) -> Session:
-    return replace(session, views=tuple(view for view, kept in zip(session.views, keep, strict=True) if kept))
-
-
-def _fit_table(session: Session, effects: Sequence[str]) -> Robot:
-    assert session.robot is not None
-    return with_geometry(session.robot, run(session, effects=effects).terms) if effects else session.robot
+    with np.errstate(invalid="ignore"):
+        return np.asarray(total / count)
 
 
 def _read_back(robot: Robot, unit: str) -> Robot:
@@ -303,7 +386,8 @@ def write_robot(table: LinkTable, run: Run, folder: Path) -> None:
 
 def robot_notes(table: LinkTable, run: Run) -> list[str]:
     """What the table is worth, what is not in it, and what has to be done so that it counts; a line each."""
-    told = [table.sentence(run.session.length_unit), beyond_sentence(calibrated_robot_of_run(run), table.effects)]
+    told = [table.sentence(run.session.length_unit), *filter(None, [table.range_sentence])]
+    told += [beyond_sentence(calibrated_robot_of_run(run), table.effects)]
     return [*told, *filter(None, [_reported_pose_note(table, run.session)])]
 
 
