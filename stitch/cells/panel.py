@@ -586,7 +586,7 @@ def _robot_session(readings: ReflectorReadings, model: RobotModel, legs: Legs | 
 def control_shape(file: Path, drive: str, folder: Path) -> tuple[PanelJob, PanelResult, list[float]]:
     """Correct until all control points are within the tolerance.
 
-    The first move takes the panel to its target; from then on its shape is judged there.
+    With targets the first move takes the panel to its place; from then on its shape is judged there.
 
     Returns:
         The last job, its result, and the largest deviation before each correction and at the end, mm.
@@ -609,7 +609,7 @@ def control_shape(file: Path, drive: str, folder: Path) -> tuple[PanelJob, Panel
             raise InputError(f"{file}: files.control is missing; to fix: name the table of the shape's control points")
         write_folder(job, result, folder)
         largest.append(float(result.shape_largest.max()))
-        if largest[-1] <= job.tolerance:
+        if largest[-1] <= job.tolerance and job.targets is None:
             return job, result, largest
         if len(largest) > _MOST_CORRECTIONS:
             raise NoResultError(
