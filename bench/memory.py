@@ -38,7 +38,7 @@ print(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
 
 def peak(folder: Path, arrays: Path | str) -> float:
     """Return the peak memory of one process, MB."""
-    done = subprocess.run([sys.executable, "-c", _RUN, folder, arrays], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", _RUN, folder, arrays], stdout=subprocess.PIPE, text=True, check=True)
     return float(done.stdout) * 1024 / 1e6
 
 

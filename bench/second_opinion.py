@@ -1,9 +1,9 @@
-"""Does Open3D find a hand-eye where the own coarse search does not? Table of docs/dependencies.md.
+"""Does Open3D find a hand-eye where the own coarse search does not? Tables of docs/dependencies.md.
 
-`python -m bench.second_opinion [--seed 0] [--write]`. No hand-eye is known. Neighbouring views are registered by
-Open3D: FPFH with RANSAC, and fast global registration. The motions go through the same five solvers, their hand-eyes
-are closed in as the own starts are, and the best of both is taken. Right: the part is placed within 3 % of its size of
-the truth, which for measured objects is the whole run of all views.
+`python -m bench.second_opinion [measured] [simulated] [--seed 0] [--write]`. No hand-eye is known. Neighbouring views
+are registered by Open3D: FPFH with RANSAC, and fast global registration. The motions go through the same five solvers,
+their hand-eyes are closed in as the own starts are, and the best of both is taken. Right: the part is placed within 3 %
+of its size of the truth, which for measured objects is the whole run of all views.
 
 Cells: five measured objects whole, and with every other view; simulated blades, spheres, door panels and drilled
 plates of three, four and five views.
@@ -131,51 +131,58 @@ def opinions(capture: Capture, truth: Array, o3d) -> dict[str, str]:
     return out
 
 
-def cells(seed: int):
-    """Yield name, capture and true hand-eye of every cell."""
+def measured_cells():
+    """Yield name, capture and hand-eye by the whole run of the measured objects, whole and every other view."""
     for name in OBJECTS:
         session = stitch.load_session(SHARED / "reghec" / name)
         truth = stitch.run(session).T_mount
         yield name, prepare_capture(session), truth
         yield f"{name}, 5 views", prepare_capture(session.without(session.names[1::2])), truth
+
+
+def simulated_cells(seed: int):
+    """Yield name, capture and true hand-eye of the simulated cells."""
     for number in range(12):
         scene, views = SCENES[number % 4], (3, 4, 5)[number // 4]
         measured = simulate(load_scene(scene), {}, seed + number, views)
         yield f"{scene}, {views} views", prepare_capture(session_of(measured)), measured.T_mount
 
 
-def main() -> None:
-    """Print the table, and write it into the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", action="store_true", help="put the table into docs/dependencies.md")
-    options = parser.parse_args()
-    o3d, found = import_open3d("bench"), []
-    o3d.utility.random.seed(0)
-    with library_threads_off():
-        for name, capture, truth in cells(options.seed):
-            found.append(opinions(capture, truth, o3d))
-            print(name, found[-1], flush=True)
+def table(found: list[dict[str, str]], kind: str) -> str:
+    """Return the table of some cells."""
     lines = [
-        "| search | right | of these unsure | wrong or none | processor seconds, median |",
-        "|---|---:|---:|---:|---:|",
+        f"| {len(found)} {kind} cells | right | of these unsure | processor seconds, median |",
+        "|---|---:|---:|---:|",
     ]
     for way in ("own", "RANSAC alone", "FGR alone", "own and RANSAC", "own and FGR"):
-        said = [own[way] for own in found]
-        right = [text for text in said if text.startswith("right")]
-        seconds = np.median(
-            [float(own[f"{way.split()[-1] if ' and ' in way else way.split()[0]} seconds"]) for own in found]
-        )
-        unsure = sum("unsure" in text for text in right)
-        lines.append(f"| {way} | {len(right)} of {len(said)} | {unsure} | {len(said) - len(right)} | {seconds:.1f} |")
-    table = "\n".join(lines)
-    print(f"\n{table}")
-    if options.write:
-        before, rest = PAGE.read_text(encoding="utf-8").split("<!-- second opinion: begin -->\n")
-        _, after = rest.split("<!-- second opinion: end -->")
-        PAGE.write_text(
-            f"{before}<!-- second opinion: begin -->\n{table}\n<!-- second opinion: end -->{after}", encoding="utf-8"
-        )
+        right = [own[way] for own in found if own[way].startswith("right")]
+        of = [word for word in ("own", "RANSAC", "FGR") if word in way]
+        seconds = np.median([sum(float(own[f"{word} seconds"]) for word in of) for own in found])
+        lines.append(f"| {way} | {len(right)} | {sum('unsure' in text for text in right)} | {seconds:.1f} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the tables, and write them into the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kinds", nargs="*", default=["measured", "simulated"], help="both, unless named")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--write", action="store_true", help="put the tables into docs/dependencies.md")
+    options = parser.parse_args()
+    o3d = import_open3d("bench")
+    for kind in options.kinds:
+        found = []
+        o3d.utility.random.seed(0)
+        with library_threads_off():
+            for name, capture, truth in measured_cells() if kind == "measured" else simulated_cells(options.seed):
+                found.append(opinions(capture, truth, o3d))
+                print(name, found[-1], flush=True)
+        print(f"\n{table(found, kind)}")
+        if options.write:
+            begin, end = (f"<!-- {kind} opinions: {word} -->" for word in ("begin", "end"))
+            before, rest = PAGE.read_text(encoding="utf-8").split(begin)
+            text = f"{before}{begin}\n{table(found, kind)}\n{end}{rest.split(end)[1]}"
+            PAGE.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
