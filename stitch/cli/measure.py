@@ -110,6 +110,7 @@ def _write_dfq(found: MeasuredFeatures, part: str, run: Path, file: Path) -> Non
 
 def _show_numbers(found: MeasuredFeatures, checked: MonteCarlo | None) -> None:
     from stitch.measuring.error_sources import NOT_INCLUDED
+    from stitch.measuring.verification import verify
 
     title = f"Numbers with U (k = 2), {found.length_unit} and rad"
     rows = [
@@ -119,6 +120,9 @@ def _show_numbers(found: MeasuredFeatures, checked: MonteCarlo | None) -> None:
     if checked is not None:
         low, high = float(checked.ratio.min()), float(checked.ratio.max())
         say(f"Monte Carlo over propagation, {checked.trials:,} trials: {low:.3f} to {high:.3f}.")
+    held = verify(found, None)
+    if held.numbers:
+        say(f"{held.agreeing} of {len(held.numbers)} calibrated numbers agree within U and that of their calibration.")
     show_block([("not in U", text) for text in NOT_INCLUDED])
 
 

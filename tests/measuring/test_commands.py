@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import tomllib
 
 import numpy as np
@@ -34,8 +35,9 @@ def cell(tmp_path_factory):
 
 
 def test_measure_writes_numbers_budgets_and_a_dfq_file(cell):
-    done = _stitch("measure", cell / "run", cell / "part.toml", "--dfq", cell / "part.dfq", "--json")
+    done = _stitch("measure", cell / "run", cell / "part.toml", "--dfq", cell / "part.dfq")
     assert done.exit_code == 0, done.output
+    assert re.search(r"[45] of 5 calibrated numbers agree", " ".join(done.output.split()))
     document = json.loads((cell / "run" / "features.json").read_text())
     numbers = {f"{n['feature']}.{n['quantity']}": n for n in document["numbers"]}
     point = numbers["point 1.deviation"]
