@@ -137,7 +137,10 @@ def _plan_request(views: int | None, split: tuple[str, str] | None, halve: bool,
     if split is not None and split[0] == split[1]:
         raise InputError(f"--split {split[0]} {split[1]}: to fix: name two effects")
     at = None if feature is None else _option_numbers("--for", feature, "a place as x,y,z, as 0,20,150", (3, 6))
-    return PlanRequest(halve=halve or split is None, split=split, split_any=not halve, views=views, feature=at)
+    if at is not None and not any(at[3:]) and len(at) > 3:
+        raise InputError(f"--for {feature!r}: the normal has no direction; to fix: give x,y,z,nx,ny,nz, or x,y,z alone")
+    split_any = not halve and at is None
+    return PlanRequest(halve=halve or split is None, split=split, split_any=split_any, views=views, feature=at)
 
 
 def _cell_of_run(folder: Path, stated: Mapping[str, object], trust: bool) -> tuple[Session, PlannedCell]:

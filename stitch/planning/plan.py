@@ -363,7 +363,7 @@ def _place_goal(views: PossibleViews, request: PlanRequest) -> KnownPlace:
     centre = views.simulated.unconstrained.overlaps.gram.centre
     lever = place_lever(request.feature[:3] - centre, width, start=6)
     if len(request.feature) > 3:
-        lever = request.feature[None, 3:] @ lever
+        lever = request.feature[None, 3:] / np.linalg.norm(request.feature[3:]) @ lever
     return KnownPlace(channel, lever, float("nan"), _MUCH)
 
 

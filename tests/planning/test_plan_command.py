@@ -70,6 +70,7 @@ def test_before_any_scan_it_says_what_views_tell_and_which_to_add(planned, measu
         (None, ["--size", "9", "--views", "0"], ["--views 0", "to fix"]),
         (None, ["--size", "9", "--field", "200"], ["--field 200", "to fix"]),
         (None, ["--size", "9", "--for", "hole"], ["--for 'hole'", "x,y,z"]),
+        (None, ["--size", "9", "--for", "1,2,3,0,0,0"], ["no direction", "nx,ny,nz"]),
         (None, ["--part", "nowhere.stl"], ["nowhere.stl", "not found"]),
         (None, ["--size", "9", "--split", "elbow", "backlash"], ["no effect 'elbow'"]),
         (None, ["--size", "250", "--split", "backlash", "backlash"], ["--split", "two"]),
