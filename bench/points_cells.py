@@ -1,10 +1,10 @@
 """Sessions of labelled points of ten kinds through `add --suggested`: is a name wrong, idle or named again?
 
 Run: python bench/points_cells.py [--seeds 700 706] [--kinds …]. An ABB IRB 120 of the generator before a tracker: a
-ball, three reflectors, a 6D probe; the sensor's kind stated and not; points in the robot's base; sweeps of single joints;
-an arm driven by cables; a part that slips; joints that count otherwise in either direction. Wrong: the first single name
-is none of the errors that are there. Zero: an effect of the final model no parameter of which is three sigmas off zero.
-Again: the closing diagnosis names what was dropped on the way.
+ball, three reflectors, a 6D probe; the sensor's kind stated and not; points in the robot's base; sweeps of single
+joints; an arm driven by cables; a part that slips; joints that count otherwise in either direction. Wrong: the first
+single name is none of the errors that are there. Zero: an effect of the final model no parameter of which is three
+sigmas off zero. Again: the closing diagnosis names what was dropped on the way.
 """
 
 import argparse
