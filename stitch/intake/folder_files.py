@@ -189,7 +189,10 @@ def _no_clouds_message(folder: Path, files: Sequence[Path]) -> str:
         return f"{folder}: no clouds there, only packed in {packed.relative_to(folder)}; to fix: unpack it there"
     kinds = Counter(f.suffix.lower() or f.name for f in files).most_common(3)
     there = f", only {', '.join(f'{count} {kind}' for kind, count in kinds)}" if kinds else ""
-    return f"{folder}: no clouds there{there}; to fix: put the scans there as {', '.join(CLOUD_SUFFIXES)}"
+    return (
+        f"{folder}: no clouds there{there}; to fix: put the scans there as {', '.join(CLOUD_SUFFIXES)}, or "
+        "the points that a tracker measured beside the poses"
+    )
 
 
 def list_files(folder: Path, depth: int = 0) -> list[Path]:

@@ -104,11 +104,8 @@ def find_measured(tables: Sequence[Table], poses: RobotPoses, geometry: Geometry
     return told or out
 
 
-def observed(found: Sequence[Measured], count: int, same_table: bool) -> Observed:
+def observed(found: Sequence[Measured], poses: RobotPoses) -> Observed:
     """Return what was measured view by view.
-
-    Args:
-        count: of the poses.
 
     Raises:
         InputError: rows that do not tell which view and which target they belong to.
@@ -121,8 +118,9 @@ def observed(found: Sequence[Measured], count: int, same_table: bool) -> Observe
         ways = tuple(way for layout in possible_layouts(raw) for way in readings(layout))
         probe = tuple({"probe": seen} for seen in zip(first.points, first.sigma.tolist(), strict=True))
         return Observed(names, probe, ways, rows, "one probe with its turn, a row a view")
-    if len(found) == 1 and not same_table:
-        return _long_table(first, count)
+    recorded = poses.table.times is not None and first.table.times is not None and not any(first.table.raw.labels)
+    if len(found) == 1 and first.table is not poses.table and not recorded:
+        return _long_table(first, len(poses.raw.numbers))
     if len({len(m.points) for m in found}) > 1:
         titles = ", ".join(dict.fromkeys(m.table.title for m in found))
         raise InputError(f"{titles}: have different numbers of rows; to fix: take out what does not belong")
@@ -395,8 +393,7 @@ def measured_session(folder: Path, stated: StatedFolder) -> MeasuredSession | No
     found = find_measured(tables, poses, geometry) if poses is not None else []
     if poses is None or not found:
         return None
-    same = found[0].table is poses.table
-    seen, pairs = pair(observed(found, len(poses.raw.numbers), same), found, poses)
+    seen, pairs = pair(observed(found, poses), found, poses)
     ways = ways_to_read(seen, found, poses, pairs, stated)
     if not ways or not np.isfinite(ways[0].misfit):
         raise InputError(

@@ -268,8 +268,11 @@ def _posed(table: Table, geometry: Geometry | None) -> Iterator[tuple[str | None
         return
     if geometry is not None and geometry.urdf is not None:
         raw = with_joints_of(raw, geometry.urdf)
-    joints = read_names(raw.header or ()).joints
-    if joints:
+    named = read_names(raw.header or ())
+    if len(named.rotation) in (12, 16):
+        yield None, raw
+        return
+    if named.joints:
         placed = {i for columns in table.groups.values() for i in columns.values()}
         yield None, columns_of(raw, [i for i in range(raw.numbers.shape[1]) if i not in placed])
         return

@@ -52,6 +52,25 @@ def test_what_does_not_belong_together_is_refused(tmp_path):
         measured_session(tmp_path, StatedFolder())
 
 
+def test_one_marker_that_was_recorded_is_paired_by_time(tmp_path):
+    """While the arm stands for 0.8 s at every pose, and moves on in between."""
+    arm = tracked_arm(34, 14)
+    times, places = np.arange(0, 14, 0.02), arm.points[:, 0]
+    between = np.stack([np.interp(times, np.arange(14) + 0.5, axis) for axis in places.T], axis=1)
+    stands = np.abs(times % 1 - 0.5) < 0.4
+    between[stands] = places[times[stands].astype(int)]
+    np.savetxt(
+        tmp_path / "marker.csv", np.column_stack([times, between]), "%.6f", ",", header="time [s],x,y,z", comments=""
+    )
+    poses = np.column_stack([np.arange(14) + 0.5, arm.T.reshape(-1, 16)])
+    names = ",".join(["time", *(f"m{i}{k}" for i in range(4) for k in range(4))])
+    np.savetxt(tmp_path / "robot.csv", poses, "%.9f", ",", header=names, comments="")
+    made = measured_session(tmp_path, StatedFolder())
+    write_measured(tmp_path / "made", made)
+    found = closed_form_hand_eye(prepare_capture(load_session(tmp_path / "made")))
+    assert np.linalg.norm(found[:3, 3] - arm.T_base_sensor[:3, 3]) < 0.3
+
+
 def test_joints_without_the_robot_are_refused(tmp_path):
     FOLDERS["joints and a reflector in one table"](tmp_path, tracked_arm(33, 9))
     (tmp_path / "dh_parameters.csv").unlink()
