@@ -72,8 +72,8 @@ def _sphere_sentence(folder: Path) -> str:
     diameter, U, stated = 2 * fit.radius, 4 * np.sqrt(fit.covariance[9, 9]), 2 * (session.sphere_radius or np.nan)
     return (
         f"A real sphere of {stated:g} mm under {len(session.views)} laser lines of a FANUC arm: its diameter is "
-        f"{diameter:.2f} mm with U = {U:.2f} mm, E_n = {abs(diameter - stated) / U:.2f} (`stitch calibrate sphere "
-        "--radius-free`). The lines pass near its equator and hardly turn, which U says."
+        f"{diameter:.2f} mm with U = {U:.2f} mm, E_n = {abs(diameter - stated) / U:.2f}\n"
+        "(`stitch calibrate sphere --radius-free`). The lines pass near its equator and hardly turn, which U says."
     )
 
 
