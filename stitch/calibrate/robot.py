@@ -312,7 +312,7 @@ def _observe_links(session: Session) -> _SeenLinks:
     variances = fit_variances(every, both_starts=True).variances if enough else found.targets.variances
     half = whitener(rows.mixed_model(base), variances)
     V = len(rows.lever)
-    shown = np.flatnonzero(rows.used.any(axis=1)[:V])
+    shown = np.flatnonzero(np.asarray(rows.used.any(axis=1))[:V])
     white = (half @ np.concatenate([base, columns, every.z[..., None]], axis=2))[shown]
     names = tuple(found.session.names[v] for v in shown)
     products = white.transpose(0, 2, 1) @ white
