@@ -4,7 +4,8 @@ Run: python bench/points_cells.py [--seeds 700 706] [--kinds …]. An ABB IRB 12
 ball, three reflectors, a 6D probe; the sensor's kind stated and not; points in the robot's base; sweeps of single
 joints; an arm driven by cables; a part that slips; joints that count otherwise in either direction. Wrong: the first
 single name is none of the errors that are there. Zero: an effect of the final model no parameter of which is three
-sigmas off zero. Again: the closing diagnosis names what was dropped on the way.
+sigmas off zero: of one that is there too, where its parameters are only known together. Again: the closing diagnosis
+names what was dropped on the way.
 """
 
 import argparse
