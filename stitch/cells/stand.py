@@ -481,7 +481,7 @@ def _cosine_rules(
 
 def _angles_between(a: Array, b: Array) -> Array:
     """(N,) angles of vectors b (N, 2) against a (2,), without sign."""
-    return np.abs(np.arctan2(a[0] * b[:, 1] - a[1] * b[:, 0], b @ a))
+    return np.asarray(np.abs(np.arctan2(a[0] * b[:, 1] - a[1] * b[:, 0], b @ a)))
 
 
 def _third_side(a: float, b: float, between: float) -> float:
