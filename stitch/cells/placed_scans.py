@@ -55,8 +55,16 @@ class JoinedScans:
 
     def take(self, keep: NDArray[np.bool_] | Indices) -> "JoinedScans":
         """The points of a mask or of indices."""
-        names = ("points", "normals", "usable", "area", "view", "carried")
-        return replace(self, **{n: v[keep] for n in names if isinstance(v := getattr(self, n), np.ndarray)})
+        carried = self.carried[keep] if isinstance(self.carried, np.ndarray) else self.carried
+        return replace(
+            self,
+            points=self.points[keep],
+            normals=self.normals[keep],
+            usable=self.usable[keep],
+            area=self.area[keep],
+            view=self.view[keep],
+            carried=carried,
+        )
 
 
 def join_scans(scans: Sequence[Scan], T_base_scanner: Array) -> JoinedScans:
