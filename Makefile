@@ -52,6 +52,8 @@ endif
 demo: install
 	@$(VENV)/bin/stitch demo
 
+# Programs that the tests start would compile stitch anew where nothing may be kept.
+test: export PYTHONDONTWRITEBYTECODE =
 test: install
 	$(PYTHON) -m pytest
 

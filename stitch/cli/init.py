@@ -172,7 +172,7 @@ def _init_from_points(folder: Path, out: Path, stated: StatedFolder, yes: bool, 
         return False
     _print_guesses(made.guesses)
     if not yes:
-        _require_told(out, made.guesses)
+        _require_determined(out, made.guesses)
     write_measured(out, made, force=force)
     _report_session(out, len(made.way.pairing.used), made.guesses, as_json, "run")
     return True
@@ -229,7 +229,7 @@ def _ask_uncertain(folder: Path, out: Path, first: FirstSession, stated: StatedF
     """
     untold = [guess for guess in first.guesses if not guess.determined]
     if not sys.stdin.isatty():
-        _require_told(out, first.guesses)
+        _require_determined(out, first.guesses)
         return first
     asked = [guess for guess in untold if guess.what in _QUESTIONS]
     while asked:
@@ -247,7 +247,7 @@ def _ask_uncertain(folder: Path, out: Path, first: FirstSession, stated: StatedF
     return first
 
 
-def _require_told(out: Path, guesses: Sequence[Guess]) -> None:
+def _require_determined(out: Path, guesses: Sequence[Guess]) -> None:
     """Refuse guesses that neither files nor measurements tell."""
     untold = [guess for guess in guesses if not guess.determined]
     if untold:

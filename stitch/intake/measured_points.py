@@ -299,7 +299,18 @@ def _capture(seen: Observed, way: Way, views: Sequence[int]) -> Capture:
         for v, pose in zip(views, T, strict=True)
     ]
     scanner = Scanner(None, None, None, np.array([0.0, 0.0, 1.0]))
-    session = Session(Path(), "", "mm", way.mount, scanner, None, None, None, None, tuple(each))
+    session = Session(
+        Path(),
+        "",
+        "mm",
+        way.mount,
+        scanner,
+        robot=None,
+        sphere_radius=None,
+        cad=None,
+        cad_unit=None,
+        views=tuple(each),
+    )
     return build_capture("", (), T, way.mount, sightings_of(session))
 
 
@@ -327,7 +338,7 @@ def _misfit(seen: Observed, way: Way, at_most: int) -> float:
     return left + _LEVER_MM * float(np.median(turned))
 
 
-def ways_to_read(
+def candidate_ways(
     seen: Observed, found: Sequence[Measured], poses: RobotPoses, pairs: Sequence[Pairing], stated: StatedFolder
 ) -> list[Way]:
     """Every way that is not ruled out by what files or people say, the best first."""
@@ -341,7 +352,7 @@ def ways_to_read(
         known = stated.length_unit or reading.layout.length_unit or poses.table.unit
         units = [known] if known else pose_units(reading.T[:, :3, 3])
         for unit, point_unit, turn in product(units, [told] if told else ["mm", "m"], turns):
-            way = Way(reading, robot, pairing, mount, unit, point_unit, turn, 0.0)
+            way = Way(reading, robot, pairing, mount, unit=unit, point_unit=point_unit, turn=turn, misfit=0.0)
             out.append(replace(way, misfit=_misfit(seen, way, _FEW_VIEWS)))
     out.sort(key=_misfit_of)
     judged = [replace(way, misfit=_misfit(seen, way, _MORE_VIEWS)) for way in out[:_BEST]]
@@ -394,7 +405,7 @@ def measured_session(folder: Path, stated: StatedFolder) -> MeasuredSession | No
     if poses is None or not found:
         return None
     seen, pairs = pair(observed(found, poses), found, poses)
-    ways = ways_to_read(seen, found, poses, pairs, stated)
+    ways = candidate_ways(seen, found, poses, pairs, stated)
     if not ways or not np.isfinite(ways[0].misfit):
         raise InputError(
             f"{folder}: no one hand-eye fits what was measured to the robot's poses; to fix: turn the flange about two "
@@ -472,7 +483,7 @@ def write_measured(folder: Path, made: MeasuredSession, *, force: bool = False) 
     views = _views_columns(made, order, [row_of[v] or 0 for v in order])
     texts = {
         "views.csv": table_text(views),
-        shown: table_text(_shown_columns(made, order, list(map(str, views["view"])))),
+        shown: table_text(_file_columns(made, order, list(map(str, views["view"])))),
         "session.toml": _toml(folder, made),
     }
     for name, text in texts.items():
@@ -500,7 +511,7 @@ def _views_columns(made: MeasuredSession, order: Sequence[int], rows: Sequence[i
     return out
 
 
-def _shown_columns(made: MeasuredSession, order: Sequence[int], names: Sequence[str]) -> dict[str, Sequence[object]]:
+def _file_columns(made: MeasuredSession, order: Sequence[int], names: Sequence[str]) -> dict[str, Sequence[object]]:
     """points.csv or frames.csv, mm; sigma where one is stated."""
     seen = [_sighting(made.seen, made.way, v) for v in order]
     places, sigma = np.concatenate([s.points for s in seen]), np.concatenate([s.sigma for s in seen])

@@ -240,7 +240,7 @@ def find_robot_poses(tables: Sequence[Table], geometry: Geometry | None, stated:
             said = f"{table.title} {group or ''}"
             score = 2 * bool(_ROBOT.search(said)) - 2 * bool(MEASURED.search(said)) + 9 * (table.file == stated.poses)
             try:
-                ways, jointed = _ways_to_read(raw, geometry, stated)
+                ways, jointed = _candidate_readings(raw, geometry, stated)
             except InputError as error:
                 refused = error
                 continue
@@ -290,7 +290,7 @@ def columns_of(raw: RawPoses, kept: Sequence[int], owner: str = "") -> RawPoses:
     return replace(raw, header=tuple(header), numbers=raw.numbers[:, kept])
 
 
-def _ways_to_read(
+def _candidate_readings(
     raw: RawPoses, geometry: Geometry | None, stated: StatedFolder
 ) -> tuple[tuple[ReadingOfArm, ...], bool]:
     """Each reading, lengths as the file has them, and whether it is one of joints."""

@@ -96,7 +96,9 @@ def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> Ra
         trusted.append(np.mean(far > image[i, j] + 2 * _STEEPEST * size * far) < _MOST_BEHIND)
     limits = np.array([np.quantile(far, (0.01, 0.99)) for far in ranges])
     reach = float(limits[:, 0].min()), float(limits[:, 1].max())
-    return RangeImages(axes, low, size, np.array(nearest), np.array(empty), seen >= 2, reach, np.array(trusted))
+    return RangeImages(
+        axes, low, size, np.array(nearest), np.array(empty), field=seen >= 2, reach=reach, trusted=np.array(trusted)
+    )
 
 
 def solid_angle(scan: Scan) -> float:
