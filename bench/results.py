@@ -316,7 +316,7 @@ SYSTEMS: dict[str, tuple[Row, ...]] = {
         Row("window onto its CAD", LINE[:3], "fit error 0.573", fitted("window")),
         Row("path corrected for the found body, as the robot's program", (*LINE[:2], LINE[3], PLACE), "–", program),
         Row("flush and gap at eight places", LINE, "flush 0 ± 1.5, gap 16 ± 2 mm", seam),
-        Row("table 1: bond gap at D1 to D8", LINE, "figures lost; all within 16 ± 2 mm", each_gap),
+        Row("table 1: gap width at D1 to D8", LINE, "figures lost; all within 16 ± 2 mm", each_gap),
         Row(
             "the whole line, 5 cells: window set against its design place",
             ("python bench/window_line.py",),
