@@ -1,9 +1,6 @@
 """A panel job from its readings to the commands of all robots."""
 
 import json
-import shlex
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +15,7 @@ from stitch.cells.job_files import (
     CsvColumns,
     JobTable,
     Wanted,
+    call_machines,
     points_table,
     poses_from_columns,
     poses_from_rows,
@@ -616,21 +614,7 @@ def control_shape(file: Path, drive: str, folder: Path) -> tuple[PanelJob, Panel
                 f"the shape is still {largest[-1]:.2f} mm off after {_MOST_CORRECTIONS} corrections, "
                 f"{job.tolerance:g} mm are allowed; to fix: look at the forces, and which clamp a point belongs to"
             )
-        _call_machines(drive)
-
-
-def _call_machines(drive: str) -> None:
-    try:
-        done = subprocess.run(shlex.split(drive), check=False, capture_output=True, text=True)
-    except (OSError, ValueError) as error:
-        raise InputError(f"--drive {drive}: {error}; to fix: write a program and its arguments") from None
-    print(done.stdout, end="", file=sys.stderr)
-    if done.returncode:
-        told = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise NoResultError(
-            f"--drive {drive}: exit code {done.returncode}, {told}. The robots stand where it left them; to fix: see "
-            "its message, then call again"
-        )
+        call_machines(drive)
 
 
 def run_panel(file: Path, drive: str | None, wanted: Wanted) -> None:
