@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from drilling_loop import calibrate_sensors, drive_pose, measure_hole, run_group
 
-from data_synth.drilling_cell import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
-from data_synth.drilling_image import render_plate
+from data_synth.cells.drilling import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
+from data_synth.cells.drilling_image import render_plate
 from stitch.cells.drilling_sensors import (
     HoleObservations,
     fit_homography,

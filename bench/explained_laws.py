@@ -18,10 +18,10 @@ from scipy.stats import binomtest
 from unknown_cells import asked, seen, true_column
 from unknown_worlds import PARTS, grown
 
-from data_synth.foreign_laws import FOREIGN
-from data_synth.further_laws import FURTHER
-from data_synth.later_laws import LATER
-from data_synth.unnamed_laws import UNNAMED
+from data_synth.laws.blind_first import FOREIGN
+from data_synth.laws.blind_second import FURTHER
+from data_synth.laws.blind_third import LATER
+from data_synth.laws.unnamed import UNNAMED
 from stitch.explanation.explain import explain
 from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel

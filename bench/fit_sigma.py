@@ -14,12 +14,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from data_synth.cells.window_scans import area_scanner
+from data_synth.cells.window_views import along_edges, over
 from data_synth.scanner import field_map
 from data_synth.scanning import scan
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
-from data_synth.window_scans import area_scanner
-from data_synth.window_views import along_edges, over
 from stitch import frames
 from stitch.cells.cad import cad_surface
 from stitch.cells.placed_scans import PlacingErrors, join_scans

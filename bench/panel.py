@@ -12,8 +12,8 @@ from panel_drift import drift_table
 from panel_loops import run_pose
 from panel_ready import MASTER, POSES, TOLERANCE, pose_error, read, ready, ready_without_panel, shape_run
 
-from data_synth import hexapod, panel_job
-from data_synth.panel_cell import NAMES, PanelCell, Sizes
+from data_synth.cells import hexapod, panel_job
+from data_synth.cells.panel import NAMES, PanelCell, Sizes
 from stitch import frames
 from stitch.cells.panel_model import (
     SHAPE_AXES,

@@ -9,8 +9,8 @@ import numpy as np
 from panel_loops import measure_pose
 from panel_ready import POSES, ready
 
-from data_synth import panel_job
-from data_synth.panel_cell import NAMES
+from data_synth.cells import panel_job
+from data_synth.cells.panel import NAMES
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "panel"
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from panel_loops import PanelSetup, ShapeRun, run_pose, run_shape
 
-from data_synth import panel_job
-from data_synth.panel_cell import NAMES, PanelCell
+from data_synth.cells import panel_job
+from data_synth.cells.panel import NAMES, PanelCell
 from stitch import frames
 from stitch.cells.panel_model import (
     ClampLayout,

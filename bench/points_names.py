@@ -21,9 +21,9 @@ from scipy.stats import binomtest
 
 from data_synth.arms import ARMS
 from data_synth.fixtures.labelled_arm import joints_of, labelled_cell
+from data_synth.laws.unnamed import UNNAMED
 from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
-from data_synth.unnamed_laws import UNNAMED
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit

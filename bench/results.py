@@ -125,9 +125,8 @@ LINE = (
 )
 DRILL = ("stitch synth drilling drilling --seed 3", "stitch drill drilling/job.toml --json")
 PANEL = ("stitch synth panel-robots panel --seed 3", "stitch panel panel/job.toml --json")
-SHAPED = (
-    "stitch panel panel/job.toml -o moves --json --drive 'python -m data_synth.panel_job panel moves/shape_move.csv'"
-)
+MACHINES = "python -m data_synth.cells.panel_job panel moves/shape_move.csv"
+SHAPED = f"stitch panel panel/job.toml -o moves --json --drive '{MACHINES}'"
 PLACE = "stitch export line/found-body --program line/place.src -o line/there.src --frame 0,0,0,0,0,0 --json"
 
 

@@ -10,11 +10,11 @@ from blind_trials import LIBRARY
 from unknown_cells import Asked, World, true_column
 
 from data_synth import nature
-from data_synth.foreign_laws import FOREIGN, FOREIGN_IN_TIME, FOREIGN_OF_FLANGE
-from data_synth.further_laws import FURTHER, FURTHER_IN_TIME, FURTHER_OF_FLANGE
-from data_synth.later_laws import LATER, LATER_IN_TIME, LATER_OF_FLANGE
+from data_synth.laws.blind_first import FOREIGN, FOREIGN_IN_TIME, FOREIGN_OF_FLANGE
+from data_synth.laws.blind_second import FURTHER, FURTHER_IN_TIME, FURTHER_OF_FLANGE
+from data_synth.laws.blind_third import LATER, LATER_IN_TIME, LATER_OF_FLANGE
+from data_synth.laws.unnamed import IN_TIME, UNNAMED
 from data_synth.ordinary_arm import draw_arm, with_memory
-from data_synth.unnamed_laws import IN_TIME, UNNAMED
 from stitch.diagnosis.sensitivity import least_noncentrality
 from stitch.effects import EFFECTS
 from stitch.frames import Array

@@ -10,10 +10,10 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from data_synth import window_scans, window_views
+from data_synth.cells import window_scans, window_views
+from data_synth.cells.window_scans import Weld, warp
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
-from data_synth.window_scans import Weld, warp
 from stitch import frames
 from stitch.cells.cad import Box, Regions, cad_surface
 from stitch.cells.placed_scans import join_scans

@@ -9,7 +9,7 @@ import igl
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from data_synth import window_job, window_scans, window_views
+from data_synth.cells import window_job, window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import Pane
 from stitch import frames

@@ -16,9 +16,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from data_synth.window_line import EXACT, Errors, WindowLine
-from data_synth.window_line_job import write_line, write_seam
-from data_synth.window_scans import true_seam
+from data_synth.cells.window_line import EXACT, Errors, WindowLine
+from data_synth.cells.window_line_job import write_line, write_seam
+from data_synth.cells.window_scans import true_seam
 from stitch import frames
 from stitch.cells.job_files import poses_from_columns, read_columns
 from stitch.cells.seam import Station

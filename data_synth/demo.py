@@ -64,7 +64,7 @@ def demo(
 
 def _demo_verify(folder: Path, seed: int) -> None:
     """Fit a cell on a part, measure the part with U, and verify the fit by a calibrated sphere plate."""
-    from data_synth.verified_cell import write_verified_cell
+    from data_synth.cells.verified_cell import write_verified_cell
     from stitch.cli.measure import measure
     from stitch.cli.run import run
     from stitch.cli.terminal import headlines_only, say, show_files

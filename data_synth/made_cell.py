@@ -10,15 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from data_synth import drilling_job, panel_job, window_line_job
-from data_synth.base_stand import TwoBases
-from data_synth.drilling_cell import DrillingCell, Sizes
+from data_synth.cells import drilling_job, panel_job, window_line_job
+from data_synth.cells.base_stand import TwoBases
+from data_synth.cells.drilling import DrillingCell, Sizes
+from data_synth.cells.panel import NAMES
+from data_synth.cells.window_line import WindowLine
 from data_synth.fixtures.sphere_scans import sphere_cell, write_spheres
 from data_synth.made_session import truth_path
-from data_synth.panel_cell import NAMES
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
-from data_synth.window_line import WindowLine
 from data_synth.write import truth_of, write_session
 from stitch.system.files import sync_to_disk
 from stitch.system.process import console
@@ -126,7 +126,7 @@ CELLS = {
         (
             "stitch panel FOLDER/job.toml -o commands",
             "stitch panel FOLDER/job.toml -o moves "
-            '--drive "python -m data_synth.panel_job FOLDER moves/shape_move.csv"',
+            '--drive "python -m data_synth.cells.panel_job FOLDER moves/shape_move.csv"',
         ),
     ),
     "two-bases": Made(_two_bases, ("stitch base FOLDER/stand.toml",)),

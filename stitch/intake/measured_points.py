@@ -338,7 +338,7 @@ def _misfit(seen: Observed, way: Way, at_most: int) -> float:
     return left + _LEVER_MM * float(np.median(turned))
 
 
-def candidate_ways(
+def candidate_interpretations(
     seen: Observed, found: Sequence[Measured], poses: RobotPoses, pairs: Sequence[Pairing], stated: StatedFolder
 ) -> list[Way]:
     """Every way that is not ruled out by what files or people say, the best first."""
@@ -405,7 +405,7 @@ def measured_session(folder: Path, stated: StatedFolder) -> MeasuredSession | No
     if poses is None or not found:
         return None
     seen, pairs = pair(observed(found, poses), found, poses)
-    ways = candidate_ways(seen, found, poses, pairs, stated)
+    ways = candidate_interpretations(seen, found, poses, pairs, stated)
     if not ways or not np.isfinite(ways[0].misfit):
         raise InputError(
             f"{folder}: no one hand-eye fits what was measured to the robot's poses; to fix: turn the flange about two "

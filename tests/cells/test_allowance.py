@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from data_synth import window_scans
+from data_synth.cells import window_scans
 from data_synth.scanning import scan
 from data_synth.shapes import build_shape
 from data_synth.shapes.casting import around, with_stock

@@ -21,8 +21,8 @@ import viz.cells.drilling
 import viz.cells.panel
 import viz.cells.window_fit
 import viz.cells.window_seam
-from data_synth.drilling_cell import DrillingCell, Sizes
-from data_synth.drilling_job import write_job
+from data_synth.cells.drilling import DrillingCell, Sizes
+from data_synth.cells.drilling_job import write_job
 from stitch.cells import job_files
 from stitch.cli.main import main
 from stitch.errors import InputError

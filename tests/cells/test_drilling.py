@@ -18,9 +18,9 @@ from bench.drilling_loop import (
     run_group,
     servo_to_hole,
 )
-from data_synth.drilling_cell import FOCAL, GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
-from data_synth.drilling_image import ellipse_centres, render_holes, render_plate
-from data_synth.drilling_job import write_job, write_locating, write_trials
+from data_synth.cells.drilling import FOCAL, GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
+from data_synth.cells.drilling_image import ellipse_centres, render_holes, render_plate
+from data_synth.cells.drilling_job import write_job, write_locating, write_trials
 from stitch import frames
 from stitch.cells import drilling_sensors
 from stitch.cells.drilling import read_drill_job, solve_drill_job

@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.panel_loops import PanelSetup, run_pose, run_shape
-from data_synth import hexapod, panel_job
-from data_synth.panel_cell import NAMES, PanelCell, Sizes
+from data_synth.cells import hexapod, panel_job
+from data_synth.cells.panel import NAMES, PanelCell, Sizes
 from data_synth.shell import Laminate, Shell
 from stitch import frames
 from stitch.cells.panel import read_panel_job, solve_panel_job
@@ -442,6 +442,6 @@ def test_a_panel_that_does_not_follow_ends_it(driven, capsys):
 def test_a_simulated_panel_gets_its_shape_by_one_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     main_code(["synth", "panel-robots", "cell", "--seed", "3"])
-    machine = f"{sys.executable} -m data_synth.panel_job cell moves/shape_move.csv"
+    machine = f"{sys.executable} -m data_synth.cells.panel_job cell moves/shape_move.csv"
     main_code(["panel", "cell/job.toml", "-o", "moves", "--drive", machine])
     assert "Shape control: 1 corrections" in capsys.readouterr().out

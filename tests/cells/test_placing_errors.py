@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from data_synth import window_scans, window_views
+from data_synth.cells import window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from stitch import frames

@@ -10,7 +10,7 @@ import trimesh
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from data_synth import window_scans, window_views
+from data_synth.cells import window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
 from stitch import frames

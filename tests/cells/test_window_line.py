@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data_synth.window_line import EXACT, Errors, WindowLine
-from data_synth.window_line_job import write_line, write_seam
-from data_synth.window_scans import Weld, true_seam
+from data_synth.cells.window_line import EXACT, Errors, WindowLine
+from data_synth.cells.window_line_job import write_line, write_seam
+from data_synth.cells.window_scans import Weld, true_seam
 from stitch import frames
 from stitch.cells.seam import Station
 from stitch.cli.main import main

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from data_synth.arms import ARMS
-from data_synth.foreign_laws import FOREIGN, FOREIGN_IN_TIME, FOREIGN_OF_FLANGE
-from data_synth.further_laws import FURTHER, FURTHER_IN_TIME, FURTHER_OF_FLANGE
-from data_synth.later_laws import LATER, LATER_IN_TIME, LATER_OF_FLANGE
+from data_synth.laws.blind_first import FOREIGN, FOREIGN_IN_TIME, FOREIGN_OF_FLANGE
+from data_synth.laws.blind_second import FURTHER, FURTHER_IN_TIME, FURTHER_OF_FLANGE
+from data_synth.laws.blind_third import LATER, LATER_IN_TIME, LATER_OF_FLANGE
+from data_synth.laws.unnamed import UNNAMED
 from data_synth.moment import Plan
-from data_synth.unnamed_laws import UNNAMED
 from tests.data_synth.law_plans import SEEDS, SIZE, VIEWS, plan_of, relative
 
 LAWS, OF_FLANGE = FOREIGN | FURTHER | LATER, (*FOREIGN_OF_FLANGE, *FURTHER_OF_FLANGE, *LATER_OF_FLANGE)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from data_synth.base_stand import TwoBases
+from data_synth.cells.base_stand import TwoBases
 from data_synth.made_cell import CELLS
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate

@@ -8,8 +8,8 @@ from scipy.linalg import null_space
 from scipy.stats import multivariate_normal
 
 from data_synth import kinematics
+from data_synth.laws.unnamed import UNNAMED
 from data_synth.ordinary_arm import with_memory
-from data_synth.unnamed_laws import UNNAMED
 from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import gather_evidence

@@ -5,9 +5,9 @@ import pytest
 
 from data_synth.arms import ARMS
 from data_synth.fixtures.labelled_arm import TARGETS, flange, joints_of, labelled_cell
+from data_synth.laws.unnamed import UNNAMED
 from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
-from data_synth.unnamed_laws import UNNAMED
 from stitch.diagnosis.unnamed_time_laws import least_log_bayes_factor, unnamed_courses
 from stitch.pipeline import diagnose, run
 

@@ -11,7 +11,7 @@ import tomli_w
 from plyfile import PlyData
 from typer.testing import CliRunner
 
-from data_synth.verified_cell import write_verified_cell
+from data_synth.cells.verified_cell import write_verified_cell
 from stitch.cli.main import build
 from stitch.cli.plan import place_of
 from stitch.errors import InputError

@@ -9,10 +9,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from data_synth.cells.window_views import across_seam, along_edges, over
 from data_synth.scanner import Scanner
 from data_synth.scanning import scan
 from data_synth.shapes.car_door import CarDoor
-from data_synth.window_views import across_seam, along_edges, over
 from stitch import frames
 
 Array = NDArray[np.float64]

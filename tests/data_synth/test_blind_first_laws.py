@@ -3,7 +3,7 @@
 import numpy as np
 
 from data_synth import kinematics
-from data_synth.foreign_laws import FOREIGN
+from data_synth.laws.blind_first import FOREIGN
 from data_synth.moment import Plan
 from tests.data_synth.law_plans import VIEWS, plan_of
 

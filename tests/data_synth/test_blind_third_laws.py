@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from data_synth import kinematics
-from data_synth.later_laws import LATER
+from data_synth.laws.blind_third import LATER
 from data_synth.moment import Plan
 from tests.data_synth.law_plans import SEEDS, SHIFT, SIZE, VIEWS, plan_of
 

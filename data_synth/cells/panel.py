@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_synth import hexapod
+from data_synth.cells import hexapod
 from data_synth.shell import HeldShell, Laminate, Shell
 from stitch import frames
 

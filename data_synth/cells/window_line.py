@@ -12,12 +12,12 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from data_synth.cells.window_scans import NO_FIELD, Weld, area_scanner, warp
+from data_synth.cells.window_views import across_seam, along_edges, looking_at, over, stations
 from data_synth.scanner import Cloud, Scanner, profile_times
 from data_synth.scanning import scan
 from data_synth.shapes import car_door, spheres
 from data_synth.shapes.car_door import CarDoor, Pane
-from data_synth.window_scans import NO_FIELD, Weld, area_scanner, warp
-from data_synth.window_views import across_seam, along_edges, looking_at, over, stations
 from stitch import frames
 
 Array = NDArray[np.float64]

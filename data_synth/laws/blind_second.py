@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from data_synth import kinematics
-from data_synth.law_sizes import (
+from data_synth.laws.sizes import (
     SHIFT,
     SIZE,
     Array,

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_synth.window_job import pose_table, write_path, write_stations
-from data_synth.window_line import RADIUS, Scans, WindowLine
+from data_synth.cells.window_job import pose_table, write_path, write_stations
+from data_synth.cells.window_line import RADIUS, Scans, WindowLine
 from data_synth.write import cloud_file
 from stitch.writing.session_files import SessionFiles, pose_columns, write_session
 

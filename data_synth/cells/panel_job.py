@@ -1,7 +1,7 @@
 """A panel cell's measurements as the files that `stitch panel` reads.
 
-As a program it stands for the machines: `python -m data_synth.panel_job FOLDER MOVES` lets the robots of a cell that
-`stitch synth panel-robots FOLDER` wrote go where the table MOVES says, and measures anew.
+As a program it stands for the machines: `python -m data_synth.cells.panel_job FOLDER MOVES` lets the robots of a cell
+that `stitch synth panel-robots FOLDER` wrote go where the table MOVES says, and measures anew.
 """
 
 import csv
@@ -14,9 +14,9 @@ import tomli_w
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from data_synth import hexapod
+from data_synth.cells import hexapod
+from data_synth.cells.panel import LENGTH, NAMES, RADIUS, PanelCell
 from data_synth.csv_rows import POSE, pose_numbers, write_rows
-from data_synth.panel_cell import LENGTH, NAMES, RADIUS, PanelCell
 from stitch import frames
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from data_synth.law_sizes import SIZE, Array, at_joint, direction, of_joint
+from data_synth.laws.sizes import SIZE, Array, at_joint, direction, of_joint
 from data_synth.moment import Plan
 
 _RMS_OF_WAVE, _RMS_OF_SAW = float(np.sqrt(2.0)), float(np.sqrt(12.0))

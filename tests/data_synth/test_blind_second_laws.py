@@ -3,7 +3,7 @@
 import numpy as np
 
 from data_synth import kinematics
-from data_synth.further_laws import FURTHER
+from data_synth.laws.blind_second import FURTHER
 from data_synth.moment import Plan
 from tests.data_synth.law_plans import SEEDS, SHIFT, SIZE, VIEWS, plan_of
 

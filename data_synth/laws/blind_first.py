@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from data_synth import kinematics
-from data_synth.law_sizes import Array, clock, joint_with, of_base_frame, of_flange, of_joint, torque_of
+from data_synth.laws.sizes import Array, clock, joint_with, of_base_frame, of_flange, of_joint, torque_of
 from data_synth.moment import Plan
 
 _FOOT = 250.0  # mm from a base's middle to its anchor bolts

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from data_synth.drilling_cell import FOCAL, HEIGHT, HOLE_DIAMETER, IMAGE, NINE, DrillingCell
+from data_synth.cells.drilling import FOCAL, HEIGHT, HOLE_DIAMETER, IMAGE, NINE, DrillingCell
 from stitch import frames
 
 _FINE = 4  # rays per pixel and direction

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from data_synth.cells.drilling import GROUPS, HEIGHT, HOLE_DIAMETER, IMAGE, DrillingCell
 from data_synth.csv_rows import POSE, pose_numbers, write_rows
-from data_synth.drilling_cell import GROUPS, HEIGHT, HOLE_DIAMETER, IMAGE, DrillingCell
 from stitch import frames
 
 _JOB = f"""# A drilling job: where must the robot be sent so that the holes come where they belong?

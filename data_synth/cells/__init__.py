@@ -1,0 +1,1 @@
+"""Cells that are more than scans of a part: bases, drilling, panel, window, an artefact to verify."""
