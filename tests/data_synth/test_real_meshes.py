@@ -51,7 +51,10 @@ def turbine_blade(request):
     return trimesh.load_mesh(request.getfixturevalue("shared_data") / "meshes" / "turbineblade.ply")
 
 
-@pytest.mark.parametrize(("load", "closed"), [(closed_bunny, True), (broken_bunny, False), (turbine_blade, True)])
+@pytest.mark.parametrize(
+    ("load", "closed"),
+    [(closed_bunny, True), (broken_bunny, False), pytest.param(turbine_blade, True, marks=pytest.mark.slow)],
+)
 def test_a_real_mesh_is_scanned_stitched_and_fitted(load, closed, request, tmp_path):
     mesh = load(request)
     mesh.apply_scale(SIZE / mesh.extents.max())

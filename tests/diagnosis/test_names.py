@@ -69,7 +69,14 @@ def test_poses_that_wander_get_no_name(cell):
 
 @pytest.mark.parametrize(
     ("law", "seed", "joint"),
-    [("dress_pack", 2, 2), ("coupling", 1, 3), ("coupling", 3, 2), ("ripple", 4, 4), ("ripple", 1, 3), ("spall", 3, 5)],
+    [
+        ("dress_pack", 2, 2),
+        ("spall", 3, 5),
+        *(
+            pytest.param(*further, marks=pytest.mark.slow)
+            for further in (("coupling", 1, 3), ("coupling", 3, 2), ("ripple", 4, 4), ("ripple", 1, 3))
+        ),
+    ],
 )
 def test_a_joint_that_follows_no_known_law_gets_no_name_but_its_number(cell, law, seed, joint):
     """0.3 mrad by laws of no library, which beside all joints and links at once look like one of them."""

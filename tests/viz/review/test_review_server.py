@@ -157,7 +157,8 @@ def test_own_python_is_checked_by_a_command_and_its_fault_told_in_a_line(server,
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="finds the fit's process by Linux's /proc")
-@pytest.mark.parametrize("how", [pytest.param("stopped", marks=pytest.mark.slow), "killed"])
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["stopped", "killed"])
 def test_a_fit_that_is_ended_leaves_the_run_as_it_was(server, run, how):
     page, before = server.listen(), server.state()
     kept = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
