@@ -23,6 +23,8 @@ DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 # A pose as Universal Robots writes it: p[0.1, 0.2, …].
 _POSE_OF_UR = re.compile(r"(?<!\w)p\s*\[(?=\s*[+-]?\.?\d)")
 # What programs write where they have no number.
+_MARKED_NUMBER = re.compile(r"^#\d+\b(?=\s*[(\[])")
+_GROUPS = re.compile(r"[)\]]\s*[(\[]")
 _NO_NUMBER = re.compile(r"[+-]?(nan|inf(inity)?)|null|none|#?n/?a|-?1\.#(qnan|ind|inf)", re.IGNORECASE)
 # A number behind a name, "pose 0: 0.83" or "P0 0.83", and before a name or a unit, "0.83 a.ply" or "0.83 mm".
 _DECIMAL = r"[+-]?\d*[.,]\d+(?:[eE][+-]?\d+)?"
@@ -37,6 +39,8 @@ def split_cells(line: str, separator: str) -> list[str]:
     """Cells of a line, trimmed."""
     if ";" in line and _ROWS.search(line):
         line = _ROWS.sub(lambda rows: re.sub("[,;] *", separator, rows[0]), line.rstrip("; "))
+    # "#1 (x, y, z) (q…)": a row's number, and groups of numbers.
+    line = _GROUPS.sub(separator, _MARKED_NUMBER.sub(lambda mark: mark[0] + separator, line))
     line = _POSE_OF_UR.sub("[", line).translate(_BRACKETS).strip()
     if separator == " ":
         return line.split()
@@ -77,10 +81,13 @@ def trimmed_rows(rows: NumberedRows) -> NumberedRows:
         return [(line, short) for line, cells in rows if (short := without_trailing_blanks(cells))]
     written = Counter(len(cells) for cells in numbered).most_common(1)[0][0]
     width = max(len(without_trailing_blanks(cells)) for cells in numbered)
+    first, *_, last = [line for line, cells in rows if _number_count(cells) >= _SEVERAL] * 2
     out = []
     for line, cells in rows:
         some = sum(bool(cell) for cell in cells)
-        of_table = len(cells) == written and (_number_count(cells) >= _SEVERAL or 2 * some > width)
+        # Between rows of numbers, a name alone is a view without a pose; elsewhere it is a title or a remark.
+        named = _number_count(cells) >= _SEVERAL or 2 * some > width or first < line < last
+        of_table = len(cells) == written and named
         short = cells[:width] if of_table else without_trailing_blanks(cells)
         out += [(line, short)] if some else []
     return out
@@ -302,6 +309,8 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     lines = [(i, line.strip()) for i, line in enumerate(content.splitlines(), 1)]
     kept = [(i, line) for i, line in lines if line and not _RULE.fullmatch(line)]
     body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
+    # Where every line is marked, #1 is a row's number.
+    body = body or [(i, line) for i, line in kept if _MARKED_NUMBER.match(line)]
     if not body:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
     separator = _separator_of([line for _, line in body])
@@ -314,7 +323,9 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     text, numeric = _text_and_number_columns(rows)
     if len(numeric) < (1 if header else _SEVERAL):
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
-    numbers = np.array([[_cell_number(file, i, row[c]) for c in numeric] for i, row in rows])
+    numbers = np.array(
+        [[_cell_number(file, i, row[c] if any(row[k] for k in numeric) else "nan") for c in numeric] for i, row in rows]
+    )
     _require_one_decimal_mark(file, rows, numeric)
     decimal = any(DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
     words = f"separated by {_SEPARATORS[separator]}{', decimal commas' * decimal}"

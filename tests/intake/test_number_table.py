@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stitch.errors import InputError
-from stitch.intake.pose_tables import read_number_table
+from stitch.intake.pose_tables import parse_number_table, read_number_table
 
 ROWS = [[111.5, -331.25, 317.0, -2.5, 0.125, 3.0], [114.0, -358.5, 360.75, -2.75, 0.25, -3.0]]
 
@@ -117,3 +117,17 @@ def test_a_number_that_lacks_at_the_end_is_no_remark(tmp_path):
     (tmp_path / "t.csv").write_text("x;y;z\n1;2;3\n4;5;\n7;8;9\n", encoding="utf-8")
     with pytest.raises(InputError, match="line 3: '' is no number"):
         read_number_table(tmp_path / "t.csv")
+
+
+def test_a_row_whose_every_line_is_marked_has_its_number(tmp_path):
+    rows = "".join(f"#{i} ({i}.5, 2.5, -3.5) (0.1, 0.2, 0.3, 0.{i}9)\n" for i in range(1, 4))
+    table = parse_number_table(tmp_path / "poses.txt", rows)
+    np.testing.assert_allclose(table.numbers[1], [2.5, 2.5, -3.5, 0.1, 0.2, 0.3, 0.29])
+    assert [labels[0] for labels in table.labels] == ["#1", "#2", "#3"]
+
+
+def test_a_name_alone_between_rows_of_numbers_has_none(tmp_path):
+    text = "Messung vom Montag,,,\nname,x,y,z\na,1,2,3\nb,,,\nc,4,5,6\n"
+    table = parse_number_table(tmp_path / "poses.csv", text)
+    np.testing.assert_array_equal(table.numbers, [[1, 2, 3], [np.nan] * 3, [4, 5, 6]])
+    assert [labels[0] for labels in table.labels] == ["a", "b", "c"]
