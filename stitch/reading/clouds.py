@@ -1,6 +1,7 @@
 """Point clouds from PLY, PCD, XYZ and CSV files, every scalar kept; meshes, arrays and other formats after them."""
 
 import io
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -447,6 +448,10 @@ def require_room(path: Path) -> None:
             raise InputError(f"{path}: {words[2].decode()} elements announced in {size} bytes; export it again")
 
 
+# Three numbers or more, apart by blanks or semicolons, with commas before the decimals.
+_DECIMAL_COMMAS = re.compile(r"(?=.*,)(?:[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?(?:[ \t]+|;[ \t]*|$)){3,}")
+
+
 def _read_text(path: Path) -> dict[str, Array]:
     """Numbers in columns, by comma, semicolon, space or tab; a header line names them, else x y z …
 
@@ -459,6 +464,8 @@ def _read_text(path: Path) -> dict[str, Array]:
         lines = lines[1:]
     if not lines:
         return {axis: np.empty(0) for axis in "xyz"}
+    if _DECIMAL_COMMAS.fullmatch(lines[-1].strip()):
+        told, lines = ([line.replace(",", ".") for line in some] for some in (told, lines))
     separator = next((s for s in ",;" if s in lines[0]), None)
     first = _column_names(lines[0], separator)
     header = any(not is_number(cell) for cell in first)

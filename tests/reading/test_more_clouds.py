@@ -166,3 +166,10 @@ def test_broken_files_end_in_one_line(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=name):
         read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize("row", ["{} {} {} 128\n", "{}; {}; {}\n"])
+def test_commas_before_the_decimals(tmp_path, row):
+    rows = "".join(row.format(*(f"{value + 0.25:.2f}".replace(".", ",") for value in corner)) for corner in CORNERS)
+    (tmp_path / "c.txt").write_text(f"{len(CORNERS)}\n{rows}", encoding="utf-8")
+    np.testing.assert_allclose(read_cloud(tmp_path / "c.txt").points, CORNERS + 0.25)
