@@ -281,7 +281,7 @@ def mesh_tests(room: Room) -> str:
 
 
 BATCH = "stitch batch blade hidden -o runs --json --no-recording"
-MESHES = "python -m pytest -n 0 -q -m '' tests/data_synth/test_real_meshes.py"
+MESHES = "python -m pytest -n 0 -m '' tests/data_synth/test_real_meshes.py"
 
 SYSTEMS: dict[str, tuple[Row, ...]] = {
     "Main line: scans, hand-eye, what is missing": (
