@@ -642,7 +642,8 @@ def run_panel(file: Path, drive: str | None, wanted: Wanted) -> None:
     _print_moves(terminal, job, result)
     if largest:
         told = " → ".join(f"{size:.2f}" for size in largest)
-        terminal.print(f"Shape control: {len(largest) - 1} corrections, largest deviation {told} mm.")
+        made = f"{len(largest) - 1} correction{'s' * (len(largest) != 2)}"
+        terminal.print(f"Shape control: {made}, largest deviation {told} mm.")
     for name in written:
         print(f"{wanted.output}/{name}")
 

@@ -121,7 +121,8 @@ def test_two_parts_in_one_scan(pane, pane_cad):
     Ts = [truth(5), truth(5) @ frames.make(np.eye(3), [30.0, -450.0, 40.0])]
     scans = [scan_pane(pane, T, 5 + i) for i, T in enumerate(Ts)]
     columns = (np.concatenate([getattr(s, n) for s in scans]) for n in ("points", "normals", "usable", "area"))
-    both = type(scans[0])(*columns, scans[0].spacing, scans[0].noise)
+    view = np.repeat([0, 1], [len(s.points) for s in scans])
+    both = type(scans[0])(*columns, scans[0].spacing, scans[0].noise, view)
     heaps = split_instances(both, pane_cad, 2)
     middles = [s.points.mean(axis=0) for s in scans]
     whose = [int(np.argmin([np.linalg.norm(h.points.mean(axis=0) - m) for m in middles])) for h in heaps]
