@@ -132,11 +132,11 @@ class CommandGroup(TyperGroup):
 
 def command_help(entry: EntryPoint) -> str | None:
     """The docstring of the function behind an entry, or the `help` of a group of commands; None where it is neither."""
-    source = _module_source(entry.module)
-    if (start := source.find(f"\ndef {entry.attr}(")) >= 0:
-        # The function alone: the modules of all commands take a quarter of what their list does.
-        source = source[start:].partition("\n\n\n")[0]
     try:
+        source = _module_source(entry.module)
+        if (start := source.find(f"\ndef {entry.attr}(")) >= 0:
+            # The function alone: the modules of all commands take a quarter of what their list does.
+            source = source[start:].partition("\n\n\n")[0]
         nodes = ast.parse(source).body
     except (OSError, SyntaxError, ValueError):
         return None
