@@ -7,10 +7,10 @@ are true places of a reflector at 400 other poses, base and tool fitted anew, be
 """
 
 import argparse
-import re
 from pathlib import Path
 
 import numpy as np
+from batch import into_page
 from blind_trials import pin
 from scipy.spatial.transform import Rotation
 
@@ -25,7 +25,6 @@ from stitch.measurement.session import Scanner, Session, Sighting, View
 from stitch.reading.robot_description import robot_from_dh
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
-MARKS = ("<!-- ranges: begin -->", "<!-- ranges: end -->")
 _TARGETS = np.array([[60.0, 10.0, 30.0], [-40.0, 55.0, 25.0], [-20.0, -60.0, 40.0]])
 _VIEWS, _JUDGED, _NOISE, _BEND = 60, 400, 0.01, 2e-6
 _SCATTER = np.repeat([2e-5, 0.02], 3)  # of the poses, rad and mm
@@ -125,8 +124,7 @@ def main() -> None:
     printed = "\n".join(told)
     print(printed)
     if given.write:
-        text, block = PAGE.read_text(encoding="utf-8"), f"{MARKS[0]}\n{printed}\n{MARKS[1]}"
-        PAGE.write_text(re.sub(f"{MARKS[0]}.*{MARKS[1]}", lambda _: block, text, flags=re.S), encoding="utf-8")
+        into_page("ranges", printed.split("\n"), PAGE)
 
 
 if __name__ == "__main__":

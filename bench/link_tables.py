@@ -5,16 +5,15 @@ project.
 """
 
 import argparse
-import re
 from pathlib import Path
 
+from batch import into_page
 from kept_arm import SHARED, every
 
 from stitch.calibrate.robot import link_table
 from stitch.reading.session_folder import load_session
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
-MARKS = ("<!-- tables: begin -->", "<!-- tables: end -->")
 # Every how manieth pose: about 600 of each arm.
 SESSIONS = {"irb120-tracker": 1, "ur10-tmac": 1, "ur10-tmac-A": 20, "ur10-tmac-C": 5}
 
@@ -37,8 +36,7 @@ def main() -> None:
     printed = "\n".join(lines)
     print(printed)
     if given.write:
-        text, block = PAGE.read_text(encoding="utf-8"), f"{MARKS[0]}\n{printed}\n{MARKS[1]}"
-        PAGE.write_text(re.sub(f"{MARKS[0]}.*{MARKS[1]}", lambda _: block, text, flags=re.S), encoding="utf-8")
+        into_page("tables", printed.split("\n"), PAGE)
 
 
 if __name__ == "__main__":

@@ -138,20 +138,12 @@ def _course_of_views(
     """
     motion = _motion(linear, term, form, values)
     views = linear.measurement.views
-    weight = next((n for n in ("gravity_at_mount", "gravity_at_part") if n in term.effect.needs), None)
-    axis = _along_gravity(getattr(views, weight), motion) if weight else _lives_on(views, term, motion.joint)
+    axis = _lives_on(views, term, motion)
     # Where the part sat at first is nobody's error.
     course = _along_motion(linear, motion, explained, len(values), axis, from_first=term.effect.place == "part")
     if course is None or motion.joint is None or not course.follows.startswith("angle"):
         return course
     return replace(course, law=_over_a_turn(views, form.at(values), motion.joint))
-
-
-def _along_gravity(gravity: Array, motion: _Motion) -> tuple[str, str, Array]:
-    """What gives way under its weight lives on the pull of gravity (V, 3) along the direction that moves it most."""
-    line = np.sum(motion.columns * motion.response, axis=1) / np.maximum(np.sum(motion.columns**2, axis=1), 1e-300)
-    slope = np.linalg.lstsq(np.column_stack([gravity, np.ones(len(line))]), line, rcond=1e-6)[0][:3]
-    return "pull of gravity where it gives way most", "g", gravity @ slope / max(float(np.linalg.norm(slope)), 1e-300)
 
 
 def _over_a_turn(views: Views, fitted: Term, joint: int) -> Array:
@@ -270,9 +262,9 @@ def _displacements(linear: LinearModel, response: Array) -> Array:
     return np.asarray(out)
 
 
-def _lives_on(views: Views, term: Term, joint: int | None) -> tuple[str, str, Array]:
+def _lives_on(views: Views, term: Term, motion: _Motion) -> tuple[str, str, Array]:
     """What an effect lives on, its unit, and where the views stand along it."""
-    name = term.name
+    name, joint = term.name, motion.joint
     covariate = next((n for n in (*term.effect.prefers, *term.effect.needs) if n in views.covariates), None)
     if joint is not None:
         number = joint + 1
@@ -289,6 +281,9 @@ def _lives_on(views: Views, term: Term, joint: int | None) -> tuple[str, str, Ar
         if "velocity" in term.effect.needs and views.velocity is not None:
             return f"speed of joint {number}", "°/s", np.degrees(views.velocity[:, joint])
         return f"angle of joint {number}", "°", np.degrees(views.joints[:, joint])
+    for weight in ("gravity_at_mount", "gravity_at_part"):
+        if weight in term.effect.needs:
+            return _along_gravity(getattr(views, weight), motion)
     if covariate is not None:
         return covariate, "", views.covariates[covariate]
     if any(p.discrete for p in term.parameters) or not views.has("time"):
@@ -296,6 +291,13 @@ def _lives_on(views: Views, term: Term, joint: int | None) -> tuple[str, str, Ar
     if "time" in (*term.effect.needs, *term.effect.prefers) or term.effect.prefers:
         return "time", "s", views.time
     return "view order", "", np.arange(views.count, dtype=float)
+
+
+def _along_gravity(gravity: Array, motion: _Motion) -> tuple[str, str, Array]:
+    """What gives way under its weight lives on the pull of gravity (V, 3) along the direction that moves it most."""
+    line = np.sum(motion.columns * motion.response, axis=1) / np.maximum(np.sum(motion.columns**2, axis=1), 1e-300)
+    slope = np.linalg.lstsq(np.column_stack([gravity, np.ones(len(line))]), line, rcond=1e-6)[0][:3]
+    return "pull of gravity where it gives way most", "g", gravity @ slope / max(float(np.linalg.norm(slope)), 1e-300)
 
 
 # Effects that change points: along the rays of the scanner, or as the part's shape moves.
