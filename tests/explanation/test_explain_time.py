@@ -35,6 +35,7 @@ def test_a_flange_that_swings_gets_the_formula_of_a_swing(cell, tmp_path):
     assert load(tmp_path / "mine.py") == ["explained"]
 
 
+@pytest.mark.slow
 def test_a_joint_that_swings_in_time_gets_the_formula_of_a_swing(cell):
     joints, seconds = cell.measured.plan.joints, cell.measurement.views.time
     period = seconds[-1] / 1.3

@@ -120,6 +120,7 @@ def test_every_view_by_itself(law: Law, with_time: bool):
     assert found.rms_by_view < 0.2
 
 
+@pytest.mark.slow
 def test_the_same_in_every_view_is_no_view_of_its_own():
     linear = linear_of(alike)
     found = field_error(linear.measurement, linear.model, linear.observation.unconstrained, 0.01)

@@ -110,6 +110,7 @@ def test_no_map_of_what_is_no_error_along_the_ray(change):
     assert found(change)[0].map is None
 
 
+@pytest.mark.slow
 def test_robust_weights_let_five_sixths_of_a_small_error_through():
     """Of normal residuals Σ ψ′/Σ ψ/e of the biweight at 4.685 σ: 0.758/0.915."""
     assert found(along(nothing))[1] == pytest.approx(0.828, abs=0.02)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.special import logsumexp
-from scipy.stats import halfcauchy, multivariate_normal
+from scipy.stats import halfcauchy
 
 from stitch.statistics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior, MixedModel, fit_variances, log_density
 from stitch.statistics.variance_posterior import mean_variances
@@ -34,15 +34,17 @@ def on_a_grid(mixed: MixedModel) -> np.ndarray:
     # Of arms that are known to a factor half err by more than three usual sizes.
     factors = np.linspace(np.log(0.01), np.log(30), 60) if kin else np.zeros(1)
     of_factor = halfcauchy(scale=3).logpdf(np.exp(factors)) + factors if kin else np.zeros(1)
-    for a, b in zip(noise.ravel(), group.ravel(), strict=True):
-        V = np.exp(a) * mixed.components[2, 0] + np.exp(b) * mixed.components[3, 0]
+    for a, b in zip(noise, group, strict=True):
+        V = np.exp(a)[:, None, None] * mixed.components[2, 0] + np.exp(b)[:, None, None] * mixed.components[3, 0]
         weights = np.linalg.solve(V, ones)
-        mean = float(weights @ mixed.z[0] / weights.sum())
-        likelihood = multivariate_normal(mean * ones, V).logpdf(mixed.z[0]) - 0.5 * np.log(weights.sum())
-        over = b - 2 * np.log(SCALE) - 2 * factors
-        further = logsumexp(of_factor + 0.5 * shape * over - 0.5 * (1 + shape) * np.log1p(np.exp(over)))
+        total = weights.sum(axis=1)
+        off = mixed.z[0] - (weights @ mixed.z[0] / total)[:, None]
+        squares = np.einsum("gi,gi->g", off, np.linalg.solve(V, off[..., None])[..., 0])
+        likelihood = -0.5 * (squares + np.linalg.slogdet(V)[1] + np.log(total))
+        over = b[:, None] - 2 * np.log(SCALE) - 2 * factors
+        further = logsumexp(of_factor + 0.5 * shape * over - 0.5 * (1 + shape) * np.log1p(np.exp(over)), axis=1)
         prior = further - 0.5 * ((a - np.log(2)) / 1.5) ** 2
-        logs.append(likelihood + prior)
+        logs.extend(likelihood + prior)
     w = np.exp(np.array(logs) - max(logs))
     return np.array([w @ np.exp(noise.ravel()), w @ np.exp(group.ravel())]) / w.sum()
 
