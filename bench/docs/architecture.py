@@ -104,7 +104,7 @@ def box(ax: Axes, x: float, y: float, width: float, room: str) -> None:
         )
     )
     ax.text(x, y + 0.25, room, ha="center", va="center", weight="bold", fontsize=13, zorder=3)
-    lines = textwrap.wrap(purpose(room), 54 if width > 4 else 36)[:2]
+    lines = textwrap.wrap(purpose(room), 54 if width > 4 else 36, max_lines=2, placeholder=" …")
     ax.text(x, y - 0.2, "\n".join(lines), ha="center", va="center", fontsize=8.6, zorder=3)
 
 

@@ -272,22 +272,103 @@ def read_zdf_image(path: Path) -> tuple[Array, Array | None]:
         return points, np.moveaxis(np.asarray(image[..., :3], float), 2, 0)
 
 
+def read_ply(path: Path) -> dict[str, Array]:
+    """Columns (N,) of the vertices of a PLY by name, as stored."""
+    from plyfile import PlyData
+
+    require_room(path)
+    with path.open("rb") as stream:
+        if stream.read(3) != b"ply":
+            raise InputError(f"{path}: is not a PLY file; export it again, or name it by its kind")
+    data: NDArray[np.void] = PlyData.read(_without_blank_lines(path))["vertex"].data
+    # List properties have no column of numbers.
+    return {name: data[name] for name in data.dtype.names or () if not data.dtype[name].hasobject}
+
+
+def _without_blank_lines(path: Path) -> Path | io.BytesIO:
+    """Return the file, or its bytes without the blank lines that some programs leave in the header."""
+    with path.open("rb") as stream:
+        header, end, _ = stream.read(_HEADER_BYTES).partition(b"end_header")
+        lines = header.splitlines(keepends=True)
+        if not end or all(line.strip() for line in lines):
+            return path
+        stream.seek(len(header))
+        return io.BytesIO(b"".join(line for line in lines if line.strip()) + stream.read())
+
+
+def require_room(path: Path) -> None:
+    """Refuse a PLY whose header announces more elements than the file has bytes, before room is made for them.
+
+    Raises:
+        InputError: no such file, or the header promises too much.
+    """
+    require_file(path, "name a PLY file")
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        header = stream.read(65536).split(b"end_header", 1)[0]
+    for line in header.splitlines():
+        words = line.split()
+        if len(words) == 3 and words[0] == b"element" and words[2].isdigit() and int(words[2]) > size:
+            raise InputError(f"{path}: {words[2].decode()} elements announced in {size} bytes; export it again")
+
+
+# Three numbers or more, apart by blanks or semicolons, with commas before the decimals.
+_DECIMAL_COMMAS = re.compile(r"(?=.*,)(?:[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?(?:[ \t]+|;[ \t]*|$)){3,}")
+
+
+def _read_text(path: Path) -> dict[str, Array]:
+    """Numbers in columns, by comma, semicolon, space or tab; a header line names them, else x y z …
+
+    The header may be a comment, as numpy writes it: the last line before the numbers, if it names x, y and z.
+    """
+    told = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+    lines = [line for line in told if not _is_comment(line)]
+    # Leica's .pts and others write the number of points above them.
+    if len(lines) > 1 and lines[0].strip().isdigit() and int(lines[0]) == len(lines) - 1:
+        lines = lines[1:]
+    if not lines:
+        return {axis: np.empty(0) for axis in "xyz"}
+    if _DECIMAL_COMMAS.fullmatch(lines[-1].strip()):
+        told, lines = ([line.replace(",", ".") for line in some] for some in (told, lines))
+    separator = next((s for s in ",;" if s in lines[0]), None)
+    first = _column_names(lines[0], separator)
+    header = any(not is_number(cell) for cell in first)
+    above = told[: told.index(lines[0])]
+    names = first if header or not above else _column_names(above[-1].lstrip(" #"), separator)
+    if not header and not (len(names) == len(first) and {*"xyz"} <= {*names}):
+        names = ["x", "y", "z", *(f"scalar_{i}" for i in range(len(first) - 3))][: len(first)]
+    if len(lines) == header:
+        return {name: np.empty(0) for name in names}
+    table = np.loadtxt(lines[header:], delimiter=separator, ndmin=2).reshape(-1, len(names))
+    return dict(zip(names, table.T, strict=True))
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip()[0] == "#"
+
+
+def _column_names(line: str, separator: str | None) -> list[str]:
+    cells = [cell.strip() for cell in line.split(separator)]
+    return [cell.lower() if cell.lower() in "xyz" else cell for cell in cells]
+
+
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 _TEXT_SUFFIXES = (".xyz", ".csv", ".txt", ".asc", ".pts")
-# Kinds that are read, by the ending of the file's name.
-CLOUD_SUFFIXES = (
-    ".ply",
-    ".pcd",
-    *_TEXT_SUFFIXES,
-    *MESHES,
-    ".npy",
-    ".ptx",
-    ".e57",
-    ".las",
-    ".laz",
-    ".zdf",
-    *DEPTH_SUFFIXES,
-)
+# What reads a kind, by the ending of the file's name.
+_READERS: dict[str, Callable[[Path], dict[str, Array]]] = {
+    ".ply": read_ply,
+    ".pcd": read_pcd,
+    **dict.fromkeys(_TEXT_SUFFIXES, _read_text),
+    **dict.fromkeys(MESHES, read_mesh),
+    ".npy": read_array,
+    ".ptx": read_ptx,
+    ".e57": read_e57,
+    ".las": read_las,
+    ".laz": read_las,
+    ".zdf": read_zdf,
+    **dict.fromkeys(DEPTH_SUFFIXES, read_depth_columns),
+}
+CLOUD_SUFFIXES = tuple(_READERS)
 
 
 @readable()
@@ -300,21 +381,10 @@ def read_cloud(path: Path, scale: float = 1.0) -> Cloud:
     if not path.exists():
         raise InputError(f"{path}: no such cloud file; correct the column cloud of views.csv")
     require_file(path, "name a file in the column cloud of views.csv")
-    readers: dict[str, Callable[[Path], dict[str, Array]]] = {".ply": read_ply, ".pcd": read_pcd}
-    readers |= dict.fromkeys(_TEXT_SUFFIXES, _read_text) | dict.fromkeys(MESHES, read_mesh)
-    readers |= {
-        ".npy": read_array,
-        ".ptx": read_ptx,
-        ".e57": read_e57,
-        ".las": read_las,
-        ".laz": read_las,
-        ".zdf": read_zdf,
-    }
-    readers |= dict.fromkeys(DEPTH_SUFFIXES, read_depth_columns)
     kind = path.suffix.lower()
-    reader = readers.get(kind)
+    reader = _READERS.get(kind)
     if reader is None:
-        raise InputError(f"{path}: unknown cloud format {path.suffix!r}; use PLY, PCD, XYZ or CSV")
+        raise InputError(f"{path}: unknown cloud format {path.suffix!r}; use {', '.join(CLOUD_SUFFIXES)}")
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty; export it again, or leave this view out of views.csv")
     try:
@@ -406,83 +476,3 @@ def _code(values: Array) -> float | None:
         if away > _CODE_AWAY * (high - low) > 0 and len(np.unique(sample)) >= _CODE_VALUES:
             return float(extreme)
     return None
-
-
-def read_ply(path: Path) -> dict[str, Array]:
-    """Columns (N,) of the vertices of a PLY by name, as stored."""
-    from plyfile import PlyData
-
-    require_room(path)
-    with path.open("rb") as stream:
-        if stream.read(3) != b"ply":
-            raise InputError(f"{path}: is not a PLY file; export it again, or name it by its kind")
-    data: NDArray[np.void] = PlyData.read(_without_blank_lines(path))["vertex"].data
-    # List properties have no column of numbers.
-    return {name: data[name] for name in data.dtype.names or () if not data.dtype[name].hasobject}
-
-
-def _without_blank_lines(path: Path) -> Path | io.BytesIO:
-    """Return the file, or its bytes without the blank lines that some programs leave in the header."""
-    with path.open("rb") as stream:
-        header, end, _ = stream.read(_HEADER_BYTES).partition(b"end_header")
-        lines = header.splitlines(keepends=True)
-        if not end or all(line.strip() for line in lines):
-            return path
-        stream.seek(len(header))
-        return io.BytesIO(b"".join(line for line in lines if line.strip()) + stream.read())
-
-
-def require_room(path: Path) -> None:
-    """Refuse a PLY whose header announces more elements than the file has bytes, before room is made for them.
-
-    Raises:
-        InputError: no such file, or the header promises too much.
-    """
-    require_file(path, "name a PLY file")
-    size = path.stat().st_size
-    with path.open("rb") as stream:
-        header = stream.read(65536).split(b"end_header", 1)[0]
-    for line in header.splitlines():
-        words = line.split()
-        if len(words) == 3 and words[0] == b"element" and words[2].isdigit() and int(words[2]) > size:
-            raise InputError(f"{path}: {words[2].decode()} elements announced in {size} bytes; export it again")
-
-
-# Three numbers or more, apart by blanks or semicolons, with commas before the decimals.
-_DECIMAL_COMMAS = re.compile(r"(?=.*,)(?:[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?(?:[ \t]+|;[ \t]*|$)){3,}")
-
-
-def _read_text(path: Path) -> dict[str, Array]:
-    """Numbers in columns, by comma, semicolon, space or tab; a header line names them, else x y z …
-
-    The header may be a comment, as numpy writes it: the last line before the numbers, if it names x, y and z.
-    """
-    told = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
-    lines = [line for line in told if not _is_comment(line)]
-    # Leica's .pts and others write the number of points above them.
-    if len(lines) > 1 and lines[0].strip().isdigit() and int(lines[0]) == len(lines) - 1:
-        lines = lines[1:]
-    if not lines:
-        return {axis: np.empty(0) for axis in "xyz"}
-    if _DECIMAL_COMMAS.fullmatch(lines[-1].strip()):
-        told, lines = ([line.replace(",", ".") for line in some] for some in (told, lines))
-    separator = next((s for s in ",;" if s in lines[0]), None)
-    first = _column_names(lines[0], separator)
-    header = any(not is_number(cell) for cell in first)
-    above = told[: told.index(lines[0])]
-    names = first if header or not above else _column_names(above[-1].lstrip(" #"), separator)
-    if not header and not (len(names) == len(first) and {*"xyz"} <= {*names}):
-        names = ["x", "y", "z", *(f"scalar_{i}" for i in range(len(first) - 3))][: len(first)]
-    if len(lines) == header:
-        return {name: np.empty(0) for name in names}
-    table = np.loadtxt(lines[header:], delimiter=separator, ndmin=2).reshape(-1, len(names))
-    return dict(zip(names, table.T, strict=True))
-
-
-def _is_comment(line: str) -> bool:
-    return line.lstrip()[0] == "#"
-
-
-def _column_names(line: str, separator: str | None) -> list[str]:
-    cells = [cell.strip() for cell in line.split(separator)]
-    return [cell.lower() if cell.lower() in "xyz" else cell for cell in cells]
