@@ -97,9 +97,9 @@ def test_a_view_that_was_displaced_is_left_out_with_its_amount(good):
     T[:3, 3] += [3.0, 0.0, 4.0]
     found = run(with_view(good, 4, T_base_flange=T, joints=None, approach=None))
     assert [item.view for item in found.left_out] == ["v004"]
-    # Few points a view: the amount is known to a twentieth.
-    amount = float(found.left_out[0].why.split("off by ")[1].split(" mm")[0])
-    assert amount == pytest.approx(5.0, rel=0.05)
+    # Few points a view: what is said is a bound, which the truth keeps and which is beyond what any arm does.
+    amount = float(found.left_out[0].why.split("off by at least ")[1].split(" mm")[0])
+    assert 2.5 < amount <= 5.0
 
 
 @pytest.mark.slow
