@@ -17,7 +17,7 @@ from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
 from data_synth.write import write_session
 from stitch.closed_form.hand_eye import park_martin
-from stitch.closed_form.odometry import is_stream, motions_between, scan_odometry, size_of_scan, turned_pairs
+from stitch.closed_form.odometry import is_stream, motions_between, motions_of_stream, scan_odometry, size_of_scan
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.pipeline import run
@@ -53,9 +53,8 @@ def of_odometry(measured: Measured, times: list[Array] | None) -> dict[str, floa
     scans = [cloud.points for cloud in measured.clouds]
     odometry = scan_odometry(scans, times, 1 / measured.scene.plan.rate)
     right, of = right_steps(measured, odometry)
-    pairs = turned_pairs(measured.T_base_flange)
     try:
-        T_mount = park_martin(motions_between(measured.T_base_flange, pairs), motions_between(odometry, pairs))
+        T_mount = park_martin(*motions_of_stream(measured.T_base_flange, odometry))
         off = hand_eye_error(measured, T_mount)
     except NoResultError:
         off = float("nan")
@@ -114,7 +113,7 @@ def table(seeds: list[dict[str, dict[str, float]]], first: int) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--first", type=int, default=4900)
+    parser.add_argument("--first", type=int, default=4910)
     parser.add_argument("--keep", type=Path, help="seeds that are done; goes on from there")
     parser.add_argument("--write", action="store_true", help="put the table into docs/session.md")
     given = parser.parse_args()

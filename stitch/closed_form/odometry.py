@@ -103,6 +103,24 @@ def turned_pairs(T_reference_mount: Array) -> list[tuple[int, int]]:
     return list(zip(v[turned].tolist(), w[turned].tolist(), strict=True))
 
 
+def motions_of_stream(T_reference_mount: Array, odometry: Array) -> tuple[Array, Array]:
+    """Return (A, B), each (M, 4, 4): motions of the mount and of the scanner between views where the robot turned.
+
+    Both turn by the same angle, whatever the hand-eye is (Chen 1991). A step that went wrong spoils every motion across
+    it: the half whose angles agree best is kept.
+    """
+    pairs = turned_pairs(T_reference_mount)
+    A, B = motions_between(T_reference_mount, pairs), motions_between(odometry, pairs)
+    apart = angle_differences(A, B)
+    kept = np.sort(np.argsort(apart, kind="stable")[: -(-len(pairs) // 2)])
+    return A[kept], B[kept]
+
+
+def angle_differences(A: Array, B: Array) -> Array:
+    """Return by how much the rotation angles of motions (M, 4, 4) differ, (M,) rad."""
+    return np.asarray(np.abs(frames.angle_between(np.eye(4), A) - frames.angle_between(np.eye(4), B)))
+
+
 def motions_between(poses: Array, pairs: Sequence[tuple[int, int]]) -> Array:
     """Return (M, 4, 4) motions that map the frame of view w into that of view v, of poses (V, 4, 4)."""
     return np.array([frames.inverse(poses[v]) @ poses[w] for v, w in pairs]).reshape(-1, 4, 4)

@@ -6,7 +6,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.closed_form.hand_eye import park_martin
-from stitch.closed_form.odometry import is_stream, motions_between, scan_odometry, turned_pairs
+from stitch.closed_form.odometry import is_stream, motions_of_stream, scan_odometry
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.measurement.session import Session
@@ -68,9 +68,8 @@ def stream_hand_eye(session: Session) -> Array | None:
     times = [cloud.scalars["time"] for cloud in clouds] if session.scanner.moving else None
     seconds = [view.time_s for view in session.views if view.time_s is not None]
     interval = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
-    odometry, pairs = scan_odometry(scans, times, interval), turned_pairs(T_reference_mount)
     try:
-        return park_martin(motions_between(T_reference_mount, pairs), motions_between(odometry, pairs))
+        return park_martin(*motions_of_stream(T_reference_mount, scan_odometry(scans, times, interval)))
     except NoResultError:
         return None
 

@@ -20,7 +20,13 @@ from stitch import frames
 from stitch.closed_form import feature_matching
 from stitch.closed_form.feature_matching import FeaturedSurface
 from stitch.closed_form.hand_eye import AXXB_SOLVERS
-from stitch.closed_form.odometry import is_stream, motions_between, scan_odometry, turned_pairs
+from stitch.closed_form.odometry import (
+    angle_differences,
+    is_stream,
+    motions_between,
+    motions_of_stream,
+    scan_odometry,
+)
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.measurement.capture import Capture, part_size
@@ -191,10 +197,7 @@ def robot_motions(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
 
 def consistent_motions(A: Array, B: Array) -> tuple[Array, Array]:
     """The motions whose rotation angles agree."""
-    if not len(A):
-        return A, B
-    angles = [np.linalg.norm(frames.log(T)[:, :3], axis=1) for T in (A, B)]
-    keep = np.abs(angles[0] - angles[1]) < _ANGLE_TOLERANCE
+    keep = angle_differences(A, B) < _ANGLE_TOLERANCE
     return A[keep], B[keep]
 
 
@@ -235,8 +238,7 @@ def sequence_motions(capture: Capture) -> tuple[Array, Array]:
     scans = [scan.points[even_indices(len(scan.points), _POINTS)] for scan in capture.scans]
     if not is_stream(capture.T_reference_mount, scans):
         return np.zeros((0, 4, 4)), np.zeros((0, 4, 4))
-    pairs = turned_pairs(capture.T_reference_mount)
-    return robot_motions(capture, pairs), motions_between(scan_odometry(scans), pairs)
+    return motions_of_stream(capture.T_reference_mount, scan_odometry(scans))
 
 
 _SEARCH_POINTS = 2000

@@ -10,7 +10,8 @@ from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from data_synth.write import write_session
 from stitch import frames
-from stitch.closed_form.odometry import is_stream, motions_between, scan_odometry
+from stitch.closed_form.hand_eye import park_martin
+from stitch.closed_form.odometry import is_stream, motions_between, motions_of_stream, scan_odometry
 from stitch.errors import InputError
 from stitch.reading.session_folder import load_session
 
@@ -55,6 +56,20 @@ def test_odometry_follows_a_stream_and_separate_views_are_none():
     off = np.linalg.norm(np.einsum("nij,nj->ni", found - true, middle)[:, :3], axis=1)
     moved = np.linalg.norm(np.einsum("nij,nj->ni", true - np.eye(4), middle)[:, :3], axis=1)
     assert np.mean(off < 0.25 * moved) >= 0.9
+
+
+def test_steps_that_went_wrong_do_not_reach_the_hand_eye():
+    rng = np.random.default_rng(3)
+    T_mount = frames.exp(np.array([0.3, -0.2, 0.9, 40.0, -60.0, 90.0]))
+    T_base_flange, odometry = [np.eye(4)], [np.eye(4)]
+    for v in range(59):
+        # A path that turns on about an axis which itself turns.
+        step = frames.exp(np.r_[0.04 * np.array([np.cos(v / 9), np.sin(v / 9), 0.3]), rng.uniform(-5, 5, 3)])
+        wrong = frames.exp(np.r_[rng.normal(0, 0.02, 3), rng.normal(0, 3, 3)]) if v in (20, 21) else np.eye(4)
+        T_base_flange.append(T_base_flange[-1] @ step)
+        odometry.append(odometry[-1] @ frames.inverse(T_mount) @ step @ T_mount @ wrong)
+    A, B = motions_of_stream(np.array(T_base_flange), np.array(odometry))
+    np.testing.assert_allclose(park_martin(A, B), T_mount, atol=1e-9)
 
 
 def test_a_moving_scanner_needs_times(tmp_path):
