@@ -17,12 +17,12 @@ from batch import into_page
 from field_folders import command
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
-from stitch.export.formats import ARM, CLOUD, HAND_EYE
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch import frames
 from stitch.api.session import Session
+from stitch.export import ARM, CLOUD, HAND_EYE
 from stitch.frames import Array
 from stitch.measurement.robot import Robot, forward
 
