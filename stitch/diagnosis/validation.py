@@ -304,7 +304,7 @@ def validate_in_halves(scored: Score) -> Halves | None:
     if base is None or base.observation.numbers_per_view is not None:
         return None
     gains, p_values, shares = [], [], []
-    ways = halves_of(base.observation.T_reference_mount, base.observation.reach)
+    ways = halves_of(base.observation.T_base_flange, base.observation.reach)
     for way in ways:
         bases = [base.explained_without(other) for other in reversed(way)]
         gains.append(sum(_predictive_factor(scored, base, *pair) for pair in (bases, bases[::-1])))

@@ -102,6 +102,16 @@ class Capture:
     noise_factor: float = 1.0
 
     @property
+    def scanner_rides(self) -> bool:
+        """True if the robot carries the scanner, False if it carries the part."""
+        return np.array_equal(self.T_reference_mount, self.T_reference_flange)
+
+    @property
+    def T_base_flange(self) -> Array:
+        """(V, 4, 4) from the robot."""
+        return self.T_reference_mount if self.scanner_rides else frames.inverse(self.T_reference_mount)
+
+    @property
     def visible_points(self) -> list[Array]:
         """Per view the points (N, 3) that it shows, scanner frame: of its scan, or its labelled ones; maybe none."""
         if self.scans or self.sightings is None:

@@ -247,7 +247,7 @@ class Observation(ABC):
 
     @property
     @abstractmethod
-    def T_reference_mount(self) -> Array:
+    def T_base_flange(self) -> Array:
         """(V, 4, 4) of the views, in the order of time."""
 
     @property
@@ -301,7 +301,7 @@ class Observation(ABC):
 
     @cached_property
     def _folds(self) -> list[Indices]:
-        return grouped_folds(self.T_reference_mount, self.reach)
+        return grouped_folds(self.T_base_flange, self.reach)
 
     def joint_ends(self, joints: Array) -> list[JointEnd]:
         """Ends of joints' ranges that may be left out; none where a square of a trial is no view's own."""

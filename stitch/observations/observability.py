@@ -133,10 +133,9 @@ def _named_axes(captures: Sequence[Capture], robot: Robot | None, joints: Array 
     if robot is not None and joints is not None:
         T_base_flange = kinematics.forward(robot, joints)
         _, base_axes = kinematics.joint_axes(robot, joints)
-        scanner_rides = np.array_equal(first.T_reference_mount, first.T_reference_flange)
         for i in np.flatnonzero(np.ptp(joints, axis=0) > _TURNED):
             seen = base_axes[:, i]
-            if scanner_rides:
+            if first.scanner_rides:
                 seen = np.einsum("vji,vj->vi", T_base_flange[:, :3, :3], seen)
             # A joint's axis has a place in the mount frame only while it does not move there.
             if np.linalg.norm(seen.mean(axis=0)) > _PARALLEL:

@@ -167,9 +167,9 @@ class RowObservation(Observation):
     rows: Rows
 
     @property
-    def T_reference_mount(self) -> Array:
+    def T_base_flange(self) -> Array:
         """(V, 4, 4) of the views, in the order of time."""
-        return self.rows.capture.T_reference_mount
+        return self.rows.capture.T_base_flange
 
     @property
     def centre(self) -> Array:

@@ -442,7 +442,7 @@ def fit_targets(sessions: Sequence[TargetStart], recorder: Recorder | None = Non
 
 
 def _places(rows: TargetRows) -> list[Indices]:
-    return view_clusters(rows.capture.T_reference_mount, rows.reach)
+    return view_clusters(rows.capture.T_base_flange, rows.reach)
 
 
 def _heldout(rows: TargetRows, blocks: BlockLeastSquares, begins: int) -> Array:
@@ -454,7 +454,7 @@ def _heldout(rows: TargetRows, blocks: BlockLeastSquares, begins: int) -> Array:
     square, count = np.zeros((2, *rows.distances(rows.residual).shape))
     B, m = rows.residual.shape
     X, z = blocks.X[begins : begins + B, :m], blocks.z[begins : begins + B, :m]
-    for fold in grouped_folds(rows.capture.T_reference_mount, rows.reach):
+    for fold in grouped_folds(rows.capture.T_base_flange, rows.reach):
         residual = X @ blocks.solve(begins + fold) - z
         square[fold] += rows.distances(residual)[fold] ** 2
         count[fold] += 1

@@ -34,30 +34,30 @@ class JointEnd:
         return f"the {'highest' if self.upper else 'lowest'} fifth of joint {self.joint + 1}"
 
 
-def grouped_folds(T_reference_mount: Array, lever: float) -> list[Indices]:
+def grouped_folds(T_base_flange: Array, lever: float) -> list[Indices]:
     """Index arrays of the views to leave out together; every view is left out twice where there are enough.
 
     Args:
-        T_reference_mount: (V, 4, 4) in the order of time.
+        T_base_flange: (V, 4, 4) in the order of time.
         lever: length that makes a radian of orientation comparable with a distance.
     """
-    count = len(T_reference_mount)
+    count = len(T_base_flange)
     if count < _FEW:
         return [np.array([v]) for v in range(count)]
     by_time = np.array_split(np.arange(count), _GROUPS)
     # A region that holds most views would leave too little to fit.
-    return [f for f in [*by_time, *_regions(T_reference_mount, lever, _GROUPS)] if 0 < len(f) <= count // 2]
+    return [f for f in [*by_time, *_regions(T_base_flange, lever, _GROUPS)] if 0 < len(f) <= count // 2]
 
 
-def halves_of(T_reference_mount: Array, lever: float) -> list[tuple[Indices, Indices]]:
+def halves_of(T_base_flange: Array, lever: float) -> list[tuple[Indices, Indices]]:
     """Three ways to halve V views: in the order of time, by the region of their poses, alternately.
 
     Args:
-        T_reference_mount: (V, 4, 4) in the order of time.
+        T_base_flange: (V, 4, 4) in the order of time.
         lever: length that makes a radian of orientation comparable with a distance.
     """
-    views = np.arange(len(T_reference_mount))
-    twists = _pose_offsets(T_reference_mount, lever)
+    views = np.arange(len(T_base_flange))
+    twists = _pose_offsets(T_base_flange, lever)
     # Along the direction in which the poses differ most.
     along = np.linalg.svd(twists - twists.mean(axis=0), full_matrices=False)[0][:, 0]
     orders = views, np.argsort(along, kind="stable"), np.argsort(views % 2, kind="stable")
@@ -65,12 +65,12 @@ def halves_of(T_reference_mount: Array, lever: float) -> list[tuple[Indices, Ind
     return [(np.sort(first), np.sort(second)) for first, second in halves]
 
 
-def view_clusters(T_reference_mount: Array, lever: float) -> list[Indices]:
+def view_clusters(T_base_flange: Array, lever: float) -> list[Indices]:
     """Index arrays of views near each other, every view in one: what a model does not know errs alike in one place."""
-    count = len(T_reference_mount)
+    count = len(T_base_flange)
     if count < _PLACES * _VIEWS_PER_PLACE:
         return [np.array([v]) for v in range(count)]
-    return [f for f in _regions(T_reference_mount, lever, _PLACES) if len(f)]
+    return [f for f in _regions(T_base_flange, lever, _PLACES) if len(f)]
 
 
 def joint_ends(joints: Array, observed: Indices) -> list[JointEnd]:
@@ -90,15 +90,15 @@ def joint_ends(joints: Array, observed: Indices) -> list[JointEnd]:
     return out
 
 
-def _pose_offsets(T_reference_mount: Array, lever: float) -> Array:
-    """(V, 6) twists of the poses from the first, as lengths."""
+def _pose_offsets(T_base_flange: Array, lever: float) -> Array:
+    """(V, 6) twists of the flange from its first pose, as lengths: the same wherever the base's frame lies."""
     return np.asarray(
-        frames.log(frames.inverse(T_reference_mount[:1]) @ T_reference_mount) * np.repeat([lever, 1.0], 3)
+        frames.log(frames.inverse(T_base_flange[:1]) @ T_base_flange) * np.repeat([lever, 1.0], 3)
     )
 
 
-def _regions(T_reference_mount: Array, lever: float, groups: int) -> list[Indices]:
-    twists = _pose_offsets(T_reference_mount, lever)
+def _regions(T_base_flange: Array, lever: float, groups: int) -> list[Indices]:
+    twists = _pose_offsets(T_base_flange, lever)
     # Poses that repeat count once, in the order of their first visit: of fewer places than groups k-means would find
     # none to begin the last group with.
     _, first, pose = np.unique(twists, axis=0, return_index=True, return_inverse=True)

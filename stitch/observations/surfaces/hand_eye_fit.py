@@ -173,7 +173,7 @@ class CaptureEvidence:
 
     def folds(self) -> list[Indices]:
         """Groups of views to leave out."""
-        return grouped_folds(self.capture.T_reference_mount, max(self.gram.lever, 1e-9))
+        return grouped_folds(self.capture.T_base_flange, max(self.gram.lever, 1e-9))
 
     def without(self, views: Indices) -> "CaptureEvidence":
         g = self.gram

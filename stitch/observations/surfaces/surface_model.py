@@ -113,9 +113,9 @@ class SurfaceObservation(Observation):
         return self.unconstrained.overlaps.gram.centre
 
     @property
-    def T_reference_mount(self) -> Array:
+    def T_base_flange(self) -> Array:
         """(V, 4, 4) of the views, in the order of time."""
-        return self.capture.T_reference_mount
+        return self.capture.T_base_flange
 
     @property
     def reach(self) -> float:
