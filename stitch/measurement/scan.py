@@ -33,6 +33,8 @@ _IN_CACHE = 4096
 # radius, the centroid has left the point: the surface ends here.
 GRAZING_COSINE = np.cos(np.radians(75.0))
 _EDGE_OFFSET = 0.35
+# A surface bends where a plane leaves so many times the noise: then it leaves as much of the bend as of the noise.
+_BENT = 2**0.5
 # Surface variation λ₀/(λ₀+λ₁+λ₂) of a crease (Pauly et al. 2002); a plane has 0.
 _CREASE_VARIATION = 0.05
 
@@ -65,7 +67,7 @@ def rays_to(points: Array, eye: Array) -> Array:
 
 
 def prepare_scan(name: str, points: Array, picked: Indices | None = None, eye: Array | None = None) -> Scan:
-    """KD-tree, normals (local plane of 16 neighbours), edge mask, spacing and noise of one scan.
+    """KD-tree, normals (local plane of 16 neighbours, quadric where that bends), edges, spacing and noise of one scan.
 
     Args:
         picked: indices of the points that the scan keeps; normals, edges and noise are those of all points.
@@ -77,17 +79,20 @@ def prepare_scan(name: str, points: Array, picked: Indices | None = None, eye: A
     neighbours = min(_NEIGHBOURS, len(points))
     distance, index = tree.query(own, k=neighbours)
     radius = distance[:, -1]
-    centroid, normals, variation = fit_planes(points, index)
+    centroid, normals, variation, left = fit_planes(points, index)
     eye = np.zeros(3) if eye is None else eye
-    cosine = np.einsum("ij,ij->i", normals, rays_to(own, eye))
-    normals *= -np.sign(cosine)[:, None]
-    confidence = np.abs(cosine)
-    offset = np.linalg.norm(centroid - own, axis=1)
-    usable = (confidence > GRAZING_COSINE) & (offset < _EDGE_OFFSET * radius)
-    usable &= variation < _CREASE_VARIATION
+    rays = rays_to(own, eye)
+    usable = (np.abs(np.einsum("ij,ij->i", normals, rays)) > GRAZING_COSINE) & (variation < _CREASE_VARIATION)
+    usable &= np.linalg.norm(centroid - own, axis=1) < _EDGE_OFFSET * radius
     # Across an edge no quadric fits: there the surface would count as noise.
     smooth = usable if usable.any() else np.ones_like(usable)
     noise = _estimate_noise(points, own[smooth], normals[smooth], index[smooth])
+    bent = np.flatnonzero(smooth & (left > _BENT * noise))
+    normals[bent] = _bent_normals(points, own[bent], normals[bent], index[bent])
+    cosine = np.einsum("ij,ij->i", normals, rays)
+    normals *= -np.sign(cosine)[:, None]
+    confidence = np.abs(cosine)
+    usable &= confidence > GRAZING_COSINE
     spacing = scanned_spacing = float(np.median(distance[:, 1]))
     if len(own) < len(points):
         tree = KDTree(own, leafsize=16)
@@ -137,9 +142,12 @@ def _estimate_spacing(points: Array, tree: Any) -> float:
     return float(np.median(distance[:, 1]))
 
 
-def fit_planes(points: Array, index: Indices) -> tuple[Array, Array, Array]:
-    """Centroids (N, 3), unit normals (N, 3) and surface variation (N,) of neighbourhoods, rows (N, k) of points."""
-    centroid, normals, variation = np.empty((len(index), 3)), np.empty((len(index), 3)), np.empty(len(index))
+def fit_planes(points: Array, index: Indices) -> tuple[Array, Array, Array, Array]:
+    """Centroids (N, 3), unit normals (N, 3), surface variation (N,) and 1-sigma about the plane (N,) of neighbourhoods,
+    rows (N, k) of points.
+    """
+    centroid, normals = np.empty((len(index), 3)), np.empty((len(index), 3))
+    variation, left = np.empty(len(index)), np.empty(len(index))
     columns = np.ascontiguousarray(points.T)
     for start in range(0, len(index), _IN_CACHE):
         at = slice(start, start + _IN_CACHE)
@@ -153,7 +161,8 @@ def fit_planes(points: Array, index: Indices) -> tuple[Array, Array, Array]:
             C[i, j] = C[j, i] = np.einsum("kn,kn->n", around[i], around[j])
         centroid[at] = middle.T
         normals[at], variation[at] = _weakest_directions(C)
-    return centroid, normals, variation
+        left[at] = np.sqrt(np.maximum(variation[at], 0) * np.trace(C) / max(len(rows) - 3, 1))
+    return centroid, normals, variation, left
 
 
 # Share of the largest eigenvalue's square by which a plane stands out from a line; below it digits are lost.
@@ -201,22 +210,63 @@ def _estimate_noise(points: Array, own: Array, normals: Array, index: Indices) -
     if count <= 8:
         return float("nan")
     centre = even_indices(len(own), _NOISE_SAMPLES)
-    local = np.array([column[index[centre].T] for column in points.T]) - own[centre].T[:, None]
-    n = normals[centre].T
+    rest, _, coefficients = _fit_quadrics(points, own[centre], normals[centre], index[centre])
+    degrees = count - coefficients
+    variance = (rest**2).sum(axis=0) / degrees
+    # The median of χ²/ν lies at (1 − 2/(9ν))³ of the mean (Wilson–Hilferty).
+    return float(np.sqrt(np.median(variance / (1 - 2 / (9 * degrees)) ** 3)))
+
+
+def _bent_normals(points: Array, own: Array, normals: Array, index: Indices) -> Array:
+    """(N, 3) unit normals of local quadrics at points `own` (N, 3), from those of the local planes.
+
+    A scanner sees a bent surface in closer steps where it looks at it straight. The plane of a point's neighbours is
+    that of a place nearer to there: normals at a slant lean towards the scanner, by some hundredths of a radian.
+    """
+    out = np.empty_like(normals)
+    for start in range(0, len(own), _IN_CACHE):
+        at = slice(start, start + _IN_CACHE)
+        out[at] = _fit_quadrics(points, own[at], normals[at], index[at])[1]
+    return out
+
+
+# Of the square of a quadric's term, what neighbours must show of it beside the others: of two profiles none shows how
+# the surface bends between them. Neighbours all around show half of it.
+_SHOWN = 0.1
+
+
+def _fit_quadrics(points: Array, own: Array, normals: Array, index: Indices) -> tuple[Array, Array, Indices]:
+    """What quadrics of k neighbours leave along normals (k, N), their normals at the points (N, 3), and how many
+    coefficients (N,) each has."""
+    local = np.array([column[index.T] for column in points.T]) - own.T[:, None]
+    n = normals.T
     a = _cross(n, np.where(np.abs(n[0]) < 0.7, [[1.0], [0.0], [0.0]], [[0.0], [1.0], [0.0]]))
     # A point that is seen edge-on has no normal.
     a /= np.maximum(np.linalg.norm(a, axis=0), 1e-300)
-    x, y, rest = (np.einsum("in,ikn->kn", axis, local) for axis in (a, _cross(n, a), n))
+    b = _cross(n, a)
+    x, y, rest = (np.einsum("in,ikn->kn", axis, local) for axis in (a, b, n))
     scale = np.maximum(np.abs(x).max(axis=0), 1e-300)
     x, y = x / scale, y / scale
-    basis = list[Array]()
+    terms = np.array([np.ones_like(x), x, y, x * x, x * y, y * y])
+    at_point = np.zeros((6, 2, x.shape[1]))  # slopes of the terms along a and b, there
+    at_point[1, 0] = at_point[2, 1] = 1
+    slope, coefficients = np.zeros((2, x.shape[1])), np.zeros(x.shape[1], np.int64)
     # Gram and Schmidt for all neighbourhoods at once: a library's loop over them takes twice as long.
-    for column in (np.ones_like(x), x, y, x * x, x * y, y * y):
-        for before in basis:
-            column = column - np.einsum("kn,kn->n", before, column) * before
-        basis.append(column / np.maximum(np.linalg.norm(column, axis=0), 1e-300))
-        rest = rest - np.einsum("kn,kn->n", basis[-1], rest) * basis[-1]
-    degrees = count - 6
-    variance = (rest**2).sum(axis=0) / degrees
-    # The median of χ²/ν lies at (1 − 2/(9ν))³ of the mean (Wilson–Hilferty).
-    return float(np.sqrt(np.median(variance) / (1 - 2 / (9 * degrees)) ** 3))
+    for k, term in enumerate(terms):
+        whole = np.einsum("kn,kn->n", term, term)
+        for before in range(k):
+            share = np.einsum("kn,kn->n", terms[before], term)
+            term -= share * terms[before]
+            at_point[k] -= share * at_point[before]
+        square = np.einsum("kn,kn->n", term, term)
+        shown = square > _SHOWN * whole
+        unit = shown / np.sqrt(np.maximum(square, 1e-300))
+        term *= unit
+        at_point[k] *= unit
+        height = np.einsum("kn,kn->n", term, rest)
+        rest -= height * term
+        slope += height * at_point[k]
+        coefficients += shown
+    slope /= scale
+    bent = n - slope[0] * a - slope[1] * b
+    return rest, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, coefficients

@@ -12,7 +12,7 @@ effects that change points, move the points themselves as well. The sizes are po
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -21,7 +21,7 @@ from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array, Mask
 from stitch.measurement.capture import Capture
-from stitch.measuring.place_errors import LEAST_COSINE, ErrorSource, PlaceErrors
+from stitch.measuring.place_errors import ErrorSource, PlaceErrors
 from stitch.model.forward import PointSlopes, corrected_capture, moves_points
 from stitch.model.model import kept_root, sizes_of, stack_parameters, values_of
 from stitch.observations.pose_errors import DRIFT_MEMORY, STOP_COMPONENTS, prior_pose_errors
@@ -32,8 +32,6 @@ from stitch.observations.surfaces.hand_eye_fit import (
     hand_eye_jacobian,
     solve_hand_eye,
 )
-from stitch.observations.surfaces.matching import Match
-from stitch.observations.surfaces.normal_equations import append_targets, gram
 from stitch.observations.surfaces.scanner_errors import half_field, shared_error_likelihood, sum_smooth_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.runs.run import Run
@@ -59,8 +57,6 @@ NOT_INCLUDED = (
 _MANY = 1e6
 # Directions with a smaller share of a component's largest variance are rounding.
 _ROUNDING = 1e-12
-# Spacings along the surface between partners that tell of smooth errors: the median of two lattices is 0.45.
-_CLOSE = 0.5
 
 
 def place_errors(run: Run) -> PlaceErrors:
@@ -184,46 +180,18 @@ def _sources(run: Run, chain: ErrorChain) -> Iterator[ErrorSource]:
 def _smooth_errors(run: Run, chain: ErrorChain) -> tuple[Array, Array, Array]:
     """Twists (6V, K) that the overlaps show for unit smooth errors, their sizes (K,), and degrees of freedom (K,).
 
-    One whose logarithm is known to s has ½/s² degrees of freedom (JCGM 100, G.4.2).
+    Sizes are those that the covariance of the hand-eye counts. One whose logarithm is known to s has ½/s² degrees of
+    freedom (JCGM 100, G.4.2).
     """
     sums, noise = sum_smooth_errors(run.measurement, chain.freed)
     twists = apparent_twists(sums, chain.freed)
     if not np.isfinite(noise):
         return twists, np.zeros(twists.shape[1]), np.full(twists.shape[1], _MANY)
-    near = _close_pairs(run, chain)
-    sums, noise = sum_smooth_errors(run.measurement, near)
-    likelihood = shared_error_likelihood(sums, apparent_twists(sums, near), near, noise)
+    likelihood = shared_error_likelihood(sums, twists, chain.freed, noise)
     shares = likelihood.map_shares
     spread = likelihood.share_spread(shares)
     of_mode = np.append(np.zeros(twists.shape[1] - 1, int), 1)  # all over the field have one size, incidence its own
     return twists, (noise * shares)[of_mode], (0.5 / spread**2)[of_mode]
-
-
-def _close_pairs(run: Run, chain: ErrorChain) -> UnconstrainedPoses:
-    """Return the overlaps by which smooth errors are sized: partners near each other that no view sees at a slant.
-
-    Where a surface bends, normals at a slant lean towards the scanner. Between points that lie apart along the surface
-    that looks like an error of incidence, several times as large as the one that there is.
-    """
-    overlaps, views, kept = chain.freed.overlaps, run.measurement.scan_views, list[Match]()
-    most = _CLOSE * run.measurement.capture.spacing
-    for match in overlaps.matches:
-        p, q = (
-            frames.transform(chain.freed.poses[v], chain.capture.scans[v].points[index])
-            for v, index in ((match.v, match.index_v), (match.w, match.index_w))
-        )
-        along = np.linalg.norm(np.cross(p - q, match.normal), axis=1)
-        cosine = np.minimum(views[match.v].cosine[match.index_v], views[match.w].cosine[match.index_w])
-        own = match.subset((along < most) & (cosine > LEAST_COSINE))
-        if len(own.residual):
-            kept.append(own)
-    if not kept:
-        return chain.freed
-    g = overlaps.gram
-    sums = append_targets(
-        gram(kept, g.views, g.centre, g.scale), overlaps.targets, run.measurement.capture.noise_factor
-    )
-    return replace(chain.freed, overlaps=replace(overlaps, matches=kept, gram=sums))
 
 
 def _pose_modes(run: Run, chain: ErrorChain) -> Iterator[_Modes]:

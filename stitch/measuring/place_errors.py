@@ -17,7 +17,7 @@ from stitch.runs.run import FusedCloud
 from stitch.system.files import whole_file
 
 # What is seen at more than 60° errs most with incidence, and other views see it better.
-LEAST_COSINE = 0.5
+_LEAST_COSINE = 0.5
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class PlaceErrors:
     def points(self) -> RunPoints:
         """All usable points that the scanner does not see at a slant."""
         scans = self.capture.scans
-        kept = [np.flatnonzero(scan.usable.astype(bool) & (scan.confidence > LEAST_COSINE)) for scan in scans]
+        kept = [np.flatnonzero(scan.usable.astype(bool) & (scan.confidence > _LEAST_COSINE)) for scan in scans]
         return RunPoints(
             np.vstack([frames.transform(T, s.points[k]) for s, T, k in zip(scans, self.poses, kept, strict=True)]),
             np.vstack([frames.rotate(T, s.normals[k]) for s, T, k in zip(scans, self.poses, kept, strict=True)]),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stitch import frames
-from stitch.frames import Array, Indices, Mask
+from stitch.frames import Array, Indices
 from stitch.measurement.scan import Scan, bounding_box, box_corners, even_indices
 from stitch.system.threads import parallel
 
@@ -87,7 +87,7 @@ class Match:
     index_v: Indices  # (M,) point of view v
     index_w: Indices  # (M,) point of view w
 
-    def subset(self, at: slice | Mask) -> "Match":
+    def subset(self, at: slice) -> "Match":
         """Some of them."""
         return Match(self.v, self.w, *(value[at] for value in self.columns))
 
