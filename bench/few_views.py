@@ -1,18 +1,22 @@
 """Does U of the hand-eye hold where views are few? Whole fits from a coarse hand-eye, χ² against the truth.
 
-Usage: python bench/few_views.py --seed S [--cells N] [--views 4,5,6,7,8]
+Usage: python bench/few_views.py --seed S [--cells N] [--views 4,5,6,7,8] [--keep FILE] [--write]
 
 Every cell has views, clouds and an arm of its own; seeds take scenes, views and kinds of arm in turn. The scans are
 those of an arm without errors, and the reported poses those of one that has them, which is the same to first order.
-Used up: 7000, 7100, 9000 to 9026 (docs/method.md, "What U rests on").
+Used up: 7000, 7100, 9000 to 9026, 31000 to 31044 (docs/method.md, "What U rests on").
 """
 
 import argparse
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from batch import into_page
 from blind_cells import scene_of
 from blind_trials import pin
 
@@ -31,6 +35,7 @@ from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.stages.correct import correct
 
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "method.md"
 SCENES = ("blade", "drill-plate", "blade-table")
 SIZES = (0.0, 0.5, 1.0)  # of an ordinary arm; 0: nothing but scatter and the quiet effects that every cell has
 _GATE = 0.05  # first distance between partners, as a share of the part
@@ -67,25 +72,52 @@ def main() -> None:
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--cells", type=int, default=15)
     parser.add_argument("--views", default="4,5,6,7,8")
+    parser.add_argument("--keep", type=Path, help="A line for every cell; those that it holds are not run again.")
+    parser.add_argument("--write", action="store_true", help="Put the table into docs/method.md.")
     options = parser.parse_args()
     pin(0)
-    views, rows = [int(v) for v in options.views.split(",")], list[tuple[str, float, Array]]()
+    views = [int(v) for v in options.views.split(",")]
+    kept = options.keep.read_text().splitlines() if options.keep and options.keep.exists() else []
+    done = {row["seed"]: row for row in map(json.loads, kept)}
     for k in range(options.cells):
-        scene, count, size = SCENES[k % 3], views[k // 3 % len(views)], SIZES[k // (3 * len(views)) % 3]
-        xi, covariance = fitted_error(scene, options.seed + k, count, size)
-        inside = np.abs(xi) < COVERAGE_FACTOR * np.sqrt(np.diag(covariance))
+        seed, scene = options.seed + k, SCENES[k % 3]
+        count, size = views[k // 3 % len(views)], SIZES[k // (3 * len(views)) % 3]
+        if seed in done:
+            continue
+        xi, covariance = fitted_error(scene, seed, count, size)
         square = float(xi @ np.linalg.solve(covariance, xi)) / 6
-        rows += [(name, square, inside) for name in ("all", f"{count} views", f"ordinary {size:g}")]
-    print(
-        "| cells | fits | mean χ²/6 | beyond | largest | inside U | single axes |\n|---|---:|---:|---:|---:|---:|---|"
-    )
-    for name in dict.fromkeys(row[0] for row in rows):
-        squares = np.array([square for of, square, _ in rows if of == name])
-        axes = np.mean([inside for of, _, inside in rows if of == name], axis=0)
-        print(
-            f"| {name} | {len(squares)} | {squares.mean():.2f} | {np.sum(squares > _BEYOND)} | {squares.max():.1f} "
-            f"| {axes.mean():.3f} | {axes.min():.3f} … {axes.max():.3f} |"
+        ratio = xi / (COVERAGE_FACTOR * np.sqrt(np.diag(covariance)))
+        done[seed] = {"seed": seed, "scene": scene, "views": count, "arm": size, "chi2": square, "of_U": ratio.tolist()}
+        if options.keep:
+            with options.keep.open("a") as file:
+                file.write(json.dumps(done[seed]) + "\n")
+    lines = table(list(done.values()))
+    print("\n".join(lines))
+    if options.write:
+        into_page("few", lines, PAGE)
+
+
+def table(cells: list[dict[str, Any]]) -> list[str]:
+    """Return the lines of the table."""
+    first = min(cell["seed"] for cell in cells)
+    lines = [
+        f"{len(cells)} cells from seed {first} on:",
+        "",
+        "| cells | fits | mean χ²/6 (95 %) | beyond 2.8 | largest | inside U (k = 2) | single axes |",
+        "|---|---:|---:|---:|---:|---:|---|",
+    ]
+    groups = {"all": cells}
+    for key, name in (("arm", "ordinary {:g}"), ("views", "{} views")):
+        for value in sorted({cell[key] for cell in cells}):
+            groups[name.format(value)] = [cell for cell in cells if cell[key] == value]
+    for name, own in groups.items():
+        squares, axes = np.array([cell["chi2"] for cell in own]), np.abs([cell["of_U"] for cell in own]) < 1
+        wide, each = 1.96 * squares.std() / np.sqrt(len(squares)), axes.mean(axis=0)
+        lines.append(
+            f"| {name} | {len(own)} | {squares.mean():.2f} ± {wide:.2f} | {np.sum(squares > _BEYOND)} "
+            f"| {squares.max():.1f} | {axes.mean():.3f} | {each.min():.3f} … {each.max():.3f} |"
         )
+    return lines
 
 
 if __name__ == "__main__":
