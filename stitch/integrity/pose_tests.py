@@ -17,6 +17,7 @@ from stitch.integrity.view_model import (
     displacement_lower_bound,
     hstack_columns,
     leave_one_out_test,
+    left_out_test,
     projector,
     rotation_shift_lower_bounds,
     test_alternative,
@@ -411,8 +412,8 @@ def length_problem(model: ViewModel, T_reference_mount: Array, further: Array | 
         T_reference_mount: (V, 4, 4), length_unit: a factor 1 + κ on them is a left twist (0, κ t) of every view.
     """
     column = np.einsum("vni,vi->n", model.views[:, :, 3:], T_reference_mount[:, :3, 3])[:, None]
-    found = test_alternative(projector(model, model.fit(hstack_columns(further, column)), further), column)
+    found, p = left_out_test(model, further, column, column)
     share = float(found.estimate[0])
-    if abs(share) < _SCALE or found.p_value > _LENGTH_CHANCE:
+    if abs(share) < _SCALE or p > _LENGTH_CHANCE:
         return None
     return SessionProblem("scale", (), scale_text(1 + share))

@@ -221,18 +221,26 @@ def _pseudo_inverse(N: Array) -> tuple[Array, int]:
     return np.asarray((scaled / values[keep]) @ scaled.T), int(keep.sum())
 
 
-def leave_one_out_test(model: ViewModel, columns: Array | None, view: int) -> tuple[AlternativeTest, float]:
-    """One view tested under the scatter that all others have without it, and the chance of that.
+def left_out_test(model: ViewModel, columns: Array | None, own: Array, held: Array) -> tuple[AlternativeTest, float]:
+    """An alternative tested under the scatter that is left where it is free, and the chance of that.
 
     One of six views hides in a scatter that it inflates itself. Rotations and translations share the degrees of freedom
     of a scatter taken from the rest: half of them count.
+
+    Args:
+        columns: (n, K) of what else there is.
+        own: (n, k) of the alternative.
+        held: (n, k) the same, less directions that nothing holds.
     """
-    own = model.views[view]
     under = projector(model, model.fit(hstack_columns(columns, own)), columns)
-    # Where a scan slides it rests anywhere.
-    tested = test_alternative(under, model.held_responses[view])
+    tested = test_alternative(under, held)
     free = max((under.degrees - tested.degrees) // 2, 1)
     return tested, f_tail(tested.statistic / max(tested.degrees, 1), max(tested.degrees, 1), free)
+
+
+def leave_one_out_test(model: ViewModel, columns: Array | None, view: int) -> tuple[AlternativeTest, float]:
+    """One view tested under the scatter that all others have without it: where a scan slides it rests anywhere."""
+    return left_out_test(model, columns, model.views[view], model.held_responses[view])
 
 
 # What only a weak direction seems to show is no size of a displacement: a scan that slides along the part, or that few
