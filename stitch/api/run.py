@@ -32,7 +32,13 @@ from stitch.writing.run_folder import recordings, residual_table
 
 
 class AtPart(NamedTuple):
-    """Expanded uncertainty U (k = 2) over all directions."""
+    """Expanded uncertainty U (k = 2) over all directions.
+
+    Example:
+        >>> mm, mrad = run.hand_eye.U
+        >>> mm < 1
+        True
+    """
 
     mm: float  # of the middle of what the scanner saw
     mrad: float

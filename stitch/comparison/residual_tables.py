@@ -99,7 +99,13 @@ _FAIR = 50  # correspondences of a bin that may be called the worst
 
 @dataclass(frozen=True)
 class ResidualTable:
-    """One property in bins; lengths in length_unit, counts of correspondences and of views."""
+    """One property in bins; lengths in length_unit, counts of correspondences and of views.
+
+    Example:
+        >>> table = stitch.compare(run).table("view")
+        >>> table.label[0], table.rms.shape
+        ('v000', (5,))
+    """
 
     name: str
     unit: str
@@ -127,7 +133,12 @@ class ResidualTable:
         return float(np.nanmin(self.p_value, initial=1.0))
 
     def worst(self, at_most: int) -> list[int]:
-        """Numbers of the bins of largest rms, of those with a fair count."""
+        """Return the numbers of the bins of largest rms, of those with a fair count.
+
+        Example:
+            >>> len(stitch.compare(run).table("view").worst(2))
+            2
+        """
         fair = self.count > np.minimum(_FAIR, np.median(self.count) / 4)
         return [int(i) for i in np.argsort(-np.nan_to_num(self.rms), kind="stable") if fair[i]][:at_most]
 
@@ -182,7 +193,13 @@ CLEAR = 0.05  # p over all means
 
 @dataclass(frozen=True)
 class ResidualTables:
-    """All tables, and the rms they share."""
+    """All tables, and the rms they share, length_unit.
+
+    Example:
+        >>> tables = stitch.compare(run)
+        >>> [table.name for table in tables.labelled]
+        ['view', 'pair', 'place on the part']
+    """
 
     tables: tuple[ResidualTable, ...]
     rms: float
@@ -192,7 +209,12 @@ class ResidualTables:
     followed: tuple[FollowedCovariate, ...] = ()  # what the displacements of whole views follow, clearest first
 
     def table(self, name: str) -> ResidualTable:
-        """One table by its name."""
+        """Return one table by its name.
+
+        Example:
+            >>> stitch.compare(run).table("range").unit
+            'mm'
+        """
         return next(t for t in self.tables if t.name == name)
 
     @property
@@ -223,11 +245,23 @@ class ResidualTables:
         return len(ordered) and 1 + int((np.diff(ordered) > _SAME_VALUE * ordered[-1]).sum())
 
     def p_of_all(self, table: ResidualTable) -> float:
-        """Return the p-value of the clearest mean of a table, over all means (Bonferroni)."""
+        """Return the p-value of the clearest mean of a table, over all means (Bonferroni).
+
+        Example:
+            >>> tables = stitch.compare(run)
+            >>> tables.p_of_all(tables.places[0]) >= tables.places[0].least_p
+            True
+        """
         return min(1.0, max(self.means, 1) * table.least_p)
 
     def is_clear(self, table: ResidualTable) -> bool:
-        """True where chance does not explain its clearest mean (5 % over all means)."""
+        """Return True where chance does not explain its clearest mean (5 % over all means).
+
+        Example:
+            >>> tables = stitch.compare(run)
+            >>> [table.name for table in tables.places if tables.is_clear(table)]
+            []
+        """
         return self.p_of_all(table) <= CLEAR
 
 

@@ -111,7 +111,14 @@ class Diagnosis:
         return self.tried.get(self.effects[0]) if self.verdict == "missing_effect" else None
 
     def rms_if_added(self, validation: CrossValidation) -> tuple[float, float]:
-        """Return the rms with an effect, in the fit and on views left out (length_unit)."""
+        """Return the rms with an effect, in the fit and on views left out (length_unit).
+
+        Example:
+            >>> found = stitch.diagnose(run)
+            >>> fit, heldout = found.rms_if_added(found.candidates[0].cross_validation)
+            >>> fit < found.residual_rms
+            True
+        """
         return self.residual_rms * validation.inside**0.5, self.heldout_rms * validation.heldout**0.5
 
     @property

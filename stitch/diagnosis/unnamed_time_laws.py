@@ -238,7 +238,12 @@ ROTATION_PART, TRANSLATION_PART = slice(3), slice(3, 6)
 
 @dataclass(frozen=True)
 class TimeCurve:
-    """How far the flange turns and moves in time, in its own frame, beside where it stands otherwise."""
+    """How far the flange turns and moves in time, in its own frame, beside where it stands otherwise.
+
+    Example:
+        >>> stitch.diagnose(run).time_curve is None  # of a flange that does not
+        True
+    """
 
     steps: Array  # (G,) times in usual steps from one view to the next
     seconds: float  # that a step takes; 0 where no time is stated
@@ -246,7 +251,14 @@ class TimeCurve:
     sigma: Array  # (G, 6)
 
     def largest(self, of: slice) -> tuple[int, float, float]:
-        """Return where rotation or translation is largest, how large it is there, and its sigma."""
+        """Return where rotation or translation is largest, how large it is there, and its sigma.
+
+        Example:
+            >>> from stitch.diagnosis.unnamed_time_laws import TimeCurve
+            >>> curve = TimeCurve(np.arange(2.0), 60.0, np.eye(6)[:2] * 1e-3, np.full((2, 6), 1e-4))
+            >>> curve.largest(slice(0, 3))
+            (0, 0.001, 0.0001)
+        """
         size = np.linalg.norm(self.error[:, of], axis=1)
         k = int(size.argmax())
         along = self.error[k, of] / max(float(size[k]), 1e-300)

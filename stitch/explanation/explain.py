@@ -113,7 +113,12 @@ _TOO_FEW = (
 
 @dataclass(frozen=True)
 class Explanation:
-    """A formula of which views that took no part in finding it want the like too; or none."""
+    """A formula of which views that took no part in finding it want the like too; or none.
+
+    Example:
+        >>> print(stitch.explain(run).why)
+        Nothing can be said from 5 views. ...
+    """
 
     found: bool
     why: str  # in one sentence

@@ -18,7 +18,13 @@ from stitch.units import METRES, value_uncertainty_text
 
 @dataclass(frozen=True)
 class Term:
-    """An effect in use; P parameters in the order of the effect's arguments."""
+    """An effect in use; P parameters in the order of the effect's arguments.
+
+    Example:
+        >>> term = better.terms[0]
+        >>> term.name, term.values.shape
+        ('range_scale', (1,))
+    """
 
     effect: Effect
     parameters: tuple[Parameter, ...]
@@ -59,7 +65,12 @@ class Term:
         return self.effect.arguments(self.parameters)
 
     def at(self, values: Array, sigmas: Array | None = None) -> "Term":
-        """The term with other values (P,), and sigmas (P,) where they are known."""
+        """Return the term with other values (P,), and sigmas (P,) where they are known.
+
+        Example:
+            >>> better.terms[0].at(np.zeros(1)).values
+            array([0.])
+        """
         own = [replace(p, value=float(v)) for p, v in zip(self.parameters, values, strict=True)]
         if sigmas is not None:
             own = [replace(p, sigma=float(s)) for p, s in zip(own, sigmas, strict=True)]

@@ -24,7 +24,13 @@ _HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps sc
 
 @dataclass(frozen=True)
 class ModelFile:
-    """What model.toml says: the model with its unit and mount, parameters by effect and name."""
+    """What model.toml says: the model with its unit and mount, parameters by effect and name.
+
+    Example:
+        >>> model = stitch.read_model(better.save(folder / "better", recording=False))
+        >>> model.mount, model.T_mount.shape, list(model.effects["range_scale"])
+        ('eye_in_hand', (4, 4), ['s'])
+    """
 
     length_unit: str
     mount: str  # eye_to_hand | eye_in_hand

@@ -287,7 +287,15 @@ class ProposedView:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the present views would tell, which to add, and what all of them would tell."""
+    """What the present views would tell, which to add, and what all of them would tell.
+
+    Example:
+        >>> plan = stitch.plan(run, views=2)
+        >>> plan.now.views, [view.name for view in plan.proposed], plan.after.views
+        (5, ['p01', 'p02'], 7)
+        >>> plan.proposed[0].joints.shape, plan.proposed[0].T_base_flange.shape
+        ((6,), (4, 4))
+    """
 
     session: Session
     assumed: tuple[str, ...]

@@ -49,7 +49,12 @@ METHOD_TITLES = {"dpwvm": "DPWVM-style weighted fit", "gicp": "plane to plane (G
 
 @dataclass(frozen=True)
 class StageResult:
-    """One row of the stage table."""
+    """One row of the stage table.
+
+    Example:
+        >>> [stage.name for stage in run.stages]
+        ['coarse', 'correct', 'register', 'fuse']
+    """
 
     name: str  # coarse | correct | register | fuse
     rms: float  # length_unit
@@ -67,7 +72,12 @@ class StageResult:
 
 @dataclass(frozen=True)
 class FusedCloud:
-    """The stitched cloud in the reference frame."""
+    """The stitched cloud in the reference frame; lengths in length_unit.
+
+    Example:
+        >>> run.fused.points.shape == run.fused.normals.shape, int(run.fused.count.max())
+        (True, 5)
+    """
 
     points: Array  # (N, 3)
     normals: Array  # (N, 3)
@@ -135,7 +145,12 @@ class LedgerStep:
 
 @dataclass(frozen=True)
 class Fit:
-    """What the stages found of one session under its model; lengths in length_unit, angles in rad."""
+    """What the stages found of one session under its model; lengths in length_unit, angles in rad.
+
+    Example:
+        >>> run.fit.poses.shape, run.fit.corrections.shape
+        ((5, 4, 4), (5, 6))
+    """
 
     stages: tuple[StageResult, ...]
     poses_model: Array  # (V, 4, 4) T_reference_scanner of the model (robot, hand-eye, effects)
@@ -156,7 +171,7 @@ class Fit:
     unsupported: Unsupported = field(default_factory=Unsupported)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run:
     """One session, its model and its results, as `result.json` and the report show them.
 

@@ -1,27 +1,54 @@
-"""Every public name, and every method of what people hold, says shapes, units, frames and errors; its example is run."""
+"""Every public name, and whatever one reaches from it, says shapes, units, frames and errors; its example is run."""
 
 import ast
 import doctest
 import inspect
 import re
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
+from types import SimpleNamespace
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 
 import stitch
-from stitch.api import live, run, session
 from stitch.measurement.session import Cloud
 from tests.needs import needs_open3d
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-HELD = (session.Session, run.Run, run.FittedHandEye, run.Stitched, run.RunView, stitch.Model)
-HELD += (live.LiveSession, live.LiveView, live.ProposedPose)
 # How a method begins that returns what it did.
 VERBS = {"Return", "Write", "Take", "Run"}
 ERRORS = {"InputError", "NoResultError"}
+
+
+def classes_in(hint):
+    """Classes of stitch in a type."""
+    own = {hint} if inspect.isclass(hint) and hint.__module__.startswith("stitch.") else set()
+    return own.union(*map(classes_in, get_args(hint)))
+
+
+def returned(member):
+    """Classes of stitch that a function, method or property returns."""
+    function = getattr(member, "fget", None) or getattr(member, "func", None) or getattr(member, "__func__", member)
+    return classes_in(get_type_hints(function).get("return")) if inspect.isfunction(function) else set()
+
+
+def held():
+    """The public classes, and whatever one reaches from public functions by methods and properties."""
+    public = [getattr(stitch, name) for name in stitch.__all__]
+    waiting = [kind for kind in public if inspect.isclass(kind) and not issubclass(kind, Exception)]
+    waiting += sorted(set().union(*map(returned, public)), key=lambda kind: kind.__name__)
+    found = []
+    while waiting:
+        kind = waiting.pop(0)
+        # Of a class and the one that people hold in its place the second counts.
+        if any(issubclass(other, kind) for other in found):
+            continue
+        found.append(kind)
+        waiting += sorted(set().union(*map(returned, members(kind).values())), key=lambda kind: kind.__name__)
+    return found
 
 
 def members(kind):
@@ -30,12 +57,18 @@ def members(kind):
     return {f"{kind.__name__}.{name}": inspect.getattr_static(kind, name) for name in names}
 
 
+HELD = held()
 MEMBERS = {name: member for kind in HELD for name, member in members(kind).items()}
-METHODS = {name: getattr(m, "__func__", m) for name, m in MEMBERS.items() if callable(getattr(m, "__func__", m))}
+METHODS = {name: f for name, m in MEMBERS.items() if inspect.isfunction(f := getattr(m, "__func__", m))}
 PROPERTIES = {name: m for name, m in MEMBERS.items() if isinstance(m, property | cached_property)}
 CLASSES = {kind.__name__: kind for kind in HELD}
 FUNCTIONS = {name: getattr(stitch, name) for name in stitch.__all__ if inspect.isfunction(getattr(stitch, name))}
 NAMES = {name: getattr(stitch, name) for name in stitch.__all__} | CLASSES | METHODS
+
+
+def example_of(name, globs=None):
+    """The example of a public name, with what it finds there."""
+    return doctest.DocTestParser().get_doctest(inspect.getdoc(NAMES[name]), globs or {}, name, None, None)
 
 
 def moved(view):
@@ -50,8 +83,10 @@ def names_of_examples(arrays, cell_folder, loaded, found):
     grown = stitch.live(mount="eye_in_hand")
     for cloud, pose in zip(clouds, poses, strict=True):
         grown.add_view(cloud, pose)
+    # What takes seconds is done once, for all examples that ask for it.
+    slow = {name: cache(getattr(stitch, name)) for name in ("compare", "diagnose", "plan")}
     return {
-        "stitch": stitch,
+        "stitch": SimpleNamespace(**{name: getattr(stitch, name) for name in stitch.__all__} | slow),
         "np": np,
         "replace": replace,
         "clouds": clouds,
@@ -66,13 +101,22 @@ def names_of_examples(arrays, cell_folder, loaded, found):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_every_name_has_an_example(name):
+    assert example_of(name).examples
+
+
+# Ten seconds: a plan looks at forty views.
+PLANS = [name for name in NAMES if any("stitch.plan(" in own.source for own in example_of(name).examples)]
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in PLANS)) for name in NAMES], ids=str
+)
 def test_the_example_gives_what_it_says(name, names_of_examples, tmp_path):
     if "open3d" in name:
         needs_open3d()
-    globs = names_of_examples | {"folder": tmp_path}
-    example = doctest.DocTestParser().get_doctest(inspect.getdoc(NAMES[name]), globs, name, None, None)
-    assert example.examples, f"{name} has no example"
     said = []
+    example = example_of(name, names_of_examples | {"folder": tmp_path})
     doctest.DocTestRunner(optionflags=FLAGS).run(example, out=said.append)
     assert not said, "".join(said)
 

@@ -296,7 +296,12 @@ _SMALLER_GATE = 0.1
 
 @dataclass(frozen=True)
 class Overlaps:
-    """Correspondences of all overlapping pairs, and common targets, with the normal equations of both."""
+    """Correspondences of all overlapping pairs, and common targets, with the normal equations of both.
+
+    Example:
+        >>> len(run.overlaps.pairs), run.overlaps.gate > 0  # length_unit
+        (10, True)
+    """
 
     pairs: list[tuple[int, int]]
     matches: list[Match]

@@ -31,7 +31,12 @@ _ANYWHERE = 1e3
 
 @dataclass(frozen=True)
 class Outlier:
-    """One target of one view, or a whole view, that does not count."""
+    """One target of one view, or a whole view, that does not count.
+
+    Example:
+        >>> run.outliers  # of clouds without labelled points
+        ()
+    """
 
     view: int
     target: str | None  # None: all that the view shows

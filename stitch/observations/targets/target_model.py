@@ -17,7 +17,12 @@ from stitch.observations.targets.rows import Drawing, Landmarks, TargetRows, ini
 
 @dataclass(frozen=True)
 class TargetModelFit:
-    """Model, places of the targets and scatter of the poses; lengths in length_unit, angles in rad."""
+    """Model, places of the targets and scatter of the poses; lengths in length_unit, angles in rad.
+
+    Example:
+        >>> run.targets is None  # of clouds without labelled points
+        True
+    """
 
     model: Model
     inflation: float  # factor on the covariance that views left out ask for, ≥ 1
@@ -30,7 +35,7 @@ class TargetModelFit:
 
     @property
     def rms(self) -> float:
-        """3D root mean square over all targets of all views."""
+        """Root mean square, in 3D, over all targets of all views."""
         return rms_of(self.rows.distances(self.rows.residual))
 
     @property
