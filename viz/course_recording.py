@@ -10,11 +10,11 @@ from stitch.frames import Array
 from stitch.units import covariate_text
 from viz.colours import signed_colours
 
-# Width and height of the drawing, in its own units; y points downwards.
-_WIDE, _HIGH = 100.0, 22.0
+# Width and height of the drawing, in its own units; y points downwards. As long as an ordinary window has room.
+_WIDE, _HIGH = 170.0, 22.0
 _LEFT, _BELOW, _ABOVE = 12.0, 5.0, 3.0
-# Names of views along the axis: more would cover one another.
-_NAMED = 20
+# Letters that stand side by side along the drawing; what is longer would cover what is beside it.
+_LETTERS = 110
 _DOTS, _LINE, _WHISKER, _AXIS = (232, 235, 239), (230, 159, 0), (150, 155, 160), (110, 115, 120)
 WHERE = "diagnosis/why"
 X_RANGE, Y_RANGE = (-2.0, _LEFT + _WIDE + 3.0), (-_ABOVE - 2.0, _HIGH + _BELOW + 1.0)
@@ -57,13 +57,28 @@ def log_course(recording: rr.RecordingStream, course: dict[str, Any], names: lis
     _label(
         recording, "heights", np.column_stack([np.full(2, _LEFT / 2), to_y(heights)]), [f"{h:+.3g}" for h in heights]
     )
-    some = order[np.unique(np.linspace(0, len(x) - 1, min(len(x), _NAMED)).astype(int))]
-    told = [names[course["views"][i]] for i in some] if course["views"] else [f"{at[i]:.3g}" for i in some]
-    _label(recording, "names", np.column_stack([x[some], np.full(len(some), _HIGH + _BELOW / 2)]), told)
+    in_order = course["follows"] == "view order" and course["views"]
+    told = [names[v] for v in course["views"]] if in_order else [f"{value:.3g}" for value in at]
+    some = apart(x, (max(map(len, told)) + 2) * _WIDE / _LETTERS)
+    _label(
+        recording,
+        "names",
+        np.column_stack([x[some], np.full(len(some), _HIGH + _BELOW / 2)]),
+        [told[i] for i in some],
+    )
     if len(course["views"]) == len(names):
         colours = signed_colours(measured, float(np.abs(measured).max()))
         recording.log("robot/flanges", rr.Points3D.from_fields(colors=colours), static=True)
         recording.log("robot/arm", rr.LineStrips3D.from_fields(colors=colours), static=True)
+
+
+def apart(x: Array, least: float) -> list[int]:
+    """Return which of the places x (N,) may be named, from the left: no two are closer than `least`."""
+    kept: list[int] = []
+    for i in np.argsort(x, kind="stable").tolist():
+        if not kept or x[i] - x[kept[-1]] >= least:
+            kept.append(i)
+    return kept
 
 
 _Scale = Callable[[Array], Array]

@@ -152,8 +152,30 @@ class Head:
     doubts: Sequence[str] = ()  # in full, of which the verdict has the beginnings
 
 
-def write_page(path: Path, template: str, head: Head, **content: object) -> None:
-    """Fill in a template that extends `page.html.j2`, whole or not at all; it needs nothing beside it."""
-    page = render(template, head=head, **content)
+def write_page(
+    path: Path, template: str, head: Head, sections: dict[str, str] | None = None, **content: object
+) -> None:
+    """Fill in a template that extends `page.html.j2`, whole or not at all; it needs nothing beside it.
+
+    Args:
+        sections: put between their marks, in place of what the template says there.
+    """
+    page = with_sections(render(template, head=head, **content), sections or {})
     with whole_file(path) as file:
         file.write_text(page, encoding="utf-8")
+
+
+# Sections that a diagnosis or a comparison adds to a page that stands, each between two marks of its name.
+
+
+def with_sections(page: str, sections: dict[str, str]) -> str:
+    """The page with these sections between their marks; one from elsewhere without marks stays as it is."""
+    for name, html in sections.items():
+        begin, end = f"<!-- {name} begins -->", f"<!-- {name} ends -->"
+        page = re.sub(f"{begin}.*?{end}", lambda _, own=begin + html + end: own, page, flags=re.S)  # type: ignore[misc]
+    return page
+
+
+def sections_of(page: str) -> dict[str, str]:
+    """The sections of a page, by the names of their marks."""
+    return dict(re.findall(r"<!-- (\w+) begins -->(.*?)<!-- \1 ends -->", page, flags=re.S))

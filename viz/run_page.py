@@ -14,7 +14,7 @@ from stitch.observations.observability import NUMBERS
 from stitch.runs.run import Run, doubt_headline
 from stitch.units import MICROMETRES, value_uncertainty_text
 from viz import captions
-from viz.page_parts import Head, Subject, Tile, identity, script_json, write_page
+from viz.page_parts import Head, Subject, Tile, identity, page_written, script_json, sections_of, write_page
 from viz.part_data import part_data
 from viz.part_surface import PartShape, camera_for, part_shape, part_surface
 from viz.run_numbers import shown_points, view_shifts
@@ -144,7 +144,8 @@ def ledger_rows(run: Run) -> list[dict[str, Any]]:
 
 
 def write_report(run: Run, path: Path, tolerance: float | None = None) -> None:
-    """Write the page of a run; it needs nothing beside it.
+    """Write the page of a run; it needs nothing beside it. What a diagnosis of this very model said on the page that
+    stands there stays.
 
     Args:
         tolerance: within which the views have to agree on the part, length_unit.
@@ -153,7 +154,24 @@ def write_report(run: Run, path: Path, tolerance: float | None = None) -> None:
         begun = None if run.registered is None else beside.submit(part_shape, run.fused)
         history = model_history(run)
         shape = None if begun is None else begun.result()
-    write_page(path, "report.html.j2", _head(run, history, tolerance), **_content(run, history, tolerance, shape))
+    diagnosed = _is_diagnosed(run, path.parent)
+    write_page(
+        path,
+        "report.html.j2",
+        _head(run, history, tolerance),
+        sections_of(path.read_text(encoding="utf-8")) if diagnosed and path.is_file() else None,
+        diagnosed=diagnosed,
+        **_content(run, history, tolerance, shape),
+    )
+
+
+def _is_diagnosed(run: Run, folder: Path) -> bool:
+    """Whether the diagnosis in a folder is of this very model; where there is none nothing is loaded to ask."""
+    if not (folder / "diagnosis.json").is_file():
+        return False
+    from stitch.stored.stored_run import standing_diagnosis
+
+    return bool(standing_diagnosis(folder, run))
 
 
 def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> Head:
@@ -180,6 +198,7 @@ def _content(
     return {
         "run": run,
         "um": um,
+        "written": page_written()[1],
         "doubts": run.doubts,
         "tolerance": None if tolerance is None else tolerance * um,
         "tiles": run_tiles(run, history),

@@ -1,6 +1,5 @@
 """Add diagnosis and comparison to a run folder: the screen and the evidence of its page, a tab of its recording."""
 
-import re
 import shlex
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from stitch.writing.finding_screen import CandidateFields, candidate_fields
 from viz import captions
 from viz.diagnosis_plots import Plots, alias_rows, budget_rows, comparison_plots, diagnosis_plots
 from viz.diagnosis_recording import add_diagnosis
-from viz.page_parts import Tile, render, script_json, unbroken
+from viz.page_parts import Tile, render, script_json, unbroken, with_sections
 from viz.part_data import colour_stops
 
 # Candidate effects in the table of the page.
@@ -169,12 +168,9 @@ def write_comparison(found: ResidualTables, state: Run, folder: Path) -> None:
 
 
 def _insert(page: Path, parts: dict[str, str]) -> None:
-    """Put sections between their marks; a page from elsewhere without marks stays as it is."""
+    """Put sections into a page, if there is one."""
     if not page.is_file():
         return
-    text = page.read_text(encoding="utf-8")
-    for name, html in parts.items():
-        begin, end = f"<!-- {name} begins -->", f"<!-- {name} ends -->"
-        text = re.sub(f"{begin}.*?{end}", lambda _, own=begin + html + end: own, text, flags=re.S)
+    text = with_sections(page.read_text(encoding="utf-8"), parts)
     with whole_file(page) as file:
         file.write_text(text, encoding="utf-8")

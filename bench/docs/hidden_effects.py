@@ -52,10 +52,10 @@ def made(case: Hidden, folder: Path) -> Path:
     """Make, run and diagnose one cell; returns its page."""
     run = folder / case.effect / "run"
     if not (run / "diagnosis.json").is_file():
-        hide = f"{case.effect}={case.size:g}"
+        hide, session = f"{case.effect}={case.size:g}", run.with_name(case.scene)
         for words in (
-            ["synth", case.scene, run.with_name("session"), "--hide", hide, "--views", case.views, "--seed", 3],
-            ["run", run.with_name("session"), "-o", run, "--no-recording", "--tolerance", 0.05],
+            ["synth", case.scene, session, "--hide", hide, "--views", case.views, "--seed", 3],
+            ["run", session, "-o", run, "--no-recording", "--tolerance", 0.05],
             ["diagnose", run],
         ):
             subprocess.run([*_CALL, *map(str, words)], check=True, capture_output=True)

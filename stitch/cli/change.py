@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -102,14 +102,19 @@ def drop_effects(
 
 
 def _refit_run(run: Path, state: Run, effects: list[str], recording: bool, as_json: bool) -> None:
-    """Give the run folder the model with these effects, and show it."""
+    """Give the run folder the model with these effects, and show it; what was fitted before is not fitted anew."""
     from stitch.pipeline import change
+    from stitch.stored.stored_run import load_run
     from stitch.writing import run_folder
 
-    run_folder.preload_entry_points("stitch.reports")
-    with show_activity("reading the run"), run_folder.replace_run_files(run) as scratch:
-        result = change(state, effects, recorder_for(scratch, recording))
-        run_folder.write_with_page(result, scratch)
+    if run_folder.restore_fit(run, effects, recording):
+        with show_activity("reading the fit that was kept"):
+            result = load_run(run, None if state.effects_file is None else Path(state.effects_file))
+    else:
+        run_folder.preload_entry_points("stitch.reports")
+        with show_activity("reading the run"), run_folder.replace_run_files(run) as scratch:
+            result = change(state, effects, recorder_for(scratch, recording))
+            run_folder.write_with_page(result, scratch)
     _show_changed(result, run, as_json)
     if not as_json:
         show_next(f"Next: stitch diagnose {shlex.quote(str(run))}")
@@ -121,18 +126,22 @@ def _add_diagnosed(
     """Add what a diagnosis chooses: at most so many effects one by one, or None: a group that it cannot tell apart."""
     from stitch.cli.diagnose import write_diagnosis
     from stitch.pipeline import change, suggest, suggest_group
-    from stitch.stored.stored_run import load_run, named_before
+    from stitch.stored.stored_run import load_run, named_before, standing_diagnosis
     from stitch.writing import run_folder
     from stitch.writing.diagnosis_document import plain_finding, suggested_command
 
     with run_folder.lock_run_folder(run):
         with show_activity("diagnosing"):
             state = load_run(run, effects_file, trust=trust)
+            told = {} if at_most is None else standing_diagnosis(run, state)
+            if told.get("verdict", "missing_effect") != "missing_effect" and "next_command" in told:
+                _show_nothing_missing(told, run, as_json)
+                return
             run_folder.preload_entry_points("stitch.reports")
             if at_most is None:
                 result, lines, found = suggest_group(state)
             else:
-                result, lines, found = suggest(state, at_most, named_before(run, state))
+                result, lines, found = suggest(state, at_most, named_before(state, told))
         for line in lines if in_full() else ():
             say(line)
         if result is not None:
@@ -145,15 +154,30 @@ def _add_diagnosed(
                     result = again.with_fit(notes=result.notes)
                 run_folder.write_with_page(result, scratch)
             _show_changed(result, run, as_json)
-        elif as_json:
-            emit((run / "result.json").read_text(encoding="utf-8").rstrip())
         else:
-            say("Nothing was added: the model is as it was.")
+            _show_unchanged(run, as_json)
         write_diagnosis(found, result or state, run)
     if not in_full():
         say(plain_finding(found, state.session.length_unit))
     if not as_json:
         show_next(suggested_command(found, shlex.quote(str(run))))
+
+
+def _show_nothing_missing(told: dict[str, Any], run: Path, as_json: bool) -> None:
+    """Print what a standing diagnosis says, which names nothing to be added."""
+    notes = (f"{note}." for note in told["notes"] if note not in told["sentence"])
+    for line in (told["plain"], *((told["sentence"], *notes) if in_full() else ())):
+        say(line)
+    _show_unchanged(run, as_json)
+    if not as_json:
+        show_next(told["next_command"].replace("RUN", shlex.quote(str(run))))
+
+
+def _show_unchanged(run: Path, as_json: bool) -> None:
+    if as_json:
+        emit((run / "result.json").read_text(encoding="utf-8").rstrip())
+    else:
+        say("Nothing was added: the model is as it was.")
 
 
 def _show_changed(result: Run, run: Path, as_json: bool) -> None:

@@ -121,7 +121,7 @@ def _write_run_page(
     from stitch.cli.diagnose import write_diagnosis
     from stitch.cli.run import show_light
     from stitch.pipeline import diagnose
-    from stitch.stored.stored_run import load_run
+    from stitch.stored.stored_run import load_run, standing_diagnosis
     from stitch.writing import run_folder
 
     page = run / "report.html"
@@ -130,8 +130,11 @@ def _write_run_page(
             shown = load_run(run, effects_file, trust=trust)
             run_folder.call_entry_points("stitch.reports", shown, page, tolerance)
         show_light(shown, tolerance)
-        if with_diagnosis:
+        # A diagnosis of this very model stays on the page.
+        stands = 'id="screen-data"' in page.read_text(encoding="utf-8") and standing_diagnosis(run, shown)
+        if with_diagnosis and not (stands and (run / "compare.json").is_file()):
             write_comparison(shown, run)
+        if with_diagnosis and not stands:
             with show_activity("diagnosing: trying every effect"):
                 found = diagnose(shown)
             write_diagnosis(found, shown, run)

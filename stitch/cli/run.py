@@ -360,14 +360,15 @@ def show_report(result: Run, tolerance: float | None = None, with_hand_eye: bool
 
     session = result.session
     say(f"{session.name}: {run_headline(result, model_history(result))}", bold=True)
-    for doubt in result.doubts:
+    for doubt in result.doubts if in_full() else ():
         if more := doubt_remedy(doubt):
             say(more)
     gone = len(result.left_out)
     for note in result.notes[:gone]:
         say(note, bold=True)
     show_light(result, tolerance)
-    show_block(report_rows(result))
+    rows = report_rows(result)
+    show_block(rows if in_full() else [rows[0], rows[2]])  # error on views left out, sensor's noise
     if not in_full():
         return
     if with_hand_eye:

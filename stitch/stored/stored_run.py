@@ -312,24 +312,32 @@ def diagnosed_state(run: Run, folder: Path) -> str:
     return " ".join((version("stitch"), session_hash(run.session), own, effects)).strip()
 
 
-def named_before(folder: Path, run: Run) -> "Finding | None":
-    """Return the effects that the diagnosis in a run's folder names to be added; None where it names none, or is of
-    another state."""
+def standing_diagnosis(folder: Path, run: Run) -> dict[str, Any]:
+    """Return the diagnosis in a run's folder; {} where there is none, or one of another state or version."""
+    try:
+        told = read_diagnosis(folder)
+    except InputError:
+        return {}  # damaged: it is soon written anew
+    state = diagnosed_state(run, folder) if told else UNKNOWN
+    return told if UNKNOWN not in state and told.get("of") == state else {}
+
+
+def named_before(run: Run, told: dict[str, Any]) -> "Finding | None":
+    """Return the effects that a standing diagnosis of a run names to be added; None where it names none."""
     from stitch.diagnosis.diagnosis import Finding
     from stitch.diagnosis.validation import CrossValidation
 
     try:
-        told = read_diagnosis(folder)
-        odds, state = told["log_odds_over_nothing"], diagnosed_state(run, folder)
-        if told["verdict"] != "missing_effect" or told["of"] != state or UNKNOWN in state:
+        odds = told["log_odds_over_nothing"]
+        if told["verdict"] != "missing_effect":
             return None
         if told["effects"][0] in run.tried or (odds is not None and odds <= 0):
             return None
         notes = (f"{note}." for note in told["notes"] if note not in told["sentence"])
         left_out = {row["effect"]: CrossValidation(**row["left_out"]) for row in told["candidates"] if row["left_out"]}
         return Finding((told["plain"], told["sentence"], *notes), tuple(told["together"]), left_out)
-    except (InputError, LookupError, TypeError):
-        return None  # damaged, or of an earlier version: it is soon written anew
+    except (LookupError, TypeError):
+        return None  # of an earlier version
 
 
 def _dropped_before(folder: Path) -> dict[str, str]:

@@ -15,7 +15,7 @@ from stitch.diagnosis.validation import CrossValidation, group_helps, group_shar
 from stitch.observations.surfaces.scanner_errors import FieldError
 from stitch.runs.run import doubt_headline, effect_cure
 from stitch.units import length_text
-from stitch.writing.finding_screen import finding_screen
+from stitch.writing.finding_screen import finding_screen, plain_covariate
 from stitch.writing.json_file import rows_of_fields
 
 # The variance budget for people: the largest sources by name, those below this share as one line.
@@ -79,8 +79,8 @@ _AT_THE_MACHINE = {
     "joint_offset": "set the zero of the joint anew, or write the corrected arm back into the controller",
     "link_geometry": "write the corrected arm back into the controller",
     "joint_compliance": "state the payload in the controller, or keep the effect in the model",
-    "gear_eccentricity": "keep the effect in the model: it belongs to the gear",
-    "gear_harmonic": "keep the effect in the model: it belongs to the gear",
+    "gear_eccentricity": "have the joint's gear checked at the next service; until then keep the effect in the model",
+    "gear_harmonic": "have the joint's gear checked at the next service; until then keep the effect in the model",
     "backlash": "approach every pose from the same side, or have the joint's gear adjusted",
     "settling": "wait longer at each pose before the scan",
     "robot_thermal_growth": "warm the arm up before scanning",
@@ -103,7 +103,13 @@ _AT_THE_MACHINE = {
 
 
 def remedy_at_machine(found: Diagnosis) -> str:
-    """Return what would end the effect that is named, as a sentence; empty where none is, or only perhaps."""
+    """Return what would end the effect that is named, or where to look for one without a name, as a sentence; empty
+    where nothing is named, or only perhaps."""
+    if found.verdict == "unknown_effect":
+        follows = [plain_covariate(x.covariate) for x in found.depends_on if x.p_value < CLEAR_DEPENDENCE]
+        if found.curves:
+            return f"At the machine: have joint {found.curves[0].joint} checked: gear, bearing, and what hangs on it."
+        return f"At the machine: look for what changes with {follows[0]}." if follows else ""
     named = found.effects[0] if found.verdict == "missing_effect" and found.certain else ""
     return f"At the machine: {_AT_THE_MACHINE[named]}." if named in _AT_THE_MACHINE else ""
 
@@ -269,6 +275,7 @@ def diagnosis_document(d: Diagnosis) -> dict[str, Any]:
         "joint_laws": [_curve(curve) for curve in d.curves],
         "time_law": None if d.time_curve is None else _time_curve(d.time_curve),
         "next": rows_of_fields(d.next, "do separates joints_deg views"),
+        "next_command": suggested_command(d, "RUN"),
         "alias_matrix": {"effects": [c.name for c in d.candidates], "correlation": np.round(d.matrix, 4).tolist()},
         "log_odds_over_nothing": d.log_odds_over_nothing if np.isfinite(d.log_odds_over_nothing) else None,
         "notes": list(d.notes),

@@ -216,7 +216,7 @@ def _headline(found: Diagnosis, why: EffectCourse | None, descriptions: dict[str
             if found.curves:
                 follows = f": the error follows joint {found.curves[0].joint}"
             elif found.depends_on and found.depends_on[0].p_value < CLEAR_DEPENDENCE:
-                follows = f": the error follows {_plain_covariate(found.depends_on[0].covariate)}"
+                follows = f": the error follows {plain_covariate(found.depends_on[0].covariate)}"
             return f"Something is missing that no known effect explains{follows}."
     causes = [_cause(c, why, descriptions) for c in compared(found) if c.name in found.effects]
     if len(causes) > 1:
@@ -225,7 +225,7 @@ def _headline(found: Diagnosis, why: EffectCourse | None, descriptions: dict[str
     return f"{'' if found.certain else 'Perhaps: '}{causes[0]}."
 
 
-def _plain_covariate(name: str) -> str:
+def plain_covariate(name: str) -> str:
     """Return a covariate as people call it: j2_deg is the angle of joint 2."""
     joint = re.fullmatch(r"j(\d+)_deg", name)
     return f"the angle of joint {joint[1]}" if joint else covariate_text(name).partition(" (")[0]
@@ -259,7 +259,11 @@ def certainty(found: Diagnosis) -> str:
             among = named.posterior / sum(c.ranked.posterior for c in found.candidates)
             share = "more than 99%" if among > 0.99 else f"{among:.0%}"
             held = f"Of {named.tests} known effects tried, it holds {share} of the evidence."
-            nameless = "" if named.posterior > 0.5 else " A curve without a physical cause would explain as much."
+            nameless = (
+                ""
+                if named.posterior > 0.5
+                else " Its cause is less sure: a curve without a name would explain as much."
+            )
             return f"{chance_text(named.adjusted)} {held}{nameless}"
         case "cannot_tell":
             return chance_text(min(c.ranked.adjusted for c in found.candidates if c.name in found.effects))
@@ -295,7 +299,7 @@ def _size(why: EffectCourse, unit: str) -> str:
     if why.follows == "view order" and len(why.views):
         away = int(np.sum(np.abs(why.predicted) > largest / 2))
         return f"{away} of {len(why.views)} views sit {size} away from the others."
-    follows = _plain_covariate(why.follows).partition(":")[0]
+    follows = plain_covariate(why.follows).partition(":")[0]
     article = "" if follows == "time" or follows.startswith("the ") else "the "
     goes_with = "" if follows == "view order" else f"; it goes with {article}{follows}"
     return f"{why.of.capitalize()} is off by up to {size}{goes_with}."

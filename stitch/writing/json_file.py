@@ -39,6 +39,8 @@ FILES = {
     "robot.toml",
     "robot.urdf",
 }
+# Earlier fits of the run, by what they were made of.
+FITS = ".fits"
 # "suspects" is what "candidates" was called once.
 _PICTURES = {
     "budget",
@@ -65,6 +67,8 @@ def is_run_file(path: Path) -> Ours:
         match inside.parts:
             case (name,):
                 return name in FILES or (name.startswith(".") and name.endswith(".new") and name[1:-4] in FILES)
+            case (folder, *_) if folder == FITS:
+                return True
             case ("pictures", _):
                 return inside.stem in _PICTURES and inside.suffix in (".png", ".svg")
         return False

@@ -1,10 +1,15 @@
 """The run folder on disk: written whole or not at all."""
 
+import csv
+import hashlib
+import json
+import os
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from importlib.metadata import entry_points
+from importlib.metadata import entry_points, version
 from pathlib import Path
 from threading import Thread
 from typing import Any, TypeVar
@@ -12,16 +17,18 @@ from typing import Any, TypeVar
 import numpy as np
 from plyfile import PlyData, PlyElement
 
+from stitch.effects import EFFECTS
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.session import Session, View
-from stitch.model.model_toml import write_model
+from stitch.model.model_toml import read_model, write_model
 from stitch.observations.surfaces.matching import Match
+from stitch.reading.session_folder import measured_files
 from stitch.runs.recorder import Recorder
 from stitch.runs.run import FusedCloud, Run
 from stitch.system.files import claim_folder, rewrite_folder
 from stitch.system.threads import release_mapped
-from stitch.writing.json_file import is_run_file, require_free, write_json
+from stitch.writing.json_file import FILES, FITS, is_run_file, require_free, write_json
 from stitch.writing.result_document import ledger, model_of, residual_columns, result_document
 
 # Recordings of a run, made by the packages that offer one.
@@ -160,9 +167,75 @@ def new_folder(path: Path, sessions: Sequence[Path], force: bool = False) -> Ite
 
 @contextmanager
 def replace_run_files(path: Path) -> Iterator[Path]:
-    """A scratch folder whose files take the place of all that was made of the old model if the block succeeds."""
+    """A scratch folder whose files take the place of all that was made of the old model if the block succeeds; the old
+    fit is kept for `restore_fit`."""
     with rewrite_folder(path, is_run_file(path)) as scratch:
         yield scratch
+        # A file system without links keeps none.
+        with suppress(OSError, InputError):
+            _keep_fit(path, scratch)
+
+
+# Fits that a run has had, linked and not copied: the way back to one takes no fit.
+
+# All that are kept; beyond it the oldest go.
+_KEPT_BYTES = 1e9
+
+
+def restore_fit(path: Path, effects: Iterable[str], recording: bool) -> bool:
+    """Give a run the fit with these effects that it has had before, as a further step of its ledger.
+
+    False where none is kept, or only one without the recording that is asked for.
+
+    Raises:
+        InputError: another process writes there.
+    """
+    kept = _place_of_fit(path, effects)
+    if kept is None or not all((kept / name).is_file() for name in ("ledger.json", "recording.rrd")[: 1 + recording]):
+        return False
+    with lock_run_folder(path), replace_run_files(path) as scratch:
+        for file in kept.iterdir():
+            os.link(file, scratch / file.name)
+        steps, earlier = (json.loads((at / "ledger.json").read_text(encoding="utf-8")) for at in (path, kept))
+        again = {key: told for key, told in earlier[-1].items() if key != "notes"} | {"step": len(steps)}
+        write_json([*steps, again], scratch / "ledger.json")
+    return True
+
+
+def _place_of_fit(path: Path, effects: Iterable[str]) -> Path | None:
+    """Return where the fit of a run's session with these effects is kept; None where the session or the model is not
+    what was fitted, and for effects of a user's own file, which may change."""
+    try:
+        session = Path(json.loads((path / "result.json").read_text(encoding="utf-8"))["session"])
+        fitted, own = (path / "result.json").stat().st_mtime_ns, (path / "model.toml").stat().st_mtime_ns
+        marks = [
+            (file.name, told.st_size, told.st_mtime_ns) for file in measured_files(session) for told in [file.stat()]
+        ]
+        known = {effect.name for effect in EFFECTS.values() if effect.tier != "user"}
+    except (OSError, ValueError, LookupError, csv.Error):
+        return None
+    if max(own, *(time for _, _, time in marks)) > fitted or not known.issuperset(effects):
+        return None
+    made_of = json.dumps([version("stitch"), sorted(effects), marks])
+    return path / FITS / hashlib.sha256(made_of.encode()).hexdigest()[:16]
+
+
+def _keep_fit(path: Path, scratch: Path) -> None:
+    """Link the fits that a run keeps, and the one that it has, into the folder that takes its place."""
+    if (path / FITS).is_dir():
+        shutil.copytree(path / FITS, scratch / FITS, copy_function=os.link)
+    if (place := _place_of_fit(path, read_model(path).effects)) is not None:
+        place = scratch / FITS / place.name
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        for name in FILES:
+            if (path / name).is_file():
+                os.link(path / name, place / name)
+    size = 0
+    for fit in sorted((scratch / FITS).iterdir(), key=lambda fit: -fit.stat().st_mtime_ns):
+        size += sum(file.stat().st_size for file in fit.iterdir())
+        if size > _KEPT_BYTES:
+            shutil.rmtree(fit)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from stitch.units import length_text
 from stitch.writing.result_document import result_document
 from tests.viz.test_steps_told import told_at
 from viz.colours import UNSEEN, signed_colours
-from viz.course_recording import log_course
+from viz.course_recording import apart, log_course
 from viz.diagnosis_recording import log_diagnosis
 from viz.model_timeline import one_above_the_other
 from viz.page_parts import unbroken
@@ -102,6 +102,11 @@ def test_why_is_drawn_to_scale_and_colours_the_arms(tmp_path):
     colours = columns(tmp_path / "d.rrd", "LineStrips3D:colors")["/robot/arm"]
     assert len(set(colours)) == 3
     assert columns(tmp_path / "d.rrd", "Points2D:labels")["/diagnosis/why/names"] == ["a", "b", "c"]
+
+
+def test_of_places_that_lie_together_one_is_named():
+    """Over a torque views crowd: from the left each that leaves room for the words of the last that is named."""
+    assert apart(np.array([5.0, 0.0, 1.0, 9.9, 4.1]), 4.0) == [1, 4, 3]
 
 
 def test_no_name_of_a_view_covers_another():

@@ -15,7 +15,7 @@ from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.integrity.pose_tests import PoseStep
 from stitch.observations.surfaces.scanner_errors import FieldError
-from stitch.writing.diagnosis_document import effect_in_words, plain_finding, suggested_command
+from stitch.writing.diagnosis_document import effect_in_words, plain_finding, remedy_at_machine, suggested_command
 
 
 def test_every_effect_of_the_library_has_words():
@@ -211,7 +211,7 @@ def _found(
         (_found("missing_effect", 1e-3), "one of 1,000 sessions (p = 0.001). Of 21 known effects tried, it holds 97%"),
         (
             _found("missing_effect", 1e-3, posterior=0.22),
-            "it holds 97% of the evidence. A curve without a physical cause would explain as much.",
+            "it holds 97% of the evidence. Its cause is less sure: a curve without a name would explain as much.",
         ),
         (
             _found("missing_effect", 1e-3, certain=False),
@@ -224,6 +224,19 @@ def _found(
 )
 def test_the_screen_says_how_sure_it_is(found, said):
     assert said in finding_screen.certainty(found)
+
+
+@pytest.mark.parametrize(
+    ("curves", "said"),
+    [
+        ((), "look for what changes with the angle of joint 2."),
+        ((SimpleNamespace(joint=5),), "have joint 5 checked: gear, bearing, and what hangs on it."),
+    ],
+)
+def test_where_no_effect_is_named_the_machine_is_still_told_of(curves, said):
+    follows = (SimpleNamespace(covariate="j2_deg", p_value=1e-9),)
+    found = SimpleNamespace(verdict="unknown_effect", curves=curves, depends_on=follows)
+    assert remedy_at_machine(found) == f"At the machine: {said}"
 
 
 @pytest.mark.parametrize(("heldout", "shown"), [(0.5, 1), (1.1, 0)])

@@ -127,6 +127,19 @@ class Jobs:
         self._say(job)
         return job
 
+    @property
+    def busy(self) -> bool:
+        """Whether a command runs or waits."""
+        return any(job.state in ("waiting", "running") for job in self.all)
+
+    def note_done(self, kind: str, arguments: Sequence[str], seconds: float) -> Job:
+        """Append a command whose work is done already, without a process of its own."""
+        self._number += 1
+        job = Job(self._number, kind, list(arguments), state="done", seconds=seconds)
+        self.all.append(job)
+        self._say(job)
+        return job
+
     def stop(self) -> None:
         """Ask the running command to end, and forget those that wait."""
         for job in self.all:

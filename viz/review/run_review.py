@@ -15,6 +15,7 @@ from stitch.frames import Indices
 from stitch.model.model_toml import read_model
 from stitch.system.files import whole_file
 from stitch.units import MICROMETRES
+from stitch.writing.run_folder import restore_fit
 from viz.review.chosen_field import Choice, PatchWeights, chosen_field, chosen_points, numbered_marks, patch_weights
 from viz.review.residual_rows import ResidualRows, read_rows, read_sightings
 from viz.review.run_snapshot import Snapshot, read_snapshot, version_of
@@ -154,6 +155,20 @@ class RunReview:
             self._rows = known_residuals(self.run, found, um)
         known = self._rows
         return {"model": found.model, "all": known.all, "chosen": known.chosen(choice, found.comparison, um)}
+
+    def restore(self, kind: str, asked: dict[str, Any]) -> bool:
+        """Bring back the fit that a change of the model leads to, where the run folder keeps it; False elsewhere.
+
+        Raises:
+            InputError: as `arguments`, or another process writes there.
+        """
+        found = self.snapshot()
+        change = found.state["history"][kind] if kind in ("undo", "redo") else {"command": kind} | asked
+        if change is None:
+            return False
+        present, named = set(found.result["effects"]), set(_names(change.get("effects")))
+        target = present | named if change["command"] == "add" else present - named
+        return target != present and restore_fit(self.run, target, bool(found.state["recording"]))
 
     def arguments(self, kind: str, asked: dict[str, Any]) -> list[str]:
         """The command of what a page asked for.

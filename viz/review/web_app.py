@@ -6,6 +6,7 @@ import json
 import secrets
 import socket
 import sys
+import time
 import webbrowser
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
@@ -172,6 +173,11 @@ class ReviewActions:
             return error_response("the run has changed since this page read it; look at it again", 409)
         try:
             arguments = await asyncio.to_thread(self.review.arguments, kind, asked)
+            begun = time.monotonic()
+            if changes and not self.jobs.busy and await asyncio.to_thread(self.review.restore, kind, asked):
+                job = self.jobs.note_done(kind, arguments, time.monotonic() - begun)
+                self.news.tell({"type": "changed", "version": self.review.version})
+                return json_response(job.told)
             return json_response(self._submitted(kind, arguments, model if changes else None))
         except StitchError as error:
             return refusal_response(error)

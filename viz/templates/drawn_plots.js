@@ -40,7 +40,7 @@ function xyPlot(root, spec, height = 220, chosen = null) {
   const svg = svgNode("svg", { class: "plot-svg", viewBox: `0 0 ${width} ${height}`, width, height, role: chosen ? "group" : "img", "aria-label": spec.label || `${spec.y.label} over ${spec.x.label}` });
   for (const y of roundMarks(y0, y1, height > 150 ? 5 : 3)) svg.append(svgNode("line", { class: y === 0 ? "zero" : "grid", x1: left, x2: width - right, y1: Y(y), y2: Y(y) }),
     svgNode("text", { x: left - 6, y: Y(y) + 4, "text-anchor": "end" }, shortNumber(y)));
-  const names = spec.x.names, room = Math.max(1, Math.ceil((names ? names.length : 0) * 52 / (width - left - right)));
+  const names = spec.x.names, wide = Math.max(52, 12 + 6.5 * Math.max(0, ...(names || []).map(n => n.length))), room = Math.max(1, Math.ceil((names ? names.length : 0) * wide / (width - left - right)));
   const marks = names ? names.map((_, i) => i).filter(i => i % room === 0) : roundMarks(x0, x1, width > 500 ? 8 : 4);
   for (const x of marks) svg.append(svgNode("text", { x: X(x), y: height - bottom + 16, "text-anchor": "middle" }, names ? names[x] : shortNumber(x)));
   svg.append(svgNode("text", { class: "axis", x: (left + width - right) / 2, y: height - 4, "text-anchor": "middle" }, spec.x.label));

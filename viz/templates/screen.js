@@ -35,7 +35,7 @@ function showScreen(root, part, found, um) {
       const signed = one && (i === 0 || !shown);
       const values = signed ? numbers.unpack(one.steps[k]) : state.values;
       views[i].show(values, signed ? part.fullSigned : part.full, Boolean(signed));
-      views[i].title.textContent = signed ? `${state.title}: view ${one.name} against the others` : `${state.title}: ${roundLength(state.mean)} on average`;
+      views[i].title.textContent = signed ? `${state.title}: view ${one.name} against the others, blue −${shortLength(part.fullSigned)} to red +${shortLength(part.fullSigned)}` : `${state.title}: ${roundLength(state.mean)} on average`;
     });
     views.forEach(v => v.tag(tags));
     legend(both);

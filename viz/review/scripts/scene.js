@@ -30,7 +30,7 @@ export async function show(state) {
   model = told.model; diagnosed = mark; marks = told.part.marks || null;
   if (!viewer) return true;
   const last = Math.max(viewer.names().length - 2, 0);  // the present model; register comes after it
-  viewer.jump(changed ? Math.max(last - 1, 0) : last);
+  viewer.jump(changed ? Math.max(last - 1, Math.min(told.part.begin ?? 0, last)) : last);  // never from the coarse hand-eye
   if (changed) viewer.glide(last);
   return true;
 }
