@@ -13,7 +13,7 @@ from stitch.errors import NoResultError
 from stitch.frames import Array, Indices, Mask
 from stitch.runs.run import FusedCloud
 from stitch.system.threads import release_mapped
-from stitch.writing.mesh import TriangleMesh, mesh_of
+from stitch.writing.mesh import TriangleMesh, mesh_of, spacing
 
 # From where the part is looked at: what is long stands upright, and the side that shows most comes to the front.
 
@@ -66,6 +66,8 @@ def camera_for(points: Array, normals: Array, upright: bool) -> Camera:
 _FINENESS = 120
 # Many for each of the cells; more would not be seen.
 _POINTS = 1_000_000
+# Cells by which the surface is sought outside: the sides of the thinnest sheet are one cell apart there.
+_OUTSIDE = 0.5
 # Share of the triangles up to which a piece of surface for itself is not shown.
 _CRUMB = 0.005
 # Share of places seen once up to which they are not shown.
@@ -120,7 +122,7 @@ def part_shape(fused: FusedCloud) -> PartShape:
     points, normals = _thinned(fused)
     triangles = np.zeros((0, 3), np.int64)
     try:
-        mesh = _without_overhang(mesh_of(points, normals), points)
+        mesh = _drawn_in(mesh_of(points, normals, _OUTSIDE), points, normals)
         points, triangles = _level_edges(*_whole_pieces(mesh))
         normals = vertex_normals(points, triangles)
     except NoResultError:
@@ -139,21 +141,33 @@ def _whole_pieces(mesh: TriangleMesh) -> tuple[Array, Indices]:
     return mesh.vertices[kept], triangles.reshape(-1, 3).astype(np.int64)
 
 
-# A mesh runs on beyond the last points, in teeth; so far from them, in spacings of the points, it is shown.
-_OVERHANG = 1.25
+# Spacings of the points beyond which a vertex is drawn in towards the point next to it, along that point's plane; from
+# the second on it is levelled with its neighbours, in so many steps.
+_BESIDE, _LOOSE, _STEPS = 0.6, 0.8, 10
 
 
-def _without_overhang(mesh: TriangleMesh, points: Array) -> TriangleMesh:
-    """The mesh where points (N, 3) are."""
+def _drawn_in(mesh: TriangleMesh, points: Array, normals: Array) -> TriangleMesh:
+    """The mesh without what runs on beyond points (N, 3) with unit normals (N, 3)."""
     tree = KDTree(np.ascontiguousarray(points))
-    spacing = float(np.median(tree.query(points[:: max(1, len(points) // _ASKED)], k=2)[0][:, 1]))
-    near = tree.query(np.ascontiguousarray(mesh.vertices), k=1)[0] < _OVERHANG * spacing
-    inside = near[mesh.triangles].all(axis=1)
-    return TriangleMesh(mesh.vertices, mesh.triangles[inside]) if inside.mean() > _LEFT else mesh
+    size, nearest = spacing(points, tree), tree.query(mesh.vertices, k=1)[1].astype(np.int64)
+    off = mesh.vertices - points[nearest]
+    along = off - np.einsum("ni,ni->n", off, normals[nearest])[:, None] * normals[nearest]
+    far = np.linalg.norm(along, axis=1)
+    vertices = mesh.vertices - (np.maximum(1 - _BESIDE * size / np.maximum(far, 1e-300), 0)[:, None] * along)
+    links = _side_by_side(len(vertices), mesh.triangles)
+    loose = (far > _LOOSE * size) | (links @ (far > _LOOSE * size) > 0)
+    count = np.maximum(np.asarray(links.sum(axis=1)), 1).reshape(-1, 1)
+    for _ in range(_STEPS):
+        vertices[loose] = 0.5 * (vertices + links @ vertices / count)[loose]
+    return TriangleMesh(vertices, mesh.triangles)
 
 
-# Points that tell the spacing of all.
-_ASKED = 5_000
+def _side_by_side(count: int, triangles: Indices) -> csr_matrix:
+    """(N, N) 1 where a triangle has a side from one of N vertices to the other."""
+    a, b = triangles[:, [0, 1, 2, 1, 2, 0]].ravel(), triangles[:, [1, 2, 0, 0, 1, 2]].ravel()
+    links = coo_matrix((np.ones(len(a), np.int32), (a, b)), shape=(count, count)).tocsr()
+    links.data[:] = 1
+    return links
 
 
 # The grid of cells leaves teeth along an edge: what is narrower than twice so many triangles is not shown.
@@ -164,10 +178,7 @@ _EDGE_STEPS, _LEFT = 12, 0.8
 
 def _level_edges(vertices: Array, triangles: Indices) -> tuple[Array, Indices]:
     """Vertices and triangles without teeth along open edges (an opening of the surface), the edges levelled."""
-    count = len(vertices)
-    sides = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-    next_to = coo_matrix((np.ones(len(sides), np.int32), (sides[:, 0], sides[:, 1])), shape=(count, count)).tocsr()
-    next_to = next_to + next_to.T
+    next_to = _side_by_side(len(vertices), triangles)
     gone = _on_open_edge(vertices, triangles)[0]
     for _ in range(_TOOTH - 1):
         gone = gone | (next_to @ gone > 0)

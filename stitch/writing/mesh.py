@@ -49,11 +49,15 @@ def write_mesh(mesh: TriangleMesh, path: Path) -> None:
     PlyData(elements, byte_order="<").write(str(path))
 
 
-def mesh_of(points: Array, normals: Array) -> TriangleMesh:
+def mesh_of(points: Array, normals: Array, outside: float = 0.0) -> TriangleMesh:
     """The surface through points (N, 3) with unit normals (N, 3), open where there are no points.
 
     Marching cubes (Lorensen & Cline 1987) over the signed distance from the points' weighted tangent planes: implicit
     moving least squares (Kolluri 2008), in the cells about the points alone. Nothing is closed that nobody saw.
+
+    Args:
+        outside: cells by which the surface is sought outside, before its vertices are moved back: a sheet that is
+            thinner than a cell has corners of cells within it only so.
 
     Raises:
         NoResultError: the points span no surface.
@@ -65,14 +69,17 @@ def mesh_of(points: Array, normals: Array) -> TriangleMesh:
     places, cells = _cells_about(points, size)
     heights, nearest = _heights(places, points, normals, tree, size)
     cells = cells[(nearest < _REACH * size)[cells].all(axis=1)]
-    vertices, triangles, _ = igl.marching_cubes(heights, places, cells, 0.0)
+    vertices, triangles, _ = igl.marching_cubes(heights, places, cells, outside * size)
     # Beyond the last points the tangent planes run on; what lies farther than a hole between points ends there.
-    gap, _ = tree.query(vertices, k=1)
-    triangles = triangles[(gap < _OVERHANG * size)[triangles].all(axis=1)]
+    gap, nearest = tree.query(vertices, k=1)
+    triangles = triangles[(gap < np.hypot(_OVERHANG, outside) * size)[triangles].all(axis=1)]
     if not len(triangles):
         raise NoResultError(NO_SURFACE)
     kept, triangles = np.unique(triangles, return_inverse=True)
-    return TriangleMesh(vertices[kept], triangles.reshape(-1, 3))
+    vertices, nearest = vertices[kept], nearest[kept].astype(np.int64)
+    if outside:
+        vertices = vertices - _heights(vertices, points, normals, tree, size)[0][:, None] * normals[nearest]
+    return TriangleMesh(vertices, triangles.reshape(-1, 3))
 
 
 def spacing(points: Array, tree: Any) -> float:
