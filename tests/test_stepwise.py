@@ -14,7 +14,7 @@ from stitch.effects.contract import find_effect, parameters_in
 from stitch.model.model import Term
 from stitch.pipeline import diagnose, run
 from stitch.reading.session_folder import load_session
-from stitch.stored.stored_run import diagnosed_state, load_run, named_before
+from stitch.stored.stored_run import diagnosed_state, load_run, named_before, standing_diagnosis
 from stitch.writing.diagnosis_document import diagnosis_document, suggested_command
 from stitch.writing.json_file import write_json
 from stitch.writing.run_folder import write_with_page
@@ -135,7 +135,7 @@ def test_a_diagnosis_of_the_same_state_is_read_and_not_made_again(monkeypatch, t
         diagnosis_document(found) | {"of": diagnosed_state(first, tmp_path / "run")}, tmp_path / "run/diagnosis.json"
     )
     again = load_run(tmp_path / "run")
-    known = named_before(tmp_path / "run", again)
+    known = named_before(again, standing_diagnosis(tmp_path / "run", again))
 
     def of_what_was_added(state):
         made.append(state.effects)
@@ -147,7 +147,7 @@ def test_a_diagnosis_of_the_same_state_is_read_and_not_made_again(monkeypatch, t
     assert lines[: len(known.lines)] == [said(found), found.sentence, *(f"{note}." for note in found.notes)]
     with open(folder / "views.csv", "a") as table:
         table.write("\n")
-    assert named_before(tmp_path / "run", again) is None
+    assert standing_diagnosis(tmp_path / "run", again) == {} and named_before(again, {}) is None
 
 
 def said(found):

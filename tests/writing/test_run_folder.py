@@ -17,7 +17,7 @@ from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import LedgerStep
 from stitch.stored.stored_run import load_run
-from stitch.writing.run_folder import write_with_page
+from stitch.writing.run_folder import restore_fit, write_with_page
 from viz import run_page
 
 EFFECT = "scanner_thermal_scale"
@@ -122,9 +122,28 @@ def changing(folder, tmp_path, monkeypatch):
 def test_nothing_of_the_old_model_stays_beside_the_new_one(changing, stitch_command):
     run, _ = changing
     stitch_command("drop", run, EFFECT, "--no-recording")
-    assert {path.name for path in run.iterdir()} == {
+    assert {path.name for path in run.iterdir() if path.is_file()} == {
         "model.toml", "result.json", "ledger.json", "stitched.ply", "residuals.parquet", "report.html",
     }  # fmt: skip
+
+
+def test_the_way_back_to_an_earlier_fit_takes_no_fit(changing, folder, stitch_command):
+    """All that was made of the model comes back bit for bit, as one more step; not once a scan or a table has changed."""
+    run, _ = changing
+    (run / "result.json").touch()  # written last, as a run writes it
+    before = files(run)
+    stitch_command("drop", run, EFFECT, "--no-recording")
+    steps = len(json.loads((run / "ledger.json").read_text()))
+    assert not restore_fit(run, [], recording=False)
+    assert restore_fit(run, [EFFECT], recording=True)
+    after = files(run)
+    assert after.keys() == before.keys() and all(
+        after[name] == before[name] for name in before.keys() - {"ledger.json"}
+    )
+    ledger = json.loads(after["ledger.json"])
+    assert len(ledger) == steps + 1 == ledger[-1]["step"] + 1 and ledger[-1]["effects"] == [EFFECT]
+    (folder / "o" / "views.csv").touch()
+    assert not restore_fit(run, [EFFECT], recording=True)
 
 
 @pytest.mark.parametrize("error", [NoResultError("no"), KeyboardInterrupt()])
