@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from stitch.system.process import tell_seconds
+
 JobFile = Annotated[Path, typer.Argument(metavar="JOB", help="Job file, TOML.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON alone on standard output.")]
 RecordingOption = Annotated[
@@ -36,7 +38,8 @@ def base(
     from stitch.cells.base_to_base import run_base
     from stitch.cells.job_files import Wanted
 
-    run_base(file, Wanted(None, recording, report, session, as_json))
+    with tell_seconds("base: the transform between both robots"):
+        run_base(file, Wanted(None, recording, report, session, as_json))
 
 
 def drill(
@@ -56,7 +59,8 @@ def drill(
     from stitch.cells.drilling import run_drill
     from stitch.cells.job_files import Wanted
 
-    run_drill(file, Wanted(output, recording, report, session, as_json))
+    with tell_seconds("drill: the drives of the holes"):
+        run_drill(file, Wanted(output, recording, report, session, as_json))
 
 
 def panel(
@@ -85,7 +89,8 @@ def panel(
     from stitch.cells.job_files import Wanted
     from stitch.cells.panel import run_panel
 
-    run_panel(file, drive, Wanted(output, recording, report, session, as_json))
+    with tell_seconds("panel: robots and tracker in one model"):
+        run_panel(file, drive, Wanted(output, recording, report, session, as_json))
 
 
 def fit(
@@ -112,7 +117,8 @@ def fit(
     from stitch.cells.job_files import Wanted
     from stitch.cells.window import run_fit
 
-    run_fit(file, allowance, Wanted(output, recording, report, session, as_json))
+    with tell_seconds("fit: the scans onto the CAD model"):
+        run_fit(file, allowance, Wanted(output, recording, report, session, as_json))
 
 
 def seam(
@@ -132,4 +138,5 @@ def seam(
     from stitch.cells.job_files import Wanted
     from stitch.cells.window import run_seam
 
-    run_seam(file, Wanted(output, recording, report, session, as_json))
+    with tell_seconds("seam: flush and gap at every station"):
+        run_seam(file, Wanted(output, recording, report, session, as_json))

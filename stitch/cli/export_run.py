@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust, require_new
+from stitch.cli.progress import show_activity
 from stitch.cli.terminal import emit, results_stream, say, show_table
 from stitch.errors import InputError
 from stitch.export import ARM, CLOUD, HAND_EYE, LIMIT_MM
@@ -92,12 +93,14 @@ def export_run(
     if program is not None and (run / "fit.json").is_file():
         _export_moved_program(program, run / "fit.json", output, frame, part=part, as_json=as_json)
     elif program is not None:
-        arm = arm_of_run(run, effects_file, trust)
+        with show_activity("export: reading the run"):
+            arm = arm_of_run(run, effects_file, trust)
         _export_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
     elif to in ARM_FORMATS:
         _export_text(ARM_FORMATS[to](arm_of_run(run, effects_file, trust)), to, output)
     elif to in HAND_EYE_FORMATS:
-        eye = hand_eye_of_run(run, parent, child)
+        with show_activity("export: reading the run"):
+            eye = hand_eye_of_run(run, parent, child)
         # ROS 1 knows launch files in XML only.
         old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
         _export_text(ros_launch(eye) if old else HAND_EYE_FORMATS[to](eye), to, output)
@@ -124,8 +127,8 @@ def _export_cloud(run: Path, to: str, output: Path | None) -> None:
     if output is None or output.suffix.lower() != f".{to}":
         raise InputError(f"--to {to}: no output file; to fix: name the file with -o NAME.{to}")
     write, lost = CLOUD_FORMATS[to]
-    cloud = coloured_cloud(run)
-    with whole_file(output) as file:
+    with show_activity("export: reading and writing the cloud"), whole_file(output) as file:
+        cloud = coloured_cloud(run)
         write(cloud, file)
     span = cloud.span * MICROMETRES[cloud.length_unit]
     told = [f"{output}: coloured by residual, from dark at 0 to yellow at {span:.3g} µm; grey: one view alone"]

@@ -16,6 +16,8 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stitch.system.process import AGAIN, QUIET
+
 if TYPE_CHECKING:
     from stitch.frames import Array
     from stitch.measurement.session import Session
@@ -23,8 +25,6 @@ if TYPE_CHECKING:
     from stitch.runs.run import Run, StageResult
 
 _SOON = 1.0  # a loop that ends sooner (s) needs no time left
-_QUIET = 2.0  # work that ends sooner (s) needs no plain line
-_AGAIN = 10.0  # the same step is named again after so long (s)
 PROGRESS_VARIABLE = "STITCH_PROGRESS"  # json: lines for programs; off: none on what is no terminal
 
 
@@ -131,10 +131,10 @@ class _PlainLines:
         """Print a step as it begins, and again after a while; nothing while the work may soon be over."""
         self._step, self._text = step, text
         if self._timer is None:
-            self._timer = threading.Timer(_QUIET, self._print)
+            self._timer = threading.Timer(QUIET, self._print)
             self._timer.daemon = True
             self._timer.start()
-        elif self._printed and (step not in self._printed or time.monotonic() - max(self._printed.values()) > _AGAIN):
+        elif self._printed and (step not in self._printed or time.monotonic() - max(self._printed.values()) > AGAIN):
             self._print()
 
     def _print(self) -> None:

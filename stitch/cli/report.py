@@ -131,7 +131,8 @@ def _write_run_page(
             run_folder.call_entry_points("stitch.reports", shown, page, tolerance)
         show_light(shown, tolerance)
         # A diagnosis of this very model stays on the page.
-        stands = 'id="screen-data"' in page.read_text(encoding="utf-8") and standing_diagnosis(run, shown)
+        shows = page.is_file() and 'id="screen-data"' in page.read_text(encoding="utf-8")
+        stands = shows and standing_diagnosis(run, shown)
         if with_diagnosis and not (stands and (run / "compare.json").is_file()):
             write_comparison(shown, run)
         if with_diagnosis and not stands:

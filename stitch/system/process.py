@@ -56,6 +56,29 @@ def announce(step: str) -> None:
     _notify_watchers(step, 0, 0)
 
 
+QUIET, AGAIN = 2.0, 10.0  # seconds until a line says what is done, and until the next one
+
+
+@contextmanager
+def tell_seconds(step: str) -> Iterator[None]:
+    """Say on standard error what the block does and for how long, once it has lasted a while; nothing where another
+    program asked for its own lines (STITCH_PROGRESS)."""
+    ended, begun = threading.Event(), time.monotonic()
+
+    def tell() -> None:
+        wait = QUIET
+        while not ended.wait(wait):
+            seconds, wait = round(time.monotonic() - begun), AGAIN
+            print(f"{step}; {seconds // 60}:{seconds % 60:02d}", file=sys.stderr, flush=True)
+
+    if not os.environ.get("STITCH_PROGRESS"):
+        threading.Thread(target=tell, daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
+
+
 def _notify_watchers(label: str, done: int, total: int) -> None:
     for watcher in _watchers:
         watcher(label, done, total)

@@ -259,12 +259,8 @@ def certainty(found: Diagnosis) -> str:
             among = named.posterior / sum(c.ranked.posterior for c in found.candidates)
             share = "more than 99%" if among > 0.99 else f"{among:.0%}"
             held = f"Of {named.tests} known effects tried, it holds {share} of the evidence."
-            nameless = (
-                ""
-                if named.posterior > 0.5
-                else " Its cause is less sure: a curve without a name would explain as much."
-            )
-            return f"{chance_text(named.adjusted)} {held}{nameless}"
+            nameless = " Its cause is less sure: a curve without a name would explain as much."
+            return f"{chance_text(named.adjusted)} {held}{nameless if named.posterior <= 0.5 else ''}"
         case "cannot_tell":
             return chance_text(min(c.ranked.adjusted for c in found.candidates if c.name in found.effects))
         case "unknown_effect":

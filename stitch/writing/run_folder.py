@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -182,7 +182,7 @@ def replace_run_files(path: Path) -> Iterator[Path]:
 _KEPT_BYTES = 1e9
 
 
-def restore_fit(path: Path, effects: Iterable[str], recording: bool) -> bool:
+def restore_fit(path: Path, effects: Collection[str], recording: bool) -> bool:
     """Give a run the fit with these effects that it has had before, as a further step of its ledger.
 
     False where none is kept, or only one without the recording that is asked for.
@@ -202,7 +202,7 @@ def restore_fit(path: Path, effects: Iterable[str], recording: bool) -> bool:
     return True
 
 
-def _place_of_fit(path: Path, effects: Iterable[str]) -> Path | None:
+def _place_of_fit(path: Path, effects: Collection[str]) -> Path | None:
     """Return where the fit of a run's session with these effects is kept; None where the session or the model is not
     what was fitted, and for effects of a user's own file, which may change."""
     try:

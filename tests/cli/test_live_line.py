@@ -5,6 +5,7 @@ import pty
 import re
 import subprocess
 import sys
+import time
 from itertools import count
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ import pytest
 
 from stitch.cli import progress as live_line
 from stitch.cli.progress import TimeLeft, time_left_text
+from stitch.system import process
 from stitch.system.process import steps, watched
 from stitch.system.threads import parallel
 
@@ -57,6 +59,17 @@ def test_loops_within_loops_are_told_together(said):
 def test_nobody_watches_nobody_counts(said):
     assert list(steps("scans", (i for i in range(3)))) == [0, 1, 2] and list(steps("scans", [1, 2])) == [1, 2]
     assert not said
+
+
+def test_a_block_that_lasts_says_what_it_does_and_a_short_one_nothing(monkeypatch, capsys):
+    monkeypatch.setattr(process, "QUIET", 0.02)
+    monkeypatch.delenv("STITCH_PROGRESS", raising=False)
+    with process.tell_seconds("fit"):
+        time.sleep(0.3)
+    monkeypatch.setattr(process, "QUIET", 60.0)
+    with process.tell_seconds("seam"):
+        pass
+    assert re.fullmatch(r"fit; 0:00\n", capsys.readouterr().err)
 
 
 CODE = """

@@ -16,9 +16,10 @@ from stitch.model.model_toml import read_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
 from stitch.runs.run import LedgerStep
-from stitch.stored.stored_run import load_run
+from stitch.stored.stored_run import diagnosed_state, load_run
 from stitch.writing.run_folder import restore_fit, write_with_page
 from viz import run_page
+from viz.page_parts import sections_of, with_sections
 
 EFFECT = "scanner_thermal_scale"
 
@@ -100,6 +101,33 @@ def test_a_model_that_was_edited_gets_no_page_of_another(folder, tmp_path, capsy
     line = capsys.readouterr().err.strip()
     assert stop.value.code == 2 and "\n" not in line and "model.toml: changed after the run" in line
     assert files(run)["report.html"] == files(folder / "r")["report.html"]
+
+
+def test_a_diagnosis_of_this_very_model_is_not_made_anew(folder, tmp_path, monkeypatch, capsys, stitch_command):
+    """The page keeps what it said, and nothing is added where it names nothing; of another state it is forgotten."""
+    run, page = tmp_path / "r", tmp_path / "r" / "report.html"
+    run.mkdir()
+    for name, data in files(folder / "q").items():
+        (run / name).write_bytes(data)
+    document = {"verdict": "adequate", "plain": "Nothing.", "sentence": "Nothing at all.", "notes": []}
+    document |= {"next_command": "Next: stitch export RUN --to ros", "of": diagnosed_state(load_run(run), run)}
+    (run / "diagnosis.json").write_text(json.dumps(document))
+    (run / "compare.json").write_text("{}")
+    said = {"missing": "<p>asked</p>", "screen": '<script id="screen-data"></script>'}
+    page.write_text(with_sections(page.read_text(), said))
+
+    def again(*_):
+        raise AssertionError("diagnosed again")
+
+    monkeypatch.setattr(pipeline, "diagnose", again)
+    stitch_command("report", run)
+    assert said.items() <= sections_of(page.read_text()).items()
+    stitch_command("add", run, "--suggested")
+    told = capsys.readouterr().err
+    assert "Nothing at all.\nNothing was added" in told and f"Next: stitch export {run} --to ros" in told
+    (run / "diagnosis.json").write_text(json.dumps(document | {"of": "another"}))
+    stitch_command("report", run, "--no-diagnosis")
+    assert "Nobody has asked yet" in page.read_text() and "asked</p>" not in page.read_text()
 
 
 STALE = ("diagnosis.json", "diagnosis.rrd", "compare.json", "mesh.ply", "recording.rrd", "robot.toml", "robot.urdf")
