@@ -31,6 +31,8 @@ _SIGMAS = 4.0
 # four times.
 _ALONE = 6.0
 _EDGE_ALONE = 3.0
+# Noise and spacing of a view are believed up to so many times the median over the views.
+_OF_OTHERS = 2.0
 # Neighbours scatter about one surface by less than this share of their distance.
 _FLAT = 0.2
 # The centroid of neighbours all around lies within this share of the distance; beyond, the surface ends. There a point
@@ -47,8 +49,9 @@ _MARGIN = 3.0
 _PAST = 2
 # Parts hang together over gaps of so many cells; at most so many such steps make the largest side.
 _GAP, _STEPS = 4.0, 128
-# A body is no part of what was scanned if so few of its points are seen twice, and so many are looked past.
-_SEEN_TWICE, _CONTRADICTED = 0.02, 0.5
+# A body is no part of what was scanned if so few of its points are seen twice, and so many, more than five, are looked
+# past: of surfaces that one view alone saw, views look past next to none, where scans hold a third of junk too.
+_SEEN_TWICE, _CONTRADICTED, _WITNESSES = 0.05, 0.05, 5
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,10 @@ def find_support(scans: Sequence[Scan], poses: Array, placed: PlacedPoints, cell
     """
     settled, scatter = _points_on_surface(placed, cell)
     parts = np.split(settled, np.cumsum([len(scan.points) for scan in scans])[:-1])
-    tests = list(parallel(lambda item: _held_by_own_view(*item), zip(scans, parts, strict=True)))
+    # What a view full of junk says of itself is not believed beyond what the others say of the same scanner.
+    noise = _limited([scan.noise for scan in scans])
+    angles = _limited([solid_angle(scan) for scan in scans])
+    tests = list(parallel(lambda item: _held_by_own_view(*item), zip(scans, parts, noise, angles, strict=True)))
     held = np.concatenate([test[0] for test in tests])
     junk = np.array([test[1] for test in tests])
     held |= _held_by_all_views(placed, held, scatter, cell)
@@ -164,8 +170,18 @@ def _points_on_surface(placed: PlacedPoints, cell: float) -> tuple[Mask, float]:
     return near & (others >= np.where(placed.usable, 1, 2)), scatter
 
 
-def _held_by_own_view(scan: Scan, settled: Mask) -> tuple[Mask, float]:
-    """Points (N,) of a scan that are settled or lie on a surface of their neighbours, and the share that is alone."""
+def _limited(values: Sequence[float]) -> Array:
+    """(V,) values of one scanner's views, none beyond twice their median."""
+    return np.minimum(values, _OF_OTHERS * float(np.median(values)))
+
+
+def _held_by_own_view(scan: Scan, settled: Mask, noise: float, angle_each: float) -> tuple[Mask, float]:
+    """Points (N,) of a scan that are settled or lie on a surface of their neighbours, and the share that is alone.
+
+    Args:
+        noise: of the scan across a surface, length_unit.
+        angle_each: solid angle that a point on a smooth surface has for itself.
+    """
     held, asked = np.ones(len(scan.points), bool), np.flatnonzero(~settled)
     if not len(asked) or len(scan.points) <= _NEIGHBOURS:
         return held, 0.0
@@ -173,7 +189,7 @@ def _held_by_own_view(scan: Scan, settled: Mask) -> tuple[Mask, float]:
     index, radius = index[:, 1:], distance[:, -1]
     angle = radius**2 * np.pi / (_NEIGHBOURS + 1) * np.maximum(scan.confidence[asked], 0.1)
     angle /= np.einsum("ij,ij->i", scan.points[asked] - scan.eye, scan.points[asked] - scan.eye)
-    share = angle / solid_angle(scan)
+    share = angle / angle_each
     alone = share > _ALONE
     junk = float(alone.sum()) / len(scan.points)
     credit = edge_credit(junk)
@@ -185,7 +201,7 @@ def _held_by_own_view(scan: Scan, settled: Mask) -> tuple[Mask, float]:
         local = _LocalSurface(around, scan.normals[index], vote * held[index])
         aside = np.linalg.norm(centroid - np.einsum("ij,ij->i", centroid, local.normal)[:, None] * local.normal, axis=1)
         rounded = np.minimum(credit * np.maximum(aside - _AROUND * radius, 0), _ROUNDED * radius)
-        within = _SIGMAS * scan.noise + local.bend * radius / 2 + np.where(share < _EDGE_ALONE, rounded, 0.0)
+        within = _SIGMAS * noise + local.bend * radius / 2 + np.where(share < _EDGE_ALONE, rounded, 0.0)
         flat = local.scatter < _FLAT * (1 + credit / 2) * radius
         held[asked] &= ~alone & (local.votes >= _LEAST) & flat & (np.abs(local.height) < within)
     return held, junk
@@ -254,24 +270,23 @@ def _looked_through(
     through = past >= np.where(placed.usable[asked], _PAST, 1)
     contradicted = np.zeros(len(held), bool)
     contradicted[asked] = past + missed > 0
-    every = np.flatnonzero(held)
-    return np.asarray(through | _in_loose_body(placed.points, every, settled, contradicted, cell)[asked])
+    loose = np.zeros(len(held), bool)
+    for v in np.unique(own[contradicted[asked]]):
+        # What stands in the way of one view may stand near what others show.
+        every = np.flatnonzero(held & (placed.view == v))
+        loose[every] = _in_loose_body(placed.points[every], settled[every], contradicted[every], cell)
+    return np.asarray(through | loose[asked])
 
 
-def _in_loose_body(points: Array, every: Indices, settled: Mask, contradicted: Mask, cell: float) -> Mask:
-    """(N,) points of bodies that hang together with nothing that is seen twice, and past which views look."""
-    loose = np.zeros(len(points), bool)
-    if not contradicted.any():
-        return loose
+def _in_loose_body(points: Array, settled: Mask, contradicted: Mask, cell: float) -> Mask:
+    """(N,) points of a view in bodies that hang together with nothing that is seen twice, and past which views look."""
     from scipy.ndimage import label
 
-    columns = [column[every] for column in points.T]
-    step = max(_GAP * cell, *(float(np.ptp(column)) / _STEPS for column in columns))
-    at = tuple(((column - column.min()) / step).astype(np.int32) for column in columns)
+    step = max(_GAP * cell, *(float(np.ptp(column)) / _STEPS for column in points.T))
+    at = tuple(((column - column.min()) / step).astype(np.int32) for column in points.T)
     grid = np.zeros([int(i.max()) + 1 for i in at], bool)
     grid[at] = True
     body = label(grid, np.ones((3, 3, 3)))[0][at]
     size = np.bincount(body)
-    twice, against = (np.bincount(body, mask[every], len(size)) for mask in (settled, contradicted))
-    loose[every] = ((twice < _SEEN_TWICE * size) & (against > _CONTRADICTED * size))[body]
-    return loose
+    twice, against = (np.bincount(body, mask, len(size)) for mask in (settled, contradicted))
+    return np.asarray(((twice < _SEEN_TWICE * size) & (against > np.maximum(_CONTRADICTED * size, _WITNESSES)))[body])
