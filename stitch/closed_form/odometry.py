@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from stitch import frames
+from stitch.closed_form.hand_eye import park_martin
+from stitch.errors import NoResultError
 from stitch.frames import Array, Indices
 
 # From one scan to the next a stream turns and shifts no more than this: rad, share of the part's size.
@@ -25,6 +27,10 @@ _VOXEL, _KERNEL = 0.02, 0.02
 _STREET = 100.0
 # Started from the last motion it is there within some ten steps, or nowhere.
 _STEPS = 60
+# Passes of the odometry: the second one knows from the first where the robot carries the scanner.
+_PASSES = 2
+# Of the motions that agree best, the middle one turns as the robot does within so much, rad.
+_TURNS_ALIKE = np.radians(0.5)
 # Motions that show a hand-eye turn by so much, rad; steps of the stream between their ends, as shares of its length.
 _TURNED, _STRIDES = np.radians(10.0), (0.05, 0.1, 0.2, 0.35)
 
@@ -44,13 +50,19 @@ def is_stream(T_reference_mount: Array, scans: Sequence[Array]) -> bool:
     return bool(np.mean((turned < _LARGEST_TURN) & (shifted < _LARGEST_SHIFT)) >= _MOST)
 
 
-def scan_odometry(scans: Sequence[Array], times: Sequence[Array] | None = None, interval: float = 1.0) -> Array:
+def scan_odometry(
+    scans: Sequence[Array],
+    times: Sequence[Array] | None = None,
+    interval: float = 1.0,
+    predicted: Array | None = None,
+) -> Array:
     """Return T_first_scanner (V, 4, 4) of every scan of a stream.
 
     Args:
         scans: points (N, 3) each, scanner frame.
         times: s from the time of its scan to each point (N,), of a scanner that moved meanwhile; None: it stood still.
         interval: s from one scan to the next.
+        predicted: (V - 1, 4, 4) motions of the scanner from scan to scan; None: it moves on as it did last.
     """
     from kiss_icp.config import KISSConfig
     from kiss_icp.kiss_icp import KissICP
@@ -68,11 +80,45 @@ def scan_odometry(scans: Sequence[Array], times: Sequence[Array] | None = None, 
     odometry.preprocessor = _ToTheTimeOfTheScan(odometry.preprocessor, interval)
     poses = []
     for v, points in enumerate(scans):
+        if predicted is not None and v:
+            odometry.last_delta = frames.make(predicted[v - 1, :3, :3], scale * predicted[v - 1, :3, 3])
         odometry.register_frame(np.ascontiguousarray(scale * points), np.zeros(0) if times is None else times[v])
         poses.append(odometry.last_pose.copy())
     found = np.array(poses)
     found[:, :3, 3] /= scale
     return found
+
+
+def hand_eye_of_stream(
+    T_reference_mount: Array,
+    scans: Sequence[Array],
+    times: Sequence[Array] | None,
+    interval: float,
+    T_mount: Array | None,
+) -> tuple[Array | None, Array]:
+    """Return T_mount (4, 4) of A·X = X·B over the odometry of a stream, and the odometry, T_first_scanner (V, 4, 4).
+
+    Where the scans show little, as along an edge, the robot says where the next one is to be sought. That needs a
+    hand-eye: the stated one, or that of a first pass, which goes on as it moved last. None: the odometry does not turn
+    as the robot does.
+
+    Args:
+        T_reference_mount: (V, 4, 4) from the robot.
+        times, interval: as for `scan_odometry`.
+        T_mount: (4, 4) hand-eye to begin with, off by some per cent of the distance to the part; None: not known.
+    """
+    steps = motions_between(T_reference_mount, [(v, v + 1) for v in range(len(scans) - 1)])
+    for _ in range(_PASSES):
+        predicted = None if T_mount is None else frames.inverse(T_mount) @ steps @ T_mount
+        odometry = scan_odometry(scans, times, interval, predicted)
+        A, B = motions_of_stream(T_reference_mount, odometry)
+        if not len(A) or np.median(angle_differences(A, B)) > _TURNS_ALIKE:
+            return None, odometry
+        try:
+            T_mount = park_martin(A, B)
+        except NoResultError:
+            return None, odometry
+    return T_mount, odometry
 
 
 class _ToTheTimeOfTheScan:

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from stitch import frames
-from stitch.closed_form.hand_eye import park_martin
-from stitch.closed_form.odometry import is_stream, motions_of_stream, scan_odometry
-from stitch.errors import InputError, NoResultError
+from stitch.closed_form.odometry import hand_eye_of_stream, is_stream
+from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.measurement.session import Session
 
@@ -68,10 +67,12 @@ def stream_hand_eye(session: Session) -> Array | None:
     times = [cloud.scalars["time"] for cloud in clouds] if session.scanner.moving else None
     seconds = [view.time_s for view in session.views if view.time_s is not None]
     interval = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
-    try:
-        return park_martin(*motions_of_stream(T_reference_mount, scan_odometry(scans, times, interval)))
-    except NoResultError:
-        return None
+    starts = [None] if session.scanner.T_mount is None else [session.scanner.T_mount, None]
+    for T_mount in starts:
+        found, _ = hand_eye_of_stream(T_reference_mount, scans, times, interval, T_mount)
+        if found is not None:
+            return found
+    return None
 
 
 class _RobotPath:
