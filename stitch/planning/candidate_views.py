@@ -17,20 +17,29 @@ from stitch.planning.expected_model import FEWEST, CellModel, expected_scans
 
 _SAMPLES = 6000
 _SPREAD = np.radians(40.0)  # about joint angles that were driven before
+_CLOSER = np.radians(20.0)  # about views that were chosen among those
 _LIMIT = np.radians(170.0)  # of joints whose limits nobody stated, unless they were beyond already
 # A view may see the part by this share of its distance farther off than any before, and turned by so much.
 _MARGIN, _TURNED = 0.15, np.cos(np.radians(50.0))
 
 
-def nearby(seen: Array) -> Array:
-    """(K, n) joint angles near those that were driven (V, n), within the limits that were kept."""
+def nearby(seen: Array, chosen: Array | None = None) -> Array:
+    """(K, n) joint angles near those that were driven (V, n), or closer to chosen ones (C, n), within the limits that
+    were kept."""
     rng = np.random.default_rng(0)
-    joints = seen[rng.integers(0, len(seen), _SAMPLES)] + rng.uniform(-_SPREAD, _SPREAD, (_SAMPLES, seen.shape[1]))
+    about, spread = (seen, _SPREAD) if chosen is None else (chosen, _CLOSER)
+    joints = about[rng.integers(0, len(about), _SAMPLES)] + rng.uniform(-spread, spread, (_SAMPLES, seen.shape[1]))
     limit = np.maximum(_LIMIT, np.abs(seen).max(axis=0))
     return np.asarray(joints[(np.abs(joints) < limit).all(axis=1)])
 
 
-def reachable(seen: Array, poses_of: Callable[[Array], Array], seen_from: Array, centre: Array) -> Array:
+def reachable(
+    seen: Array,
+    poses_of: Callable[[Array], Array],
+    seen_from: Array,
+    centre: Array,
+    chosen: Array | None = None,
+) -> Array:
     """(K, n) joint angles in which the scanner sees the part about as it has before.
 
     Args:
@@ -38,8 +47,9 @@ def reachable(seen: Array, poses_of: Callable[[Array], Array], seen_from: Array,
         poses_of: T_reference_scanner (K, 4, 4) at joint angles (K, n).
         seen_from: the same (V, 4, 4) of the views that there are.
         centre: (3,) of what they see, reference frame.
+        chosen: (C, n) joint angles to stay close to.
     """
-    joints = nearby(seen)
+    joints = nearby(seen, chosen)
     poses = poses_of(joints)
     there = frames.transform(frames.inverse(poses), centre[None])[:, 0]
     before = frames.transform(frames.inverse(seen_from), centre[None])[:, 0]
@@ -122,8 +132,9 @@ def with_views(session: Session, joints: Sequence[Array], in_turn: bool = True) 
     return replace(session, views=tuple(views))
 
 
-def candidate_joints(session: Session, cell: CellModel, count: int) -> Array:
-    """(K, n) joint angles near those that are planned in which the scanner would see the part, K ≤ count."""
+def candidate_joints(session: Session, cell: CellModel, count: int, chosen: Array | None = None) -> Array:
+    """(K, n) joint angles near those that are planned, or closer to chosen ones (C, n), in which the scanner would see
+    the part, K ≤ count."""
     T_mount = cell.model.T_mount
     driven, T_base_flange = session.joints, np.array([view.T_base_flange for view in session.views])
     assert driven is not None
@@ -133,7 +144,7 @@ def candidate_joints(session: Session, cell: CellModel, count: int) -> Array:
         return build_capture(session.name, (), forward(session.robot, joints), session.mount).poses(T_mount)
 
     seen_from = build_capture(session.name, (), T_base_flange, session.mount).poses(T_mount)
-    joints = reachable(driven, poses_of, seen_from, cell.part.centre)
+    joints = reachable(driven, poses_of, seen_from, cell.part.centre, chosen)
     least = max(FEWEST, _SHARE * np.median([len(index) for index in expected_scans(cell, seen_from)]))
     seen = (len(index) >= least for index in expected_scans(cell, poses_of(joints[: _TRIES * count])))
     return np.asarray(joints[: _TRIES * count][list(seen)][:count])

@@ -252,6 +252,8 @@ def travel_order(joints: Array, last: int, chosen: Sequence[int]) -> list[int]:
 _MIN_PRESENT_VIEWS = 3
 # Views that are tried; and proposed, beside present ones or where there are none, unless a number is asked for.
 _TRIED, _MORE, _ALL = 40, 6, 12
+# For one feature as many are tried again, so many times, close to those that were chosen.
+_CLOSER = 2
 # Effects that would be detected so often at usual size are worth telling apart; so many hard pairs are looked at, and
 # what a single view must bring to one of them.
 _DETECTED, _PAIRS, _BETTER = 0.5, 6, 0.02
@@ -323,20 +325,11 @@ def plan_further_views(session: Session, planned: PlannedCell, request: PlanRequ
         empty = Plan(session, planned.assumed, now, request.split, (), None)
         if session.robot is None or session.joints is None or not (request.halve or request.split or request.split_any):
             return empty
-        possible = candidate_joints(session, cell, _TRIED)
-        if not len(possible):
-            return empty
         told = planned.fitted_scatter if now is None else now.fitted_scatter
-        every = with_views(session, list(possible), in_turn=False)
-        coarse = replace(cell, part=thinned_surface(cell.part.points, cell.part.normals, _POINTS))
-        simulated = simulate_views(every, coarse, _SAMPLES, _MIN_VIEW_SAMPLES)
-        views = PossibleViews(every, coarse, simulated, told.believed if told else cell.scatter)
-        goals, joints = _plan_goals(views, now, request), np.array([view.joints for view in every.views])
-        most = request.views or (_ALL if now is None else _MORE)
-        chosen = choose_views(goals, joints, present, most) if goals else []
+        goals, chosen, joints = _search_views(session, cell, told.believed if told else cell.scatter, now, request)
         if not chosen:
             return empty
-        further = with_views(session, [joints[k] for k in chosen])
+        further = with_views(session, list(joints))
         after = view_outlook(further, cell, told, request.place, chances=now is None)
         split = next((goal.names for goal in goals if isinstance(goal, SplitPair)), None)
         place_now = next((goal.now for goal in goals if isinstance(goal, KnownPlace) and np.isfinite(goal.now)), None)
@@ -347,6 +340,29 @@ def plan_further_views(session: Session, planned: PlannedCell, request: PlanRequ
             after=after,
             place_now=None if request.feature is None else place_now,
         )
+
+
+def _search_views(
+    session: Session, cell: CellModel, scatter: Scatter, now: Outlook | None, request: PlanRequest
+) -> tuple[list[Goal], list[int], Array]:
+    """Return goals over all views that were tried, the indices of the C chosen ones there, and their joints (C, n)."""
+    assert session.joints is not None
+    coarse = replace(cell, part=thinned_surface(cell.part.points, cell.part.normals, _POINTS))
+    goals, chosen, joints = list[Goal](), list[int](), session.joints[:0]
+    for _ in range(1 if request.feature is None else 1 + _CLOSER):
+        tried = np.vstack([joints, candidate_joints(session, cell, _TRIED, joints if chosen else None)])
+        if not len(tried):
+            break
+        every = with_views(session, list(tried), in_turn=False)
+        simulated = simulate_views(every, coarse, _SAMPLES, _MIN_VIEW_SAMPLES)
+        goals = _plan_goals(PossibleViews(every, coarse, simulated, scatter), now, request)
+        possible = np.array([view.joints for view in every.views])
+        most = request.views or (_ALL if now is None else _MORE)
+        chosen = choose_views(goals, possible, len(session.views), most) if goals else []
+        if not chosen:
+            break
+        joints = possible[chosen]
+    return goals, chosen, joints
 
 
 def _plan_goals(views: PossibleViews, now: Outlook | None, request: PlanRequest) -> list[Goal]:

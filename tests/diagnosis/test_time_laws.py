@@ -75,7 +75,7 @@ def test_a_stretch_of_views_that_stands_off_is_said_to(cell):
 def test_a_long_stretch_is_told_in_place_of_what_wanders(cell):
     """What wanders can do what a long stretch does: beside it the stretch gains little, alone it explains more."""
     stretch = np.exp(-0.5 * ((np.arange(VIEWS) - 9) / 3.5) ** 2)
-    linear = linear_of(cell, 1.6 * stretch[:, None] * DIRECTION)
+    linear = linear_of(cell, 1.5 * stretch[:, None] * DIRECTION)
     assert likeliest_time_law(linear).log_bayes_factor < ODDS
     law = significant_time_law(linear)
     assert law.course.words.startswith("are off for a stretch")
