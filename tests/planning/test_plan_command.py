@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit
 from stitch.observations.surfaces.surface_model import surface_model
+from stitch.planning import plan
 from stitch.planning.candidate_views import with_views
 from stitch.planning.expected_model import cell_of_session, simulate_views
 from stitch.planning.plan import PlanRequest, plan_further_views
@@ -128,6 +130,17 @@ def test_without_any_view_it_proposes_them_all(planned, measured, tmp_path, stit
     U = [view["U_at_part"] for view in told["proposed"]]
     assert 4 <= len(U) <= 8 and np.diff(U[2:]).max() <= 0
     assert told["after"]["hand_eye"]["U_at_part"] < 1.0
+
+
+@pytest.mark.slow
+def test_views_for_a_place_are_sought_again_close_to_the_first(planned):
+    session = load_session(planned / "s", scans=False)
+    known = cell_of_session(session, planned / "blade.ply")
+    request, U = PlanRequest(split_any=False, views=3, feature=known.cell.part.centre), []
+    for closer in (0, plan._CLOSER):
+        with patch.object(plan, "_CLOSER", closer):
+            U.append(plan_further_views(session, known, request).proposed[-1].U)
+    assert U[1] < U[0]
 
 
 @pytest.mark.slow
