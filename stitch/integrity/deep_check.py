@@ -256,6 +256,10 @@ def _check_views(session: Session, capture: Capture, found: Sequence[MotionFit])
         problems = [SessionProblem(rounded.kind, (), rounded.describe(), certain=contradicted), *problems]
         return problems, False
     if contradicted:
+        size = length_problem(
+            snooped.model, capture.T_reference_mount, snooped.blunder_search.mean_columns, likely=True
+        )
+        problems = problems if size is None else [size, *problems]
         problems.append(SessionProblem("displaced", tuple(session.names), _unexplained_text(session, snooped)))
     for m in snooped.suspected:
         fix = (

@@ -136,21 +136,23 @@ UNITS = {
     10.0: "mm where cm are stated",
     0.1: "cm where mm are stated",
 }
-# A fitted factor is one between units if it is this near; no scanner's and no arm's own scale is off by the other one.
-_UNIT_NEAR, _LARGEST_SCALE = 0.05, 1.25
+# A fitted factor is one between units if it is this near, or within three sigmas and the second share. No scanner's and
+# no arm's own scale is off by the last one.
+_UNIT_NEAR, _UNIT_FAR, _LARGEST_SCALE = 0.05, 0.2, 1.25
 
 
-def known_unit_ratio(scale: float) -> float | None:
+def known_unit_ratio(scale: float, sigma: float = 0.0) -> float | None:
     """Return the factor of `UNITS` that a fitted scale is, None where it is none."""
     if scale <= 0:
         return None
     factor = min(UNITS, key=lambda u: abs(np.log(scale / u)))
-    return factor if abs(scale / factor - 1) < _UNIT_NEAR else None
+    near = np.clip(3 * sigma / factor, _UNIT_NEAR, _UNIT_FAR)
+    return factor if abs(scale / factor - 1) < near else None
 
 
-def scale_text(scale: float) -> str:
+def scale_text(scale: float, sigma: float = 0.0) -> str:
     """Return what a fitted factor between clouds and robot says, without the factor where lengths cannot differ so."""
-    unit = known_unit_ratio(scale)
+    unit = known_unit_ratio(scale, sigma)
     if unit is not None or 1 / _LARGEST_SCALE <= scale <= _LARGEST_SCALE:
         factor = f"{scale:.5g}" if unit is None else f"{unit:.6g}"
         return f"the clouds are {factor} times as large as the robot's motions; to fix: check the scale of both"

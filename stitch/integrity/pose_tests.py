@@ -399,10 +399,13 @@ def least_displacement(
 
 # No scanner in use is off by this share of its lengths, and no arm.
 _SCALE = 0.01
-_LENGTH_CHANCE = 1e-4
+# Chance of a factor by which a session is refused, and of one that is named where it is refused anyway.
+_LENGTH_CHANCE, _LIKELY_LENGTH = 1e-4, 0.01
 
 
-def length_problem(model: ViewModel, T_reference_mount: Array, further: Array | None = None) -> SessionProblem | None:
+def length_problem(
+    model: ViewModel, T_reference_mount: Array, further: Array | None = None, likely: bool = False
+) -> SessionProblem | None:
     """Test the robot's lengths as one factor on all its translations; None if they agree with the scans'.
 
     Under a wrong one the part would come out whole but of the wrong size, and fit itself.
@@ -410,10 +413,14 @@ def length_problem(model: ViewModel, T_reference_mount: Array, further: Array | 
     Args:
         further: (n, K) columns of what was found beside: a factor must not explain what single views do.
         T_reference_mount: (V, 4, 4), length_unit: a factor 1 + κ on them is a left twist (0, κ t) of every view.
+        likely: the poses contradict the scans, and what is asked for is why.
     """
     column = np.einsum("vni,vi->n", model.views[:, :, 3:], T_reference_mount[:, :3, 3])[:, None]
+    if further is not None and model.deviance(column) + 2 < model.deviance(further) + 2 * further.shape[1]:
+        # One number says as much as the six of every view (Akaike 1974): of few views one takes the factor upon itself.
+        further = None
     found, p = left_out_test(model, further, column, column)
     share = float(found.estimate[0])
-    if abs(share) < _SCALE or p > _LENGTH_CHANCE:
+    if abs(share) < _SCALE or p > (_LIKELY_LENGTH if likely else _LENGTH_CHANCE):
         return None
-    return SessionProblem("scale", (), scale_text(1 + share))
+    return SessionProblem("scale", (), scale_text(1 + share, float(found.normal[0, 0]) ** -0.5))

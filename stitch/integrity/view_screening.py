@@ -87,7 +87,7 @@ def screen_views(session: Session, measurement: Measurement, correction: Correct
     size = length_problem(found.model, own.T_reference_mount, found.blunder_search.mean_columns)
     if size is not None:
         # Other mistakes look like a factor on lengths too.
-        refuse(session, deep_check(session))
+        refuse(session, [size if problem.kind == size.kind else problem for problem in deep_check(session)])
         refuse(session, [size])
     if scatter_is_doubtful(session, found):
         # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
