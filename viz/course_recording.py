@@ -58,7 +58,7 @@ def log_course(recording: rr.RecordingStream, course: dict[str, Any], names: lis
         recording, "heights", np.column_stack([np.full(2, _LEFT / 2), to_y(heights)]), [f"{h:+.3g}" for h in heights]
     )
     in_order = course["follows"] == "view order" and course["views"]
-    told = [names[v] for v in course["views"]] if in_order else [f"{value:.3g}" for value in at]
+    told = [names[v] for v in course["views"]] if in_order else [f"{float(f'{value:.3g}'):g}" for value in at]
     some = apart(x, (max(map(len, told)) + 2) * _WIDE / _LETTERS)
     _label(
         recording,
