@@ -221,7 +221,7 @@ def run_tiles(run: Run, history: ModelHistory | None) -> list[Tile]:
     """Return the three numbers of a run: those of the model before and of the present one."""
     unit, before = run.session.length_unit, len(run.ledger) > 1
     heldout = [step.heldout_rms for step in run.ledger[-2:]] if before else [run.heldout_or_fit_rms]
-    tiles = [Tile("heldout", "rms, views left out", heldout, unit)]
+    tiles = [Tile("heldout", "rms on held-out views", heldout, unit)]
     if history is not None:
         fields = [step.field for step in history.models[-2:]]
         tiles += [

@@ -63,7 +63,7 @@ def _words(text: str) -> str:
 def _tiles(screen: dict[str, Any], unit: str) -> list[Tile]:
     """Return the three numbers now, and with the candidate that is named."""
     best, now = screen["candidates"][0], screen["now"]
-    names = {"heldout": "rms, views left out", "mean": "mean on the part", "worst": "worst place"}
+    names = {"heldout": "rms on held-out views", "mean": "mean on the part", "worst": "worst place"}
     return [
         Tile(key, name, [now[key]] if best[key] is None else [now[key], best[key]], unit)
         for key, name in names.items()

@@ -181,6 +181,9 @@ def _why(found: Diagnosis, courses: dict[str, EffectCourse | None]) -> EffectCou
 
 # The cause and its proof in words.
 
+# What an effect changes over the views by less than this share of its size is the same in all.
+_FLAT = 0.02
+
 _OF_A_JOINT = {
     "joint_offset": "counts its angle from a wrong zero",
     "joint_compliance": "gives way under load",
@@ -235,16 +238,17 @@ def _proof(found: Diagnosis, why: EffectCourse | None) -> str:
     """Return how large it is, and what it does to the error on views left out."""
     unit = found.linear.measurement.length_unit
     now, noise = length_text(found.heldout_rms, unit, 2), length_text(found.noise_floor, unit, 2)
+    error = f"The error on held-out views is {now}; the scanner's noise alone would leave {noise}."
     if found.verdict not in ("missing_effect", "cannot_tell"):
-        return f"On views left out the error is {now}; the scanner's noise alone would leave {noise}."
+        return error
     named = next(c for c in found.candidates if c.name == found.effects[0])
     size = "" if why is None else f"{_size(why, unit)} "
     if named.cross_validation is None:
-        return f"{size}On views left out the error is {now}; the scanner's noise alone would leave {noise}."
+        return f"{size}{error}"
     then = length_text(found.rms_if_added(named.cross_validation)[1], unit, 2)
     return (
-        f"{size}Adding it should take the error on views left out from {now} to {then}; the scanner's noise alone "
-        f"would leave {noise}."
+        f"{size}Adding this effect to the model should take the error on held-out views from {now} to {then}. "
+        f"The scanner's noise alone would leave {noise}."
     )
 
 
@@ -297,5 +301,7 @@ def _size(why: EffectCourse, unit: str) -> str:
         return f"{away} of {len(why.views)} views sit {size} away from the others."
     follows = plain_covariate(why.follows).partition(":")[0]
     article = "" if follows == "time" or follows.startswith("the ") else "the "
+    if np.ptp(why.predicted) < _FLAT * largest:
+        return f"{why.of.capitalize()} is off by {size}, whatever {article}{follows} is."
     goes_with = "" if follows == "view order" else f"; it goes with {article}{follows}"
     return f"{why.of.capitalize()} is off by up to {size}{goes_with}."

@@ -73,7 +73,7 @@ export function showNumbers(state) {
     element("b", {}, um(value)), element("small", {}, words), old != null && value != null && fell(value, old));
   at("tiles").replaceChildren(
     tile(state.residual, state.labelled ? "rms of labelled points, in the fit" : "rms between views, in the fit", before && before.residual),
-    tile(state.heldout, "rms on views left out", before && before.heldout),
+    tile(state.heldout, "rms on held-out views", before && before.heldout),
     tile(state.floor, "noise floor of the sensor"));
 }
 
