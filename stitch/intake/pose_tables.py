@@ -473,6 +473,7 @@ def _merged_name(heads: list[list[str]], column: int) -> str:
 
 
 def _separator_of(lines: Sequence[str]) -> str:
-    return max(
-        _SEPARATORS, key=lambda s: sum(parse_number(c) is not None for line in lines for c in split_cells(line, s))
-    )
+    counts = {s: [_number_count(split_cells(line, s)) for line in lines] for s in _SEPARATORS}
+    # A number in the words above a table is none of its cells.
+    least = _SEVERAL if max(map(max, counts.values())) >= _SEVERAL else 1
+    return max(counts, key=lambda s: sum(n for n in counts[s] if n >= least))

@@ -31,6 +31,15 @@ def test_any_separator_decimal_mark_and_header(tmp_path, separator, comma, heade
     assert table.header == (("x", "y", "z", "rx", "ry", "rz") if header else None)
 
 
+def test_a_number_in_the_title_and_blanks_in_names_leave_the_tabs(tmp_path):
+    (tmp_path / "t.txt").write_text(
+        "Roboterposen Zelle 4\n\ncloud\tx\ty\tz\nscan 0.asc\t1.5\t2\t3\nscan 1.asc\t2\t3\t4\n"
+    )
+    table = read_number_table(tmp_path / "t.txt")
+    assert table.header == ("x", "y", "z") and table.numbers.tolist() == [[1.5, 2, 3], [2, 3, 4]]
+    assert table.labels == (("scan 0.asc",), ("scan 1.asc",))
+
+
 def test_a_table_in_markdown_and_matrices_in_one_row(tmp_path):
     (tmp_path / "t.md").write_text("| scan | x | y |\n|:---|---:|---:|\n| a.ply | 1.5 | -2 |\n| b.ply | 2.5 | 3 |\n")
     table = read_number_table(tmp_path / "t.md")
