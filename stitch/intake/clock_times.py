@@ -53,31 +53,25 @@ def clock_times(cells: Sequence[str]) -> ClockTimes | None:
 
     Dates whose order nobody states are read both ways. What runs backwards one way is read the other way.
     """
-    both = [_column_seconds(cells, day_first) for day_first in (True, False)]
-    known = [moments for moments in both if moments is not None]
-    if not known or all((moments == moments[0]).all() for moments in known):
+    known: dict[str, Array] = {}
+    for words, day_first in ((DAY_FIRST, True), (MONTH_FIRST, False)):
+        told = [_time_of_day_seconds(cell.strip(), day_first) for cell in cells]
+        if told and None not in told:
+            known[words] = np.array(told, float)
+    if not known or all((moments == moments[0]).all() for moments in known.values()):
         return None
-    forwards = [moments for moments in known if (np.diff(moments) >= 0).all()]
+    forwards = {words: moments for words, moments in known.items() if (np.diff(moments) >= 0).all()}
     if not forwards:
         return ClockTimes(None, "times of day run backwards and are left out; to fix: write the date beside them")
-    since_first = [moments - moments[0] for moments in forwards]
+    since_first = [moments - moments[0] for moments in forwards.values()]
     if len(forwards) == 2 and not np.array_equal(since_first[0], since_first[1]):
         return ClockTimes(
             None,
             f"times are left out, as {cells[0].strip()} may begin with the day or the month; to fix: write dates as "
             "2026-12-31",
         )
-    alike = len(forwards) == 2
-    words = "" if alike else DAY_FIRST if forwards[0] is both[0] else MONTH_FIRST
-    return ClockTimes(np.asarray(since_first[0]), words, float(forwards[0][0]))
-
-
-def _column_seconds(cells: Sequence[str], day_first: bool) -> Array | None:
-    told = [_time_of_day_seconds(cell.strip(), day_first) for cell in cells]
-    if not told or any(t is None for t in told):
-        return None
-    moments: Array = np.array(told, float)
-    return moments
+    words, moments = next(iter(forwards.items()))
+    return ClockTimes(since_first[0], "" if len(forwards) == 2 else words, float(moments[0]))
 
 
 def _time_of_day_seconds(cell: str, day_first: bool) -> float | None:
@@ -175,9 +169,8 @@ def _calendar_seconds(name: str) -> float | None:
     if len(found) != 1:
         return None
     year, month, day, hour, minute, second, part = found[0]
-    try:
-        days = date(int(year), int(month), int(day)).toordinal()
-    except ValueError:
+    days = _date_ordinal(f"{year}-{month}-{day}", day_first=True)
+    if days is None:
         return None
     clock = 3600 * int(hour) + 60 * int(minute) + int(second)
     return DAY_S * days + clock + (float(f"0.{part}") if part else 0.0)

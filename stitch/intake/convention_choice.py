@@ -22,7 +22,6 @@ from stitch.integrity.conventions import (
     FEWEST,
     ROTATION,
     TRANSLATION_M,
-    MotionFit,
     RelativeScans,
     equivalent_hypotheses,
     fit_centroids,
@@ -174,17 +173,6 @@ class ConventionChoice:
     overruled: str = ""  # the reading that the names of the columns tell, where the scans contradict it
     only_believed: str = ""  # another reading under which the views meet as well as under the one that names tell
 
-    @property
-    def scanner_at_flange(self) -> bool:
-        """True if the scanner rather than the part sits at the flange."""
-        return self.scanner_away <= self.part_away
-
-    @property
-    def mount_determined(self) -> bool:
-        """True if one of the two clearly sits nearer than the other."""
-        low, high = sorted((self.scanner_away, self.part_away))
-        return high > _NEARER * low
-
 
 def choose_convention(
     capture: Capture,
@@ -285,21 +273,16 @@ def _choose_interpretation(
     if not by_targets:
         judged.sort(key=lambda j: j.misfit)
     best, runner_up = judged[0], judged[1] if len(judged) > 1 else None
-    alone = _sole_contender(list(closing.values()))
     clear = runner_up is None or runner_up.misfit >= CLEARLY_BETTER * best.misfit
-    single = alone is not None and interpretations[alone] is best.interpretation
+    # The motions alone single a way out.
+    close = equivalent_hypotheses(list(closing.values()))
+    single = len(close) == 1 and interpretations[int(close[0].hypothesis.kind)] is best.interpretation
     told = single if by_targets else (clear or single) and best.meets and len(best.interpretation.pairing.used) > 2
     same = equivalent_interpretations(best.interpretation, interpretations)
     best = replace(
         best, interpretation=same[0], T_mount=transferred_hand_eye(best.interpretation, same[0], best.T_mount)
     )
     return ConventionChoice(best, runner_up, bool(told), same[1:], *_flange_distances(capture, best))
-
-
-def _sole_contender(explained: Sequence[MotionFit]) -> int | None:
-    """The way that the motions alone single out, if they do."""
-    close = equivalent_hypotheses(explained)
-    return int(close[0].hypothesis.kind) if len(close) == 1 else None
 
 
 def _with_confirmed_unit(motions: RelativeScans, interpretations: Sequence[Interpretation]) -> list[Interpretation]:
@@ -361,8 +344,8 @@ def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool 
     of_joints = reading.rotation == JOINT_ANGLES
     direct = "eye_in_hand" if decided.best.interpretation.carries else "eye_to_hand"
     other = "eye_to_hand" if decided.best.interpretation.carries else "eye_in_hand"
-    nearer = "eye_in_hand" if decided.scanner_at_flange else "eye_to_hand"
-    scanner, part = (f"{mm:.0f} mm" for mm in (decided.scanner_away, decided.part_away))
+    away = (decided.scanner_away, decided.part_away)
+    scanner, part = (f"{mm:.0f} mm" for mm in away)
     placed = (
         f"under it the scanner lies {scanner} from the origin of its frame and the part {part} from that of its own"
     )
@@ -374,8 +357,9 @@ def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool 
     elif inverse is not None or of_joints:
         chosen = other if inverse else direct
         reason = "the direction of the poses is " + ("stated" if inverse is not None else "known from joint angles")
-    elif decided.determined and decided.mount_determined:
-        chosen, reason = nearer, f"{placed}: what lies nearer sits at the flange"
+    elif decided.determined and max(away) > _NEARER * min(away):
+        chosen = "eye_in_hand" if min(away) == decided.scanner_away else "eye_to_hand"
+        reason = f"{placed}: what lies nearer sits at the flange"
     else:
         chosen, told = direct, False
         reason = (

@@ -44,7 +44,7 @@ from stitch.intake.scan_targets import TargetSearch, find_folder_targets, target
 from stitch.intake.stops import rows_with_scans
 from stitch.integrity.conventions import RelativeScans, register_scan_pairs
 from stitch.measurement.capture import Capture, distinct_points, thin_session
-from stitch.measurement.session import Cloud, Scanner, Session, Sighting, View
+from stitch.measurement.session import Cloud, Mount, Scanner, Session, Sighting, View
 from stitch.reading.clouds import read_cloud
 from stitch.reading.depth_image import DEPTH_SUFFIXES, find_intrinsics
 from stitch.reading.range_image import poses_in_scans
@@ -63,9 +63,7 @@ class StatedFolder(StatedTable):
     cloud_unit: str | None = None
     mount: str | None = None
     orientation: tuple[float, ...] = ()  # of all poses, where the table has x, y, z alone
-    within: tuple[
-        float, ...
-    ] = ()  # lowest and highest corner of the box that counts, scanner frame, unit of the clouds
+    within: tuple[float, ...] = ()  # corners of the box that counts, low first, scanner frame, unit of the clouds
     targets: TargetSearch = field(default_factory=TargetSearch)  # boards and balls in the scans
 
     def __post_init__(self) -> None:
@@ -124,16 +122,9 @@ def score_words(score: ConventionScore) -> str:
 def _files_guess(files: FolderFiles, raw: RawPoses) -> Guess:
     clouds = f"{len(files.clouds)} clouds {files.clouds[0].name} … {files.clouds[-1].name}"
     aside = f"; left aside: {', '.join(f.name for f in files.unused[:5])}" if files.unused else ""
-    return Guess(
-        "files", f"{clouds}, {len(raw.numbers)} poses in {_files_words(files)}", f"{raw.words}{aside}", True, "--poses"
-    )
-
-
-def _files_words(files: FolderFiles) -> str:
-    if not files.poses:
-        return "their headers"
-    first, last = files.poses[0].name, files.poses[-1].name
-    return first if len(files.poses) == 1 else f"{first} … {last}"
+    ends = dict.fromkeys((*files.poses[:1], *files.poses[-1:]))  # one, where there is one file
+    found = f"{clouds}, {len(raw.numbers)} poses in {' … '.join(file.name for file in ends) or 'their headers'}"
+    return Guess("files", found, f"{raw.words}{aside}", True, "--poses")
 
 
 def _pairing_guess(decided: ConventionChoice) -> Guess:
@@ -173,16 +164,11 @@ def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
     if alike:
         reason += f"; {', '.join(dict.fromkeys(alike[:3]))} would stitch alike, with another hand-eye"
     other = decided.runner_up
-    words = (
-        None
-        if other is None
-        else f"{other.interpretation.reading.words}, {_direction_words(other)}, {score_words(other)}"
-    )
+    words = None
+    if other is not None:
+        direction = "poses as they are" if other.interpretation.carries else "poses inverted"
+        words = f"{other.interpretation.reading.words}, {direction}, {score_words(other)}"
     return Guess("rotation", best.words, reason, decided.determined, "--rotation", words)
-
-
-def _direction_words(score: ConventionScore) -> str:
-    return "poses as they are" if score.interpretation.carries else "poses inverted"
 
 
 def _length_unit_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
@@ -458,31 +444,17 @@ def _read_folder_poses(files: FolderFiles) -> RawPoses:
 
 def capture_of(clouds: Sequence[Cloud], scale: float) -> Capture:
     """Scans made light, in mm, at no poses."""
-    views = tuple(
-        View(
-            name=f"v{i}",
-            cloud=Cloud(cloud.points * scale, cloud.normals),
-            T_base_flange=np.eye(4),
-            joints=None,
-            approach=None,
-            time_s=None,
-            covariates={},
-        )
-        for i, cloud in enumerate(clouds)
+    scaled = [Cloud(cloud.points * scale, cloud.normals) for cloud in clouds]
+    views = [View(f"v{i}", cloud, np.eye(4), None, None, time_s=None, covariates={}) for i, cloud in enumerate(scaled)]
+    return thin_session(bare_session(views, "eye_in_hand"), _POINTS)[1]
+
+
+def bare_session(views: Sequence[View], mount: Mount) -> Session:
+    """A session in mm of which nothing but the views is known."""
+    scanner = Scanner(None, None, None, np.array([0.0, 0.0, 1.0]))
+    return Session(
+        Path(), "", "mm", mount, scanner, robot=None, sphere_radius=None, cad=None, cad_unit=None, views=tuple(views)
     )
-    session = Session(
-        path=Path(),
-        name="",
-        length_unit="mm",
-        mount="eye_in_hand",
-        scanner=Scanner(None, None, None, np.array([0.0, 0.0, 1.0])),
-        robot=None,
-        sphere_radius=None,
-        cad=None,
-        cad_unit=None,
-        views=views,
-    )
-    return thin_session(session, _POINTS)[1]
 
 
 def guess_optical_axis(clouds: Sequence[Cloud]) -> tuple[str, Guess]:

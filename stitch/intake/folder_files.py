@@ -222,6 +222,9 @@ def _stated_pose_files(poses: Path, clouds: set[Path]) -> tuple[list[Path], list
     return [poses], []
 
 
+_NAMES_POSE = re.compile(r"pose|robot|flange|tcp|joint|trajector", re.IGNORECASE)
+
+
 def _choose_pose_files(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[Path], list[Path]]:
     """The one table, or the files that are named alike and are about as many as the clouds."""
     alike: dict[tuple[Path, str, str], list[Path]] = {}
@@ -229,7 +232,7 @@ def _choose_pose_files(folder: Path, candidates: Sequence[Path], clouds: int) ->
         alike.setdefault((file.parent, re.sub(r"\d+", "#", file.stem), file.suffix.lower()), []).append(file)
     sets = [files for files in alike.values() if len(files) > 2 and abs(len(files) - clouds) <= 2]
     single = [files for files in alike.values() if len(files) == 1]
-    groups = sets or [g for g in single if _names_pose(g[0])]
+    groups = sets or [g for g in single if _NAMES_POSE.search(g[0].stem)]
     groups = groups or (len(single) > 1 and [g for g in single if _holds_poses(g[0])]) or single
     if not groups and alike:
         most = max(alike.values(), key=len)
@@ -254,10 +257,6 @@ def _holds_poses(file: Path) -> bool:
         return len(raw.numbers) > 1 and bool(possible_layouts(raw))
     except InputError:
         return False
-
-
-def _names_pose(file: Path) -> bool:
-    return bool(re.search(r"pose|robot|flange|tcp|joint|trajector", file.stem.lower()))
 
 
 # Files that hold the scans of a whole campaign, E57 and Leica's PTX, as one file a scan.

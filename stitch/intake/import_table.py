@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch import frames
 from stitch.controllers import tracker_csv, universal_robots
-from stitch.controllers.program import POSE_COLUMNS, ImportedTable, csv_text, numbered_names, pose_cells
+from stitch.controllers.program import POSE_COLUMNS, ImportedTable, numbered_names, pose_cells
 from stitch.errors import InputError
 from stitch.intake.layouts import POSE_UNITS, ColumnLayout, covariate_columns, pose_units, possible_layouts
 from stitch.intake.pose_tables import read_number_table
@@ -15,6 +15,7 @@ from stitch.intake.raw_poses import PROGRAMS, STRUCTURED, RawPoses, read_raw_pos
 from stitch.intake.readings import Reading, StatedTable, angle_units, readings
 from stitch.reading.clouds import CLOUD_SUFFIXES
 from stitch.units import METRES
+from stitch.writing.session_files import table_text
 
 
 def is_table_of_poses(file: Path) -> bool:
@@ -53,34 +54,27 @@ def import_table(file: Path, unit: str, stated: StatedTable) -> ImportedTable:
         ways = "; or ".join(layout.words for layout in found)
         raise InputError(f"{file}: {ways}; to fix: name the columns with --columns, for example x,y,z,rx,ry,rz")
     layout = found[0]
-    header, cells, words = ["view"], [[name] for name in _view_names(raw)], []
-    clouds = _cloud_names(raw)
-    if clouds is not None:
-        header, cells = [*header, "cloud"], [[*row, cloud] for row, cloud in zip(cells, clouds, strict=True)]
+    columns: dict[str, Sequence[str]] = {"view": _view_names(raw)}
+    count, words = len(columns["view"]), []
+    if (clouds := _cloud_names(raw)) is not None:
+        columns["cloud"] = clouds
     if layout.joints is not None:
         degrees = _table_joints(file, layout, stated)
-        header += [f"j{i + 1}_deg" for i in range(degrees.shape[1])]
-        cells = [[*row, *(f"{q:.9g}" for q in values)] for row, values in zip(cells, degrees, strict=True)]
+        columns |= {f"j{i}_deg": [f"{q:.9g}" for q in joint] for i, joint in enumerate(degrees.T, 1)}
         words.append("joint angles")
     if layout.rotation.shape[1]:
         reading = _table_reading(file, layout, stated)
         file_unit = _table_unit(file, layout, stated)
         T = frames.inverse(reading.T) if stated.inverse else reading.T
         scale = POSE_UNITS[file_unit] / METRES[unit]
-        header += POSE_COLUMNS
-        cells = [[*row, *pose_cells(pose, scale)] for row, pose in zip(cells, T, strict=True)]
+        columns |= zip(POSE_COLUMNS, zip(*(pose_cells(pose, scale) for pose in T), strict=True), strict=True)
         words.append(
             f"{reading.words}, positions in {file_unit}, {'T_flange_base' if stated.inverse else 'T_base_flange'}"
         )
-    rest = covariate_columns(layout, range(len(cells)), raw.time_s)
-    header += rest
-    cells = [[*row, *(column[i] for column in rest.values())] for i, row in enumerate(cells)]
-    return ImportedTable("views.csv", csv_text([header, *cells]), len(cells), "; ".join(words), _warnings(raw))
-
-
-def _warnings(raw: RawPoses) -> tuple[str, ...]:
-    """How times of day were read, or why they are left out."""
-    return (raw.clock.words,) if raw.clock is not None and raw.clock.words else ()
+    columns |= covariate_columns(layout, range(count), raw.time_s)
+    # How times of day were read, or why they are left out.
+    warnings = (raw.clock.words,) if raw.clock is not None and raw.clock.words else ()
+    return ImportedTable("views.csv", table_text(columns), count, "; ".join(words), warnings)
 
 
 def _view_names(raw: RawPoses) -> list[str]:

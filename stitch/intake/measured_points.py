@@ -4,7 +4,6 @@ Tables of a robot's poses or joints and of what a tracker, a camera or a motion 
 paired and read in every way that they can be meant; the way under which one hand-eye fits best is taken.
 """
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from stitch.controllers.program import numbered_names
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array
 from stitch.intake.cloud_pairs import LACKING, Pairing, pairings
-from stitch.intake.first_session import StatedFolder
+from stitch.intake.first_session import StatedFolder, bare_session
 from stitch.intake.folder_files import Guess, clouds_among, list_files
 from stitch.intake.layouts import POSE_UNITS, covariate_columns, pose_units, possible_layouts
 from stitch.intake.measured_tables import (
@@ -38,10 +37,10 @@ from stitch.intake.measured_tables import (
     read_tables,
 )
 from stitch.intake.raw_poses import PROGRAMS, STRUCTURED, TABLES
-from stitch.intake.readings import JOINT_ANGLES, Reading, arm_from_urdf, readings
-from stitch.intake.session_draft import comment_lines, joint_degrees, require_free
+from stitch.intake.readings import JOINT_ANGLES, Reading, readings
+from stitch.intake.session_draft import comment_lines, joint_columns, require_free, robot_lines, session_name
 from stitch.measurement.capture import Capture, build_capture, sightings_of
-from stitch.measurement.session import Mount, Scanner, Session, Sighting, View
+from stitch.measurement.session import Mount, Sighting, View
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
 from stitch.reading.session_folder import SESSION_FORMAT
 from stitch.reading.text_files import WORKBOOKS
@@ -111,7 +110,8 @@ def observed(found: Sequence[Measured], poses: RobotPoses) -> Observed:
         InputError: rows that do not tell which view and which target they belong to.
     """
     first, columns = found[0], found[0].columns
-    names, rows = _row_names(first.table), tuple(range(len(first.points)))
+    names = tuple(texts[0] if texts else "" for texts in first.table.raw.labels)
+    rows = tuple(range(len(first.points)))
     if len(found) == 1 and first.is_probe:
         kept = [i for role, i in columns.items() if not role.startswith("sigma")]
         raw = columns_of(first.table.raw, kept, first.group)
@@ -143,10 +143,6 @@ def _target_names(found: Sequence[Measured]) -> list[str]:
     common = set.intersection(*({*name.split()} for name in names)) if len(names) > 1 else set()
     own = ["-".join(word for word in name.split() if word not in common) for name in names]
     return numbered_names(name or f"t{k + 1}" for k, name in enumerate(own))
-
-
-def _row_names(table: Table) -> tuple[str, ...]:
-    return tuple(texts[0] if texts else "" for texts in table.raw.labels)
 
 
 def _keys(m: Measured) -> list[list[str]]:
@@ -275,11 +271,8 @@ class Way:
     @property
     def T(self) -> Array:
         """(n, 4, 4) of all rows, mm."""
-        return _scaled(self.reading.T, self.unit)
-
-
-def _scaled(T: Array, unit: str) -> Array:
-    return frames.make(T[:, :3, :3], T[:, :3, 3] * (1e3 * POSE_UNITS[unit]))
+        T = self.reading.T
+        return frames.make(T[:, :3, :3], T[:, :3, 3] * (1e3 * POSE_UNITS[self.unit]))
 
 
 def _sighting(seen: Observed, way: Way, view: int) -> Sighting:
@@ -293,25 +286,12 @@ def _sighting(seen: Observed, way: Way, view: int) -> Sighting:
 
 def _capture(seen: Observed, way: Way, views: Sequence[int]) -> Capture:
     """Some of the views as a way reads them, mm."""
-    T = _scaled(way.reading.T[[way.pairing.rows[v] or 0 for v in views]], way.unit)
+    T = way.T[[way.pairing.rows[v] or 0 for v in views]]
     each = [
         View("", None, pose, None, None, time_s=None, covariates={}, sighting=_sighting(seen, way, v))
         for v, pose in zip(views, T, strict=True)
     ]
-    scanner = Scanner(None, None, None, np.array([0.0, 0.0, 1.0]))
-    session = Session(
-        Path(),
-        "",
-        "mm",
-        way.mount,
-        scanner,
-        robot=None,
-        sphere_radius=None,
-        cad=None,
-        cad_unit=None,
-        views=tuple(each),
-    )
-    return build_capture("", (), T, way.mount, sightings_of(session))
+    return build_capture("", (), T, way.mount, sightings_of(bare_session(each, way.mount)))
 
 
 _LEVER_MM = 100.0  # at which a turn of a probe counts
@@ -354,13 +334,9 @@ def candidate_interpretations(
         for unit, point_unit, turn in product(units, [told] if told else ["mm", "m"], turns):
             way = Way(reading, robot, pairing, mount, unit=unit, point_unit=point_unit, turn=turn, misfit=0.0)
             out.append(replace(way, misfit=_misfit(seen, way, _FEW_VIEWS)))
-    out.sort(key=_misfit_of)
+    out.sort(key=lambda way: way.misfit)
     judged = [replace(way, misfit=_misfit(seen, way, _MORE_VIEWS)) for way in out[:_BEST]]
-    return sorted([*judged, *out[_BEST:]], key=_misfit_of)
-
-
-def _misfit_of(way: Way) -> float:
-    return way.misfit
+    return sorted([*judged, *out[_BEST:]], key=lambda way: way.misfit)
 
 
 # What was found, with reasons, and the files of the session.
@@ -427,7 +403,6 @@ def _tables_of(file: Path) -> list[Table]:
 def _guesses(
     found: Sequence[Measured], poses: RobotPoses, seen: Observed, ways: Sequence[Way], stated: StatedFolder
 ) -> tuple[Guess, ...]:
-    """Return each guess with its reason."""
     best = ways[0]
     places = np.array([place for targets in seen.targets for place, _ in targets.values()])
     extent = 1e3 * POSE_UNITS[best.point_unit] * float(np.linalg.norm(np.ptp(places, axis=0)))
@@ -464,10 +439,6 @@ def _guesses(
     )
 
 
-def _turned(way: Way) -> Any:
-    return way.reading.words, way.turn, str(way.robot)
-
-
 def write_measured(folder: Path, made: MeasuredSession, *, force: bool = False) -> None:
     """Write session.toml, views.csv, and points.csv or frames.csv, into a folder, made where there is none.
 
@@ -497,9 +468,7 @@ def _views_columns(made: MeasuredSession, order: Sequence[int], rows: Sequence[i
     named = [made.seen.views[v] or next(iter(raw.labels[row]), "") for v, row in zip(order, rows, strict=True)]
     plain = [re.sub(r"[^\w.+-]+", "-", name).strip("-") or f"p{i + 1:03d}" for i, name in enumerate(named)]
     out: dict[str, Sequence[object]] = {"view": numbered_names(plain)}
-    if reading.layout.joints is not None:
-        joints = joint_degrees(reading)[rows]
-        out |= {f"j{i + 1}_deg": [f"{q:.9g}" for q in joints[:, i]] for i in range(joints.shape[1])}
+    out |= joint_columns(reading, rows)
     if reading.rotation != JOINT_ANGLES:
         out |= {name: list(values) for name, values in pose_columns(made.way.T[rows]).items()}
     out |= covariate_columns(reading.layout, rows, raw.time_s)
@@ -526,8 +495,7 @@ def _file_columns(made: MeasuredSession, order: Sequence[int], names: Sequence[s
 
 def _toml(folder: Path, made: MeasuredSession) -> str:
     """session.toml with every guess as a comment, mm."""
-    name = re.sub(r"[^\w+-]+", "-", made.folder.resolve().name).strip("-") or "session"
-    lines = [f'format = "{SESSION_FORMAT}"', f'name = "{name}"', ""]
+    lines = [f'format = "{SESSION_FORMAT}"', f'name = "{session_name(made.folder)}"', ""]
     lines += [line for guess in made.guesses for line in comment_lines(guess)]
     lines += ['length_unit = "mm"', f'mount = "{made.way.mount}"', ""]
     kind = "camera" if any(CAMERAS.search(f"{m.table.title} {m.group}") for m in made.found) else "tracker"
@@ -537,11 +505,7 @@ def _toml(folder: Path, made: MeasuredSession) -> str:
     if made.way.robot is not None:
         lines.append(tomli_w.dumps({"robot": made.way.robot}))
     elif made.way.reading.rotation == JOINT_ANGLES:
-        urdf, joints = _arm_file(made.poses), made.way.reading.layout.joints
-        assert joints is not None
-        _, base, flange = arm_from_urdf(urdf, joints.shape[1])
-        path = Path(os.path.relpath(urdf, folder)).as_posix()
-        lines += ["[robot]", f'urdf = "{path}"', f'base_link = "{base}"', f'flange_link = "{flange}"']
+        lines += robot_lines(folder, _arm_file(made.poses), made.way.reading)
     return "\n".join(lines) + "\n"
 
 

@@ -134,33 +134,25 @@ _TF_ECHO = re.compile(rf"Translation:\s*{_list_of(3)}.*?Quaternion[^\[]*{_list_o
 
 
 def _robtarget_rows(text: str) -> list[PoseRow]:
-    def row(n: list[float]) -> dict[str, float]:
-        return dict(zip(("x [mm]", "y [mm]", "z [mm]", "qw", "qx", "qy", "qz"), n, strict=True))
-
-    return _matched_rows(_ROBTARGET, text, row)
+    return _matched_rows(_ROBTARGET, text, ("x [mm]", "y [mm]", "z [mm]", "qw", "qx", "qy", "qz"))
 
 
 def _ur_rows(text: str) -> list[PoseRow]:
-    def row(n: list[float]) -> dict[str, float]:
-        return dict(zip(("x [m]", "y [m]", "z [m]", "rvx [rad]", "rvy [rad]", "rvz [rad]"), n, strict=True))
-
-    return _matched_rows(_UR_POSE, text, row)
+    return _matched_rows(_UR_POSE, text, ("x [m]", "y [m]", "z [m]", "rvx [rad]", "rvy [rad]", "rvz [rad]"))
 
 
 def _tf_echo_rows(text: str) -> list[PoseRow]:
-    def row(n: list[float]) -> dict[str, float]:
-        return dict(zip(("x [m]", "y [m]", "z [m]", "qx", "qy", "qz", "qw"), n, strict=True))
-
-    rows = _matched_rows(_TF_ECHO, text, row)
+    rows = _matched_rows(_TF_ECHO, text, ("x [m]", "y [m]", "z [m]", "qx", "qy", "qz", "qw"))
     times = _floats(re.findall(rf"At time ({_POINTED})", text))
     if len(times) == len(rows):
         return [((), {"time_s": time} | numbers) for time, (_, numbers) in zip(times, rows, strict=True)]
     return [((), numbers) for _, numbers in rows]
 
 
-def _matched_rows(pattern: re.Pattern[str], text: str, row: Callable[[list[float]], dict[str, float]]) -> list[PoseRow]:
+def _matched_rows(pattern: re.Pattern[str], text: str, names: Sequence[str]) -> list[PoseRow]:
     found = list(pattern.finditer(text))
-    return _labelled(text, [m.span() for m in found], [row(_floats(m.groups())) for m in found]) if found else []
+    rows = [dict(zip(names, _floats(m.groups()), strict=True)) for m in found]
+    return _labelled(text, [m.span() for m in found], rows) if found else []
 
 
 # Pose files of HALCON, one pose each.

@@ -18,7 +18,7 @@ from stitch.intake.clock_times import ClockTimes, find_clock_column
 from stitch.intake.pose_formats import PoseRow, joint_state_rows, open3d_rows, read_pose_text
 from stitch.intake.pose_tables import NumberTable, parse_number_table, with_one_header
 from stitch.reading.range_image import poses_in_scans, times_in_scans
-from stitch.reading.text_files import WORKBOOKS, read_any_text, read_text, require_file, shortened, workbook_sheets
+from stitch.reading.text_files import WORKBOOKS, read_any_text, read_text, reason_of, require_file, workbook_sheets
 from stitch.reading.yaml_file import parse_yaml
 
 # Poses in JSON and YAML: lists, matrices and mappings, however deep, as rows of named numbers.
@@ -323,8 +323,7 @@ def _from_json(file: Path, text: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{file}: not valid JSON ({shortened(reason)}); to fix: correct it there") from None
+        raise InputError(f"{file}: not valid JSON ({reason_of(error)}); to fix: correct it there") from None
 
 
 def _from_numpy(file: Path) -> RawPoses:
@@ -332,8 +331,7 @@ def _from_numpy(file: Path) -> RawPoses:
         loaded = np.load(file, allow_pickle=False)
         arrays = {file.stem: loaded} if isinstance(loaded, np.ndarray) else {k: loaded[k] for k in loaded.files}
     except (ValueError, OSError, EOFError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{file}: cannot be read ({shortened(reason)}); to fix: save plain numbers") from None
+        raise InputError(f"{file}: cannot be read ({reason_of(error)}); to fix: save plain numbers") from None
     fitting = [a for a in arrays.values() if a.dtype.kind in "fiu" and a.ndim in (2, 3) and a.size]
     if not fitting:
         raise InputError(f"{file}: holds no array (V, C) or (V, 4, 4); to fix: save the poses as one of these")

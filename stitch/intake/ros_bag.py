@@ -174,34 +174,37 @@ def identify_frames(tree: TransformTree, scanner: str, named: Sequence[str]) -> 
     if unknown is not None:
         raise InputError(f"--frames: tf has no {unknown}; to fix: use {', '.join(tree.names)}")
     path = tree.above(scanner)[::-1]
-    moving = [i for i in range(1, len(path)) if tree.moves(path[i])]
+    moving = _moving_places(tree, path)
     known = len(path) > 1
     if len(named) > 1:
         base, flange, reason = named[0], named[1], "stated with --frames"
         carried: bool | None = None if scanner not in tree.names else bool(moving) and flange in path
-    elif moving:
-        first, last = moving[0], moving[-1]
-        base = _most_usual_name(path[:first], _BASES) or path[first - 1]
-        # Tools that are fixed to the last link beside the scanner's way count too.
-        fixed = [f for f in tree.names if path[last] in tree.above(f) and _is_rigid(tree, f, path[last])]
-        flange = _most_usual_name(fixed, _FLANGES) or path[last]
-        carried, reason = True, f"the scanner's frame {scanner} moves with it"
     else:
-        ends = [f for f in tree.names if tree.moves(f)]
-        if not ends:
-            raise InputError("tf: no frame moves, so that nothing says where the arm is; to fix: record /tf of the arm")
-        last_end = max(ends, key=lambda f: len(tree.above(f)))
-        chain = tree.above(last_end)[::-1]
-        first = next(i for i in range(1, len(chain)) if tree.moves(chain[i]))
+        chain, carried, reason = path, True, f"the scanner's frame {scanner} moves with it"
+        if not moving:
+            ends = [f for f in tree.names if tree.moves(f)]
+            if not ends:
+                raise InputError(
+                    "tf: no frame moves, so that nothing says where the arm is; to fix: record /tf of the arm"
+                )
+            chain = tree.above(max(ends, key=lambda f: len(tree.above(f))))[::-1]
+            moving = _moving_places(tree, chain)
+            carried, reason = False, f"the scanner's frame {scanner} does not move"
+            if scanner not in tree.names:
+                carried, reason = None, f"tf has no frame {scanner}"
+            known = known and bool(set(path) & set(chain))
+        first, last = moving[0], chain[moving[-1]]
         base = _most_usual_name(chain[:first], _BASES) or chain[first - 1]
-        fixed = [f for f in tree.names if last_end in tree.above(f) and _is_rigid(tree, f, last_end)]
-        flange = _most_usual_name(fixed, _FLANGES) or last_end
-        carried, reason = False, f"the scanner's frame {scanner} does not move"
-        if scanner not in tree.names:
-            carried, reason = None, f"tf has no frame {scanner}"
-        known = known and bool(set(path) & set(chain))
+        # Tools that are fixed to the last link beside the scanner's way count too.
+        fixed = [f for f in tree.names if last in tree.above(f) and _is_rigid(tree, f, last)]
+        flange = _most_usual_name(fixed, _FLANGES) or last
     mount = None if carried is None else "eye_in_hand" if carried else "eye_to_hand"
     return BagFrames(base, flange, scanner, mount, reason, known)
+
+
+def _moving_places(tree: TransformTree, chain: Sequence[str]) -> list[int]:
+    """Places in a chain, from its root, of frames that move in their parents."""
+    return [i for i in range(1, len(chain)) if tree.moves(chain[i])]
 
 
 def _most_usual_name(frames: Sequence[str], usual_names: Sequence[str]) -> str | None:
@@ -350,35 +353,19 @@ def recorded_tree(contents: BagContents) -> TransformTree:
     tree = TransformTree(contents.edges)
     if not tree.still or not contents.joints or contents.urdf is None:
         return tree
-    for base, flange in _link_pairs(contents.urdf):
-        names = _turning_joints(contents.urdf, base, flange)
-        rows = [(time, [q[name] for name in names]) for time, q in contents.joints if all(name in q for name in names)]
-        if names and rows:
-            T = _flange_poses(contents.urdf, base, flange, np.array([q for _, q in rows]))
-            moved = [(time, base, flange, pose, False) for (time, _), pose in zip(rows, T, strict=True)]
-            # Links between them, published as fixed, would hold the flange elsewhere.
-            return TransformTree([edge for edge in contents.edges if edge[2] != flange] + moved)
-    return tree
-
-
-def _link_pairs(urdf: str) -> list[tuple[str, str]]:
-    with _temporary_urdf(urdf) as file:
-        return arm_link_pairs(file)
-
-
-def _flange_poses(urdf: str, base: str, flange: str, joints: Array) -> Array:
-    """T_base_flange (M, 4, 4), m, of joint angles (M, n), rad."""
-    with _temporary_urdf(urdf) as file:
-        return np.asarray(forward(robot_from_urdf(file, base, flange, "m", _GRAVITY), joints))
-
-
-@contextmanager
-def _temporary_urdf(urdf: str) -> Iterator[Path]:
-    """The text of a bag as the file that robots are read from."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "robot.urdf"
-        file.write_text(urdf, encoding="utf-8")
-        yield file
+        file.write_text(contents.urdf, encoding="utf-8")
+        for base, flange in arm_link_pairs(file):
+            names = _turning_joints(contents.urdf, base, flange)
+            rows = [(t, [q[name] for name in names]) for t, q in contents.joints if all(name in q for name in names)]
+            if names and rows:
+                robot = robot_from_urdf(file, base, flange, "m", _GRAVITY)
+                T = forward(robot, np.array([q for _, q in rows]))
+                moved = [(time, base, flange, pose, False) for (time, _), pose in zip(rows, T, strict=True)]
+                # Links between them, published as fixed, would hold the flange elsewhere.
+                return TransformTree([edge for edge in contents.edges if edge[2] != flange] + moved)
+    return tree
 
 
 def interpolated_joints(contents: BagContents, names: list[str], times: Array) -> Array | None:
@@ -449,14 +436,10 @@ def depth_array(message: Any, camera: Any) -> Array:
     width = message.width * np.dtype(kind).itemsize
     z = np.ascontiguousarray(rows[:, :width]).view(order + kind).astype(float) * scale
     z = np.where(np.isfinite(z) & (z > 0), z, np.nan)
-    fx, cx, fy, cy = (float(_camera_matrix(camera)[i]) for i in (0, 2, 4, 5))
+    K = camera.k if hasattr(camera, "k") else camera.K  # in ROS 2, in ROS 1
+    fx, cx, fy, cy = (float(K[i]) for i in (0, 2, 4, 5))
     v, u = np.mgrid[: message.height, : message.width]
     return np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=-1)
-
-
-def _camera_matrix(camera: Any) -> Any:
-    """K, in ROS 1 and 2."""
-    return camera.k if hasattr(camera, "k") else camera.K
 
 
 _FEWEST = 3
@@ -602,7 +585,6 @@ def _write_scans(bag: Path, topic: str, contents: BagContents, chosen: _ChosenSc
 
 
 def _camera_info(contents: BagContents, topic: str, where: str) -> Any:
-    """The CameraInfo beside a topic of images."""
     beside = topic.rsplit("/", 1)[0] + "/camera_info"
     if beside not in contents.cameras:
         raise InputError(f"{where}: a depth image needs {beside}; to fix: record that topic too")

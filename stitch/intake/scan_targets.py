@@ -53,9 +53,6 @@ def _relative_motion(first: Sighting, second: Sighting) -> Array | None:
     return None if extent[1] < _LINE * extent[0] else align_points(b, a)
 
 
-_METRES_PER_MM = 1e-3
-
-
 @dataclass(frozen=True)
 class TargetSearch:
     """What a person says that the scans show."""
@@ -83,7 +80,7 @@ class ViewScans:
     @property
     def to_mm(self) -> float:
         """Millimetres per unit."""
-        return self.unit / _METRES_PER_MM
+        return self.unit / MM
 
 
 def scans_of_session(session: Session) -> ViewScans:

@@ -1,12 +1,10 @@
 """session.toml with every guess as a comment beside its reason, and views.csv; written both or not at all."""
 
-import csv
-import io
 import os
 import re
 import shlex
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +21,7 @@ from stitch.intake.scan_targets import points_columns
 from stitch.reading.session_folder import SESSION_FORMAT
 from stitch.system.files import whole_file
 from stitch.units import METRES
-from stitch.writing.session_files import pose_columns, write_table
+from stitch.writing.session_files import pose_columns, table_text, write_table
 
 _WIDTH = 118
 
@@ -88,7 +86,7 @@ def length_unit(first: FirstSession) -> str:
 def toml_text(folder: Path, first: FirstSession) -> str:
     """session.toml."""
     told = {guess.what: guess for guess in first.guesses}
-    lines = [f'format = "{SESSION_FORMAT}"', f'name = "{_session_name(first.files.folder)}"']
+    lines = [f'format = "{SESSION_FORMAT}"', f'name = "{session_name(first.files.folder)}"']
     lines += ["", "# What follows as a comment alone was read so into views.csv. To read it otherwise:"]
     lines += [f"# stitch init {shlex.quote(str(first.files.folder))} --force, with the flag that is named beside it."]
     for what in ("files", "pairing", "columns", "rotation"):
@@ -103,12 +101,8 @@ def toml_text(folder: Path, first: FirstSession) -> str:
         lines += ["", "# stated with --within: what lies beyond stands still before the scanner", f"within = {corners}"]
     if first.sphere_mm is not None:
         lines += ["", "[sphere]", f"radius = {first.sphere_mm * MM / METRES[unit]:.9g}"]
-    reading = first.choice.best.interpretation.reading
-    urdf = first.files.urdf
-    if reading.layout.joints is not None and urdf is not None:
-        path = Path(os.path.relpath(urdf, folder)).as_posix()
-        _, base, flange = arm_from_urdf(urdf, reading.layout.joints.shape[1])
-        lines += ["", "[robot]", f'urdf = "{path}"', f'base_link = "{base}"', f'flange_link = "{flange}"']
+    if robot := robot_lines(folder, first.files.urdf, first.choice.best.interpretation.reading):
+        lines += ["", *robot]
     return "\n".join(lines) + "\n"
 
 
@@ -123,7 +117,17 @@ def comment_lines(guess: Guess, with_flag: bool = False) -> list[str]:
     return [f"# {'  ' * bool(i)}{line}" for i, line in enumerate(lines)]
 
 
-def _session_name(folder: Path) -> str:
+def robot_lines(folder: Path, urdf: Path | None, reading: Reading) -> list[str]:
+    """Return the table [robot] of session.toml, in lines; none without joints or a URDF."""
+    joints = reading.layout.joints
+    if joints is None or urdf is None:
+        return []
+    path = Path(os.path.relpath(urdf, folder)).as_posix()
+    _, base, flange = arm_from_urdf(urdf, joints.shape[1])
+    return ["[robot]", f'urdf = "{path}"', f'base_link = "{base}"', f'flange_link = "{flange}"']
+
+
+def session_name(folder: Path) -> str:
     """A name for the session that can be that of its run."""
     return re.sub(r"[^\w+-]+", "-", folder.resolve().name).strip("-") or "session"
 
@@ -138,19 +142,13 @@ def views_text(folder: Path, first: FirstSession) -> str:
         "cloud": [Path(os.path.relpath(cloud, folder)).as_posix() for cloud in clouds],
     }
     reading = first.choice.best.interpretation.reading
-    if reading.layout.joints is not None:
-        joints = joint_degrees(reading)[rows]
-        columns |= {f"j{i + 1}_deg": [f"{q:.9g}" for q in joints[:, i]] for i in range(joints.shape[1])}
+    columns |= joint_columns(reading, rows)
     if reading.rotation != JOINT_ANGLES:
         columns |= {
             name: [f"{x:.9g}" for x in values] for name, values in pose_columns(_flange_poses(first, rows)).items()
         }
     columns |= covariate_columns(reading.layout, rows, first.raw.time_s)
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
-    return out.getvalue()
+    return table_text(columns)
 
 
 def _clouds_in_order(first: FirstSession) -> tuple[int, ...]:
@@ -167,12 +165,14 @@ def _flange_poses(first: FirstSession, rows: list[int]) -> Array:
     return first.mounting.flange(frames.make(T[:, :3, :3], T[:, :3, 3] * scale))
 
 
-def joint_degrees(reading: Reading) -> Array:
-    """(V, n) of a reading that has joints."""
+def joint_columns(reading: Reading, rows: Sequence[int]) -> dict[str, list[str]]:
+    """Columns j1_deg, j2_deg … of views.csv for some rows; none of a reading without joints."""
     joints = reading.layout.joints
-    assert joints is not None
+    if joints is None:
+        return {}
     in_radians = reading.angle_unit == "rad" if reading.rotation == JOINT_ANGLES else np.abs(joints).max() <= 2 * np.pi
-    return np.degrees(joints) if in_radians else joints
+    degrees = (np.degrees(joints) if in_radians else joints)[list(rows)]
+    return {f"j{i}_deg": [f"{q:.9g}" for q in column] for i, column in enumerate(degrees.T, 1)}
 
 
 def _view_names(clouds: list[Path], folder: Path) -> list[str]:

@@ -84,15 +84,12 @@ def _triggered_rows(raw: RawPoses, count: int) -> Indices | None:
     return None
 
 
-def _rank(reading: Reading) -> int:
-    return -reading.rank
-
-
 def _rows_at_stops(found: Sequence[Reading], count: int) -> Indices:
     """Return the middle rows of the stops, of the longest ones where others are much shorter."""
     best: list[list[int]] = []
     # Where the arm stands, any order of angles shows it; a vector of rotation and quaternions have another sign at π.
-    usual = {(r.layout.words, r.angle_unit, r.rotation == "rotation-vector"): r for r in sorted(found, key=_rank)}
+    found = sorted(found, key=lambda reading: -reading.rank)
+    usual = {(r.layout.words, r.angle_unit, r.rotation == "rotation-vector"): r for r in found}
     for reading in usual.values():
         unit = reading.layout.length_unit or pose_units(reading.T[:, :3, 3])[0]
         metres = 1e-3 if reading.rotation == JOINT_ANGLES else POSE_UNITS[unit]
