@@ -58,8 +58,7 @@ def read(file: Path, text: str) -> list[TrackerPoint]:
     if angles and not re.search(r"deg|°", first):
         raise InputError(
             f"{file} line 1: rx, ry, rz may be degrees or a rotation vector; to fix: write Rx (deg) … for a "
-            "tracker's angles, "
-            "actual_TCP_pose_0 … for a UR's pose"
+            "tracker's angles, actual_TCP_pose_0 … for a UR's pose"
         )
     out: list[TrackerPoint] = []
     reader = csv.reader(text.splitlines(), delimiter=separator, skipinitialspace=True)

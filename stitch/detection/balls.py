@@ -217,7 +217,7 @@ def _best_matching(
             if all(
                 view.R_flange is None
                 or flange is None
-                or abs(_angle(R.T @ T[:3, :3]) - _angle(flange.T @ view.R_flange)) <= _ANGLE
+                or abs(frames.angle_between(R, T) - frames.angle_between(flange, view.R_flange)) <= _ANGLE
                 for R, flange in turned
             )
         ]
@@ -257,10 +257,6 @@ def _matching_motion(
     own, other = view.centres[[b for b, _ in matching]], arrangement.places[[k for _, k in matching]]
     T = align_points(own, other)
     return T, float(np.sqrt(np.mean(np.sum((other - frames.transform(T, own)) ** 2, axis=1))))
-
-
-def _angle(R: Array) -> float:
-    return float(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
 
 
 def _extend_arrangement(

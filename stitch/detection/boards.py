@@ -296,7 +296,6 @@ _SCALE_TOLERANCE = 0.03
 # Corners so many sigmas off the drawing are wrong.
 _CORNER_GATE = 5.0
 _MIN_SIGMA_FACTOR = 0.3
-_MIN_PLACED_CORNERS = 4
 
 
 @dataclass(frozen=True)
@@ -332,7 +331,7 @@ def boards_in(image: RangeImage, board: Board, cv2: Any) -> list[PlacedBoard]:
         nearest = np.where(apart > 0, apart, np.inf).min(axis=1)
         points, sigma = lift_points(image, corners.pixels, window * nearest, _PIXEL_SIGMA)
         placed.append(PlacedBoard(corners.names, points, sigma, corners.drawing).only(np.isfinite(points[:, 0])))
-    return [p for p in placed if len(p.names) >= _MIN_PLACED_CORNERS]
+    return [p for p in placed if len(p.names) >= _MIN_BOARD_CORNERS]
 
 
 def board_sightings(
@@ -356,7 +355,7 @@ def board_sightings(
     _require_size(seen, board, to_mm)
     kept = [[_consistent_corners(placed) for placed in view] for view in views]
     gone = sum(len(p.names) for p in seen) - sum(len(p.names) for view in kept for p in view)
-    judged = [p for view in kept for p in view if len(p.names) >= _MIN_PLACED_CORNERS]
+    judged = [p for view in kept for p in view if len(p.names) >= _MIN_BOARD_CORNERS]
     freedom = sum(3 * len(p.names) - 6 for p in judged)
     squares = sum(float((_drawing_deviation(p) ** 2).sum()) for p in judged)
     factor = max(np.sqrt(squares / freedom), _MIN_SIGMA_FACTOR) if freedom else 1.0
@@ -391,7 +390,7 @@ def _median_corner_distance(points: Array) -> float:
 def _consistent_corners(placed: PlacedBoard) -> PlacedBoard:
     """The corners that lie where the drawing has them, within what they scatter by themselves."""
     for _ in range(len(placed.names)):
-        if len(placed.names) <= _MIN_PLACED_CORNERS:
+        if len(placed.names) <= _MIN_BOARD_CORNERS:
             break
         off = _drawing_deviation(placed)
         worst = int(np.argmax(off))
