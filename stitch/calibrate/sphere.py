@@ -103,8 +103,7 @@ def _require_radius(session: Session, fitted_radius: float, sigma: float) -> Non
     if abs(fitted_radius - stated) > max(_OTHER_RADIUS * stated, _RADIUS_SIGMAS * sigma):
         raise InputError(
             f"{session.path / 'session.toml'}: sphere.radius is {stated:.4g}, the scans show {fitted_radius:.4g} "
-            f"± {sigma:.2g} "
-            f"{session.length_unit}; to fix: correct it, or cloud_unit"
+            f"± {sigma:.2g} {session.length_unit}; to fix: correct it, or cloud_unit"
         )
 
 
@@ -241,15 +240,14 @@ def sphere_document(result: SphereCalibration, session: Session) -> dict[str, An
         },
         "weak": sphere_weak_components(result, unit),
         "notes": sphere_notes(result, unit),
-        "views": [_view_row(*row) for row in zip(result.views, fit.view_rms, result.signs, strict=True)],
-    }
-
-
-def _view_row(view: SphereView, rms: float, sign: float) -> dict[str, Any]:
-    return {
-        "view": view.name,
-        "points": len(view.points),
-        "dropped": view.dropped,
-        "rms": float(rms),
-        "side": int(sign) if view.is_line else None,
+        "views": [
+            {
+                "view": view.name,
+                "points": len(view.points),
+                "dropped": view.dropped,
+                "rms": float(rms),
+                "side": int(sign) if view.is_line else None,
+            }
+            for view, rms, sign in zip(result.views, fit.view_rms, result.signs, strict=True)
+        ],
     }

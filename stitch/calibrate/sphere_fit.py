@@ -152,11 +152,6 @@ class SphereState:
         return SphereState(self.T_mount @ frames.exp(x[:6]), self.centre + x[6:9], radius)
 
 
-def sphere_distances(G: Array, points: Array, state: SphereState) -> Array:
-    """Distances (N,) of one view's points (N, 3) from the sphere, positive outside."""
-    return np.asarray(np.linalg.norm(frames.transform(G @ state.T_mount, points) - state.centre, axis=1) - state.radius)
-
-
 def _residuals(G: Array, views: Sequence[SphereView], state: SphereState) -> tuple[list[Array], list[Array]]:
     """Predicted less measured circle or sphere of each view, (k + 1,), and its response to a shift, (k + 1, 3)."""
     seen = frames.transform(frames.inverse(G @ state.T_mount), state.centre[None])[:, 0]
@@ -481,7 +476,8 @@ def fit_sphere(
     if not by_views:
         found = _reweight(G, views, found, _points_weights(views, radius))
     state, statistics = found.state, _statistics(found, views, free)
-    off = [sphere_distances(G[v], view.points, state) for v, view in enumerate(views)]
+    arms = [frames.transform(T, v.points) - state.centre for T, v in zip(G @ state.T_mount, views, strict=True)]
+    off = [np.linalg.norm(arm, axis=1) - state.radius for arm in arms]
     return SphereFit(
         T_mount=state.T_mount,
         centre=state.centre,

@@ -17,7 +17,7 @@ from stitch.closed_form.hand_eye import axis_spread, motions_from_first, park_ma
 from stitch.errors import NoResultError
 from stitch.frames import Array
 from stitch.measurement.session import Session
-from stitch.reading.session_tables import MeasuredFrames, read_frames
+from stitch.reading.session_tables import read_frames
 from stitch.statistics.distributions import mad_sigma
 from stitch.statistics.least_squares import grouped_inflation
 
@@ -156,13 +156,10 @@ def _normal_equations(jacobian: Array, e: Array, robust: bool) -> tuple[Array, A
 def _residual_scatter(e: Array, robust: bool) -> tuple[float, float]:
     """σ of rotations and of translations; each half of the residuals pays for half of the unknowns."""
     free = max(1 - _UNKNOWNS / e.size, 1 / e.size)
-    rotation, translation = (mad_sigma(half) if robust else _rms(half) for half in (e[:, :3], e[:, 3:]))
+    halves = (e[:, :3], e[:, 3:])
+    rotation, translation = (mad_sigma(half) if robust else float(np.sqrt(np.mean(half**2))) for half in halves)
     # Exact data have no scatter; what rounding leaves of lengths keeps the weights finite.
     return max(rotation / np.sqrt(free), 1e-12), max(translation / np.sqrt(free), 1e-9)
-
-
-def _rms(e: Array) -> float:
-    return float(np.sqrt(np.mean(e**2)))
 
 
 # What a calibrated hand-eye's covariance says: which components are weak, and how little the wrist turned.
@@ -281,7 +278,8 @@ def calibrate_tracker(session: Session) -> TrackerCalibration:
     A = np.array([flange[name] for name in measured.views])
     eye_to_hand = session.mount == "eye_to_hand"
     B = measured.T_sensor_probe if eye_to_hand else frames.inverse(measured.T_sensor_probe)
-    fit = refine_axzb(A, B, weights=_pose_weights(measured), robust=True, groups=_neighbourhoods(A))
+    weights = None if measured.sigma is None else (np.median(measured.sigma) / measured.sigma) ** 2
+    fit = refine_axzb(A, B, weights=weights, robust=True, groups=_neighbourhoods(A))
     if fit.sigma[0] > _UNRELATED:
         raise NoResultError(
             f"flange poses and frames.csv do not fit together (rotations scatter by {np.degrees(fit.sigma[0]):.0f}°); "
@@ -295,12 +293,6 @@ def _neighbourhoods(A: Array) -> Array | None:
     if len(A) < _VIEWS_PER_PLACE * _PLACES:
         return None
     return np.asarray(kmeans2(A[:, :3, 3], _PLACES, minit="++", rng=0)[1])
-
-
-def _pose_weights(measured: MeasuredFrames) -> Array | None:
-    if measured.sigma is None:
-        return None
-    return np.asarray((np.median(measured.sigma) / measured.sigma) ** 2)
 
 
 def tracker_document(result: TrackerCalibration, session: Session) -> dict[str, Any]:
