@@ -18,7 +18,7 @@ from stitch import frames
 from stitch.closed_form.feature_matching import align_points
 from stitch.errors import InputError
 from stitch.frames import Array, Indices, Mask
-from stitch.measurement.scan import prepare_scan
+from stitch.measurement.scan import Scan, prepare_scan
 from stitch.measurement.session import Sighting
 from stitch.system.threads import parallel
 
@@ -296,13 +296,6 @@ _ROUGHLY, _ROUGHLY_COVERED = 0.06, 0.6
 _THINNEST, _THICKEST = 150, 200_000
 
 
-@dataclass(frozen=True)
-class _ThinningLevel:
-    points: Array  # (N, 3)
-    normals: Array  # (N, 3) towards the scanner
-    spacing: float
-
-
 def find_balls(points: Array, limits: tuple[float, float] = (0.0, np.inf)) -> list[Ball]:
     """Find convex balls in a scan (N, 3) seen from the origin, the one with most points first; radii free.
 
@@ -314,8 +307,8 @@ def find_balls(points: Array, limits: tuple[float, float] = (0.0, np.inf)) -> li
         return []
     noise = prepare_scan("", points, np.arange(0, len(points), max(1, len(points) // 2000))).noise
     found: list[Ball] = []
-    for level in _thinning_levels(points, *limits):
-        for centre, radius in _candidates(level):
+    for scan, spacing in _thinning_levels(points, *limits):
+        for centre, radius in _candidates(scan, spacing):
             if any(np.linalg.norm(centre - ball.centre) < 0.5 * ball.radius for ball in found):
                 continue
             ball = _confirmed_ball(points, centre, radius, noise)
@@ -329,9 +322,9 @@ def find_balls(points: Array, limits: tuple[float, float] = (0.0, np.inf)) -> li
     return out
 
 
-def _thinning_levels(points: Array, min_radius: float, max_radius: float) -> list[_ThinningLevel]:
-    """Ever thinner scans, from the scan's own spacing on; those that show balls of the radii looked for."""
-    out: list[_ThinningLevel] = []
+def _thinning_levels(points: Array, min_radius: float, max_radius: float) -> list[tuple[Scan, float]]:
+    """Ever thinner scans with their spacing, from the scan's own on; those that show balls of the radii looked for."""
+    out: list[tuple[Scan, float]] = []
     spacing = float(np.median(cKDTree(points).query(points[:: max(1, len(points) // 500)], k=2)[0][:, 1]))
     size = 1.5 * max(spacing, 1e-9 * float(np.ptp(points)))
     while True:
@@ -339,8 +332,7 @@ def _thinning_levels(points: Array, min_radius: float, max_radius: float) -> lis
         if len(thin) < _THINNEST:
             return out
         if len(thin) <= _THICKEST and size * _RADII[1] > min_radius:
-            scan = prepare_scan("", thin)
-            out.append(_ThinningLevel(scan.points, scan.normals, size))
+            out.append((prepare_scan("", thin), size))
         size *= 2.0
         if size * _RADII[0] > max_radius:
             return out
@@ -354,18 +346,18 @@ def _thinned(points: Array, size: float) -> Array:
     return np.stack([np.bincount(voxel, column) / count for column in points.T], axis=1)
 
 
-def _candidates(level: _ThinningLevel) -> list[tuple[Array, float]]:
+def _candidates(scan: Scan, spacing: float) -> list[tuple[Array, float]]:
     """Centres and radii that many pairs agree on, the best first."""
     rng = np.random.default_rng(0)
-    N, count = len(level.points), min(_NEIGHBOURS, len(level.points) - 1)
-    _, near = cKDTree(level.points).query(level.points, k=count + 1)
+    N, count = len(scan.points), min(_NEIGHBOURS, len(scan.points) - 1)
+    _, near = cKDTree(scan.points).query(scan.points, k=count + 1)
     first = np.repeat(np.arange(N), _PAIRS)
     second = near[first, rng.integers(1, count + 1, len(first))]
-    apart, turn = level.points[first] - level.points[second], level.normals[first] - level.normals[second]
+    apart, turn = scan.points[first] - scan.points[second], scan.normals[first] - scan.normals[second]
     square = np.einsum("ij,ij->i", turn, turn)
     radius = np.einsum("ij,ij->i", apart, turn) / np.maximum(square, 1e-12)
-    ends = [level.points[i] - radius[:, None] * level.normals[i] for i in (first, second)]
-    good = (square > _MIN_NORMAL_ANGLE**2) & (radius > _RADII[0] * level.spacing) & (radius < _RADII[1] * level.spacing)
+    ends = [scan.points[i] - radius[:, None] * scan.normals[i] for i in (first, second)]
+    good = (square > _MIN_NORMAL_ANGLE**2) & (radius > _RADII[0] * spacing) & (radius < _RADII[1] * spacing)
     good &= np.linalg.norm(ends[0] - ends[1], axis=1) < _MIN_PAIR_DISTANCE * radius
     centre, radius = (ends[0] + ends[1])[good] / 2, radius[good]
     if len(centre) > _MOST:
@@ -435,15 +427,6 @@ def _even_directions() -> Array:
 _STATED_RADIUS_SHARE, _STATED_RADIUS_SIGMAS = 0.02, 4.0
 # Radii around the stated ones that are looked at first.
 _AROUND = 1.5
-
-
-@dataclass(frozen=True)
-class _AgreedBall:
-    """One ball of one view, with the radius that all views agree on."""
-
-    ball: Ball
-    radius: float
-    scatter: float  # of the radius over the views, beyond what a view's own points explain
 
 
 def ball_sightings(
@@ -525,8 +508,11 @@ def _radius_error(balls: Sequence[Sequence[Ball]], stated: Sequence[float], to_m
 
 def _agree_on_radius(
     clouds: Sequence[Array | None], balls: Sequence[Sequence[Ball]], stated: Sequence[float]
-) -> list[list[_AgreedBall]]:
-    """Fit the balls anew with one radius for each size: the one stated, or the mean over the views."""
+) -> list[list[tuple[Ball, float]]]:
+    """Fit the balls anew with one radius for each size: the one stated, or the mean over the views.
+
+    Beside each ball stands the scatter of the radius over the views, beyond what a view's own points explain.
+    """
     every = [ball for view in balls for ball in view]
     radii = np.array([ball.radius for ball in every])
     out = []
@@ -541,13 +527,13 @@ def _agree_on_radius(
             assert cloud is not None
             local = cloud[np.linalg.norm(cloud - ball.centre, axis=1) < 1.3 * radius]
             fitted = refine_ball(local, ball.centre, ball.radius, known=radius)
-            own.append(_AgreedBall(fitted, radius, float(np.sqrt(max(spread - noise, 0.0)))))
+            own.append((fitted, float(np.sqrt(max(spread - noise, 0.0)))))
         out.append(own)
     return out
 
 
-def _view_balls(balls: Sequence[_AgreedBall], R_flange: Array | None) -> ViewBalls:
+def _view_balls(balls: Sequence[tuple[Ball, float]], R_flange: Array | None) -> ViewBalls:
     # A radius that differs from view to view is an error of the scanner: the centre has one of that size too.
-    sigma = [np.hypot(_sigma_of_centre(s.ball), s.scatter) for s in balls]
-    centres = np.array([s.ball.centre for s in balls]).reshape(-1, 3)
-    return ViewBalls(centres, np.array(sigma), np.array([s.radius for s in balls]), R_flange)
+    sigma = [np.hypot(_sigma_of_centre(ball), scatter) for ball, scatter in balls]
+    centres = np.array([ball.centre for ball, _ in balls]).reshape(-1, 3)
+    return ViewBalls(centres, np.array(sigma), np.array([ball.radius for ball, _ in balls]), R_flange)

@@ -10,7 +10,6 @@ import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -33,24 +32,18 @@ from stitch.watch.run_record import Estimate, RunRecord
 _EPOCH = 1e9
 
 
-@dataclass(frozen=True)
-class SessionConditions:
-    """Of one session."""
-
-    time: float  # s since 1970, UTC
-    time_from: str
-    covariates: dict[str, float]  # means over the views
-
-
-def session_conditions(session: Path, result: Path) -> SessionConditions:
+def session_conditions(session: Path, result: Path) -> tuple[float, str, dict[str, float]]:
     """What views.csv says; where it has gone, the time of a run's result.json.
+
+    Returns:
+        The time, s since 1970, UTC, how that is known, and the covariates' means over the views.
 
     Raises:
         InputError: views.csv is no table.
     """
     file = session / "views.csv"
     if not file.is_file():
-        return SessionConditions(result.stat().st_mtime, "file time of result.json", {})
+        return result.stat().st_mtime, "file time of result.json", {}
     header, lines = read_csv_lines(file)
     rows = [(line, dict(zip(header, cells, strict=True))) for line, cells in lines]
     if not rows:
@@ -61,8 +54,8 @@ def session_conditions(session: Path, result: Path) -> SessionConditions:
     times = columns.pop("time_s", [])
     covariates = {name: float(np.mean(numbers)) for name, numbers in columns.items() if numbers}
     if times and min(times) > _EPOCH:
-        return SessionConditions(float(np.mean(times)), "time_s of views.csv", covariates)
-    return SessionConditions(file.stat().st_mtime, "file time of views.csv", covariates)
+        return float(np.mean(times)), "time_s of views.csv", covariates
+    return file.stat().st_mtime, "file time of views.csv", covariates
 
 
 # The hand-eye of a run as six numbers that can be compared from day to day: a twist about the part.
@@ -129,7 +122,7 @@ def read_record(folder: Path, at: float | None = None) -> RunRecord:
             "session without --hand-eye"
         )
     session = Path(document["session"])
-    found = session_conditions(session, folder / "result.json")
+    time, time_from, covariates = session_conditions(session, folder / "result.json")
     run_hash = _files_hash([folder / "model.toml", folder / "result.json"])
     own = [session / name for name in _TABLES if (session / name).is_file()]
     repeatability = document["repeatability"]
@@ -139,14 +132,14 @@ def read_record(folder: Path, at: float | None = None) -> RunRecord:
         name=document.get("name") or session.name,
         run_hash=run_hash,
         session_hash=_files_hash(own) if own else run_hash,
-        time=found.time if at is None else at,
-        time_from=found.time_from if at is None else "stated",
+        time=time if at is None else at,
+        time_from=time_from if at is None else "stated",
         length_unit=model.length_unit,
         mount=model.mount,
         T_mount=model.T_mount,
         covariance=model.covariance,
         estimates=tuple(_estimates(model)),
-        covariates=found.covariates,
+        covariates=covariates,
         numbers={name: document[name] for name in ("residual_rms", "noise_floor")}
         | {f"repeatability_{name}": repeatability[name] for name in ("rotation", "translation")},
         document=document,

@@ -12,15 +12,7 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.units import MICROMETRES, covariate_unit, display_unit, length_text
 from stitch.watch.history import History
-from stitch.watch.tracking import (
-    COVARIATES,
-    SLOPE,
-    Alarm,
-    Bank,
-    find_onset,
-    predicted_bank,
-    smoothed_states,
-)
+from stitch.watch.tracking import COVARIATES, SLOPE, Alarm, Bank, find_onset, predicted_bank, smoothed_states
 from stitch.watch.update import (
     DAY_SECONDS,
     SessionColumns,
@@ -351,7 +343,7 @@ def cell_trend(history: History, report: CellReport, max_sessions: int = MAX_SES
     sessions, moved = sessions_after(history, kept), defaultdict(list)
     for alarm in stored_alarms(history):
         moved[alarm.onset].append(alarm.parameter)
-    seen = smoothed_states(state_or_first(history, kept), sessions, moved, last.state)
+    smoothed, own_sigmas = smoothed_states(state_or_first(history, kept), sessions, moved, last.state)
     part = slice(max(len(sessions.ids) - max_sessions, 0), None)
     common = np.array([p.common_sigma for p in report.parameters])
     times = dict(history.sql("SELECT id, time FROM runs"))
@@ -360,8 +352,8 @@ def cell_trend(history: History, report: CellReport, max_sessions: int = MAX_SES
         times=np.array([times[run] for run in sessions.ids[part]]),
         values=sessions.values[part],
         sigmas=sessions.sigmas[part],
-        smoothed=seen.values[part],
-        smoothed_sigmas=np.hypot(seen.own_sigmas[part], common),
+        smoothed=smoothed[part],
+        smoothed_sigmas=np.hypot(own_sigmas[part], common),
         in_use=calibration_in_use(history, len(report.parameters)),
         channels=_channels(history, list(sessions.ids[part])),
     )
@@ -400,9 +392,7 @@ _Alarmed = tuple[ParameterReport, Change]
 
 def headline(report: CellReport) -> str:
     """The verdict on a cell in one line."""
-    told = event_sentences(report)
-    if not told:
-        return f"{report.name}: nothing moves in {report.sessions:,} sessions; {_recalibration_note(report)}."
+    told = event_sentences(report) or [f"nothing moves in {report.sessions:,} sessions"]
     return f"{report.name}: {'; '.join(told)}; {_recalibration_note(report)}."
 
 
@@ -499,11 +489,9 @@ def _recalibration_note(report: CellReport) -> str:
         return uncertainty_note(report)
     if end is None:
         return "the calibration in use holds"
-    return (
-        "the calibration in use does not hold: recalibrate now"
-        if end <= report.last
-        else f"recalibrate before {day_text(end)}"
-    )
+    if end <= report.last:
+        return "the calibration in use does not hold: recalibrate now"
+    return f"recalibrate before {day_text(end)}"
 
 
 # Units in which parameters are told in tables and drawings: those with digits before the point.

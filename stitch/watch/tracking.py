@@ -16,7 +16,7 @@ variances that sessions do not have in common.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -145,10 +145,6 @@ class Bank:
         by_member = ("mean", "covariance", "squares", "log_likelihood", "noise")
         return replace(self, **{name: getattr(self, name)[rows, members][:, None] for name in by_member})
 
-    def arrays(self) -> dict[str, Array]:
-        """All of it by name, to be stored."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
 
 def empty_bank(covariates: int, members: Sequence[tuple[float, float, float]] = MEMBERS) -> Bank:
     """A bank that knows no parameter yet."""
@@ -180,7 +176,7 @@ def with_parameters(
     noise = np.broadcast_to(np.stack([level, wander], axis=1), (K, M, 2))
     new = {"mean": np.zeros((K, M, d)), "covariance": covariance, "squares": np.zeros((K, M)), "count": np.zeros(K)}
     new |= {"log_likelihood": np.zeros((K, M)), "noise": noise, "origin": values, "unit": sigmas}
-    return Bank(**{name: np.concatenate([own, new[name]]) for name, own in bank.arrays().items()})
+    return Bank(**{name: np.concatenate([own, new[name]]) for name, own in vars(bank).items()})
 
 
 def reset_moved(bank: Bank, moved: Mask) -> Bank:
@@ -267,10 +263,6 @@ class Charts:
 
     cusums: Array  # (P, 2, 2) by reference value, upwards and downwards
     ewma: Array  # (P,)
-
-    def arrays(self) -> dict[str, Array]:
-        """All of it by name, to be stored."""
-        return {"cusums": self.cusums, "ewma": self.ewma}
 
 
 def empty_charts(parameters: int) -> Charts:
@@ -527,18 +519,11 @@ def raise_alarm(sessions: Sessions, k: int, parameter: int, chart: str, before: 
 _SINGULAR = 1e-13
 
 
-@dataclass(frozen=True)
-class SmoothedStates:
-    """n sessions, P parameters, in their units."""
-
-    values: Array  # (n, P) at the conditions of each session
-    own_sigmas: Array  # (n, P) without what all sessions have in common
-
-
 def smoothed_states(
     state: CellState, sessions: Sessions, moved: Mapping[int, Sequence[int]], last: CellState
-) -> SmoothedStates:
-    """The sessions after a state, smoothed.
+) -> tuple[Array, Array]:
+    """The sessions after a state, smoothed: values (n, P) at the conditions of each session, and their sigmas (n, P)
+    without what all sessions have in common; in the parameters' units.
 
     Args:
         state: just before the first of the sessions.
@@ -557,7 +542,7 @@ def smoothed_states(
 
 def _smooth_backwards(
     filtered: Sequence[Bank], sessions: Sessions, moved: Mapping[int, Sequence[int]], last: Bank
-) -> SmoothedStates:
+) -> tuple[Array, Array]:
     n, P, d = len(filtered), len(last.origin), last.mean.shape[2]
     means, covariances = np.full((n, P, d), np.nan), np.full((n, P, d, d), np.nan)
     mean, covariance = filtered[-1].mean[:, 0], filtered[-1].covariance[:, 0]
@@ -576,10 +561,8 @@ def _smooth_backwards(
         means[k, :known], covariances[k, :known] = mean, covariance
     x = np.column_stack([np.ones(n), np.zeros(n), sessions.covariates])
     variance = np.einsum("ni,npij,nj->np", x, covariances, x) * last.scatter[:, 0]
-    return SmoothedStates(
-        values=last.origin + last.unit * np.einsum("npi,ni->np", means, x),
-        own_sigmas=last.unit * np.sqrt(np.maximum(variance, 0.0)),
-    )
+    values = last.origin + last.unit * np.einsum("npi,ni->np", means, x)
+    return values, last.unit * np.sqrt(np.maximum(variance, 0.0))
 
 
 def _inverse(covariance: Array) -> Array:

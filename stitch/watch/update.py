@@ -79,7 +79,6 @@ def _is_temperature(channel: str) -> bool:
 
 
 def _filled_gaps(column: Array) -> Array:
-    """A channel without gaps."""
     seen = np.isfinite(column)
     last = np.maximum.accumulate(np.where(seen, np.arange(len(column)), -1))
     return np.where(last >= 0, column[np.maximum(last, 0)], 0.0)
@@ -165,7 +164,6 @@ def _regressors(history: History, names: SessionColumns, rows: Sequence[tuple[in
 
 
 def _rows_of_runs(history: History, table: str, runs: Sequence[int]) -> list[tuple[Any, ...]]:
-    """Rows of a table that belong to some runs."""
     if len(runs) > _MANY:
         known = set(runs)
         return [row for row in history.sql(f"SELECT * FROM {table}") if row[0] in known]
@@ -260,13 +258,12 @@ def _follow_remaining(history: History) -> float | None:
     return None
 
 
-def recent_sessions(history: History, run: int, most: int = 640) -> Sessions:
-    """The sessions up to one, `most` at most."""
+def recent_sessions(history: History, run: int) -> Sessions:
+    """The sessions up to one, 640 at most."""
     rows = history.sql(
         "SELECT id FROM runs WHERE (time, id) <= (SELECT time, id FROM runs WHERE id = ?) "
-        "ORDER BY time DESC, id DESC LIMIT ?",
+        "ORDER BY time DESC, id DESC LIMIT 640",
         run,
-        most,
     )
     return sessions_from(history, [run for (run,) in rows])
 
@@ -281,8 +278,7 @@ def _store_state(history: History, run: int, time: float, number: int, state: Ce
 
 def _pack_state(state: CellState) -> bytes:
     buffer = io.BytesIO()
-    arrays: dict[str, Any] = state.bank.arrays() | state.charts.arrays() | {"day": np.array(state.day)}
-    np.savez(buffer, **arrays)
+    np.savez(buffer, **vars(state.bank), **vars(state.charts), day=np.array(state.day))
     return buffer.getvalue()
 
 
@@ -414,9 +410,6 @@ def _update_channels(history: History, record: RunRecord) -> bool:
 
 
 def _numbers_hash(record: RunRecord) -> str:
-    told = (
-        matrix_json(record.T_mount)
-        + matrix_json(record.covariance)
-        + repr([(e.name, e.value) for e in record.estimates])
-    )
+    values = repr([(e.name, e.value) for e in record.estimates])
+    told = matrix_json(record.T_mount) + matrix_json(record.covariance) + values
     return hashlib.sha256(told.encode()).hexdigest()

@@ -73,8 +73,8 @@ def test_smoother_is_the_dense_posterior(member):
     for k in range(n):
         last = next_state(last, s, k)
     likeliest = np.where(np.arange(len(MEMBERS)) == member, 0.0, -1e9)[None]
-    last = type(last)(type(last.bank)(**(last.bank.arrays() | {"log_likelihood": likeliest})), last.charts, last.day)
-    found = smoothed_states(state, s, {}, last)
+    last = type(last)(type(last.bank)(**(vars(last.bank) | {"log_likelihood": likeliest})), last.charts, last.day)
+    smoothed, own_sigmas = smoothed_states(state, s, {}, last)
     level, start, wander = np.array(only[0]) ** 2
     t = s.days - s.days[0]
     start += wander * s.days[0]  # what the slope has wandered before
@@ -88,11 +88,11 @@ def test_smoother_is_the_dense_posterior(member):
     B = np.linalg.inv(A.T @ np.linalg.solve(S, A))
     b = B @ A.T @ np.linalg.solve(S, y)
     middle = A @ b + K @ np.linalg.solve(S, y - A @ b)
-    np.testing.assert_allclose((found.values[:, 0] - origin) / unit, middle, atol=2e-6)
+    np.testing.assert_allclose((smoothed[:, 0] - origin) / unit, middle, atol=2e-6)
     beside = A - K @ np.linalg.solve(S, A)
     variance = np.diag(K - K @ np.linalg.solve(S, K) + beside @ B @ beside.T)
     scatter = last.bank.chosen(np.full(1, member)).scatter[0, 0]
-    np.testing.assert_allclose(found.own_sigmas[:, 0] / unit, np.sqrt(variance * scatter), rtol=1e-5)
+    np.testing.assert_allclose(own_sigmas[:, 0] / unit, np.sqrt(variance * scatter), rtol=1e-5)
 
 
 def test_process_noise_is_found_by_likelihood():
