@@ -79,13 +79,12 @@ def test_version_is_the_package_s(capsys):
     ("typed", "offered"),
     [
         ("stitch ex", ["explain", "export"]),
-        # These load what the command needs.
         pytest.param("stitch calibrate sp", ["sphere"], marks=pytest.mark.slow),
         pytest.param("stitch run --eff", ["--effects", "--effects-file"], marks=pytest.mark.slow),
     ],
 )
 def test_the_tab_key(typed, offered):
-    """As a shell asks; for the name of a command no library is loaded."""
+    """As a shell asks: no library is loaded for a name."""
     code = "import sys; sys.argv[0] = 'stitch'\nfrom stitch.cli.main import main\ntry: main()\nfinally: print('numpy' in sys.modules)"
     asked = {"_STITCH_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" "))}
     out = subprocess.run(
@@ -93,7 +92,7 @@ def test_the_tab_key(typed, offered):
     )
     *names, loaded = out.stdout.split()
     assert names == offered
-    assert loaded == str(typed.count(" ") > 1)
+    assert loaded == "False"
 
 
 def test_run_takes_the_session_one_stands_in(session, monkeypatch, capsys):
