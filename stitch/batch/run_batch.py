@@ -89,7 +89,6 @@ def _first_step_hash(folder: Path) -> str:
 
 
 def _document_texts(value: Any) -> Iterator[str]:
-    """Yield all texts of a document."""
     if isinstance(value, str) and value and "\0" not in value:
         yield value
     elif isinstance(value, dict):

@@ -360,13 +360,10 @@ def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool 
     elif decided.determined and max(away) > _NEARER * min(away):
         chosen = "eye_in_hand" if min(away) == decided.scanner_away else "eye_to_hand"
         reason = f"{placed}: what lies nearer sits at the flange"
+    elif decided.determined:
+        chosen, reason, told = direct, f"{placed}; poses are usually those of the flange in the base", False
     else:
-        chosen, told = direct, False
-        reason = (
-            f"{placed}; poses are usually those of the flange in the base"
-            if decided.determined
-            else "as poses usually are"
-        )
+        chosen, reason, told = direct, "as poses usually are", False
     inverted = chosen != direct
     value = f"{chosen}, {_WORDS[chosen]}; the poses are {'T_flange_base' if inverted else 'T_base_flange'}"
     rest = other if chosen == direct else direct
