@@ -65,10 +65,9 @@ def solve_stand(stand: Stand) -> BaseResult:
     comparisons = compare_distances(stand)
     wrong = [c for c in comparisons if c.sigmas > CONTRADICTION_SIGMAS]
     if wrong:
+        told = "; ".join(comparison_text(c, stand.length_unit) for c in wrong)
         raise NoResultError(
-            "rod and joints contradict each other: "
-            + "; ".join(comparison_text(c, stand.length_unit) for c in wrong)
-            + ". No transform is given; to fix: read these points again"
+            f"rod and joints contradict each other: {told}. No transform is given; to fix: read these points again"
         )
     solution = fit_stand(stand)
     if solution.p_value < 2 * norm.sf(CONTRADICTION_SIGMAS):
@@ -238,14 +237,14 @@ def _touched_points(
                     "radius and height"
                 )
         joint1, radius, height = (entry.number(key, positive=key == "radius") for key in _CYLINDER)
-        points.append(cylinder_points(np.array(joint1 * to_rad), np.array(radius), np.array(height)))
+        points.append(cylinder_points(joint1 * to_rad, radius, height))
         default = sigma.entries.get("point", _POINT / unit)
         spread = (
             sigma.number("joint1", default / radius / to_rad, positive=True) * to_rad,
             sigma.number("radius", default, positive=True),
             sigma.number("height", default, positive=True),
         )
-        covariances.append(cylinder_covariance(np.array(joint1 * to_rad), np.array(radius), spread))
+        covariances.append(cylinder_covariance(joint1 * to_rad, radius, spread))
     turns = None if rpy is None else rpy * to_rad
     return TouchedPoints(names, np.array(points, float), np.array(covariances, float), turns), entries
 
@@ -356,12 +355,9 @@ def _plane_lines(projection: Projection, unit: str) -> Iterator[str]:
     for (plane, letter, angle), offsets in zip(turns, projection.offsets[1:], strict=True):
         own = "open, taken as level" if np.isnan(angle) else f"{fixed_digits(np.array([angle]), 6)} rad"
         found = projection.likewise[plane]
-        told = (
-            found
-            if isinstance(found, str)
-            else f"{letter} {fixed_digits(found[:1], 6)} rad, {fixed_digits(found[1:], 5)} {unit}"
-        )
-        yield f"{plane}: {letter} {own}, {fixed_digits(offsets, 5)} {unit}; by the cosine rules of X-Y: {told}."
+        if not isinstance(found, str):
+            found = f"{letter} {fixed_digits(found[:1], 6)} rad, {fixed_digits(found[1:], 5)} {unit}"
+        yield f"{plane}: {letter} {own}, {fixed_digits(offsets, 5)} {unit}; by the cosine rules of X-Y: {found}."
     if projection.flange_beta_alpha is not None:
         yield f"By the pins, upright in their cups: β α {fixed_digits(projection.flange_beta_alpha, 6)} rad."
 
@@ -369,9 +365,8 @@ def _plane_lines(projection: Projection, unit: str) -> Iterator[str]:
 def _print_solution(result: BaseResult) -> None:
     terminal = console()
     unit, solution = result.length_unit, result.fit
-    table = Table(title="T_base1_base2, translation and turn about the axes of base 1", title_justify="left")
-    for heading in ("solution", f"x y z / {unit}", "rotation vector / rad"):
-        table.add_column(heading)
+    headings = ("solution", f"x y z / {unit}", "rotation vector / rad")
+    table = Table(*headings, title="T_base1_base2, translation and turn about the axes of base 1", title_justify="left")
     poses = {"least squares": solution.T_base1_base2}
     if result.projection is not None:
         poses["projection"] = result.projection.T_base1_base2

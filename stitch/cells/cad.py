@@ -1,5 +1,6 @@
 """The CAD surface: nearest places for scanned points, told apart by the side they look to."""
 
+from bisect import bisect_right
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -233,11 +234,8 @@ def sample_normal_space(scan: JoinedScans, T_base_part: Array) -> Indices:
     _, bucket, counts = np.unique(directions.astype(int), axis=0, return_inverse=True, return_counts=True)
     bucket = bucket.ravel()
     # The largest share per direction that keeps the sum within the points to draw.
-    low, quota = 1, _SAMPLED_POINTS
-    while low < quota:
-        middle = (low + quota + 1) // 2
-        fits = np.minimum(counts, middle).sum() <= _SAMPLED_POINTS
-        low, quota = (middle, quota) if fits else (low, middle - 1)
+    shares = range(1, _SAMPLED_POINTS + 1)
+    quota = max(1, bisect_right(shares, _SAMPLED_POINTS, key=lambda share: np.minimum(counts, share).sum()))
     order = np.argsort(bucket, kind="stable")
     first = np.cumsum(counts) - counts
     picked = [order[f + np.linspace(0, c - 1, min(quota, c)).astype(int)] for f, c in zip(first, counts, strict=True)]

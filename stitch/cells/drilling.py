@@ -564,9 +564,8 @@ def run_drill(file: Path, wanted: Wanted) -> None:
 
 
 def _ranger_table(result: DrillResult, unit: str) -> Table:
-    table = Table(title="Beams of the range sensors, in the frame of the flange", title_justify="left")
-    for heading in ("sensor", f"origin x y z / {unit}", "direction", f"rms / {unit}"):
-        table.add_column(heading)
+    headings = ("sensor", f"origin x y z / {unit}", "direction", f"rms / {unit}")
+    table = Table(*headings, title="Beams of the range sensors, in the frame of the flange", title_justify="left")
     for name, beam in result.rangers.items():
         table.add_row(name, fixed_digits(beam.origin, 3), fixed_digits(beam.direction, 4), f"{beam.rms:.3f}")
     return table
@@ -574,9 +573,8 @@ def _ranger_table(result: DrillResult, unit: str) -> Table:
 
 def _drive_table(result: DrillResult, unit: str) -> Table:
     """Corrected poses of the tool, and how far each went from where the drawing has it."""
-    table = Table(title="Drives: T_base_tool, angles about z, y', x''", title_justify="left")
-    for heading in ("hole", "group", f"x y z / {unit}", "a b c / °", f"shift / {unit}"):
-        table.add_column(heading)
+    headings = ("hole", "group", f"x y z / {unit}", "a b c / °", f"shift / {unit}")
+    table = Table(*headings, title="Drives: T_base_tool, angles about z, y', x''", title_justify="left")
     for drive in result.drives:
         shift = float(np.linalg.norm(drive.position - drive.hole.position))
         place, angles = fixed_digits(drive.position, 3), fixed_digits(np.degrees(drive.angles), 3)

@@ -649,9 +649,8 @@ def run_panel(file: Path, drive: str | None, wanted: Wanted) -> None:
 
 
 def _print_model(terminal: Console, result: PanelResult) -> None:
-    table = Table(title="Robots and tracker in one model: 1 σ of the worst axis", title_justify="left")
-    for heading in ("robot", "base σ / mm", "base σ / °", "clamp σ / mm", "clamp σ / °", "misfit p"):
-        table.add_column(heading)
+    headings = ("robot", "base σ / mm", "base σ / °", "clamp σ / mm", "clamp σ / °", "misfit p")
+    table = Table(*headings, title="Robots and tracker in one model: 1 σ of the worst axis", title_justify="left")
     for model in result.models:
         sigma = np.sqrt(np.diag(model.covariance)).reshape(4, 3).max(axis=1)
         degrees = np.degrees(sigma)

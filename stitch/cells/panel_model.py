@@ -175,15 +175,10 @@ def calibrate_robot(readings: ReflectorReadings) -> RobotModel:
 
 def _contact_jacobian(points: Array) -> Array:
     """(6, 9): twist of the contact frame per mm of each reflector coordinate, by central differences."""
-    step = 1e-3
-    T_inverse = frames.inverse(contact_frame(points))
-    columns = []
-    for k in range(9):
-        change = np.zeros(9)
-        change[k] = step
-        ahead, back = (contact_frame(points + sign * change.reshape(3, 3)) for sign in (1, -1))
-        columns.append((frames.log(T_inverse @ ahead) - frames.log(T_inverse @ back)) / (2 * step))
-    return np.column_stack(columns)
+    step, T_inverse = 1e-3, frames.inverse(contact_frame(points))
+    changes = step * np.eye(9).reshape(9, 3, 3)
+    ahead, back = (frames.log(T_inverse @ contact_frame(points + sign * changes)) for sign in (1, -1))
+    return np.asarray((ahead - back).T / (2 * step))
 
 
 # Error of the slaves against the master along a motion: what the global model's uncertainty makes of it.
@@ -379,9 +374,7 @@ def leg_jacobian(legs: Legs, T_base_flange: Array) -> Array:
 
     From l = |R p + t − b|: ∂l/∂v = Rᵀu and ∂l/∂ω = p × Rᵀu, u the leg's unit direction (Merlet 2006, ch. 2).
     """
-    ends = frames.transform(T_base_flange, legs.platform)
-    direction = ends - legs.base
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction = _unit(frames.transform(T_base_flange, legs.platform) - legs.base)
     inside = np.einsum("mji,mkj->mki", T_base_flange[:, :3, :3], direction)
     return np.concatenate([np.cross(legs.platform, inside), inside], axis=-1)
 

@@ -32,6 +32,7 @@ from stitch.closed_form import feature_matching
 from stitch.errors import InputError, NoResultError
 from stitch.frames import Array, Indices
 from stitch.measurement.scan import even_indices
+from stitch.reading.csv_files import is_number
 
 # Stock on a casting: how far the scan stands off the CAD, even or slowly varying. Positive is outside: stock on it.
 
@@ -86,16 +87,12 @@ def read_allowance(text: str | None) -> AllowancePrior:
         return AllowancePrior()
     if text in (FREE, VARYING):
         return AllowancePrior(free=True, varying=text == VARYING)
-    try:
-        known = float(text)
-    except ValueError:
-        known = float("nan")
-    if not np.isfinite(known):
+    if not is_number(text) or not np.isfinite(float(text)):
         raise InputError(
             f"--allowance is {text!r}; to fix: write free (to find an even one), varying (one that changes slowly "
             "over the part), or the stock in the CAD's unit, as 0.3"
         )
-    return AllowancePrior(known=known)
+    return AllowancePrior(known=float(text))
 
 
 def allowance_columns(points: Array, cad: CadSurface, prior: AllowancePrior) -> Array:
@@ -311,8 +308,7 @@ def fit_cad(
 
 def moved_about(T_base_part: Array, step: Array, centre: Array) -> Array:
     """The pose (4, 4) after a Gauss-Newton step, a twist (6,) about a centre (3,) of the part."""
-    shift = frames.make(np.eye(3), centre)
-    return np.asarray(T_base_part @ frames.inverse(shift @ frames.exp(step) @ frames.inverse(shift)))
+    return np.asarray(T_base_part @ frames.inverse(frames.moved_about(centre, step, np.eye(4))))
 
 
 def _covariances(

@@ -59,23 +59,16 @@ class Stand:
         return rod_points(self.slide, self.angle, self.length, self.turn)
 
 
-def cylinder_points(joint1: Array, radius: Array, height: Array) -> Array:
-    """Points (N, 3) of a robot that reaches `radius` and `height` at the joint-1 angle, right-handed about z."""
+def cylinder_points(joint1: Array | float, radius: Array | float, height: Array | float) -> Array:
+    """Points (..., 3) of a robot that reaches `radius` and `height` at the joint-1 angle, right-handed about z."""
     return np.stack([radius * np.cos(joint1), radius * np.sin(joint1), height], axis=-1)
 
 
-def cylinder_covariance(joint1: Array, radius: Array, sigma: tuple[float, float, float]) -> Array:
-    """Covariance (N, 3, 3) of `cylinder_points` from the sigmas of joint 1 (rad), radius and height."""
-    c, s, zero = np.cos(joint1), np.sin(joint1), np.zeros_like(joint1)
-    jacobian = np.stack(
-        [
-            np.stack([-radius * s, c, zero], -1),
-            np.stack([radius * c, s, zero], -1),
-            np.stack([zero, zero, zero + 1], -1),
-        ],
-        axis=-2,
-    )
-    return np.asarray(jacobian @ np.diag(np.square(sigma)) @ np.swapaxes(jacobian, -1, -2))
+def cylinder_covariance(joint1: float, radius: float, sigma: tuple[float, float, float]) -> Array:
+    """Covariance (3, 3) of one of `cylinder_points` from the sigmas of joint 1 (rad), radius and height."""
+    c, s = np.cos(joint1), np.sin(joint1)
+    jacobian = np.array([[-radius * s, c, 0.0], [radius * c, s, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(jacobian @ np.diag(np.square(sigma)) @ jacobian.T)
 
 
 @dataclass(frozen=True)
@@ -129,9 +122,7 @@ def level_stand(rail: Array, rail_slide: Array) -> Array:
     y /= np.linalg.norm(y)
     known = np.isfinite(rail_slide)
     origin = np.mean(rail[known] - rail_slide[known, None] * x, axis=0)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.stack([x, y, np.cross(x, y)], axis=-1), origin
-    return T
+    return frames.make(np.stack([x, y, np.cross(x, y)], axis=-1), origin)
 
 
 def rail_direction(rail: Array) -> Array:

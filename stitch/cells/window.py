@@ -10,13 +10,7 @@ import numpy as np
 from rich.table import Table
 
 from stitch import frames
-from stitch.cells.cad import (
-    Box,
-    CadSurface,
-    Regions,
-    coverage,
-    read_cad,
-)
+from stitch.cells.cad import Box, CadSurface, Regions, coverage, read_cad
 from stitch.cells.job_files import (
     POSE_COLUMNS,
     JobTable,
@@ -191,12 +185,12 @@ def _read_scans(document: JobTable) -> PlacedScans:
         )
     if "scans" in document:
         placed = read_scan_table(document.path("scans"))
-        return replace(placed, errors=stated_errors(document, placed))
-    if "hand_eye" not in document:
+    elif "hand_eye" in document:
+        placed = read_placed_session(document.path("session"), document.path("hand_eye"))
+    else:
         raise InputError(
             f"{file}: session has no hand_eye; to fix: name the file that `stitch calibrate sphere -o` wrote"
         )
-    placed = read_placed_session(document.path("session"), document.path("hand_eye"))
     return replace(placed, errors=stated_errors(document, placed))
 
 
@@ -431,11 +425,8 @@ def _sigma_sentence(job: FitJob, part: FittedPart) -> str:
     if len(sizes) == 1:
         return "± counts the scan's noise alone; [errors] in the job states those of robot and scanner."
     ranked = sorted((name for name, size in sizes.items() if size), key=lambda name: -sizes[name])
-    return (
-        "± of the place by source: "
-        + ", ".join(with_unit(job, f"{_SOURCE_WORDS[name]} {uncertainty_text(sizes[name])}") for name in ranked)
-        + "."
-    )
+    told = ", ".join(with_unit(job, f"{_SOURCE_WORDS[name]} {uncertainty_text(sizes[name])}") for name in ranked)
+    return f"± of the place by source: {told}."
 
 
 # The scans of a part or a seam as a cloud session, with the hand-eye that placed them and their CAD.
@@ -516,9 +507,7 @@ def run_seam(file: Path, wanted: Wanted) -> None:
         rows = [{k: None if isinstance(v, float) and np.isnan(v) else v for k, v in asdict(s).items()} for s in seams]
         print(json.dumps(rows, indent=1))
         return
-    table = Table(title="Stations, ± 1 σ", title_justify="left")
-    for heading in ("station", "flush / mm", "gap / mm", "verdict"):
-        table.add_column(heading)
+    table = Table("station", "flush / mm", "gap / mm", "verdict", title="Stations, ± 1 σ", title_justify="left")
     for s in seams:
         if s.reason:
             table.add_row(s.station, "", "", f"{s.verdict}: {s.reason}")
