@@ -413,7 +413,7 @@ SYSTEMS["Named programs and libraries"] = (
         "KISS-ICP on a scanner that never stops: right motions",
         ("python -m bench.odometry --write",),
         "–",
-        lambda _: of_page("session.md", r"odometry, de-skewed \|[^|]*\|([^|]*)\|"),
+        lambda _: of_page("session.md", r"odometry from the stated hand-eye \|[^|]*\|([^|]*)\|"),
     ),
     Row(
         "hand-eye from it, and from the whole run on the same scans, off by / mm",
@@ -421,7 +421,7 @@ SYSTEMS["Named programs and libraries"] = (
         "–",
         lambda _: ", ".join(
             of_page("session.md", rf"\| `{name} \|[^|]*\|[^|]*\|([^|]*)\|")
-            for name in ("moving-scan`, odometry, de-skewed", "moving-scan`, the whole run")
+            for name in ("moving-scan`, odometry from the stated hand-eye", "moving-scan`, the whole run")
         ),
     ),
     Row("Rerun: every stage and iteration", (*BLADE, "rerun rrd verify blade-run/recording.rrd"), "–", recording),
