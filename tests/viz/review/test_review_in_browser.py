@@ -91,7 +91,7 @@ def test_everybody_can_read_and_reach_it(browser, address, colours):
 
 def test_from_opening_to_error_fell_in_six_clicks(browser, soft_joint, address):
     story = Story(browser, address)
-    story.says("#tiles", "rms on views left out")
+    story.says("#tiles", "rms on held-out views")
     title = story.page.locator("#scene [data-title]")
     everything = title.inner_text()
     story.page.locator("#plots .plot:not(.wide) .bins button").first.click()
