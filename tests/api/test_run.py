@@ -143,8 +143,8 @@ def test_what_is_added_and_dropped_is_what_the_commands_write(found, cell_folder
     restored, dropped = stitch.load_run(command), stitch.drop(better, "range_scale")
     assert (command / "model.toml").read_bytes() == first
     apart = frames.log(frames.inverse(restored.T_mount) @ dropped.T_mount)
-    assert (np.abs(apart) < 0.1 * np.sqrt(np.diag(restored.mount_covariance))).all()
-    assert restored.effects == dropped.effects == ()
+    assert (np.abs(apart) < 0.5 * np.sqrt(np.diag(restored.mount_covariance))).all()
+    assert not restored.effects and not dropped.effects
 
 
 def test_effects_fitted_at_once_are_what_the_command_writes(loaded, cell_folder, tmp_path, stitch_command):
