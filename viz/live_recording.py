@@ -1,6 +1,8 @@
 """Show a live session in Rerun: each scan at its pose in the colour of its verdict, U, and what was said."""
 
 import os
+import sys
+from pathlib import Path
 
 import numpy as np
 import rerun as rr
@@ -24,6 +26,16 @@ _COLOURS = {
 _MOST_POINTS = 20_000
 
 
+def _open_viewer(stream: rr.RecordingStream) -> None:
+    """Open the viewer that came with the library: it lies beside Python, which need not be on the path."""
+    path = os.environ.get("PATH", "")
+    os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), path])
+    try:
+        stream.spawn()
+    finally:
+        os.environ["PATH"] = path
+
+
 class RerunLiveRecording:
     """A `stitch.api.live.LiveRecording` that streams to a viewer or a file."""
 
@@ -31,7 +43,7 @@ class RerunLiveRecording:
         self._stream = rr.RecordingStream("stitch", recording_id=id_of(session.name))
         self._count = 0
         if target == "view":
-            self._stream.spawn()
+            _open_viewer(self._stream)
         elif target.startswith("rerun"):
             self._stream.connect_grpc(target)
         else:
