@@ -121,7 +121,7 @@ def test_a_killed_or_interrupted_client_is_started_again_and_goes_on(room):
     os.killpg(second.pid, signal.SIGINT)
     _, told = second.communicate(timeout=60)
     assert second.returncode == 1
-    assert told.splitlines()[-1].startswith("stitch: stopped with ")
+    assert told.splitlines()[-1].startswith("stitch: stopped after ")
     assert "Traceback" not in told
     after = stands(room)
     third = start(room, "--json")
