@@ -35,6 +35,7 @@ _PAIR_FIELDS = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_s
 # see is known by their sigma, as long as the lever is not noise itself: a three-hundredth of the part's.
 NEAR_NULL = 1e-3
 _NULL = 1e-5
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,9 @@ class Gram:
         targets = assemble(self, self.labelled)[0] * scale[:, None] * scale
         basis = np.hstack([seen, _target_only_directions(targets, seen)])
         values, within = np.linalg.eigh(basis.T @ ((seen * values) @ seen.T + targets) @ basis)
-        return VisibleDirections(values, basis @ within, scale, seen)
+        # Beside surfaces, points of a huge sigma leave rounding, which has either sign.
+        held = values > _ROUNDING * values[-1]
+        return VisibleDirections(values[held], basis @ within[:, held], scale, seen)
 
     def only(self, keep: Mask) -> "Gram":
         """The sums of some pairs (P,)."""
