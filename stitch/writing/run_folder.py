@@ -176,7 +176,7 @@ def replace_run_files(path: Path) -> Iterator[Path]:
             _keep_fit(path, scratch)
 
 
-# Fits that a run has had, linked and not copied: the way back to one takes no fit.
+# Fits that a run has had, kept by links: the way back to one takes no fit.
 
 # All that are kept; beyond it the oldest go.
 _KEPT_BYTES = 1e9
@@ -194,8 +194,8 @@ def restore_fit(path: Path, effects: Collection[str], recording: bool) -> bool:
     if kept is None or not all((kept / name).is_file() for name in ("ledger.json", "recording.rrd")[: 1 + recording]):
         return False
     with lock_run_folder(path), replace_run_files(path) as scratch:
-        for file in kept.iterdir():
-            os.link(file, scratch / file.name)
+        # No links: who edits model.toml where it stands would edit the kept one.
+        shutil.copytree(kept, scratch, dirs_exist_ok=True)
         steps, earlier = (json.loads((at / "ledger.json").read_text(encoding="utf-8")) for at in (path, kept))
         again = {key: told for key, told in earlier[-1].items() if key != "notes"} | {"step": len(steps)}
         write_json([*steps, again], scratch / "ledger.json")

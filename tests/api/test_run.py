@@ -142,6 +142,8 @@ def test_what_is_added_and_dropped_is_what_the_commands_write(found, cell_folder
     stitch_command("drop", command, "range_scale", "--no-recording")
     restored, dropped = stitch.load_run(command), stitch.drop(better, "range_scale")
     assert (command / "model.toml").read_bytes() == first
+    # Who edits a file where it stands edits no kept fit.
+    assert (command / "model.toml").stat().st_nlink == 1
     apart = frames.log(frames.inverse(restored.T_mount) @ dropped.T_mount)
     assert (np.abs(apart) < 0.5 * np.sqrt(np.diag(restored.mount_covariance))).all()
     assert not restored.effects and not dropped.effects
