@@ -114,8 +114,9 @@ def run_rig(
             fit = partial(steps.apply, file=model)
         else:
             fit = partial(steps.fit, starts=begun, initial_model=with_arm(arm), recorder=recorders[0])
-        found = fit_screened_views(sessions, measurements, partial(_fit_and_report, fit, sessions, recorders), keep)
-        end = FitSummary(begun, found.fitted, clock.lap(), model.effects_file if model else None, register)
+        fit = partial(_fit_and_report, fit, partial(steps.begin_to_register, register=register), sessions, recorders)
+        found = fit_screened_views(sessions, measurements, fit, keep)
+        end = FitSummary(begun, found.fitted, clock.lap(), model.effects_file if model else None)
         if model and not sessions[0].has_clouds:
             found = check_model_transfer(found, partial(_fit_own_model, steps, found, with_arm(arm_model(model))))
         if len(sessions) > 1 and effects:
@@ -131,16 +132,20 @@ def run_rig(
 
 def _fit_and_report(
     fit: Callable[[Sequence[Session], Sequence[Measurement]], FittedRig],
+    begin_to_register: Callable[[FittedRig], FittedRig],
     whole: Sequence[Session],
     recorders: Sequence[Recorder],
     sessions: Sequence[Session],
     measurements: Sequence[Measurement],
 ) -> FittedRig:
-    """Fit the views that are left, and tell the recorders where these are fewer."""
+    """Fit the views that are left, tell the recorders where these are fewer, and begin to register.
+
+    Nearly always all views belong: they are registered while they are screened.
+    """
     for before, session, recorder in zip(whole, sessions, recorders, strict=True):
         if len(session.views) < len(before.views):
             recorder.start(session)
-    return fit(sessions, measurements)
+    return begin_to_register(fit(sessions, measurements))
 
 
 def _note_arm_transfer(end: FitSummary, here: ArmTransfer, length_unit: str) -> FitSummary:
@@ -233,13 +238,13 @@ def change(state: Run, effects: Sequence[str], recorder: Recorder | None = None)
         before = steps.initial_stage(measurement, begun, clock.lap(), recorder)
         clock.lap()
         fitted = steps.refit([session], [measurement], model, [state.gate], recorder)
+        fitted = steps.begin_to_register(fitted, state.register_method or DEFAULT)
         own = fitted.sessions[0].measurement
         end = FitSummary(
             starts=[begun],
             fitted=fitted,
             seconds=clock.lap(),
             effects_file=state.effects_file,
-            register=state.register_method or DEFAULT,
             ledger=state.ledger,
             left_out=state.left_out,
             links=state.links,

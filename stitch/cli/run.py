@@ -6,6 +6,7 @@ import shlex
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -161,11 +162,9 @@ def _require_known(
 def _begin_to_prepare(sessions: list[Session]) -> list[Future[Capture]]:
     """Return what `prepare_capture` will find of each session, in a thread that has begun with it."""
     from stitch.measurement.capture import prepare_capture
+    from stitch.system.threads import begin
 
-    beside = ThreadPoolExecutor(1)
-    captures = [beside.submit(prepare_capture, session) for session in sessions]
-    beside.shutdown(wait=False)
-    return captures
+    return [begin(partial(prepare_capture, session)) for session in sessions]
 
 
 def _require_mesh_kind(kind: str | None) -> None:

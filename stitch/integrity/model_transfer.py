@@ -143,7 +143,7 @@ def find_disagreeing_sessions(
     out = []
     for i, (name, together) in enumerate(zip(names, every, strict=True)):
         own = fit_separately(i)
-        numbers = sum(int(np.count_nonzero(term.values)) for term in own.model.terms)
+        numbers = sum(int(np.count_nonzero(term.values)) for term in own.model_of(0).terms)
         tested = compare_with_own_effects(name, together, view_mean_squares(own), numbers)
         out += [tested] if tested.large and tested.p_value < _SESSION_CHANCE / len(names) else []
     return out

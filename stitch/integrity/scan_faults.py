@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -59,7 +60,8 @@ def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder 
         size: of the part, length_unit.
     """
     views = [v for v, scan in enumerate(scans) if len(scan.points)]
-    looks = {v: ray_tree(scans[v]) for v in views}
+    # Most scans are never asked.
+    look_into = cache(lambda w: ray_tree(scans[w]))
     shares = {}
     for v in views:
         asked = _evenly([w for w in views if w != v], _OCCLUDER_VIEWS_COMPARED)
@@ -74,7 +76,7 @@ def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder 
         through = np.zeros(len(alone), bool)
         for w in asked if len(alone) >= _FEWEST else ():
             there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
-            through |= _looks_through(scans[w], looks[w], there, apart[w])
+            through |= _looks_through(scans[w], look_into(w), there, apart[w])
         shares[v] = through.sum() / count if through.sum() >= _FEWEST else 0.0
     found = tuple(v for v, share in shares.items() if share > _OCCLUDER_MIN_SHARE)
     return Occluder(found, float(np.mean([shares[v] for v in found]))) if found else None

@@ -74,7 +74,7 @@ def screen_views(session: Session, measurement: Measurement, correction: Correct
         InputError: the poses contradict the scans beyond any arm, and a usual mistake explains it.
         NoResultError: they do, and none does; or two views alone do; or groups of views share no surface.
     """
-    own, T_mount = correction.captures[index], correction.model.T_mount
+    own, T_mount = correction.captures[index], correction.geometry.T_mount
     if correction.given:
         require_own_model(session, correction, index)
     announce("checking every view against the others")
@@ -122,13 +122,13 @@ def session_warnings(
         return targets
     announce("checking every view against the others")
     found = _snoop_session(session, measurement, correction, index)
-    return (*targets, *snooping_warnings(session, correction.captures[index], found, correction.model.T_mount))
+    return (*targets, *snooping_warnings(session, correction.captures[index], found, correction.geometry.T_mount))
 
 
 def _snoop_session(session: Session, measurement: Measurement, correction: Correction, index: int) -> Snooping:
-    usual, gate = UsualEffects(measurement, correction.model), correction.overlaps[index].gate
+    usual, gate = UsualEffects(measurement, correction.geometry), correction.overlaps[index].gate
     found = snoop_views(
-        correction.captures[index], correction.model.T_mount, gate, correction.unconstrained[index], usual
+        correction.captures[index], correction.geometry.T_mount, gate, correction.unconstrained[index], usual
     )
     if len(session.views) >= MAX_VIEWS_WITH_EFFECTS:
         # Held against white scatter alone, since what arms do takes minutes there: what they do looks like steps.
@@ -220,10 +220,12 @@ def fit_screened_views(
     for _ in range(_MAX_ROUNDS):
         with _naming_excluded_views(sessions, taken):
             fitted = fit(own, measured)
-            found = [_screen_fitted_session(session, fitted, i) for i, session in enumerate(own)]
+            with _discarded_if_refused(fitted):
+                found = [_screen_fitted_session(session, fitted, i) for i, session in enumerate(own)]
         taken = [replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, found, strict=True)]
         if keep or not any(a.left_out for a in found):
             break
+        fitted.discard()
         for session, a in zip(sessions, taken, strict=True):
             require_majority(session, a.left_out)
         measured = [m.without(a.indices(s)) for m, a, s in zip(measured, found, own, strict=True)]
@@ -236,6 +238,15 @@ def fit_screened_views(
         # The last round has left views out too: what is returned is the fit of those that are left.
         fitted = fit(own, measured)
     return ScreenedFit(own, measured, fitted, taken)
+
+
+@contextmanager
+def _discarded_if_refused(fitted: FittedRig) -> Iterator[None]:
+    try:
+        yield
+    except BaseException:
+        fitted.discard()
+        raise
 
 
 @contextmanager

@@ -186,9 +186,8 @@ def build_capture(
 
 
 def part_size(captures: Sequence[Capture]) -> float:
-    """Median diameter of the scans' point sets: twice the rms distance from their centroids."""
-    spread = [np.sqrt(scan.points.var(axis=0).sum()) for c in captures for scan in c.scans]
-    return 2 * float(np.median(spread))
+    """Median diameter of the scans, length_unit."""
+    return float(np.median([scan.size for c in captures for scan in c.scans]))
 
 
 # Large scans made light: fewer points, each with the surface of all of them; the whole cloud stays where it is.

@@ -1,6 +1,7 @@
 """A view made ready for matching, once: KD-tree, normals, edges, spacing and noise, scanner frame."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,19 @@ class Scan:
     scanned_spacing: float  # the same between all points that were scanned, of which these may be some
     noise: float  # 1-sigma across the surface, from the scan itself
     eye: Array  # (3,) from where the scanner looks
+
+    @cached_property
+    def size(self) -> float:
+        """Diameter of the points, length_unit: twice their rms distance from their centroid."""
+        return 2 * float(np.sqrt(self.points.var(axis=0).sum()))
+
+    @cached_property
+    def solid_angle(self) -> float:
+        """Median solid angle, seen from the eye, that a point on a smooth surface has for itself."""
+        smooth = self.usable if self.usable.any() else np.ones_like(self.usable)
+        away = self.points[smooth] - self.eye
+        each = (self.area * self.confidence)[smooth] / np.einsum("ij,ij->i", away, away)
+        return float(np.median(each))
 
     def rays(self, points: Array) -> Array:
         """(N, 3) unit vectors from the eye to points (N, 3), scanner frame."""

@@ -1,6 +1,7 @@
 """What the stages show while they work; a viewer implements `Recorder`, the stages do not know it."""
 
 from collections.abc import Sequence
+from concurrent.futures import CancelledError
 from typing import Protocol
 
 from stitch.frames import Array
@@ -31,6 +32,29 @@ class SilentRecorder:
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None: ...
     def stage(self, result: StageResult, poses: Array) -> None: ...
     def finish(self, run: Run) -> None: ...
+
+
+class IterationMemory(SilentRecorder):
+    """Keeps the iterations of a stage that runs beside others, to tell them in their turn."""
+
+    def __init__(self) -> None:
+        self._kept: list[tuple[str, int, Array, float, float]] = []
+        self.stopped = False
+
+    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
+        """Keep one iteration.
+
+        Raises:
+            CancelledError: nobody wants the stage any more (`stopped`).
+        """
+        if self.stopped:
+            raise CancelledError
+        self._kept.append((stage, index, poses, rms, gate))
+
+    def tell(self, recorder: Recorder) -> None:
+        """Pass on all that was kept."""
+        for kept in self._kept:
+            recorder.iteration(*kept)
 
 
 class RecorderGroup:

@@ -6,7 +6,7 @@ generalised least-squares step weighs the views by the robot's own scatter (`han
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -40,6 +40,7 @@ from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstr
 from stitch.runs.recorder import Recorder, SilentRecorder
 from stitch.statistics.least_squares import least_squares
 from stitch.system.process import announce
+from stitch.system.threads import begin, known
 
 # What the correction of a model from overlapping surfaces found.
 
@@ -48,13 +49,24 @@ from stitch.system.process import announce
 class Correction:
     """The model of a rig; overlaps, freed poses and captures in the order of its sessions."""
 
-    model: Model
-    hand_eye: HandEyeFit  # its statistics
+    geometry: Model  # hand-eye and effects, maybe without how certain the hand-eye is
+    statistics: Future[HandEyeFit]  # of the hand-eye: they take half a second of one core, and register needs none
+    scatter: tuple[Repeatability, ...]  # of the poses
     overlaps: tuple[Overlaps, ...]
     unconstrained: tuple[UnconstrainedPoses, ...]  # views moved by the overlaps alone: where register starts
     history: tuple[float, ...]  # rms per iteration
     captures: tuple[Capture, ...]  # without the effects in use
     given: bool = False  # the model is that of another run, nothing was fitted
+
+    @property
+    def hand_eye(self) -> HandEyeFit:
+        """Statistics of the hand-eye, waited for."""
+        return self.statistics.result()
+
+    @property
+    def model(self) -> Model:
+        """The model, with how certain its hand-eye is."""
+        return replace(self.geometry, covariance=self.hand_eye.covariance)
 
 
 # Queries per view, at most, while the gate closes; the final normal equations take FINE_SAMPLES. While partners may lie
@@ -178,24 +190,22 @@ def correct(
     freed = _update_unconstrained(captures, freed, gates, T_first)
     solved = solve_hand_eye(captures, freed, T_first)
 
-    def final_overlaps() -> tuple[Overlaps, ...]:
-        return tuple(
-            collect_overlaps(c, c.poses(solved.T_mount), gate, [sample_points(s, FINE_SAMPLES) for s in c.scans])
-            for c, gate in zip(captures, gates, strict=True)
-        )
-
-    announce("correct: how certain the hand-eye is")
-    # Where the hand-eye is says least squares at once; how certain it is takes half a second of one core.
-    with ThreadPoolExecutor(2) as beside:
-        field = None if scanner_errors is None else beside.submit(scanner_errors, freed)
-        overlaps_there = beside.submit(final_overlaps)
+    def statistics() -> HandEyeFit:
+        common = None if scanner_errors is None else scanner_errors(freed)
         errors = None if pose_error_prior is None else pose_error_prior(freed, T_first)
-        common = None if field is None else field.result()
-        hand_eye = fit_hand_eye(captures, freed, T_first, scanner_errors=common, errors=errors, solved=solved)
-        final = overlaps_there.result()
+        return fit_hand_eye(captures, freed, T_first, scanner_errors=common, errors=errors, solved=solved)
+
+    # Where the hand-eye is says least squares at once; how certain it is may wait until the end of the run.
+    begun = begin(statistics)
+    announce("correct: what the corrected hand-eye leaves")
+    final = tuple(
+        collect_overlaps(c, c.poses(solved.T_mount), gate, [sample_points(s, FINE_SAMPLES) for s in c.scans])
+        for c, gate in zip(captures, gates, strict=True)
+    )
     return Correction(
-        model=Model(hand_eye.T_mount, (), hand_eye.covariance),
-        hand_eye=hand_eye,
+        geometry=Model(solved.T_mount),
+        statistics=begun,
+        scatter=solved.scatter,
         overlaps=final,
         unconstrained=freed,
         history=(*history, pooled_rms(final)),
@@ -244,8 +254,9 @@ def apply_given_hand_eye(captures: Sequence[Capture], model: Model) -> Correctio
     freed = [unconstrained_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True)]
     scatter = tuple(capture_repeatability(c, f, model.T_mount) for c, f in zip(captures, freed, strict=True))
     return Correction(
-        model=model,
-        hand_eye=HandEyeFit(model.T_mount, model.covariance, 1.0, scatter, 1.0),
+        geometry=model,
+        statistics=known(HandEyeFit(model.T_mount, model.covariance, 1.0, scatter, 1.0)),
+        scatter=scatter,
         overlaps=overlaps,
         unconstrained=tuple(freed),
         history=(pooled_rms(overlaps),),

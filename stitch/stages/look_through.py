@@ -79,7 +79,7 @@ def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> Ra
     axes = _axes_about(np.sum(middles, axis=0))
     maps = [_on_map(rays(scan, keep)[1], axes) for scan, keep in zip(scans, kept, strict=True)]
     # On the map lengths are half the angles, in the middle of the field.
-    angle = np.sqrt(np.median([solid_angle(scan) for scan in scans]))
+    angle = np.sqrt(np.median([scan.solid_angle for scan in scans]))
     size = max(_BIN * angle, cell / float(np.median(np.concatenate(ranges)))) / 2
     low = np.min([m.min(axis=0) for m in maps], axis=0) - 2 * size
     shape = tuple(((np.max([m.max(axis=0) for m in maps], axis=0) - low) / size).astype(int) + 3)
@@ -99,13 +99,6 @@ def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> Ra
     return RangeImages(
         axes, low, size, np.array(nearest), np.array(empty), field=seen >= 2, reach=reach, trusted=np.array(trusted)
     )
-
-
-def solid_angle(scan: Scan) -> float:
-    """Median solid angle, seen from the eye, that a point on a smooth surface has for itself."""
-    smooth = scan.usable if scan.usable.any() else np.ones_like(scan.usable)
-    away = scan.points[smooth] - scan.eye
-    return float(np.median((scan.area * scan.confidence)[smooth] / np.einsum("ij,ij->i", away, away)))
 
 
 def _axes_about(middle: Array) -> Array:

@@ -1,6 +1,7 @@
 """The last steps of a run: register single views, fuse them, collect the result."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -18,19 +19,47 @@ from stitch.observations.surfaces.hand_eye_fit import repeatability_from
 from stitch.observations.surfaces.normal_equations import RMS_GATE, Overlaps
 from stitch.observations.surfaces.view_poses import noise_floor
 from stitch.observations.targets.target_model import TargetModelFit, rms_of
-from stitch.runs.recorder import Recorder
+from stitch.runs.recorder import IterationMemory, Recorder
 from stitch.runs.run import Fit, FusedCloud, LedgerStep, StageResult
 from stitch.stages.coarse import CoarseHandEye
 from stitch.stages.correct import Correction
 from stitch.stages.fuse import RegisteredSession, fuse_every_point
-from stitch.stages.register import Method, register, register_targets, unseen_moves
+from stitch.stages.register import Method, Registration, register, register_targets, unseen_moves
 from stitch.stages.sentences import correct_note, register_note, support_note, surface_sentence, target_sentence
 from stitch.stages.target_fit import FittedSession
 from stitch.statistics.distributions import MAD_TO_SIGMA
-from stitch.system.threads import Clock, release_mapped
+from stitch.system.threads import Clock, begin, release_mapped
 
 # Places of the fused cloud that tell its rms to a part in a thousand.
 _RMS_SAMPLES = 2_000_000
+
+
+@dataclass(frozen=True)
+class BegunRegistration:
+    """One session's views, registered while something else goes on."""
+
+    method: str
+    registration: Future[tuple[Registration, float]]  # and its seconds
+    iterations: IterationMemory
+
+
+def begin_to_register_views(correction: Correction, method: Method) -> tuple[BegunRegistration, ...]:
+    """Begin to register the views of every session under the common model, one session after the other."""
+    memories = [IterationMemory() for _ in correction.captures]
+    coming = [Future[tuple[Registration, float]]() for _ in correction.captures]
+
+    def register_all() -> None:
+        for i, (own, found) in enumerate(zip(correction.captures, coming, strict=True)):
+            clock, poses = Clock(), own.poses(correction.geometry.T_mount)
+            scatter, gate, start = correction.scatter[i], correction.overlaps[i].gate, correction.unconstrained[i].poses
+            try:
+                registration = register(own, poses, scatter, gate, memories[i], start, method)
+                found.set_result((registration, clock.lap()))
+            except BaseException as error:
+                found.set_exception(error)
+
+    begin(register_all)
+    return tuple(BegunRegistration(method.name, *both) for both in zip(coming, memories, strict=True))
 
 
 def finish_surfaces(
@@ -42,27 +71,26 @@ def finish_surfaces(
     before: StageResult,
     recorder: Recorder,
     seconds: float,
-    method: Method,
+    begun: BegunRegistration,
 ) -> tuple[Fit, LedgerStep]:
-    """Register and fuse session `index` of a rig under the common model, and show it to the recorder.
+    """Wait for session `index` of a rig to be registered, fuse it, and show it to the recorder.
 
     Raises:
         InputError: a scan changed on disk since it was read.
     """
-    clock = Clock()
-    model, own, overlaps = correction.model, correction.captures[index], correction.overlaps[index]
-    scatter = correction.hand_eye.repeatability[index]
+    model, own, overlaps = correction.geometry, correction.captures[index], correction.overlaps[index]
+    scatter = correction.scatter[index]
     poses_model = own.poses(model.T_mount)
     note = correct_note(before.rms, overlaps.gram.rms)
     corrected = _overlap_stage("correct", overlaps, len(correction.history), seconds, note)
     recorder.stage(corrected, poses_model)
-    clock.lap()
-    start = correction.unconstrained[index].poses
-    registration = register(own, poses_model, scatter, overlaps.gate, recorder, start, method)
+    registration, taken = begun.registration.result()
+    begun.iterations.tell(recorder)
     note = register_note(registration, session, unseen_moves(registration, poses_model))
-    registered = _overlap_stage("register", registration.overlaps, len(registration.history), clock.lap(), note)
-    registered = replace(registered, method=method.name)
+    registered = _overlap_stage("register", registration.overlaps, len(registration.history), taken, note)
+    registered = replace(registered, method=begun.method)
     recorder.stage(registered, registration.poses)
+    clock = Clock()
     fused, unsupported = fuse_every_point(RegisteredSession(session, measurement, model, own, registration.poses))
     dropped = support_note(unsupported)
     last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap(), dropped)
@@ -174,15 +202,23 @@ InitialModel = Callable[[Measurement, Model, float], Model]
 class FittedRig:
     """The common model of a rig, and its sessions as they count."""
 
-    model: Model  # of labelled points, that of the first session
     sessions: list[FittedSession]
     captures: list[Capture]  # without the effects in use
     correction: Correction | None = None  # of surfaces
+    begun: tuple[BegunRegistration, ...] = ()  # of surfaces
+
+    def discard(self) -> None:
+        """End what has been begun of it: it is not wanted any more."""
+        for own in self.begun:
+            own.iterations.stopped = True
 
     def model_of(self, index: int) -> Model:
         """Of one session: labelled points of an arm share its effects, and each session has its own hand-eye."""
         own = self.sessions[index].targets
-        return own.model if self.correction is None and own is not None else self.model
+        if self.correction is not None:
+            return self.correction.model
+        assert own is not None
+        return own.model
 
 
 class Pipeline(Protocol):
@@ -230,6 +266,10 @@ class Pipeline(Protocol):
         """What was observed, as one linear model about a model."""
         ...
 
+    def begin_to_register(self, fitted: FittedRig, register: str) -> FittedRig:
+        """The same, with single views being registered by a method while other things go on."""
+        ...
+
     def finish(
         self,
         session: Session,
@@ -238,7 +278,6 @@ class Pipeline(Protocol):
         before: StageResult,
         recorder: Recorder,
         seconds: float,
-        register: str,
     ) -> tuple[Fit, LedgerStep]:
         """Single views registered by a method, and fused."""
         ...

@@ -12,7 +12,6 @@ from stitch.runs.recorder import Recorder
 from stitch.runs.run import ExcludedView, LedgerStep, Run, StageResult, ViewLinks
 from stitch.stages import surface_steps, target_steps
 from stitch.stages.coarse import REUSED, CoarseHandEye
-from stitch.stages.register import DEFAULT
 from stitch.stages.register_and_fuse import FittedRig, Pipeline
 from stitch.stages.sentences import view_notes
 
@@ -42,7 +41,6 @@ class FitSummary:
     fitted: FittedRig
     seconds: float
     effects_file: str | None
-    register: str = DEFAULT  # its method
     ledger: tuple[LedgerStep, ...] = ()
     left_out: tuple[ExcludedView, ...] = ()  # views of the session that do not belong
     kept: tuple[ExcludedView, ...] = ()  # such views that were fused all the same
@@ -55,7 +53,7 @@ class FitSummary:
 def assemble_run(session: Session, index: int, end: FitSummary, before: StageResult, recorder: Recorder) -> Run:
     """Register and fuse one session, collect its result with its line in the history, and show it."""
     course, fitted = pipeline_for(session), end.fitted
-    found, step = course.finish(session, fitted, index, before, recorder, end.seconds, end.register)
+    found, step = course.finish(session, fitted, index, before, recorder, end.seconds)
     own, model, begun = fitted.sessions[index], fitted.model_of(index), end.starts[index]
     # Where several sessions share a hand-eye no joint has one place for all.
     shared = fitted.captures if session.has_clouds else [fitted.captures[index]]

@@ -13,7 +13,7 @@ from pykdtree.kdtree import KDTree
 
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.scan import Scan
-from stitch.stages.look_through import range_images, solid_angle
+from stitch.stages.look_through import range_images
 from stitch.statistics.distributions import MAD_TO_SIGMA
 from stitch.system.threads import parallel
 
@@ -95,7 +95,7 @@ def find_support(scans: Sequence[Scan], poses: Array, placed: PlacedPoints, cell
     parts = np.split(settled, np.cumsum([len(scan.points) for scan in scans])[:-1])
     # What a view full of junk says of itself is not believed beyond what the others say of the same scanner.
     noise = _limited([scan.noise for scan in scans])
-    angles = _limited([solid_angle(scan) for scan in scans])
+    angles = _limited([scan.solid_angle for scan in scans])
     tests = list(parallel(lambda item: _held_by_own_view(*item), zip(scans, parts, noise, angles, strict=True)))
     held = np.concatenate([test[0] for test in tests])
     junk = np.array([test[1] for test in tests])

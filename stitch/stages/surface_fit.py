@@ -44,6 +44,7 @@ from stitch.stages.correct import Correction
 from stitch.stages.fit import WEAK, fitted_parameters, iterate
 from stitch.stages.sentences import ANOTHER_ARM, unfitted
 from stitch.statistics.parameter_selection import WhitenedData, omitted_rms
+from stitch.system.threads import known
 
 # The effect that is the scanner's scale.
 _SCALE = "range_scale"
@@ -220,8 +221,9 @@ def fit_surfaces(
     captures, freed = _solve_views(measurements, model, [f.overlaps.gate for f in last.linearised.unconstrained])
     overlaps = [_final_overlaps(c, model.T_mount, gate) for c, gate in zip(captures, gates, strict=True)]
     return Correction(
-        model=model,
-        hand_eye=last.hand_eye,
+        geometry=model,
+        statistics=known(last.hand_eye),
+        scatter=last.hand_eye.repeatability,
         overlaps=tuple(overlaps),
         unconstrained=tuple(freed),
         history=(*history, pooled_rms(overlaps)),

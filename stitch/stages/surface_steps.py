@@ -22,7 +22,7 @@ from stitch.runs.run import Fit, LedgerStep, StageResult
 from stitch.stages.coarse import REUSED, STATED, CoarseHandEye, find_coarse_hand_eye, use_given_hand_eye
 from stitch.stages.correct import Correction, apply_given_hand_eye, correct
 from stitch.stages.register import METHODS
-from stitch.stages.register_and_fuse import FittedRig, InitialModel, finish_surfaces
+from stitch.stages.register_and_fuse import FittedRig, InitialModel, begin_to_register_views, finish_surfaces
 from stitch.stages.sentences import coarse_note, mixed_notes, warnings
 from stitch.stages.surface_fit import fit_surfaces
 from stitch.stages.target_fit import FittedSession, fit_without_outliers, locate_targets
@@ -119,6 +119,12 @@ def linearise(session: Session, measurement: Measurement, model: Model, gate: fl
     return surface_model(measurement, model, own, unconstrained_poses(own, own.poses(model.T_mount), gate))
 
 
+def begin_to_register(fitted: FittedRig, register: str) -> FittedRig:
+    """The same, with the views of all sessions being registered by a method."""
+    assert fitted.correction is not None
+    return replace(fitted, begun=begin_to_register_views(fitted.correction, METHODS[register]))
+
+
 def finish(
     session: Session,
     fitted: FittedRig,
@@ -126,7 +132,6 @@ def finish(
     before: StageResult,
     recorder: Recorder,
     seconds: float,
-    register: str,
 ) -> tuple[Fit, LedgerStep]:
     """Register and fuse session `index` under the common model."""
     assert fitted.correction is not None
@@ -138,7 +143,7 @@ def finish(
         before=before,
         recorder=recorder,
         seconds=seconds,
-        method=METHODS[register],
+        begun=fitted.begun[index],
     )
 
 
@@ -151,7 +156,11 @@ def notes(session: Session, fitted: FittedRig, index: int, start: CoarseHandEye)
 
 
 def _locate_targets(measurements: Sequence[Measurement], correction: Correction) -> list[TargetModelFit | None]:
-    return [locate_targets(m, correction.model, correction.hand_eye.inflation) for m in measurements]
+    # How certain the hand-eye is need not be waited for where there are none.
+    return [
+        None if m.capture.sightings is None else locate_targets(m, correction.model, correction.hand_eye.inflation)
+        for m in measurements
+    ]
 
 
 def _fitted_rig(correction: Correction, sessions: Sequence[FittedSession]) -> FittedRig:
@@ -159,7 +168,7 @@ def _fitted_rig(correction: Correction, sessions: Sequence[FittedSession]) -> Fi
         replace(s, measurement=_with_noise_factor(s.measurement, own.noise_factor))
         for s, own in zip(sessions, correction.captures, strict=True)
     ]
-    return FittedRig(correction.model, weighed, list(correction.captures), correction)
+    return FittedRig(weighed, list(correction.captures), correction)
 
 
 def _with_noise_factor(measurement: Measurement, noise_factor: float) -> Measurement:

@@ -120,6 +120,11 @@ def linearise(session: Session, measurement: Measurement, model: Model, gate: fl
     return target_model(measurement, model, drawing_of(session.nominal, _sightings(measurement)))
 
 
+def begin_to_register(fitted: FittedRig, register: str) -> FittedRig:
+    """The same: `register` names a method of surfaces, which labelled points do not need."""
+    return fitted
+
+
 def finish(
     session: Session,
     fitted: FittedRig,
@@ -127,9 +132,8 @@ def finish(
     before: StageResult,
     recorder: Recorder,
     seconds: float,
-    register: str,
 ) -> tuple[Fit, LedgerStep]:
-    """Register single views; `register` names a method of surfaces, which labelled points do not need."""
+    """Register single views."""
     found = fitted.sessions[index].targets
     assert found is not None
     return finish_targets(session, found, before, recorder, seconds)
@@ -147,7 +151,7 @@ def _fitted_rig(
     once: Callable[[Sequence[Measurement], list[TargetModelFit] | None], list[TargetModelFit]],
 ) -> FittedRig:
     found, sessions = fit_without_outliers(measurements, once, lambda _, found: found)
-    return FittedRig(found[0].model, sessions, [own.rows.capture for own in found])
+    return FittedRig(sessions, [own.rows.capture for own in found])
 
 
 def _sightings(measurement: Measurement) -> Sightings:

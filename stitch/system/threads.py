@@ -11,9 +11,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from itertools import chain
+from threading import Thread
 from typing import Any, TypeVar
 
 import numpy as np
@@ -112,6 +113,31 @@ def parallel(function: Callable[[Item], Result], items: Iterable[Item], label: s
     size = max(len(every) // _PORTIONS, 1)
     portions = (every[start : start + size] for start in range(0, len(every), size))
     return chain.from_iterable(pool.map(lambda portion: [function(item) for item in portion], portions))
+
+
+def begin(function: Callable[[], Result]) -> Future[Result]:
+    """Begin a function in a thread of its own, and return its coming result; it may call `parallel`.
+
+    A process that ends before does not wait for it: it must not write files.
+    """
+    future = Future[Result]()
+
+    def run() -> None:
+        library_threads_off()
+        try:
+            future.set_result(function())
+        except BaseException as error:
+            future.set_exception(error)
+
+    Thread(target=run, name="stitch-beside", daemon=True).start()
+    return future
+
+
+def known(result: Result) -> Future[Result]:
+    """Return a result that is there already as one that has been begun."""
+    future = Future[Result]()
+    future.set_result(result)
+    return future
 
 
 def library_threads_off() -> Any:

@@ -14,7 +14,6 @@ from stitch.integrity.view_screening import ViewScreening, fit_screened_views
 from stitch.measurement.capture import prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.session import Cloud, Sighting
-from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile
 from stitch.pipeline import change, run
 from stitch.stages.register_and_fuse import FittedRig
@@ -159,6 +158,6 @@ def test_labelled_points_with_exchanged_coordinates_are_refused():
 def test_a_fit_that_says_nothing_about_the_poses_leaves_no_view_out():
     session, T_mount, _ = labelled_cell(0, views=12)
     measurement = measurement_of(session, prepare_capture(session))
-    fitted = FittedRig(Model(T_mount), [FittedSession(measurement, None, ())], [measurement.capture])
+    fitted = FittedRig([FittedSession(measurement, None, ())], [measurement.capture])
     found = fit_screened_views([session], [measurement], lambda sessions, measurements: fitted)
     assert found.screenings == [ViewScreening()] and found.sessions == [session]
