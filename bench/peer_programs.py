@@ -1,7 +1,8 @@
 """What other libraries make of the same scans and start poses: pairs aligned one by one, then a graph of poses.
 
 Run by `peers.py`, in an environment that has numpy, plyfile, open3d and small_gicp:
-python peer_programs.py open3d|small_gicp CLOUDS START.npy OUT.npy
+python peer_programs.py open3d|small_gicp VOXEL CLOUDS START.npy OUT.npy
+VOXEL, in mm, is the grid to which clouds are thinned for the alignment; 0: not at all.
 """
 
 import sys
@@ -19,12 +20,12 @@ NEIGHBOURS, ROBUST = 20, 0.2
 
 
 def main() -> None:
-    which, folder, start, out = sys.argv[1:]
+    which, voxel, folder, start, out = sys.argv[1:]
     files = sorted(Path(folder).iterdir())
     clouds = [np.column_stack([PlyData.read(str(f))["vertex"][a] for a in "xyz"]).astype(float) for f in files]
     edges = {"open3d": open3d_edges, "small_gicp": small_gicp_edges}[which]
     poses = np.load(start)
-    poses = optimised(poses, edges(clouds, poses))
+    poses = optimised(poses, edges(clouds, poses, float(voxel)))
     np.save(out, poses)
     merged = np.concatenate([c @ T[:3, :3].T + T[:3, 3] for c, T in zip(clouds, poses, strict=True)])
     merged.astype("<f4").tofile(Path(out).with_suffix(".xyz"))
@@ -36,7 +37,7 @@ def of_one_side(clouds, poses):
     return [(i, j) for i, j in combinations(range(len(clouds)), 2) if looks[i] @ looks[j] > 0.5]
 
 
-def open3d_edges(clouds, poses, distances=DISTANCES):
+def open3d_edges(clouds, poses, voxel=0.0, distances=DISTANCES):
     """(i, j, T_i_j, information) of all pairs that meet: robust point-to-plane ICP."""
     import open3d as o3d
 
@@ -44,6 +45,7 @@ def open3d_edges(clouds, poses, distances=DISTANCES):
     shown = []
     for points in clouds:
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        cloud = cloud.voxel_down_sample(voxel) if voxel else cloud
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
         shown.append(cloud)
     plane = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=ROBUST))
@@ -59,11 +61,12 @@ def open3d_edges(clouds, poses, distances=DISTANCES):
         yield i, j, T, information
 
 
-def small_gicp_edges(clouds, poses, distances=DISTANCES):
+def small_gicp_edges(clouds, poses, voxel=0.0, distances=DISTANCES):
     """The same by generalised ICP."""
     import small_gicp
 
-    made = [small_gicp.preprocess_points(p, downsampling_resolution=1e-3, num_neighbors=NEIGHBOURS) for p in clouds]
+    size = voxel or 1e-3
+    made = [small_gicp.preprocess_points(p, downsampling_resolution=size, num_neighbors=NEIGHBOURS) for p in clouds]
     for i, j in of_one_side(clouds, poses):
         T = np.linalg.inv(poses[i]) @ poses[j]
         (target, tree), (source, _) = made[i], made[j]

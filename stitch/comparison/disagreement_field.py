@@ -118,9 +118,8 @@ class Patches:
 
     def field(self, distances: Array) -> DisagreementField:
         """The field of signed distances (M,) of all correspondences in their order, v less w."""
-        count = self.counts.by_cell(np.ones_like(distances), 1.0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            value = self.kernel @ self.counts.by_cell(distances, -1.0) / (self.kernel @ count)
+            value = self.kernel @ self.counts.differences(distances) / (self.kernel @ self.counts.numbers)
         return DisagreementField(np.where(np.isfinite(self.sigma), value.T, np.nan), self.sigma)
 
 
@@ -134,11 +133,19 @@ class _Counts:
     views: int
     cells: int
 
-    def by_cell(self, values: Array, sign: float) -> Array:
-        """(C, V) sums of values (M,); of a w its value times `sign`."""
+    @cached_property
+    def _key(self) -> Indices:
+        return np.concatenate([self.cell, self.cell]) * self.views + self.view
+
+    @cached_property
+    def numbers(self) -> Array:
+        """(C, V) how many there are."""
+        return np.bincount(self._key, minlength=self.cells * self.views).reshape(self.cells, self.views).astype(float)
+
+    def differences(self, values: Array) -> Array:
+        """(C, V) sums of values (M,), those of a w with the other sign."""
         e = values[self.inside]
-        key = np.concatenate([self.cell, self.cell]) * self.views + self.view
-        sums = np.bincount(key, np.concatenate([e, sign * e]), self.cells * self.views)
+        sums = np.bincount(self._key, np.concatenate([e, -e]), self.cells * self.views)
         return np.asarray(sums.reshape(self.cells, self.views), float)
 
 
@@ -179,9 +186,9 @@ def _standard_errors(kernel: csr_matrix, counts: _Counts, quiet: Array) -> Array
 
     Neighbouring distances share points and normals; cells are wide enough not to.
     """
-    n = counts.by_cell(np.ones_like(quiet), 1.0)
+    n = counts.numbers
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.nan_to_num(counts.by_cell(quiet, -1.0) / n)
+        mean = np.nan_to_num(counts.differences(quiet) / n)
         total = kernel @ n
         value = kernel @ (n * mean) / total
         square, a2 = kernel.multiply(kernel).tocsr(), n**2
@@ -210,12 +217,14 @@ def _group_points(points: Array, normals: Array, size: float) -> tuple[Indices, 
     side += np.take_along_axis(normals, (side // 2)[:, None], axis=1)[:, 0] > 0
     index = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     key = np.ravel_multi_index((*index.T, side), (*(index.max(axis=0) + 1), 6))
-    _, group, count = np.unique(key, return_inverse=True, return_counts=True)
+    # The grid has some eighty cells a side: a table of all takes less than a search for the different ones.
+    every = np.bincount(key)
+    group, count = (np.cumsum(every > 0) - 1)[key], every[every > 0]
     point, normal = (
         np.stack([np.bincount(group, x, len(count)) for x in values.T], axis=1) / count[:, None]
         for values in (points, normals)
     )
-    return group.astype(np.int64), point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return group, point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
 
 
 # The field of disagreement at every step of a model's history: coarse, corrected, each effect, register.

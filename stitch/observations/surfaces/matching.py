@@ -147,12 +147,9 @@ def signed_distances(matches: Sequence[Match], poses: Array, points: Sequence[Ar
         poses: T_reference_scanner, (V, 4, 4).
         points: (N, 3) of every scan, scanner frame.
     """
-    out = []
-    for m in matches:
-        p = frames.transform(poses[m.v], points[m.v][m.index_v])
-        q = frames.transform(poses[m.w], points[m.w][m.index_w])
-        out.append(np.einsum("ij,ij->i", p - q, m.normal))
-    return np.concatenate(out)
+    placed = [frames.transform(T, own) for T, own in zip(poses, points, strict=True)]
+    along = [np.einsum("ij,ij->i", placed[m.v][m.index_v] - placed[m.w][m.index_w], m.normal) for m in matches]
+    return np.concatenate(along)
 
 
 def _partners_by_view(every: NeighbourQueries, w: int, parts: Sequence[QueryPart], gate: float) -> dict[int, Match]:
