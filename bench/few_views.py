@@ -4,7 +4,7 @@ Usage: python bench/few_views.py --seed S [--cells N] [--views 4,5,6,7,8] [--kee
 
 Every cell has views, clouds and an arm of its own; seeds take scenes, views and kinds of arm in turn. The scans are
 those of an arm without errors, and the reported poses those of one that has them, which is the same to first order.
-Used up: 7000, 7100, 9000 to 9026, 31000 to 31044, 31100 to 31123, 40000 to 40089 (docs/method.md, "What U rests on").
+Used up: 7000, 7100, 9000 to 9026, 31000 to 31044, 31100 to 31123, 40000 to 40399 (docs/method.md, "What U rests on").
 """
 
 import argparse
