@@ -26,7 +26,7 @@ from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
 
 SCENES = ("blade", "drill-plate", "blade-table")
-DEVELOPMENT, HELD_OUT = (0, 1), (746, 747, 748, 749)
+DEVELOPMENT, HELD_OUT = (0, 1), (750, 751, 752, 753)
 KINDS = (
     *(("clean", 0.0), ("ordinary arm", 0.1), ("ordinary arm", 0.3), ("ordinary arm", 1.0), ("ordinary arm", 2.0)),
     *(("memory", 0.5), ("memory", 0.9), ("stops", 1.0), ("coupling", 1.5e-4), ("coupling", 6e-4)),
