@@ -18,7 +18,7 @@ from data_synth.arms import ARMS
 from data_synth.kinematics import gravity_torques
 from data_synth.ordinary_arm import draw_arm
 from stitch import frames
-from stitch.calibrate.robot import _TRUST, _observe_links, link_table
+from stitch.calibrate.robot import LINK_TRUSTS, link_table, observe_links
 from stitch.frames import Array
 from stitch.measurement.robot import Robot, forward
 from stitch.measurement.session import Scanner, Session, Sighting, View
@@ -93,13 +93,13 @@ def row_of(seed: int) -> tuple[str, bool, float]:
     """A line of the table, whether it is better than the nominal arm everywhere, and its share of the best ridge."""
     made = SimulatedArm(seed)
     session = made.session()
-    found, seen = link_table(session), _observe_links(session)
+    found, seen = link_table(session), observe_links(session)
     every = np.ones(len(seen.joints), bool)
     cells, better, shares = [], True, []
     for half in ("other", "whole"):
         q = made.joints(_JUDGED, half)
         nominal, own = made.error(made.nominal, q), made.error(found.robot, q)
-        best = min(made.error(seen.table(made.nominal, scale, every), q) for scale in _TRUST)
+        best = min(made.error(seen.table(made.nominal, scale, every), q) for scale in LINK_TRUSTS)
         cells += [f"{nominal:.3f}", f"{own:.3f}", f"{best:.3f}"]
         better, shares = better and own < nominal, [*shares, own / best]
     meca = "43°" if seed % 4 == 0 else "half"

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.field_drawn import draw_kinds
-from data_synth.fixtures.field_folders import KINDS, Campaign, Kind, _rescale
+from data_synth.fixtures.field_folders import KINDS, Campaign, Kind, rescale
 from data_synth.write import write_session
 from stitch import frames
 from stitch.cli.main import main as stitch
@@ -124,7 +124,7 @@ def follow(refusal: str, folder: Path, campaign: Campaign | None = None) -> tupl
     if "--ball RADIUS" in refusal:
         return ("--ball", "30")
     if found := re.search(r"multiply x, y, z of the clouds by (\S+),", refusal):
-        return _rescale(float(found[1]))(folder)
+        return rescale(float(found[1]))(folder)
     if "put the URDF" in refusal and (away := list(folder.glob("*.urdf.gone"))):
         away[0].rename(away[0].with_suffix(""))
         return ()

@@ -26,12 +26,12 @@ from stitch.frames import Array
 from stitch.measurement.capture import Capture, part_size, prepare_capture
 from stitch.stages.coarse import (
     HandEyeCandidate,
-    _even_grid_size,
-    _neighbours,
     consistent_motions,
     distinct_hand_eyes,
+    even_grid_size,
     find_coarse_hand_eye,
     icp_from_starts,
+    neighbouring_views,
     robot_motions,
     same_hand_eye,
 )
@@ -48,7 +48,7 @@ CLOSE = 1.1  # two answers whose scores differ by less are equally good: the sea
 
 def motions(o3d, capture: Capture, way: str) -> Array:
     """Return the motions (M, 4, 4) of neighbouring scans by Open3D."""
-    registration, step = o3d.pipelines.registration, max(_even_grid_size(s.points) for s in capture.scans)
+    registration, step = o3d.pipelines.registration, max(even_grid_size(s.points) for s in capture.scans)
 
     def described(points: Array):
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, float))).voxel_down_sample(step)
@@ -59,7 +59,7 @@ def motions(o3d, capture: Capture, way: str) -> Array:
 
     shown = [described(scan.points) for scan in capture.scans]
     out = []
-    for v, w in _neighbours(len(shown)):
+    for v, w in neighbouring_views(len(shown)):
         (target, target_feature), (source, source_feature) = shown[v], shown[w]
         if way == "FGR":
             option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=step)
@@ -89,7 +89,7 @@ def motions(o3d, capture: Capture, way: str) -> Array:
 
 def hand_eyes(capture: Capture, B: Array) -> list[tuple[str, Array]]:
     """Return the hand-eyes that the motions give, with the names of their solvers."""
-    A, B = consistent_motions(robot_motions(capture, _neighbours(len(capture.scans))), B)
+    A, B = consistent_motions(robot_motions(capture, neighbouring_views(len(capture.scans))), B)
     out = []
     for name, solver in AXXB_SOLVERS.items() if len(A) >= 3 else ():
         try:

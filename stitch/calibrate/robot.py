@@ -181,7 +181,7 @@ def poses_to_add(run: Run) -> Array:
 # and read back, and that end is run with it and with the nominal arm, base and tool fitted anew for either.
 
 # Sizes of the prior that are tried, in plausible sizes of each parameter.
-_TRUST = tuple(2.0**k for k in range(-6, 3))
+LINK_TRUSTS = tuple(2.0**k for k in range(-6, 3))
 # Of the views, how many an end holds; joints that turn less than this, rad, have none. The table is proved at ends of
 # the joints that turn farthest.
 _END, _STILL, _ENDS_PROVED = 1 / 3, 0.05, 6
@@ -234,13 +234,13 @@ def link_table(session: Session) -> LinkTable:
     if nominal is None or joints is None:
         raise InputError(f"{session.path}: no [robot] with joint angles; a table of its links needs them")
     try:
-        seen = _observe_links(session)
+        seen = observe_links(session)
     except (InputError, NoResultError):
         return LinkTable(nominal, ())
     ends = _ends(seen.joints)
     if len(seen.joints) < _FEWEST_VIEWS or not ends:
         return LinkTable(nominal, ())
-    trust = min((0.0, *_TRUST), key=lambda scale: sum(seen.left_at(end, scale) for end in ends))
+    trust = min((0.0, *LINK_TRUSTS), key=lambda scale: sum(seen.left_at(end, scale) for end in ends))
     widest = np.argsort(-np.ptp(seen.joints, axis=0))[: _ENDS_PROVED // 2]
     proof = [(end, seen.table(nominal, trust, ~end)) for end in _ends(seen.joints, widest.tolist())]
     judged = _judge(session, seen.names, proof)
@@ -263,7 +263,7 @@ def _ends(joints: Array, of: Sequence[int] | None = None) -> list[Mask]:
 
 
 @dataclass(frozen=True)
-class _SeenLinks:
+class SeenLinks:
     """What V views that show targets tell of offsets and links about the nominal arm, whitened."""
 
     names: tuple[str, ...]
@@ -297,7 +297,7 @@ class _SeenLinks:
         return with_geometry(nominal, with_parameter_values(self.terms, values))
 
 
-def _observe_links(session: Session) -> _SeenLinks:
+def observe_links(session: Session) -> SeenLinks:
     """Linearise the targets of a session about its nominal arm."""
     found = run(session)
     if found.targets is None or found.session.joints is None:
@@ -316,7 +316,7 @@ def _observe_links(session: Session) -> _SeenLinks:
     white = (half @ np.concatenate([base, columns, every.z[..., None]], axis=2))[shown]
     names = tuple(found.session.names[v] for v in shown)
     products = white.transpose(0, 2, 1) @ white
-    return _SeenLinks(names, found.session.joints[shown], terms, base.shape[2], products)
+    return SeenLinks(names, found.session.joints[shown], terms, base.shape[2], products)
 
 
 def _judge(session: Session, names: Sequence[str], proof: Sequence[tuple[Mask, Robot | None]]) -> Array | None:

@@ -207,7 +207,7 @@ def feature_motions(capture: Capture) -> tuple[Array, Array]:
 
     def described(scan: Scan) -> FeaturedSurface:
         points, normals = feature_matching.voxel_downsample(
-            scan.points, scan.normals, max(size / 2, _even_grid_size(scan.points))
+            scan.points, scan.normals, max(size / 2, even_grid_size(scan.points))
         )
         return feature_matching.compute_fpfh(points, normals, 2.5 * size)
 
@@ -218,16 +218,17 @@ def feature_motions(capture: Capture) -> tuple[Array, Array]:
         T = feature_matching.register_ransac(source, target, reach=1.5 * size, draws=_DRAWS)
         return feature_matching.align_icp(source, target, T, reach=size)
 
-    pairs = _neighbours(len(capture.scans))
+    pairs = neighbouring_views(len(capture.scans))
     return robot_motions(capture, pairs), np.array(list(parallel(motion, pairs, "pairs of scans"))).reshape(-1, 4, 4)
 
 
-def _neighbours(views: int) -> list[tuple[int, int]]:
+def neighbouring_views(views: int) -> list[tuple[int, int]]:
+    """Pairs of views one and two apart, of two views the pair."""
     steps = [(v, v + step) for step in (1, 2) for v in range(views - step)]
     return steps if views > 2 else [(0, 1)]
 
 
-def _even_grid_size(points: Array) -> float:
+def even_grid_size(points: Array) -> float:
     """Grid size that leaves about `_POINTS` points of a surface."""
     extent = np.ptp(points, axis=0)
     return float(np.sqrt(np.prod(np.sort(extent)[1:]) / _POINTS))
