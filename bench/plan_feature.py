@@ -1,21 +1,25 @@
 """Do views that `stitch plan --for` proposes make a feature better known than random ones? A table of docs/measure.md.
 
-Run: python bench/plan_feature.py [--cells 12] [--first-seed 600]; with --expected for the table of docs/plan.md
+Run: python bench/plan_feature.py [--cells 24] [--first-seed 640]; with --expected for the table of docs/plan.md
 
 Cells of three kinds (`feature_coverage.py`) have four views of a sphere plate, of which a point is measured. Four
-further views are proposed for that point; as many are drawn from all that see the part. Both are simulated, stitched
-and measured. With --expected nothing is simulated beyond the four views: U is what the linear model of the plan says,
+further views are proposed for that point; three times as many are drawn from all that see the part. Each four are
+simulated, stitched and measured with the first. Errors of the arm hardly show in so few views, and each run takes
+others for likely, so that U is told as each run states it, and with sizes of errors that all runs of a cell share:
+their mean. With --expected nothing is simulated beyond the four views: U is what the linear model of the plan says,
 and beside the proposed views stand the best four of a dense set of reachable ones, by exchange from several starts.
 """
 
 import argparse
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
 from batch import into_page
 from feature_coverage import cell, features_of
+from scipy.stats import bootstrap
 
 from data_synth import kinematics
 from data_synth.fixtures.in_memory import session_of
@@ -23,7 +27,8 @@ from data_synth.moment import Plan
 from data_synth.simulate import Measured
 from stitch.frames import Array
 from stitch.measurement.session import Session
-from stitch.measuring.budget import measure_features
+from stitch.measuring import error_sources
+from stitch.measuring.budget import Number, measure_features
 from stitch.measuring.error_sources import place_errors
 from stitch.measuring.feature_file import FeatureList
 from stitch.measuring.features import Feature
@@ -32,12 +37,14 @@ from stitch.planning import plan
 from stitch.planning.candidate_views import candidate_joints, with_views
 from stitch.planning.detection_chances import view_outlook
 from stitch.planning.expected_model import CellModel, PlannedCell, Scatter, cell_of_state
-from stitch.planning.plan import KnownPlace, PlanRequest, plan_further_views
+from stitch.planning.plan import KnownPlace, PlanRequest
 from stitch.runs.run import Run
+from stitch.statistics.reml import MixedModel, VarianceFit
+from stitch.statistics.variance_posterior import mean_variances
 from stitch.system.threads import library_threads_off
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "measure.md"
-PRESENT, FURTHER = 4, 4
+PRESENT, FURTHER, RANDOM = 4, 4, 3
 KINDS = ("clean", "ordinary arm", "smooth scanner errors")
 PLAN_PAGE = PAGE.with_name("plan.md")
 DENSE, DRAWS, STARTS, ROUNDS = 120, 100, 3, 6
@@ -63,7 +70,8 @@ def expected(kind: str, seed: int) -> tuple[float, float, float, float, float]:
         now = view_outlook(session, cell_model, planned.fitted_scatter, wanted.at)
         scatter = now.fitted_scatter.believed
         tried = candidate_joints(session, cell_model, DENSE)
-        goal, best = _dense_search(session, cell_model, scatter, request, tried)
+        goal = _goal_over(session, cell_model, scatter, request, tried)
+        best = _dense_search(goal, len(tried))
         present, count, rng = list(range(PRESENT)), PRESENT + len(tried), np.random.default_rng(seed)
         drawn = [rng.choice(np.arange(PRESENT, count), FURTHER, replace=False) for _ in range(DRAWS)]
         random = np.median([goal.U(goal.channel.normal([*present, *views])) for views in drawn])
@@ -76,79 +84,162 @@ def expected(kind: str, seed: int) -> tuple[float, float, float, float, float]:
     return float(goal.U(goal.channel.normal(present))), float(random), searched[0], searched[1], best
 
 
-def _dense_search(
+def _goal_over(
     session: Session, cell_model: CellModel, scatter: Scatter, request: PlanRequest, tried: Array
-) -> tuple[KnownPlace, float]:
-    """The goal over all views that were tried, and the least U that exchange finds there."""
+) -> KnownPlace:
+    """The goal over the present views and some more (K, n)."""
     every = with_views(session, list(tried), in_turn=False)
     coarse = replace(
         cell_model, part=plan.thinned_surface(cell_model.part.points, cell_model.part.normals, plan._POINTS)
     )
     simulated = plan.simulate_views(every, coarse, plan._SAMPLES, plan._MIN_VIEW_SAMPLES)
-    goal = plan._place_goal(plan.PossibleViews(every, coarse, simulated, scatter), request)
+    return plan._place_goal(plan.PossibleViews(every, coarse, simulated, scatter), request)
+
+
+def _dense_search(goal: KnownPlace, tried: int) -> float:
+    """The least U that exchange finds among so many views beside the present ones."""
     present, rng, least = list(range(PRESENT)), np.random.default_rng(0), np.inf
     for _ in range(STARTS):
-        chosen = [int(k) for k in rng.choice(np.arange(PRESENT, PRESENT + len(tried)), FURTHER, replace=False)]
+        chosen = [int(k) for k in rng.choice(np.arange(PRESENT, PRESENT + tried), FURTHER, replace=False)]
         for turn in range(ROUNDS * FURTHER):
             rest = [k for i, k in enumerate(chosen) if i != turn % FURTHER]
-            others = [k for k in range(PRESENT, PRESENT + len(tried)) if k not in rest]
+            others = [k for k in range(PRESENT, PRESENT + tried) if k not in rest]
             U = goal.U(goal.channel.with_each([*present, *rest], others))
             chosen[turn % FURTHER] = others[int(U.argmin())]
             least = min(least, float(U.min()))
-    return goal, least
+    return least
 
 
-def trial(kind: str, seed: int) -> tuple[float, float, float]:
-    """U of the point by the present views, with those proposed, and with random ones; mm."""
+@dataclass(frozen=True)
+class Trial:
+    """One cell; of the 1 + RANDOM sets of further views the proposed one is first. Lengths in mm."""
+
+    kind: str
+    now: float  # U that the plan expects of the present views
+    expected: Array  # (1 + RANDOM,) U that it expects with a set
+    stated: Array  # (1 + RANDOM,) U of the measured point
+    shared: Array  # (1 + RANDOM,) the same with the sizes of errors that all sets share
+    errors: Array  # (1 + RANDOM,) of the measured point
+
+    @property
+    def factors(self) -> Array:
+        """(3,) U with random views (median) over U with the proposed ones: stated, with shared sizes, expected."""
+        return np.array([np.median(U[1:]) / U[0] for U in (self.stated, self.shared, self.expected)])
+
+    @property
+    def squares(self) -> Array:
+        """(2,) squared errors with the proposed views, and with random ones, in units of what these make usual."""
+        squares = (self.errors / np.median(self.shared[1:])) ** 2
+        return np.array([squares[0], squares[1:].mean()])
+
+
+def trial(kind: str, seed: int) -> Trial:
+    """Measure the point of a cell with the proposed views, and with random ones."""
     measured, wanted, planned, request = planned_cell(kind, seed)
-    session = session_of(measured)
-    proposed = np.array([view.joints for view in plan_further_views(session, planned, request).proposed])
-    others = candidate_joints(session, planned.cell, 40)
-    drawn = others[np.random.default_rng([seed, 5]).choice(len(others), len(proposed), replace=False)]
-    joints = np.vstack([measured.plan.joints, proposed, drawn])
-    arm, still = measured.scene.arm, np.zeros_like(joints)
-    plan = Plan(joints, kinematics.gravity_torques(arm, joints), still, arm, measured.scene.useful)
-    whole = session_of(cell(kind, seed, plan=plan))
-    sets = np.split(np.array(whole.names), [PRESENT, PRESENT + len(proposed)])
-    without = ([*sets[1], *sets[2]], [*sets[2]], [*sets[1]])
-    U = [_U(run(whole.without(names)), wanted) for names in without]
-    return U[0], U[1], U[2]
+    session, rng = session_of(measured), np.random.default_rng([seed, 5])
+    with library_threads_off():  # as `plan_further_views`, without the chances of effects
+        now = view_outlook(session, planned.cell, planned.fitted_scatter, wanted.at, chances=False)
+        scatter = now.fitted_scatter.believed
+        sets = [plan._search_views(session, planned.cell, scatter, now, request)[2]]
+        others, count = candidate_joints(session, planned.cell, 40), len(sets[0])
+        sets += [others[rng.choice(len(others), count, replace=False)] for _ in range(RANDOM)]
+        goal = _goal_over(session, planned.cell, scatter, request, np.vstack(sets))
+        starts = PRESENT + count * np.arange(len(sets))
+        present = list(range(PRESENT))
+        expects = [goal.U(goal.channel.normal([*present, *range(k, k + count)])) for k in starts]
+    states = [run(session_of(cell(kind, seed, plan=_plan_of(measured, more)))) for more in sets]
+    sizes = list[Array]()
+
+    def noted(mixed: MixedModel, fitted: VarianceFit) -> Array:
+        found = mean_variances(mixed, fitted)
+        if mixed.fixed is None:  # else only the scanner's share in the noise is asked for
+            sizes.append(found)
+        return found
+
+    with patch.object(error_sources, "mean_variances", noted):
+        stated = [_number(state, wanted) for state in states]
+    with patch.object(error_sources, "mean_variances", lambda *_: np.mean(sizes, axis=0)):
+        shared = [_number(state, wanted).U for state in states]
+    U, errors = (np.array(x) for x in zip(*((number.U, number.value) for number in stated), strict=True))
+    present_U = float(goal.U(goal.channel.normal(present)))
+    return Trial(kind, present_U, np.array(expects, float), U, np.array(shared), errors)
 
 
-def _U(state: Run, wanted: Feature) -> float:
-    return measure_features(place_errors(state), FeatureList((wanted,))).numbers[0].U
+def _plan_of(measured: Measured, further: Array) -> Plan:
+    """The views of a cell and some more (K, n)."""
+    joints, arm = np.vstack([measured.plan.joints, further]), measured.scene.arm
+    return Plan(joints, kinematics.gravity_torques(arm, joints), np.zeros_like(joints), arm, measured.scene.useful)
+
+
+def _number(state: Run, wanted: Feature) -> Number:
+    return measure_features(place_errors(state), FeatureList((wanted,))).numbers[0]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cells", type=int, default=12)
-    parser.add_argument("--first-seed", type=int, default=600)
+    parser.add_argument("--cells", type=int, default=24)
+    parser.add_argument("--first-seed", type=int, default=640)
     parser.add_argument("--expected", action="store_true", help="As the linear model expects, for docs/plan.md.")
     arguments = parser.parse_args()
-    heads = ["cells", "U now (µm)"]
+    cells = [
+        (KINDS[seed % len(KINDS)], seed) for seed in range(arguments.first_seed, arguments.first_seed + arguments.cells)
+    ]
     if arguments.expected:
-        heads += ["as many random ones", "best of 40 drawn", "proposed", f"best of {DENSE} drawn", "random / proposed"]
+        into_page("expected", expected_table(cells), PLAN_PAGE)
     else:
-        heads += ["with those proposed", "with as many random ones", "random / proposed"]
-    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+        into_page("further", measured_table(cells), PAGE)
+
+
+def expected_table(cells: Sequence[tuple[str, int]]) -> list[str]:
+    """Lines of the table of docs/plan.md."""
+    heads = ("cells", "U now (µm)", "as many random ones", "best of 40 drawn", "proposed", f"best of {DENSE} drawn")
+    lines = _head(*heads, "random / proposed")
     factors = []
-    for seed in range(arguments.first_seed, arguments.first_seed + arguments.cells):
-        kind = KINDS[seed % len(KINDS)]
-        if arguments.expected:
-            now, random, first, proposed, best = (1e3 * U for U in expected(kind, seed))
-            numbers = [now, random, first, proposed, best]
-        else:
-            now, proposed, random = (1e3 * U for U in trial(kind, seed))
-            numbers = [now, proposed, random]
-        factors.append(random / proposed)
-        lines.append(f"| {kind} | " + " | ".join(f"{x:.0f}" for x in numbers) + f" | {factors[-1]:.2f} |")
-        print(lines[-1], flush=True)
+    for kind, seed in cells:
+        numbers = expected(kind, seed)
+        factors.append(numbers[1] / numbers[3])
+        lines.append(_row(kind, numbers, factors[-1:]))
     low, median, high = np.quantile(factors, [0.25, 0.5, 0.75])
-    lines += ["", f"Median of {len(factors)} cells {median:.2f}, middle half {low:.2f} to {high:.2f}."]
-    if arguments.expected:
-        into_page("expected", lines, PLAN_PAGE)
-    else:
-        into_page("further", lines, PAGE)
+    return [*lines, "", f"Median of {len(factors)} cells {median:.2f}, middle half {low:.2f} to {high:.2f}."]
+
+
+def measured_table(cells: Sequence[tuple[str, int]]) -> list[str]:
+    """Lines of the table of docs/measure.md."""
+    heads = ("cells", "U now (µm)", "with those proposed", "with as many random ones", "random / proposed")
+    lines = _head(*heads, "at the same sizes of errors", "expected")
+    trials = list[Trial]()
+    for kind, seed in cells:
+        trials.append(trial(kind, seed))
+        told = trials[-1]
+        lines.append(_row(kind, (told.now, told.stated[0], np.median(told.stated[1:])), told.factors))
+    factors = np.array([t.factors for t in trials])
+    intervals = [bootstrap((column,), np.median, rng=0).confidence_interval for column in factors.T]
+    words = [
+        f"{m:.2f} ({i.low:.2f} to {i.high:.2f})" for m, i in zip(np.median(factors, axis=0), intervals, strict=True)
+    ]
+    squares = np.array([t.squares for t in trials]).T
+    of_errors = bootstrap(tuple(squares), _error_factor, paired=True, vectorized=True, rng=0).confidence_interval
+    return [
+        *lines,
+        "",
+        f"Medians of {len(trials)} cells with 95 % intervals: {words[0]}; at the same sizes {words[1]}; expected "
+        f"{words[2]}. True errors,\nrms: {_error_factor(*squares):.2f} ({of_errors.low:.2f} to {of_errors.high:.2f}).",
+    ]
+
+
+def _error_factor(proposed: Array, random: Array, axis: int = -1) -> Array:
+    return np.sqrt(random.mean(axis=axis) / proposed.mean(axis=axis))
+
+
+def _head(*heads: str) -> list[str]:
+    return ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+
+
+def _row(kind: str, lengths: Iterable[float], factors: Iterable[float]) -> str:
+    """A line of a table, printed; lengths in mm."""
+    line = " | ".join([kind, *(f"{1e3 * x:.0f}" for x in lengths), *(f"{x:.2f}" for x in factors)])
+    print(f"| {line} |", flush=True)
+    return f"| {line} |"
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ effects that change points, move the points themselves as well. The sizes are po
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -169,7 +169,7 @@ def _sources(run: Run, chain: ErrorChain) -> Iterator[ErrorSource]:
         (SCANNER, chain.of_overlaps(twists[:, [k]] * size), known, k)
         for k, (size, known) in enumerate(zip(sizes, degrees, strict=True))
     ]
-    for name, (views, x), known, k in [*_pose_modes(run, chain), *_model_modes(run, chain), *smooth]:
+    for name, (views, x), known, k in [*_pose_modes(run, chain, twists * sizes), *_model_modes(run, chain), *smooth]:
         parameters, field = np.zeros((len(chain.fitted), x.shape[1])), np.zeros((len(sizes), x.shape[1]))
         parameters[chain.fitted] = x[6:]
         if k is not None:
@@ -194,8 +194,11 @@ def _smooth_errors(run: Run, chain: ErrorChain) -> tuple[Array, Array, Array]:
     return twists, (noise * shares)[of_mode], (0.5 / spread**2)[of_mode]
 
 
-def _pose_modes(run: Run, chain: ErrorChain) -> Iterator[_Modes]:
-    """Errors of the poses and the noise of the overlaps, as large as the views show them."""
+def _pose_modes(run: Run, chain: ErrorChain, smooth: Array) -> Iterator[_Modes]:
+    """Errors of the poses and the noise of the overlaps, as large as the views show them.
+
+    What the overlaps vary by more than they would if smooth errors (6V, K) were known is not noise but the scanner's.
+    """
     found, g = chain.solution, chain.freed.overlaps.gram
     errors = prior_pose_errors([run.measurement], run.model, [g.centre]).repeating_only()
     mixed = found.rig.mixed(errors)
@@ -207,8 +210,12 @@ def _pose_modes(run: Run, chain: ErrorChain) -> Iterator[_Modes]:
         root = block_diag(*carried[:, :, axes])
         yield SCATTER, chain.of_poses(sigma[k] * root), float(known[k]), None
     seen = g.visible
-    noise = seen.scale[:, None] * seen.vectors * np.sqrt(g.variance / seen.values)
-    yield OVERLAPS, chain.of_overlaps(sigma[NOISE] * noise), float(known[NOISE]), None
+    noise = sigma[NOISE] * seen.scale[:, None] * seen.vectors * np.sqrt(g.variance / seen.values)
+    seen_smooth = found.rig.reduce([smooth])
+    beside = replace(mixed, fixed=(seen_smooth @ seen_smooth.T)[None])
+    left = mean_variances(beside, fit_variances(beside, both_starts=True))[NOISE] / sigma[NOISE] ** 2
+    for name, share in ((OVERLAPS, min(left, 1.0)), (SCANNER, 1.0 - min(left, 1.0))):
+        yield name, chain.of_overlaps(np.sqrt(share) * noise), float(known[NOISE]), None
     names = dict.fromkeys(DRIFT_MEMORY, WANDERING) | dict.fromkeys(STOP_COMPONENTS, STOP)
     for k, (name, component) in enumerate(zip(errors.names, errors.components, strict=True), NOISE + 1):
         yield names.get(name, ARM), chain.of_poses(sigma[k] * _root(component)), float(known[k]), None

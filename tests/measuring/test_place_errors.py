@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.in_memory import session_of
-from data_synth.fixtures.quiet_scenes import clean, plan_for, simulated
+from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.shapes.spheres import SpherePlate, centres
 from stitch import frames
+from stitch.measuring import error_sources
 from stitch.measuring.budget import OWN_NOISE, evaluate, fit_features, monte_carlo, number_table, stack_responses
-from stitch.measuring.error_sources import SCANNER, error_chain, place_errors
+from stitch.measuring.error_sources import OVERLAPS, SCANNER, error_chain, place_errors
 from stitch.measuring.feature_file import Contribution, FeatureList
 from stitch.measuring.features import Feature
 from stitch.measuring.place_errors import point_sigmas
@@ -25,7 +26,6 @@ def cell():
     scene = clean("spheres", rays=90, noise=0.02)
     part = replace(scene.part, labelled=False, parameters={"radius": PLATE.radius})
     scene = replace(scene, part=part, repeatability=(15e-6, 0.01))
-    plan_for(scene, 3, views=6)
     measured = simulated(scene, {}, 3, views=6)
     T = scene.T_reference_part
     balls = frames.transform(T, centres(PLATE))
@@ -61,7 +61,7 @@ def _lengths(wanted, values):
 @pytest.mark.slow  # a whole run again
 def test_smooth_scanner_error_moves_features_as_predicted(cell):
     state, places, wanted = cell
-    smooth = [s for s in places.sources if s.name == SCANNER]
+    smooth = [s for s in places.sources if s.field.any()]
     k, size = 2, 0.05  # one that is coarse over the field, mm
     predicted = _responses(places, wanted).loadings(smooth[k])[:, 0] * size / smooth[k].field[k, 0]
     views = []
@@ -115,9 +115,22 @@ def test_shares_add_up_and_the_largest_source_is_named(cell):
 
 def test_a_scanner_without_smooth_errors_is_not_charged_with_large_ones(cell):
     _, places, _ = cell
-    *field, incidence = [source.field.max() for source in places.sources if source.name == SCANNER]
+    *field, incidence = [source.field.max() for source in places.sources if source.field.any()]
     # Usual is 0.3 of the noise; its logarithm scatters by 0.7, so that one sigma more is 0.6.
     assert max(field) < 0.3 * 0.02 and incidence < 0.6 * 0.02
+
+
+def test_what_smooth_errors_make_of_the_overlaps_is_not_called_noise(cell):
+    state, places, _ = cell
+    chain = error_chain(state)
+    smooth = 0.1 * error_sources._smooth_errors(state, chain)[0]  # mm, five times the noise
+    rig = chain.solution.rig
+    bent = replace(rig, z=rig.z + rig.reduce([smooth]) @ np.random.default_rng(0).standard_normal(smooth.shape[1]))
+    bent = replace(chain, solution=replace(chain.solution, rig=bent))
+    modes = list(error_sources._pose_modes(state, bent, smooth))
+    noise, scanner = (sum(np.sum(m[1][0] ** 2) for m in modes if m[0] == name) for name in (OVERLAPS, SCANNER))
+    before = sum(np.sum(source.views**2) for source in places.sources if source.name == OVERLAPS)
+    assert noise < 5 * before < noise + scanner
 
 
 def test_a_distance_is_better_known_than_its_ends(cell):
