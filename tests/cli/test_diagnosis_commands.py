@@ -20,8 +20,8 @@ def session_on_disk(tmp_path_factory, stitch_command):
     """A folder with a session `s`, what was hidden in it, and a run `r0` of it."""
     folder = tmp_path_factory.mktemp("cli")
     scene = load_scene("blade")
-    scene = replace(scene, scanner=replace(scene.scanner, columns=75, rows=75))
-    measured = simulated(scene, {"joint_compliance": 3.0}, 0, 13)
+    scene = replace(scene, scanner=replace(scene.scanner, columns=55, rows=55))
+    measured = simulated(scene, {"joint_compliance": 3.0}, 0, 10)
     write_session(folder / "s", measured, "s")
     write_truth(folder / "s.truth.json", measured, 0)
     stitch_command("run", folder / "s", "-o", folder / "r0", "--no-recording")

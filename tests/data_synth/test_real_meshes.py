@@ -53,7 +53,10 @@ def turbine_blade(request):
 
 @pytest.mark.parametrize(
     ("load", "closed"),
-    [(closed_bunny, True), (broken_bunny, False), pytest.param(turbine_blade, True, marks=pytest.mark.slow)],
+    [
+        (broken_bunny, False),
+        *(pytest.param(load, True, marks=pytest.mark.slow) for load in (closed_bunny, turbine_blade)),
+    ],
 )
 def test_a_real_mesh_is_scanned_stitched_and_fitted(load, closed, request, tmp_path):
     mesh = load(request)

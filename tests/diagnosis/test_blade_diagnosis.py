@@ -14,26 +14,28 @@ from stitch.writing.diagnosis_document import diagnosis_document
 from stitch.writing.json_file import to_json
 
 
-def blade_run(seed, hidden, mount="eye_to_hand", views=12, plan_seed=None):
-    measured = measured_blade(seed, views=views, mount=mount, hidden=hidden, pixels=90, plan_seed=plan_seed)
+def blade_run(seed, hidden, mount="eye_to_hand", views=12, plan_seed=None, pixels=90):
+    measured = measured_blade(seed, views=views, mount=mount, hidden=hidden, pixels=pixels, plan_seed=plan_seed)
     return measured, run(session_of(measured))
 
 
 @pytest.fixture(scope="module")
 def nothing_hidden():
     """A run of a cell in which nothing is hidden, and its diagnosis."""
-    _, result = blade_run(11, {}, "eye_in_hand", plan_seed=1)
+    _, result = blade_run(11, {}, "eye_in_hand", views=9, plan_seed=1, pixels=60)
     return result, diagnose(result)
 
 
 # Sizes that are two to four times what these cells can show at the least.
 VISIBLE = [
-    pytest.param("joint_offset", "eye_in_hand", 4.0, marks=pytest.mark.slow),
+    ("joint_offset", "eye_in_hand", 4.0),
     ("joint_compliance", "eye_to_hand", 3.0),
-    pytest.param("lens_distortion", "eye_to_hand", 3.0, marks=pytest.mark.slow),
+    ("lens_distortion", "eye_to_hand", 3.0),
 ]
 
 
+# In `make test` by the commands and in the browser: test_diagnosis_commands.py, test_review_in_browser.py.
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "mount", "size"), VISIBLE)
 def test_a_hidden_effect_is_named_added_and_the_error_falls(name, mount, size):
     measured, before = blade_run(1, {name: size}, mount)

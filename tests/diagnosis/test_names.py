@@ -71,10 +71,9 @@ def test_poses_that_wander_get_no_name(cell):
     ("law", "seed", "joint"),
     [
         ("dress_pack", 2, 2),
-        ("spall", 3, 5),
         *(
             pytest.param(*further, marks=pytest.mark.slow)
-            for further in (("coupling", 1, 3), ("coupling", 3, 2), ("ripple", 4, 4), ("ripple", 1, 3))
+            for further in (("spall", 3, 5), ("coupling", 1, 3), ("coupling", 3, 2), ("ripple", 4, 4), ("ripple", 1, 3))
         ),
     ],
 )

@@ -13,7 +13,7 @@ VIEWS = 18
 DIRECTION = np.array([2.2e-4, -1.5e-4, 2.8e-4, 0.08, 0.05, -0.07])
 
 
-@pytest.fixture(scope="module", params=["eye_to_hand", "eye_in_hand"])
+@pytest.fixture(scope="module", params=["eye_to_hand", pytest.param("eye_in_hand", marks=pytest.mark.slow)])
 def cell(request):
     return freed_blade(5, VIEWS, request.param)
 
