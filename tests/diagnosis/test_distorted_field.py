@@ -21,7 +21,7 @@ def said_of(measured, seen=lambda points: points):
 
 @pytest.fixture(scope="module")
 def measured():
-    return measured_blade(4, views=12, pixels=60)
+    return measured_blade(4, views=9, pixels=50)
 
 
 def tilted(points):

@@ -59,6 +59,7 @@ def test_growth_is_found_wherever_the_part_is_held(mount):
     assert (np.abs(values - true) < 4 * sigmas).all()
 
 
+@pytest.mark.usefixtures("few_effects")
 def test_hand_eye_is_pushed_by_what_is_too_small_to_be_seen():
     """Offsets of the smallest detectable size, put into the same measurements joint by joint."""
     session, *_ = labelled_cell(5)

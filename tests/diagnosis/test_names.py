@@ -119,7 +119,7 @@ def test_only_joints_that_are_bent_have_a_law_of_their_load(cell):
     """The first axis stands upright, and the payload hangs on the sixth: what is left there is rounding."""
     torque = cell.measurement.views.torques.values
     assert np.ptp(torque[:, [0, 5]], axis=0).max() < 1e-9 and np.ptp(torque[:, 1:5], axis=0).min() > 1
-    _, linear = said_of(cell, cell.measured.T_base_flange)
+    linear = cell.seen(cell.measured.T_base_flange)
     law = linear.pose_errors.joint_processes[JOINT_LOAD]
     assert law.joints == (1, 2, 3, 4)
     for process in range(4):
@@ -130,7 +130,7 @@ def test_what_a_joint_may_do_in_time_and_under_load_stands_against_every_name(ce
     """A joint that drifts as its motor warms is likelier by a law in time than by any of its angles."""
     plan = cell.measured.plan
     warm = 1e-3 * (1 - np.exp(-np.arange(len(plan.joints)) / 4.0))
-    _, linear = said_of(cell, kinematics.flange(plan.arm, plan.joints + warm[:, None] * np.eye(6)[4]))
+    linear = cell.seen(kinematics.flange(plan.arm, plan.joints + warm[:, None] * np.eye(6)[4]))
     base = linear.without(["joint_offset"])
     found = {kind: laws_of_kinds(base, (kind,)) for kind in (ALL_ANGLES, OWN_ANGLE, WITH_TIME, JOINT_LOAD)}
     best = {kind: max(law.log_bayes_factor for law in laws) for kind, laws in found.items()}
@@ -141,7 +141,7 @@ def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
     """Against the density of what the hand-eye leaves, by scipy: scatter, the law at many sizes, of all else little."""
     measured = cell.measured
     off = 2 * UNNAMED["coupling"](measured.plan, np.random.default_rng(1))
-    _, linear = said_of(cell, kinematics.flange(measured.plan.arm, measured.plan.joints + off))
+    linear = cell.seen(kinematics.flange(measured.plan.arm, measured.plan.joints + off))
     law, errors = joint_laws(linear)[0], linear.pose_errors
     free = null_space(linear.mixed.A[0].T).T
     R, usual = free @ linear.observation.reduced_poses.reduction, errors.scales[errors.names.index("smooth")]
@@ -187,7 +187,7 @@ def test_joints_that_scatter_are_scatter(cell):
 
 def test_no_joint_follows_a_law_where_nothing_is_wrong(cell):
     measured = cell.measured
-    _, linear = said_of(cell, measured.T_base_flange)
+    linear = cell.seen(measured.T_base_flange)
     assert max(law.log_bayes_factor for law in joint_laws(linear)) < 1
 
 
@@ -196,7 +196,7 @@ def test_the_course_of_a_joint_law_is_the_true_one_within_its_sigma(cell):
     q = measured.plan.joints
     off = np.zeros_like(q)
     off[:, 2] = 4e-4 * np.sin(2 * q[:, 3])
-    _, linear = said_of(cell, kinematics.flange(measured.plan.arm, q + off))
+    linear = cell.seen(kinematics.flange(measured.plan.arm, q + off))
     course = joint_curves(significant_laws(linear))[0]
     true = 4e-4 * np.sin(2 * np.radians(course.at)) - off[:, 2].mean()
     assert (course.joint, course.covariate) == (3, "j4_deg") and course.share > 0.9
@@ -213,7 +213,7 @@ def test_the_course_of_a_wave_of_a_gear_is_the_true_one_within_its_sigma(cell):
     q = measured.plan.joints
     off = np.zeros_like(q)
     off[:, 4] = 4e-4 * np.sin(7 * q[:, 4])
-    _, linear = said_of(cell, kinematics.flange(measured.plan.arm, q + off))
+    linear = cell.seen(kinematics.flange(measured.plan.arm, q + off))
     (course,) = joint_curves(significant_laws(linear))
     true = 4e-4 * np.sin(7 * np.radians(course.at)) - off[:, 4].mean()
     assert (course.joint, course.covariate) == (5, "j5_deg")

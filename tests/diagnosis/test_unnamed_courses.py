@@ -54,6 +54,7 @@ def test_joints_that_scatter_do_not_repeat():
         assert found.translation == pytest.approx(drawn, rel=0.35)
 
 
+@pytest.mark.usefixtures("few_effects")
 def test_beside_a_law_scatter_is_what_the_arm_scatters():
     """20 µm are drawn, and the law does not take them for itself; of what it turns most is no scatter any more."""
     session, *_ = labelled_cell(SEED, views=VIEWS, errors=(law("coupling"), np.zeros((VIEWS, 6))))

@@ -21,7 +21,8 @@ def belt(q):
     return HEIGHT * np.array([0, 0, teeth - np.floor(teeth) - 0.5, 0, 0, 0])
 
 
-@pytest.mark.parametrize("views", [40, pytest.param(80, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("views", [40, 80])
 def test_a_belt_that_jumps_is_found_with_its_tooth(views):
     session, *_ = labelled_cell(1, views=views, targets=TARGETS[:2], gears=belt)
     found = explain(linear_model_of(run(session)))

@@ -64,6 +64,7 @@ def test_a_sensor_that_was_moved_is_said_by_how_much(cell):
     assert f"{1e3 * np.linalg.norm(off[:3]):.3g} mrad" in doubt
 
 
+@pytest.mark.usefixtures("few_effects")
 def test_a_diagnosis_says_first_what_is_doubted(cell):
     """A sensor that was moved looks like an effect of the arm; what is found is said to be perhaps no more than that."""
     model, then = cell

@@ -26,7 +26,7 @@ def moving(views, **scanner):
 
 def test_points_go_back_to_where_they_would_lie_had_the_scanner_stood(tmp_path):
     """By the distance of the points from the mesh, at the true pose of each view."""
-    measured = moving(8, noise=1e-6)
+    measured = moving(5, noise=1e-6)
     write_session(tmp_path / "s", measured, "s")
     session = load_session(tmp_path / "s")
     T_part_reference = frames.inverse(measured.scene.T_reference_part)
@@ -36,10 +36,10 @@ def test_points_go_back_to_where_they_would_lie_had_the_scanner_stood(tmp_path):
         mesh = np.array(measured.mesh.vertices), np.array(measured.mesh.faces)
         return np.sqrt(igl.point_mesh_squared_distance(placed, *mesh)[0].mean())
 
-    for v in range(8):
+    for v in range(5):
         assert off(v, measured.clouds[v].points) > 0.4
         # Before the first view and after the last nothing says how the path goes on.
-        assert off(v, session.views[v].cloud.points) < (0.1 if v in (0, 7) else 0.03)
+        assert off(v, session.views[v].cloud.points) < (0.1 if v in (0, 4) else 0.03)
 
 
 def test_odometry_follows_a_stream_and_separate_views_are_none():
