@@ -1,5 +1,6 @@
 """Fixtures: the measured data beside the project, small synthetic cells, the command line."""
 
+import gc
 import io
 import os
 import shutil
@@ -8,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from matplotlib.figure import Figure
 
 from data_synth.fixtures.blade_cells import captured_blade, measured_blade
@@ -31,6 +33,13 @@ os.environ.setdefault("STITCH_PROGRESS", "off")
 # As inside a run: the tests call the stages directly.
 library_threads_off()
 
+# A busy machine is no failure.
+settings.register_profile("any_machine", deadline=None)
+settings.load_profile("any_machine")
+
+# Of what collection makes nothing can go: looking through it again and again costs a tenth of it.
+gc.disable()
+
 # The longest files, which begin first: with files spread over two processes none is left alone at the end.
 LONGEST = (
     "test_review_in_browser.py",
@@ -43,6 +52,11 @@ LONGEST = (
     "test_sphere.py",
     "test_cell_outputs.py",
 )
+
+
+def pytest_collection_finish():
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items):

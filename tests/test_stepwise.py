@@ -28,6 +28,11 @@ def first():
     return run(session)
 
 
+@pytest.fixture(scope="module")
+def diagnosed(first):
+    return diagnose(first)
+
+
 def answered(monkeypatch, verdict, effects):
     """Diagnoses that say what a session with such effects would lead to."""
     named = tuple(SimpleNamespace(name=name) for name in effects)
@@ -57,8 +62,8 @@ def test_what_has_a_name_is_no_group(first):
     assert lines[1] == found.sentence
 
 
-def test_what_is_less_likely_than_chance_is_not_added(first, monkeypatch):
-    found = replace(diagnose(first), log_odds_over_nothing=-0.1)
+def test_what_is_less_likely_than_chance_is_not_added(first, diagnosed, monkeypatch):
+    found = replace(diagnosed, log_odds_over_nothing=-0.1)
     monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
     result, lines, _ = stepwise.suggest(first, at_most=3)
     assert result is None and lines[-1].startswith("joint_offset was not added: chance is more likely.")
@@ -81,9 +86,9 @@ def test_an_effect_stays_if_views_left_out_are_better_by_more_than_is_uncertain(
     assert stays or f"{share:.2f} ± 0.05 of the mean square error" in reason
 
 
-def test_the_uncertainty_of_the_error_on_views_left_out_is_that_between_folds(first):
+def test_the_uncertainty_of_the_error_on_views_left_out_is_that_between_folds(diagnosed):
     """As a ratio of sums over folds (Cochran 1977, eq. 2.39), by leaving folds out one by one."""
-    found = diagnose(first)
+    found = diagnosed
     judged = found.candidates[0].cross_validation
     scored, linear = found.candidates[0].ranked.score, found.linear.scatter_only
     squares = _squares_by_fold(linear, scored)[1]

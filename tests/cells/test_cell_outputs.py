@@ -2,16 +2,20 @@
 
 import csv
 import hashlib
+import io
+import json
 import re
 import subprocess
 import sys
 import tomllib
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rerun as rr
+from plyfile import PlyData
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -60,8 +64,9 @@ class Offer:
 
 @pytest.fixture(scope="module")
 def handed_out(tmp_path_factory):
-    """Every command once, with recording, page and session; Rerun strict."""
+    """Every command once, with recording, page and session; Rerun strict. The fit: its map and its document too."""
     folder = tmp_path_factory.mktemp("cells")
+    further, told = {"fit": ("-o", folder / "map", "--json")}, io.StringIO()
     part = {"stitch.cell_recordings": "record", "stitch.cell_reports": "write_page"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(job_files, "entry_points", lambda group, name: [Offer(getattr(VIEWERS[name], part[group]))])
@@ -69,9 +74,11 @@ def handed_out(tmp_path_factory):
         try:
             for command, job in JOBS.items():
                 files = ("--recording", folder / f"{command}.rrd", "--report", folder / f"{command}.html")
-                run(command, job, *files, "--session", folder / command)
+                with redirect_stdout(told if command == "fit" else io.StringIO()):
+                    run(command, job, *files, "--session", folder / command, *further.get(command, ()))
         finally:
             rr.set_strict_mode(False)
+    (folder / "fit.json").write_text(told.getvalue())
     return folder
 
 
@@ -240,6 +247,24 @@ def test_expected_shape_is_what_the_commanded_clamps_do():
     remaining = viz.cells.panel.expected_after(job, result)
     assert np.abs(remaining).max() < 0.05
     assert result.shape_largest.max() > 3.0
+
+
+def test_a_fit_is_where_the_part_stands_and_serves_the_seam(handed_out, tmp_path, capsys):
+    part = json.loads((handed_out / "fit.json").read_text())["parts"][0]
+    place = [3567.7, -2954.3, 1932.9]  # of the example's pane, mm
+    assert np.abs(np.array(part["T_base_part"])[:3, 3] - place).max() < 1.0
+    assert part["points_in_forbidden"]["gripper"] > 0
+    # Three times the scanner's noise of 0.05 mm.
+    assert PlyData.read(handed_out / "map" / "deviation.ply")["vertex"]["deviation"].std() < 0.15
+    for file in JOBS["seam"].parent.glob("s*"):
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "fit.json").write_bytes((handed_out / "map" / "fit.json").read_bytes())
+    text = JOBS["seam"].read_text()
+    (tmp_path / "seam.toml").write_text(text.split("[part]")[0] + 'fit = "fit.json"\n')
+    run("seam", tmp_path / "seam.toml", "--json", "-o", tmp_path / "out.csv")
+    seams = json.loads(capsys.readouterr().out)
+    assert len(seams) == 8
+    assert {row["verdict"] for row in seams} == {"good"}
 
 
 def test_session_never_overwrites(handed_out, capsys):

@@ -267,17 +267,23 @@ def test_shape_step_undoes_a_turned_clamp():
     assert (step.twists[:, 2:5] == 0).all()
 
 
-def test_command_on_the_example(tmp_path, capsys):
-    main_code(["panel", str(EXAMPLE / "job.toml"), "--json", "-o", str(tmp_path)])
-    found = json.loads(capsys.readouterr().out)
+@pytest.fixture(scope="module")
+def example(tmp_path_factory, stitch_command):
+    """What the command says of the example, and the folder it filled."""
+    folder = tmp_path_factory.mktemp("panel")
+    return json.loads(stitch_command("panel", EXAMPLE / "job.toml", "--json", "-o", folder)), folder
+
+
+def test_command_on_the_example(example):
+    found, folder = example
     named = [name for name, o in found["leg_offsets"].items() if o["found"]]
     assert named == ["C"]
     assert found["leg_offsets"]["C"]["leg"] == 4
     assert found["leg_offsets"]["C"]["offset"] == pytest.approx(0.5, abs=4 * found["leg_offsets"]["C"]["sigma"])
-    assert {f.name for f in tmp_path.iterdir()} >= {"preposition.csv", "pose_move.csv", "shape_move.csv", "errors.png"}
+    assert {f.name for f in folder.iterdir()} >= {"preposition.csv", "pose_move.csv", "shape_move.csv", "errors.png"}
 
 
-def test_tracker_readings_in_its_own_frame_give_the_same(tmp_path, capsys):
+def test_tracker_readings_in_its_own_frame_give_the_same(example, tmp_path, stitch_command):
     """Everything the tracker sees, turned into a frame of its own, with four reference points of the world."""
     for file in EXAMPLE.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
@@ -299,17 +305,13 @@ def test_tracker_readings_in_its_own_frame_give_the_same(tmp_path, capsys):
     (tmp_path / "world.csv").write_text("\n".join(["point,x,y,z,seen_x,seen_y,seen_z", *rows]))
     job = (tmp_path / "job.toml").read_text()
     (tmp_path / "job.toml").write_text(job.replace("[files]", '[files]\nworld = "world.csv"'))
-    found = []
-    for folder in (EXAMPLE, tmp_path):
-        main_code(["panel", str(folder / "job.toml"), "--json"])
-        found.append(json.loads(capsys.readouterr().out)["pose"]["position_error"])
-    assert found[1] == pytest.approx(found[0], abs=1e-5)
+    found = json.loads(stitch_command("panel", tmp_path / "job.toml", "--json"))
+    assert found["pose"]["position_error"] == pytest.approx(example[0]["pose"]["position_error"], abs=1e-5)
 
 
-def test_shape_of_the_example_is_judged_apart_from_its_pose(capsys):
+def test_shape_of_the_example_is_judged_apart_from_its_pose(example):
     """The panel lies 8 mm off its target; its shape at the clamps is the simulator's, a few millimetres."""
-    main_code(["panel", str(EXAMPLE / "job.toml"), "--json"])
-    found = json.loads(capsys.readouterr().out)
+    found, _ = example
     worst = max(found["shape"]["largest_deviation"].values())
     cell = PanelCell(7)
     control, _ = panel_job.control_points()
