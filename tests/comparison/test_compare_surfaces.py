@@ -9,8 +9,8 @@ from stitch.comparison.residual_tables import compare_surfaces
 from stitch.pipeline import run
 
 
-def blade_run(seed, hidden, mount="eye_to_hand", views=12):
-    measured = measured_blade(seed, views=views, mount=mount, hidden=hidden, pixels=90)
+def blade_run(seed, hidden, mount="eye_to_hand", views=9):
+    measured = measured_blade(seed, views=views, mount=mount, hidden=hidden, pixels=60)
     return measured, run(session_of(measured))
 
 

@@ -25,7 +25,7 @@ HIDDEN = {"joint_compliance": 2.0}
 @pytest.fixture(scope="module")
 def bent():
     """A blade cell in which two joints give way under load, with an arm that repeats well."""
-    return measured_blade(3, views=10, pixels=90, hidden=HIDDEN, repeatability=(5e-6, 0.005))
+    return measured_blade(3, views=10, pixels=65, hidden=HIDDEN, repeatability=(5e-6, 0.005))
 
 
 @pytest.fixture(scope="module")

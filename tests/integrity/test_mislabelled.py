@@ -90,7 +90,7 @@ def with_corners(measured, order):
 
 def test_beside_clouds_the_names_are_blamed_and_not_the_scan():
     """The labels held the scan in a wrong place, and another view was named."""
-    measured = measured_blade(21, views=8, pixels=80)
+    measured = measured_blade(21, views=8, pixels=60)
     found = run(with_corners(measured, (1, 2, 3, 0)))
     assert found.left_out == () and "targets of view v003 bear each other's names" in found.doubts[0]
     assert [(o.view, o.target) for o in found.outliers] == [(OFF, None)]

@@ -17,7 +17,7 @@ GATE, OFF = 2.5, 6
 
 @pytest.fixture(scope="module")
 def cell():
-    return captured_blade(11, views=12, pixels=90)
+    return captured_blade(11, views=12, pixels=60)
 
 
 def with_mounts(own, change):

@@ -56,7 +56,7 @@ def found(change: Callable[[np.ndarray], np.ndarray], backwards: bool = False) -
     Args:
         backwards: of a scanner whose frame is turned about its y, so that it looks against its z.
     """
-    cell = simulated(clean("spheres", rays=80), {}, 5, views=VIEWS)
+    cell = simulated(clean("spheres", rays=65), {}, 5, views=VIEWS)
     cell = replace(cell, clouds=[replace(c, points=change(c.points)) for c in cell.clouds])
     session = session_of(cell)
     if backwards:

@@ -29,7 +29,7 @@ def folder(tmp_path_factory, stitch_command):
     """Two sessions of one cell; `r` is a run of the first, named its effect twice, `q` one of the second by r's model."""
     folder = tmp_path_factory.mktemp("runs")
     for seed, name in enumerate("so"):
-        write_session(folder / name, measured_blade(seed, views=5, pixels=70), name)
+        write_session(folder / name, measured_blade(seed, views=5, pixels=50), name)
     stitch_command("run", folder / "s", "-o", folder / "r", "--no-recording", "--effects", f"{EFFECT},{EFFECT}")
     stitch_command("run", folder / "o", "-o", folder / "q", "--no-recording", "--hand-eye", folder / "r")
     return folder
