@@ -219,13 +219,14 @@ def measured_table(cells: Sequence[tuple[str, int]]) -> list[str]:
     ]
     squares = np.array([t.squares for t in trials]).T
     of_errors = bootstrap(tuple(squares), _error_factor, paired=True, vectorized=True, rng=0).confidence_interval
-    stated = {k: np.median(np.concatenate([t.shared / t.expected for t in trials if t.kind == k])) for k, _ in cells}
+    over = {k: np.median(np.concatenate([t.shared / t.expected for t in trials if t.kind == k])) for k in KINDS}
     return [
         *lines,
         "",
         f"Medians of {len(trials)} cells with 95 % intervals: {words[0]}; at the same sizes {words[1]}; expected "
-        f"{words[2]}. True\nerrors, rms: {_error_factor(*squares):.2f} ({of_errors.low:.2f} to {of_errors.high:.2f}). U over "
-        f"expected U, median: " + ", ".join(f"{kind} {x:.2f}" for kind, x in sorted(stated.items())) + ".",
+        f"{words[2]}.",
+        f"True errors, rms: {_error_factor(*squares):.2f} ({of_errors.low:.2f} to {of_errors.high:.2f}). U over what is "
+        "expected, median: " + ", ".join(f"{kind} {x:.2f}" for kind, x in over.items()) + ".",
     ]
 
 
