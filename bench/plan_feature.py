@@ -225,8 +225,8 @@ def measured_table(cells: Sequence[tuple[str, int]]) -> list[str]:
         "",
         f"Medians of {len(trials)} cells with 95 % intervals: {words[0]}; at the same sizes {words[1]}; expected "
         f"{words[2]}.",
-        f"True errors, rms: {_error_factor(*squares):.2f} ({of_errors.low:.2f} to {of_errors.high:.2f}). U over what is "
-        "expected, median: " + ", ".join(f"{kind} {x:.2f}" for kind, x in over.items()) + ".",
+        f"True errors, rms: {_error_factor(*squares):.2f} ({of_errors.low:.2f} to {of_errors.high:.2f}). U over the "
+        "expected one, median: " + ", ".join(f"{kind} {x:.2f}" for kind, x in over.items()) + ".",
     ]
 
 
