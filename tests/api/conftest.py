@@ -38,3 +38,9 @@ def loaded(cell_folder):
 def found(loaded):
     """A run of it."""
     return stitch.run(loaded)
+
+
+@pytest.fixture(scope="session")
+def better(found):
+    """The run with one effect more."""
+    return stitch.add(found, "range_scale")

@@ -77,7 +77,7 @@ def moved(view):
 
 
 @pytest.fixture(scope="module")
-def names_of_examples(arrays, cell_folder, loaded, found):
+def names_of_examples(arrays, cell_folder, loaded, found, better):
     """What the examples call as a person would, but for the folder to write into."""
     clouds, poses = arrays
     grown = stitch.live(mount="eye_in_hand")
@@ -95,7 +95,7 @@ def names_of_examples(arrays, cell_folder, loaded, found):
         "other": replace(loaded, name="other", views=tuple(moved(view) for view in loaded.views)),
         "session_folder": cell_folder,
         "run": found,
-        "better": stitch.add(found, "range_scale"),
+        "better": better,
         "live": grown,
     }
 

@@ -79,11 +79,10 @@ def test_the_stitched_cloud_for_open3d_and_back(found):
     assert tensor.point["residual"].shape[0] == len(found.stitched)
 
 
-def test_the_report_has_every_part_once(found):
+def test_the_report_has_every_part_once(found, better):
     text = str(found)
     assert re.findall(r"^\[\[(.+?)\]\]", text, re.MULTILINE)[:3] == ["s", "Hand-eye", "Errors"]
     assert f"{found.hand_eye.U.mm:.2g} mm" in text and max(map(len, text.splitlines()[2:])) < 110
-    better = stitch.add(found, "range_scale")
     added = str(better)
     assert "[[Effects]]\n  range_scale.s:" in added and "+ range_scale:" in added
     assert repr(better).startswith("Run('s', 5 views")
@@ -130,12 +129,11 @@ def test_a_saved_run_is_what_the_command_writes(loaded, cell_folder, tmp_path, s
     assert same_folder(tmp_path / "command", tmp_path / "arrays")
 
 
-def test_what_is_added_and_dropped_is_what_the_commands_write(found, cell_folder, tmp_path, stitch_command):
+def test_what_is_added_and_dropped_is_what_the_commands_write(better, cell_folder, tmp_path, stitch_command):
     command, python = tmp_path / "command", tmp_path / "python"
     stitch_command("run", cell_folder, "-o", command, "--no-recording")
     first = (command / "model.toml").read_bytes()
     stitch_command("add", command, "range_scale", "--no-recording")
-    better = stitch.add(found, "range_scale")
     better.save(python, recording=False)
     assert same_folder(command, python)
     # The command brings back the fit that the folder kept, bit for bit; from Python it is made anew, from elsewhere.
@@ -155,6 +153,7 @@ def test_effects_fitted_at_once_are_what_the_command_writes(loaded, cell_folder,
     assert same_folder(tmp_path / "command", tmp_path / "python")
 
 
+@pytest.mark.usefixtures("few_effects")
 def test_a_diagnosis_and_a_comparison_are_those_of_the_commands(found, tmp_path, stitch_command):
     folder = found.save(tmp_path / "run", recording=False)
     diagnosis = json.loads(stitch_command("diagnose", folder, "--json"))
@@ -198,11 +197,11 @@ def test_exports_are_those_of_the_command(found, tmp_path, stitch_command):
             stitch.export_run(found, to)
 
 
-def test_effects_are_asked_for_by_name(found):
+def test_effects_are_asked_for_by_name(found, better):
     for call, says in (
         (lambda: stitch.add(found, "no_such"), "no_such"),
         (lambda: stitch.drop(found, "range_scale"), "s: range_scale is not in its model; to fix: leave it out"),
-        (lambda: stitch.add(stitch.add(found, "range_scale"), "range_scale"), "s: range_scale is in its model already"),
+        (lambda: stitch.add(better, "range_scale"), "s: range_scale is in its model already"),
         (lambda: stitch.run(found.session, effects=["no_such"]), "no_such"),
     ):
         with pytest.raises(InputError, match=says):

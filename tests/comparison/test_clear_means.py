@@ -15,9 +15,8 @@ def clean(seed, views):
     return errors - errors.mean(), properties
 
 
-@pytest.mark.parametrize(
-    "views", [7, pytest.param(12, marks=pytest.mark.slow), pytest.param(18, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("views", [7, 12, 18])
 def test_chance_makes_something_clear_in_one_of_twenty_cells_at_most(views):
     cells = [compared(*clean(seed, views)) for seed in range(100)]
     # Ten of a hundred is what a rate of five in a hundred exceeds once in a hundred.

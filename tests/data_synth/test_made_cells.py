@@ -29,6 +29,7 @@ def made(tmp_path, cell, capsys, *command):
     return truth, json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_panel_names_the_hidden_leg(tmp_path, capsys):
     truth, found = made(tmp_path, "panel-robots", capsys, "panel", "FOLDER/job.toml", "--json")
     hidden = truth["hidden"]

@@ -26,7 +26,9 @@ def memory() -> np.ndarray:
     return with_memory(VIEWS, 0.9, np.random.default_rng([SEED, 2])) * np.repeat([1.2e-4, 0.12], 3)
 
 
-@pytest.mark.parametrize("which", ["hysteresis", pytest.param("dress_pack", marks=pytest.mark.slow), "memory"])
+@pytest.mark.parametrize(
+    "which", [*(pytest.param(law, marks=pytest.mark.slow) for law in ("hysteresis", "dress_pack")), "memory"]
+)
 def test_what_no_library_has_gets_no_name(which):
     nothing = np.zeros((VIEWS, 6))
     errors = (nothing, memory()) if which == "memory" else (law(which), nothing)

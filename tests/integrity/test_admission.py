@@ -70,7 +70,9 @@ def test_two_views_that_no_hand_eye_brings_together_accuse_nobody(good):
         run(replace(good, views=(good.views[0], good.views[5])))
 
 
-@pytest.mark.parametrize("axis", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.slow), 2])
+# In `make test` on the scans alone: test_snooping.py.
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_scan_that_stands_beside_the_others_is_no_second_surface(good, axis):
     """However few partners are left within the gate, and however well these fit."""
     found = run(with_view(good, 4, cloud=Cloud(good.views[4].cloud.points + np.eye(3)[axis])))

@@ -110,7 +110,8 @@ def test_a_sound_scanner_errs_in_no_view_of_its_own(sound: LinearModel):
     assert not found.unusual
 
 
-@pytest.mark.parametrize(("law", "with_time"), [pytest.param(swings, False, marks=pytest.mark.slow), (bends, True)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("law", "with_time"), [(swings, False), (bends, True)])
 def test_every_view_by_itself(law: Law, with_time: bool):
     """Neither is laid on the scanner's field; what grows with the session is told from what does not."""
     linear = linear_of(law)
