@@ -188,7 +188,10 @@ def gather_evidence(linear: LinearModel, candidates: Sequence[Candidate], limit:
     """
     evidence = select(linear, candidates, limit)
     evidence = challenge(linear, candidates, replace(evidence, left_out=cross_validate_named(linear, evidence)))
-    return with_turning_joints(linear.measurement.views, with_equal_rivals(linear, evidence))
+    equal = with_equal_rivals(linear, evidence)
+    if equal.verdict != evidence.verdict and not regime_of(linear).many_views:
+        equal = _with_validated_second(linear, candidates, evidence) or equal
+    return with_turning_joints(linear.measurement.views, equal)
 
 
 def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:
@@ -309,11 +312,20 @@ def challenge(linear: LinearModel, candidates: Sequence[Candidate], evidence: Ev
     found = with_scanner_error(linear, _validated(linear, evidence))
     if found.named or regime_of(linear).many_views:
         return found
+    with_second = _with_validated_second(linear, candidates, evidence)
+    with_second = with_second and with_scanner_error(linear, with_second)
+    return with_second if with_second and with_second.named else found
+
+
+def _with_validated_second(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Evidence | None:
+    """Add a second effect to a name where both stand every test beside each other; None where no two do.
+
+    What a second one leaves on views left out may hide by how much the first predicts them better than its rivals.
+    """
     two = find_missing_pair(linear, candidates, evidence.named[0])
     if two is None or two[0].name != evidence.named[0].name or not pair_is_validated(linear, two):
-        return found
-    with_second = with_scanner_error(linear, replace(evidence, explanation=two[:1], further=two[1]))
-    return with_second if with_second.named else found
+        return None
+    return replace(evidence, explanation=two[:1], further=two[1])
 
 
 def with_equal_rivals(linear: LinearModel, evidence: Evidence) -> Evidence:

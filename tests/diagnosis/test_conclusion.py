@@ -116,3 +116,13 @@ def test_what_predicts_views_left_out_clearly_better_is_named_though_another_is_
     monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: rival)
     left_out = {FIRST.name: replace(HELPS, fold_squares=((1.0,) * 4, (1.0,) * 4))}
     assert gathering.with_equal_rivals(None, replace(ALONE, left_out=left_out)).named == named
+
+
+@pytest.mark.parametrize(("together", "named"), [(PAIR, (FIRST,)), (None, (FIRST, SECOND))])
+def test_rivals_that_a_second_effect_makes_equal_do_not_take_the_name(monkeypatch, together, named):
+    upheld(monkeypatch, ALONE, together=together, refused=[])
+    monkeypatch.setattr(gathering, "select", lambda *asked: ALONE)
+    monkeypatch.setattr(gathering, "with_equal_rivals", lambda linear, e: replace(e, explanation=(FIRST, SECOND)))
+    monkeypatch.setattr(gathering, "with_turning_joints", lambda views, e: e)
+    linear = SimpleNamespace(measurement=SimpleNamespace(views=None))
+    assert gathering.gather_evidence(linear, (), None).named == named
