@@ -103,11 +103,11 @@ def test_command_line_end_to_end(reghec, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "cone" / "recording.rrd").exists()
 
 
-def test_diagnosis_of_a_real_object_says_that_poses_dominate_and_joints_are_not_known(runs):
+def test_diagnosis_of_a_real_object_says_how_poses_scatter_and_that_joints_are_not_known(runs):
     found = diagnose(runs["david"])
     assert found.verdict in ("unknown_effect", "cannot_tell")
-    assert "pose errors dominate" in found.sentence
-    assert "repeat" in found.sentence
+    assert "the overlaps keep a misfit of" in found.sentence
+    assert "how much of that is the robot's shows once the misfit is corrected" in found.sentence
     assert "Joint effects" in found.sentence
     assert "joint_compliance" in found.missing
 
