@@ -1,5 +1,6 @@
 """A view made ready for matching, once: KD-tree, normals, edges, spacing and noise, scanner frame."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -224,8 +225,8 @@ def _estimate_noise(points: Array, own: Array, normals: Array, index: Indices) -
     if count <= 8:
         return float("nan")
     centre = even_indices(len(own), _NOISE_SAMPLES)
-    rest, _, coefficients = _fit_quadrics(points, own[centre], normals[centre], index[centre])
-    degrees = count - coefficients
+    rest, _, numbers = _fit_quadrics(points, own[centre], normals[centre], index[centre])
+    degrees = count - numbers()
     variance = (rest**2).sum(axis=0) / degrees
     # The median of χ²/ν lies at (1 − 2/(9ν))³ of the mean (Wilson–Hilferty).
     return float(np.sqrt(np.median(variance / (1 - 2 / (9 * degrees)) ** 3)))
@@ -244,14 +245,22 @@ def _bent_normals(points: Array, own: Array, normals: Array, index: Indices) -> 
     return out
 
 
-# Of the square of a quadric's term, what neighbours must show of it beside the others: of two profiles none shows how
-# the surface bends between them. Neighbours all around show half of it.
-_SHOWN = 0.1
+# Weight of a quadric's terms being zero, as a share of their squares: what neighbours hardly show beside the rest stays
+# zero, as how a surface bends between two profiles, whatever the axes.
+_NOT_SHOWN = 0.01
+# Of the largest square, what rounding makes of none.
+_ROUNDING = 1e-12
 
 
-def _fit_quadrics(points: Array, own: Array, normals: Array, index: Indices) -> tuple[Array, Array, Indices]:
-    """What quadrics of k neighbours leave along normals (k, N), their normals at the points (N, 3), and how many
-    coefficients (N,) each has."""
+def _fit_quadrics(
+    points: Array, own: Array, normals: Array, index: Indices
+) -> tuple[Array, Array, Callable[[], Array]]:
+    """What quadrics of k neighbours leave along normals (k, N), their normals at the points (N, 3), and a function
+    for how many numbers (N,) each took.
+
+    With c the coefficients of x, y, x², √2·xy, y², S their normal matrix beside a constant and W its blocks of first
+    and of second order without: c = (S + μW)⁻¹q, and again for what is left (iterated Tikhonov).
+    """
     local = np.array([column[index.T] for column in points.T]) - own.T[:, None]
     n = normals.T
     a = _cross(n, np.where(np.abs(n[0]) < 0.7, [[1.0], [0.0], [0.0]], [[0.0], [1.0], [0.0]]))
@@ -259,28 +268,57 @@ def _fit_quadrics(points: Array, own: Array, normals: Array, index: Indices) -> 
     a /= np.maximum(np.linalg.norm(a, axis=0), 1e-300)
     b = _cross(n, a)
     x, y, rest = (np.einsum("in,ikn->kn", axis, local) for axis in (a, b, n))
-    scale = np.maximum(np.abs(x).max(axis=0), 1e-300)
+    scale = np.sqrt(np.maximum((x * x + y * y).max(axis=0), 1e-300))
     x, y = x / scale, y / scale
-    terms = np.array([np.ones_like(x), x, y, x * x, x * y, y * y])
-    at_point = np.zeros((6, 2, x.shape[1]))  # slopes of the terms along a and b, there
-    at_point[1, 0] = at_point[2, 1] = 1
-    slope, coefficients = np.zeros((2, x.shape[1])), np.zeros(x.shape[1], np.int64)
-    # Gram and Schmidt for all neighbourhoods at once: a library's loop over them takes twice as long.
-    for k, term in enumerate(terms):
-        whole = np.einsum("kn,kn->n", term, term)
-        for before in range(k):
-            share = np.einsum("kn,kn->n", terms[before], term)
-            term -= share * terms[before]
-            at_point[k] -= share * at_point[before]
-        square = np.einsum("kn,kn->n", term, term)
-        shown = square > _SHOWN * whole
-        unit = shown / np.sqrt(np.maximum(square, 1e-300))
-        term *= unit
-        at_point[k] *= unit
-        height = np.einsum("kn,kn->n", term, rest)
-        rest -= height * term
-        slope += height * at_point[k]
-        coefficients += shown
+    terms = np.array([x, y, x * x, np.sqrt(2) * x * y, y * y])
+    whole = _normal_matrices(terms)
+    whole[:2, 2:] = whole[2:, :2] = 0.0
+    for part in (slice(0, 2), slice(2, 5)):
+        whole[part, part] += _ROUNDING * np.eye(part.stop - part.start)[..., None] * np.einsum("iin->n", whole)
+    terms -= terms.mean(axis=1, keepdims=True)
+    rest -= rest.mean(axis=0)
+    solve = _solver(_normal_matrices(terms) + _NOT_SHOWN * whole)
+    slope = np.zeros((2, x.shape[1]))
+    for _ in range(2):
+        found = solve(np.einsum("ikn,kn->in", terms, rest))
+        rest -= np.einsum("ikn,in->kn", terms, found)
+        slope += found[:2]
     slope /= scale
     bent = n - slope[0] * a - slope[1] * b
-    return rest, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, coefficients
+
+    def numbers() -> Array:
+        left = np.stack(
+            [solve(_NOT_SHOWN * whole[:, j]) for j in range(len(terms))], axis=1
+        )  # by a round, of each term
+        twice = np.einsum("ijn,jkn->ikn", left, left)
+        return np.asarray(1 + len(terms) - np.einsum("ijn,jin->n", twice, twice))
+
+    return rest, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, numbers
+
+
+def _normal_matrices(terms: Array) -> Array:
+    """(m, m, N) of terms (m, k, N)."""
+    out = np.empty((len(terms), *terms[:, 0].shape))
+    for i, term in enumerate(terms):
+        out[i, : i + 1] = out[: i + 1, i] = np.einsum("kn,jkn->jn", term, terms[: i + 1])
+    return out
+
+
+def _solver(A: Array) -> Callable[[Array], Array]:
+    """From right sides (m, N) to the solutions of N systems of small symmetric positive matrices A (m, m, N)."""
+    # All systems at once by Cholesky factors: a library's loop over them takes several times as long.
+    m = len(A)
+    L = np.zeros_like(A)
+    for j in range(m):
+        below = A[j:, j] - np.einsum("ikn,kn->in", L[j:, :j], L[j, :j])
+        L[j:, j] = below / np.sqrt(np.maximum(below[0], 1e-300))
+
+    def solve(right: Array) -> Array:
+        out = np.array(right)
+        for j in range(m):
+            out[j] = (out[j] - np.einsum("kn,kn->n", L[j, :j], out[:j])) / L[j, j]
+        for j in reversed(range(m)):
+            out[j] = (out[j] - np.einsum("kn,kn->n", L[j + 1 :, j], out[j + 1 :])) / L[j, j]
+        return out
+
+    return solve

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
@@ -49,6 +50,16 @@ def test_normals_of_a_bent_surface_do_not_lean_towards_the_scanner():
     )
     assert slanted.sum() > 200 and of_planes > 0.005
     assert abs(lean) < 0.25 * of_planes
+
+
+def test_normals_and_noise_do_not_depend_on_how_the_scanner_s_axes_are_turned():
+    rng = np.random.default_rng(6)
+    x, y = rng.uniform(-20, 20, (2, 900))
+    points = np.column_stack([x, y, 300 + x**2 / 60 - x * y / 90 + 0.01 * rng.standard_normal(900)])
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.8]).as_matrix()
+    scan, turned = prepare_scan("bent", points), prepare_scan("bent", points @ turn.T)
+    assert np.abs(scan.normals @ turn.T - turned.normals).max() < 1e-9
+    assert abs(scan.noise - turned.noise) < 1e-9 * scan.noise
 
 
 def test_two_profiles_do_not_show_how_the_surface_bends_between_them():

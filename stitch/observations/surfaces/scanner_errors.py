@@ -8,7 +8,6 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.optimize import minimize
 
-from stitch.effects.contract import EFFECTS, missing_need
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.forward import PointSlopes
@@ -361,7 +360,6 @@ def rig_field_scatters(measurements: Sequence[Measurement], unconstrained: Seque
 # One standard deviation of a scanner's scale. Data sheets state length errors of 0.05 to 0.1 mm over half a metre
 # (sphere spacing, VDI/VDE 2634) at the temperature of calibration; a few degrees more make as much.
 SCALE_SIGMA = 2e-4
-_SCALE = "range_scale"
 
 
 def rig_scanner_errors(
@@ -381,7 +379,7 @@ def scale_scatter(measurement: Measurement, unconstrained: UnconstrainedPoses) -
     Scans that are all too large by the same share still fit each other, each moved along the way from the part to its
     scanner: so no overlap shows the scale, but the ways of the arm do. An arm whose lengths are all too short looks so.
     """
-    if missing_need(measurement, EFFECTS[_SCALE]):
+    if not measurement.has_optics:
         return np.zeros((6 * len(unconstrained.poses), 1))
     away = unconstrained.poses[:, :3, 3] - unconstrained.overlaps.gram.centre
     return np.asarray(SCALE_SIGMA * np.hstack([np.zeros_like(away), away]).reshape(-1, 1))
