@@ -1,6 +1,6 @@
 """Do views that `stitch plan --for` proposes make a feature better known than random ones? A table of docs/measure.md.
 
-Run: python bench/plan_feature.py [--cells 24] [--first-seed 640]; with --expected for the table of docs/plan.md
+Run: python bench/plan_feature.py [--cells 21] [--first-seed 640]; with --expected for the table of docs/plan.md
 
 Cells of three kinds (`feature_coverage.py`) have four views of a sphere plate, of which a point is measured. Four
 further views are proposed for that point; three times as many are drawn from all that see the part. Each four are
@@ -177,7 +177,7 @@ def _number(state: Run, wanted: Feature) -> Number:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cells", type=int, default=24)
+    parser.add_argument("--cells", type=int, default=21)
     parser.add_argument("--first-seed", type=int, default=640)
     parser.add_argument("--expected", action="store_true", help="As the linear model expects, for docs/plan.md.")
     arguments = parser.parse_args()
