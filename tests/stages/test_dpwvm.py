@@ -180,7 +180,7 @@ def test_register_ends_where_neither_rms_nor_step_falls_and_says_so(cell):
     """Within a gate far below the points' spacing partners change for ever, and the views swing."""
     capture, poses, _ = cell
     assert capture.spacing > 2.0
-    swinging = register(capture, poses, SCATTER, 0.5)
+    swinging = register(capture, poses, SCATTER, 0.7)
     assert len(swinging.history) < 25
     assert "no longer fell" in swinging.note
     assert len(swinging.note.split()) <= 25
