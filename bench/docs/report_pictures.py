@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import rerun.experimental as viewer
 from PIL import Image
@@ -29,7 +30,7 @@ _PAGES = {
     "report-phone": (500, 1500),
 }
 _PORT, _WINDOW, _TITLE = 9923, "1400x860", 37
-_TABS = {"before-after": 0, "cell": 3}
+_TABS = {"before-after": "Before | after", "cell": "The cell"}
 
 
 def demo_run(folder: Path) -> Path:
@@ -86,7 +87,7 @@ def recording(run: Path) -> None:
             for node in blueprint.values():
                 tabs = node.get("ContainerBlueprint", {})
                 if tabs.get("container_kind") == "Tabs":
-                    tabs["active_tab"] = tabs["contents"][tab]
+                    tabs["active_tab"] = next(own for own in tabs["contents"] if tab in _names(blueprint[f"/{own}"]))
             client.set_blueprint(blueprint, of="recording")
             time.sleep(5)
             picture = Image.open(io.BytesIO(_taken(client)))
@@ -96,6 +97,11 @@ def recording(run: Path) -> None:
         # The viewer too, which the launcher leaves behind: the next recording would open in it.
         os.killpg(shown.pid, signal.SIGTERM)
         shown.wait()
+
+
+def _names(node: dict[str, Any]) -> list[str]:
+    """What a part of a blueprint is called."""
+    return [part["display_name"] for part in node.values() if isinstance(part, dict) and "display_name" in part]
 
 
 def _taken(client: viewer.ViewerClient) -> bytes:
