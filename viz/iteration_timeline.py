@@ -16,6 +16,7 @@ from stitch.frames import Array
 from stitch.measurement.scan import even_indices
 from stitch.measurement.session import Session
 from stitch.runs.run import Run, StageResult
+from stitch.system.threads import take_mapped
 from stitch.units import MICROMETRES, length_text
 from viz.colours import UNSEEN, robust_limit, unsigned_colours, view_colours
 from viz.model_timeline import FRAMES
@@ -166,11 +167,11 @@ def _log_motion(rec: rr.RecordingStream, name: str, moments: Sequence[Moment]) -
 def _log_fused(rec: rr.RecordingStream, run: Run, shown: Sequence[str], at: int) -> None:
     """What was fused, in place of the scans."""
     some = even_indices(len(run.fused.points), _OF_FUSED)
-    colours = unsigned_colours(run.fused.residual[some], _full(run))
+    colours = unsigned_colours(take_mapped(run.fused.residual, some), _full(run))
     for name in shown:
         _clear(rec, name, at)
     rec.set_time("iteration", sequence=at)
-    rec.log("fused", rr.Points3D(run.fused.points[some].astype(np.float32), colors=colours, radii=_CLOUD))
+    rec.log("fused", rr.Points3D(take_mapped(run.fused.points, some).astype(np.float32), colors=colours, radii=_CLOUD))
     rec.reset_time()
 
 

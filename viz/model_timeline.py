@@ -12,7 +12,9 @@ import rerun as rr
 from stitch import frames
 from stitch.comparison.disagreement_field import ModelHistory, ModelStep, full_colour_distance
 from stitch.frames import Array
+from stitch.measurement.scan import even_indices
 from stitch.runs.run import Run
+from stitch.system.threads import take_mapped
 from stitch.units import MICROMETRES, length_text
 from viz.colours import COLOURS_OF_FEW, GREY, unsigned_colours
 from viz.part_surface import PartSurface
@@ -115,7 +117,7 @@ def log_model(recording: rr.RecordingStream, run: Run, scene: ModelScene, up: Ar
     before, after = shown_steps(scene.history)
     for name, step in (("before", before), ("after", after)):
         recording.log(f"part/{name}", _colours(scene, step.field.overall), static=True)
-    rest = run.fused.points[np.linspace(0, len(run.fused.points) - 1, min(len(run.fused.points), _STILL)).astype(int)]
+    rest = take_mapped(run.fused.points, even_indices(len(run.fused.points), _STILL))
     recording.log("stitched", rr.Points3D(rest.astype(np.float32), colors=[GREY]), static=True)
     at_rest = [frames.transform(run.poses[v], shown_points(run.session.views[v])) for v in scene.farthest]
     for v, own, colour in zip(scene.farthest, at_rest, COLOURS_OF_FEW, strict=False):

@@ -11,8 +11,9 @@ from scipy.sparse.csgraph import connected_components
 from stitch.comparison.disagreement_field import Patches
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices, Mask
+from stitch.measurement.scan import even_indices
 from stitch.runs.run import FusedCloud
-from stitch.system.threads import release_mapped
+from stitch.system.threads import take_mapped
 from stitch.writing.mesh import TriangleMesh, mesh_of, spacing
 
 # From where the part is looked at: what is long stands upright, and the side that shows most comes to the front.
@@ -210,12 +211,12 @@ def _on_open_edge(vertices: Array, triangles: Indices) -> tuple[Mask, csr_matrix
 
 def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
     """(N, 3) mean points and unit normals of cells, both sides of a sheet apart."""
-    some = np.linspace(0, len(fused.points) - 1, min(len(fused.points), _POINTS)).astype(np.int64)
-    once = _of(some, fused.count) < 2
+    some = even_indices(len(fused.points), _POINTS)
+    once = take_mapped(fused.count, some) < 2
     # Where views meet almost everywhere, what one view alone saw are its flying points.
     keep = ~once | (once.mean() > _FLYING)
     # As stitched.ply holds them: a page that is made anew is the same.
-    points, normals = (_of(some, x)[keep].astype(np.float32).astype(float) for x in (fused.points, fused.normals))
+    points, normals = (take_mapped(x, some)[keep].astype("f4").astype(float) for x in (fused.points, fused.normals))
     size = float(np.ptp(points, axis=0).max()) / _FINENESS
     cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     side = 2 * np.abs(normals).argmax(axis=1) + (normals.max(axis=1) > -normals.min(axis=1))
@@ -223,13 +224,6 @@ def _thinned(fused: FusedCloud) -> tuple[Array, Array]:
     count = np.bincount(group)[:, None]
     point, normal = (np.stack([np.bincount(group, x) for x in v.T], axis=1) / count for v in (points, normals))
     return point, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-
-
-def _of(some: Indices, values: Array) -> Array:
-    """Some rows; what was read for them of a cloud that is held in a file is given back."""
-    out = values[some]
-    release_mapped(values)
-    return np.asarray(out)
 
 
 def vertex_normals(vertices: Array, triangles: Indices) -> Array:

@@ -10,6 +10,7 @@ from stitch.frames import Array
 from stitch.measurement.robot import LinkMesh, Robot, link_frames
 from stitch.measurement.scan import even_indices
 from stitch.runs.run import Run
+from stitch.system.threads import take_mapped
 from viz.colours import view_colours
 from viz.run_numbers import shown_points
 
@@ -87,9 +88,7 @@ def log_robot(recording: rr.RecordingStream, run: Run) -> Array:
         seen.append(np.concatenate(lines))
         shown, label = (_SCANNER if v == 0 else colour, name) if in_hand else (_SCANNER, "scanner")
         recording.log(f"robot/scanner/{label}", rr.LineStrips3D(lines, colors=[shown], radii=_THIN), static=True)
-    points = run.fused.points[
-        np.linspace(0, len(run.fused.points) - 1, min(len(run.fused.points), _POINTS)).astype(int)
-    ]
+    points = take_mapped(run.fused.points, even_indices(len(run.fused.points), _POINTS))
     if not in_hand:
         points = frames.transform(flange[0], points)
     recording.log("robot/part", rr.Points3D(points.astype(np.float32), colors=[_PART]), static=True)

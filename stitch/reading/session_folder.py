@@ -499,10 +499,8 @@ def checked_scan(
         InputError: too few points, or one farther away than any sensor sees.
     """
 
-    def distinct() -> Cloud:
-        return distinct_points(read())
-
-    cloud = distinct()
+    whole = read()
+    cloud = distinct_points(whole)
     if len(cloud.points) < _FEWEST:
         raise InputError(
             f"{where}: {len(cloud.points)} of at least {_FEWEST} points; leave this view out of views.csv or scan "
@@ -510,7 +508,9 @@ def checked_scan(
         )
     # Looked at before some are taken: each of them will be fused.
     require_near(where, cloud.points * metres)
-    return cloud if at_most is None else thin_cloud(name, cloud, at_most, scanner, distinct)
+    if at_most is None:
+        return cloud
+    return thin_cloud(name, cloud, at_most, scanner, read if cloud is whole else lambda: distinct_points(read()))
 
 
 def _read_cropped(file: Path, scale: float, within: Array | None) -> Cloud:

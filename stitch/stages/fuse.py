@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
+from threading import Lock
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -112,7 +113,9 @@ def _fuse_voxels(voxels: _Voxels) -> FusedCloud:
 # normal, edge and support from the nearest point in memory, whose surface was that of all points.
 
 # Points of a slab; as many slabs are at work as there are cores, at some 200 bytes a point.
-_SLAB = 2_500_000
+_SLAB = 1_250_000
+# A scan is read for so many slabs at once; points of slabs that are to come wait in memory, at 24 bytes a point.
+_AHEAD = 16
 # Effects of scanner and part move a point by less than this share of the view's size.
 _MAX_MOVE = 0.02
 # A voxel on the surface of the nearest point in memory lies within so many times the edge of the square that this one
@@ -160,17 +163,16 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     del placed  # of every view: memory is for the slabs
     # One point in memory is looked up for a block of voxels, which is no larger than the place of such a point.
     block = max(1, int(place / cell))
-    ends, axis = _slabs(registered, block * cell, slab)
+    slabs = _cut_into_slabs(registered, cell, block, slab)
     split = np.cumsum([len(scan.points) for scan in own.scans])[:-1]
     parts = zip(np.split(support.alone, split), np.split(support.looked_through, split), support.junk, strict=True)
-    views = [_ViewInSlabs(registered, v, (cell, block, axis), *part) for v, part in enumerate(parts)]
+    views = [_ViewInSlabs(registered, v, slabs, *part) for v, part in enumerate(parts)]
     dropped = Unsupported()
 
-    def of_slab(bounds: tuple[float, float]) -> tuple[FusedCloud | None, Unsupported]:
-        low, high = (block * number for number in bounds)
+    def of_slab(number: int) -> tuple[FusedCloud | None, Unsupported]:
         found, dropped = list[_Voxels](), Unsupported()
         for view in views:
-            own, of_view = view.voxels(low, high)
+            own, of_view = view.voxels(number)
             found.append(own)
             dropped += of_view
         voxels = _Voxels(*(np.concatenate([getattr(f, field.name) for f in found]) for field in fields(_Voxels)))
@@ -179,17 +181,41 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
 
     def clouds() -> Iterator[FusedCloud]:
         nonlocal dropped
-        for cloud, of_one in parallel(of_slab, pairwise(ends), "fusing slabs"):
+        for cloud, of_one in parallel(of_slab, range(slabs.count), "fusing slabs"):
             dropped += of_one
             if cloud is not None:
                 yield cloud
 
-    cloud = next(clouds()) if len(ends) == 2 else FusedCloud(**map_parts(vars(cloud) for cloud in clouds()))
+    cloud = next(clouds()) if slabs.count == 1 else FusedCloud(**map_parts(vars(cloud) for cloud in clouds()))
     return cloud, dropped
 
 
-def _slabs(registered: RegisteredSession, step: float, slab: int) -> tuple[list[float], int]:
-    """Numbers of steps at which slabs end along the part's longest axis, and that axis."""
+@dataclass(frozen=True)
+class _Slabs:
+    """Slabs of the grid of cells in the reference frame."""
+
+    cell: float  # edge of a cell
+    block: int  # cells along an edge of a block
+    axis: int  # across the slabs
+    ends: Array  # (S + 1,) number of the first cell of each, and of the one after the last
+
+    @property
+    def count(self) -> int:
+        """S."""
+        return len(self.ends) - 1
+
+    def of(self, coordinate: Array) -> Indices:
+        """(N,) numbers of the slabs in which coordinates along the axis lie."""
+        return np.searchsorted(self.ends, np.floor(coordinate / self.cell), side="right") - 1
+
+    def cells(self, columns: Iterable[Array]) -> list[Indices]:
+        """Numbers of the cells, a column for each of x, y, z."""
+        return [np.floor(column / self.cell).astype(np.int64) for column in columns]
+
+
+def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int, slab: int) -> _Slabs:
+    """Slabs of so many points across the part's longest axis, which end where blocks end."""
+    step = block * cell
     own, poses = registered.own, registered.poses
     shown = [frames.transform(T, scan.points) for scan, T in zip(own.scans, poses, strict=True)]
     low, high = (f([f(p, axis=0) for p in shown], axis=0) for f in (np.min, np.max))
@@ -202,30 +228,24 @@ def _slabs(registered: RegisteredSession, step: float, slab: int) -> tuple[list[
         along += per_point * np.bincount((np.floor(points[:, axis] / step) - first).astype(np.int64), minlength=length)
     number = np.floor((np.cumsum(along) - along / 2) / slab)
     ends = first + np.flatnonzero(np.diff(number) > 0) + 1
-    return [-np.inf, *ends.tolist(), np.inf], axis
+    return _Slabs(cell, block, axis, np.array([-np.inf, *(block * ends), np.inf]))
 
 
 class _ViewInSlabs:
-    """One view, and what it shows between two planes of the reference frame."""
+    """One view, and what it shows in each slab; every slab is asked for once."""
 
     def __init__(
-        self,
-        registered: RegisteredSession,
-        v: int,
-        grid: tuple[float, int, int],
-        alone: Mask,
-        through: Mask,
-        junk: float,
+        self, registered: RegisteredSession, v: int, slabs: _Slabs, alone: Mask, through: Mask, junk: float
     ) -> None:
         """Take what slabs ask again and again.
 
         Args:
-            grid: edge of a cell, cells along a block, and the axis of the slabs.
+            slabs: the same for all views.
             alone: points in memory on no surface.
             through: those past which other views look.
             junk: share of the points that stand alone.
         """
-        self.registered, self.v, (self.cell, self.block, self.axis) = registered, v, grid
+        self.registered, self.v, self.slabs = registered, v, slabs
         self.scan, self.T = registered.own.scans[v], registered.poses[v]
         cloud = registered.session.views[v].cloud
         self.whole = None if cloud is None else cloud.whole
@@ -236,27 +256,32 @@ class _ViewInSlabs:
         self.tree = KDTree(self.scan.points[self.surface], leafsize=16) if some else self.scan.tree
         self.off_plane = _OFF_PLANE * (1 + edge_credit(junk))
 
-    def voxels(self, low: float, high: float) -> tuple[_Voxels, Unsupported]:
-        """Voxels whose number of cells along the axis lies in a range, and how many points support nothing."""
+        self.first, self.last, self.margin = 0, slabs.count - 1, slabs.cell
+        if self.whole is not None:
+            self.margin += _MAX_MOVE * float(np.ptp(self.whole.box, axis=0).max()) if self.moves else 0.0
+            height = frames.transform(self.T, box_corners(self.whole.box))[:, slabs.axis]
+            self.first, self.last = slabs.of(np.array([height.min() - self.margin, height.max() + self.margin]))
+        self.waiting: dict[int, list[Array]] = {}  # points of slabs to come
+        self.in_memory: PlacedPoints | None = None  # while there are some
+        self.lock = Lock()
+
+    def voxels(self, slab: int) -> tuple[_Voxels, Unsupported]:
+        """Voxels of a slab, and how many of its points support nothing."""
+        axis = self.slabs.axis
         if self.whole is None:
             in_memory = _place_scan(self.scan, self.T, self.v)
-            cells = self._cells(in_memory.points.T)
-            inside = (cells[self.axis] >= low) & (cells[self.axis] < high)
+            inside = self.slabs.of(in_memory.points[:, axis]) == slab
             keep = inside & self.kept
             dropped = Unsupported(
                 *(int(np.sum(m & inside)) for m in (inside, ~self.kept & ~self.through, self.through))
             )
-            return _voxels(in_memory.take(keep), pack_cells([c[keep] for c in cells], self.axis)), dropped
-        placed = self._points_near(self.whole, (low - 1) * self.cell, (high + 1) * self.cell)
-        cells = self._cells(placed)
-        inside = (cells[self.axis] >= low) & (cells[self.axis] < high)
-        if not inside.all():
-            placed, cells = [p[inside] for p in placed], [c[inside] for c in cells]
-        if not len(placed[0]):
+            kept = in_memory.take(keep)
+            return _voxels(kept, pack_cells(self.slabs.cells(kept.points.T), axis)), dropped
+        in_memory, placed = self._points_in(slab, self.whole)
+        cells = self.slabs.cells(placed)
+        if in_memory is None:
             return _Voxels(cells[0], np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))), Unsupported()
-        # Placed anew for every slab: kept of hundreds of views they are half a gigabyte.
-        in_memory = _place_scan(self.scan, self.T, self.v)
-        different, at = number_groups(pack_cells(cells, self.axis))
+        different, at = number_groups(pack_cells(cells, axis))
         count = np.bincount(at, minlength=len(different))
         mean = np.stack([np.bincount(at, p, len(different)) for p in placed], axis=1) / count[:, None]
         nearest = self._nearest(mean, count)
@@ -272,27 +297,46 @@ class _ViewInSlabs:
         found = _Voxels(different[keep], weight, mean[keep], normal[keep])
         return found, Unsupported(len(at), int(count[alone].sum()), int(count[through].sum()))
 
-    def _cells(self, columns: Iterable[Array]) -> list[Indices]:
-        return [np.floor(column / self.cell).astype(np.int64) for column in columns]
+    def _points_in(self, slab: int, whole: WholeCloud) -> tuple[PlacedPoints | None, list[Array]]:
+        """The view's points in memory, None beside an empty slab, and columns x, y, z of all points of the slab.
 
-    def _points_near(self, whole: WholeCloud, low: float, high: float) -> list[Array]:
-        """Columns x, y, z of all points between two heights along the axis, reference frame, without the effects."""
-        ends = frames.transform(self.T, box_corners(whole.box))[:, self.axis]
-        margin = _MAX_MOVE * float(np.ptp(whole.box, axis=0).max()) if self.moves else 0.0
-        if ends.max() + margin < low or ends.min() - margin > high:
-            return [np.zeros(0)] * 3
+        Both in the reference frame, and without the effects.
+        """
+        if not self.first <= slab <= self.last:
+            return None, [np.zeros(0)] * 3
+        with self.lock:
+            if slab not in self.waiting:
+                start = slab - (slab - self.first) % _AHEAD
+                self.waiting |= self._cut(whole, start, min(start + _AHEAD, self.last + 1))
+                self.in_memory = _place_scan(self.scan, self.T, self.v)
+            columns, in_memory = self.waiting.pop(slab), self.in_memory
+            if not self.waiting:
+                self.in_memory = None  # of hundreds of views they are half a gigabyte
+        return in_memory if len(columns[0]) else None, columns
+
+    def _cut(self, whole: WholeCloud, start: int, stop: int) -> dict[int, list[Array]]:
+        """The same of slabs from `start` up to `stop`, by their numbers."""
         every = whole.read()
-        height = _along(self.T, every.points, self.axis)
-        near = np.flatnonzero((height >= low - margin) & (height < high + margin))
+        height = _along(self.T, every.points, self.slabs.axis)
+        low, high = self.slabs.cell * self.slabs.ends[[start, stop]]
+        near = np.flatnonzero((height >= low - self.margin) & (height < high + self.margin))
         points = every.points[near]
         if self.moves:
-            points = _corrected_points(self.registered, self.v, points, every.scalars, near)
-        return [_along(self.T, points, i) for i in range(3)]
+            blocks = np.array_split(near, len(near) // _SLAB + 1)
+            points = np.concatenate(
+                [_corrected_points(self.registered, self.v, every.points[b], every.scalars, b) for b in blocks]
+            )
+        columns = [_along(self.T, points, i) for i in range(3)]
+        # Numbers of 16 bits are sorted in a fifth of the time.
+        slab = self.slabs.of(columns[self.slabs.axis]).astype(np.int16)
+        order = np.argsort(slab, kind="stable")
+        ends = np.searchsorted(slab[order], np.arange(start, stop + 1))
+        return {k: [c[order[a:b]] for c in columns] for k, (a, b) in enumerate(pairwise(ends), start)}
 
     def _nearest(self, mean: Array, count: Indices) -> Indices:
         """(G,) the point in memory that is nearest to the block in which a voxel lies."""
-        cells = [c // self.block for c in self._cells(mean.T)]
-        different, at = number_groups(pack_cells(cells, self.axis))
+        cells = [c // self.slabs.block for c in self.slabs.cells(mean.T)]
+        different, at = number_groups(pack_cells(cells, self.slabs.axis))
         middle = weighted_sums(at, count.astype(float), mean) / np.bincount(at, count, len(different))[:, None]
         _, index = self.tree.query(frames.transform(frames.inverse(self.T), middle), k=1)
         return np.asarray(self.surface[index][at])

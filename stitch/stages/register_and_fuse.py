@@ -28,7 +28,7 @@ from stitch.stages.register import Method, Registration, register, register_targ
 from stitch.stages.sentences import correct_note, register_note, support_note, surface_sentence, target_sentence
 from stitch.stages.target_fit import FittedSession
 from stitch.statistics.distributions import MAD_TO_SIGMA
-from stitch.system.threads import Clock, begin, release_mapped
+from stitch.system.threads import Clock, begin, take_mapped
 
 # Places of the fused cloud that tell its rms to a part in a thousand.
 _RMS_SAMPLES = 2_000_000
@@ -183,9 +183,8 @@ def per_view_rms(overlaps: Overlaps, views: int) -> Array:
 
 
 def _fused_rms(residual: Array) -> float:
-    some = residual[:: -(-len(residual) // _RMS_SAMPLES)]
+    some = take_mapped(residual, np.arange(0, len(residual), -(-len(residual) // _RMS_SAMPLES)))
     seen = some[np.isfinite(some)]
-    release_mapped(residual)
     if not len(seen):
         return float("nan")
     # As in the overlaps: what lies beyond 4 robust sigmas is an edge, not a distance of surfaces.

@@ -262,20 +262,38 @@ def _looked_through(
         return np.zeros(len(asked), bool)
     images = range_images(scans, kept, cell)
     points, normals, own = placed.points[asked], placed.normals[asked], placed.view[asked]
+    centres, radii = _balls_around(points, own, len(scans))
+    columns = np.ascontiguousarray(points.T)
+
+    def by_view(v: int) -> tuple[Indices, Indices]:
+        concerned = images.may_concern(scans[v], poses[v], centres, radii)
+        concerned[v] = False
+        near = np.flatnonzero(concerned[own])
+        return near, images.views_through(scans[v], poses[v], v, columns[:, near], normals[near], _MARGIN * cell)
+
     past, missed = np.zeros(len(asked), np.int64), np.zeros(len(asked), np.int64)
-    for v, (scan, T) in enumerate(zip(scans, poses, strict=True)):
-        found = images.views_through(scan, T, v, points, normals, _MARGIN * cell)
-        past += (found == 1) & (own != v)
-        missed += (found == 2) & (own != v)
+    for near, found in parallel(by_view, range(len(scans))):
+        past[near] += found == 1
+        missed[near] += found == 2
     through = past >= np.where(placed.usable[asked], _PAST, 1)
     contradicted = np.zeros(len(held), bool)
     contradicted[asked] = past + missed > 0
     loose = np.zeros(len(held), bool)
+    ends = np.cumsum([0, *(len(scan.points) for scan in scans)])
     for v in np.unique(own[contradicted[asked]]):
         # What stands in the way of one view may stand near what others show.
-        every = np.flatnonzero(held & (placed.view == v))
+        every = ends[v] + np.flatnonzero(kept[v])
         loose[every] = _in_loose_body(placed.points[every], settled[every], contradicted[every], cell)
     return np.asarray(through | loose[asked])
+
+
+def _balls_around(points: Array, view: Indices, views: int) -> tuple[Array, Array]:
+    """Centres (V, 3) and radii (V,) of balls around each view's points."""
+    count = np.maximum(np.bincount(view, minlength=views), 1)
+    centres = np.stack([np.bincount(view, column, views) for column in points.T], axis=1) / count[:, None]
+    radii = np.zeros(views)
+    np.maximum.at(radii, view, np.linalg.norm(points - centres[view], axis=1))
+    return centres, radii
 
 
 def _in_loose_body(points: Array, settled: Mask, contradicted: Mask, cell: float) -> Mask:

@@ -77,11 +77,24 @@ def release_mapped(array: NDArray[Any]) -> None:
         held.madvise(mmap.MADV_DONTNEED)
 
 
+def take_mapped(array: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
+    """Return some rows of an array; of a mapped one little is in memory at a time, and nothing stays."""
+    if not isinstance(array, np.memmap):
+        return array[rows]
+    taken = np.empty((len(rows), *array.shape[1:]), array.dtype)
+    for part in np.array_split(np.arange(len(rows)), _PARTS):
+        taken[part] = array[rows[part]]
+        release_mapped(array)
+    return taken
+
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 _processes = 1
+# A mapped array is looked at in so many parts.
+_PARTS = 64
 # Of a long loop: enough of them to keep all cores busy to its end.
 _PORTIONS = 100
 
