@@ -269,13 +269,13 @@ class _ViewInSlabs:
         """Voxels of a slab, and how many of its points support nothing."""
         axis = self.slabs.axis
         if self.whole is None:
-            in_memory = _place_scan(self.scan, self.T, self.v)
-            inside = self.slabs.of(in_memory.points[:, axis]) == slab
+            every = _place_scan(self.scan, self.T, self.v)
+            inside = self.slabs.of(every.points[:, axis]) == slab
             keep = inside & self.kept
             dropped = Unsupported(
                 *(int(np.sum(m & inside)) for m in (inside, ~self.kept & ~self.through, self.through))
             )
-            kept = in_memory.take(keep)
+            kept = every.take(keep)
             return _voxels(kept, pack_cells(self.slabs.cells(kept.points.T), axis)), dropped
         in_memory, placed = self._points_in(slab, self.whole)
         cells = self.slabs.cells(placed)
