@@ -41,7 +41,8 @@ class Occluder:
         where, verb = list_views([names[v] for v in self.views], names), "shows" if len(self.views) == 1 else "show"
         return (
             f"At least {self.share:.0%} of what {where} {verb} stands where other scans see through: a cable, an "
-            "arm, a clamp or stray points, which the stitched cloud contains; to fix: cut it out, or scan again."
+            "arm, a clamp or stray points. The stitched cloud leaves out what several scans see through, and may hold "
+            "the rest of it; to fix: cut it out, or scan again."
         )
 
 
@@ -53,7 +54,7 @@ def ray_tree(scan: Scan) -> KDTree:
 def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder | None:
     """Return what single scans show where others look through and see nothing; None if it is too little.
 
-    It belongs neither to the part nor to the scanner, and is in the stitched cloud at every place where it was seen.
+    It belongs neither to the part nor to the scanner.
 
     Args:
         poses: (V, 4, 4) T_reference_scanner where surfaces put the views.
@@ -72,7 +73,9 @@ def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> Occluder 
         alone, count = points, len(points)
         for w in asked:
             there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
-            alone = alone[scans[w].tree.query(there, k=1)[0] >= apart[w]] if len(alone) else alone
+            if len(alone):
+                shown, _ = scans[w].tree.query(there, k=1, distance_upper_bound=apart[w])
+                alone = alone[shown >= apart[w]]
         through = np.zeros(len(alone), bool)
         for w in asked if len(alone) >= _FEWEST else ():
             there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
@@ -94,13 +97,16 @@ def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Ma
     Where that face is too steep to be seen, there are looks on one side of the point alone.
     """
     away, rays = np.linalg.norm(points - scan.eye, axis=1), scan.rays(points)
-    beside, partners = look.query(rays, k=min(_LOOK_DIRECTIONS, len(scan.points)))
-    beside, partners = beside.reshape(len(points), -1), partners.reshape(len(points), -1).astype(int)
-    found = scan.points[partners]
-    seen = np.linalg.norm(found - scan.eye, axis=2).min(axis=1)
-    looks = scan.rays(found.reshape(-1, 3)).reshape(found.shape)
-    near, farther = beside[:, 0] * away < _SPACINGS * scan.spacing, seen > away + behind
-    return np.asarray(near & farther & _surrounded(rays, looks))
+    reach = _SPACINGS * scan.spacing / np.maximum(away, 1e-300)
+    through = look.query(rays, k=1, distance_upper_bound=float(reach.max()))[0] < reach
+    asked = np.flatnonzero(through)
+    if len(asked):
+        _, partners = look.query(rays[asked], k=min(_LOOK_DIRECTIONS, len(scan.points)))
+        found = scan.points[partners.reshape(len(asked), -1).astype(int)]
+        seen = np.linalg.norm(found - scan.eye, axis=2).min(axis=1)
+        looks = scan.rays(found.reshape(-1, 3)).reshape(found.shape)
+        through[asked] = (seen > away[asked] + behind) & _surrounded(rays[asked], looks)
+    return np.asarray(through)
 
 
 def _surrounded(rays: Array, looks: Array) -> Mask:
