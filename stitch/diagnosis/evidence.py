@@ -243,7 +243,7 @@ def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterL
     if len(group) > 1 and not regime_of(linear).many_views:
         two = find_missing_pair(linear, candidates, best)
         if two is not None:
-            return replace(found, explanation=two[:1], further=two[1])
+            return replace(found, explanation=two[:1], further=two[1], together=two)
     return replace(found, explanation=group, further=second, together=(best, *others))
 
 
@@ -312,9 +312,7 @@ def challenge(linear: LinearModel, candidates: Sequence[Candidate], evidence: Ev
     found = with_scanner_error(linear, _validated(linear, evidence))
     if found.named or regime_of(linear).many_views:
         return found
-    with_second = _with_validated_second(linear, candidates, evidence)
-    with_second = with_second and with_scanner_error(linear, with_second)
-    return with_second if with_second and with_second.named else found
+    return _with_validated_second(linear, candidates, evidence) or found
 
 
 def _with_validated_second(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Evidence | None:
@@ -325,7 +323,8 @@ def _with_validated_second(linear: LinearModel, candidates: Sequence[Candidate],
     two = find_missing_pair(linear, candidates, evidence.named[0])
     if two is None or two[0].name != evidence.named[0].name or not pair_is_validated(linear, two):
         return None
-    return replace(evidence, explanation=two[:1], further=two[1])
+    pair = with_scanner_error(linear, replace(evidence, explanation=two[:1], further=two[1], together=two))
+    return pair if pair.named else None
 
 
 def with_equal_rivals(linear: LinearModel, evidence: Evidence) -> Evidence:

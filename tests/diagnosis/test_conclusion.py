@@ -23,7 +23,7 @@ def ranked(name, beside=None, adjusted=1e-6):
 
 FIRST, SECOND = ranked("range_nonlinearity"), ranked("lens_distortion")
 ALONE = Evidence((FIRST, SECOND), (), alarm=True, explanation=(FIRST,))
-PAIR = replace(ALONE, further=SECOND)
+PAIR = replace(ALONE, further=SECOND, together=(FIRST, SECOND))
 SAME, WORSE, BETTER = (1.02, 0.97, 1.05, 0.98), (1.9, 2.1, 2.0, 2.2), (0.5, 0.6, 0.55, 0.5)
 SMOOTH = SimpleNamespace(gain=50.0, over_noise=False)
 

@@ -9,6 +9,7 @@ from stitch.effects import EFFECTS
 from stitch.errors import InputError
 from stitch.measurement.capture import points_within, prepare_capture, thin_session
 from stitch.measurement.measurement import measurement_of
+from stitch.measurement.session import WholeCloud
 from stitch.model.forward import corrected_capture
 from stitch.model.model import Model, term_of
 from stitch.reading.session_folder import load_session
@@ -48,12 +49,19 @@ def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect):
     assert np.median(apart) < 1e-3 * cell and np.quantile(apart, 0.95) < 0.1 * cell
 
 
-def test_the_number_of_slabs_does_not_matter(blade_capture):
+def test_the_number_of_slabs_does_not_matter(blade_capture, monkeypatch):
+    """Nor for how many of them a scan is read at once: no more often than that asks for."""
     measured, _ = blade_capture
     light = registered(thin_session(session_of(measured), 2000)[0], measured)
+    reads, read = [], WholeCloud.read
+    monkeypatch.setattr(WholeCloud, "read", lambda whole: reads.append(whole.scan.name) or read(whole))
     one, many = (fuse_every_point(light, slab=slab)[0] for slab in (10**9, 1500))
+    assert len(reads) < 3 * len(light.own.scans)
+    monkeypatch.setattr("stitch.stages.fuse._AHEAD", 2)
+    often, _ = fuse_every_point(light, slab=1500)
     for name in ("points", "normals", "residual", "count"):
         assert np.array_equal(getattr(one, name), getattr(many, name), equal_nan=True)
+        assert np.array_equal(getattr(one, name), getattr(often, name), equal_nan=True)
     assert isinstance(many.points, np.memmap) and not isinstance(one.points, np.memmap)
 
 

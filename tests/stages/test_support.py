@@ -86,6 +86,44 @@ def test_a_view_from_two_eyes_is_no_witness():
     assert images.trusted.tolist() == [False, True, True]
 
 
+@pytest.fixture(scope="module")
+def seen_from_three_sides():
+    """Range images of clean scans, and places anywhere about the part."""
+    scans, poses = views_of()
+    images = range_images(scans, [np.ones(len(s.points), bool) for s in scans], SPACING)
+    rng = np.random.default_rng(5)
+    places, normals = rng.uniform([-60, -60, 300], [60, 60, 600], (5000, 3)), rng.standard_normal((5000, 3))
+    return scans, poses, images, places, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("v", range(3))
+def test_a_view_sees_past_what_lies_before_the_surface_within_its_field(seen_from_three_sides, v):
+    """Where a ray first meets the surface, which is a formula, within what the scan shows of it."""
+    scans, poses, images, places, normals = seen_from_three_sides
+    found = images.views_through(scans[v], poses[v], v, places.T.copy(), normals, 3 * SPACING)
+    eye = frames.transform(poses[v], scans[v].eye)
+    along = np.linspace(1.0, 2.2, 300)[:, None, None] * (places - eye) + eye
+    beyond = along[..., 2] > wave(along[..., 0], along[..., 1])
+    meets = along[beyond.argmax(axis=0), np.arange(len(places))]
+    within = beyond.any(axis=0) & (np.abs(meets[:, :2]) < 26).all(axis=1)
+    before = within & (places[:, 2] < wave(*places[:, :2].T) - 20)
+    assert before.sum() > 100 and (found[before] == 1).mean() > 0.99
+    behind = places[:, 2] > wave(*places[:, :2].T) + 1
+    assert not (found[behind] == 1).any()
+
+
+@pytest.mark.parametrize("v", range(3))
+def test_places_that_need_not_be_asked_are_none_that_a_view_speaks_of(seen_from_three_sides, v):
+    scans, poses, images, places, normals = seen_from_three_sides
+    found = images.views_through(scans[v], poses[v], v, places.T.copy(), normals, 3 * SPACING)
+    told = images.may_concern(scans[v], poses[v], places, np.zeros(len(places)))
+    assert told[found > 0].all() and 0 < told.sum() < len(places)
+    balls = places.reshape(-1, 50, 3)
+    centres = balls.mean(axis=1)
+    radii = np.linalg.norm(balls - centres[:, None], axis=2).max(axis=1)
+    assert images.may_concern(scans[v], poses[v], centres, radii)[(found.reshape(-1, 50) > 0).any(axis=1)].all()
+
+
 @pytest.mark.parametrize("size", [0.3, 7.0])
 def test_cells_and_groups_are_those_of_numpy(size):
     points = np.random.default_rng(2).normal(0, 20, (500, 3))
