@@ -17,7 +17,7 @@ from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture
 from stitch.measurement.measurement import MIN_COSINE, Measurement, intensity_scale
 from stitch.measurement.scan import Scan, box_corners
-from stitch.measurement.session import Session, WholeCloud
+from stitch.measurement.session import Cloud, Session, WholeCloud
 from stitch.model.forward import moves_points, point_correction
 from stitch.model.model import Model
 from stitch.runs.run import FusedCloud, Unsupported
@@ -255,7 +255,6 @@ class _ViewInSlabs:
         some = len(self.surface) < len(alone)
         self.tree = KDTree(self.scan.points[self.surface], leafsize=16) if some else self.scan.tree
         self.off_plane = _OFF_PLANE * (1 + edge_credit(junk))
-
         self.first, self.last, self.margin = 0, slabs.count - 1, slabs.cell
         if self.whole is not None:
             self.margin += _MAX_MOVE * float(np.ptp(self.whole.box, axis=0).max()) if self.moves else 0.0
@@ -320,18 +319,20 @@ class _ViewInSlabs:
         height = _along(self.T, every.points, self.slabs.axis)
         low, high = self.slabs.cell * self.slabs.ends[[start, stop]]
         near = np.flatnonzero((height >= low - self.margin) & (height < high + self.margin))
-        points = every.points[near]
-        if self.moves:
-            blocks = np.array_split(near, len(near) // _SLAB + 1)
-            points = np.concatenate(
-                [_corrected_points(self.registered, self.v, every.points[b], every.scalars, b) for b in blocks]
-            )
+        points = self._corrected(every, near) if self.moves else every.points[near]
         columns = [_along(self.T, points, i) for i in range(3)]
         # Numbers of 16 bits are sorted in a fifth of the time.
         slab = self.slabs.of(columns[self.slabs.axis]).astype(np.int16)
         order = np.argsort(slab, kind="stable")
         ends = np.searchsorted(slab[order], np.arange(start, stop + 1))
         return {k: [c[order[a:b]] for c in columns] for k, (a, b) in enumerate(pairwise(ends), start)}
+
+    def _corrected(self, every: Cloud, index: Indices) -> Array:
+        """Some of the points, scanner frame, without the effects in use."""
+        blocks = np.array_split(index, len(index) // _SLAB + 1)
+        return np.concatenate(
+            [_corrected_points(self.registered, self.v, every.points[b], every.scalars, b) for b in blocks]
+        )
 
     def _nearest(self, mean: Array, count: Indices) -> Indices:
         """(G,) the point in memory that is nearest to the block in which a voxel lies."""
