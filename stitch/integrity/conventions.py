@@ -179,13 +179,12 @@ def fit_motions(hypothesis: Hypothesis, motions: RelativeScans, length: float, *
         length: what a motion may leave open, length_unit.
         scaled: fit the scale of the robot's lengths too.
     """
-    used = set(range(len(hypothesis.T_base_flange)) if hypothesis.used is None else hypothesis.used)
-    keep = [i for i, (v, w) in enumerate(motions.pairs) if v in used and w in used]
-    T = hypothesis.T_reference_mount
-    if len(keep) < FEWEST:
+    T, pairs = hypothesis.T_reference_mount, np.array(motions.pairs, int).reshape(-1, 2)
+    keep = np.isin(pairs, np.arange(len(T)) if hypothesis.used is None else hypothesis.used).all(axis=1)
+    (v, w), B = pairs[keep].T, motions.T[keep]
+    if len(v) < FEWEST:
         return MotionFit(hypothesis, np.eye(4), 0.0, 1.0, 1.0)
-    A = np.array([frames.inverse(T[v]) @ T[w] for v, w in (motions.pairs[i] for i in keep)])
-    B = motions.T[keep]
+    A = frames.inverse(T[v]) @ T[w]
     R, turned = _rotation(A, B)
     t, s, moved = _translation(A, B, R, turned < ROTATION, scaled)
     near = (turned < ROTATION) & (moved < length)
