@@ -3,9 +3,9 @@
 Run: python bench/points_cells.py [--seeds 700 706] [--kinds …]. An ABB IRB 120 of the generator before a tracker: a
 ball, three reflectors, a 6D probe; the sensor's kind stated and not; points in the robot's base; sweeps of single
 joints; an arm driven by cables; a part that slips; joints that count otherwise in either direction. Wrong: the first
-single name is none of the errors that are there. Zero: an effect of the final model no parameter of which is three
-sigmas off zero: of one that is there too, where its parameters are only known together. Again: the closing diagnosis
-names what was dropped on the way.
+single name is none of the errors that are there. Zero: an effect of the final model that is not there, and no parameter
+of which is three sigmas off zero. Weak: one that is there, and whose parameters are only known together. Again: the
+closing diagnosis names what was dropped on the way.
 """
 
 import argparse
@@ -98,7 +98,7 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
     given = parser.parse_args()
     pin(0)
-    wrong, zero, again, count = 0, 0, 0, 0
+    wrong, zero, weak, again, count = 0, 0, 0, 0, 0
     for seed in range(*given.seeds):
         for name in given.kinds:
             began, start = time.process_time(), run(session_of_kind(KINDS[name], seed))
@@ -106,13 +106,16 @@ def main() -> None:
             found, _, last = suggest(start, 5)
             final = found or start
             bad = first.verdict == "missing_effect" and first.effects[0] not in KINDS[name].right
-            idle = [term.name for term in final.terms if term.sigmas_from_zero < _SIGMAS]
+            small = {term.name for term in final.terms if term.sigmas_from_zero < _SIGMAS}
+            idle, faint = sorted(small - KINDS[name].right), sorted(small & KINDS[name].right)
             named = [effect for effect in last.effects if effect in final.tried]
-            wrong, zero, again, count = wrong + bad, zero + bool(idle), again + bool(named), count + 1
+            wrong, again, count = wrong + bad, again + bool(named), count + 1
+            zero, weak = zero + bool(idle), weak + bool(faint)
             told = f"{first.verdict} {','.join(first.effects)} | {','.join(final.effects)} | {last.verdict}"
-            marks = f"{'WRONG ' * bad}{f'ZERO {idle} ' if idle else ''}{f'AGAIN {named}' if named else ''}"
+            marks = f"{'WRONG ' * bad}{f'ZERO {idle} ' if idle else ''}"
+            marks += f"{f'WEAK {faint} ' if faint else ''}{f'AGAIN {named}' if named else ''}"
             print(f"{name} {seed} | {told} | {marks} {time.process_time() - began:.0f} s", flush=True)
-    print(f"{count} sessions: first single name wrong {wrong}, an effect at zero {zero}, named again {again}")
+    print(f"{count} sessions: first single name wrong {wrong}, at zero {zero}, weak {weak}, named again {again}")
 
 
 if __name__ == "__main__":
