@@ -124,7 +124,7 @@ def _scatter_sentences(scatter: Repeatability, registered: float, length_unit: s
     return (
         f"The robot's poses scatter by {length_text(scatter.translation, length_unit)} and "
         f"{angle_text(scatter.rotation, 2)}. After each view got its own correction, "
-        f"{length_text(registered, length_unit)} remain."
+        f"{length_text(registered, length_unit)} rms remain."
     )
 
 
