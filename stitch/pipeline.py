@@ -319,7 +319,8 @@ def _reason_to_stop(found: Diagnosis, left: int, at_most: int) -> list[str] | No
         return [f"{name} was not added: chance is more likely. To add it anyway: stitch add RUN {name}."]
     if found.dropped_before is not None:
         return [f"{name} was dropped in this run before. To add it all the same: stitch add RUN {name}."]
-    return None if left else [f"Stopped after {at_most} effects; run it again to go on."]
+    effects = "1 effect" if at_most == 1 else f"{at_most} effects"
+    return None if left else [f"Stopped after {effects}; run it again to go on."]
 
 
 def _add_found(state: Run, found: Finding, at_most: int, given: set[str]) -> tuple[Run, list[str]]:

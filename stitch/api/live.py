@@ -68,7 +68,8 @@ class LiveView:
     def __str__(self) -> str:
         known = ""
         if self.hand_eye is not None and self.hand_eye.unknown:
-            known = f" Of the hand-eye {', '.join(self.hand_eye.unknown)} are not known."
+            are = "are" if len(self.hand_eye.unknown) > 1 else "is"
+            known = f" Of the hand-eye {', '.join(self.hand_eye.unknown)} {are} not known."
         elif self.hand_eye is not None:
             known = f" U {self.hand_eye.U.mm:.2g} mm, {self.hand_eye.U.mrad:.2g} mrad."
         return f"{self.name}: {self.verdict.replace('_', ' ')}. {self.why}{known}"

@@ -72,6 +72,8 @@ def next_measurement(
         say("Nothing is missing: there is nothing to tell apart.")
     elif len(found.effects) > 1:
         say(f"No pose within reach, and no artefact that is known here, separates {' from '.join(found.effects)}.")
+    elif found.verdict == "missing_effect" and not found.likelier_than_not:
+        say(f"No alias of {found.effects[0]} is in these views: more views, at any poses, tell it from chance.")
     else:
         say("Nothing has to be told apart: no two candidate effects are aliases in these views.")
 

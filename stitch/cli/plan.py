@@ -115,7 +115,7 @@ def _require_plan_options(views: int | None, size: float | None, field: float | 
     if field is not None and not 0 < field < 150:
         raise InputError(f"--field {field:g}: to fix: give the full angle in degrees, between 0 and 150")
     if output is not None and output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise InputError(f"{output}: there is such a folder; to fix: name another, or move it away")
+        raise InputError(f"{output}: exists already; to fix: name another, or move it away")
 
 
 def place_of(folder: Path, feature: str | None) -> str | None:
@@ -192,7 +192,7 @@ def _show_plan(plan: Plan, cell: CellModel, output: Path | None) -> None:
     if plan.assumed:
         say(f"Nobody stated, so assumed: {'; '.join(plan.assumed)}.")
     if plan.now is None:
-        say("Fewer than three views give no hand-eye; views are proposed.", bold=True)
+        say(f"Fewer than three views give no hand-eye{'; views are proposed' * bool(plan.proposed)}.", bold=True)
     else:
         _show_outlook(plan, plan.now, cell)
     _show_proposed(plan)

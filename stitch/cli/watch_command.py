@@ -140,7 +140,7 @@ def _show_watch(reports: list[CellReport], folders: list[Path], added: int | Non
 
 def _show_cell(report: CellReport) -> None:
     from stitch.units import rounded
-    from stitch.watch.report import day_text, table_unit
+    from stitch.watch.report import day_text, sessions_text, table_unit
 
     rows = []
     for p in report.parameters:
@@ -153,7 +153,7 @@ def _show_cell(report: CellReport) -> None:
         rows.append((p.name, unit, value, sigma, drift, _valid_text(report, p), _moved_text(report, p)))
     span = f"{day_text(report.first)} to {day_text(report.last)}"
     show_table(
-        f"{report.name}: {report.sessions:,} sessions, {span}; calibration of {report.in_use} in use",
+        f"{report.name}: {sessions_text(report)}, {span}; calibration of {report.in_use} in use",
         ("parameter", "unit", "value", "sigma", "a day", "valid", "moved"),
         rows,
         words=("parameter", "unit", "moved"),

@@ -88,7 +88,9 @@ def toml_text(folder: Path, first: FirstSession) -> str:
     told = {guess.what: guess for guess in first.guesses}
     lines = [f'format = "{SESSION_FORMAT}"', f'name = "{session_name(first.files.folder)}"']
     lines += ["", "# What follows as a comment alone was read so into views.csv. To read it otherwise:"]
-    lines += [f"# stitch init {shlex.quote(str(first.files.folder))} --force, with the flag that is named beside it."]
+    own = first.files.folder
+    into = "" if folder.resolve() == own.resolve() else f" -o {shlex.quote(str(folder))}"
+    lines += [f"# stitch init {shlex.quote(str(own))}{into} --force, with the flag that is named beside it."]
     for what in ("files", "pairing", "columns", "rotation"):
         lines += ["", *comment_lines(told[what], with_flag=True)]
     unit = length_unit(first)

@@ -198,7 +198,8 @@ class ModelTransfer:
         if self.targets:
             more = f" and {len(self.targets) - _LISTED} more" if len(self.targets) > _LISTED else ""
             names, away = ", ".join(self.targets[:_LISTED]) + more, length_text(self.farthest, unit)
-            told.append(f"{names} lie elsewhere than in the other run, by up to {away}")
+            lie = "lie" if len(self.targets) > 1 else "lies"
+            told.append(f"{names} {lie} elsewhere than in the other run, by up to {away}")
         return (
             f"{'; '.join(told)} (targets are {off} off with it, {own} with what this session shows itself); to fix: "
             "run without --hand-eye, keep the arm alone (--arm), or give targets that moved another name"

@@ -147,8 +147,9 @@ class StaticBackground:
             low, high = (", ".join(f"{side:.4g}" for side in corner) for corner in self.within)
             fix = f"state within = [[{low}], [{high}]] under [scanner] in session.toml"
         return (
-            f"{self.share:.0%} of what the scans show stands still before the scanner: a wall, a table or a bracket, "
-            f"at {len(self.views)} places of the stitched cloud; to fix: {fix}, and run again."
+            f"{self.share:.0%} of what the scans show stands still before the scanner: a wall, a table or a bracket. "
+            f"{len(self.views)} views show it, each elsewhere on the part. The stitched cloud leaves out what other "
+            f"views look through, and may hold the rest of it; to fix: {fix}, and run again."
         )
 
 

@@ -392,8 +392,13 @@ _Alarmed = tuple[ParameterReport, Change]
 
 def headline(report: CellReport) -> str:
     """The verdict on a cell in one line."""
-    told = event_sentences(report) or [f"nothing moves in {report.sessions:,} sessions"]
+    told = event_sentences(report) or [f"nothing moves in {sessions_text(report)}"]
     return f"{report.name}: {'; '.join(told)}; {_recalibration_note(report)}."
+
+
+def sessions_text(report: CellReport) -> str:
+    """How many sessions there are, in words."""
+    return f"{report.sessions:,} session{'s' * (report.sessions != 1)}"
 
 
 def event_sentences(report: CellReport) -> list[str]:
