@@ -38,7 +38,7 @@ def demo(
     from stitch.cli.change import add
     from stitch.cli.diagnose import diagnose_run
     from stitch.cli.run import run
-    from stitch.cli.terminal import headlines_only, say
+    from stitch.cli.terminal import headlines_only, say, show_files
 
     session = folder / "blade"
     if folder.exists() and not truth_path(session).is_file():
@@ -58,7 +58,7 @@ def demo(
         add(folder / "run", suggested=True)
     say("stitch reveal: what was hidden", bold=True)
     reveal(folder / "run", truth_path(session))
-    say(f"Written: stitched.ply, recording.rrd and report.html in {folder / 'run'}")
+    show_files(folder / "run", ("stitched.ply", "recording.rrd", "report.html"))
     say(f"Next: stitch review {shlex.quote(str(folder / 'run'))}")
 
 

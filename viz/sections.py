@@ -106,7 +106,7 @@ def _in_um(value: float, unit: str) -> str:
 def _next(found: Diagnosis, run: str) -> str:
     why, command = suggested_command(found, shlex.quote(run)).rsplit(": ", 1)
     said = "Type, where the folder of this page stands" if why == "Next" else why.removeprefix("Next, ").capitalize()
-    does = "It adds the effect and fits the same scans anew." if command.startswith("stitch add") else ""
+    does = "It adds what is missing and fits the same views anew." if command.startswith("stitch add") else ""
     after = "".join(f"<p>{_words(text)}</p>" for text in (does, remedy_at_machine(found)) if text)
     typed = f"<p>{_words(said)}:</p><p><code>{escape(command)}</code></p>"
     return f'<div class="card next"><h2>Next</h2>{typed}{after}</div>'

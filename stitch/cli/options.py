@@ -15,7 +15,7 @@ Trust = Annotated[bool, typer.Option("--trust", help="Run the Python file of eff
 Force = Annotated[bool, typer.Option("--force", help="Replace the run of another session.")]
 Tolerance = Annotated[
     float | None,
-    typer.Option("--tolerance", help="On the page: within which the views have to agree on the part, length_unit."),
+    typer.Option("--tolerance", help="Within which the views have to agree on the part, length_unit."),
 ]
 Memory = Annotated[
     str | None, typer.Option("--memory", metavar="SIZE", help="Stay below so much, such as 2GB; default: no limit.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stitch.cli.options import Json, Tolerance, require_tolerance
+from stitch.cli.options import Json, require_tolerance
 from stitch.cli.progress import show_activity
 from stitch.cli.terminal import emit, say, show_table
 from stitch.errors import InputError
@@ -28,7 +28,10 @@ def watch(
         Path | None,
         typer.Option("--in-use", metavar="RUN", help="Run whose calibration the cell uses from now on."),
     ] = None,
-    tolerance: Tolerance = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option("--tolerance", help="By which the mount may displace the part; default: U of the calibration."),
+    ] = None,
     page: Annotated[bool, typer.Option("--page/--no-page", help="Write watch.html and watch.prom.")] = True,
     dfq: Annotated[Path | None, typer.Option("--dfq", metavar="FILE", help="Also write the history as Q-DAS.")] = None,
     as_json: Json = False,

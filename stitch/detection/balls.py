@@ -460,9 +460,10 @@ def ball_sightings(
         told = np.array([name is not None for name in names], bool)
         words = tuple(f"ball{name + 1}" for name in names if name is not None)
         out.append(Sighting(words, view.centres[told], view.sigma[told]))
+    balls, shown = sum(nameless), int(np.count_nonzero(nameless))
     note = (
-        f"{sum(nameless)} balls in {np.count_nonzero(nameless)} views cannot be told from others of their size and are "
-        "left out; three or more a view at distances that all differ, or balls of different sizes, can"
+        f"{balls} ball{'s' * (balls > 1)} in {shown} view{'s' * (shown > 1)} cannot be told from others of the same "
+        "size and are left out; three or more a view at distances that all differ, or balls of different sizes, can"
     )
     return out, [note] if any(nameless) else []
 

@@ -57,7 +57,7 @@ def offset(unit: str, typical: float, limit: float, axes: Sequence[str] = "xyz")
 
 
 def event() -> Spec:
-    """The view from which on something is different; every view that can show it is tried."""
+    """The view from which on something is different; every view that can show it is tried, of a hundred some fifty."""
     return Spec("number", "view", 1.0, float("inf"), EVERY_VIEW)
 
 

@@ -105,6 +105,9 @@ _AT_THE_MACHINE = {
 def remedy_at_machine(found: Diagnosis) -> str:
     """Return what would end the effect that is named, or where to look for one without a name, as a sentence; empty
     where nothing is named, or only perhaps."""
+    if found.verdict == "unknown_effect" and found.follows_field:
+        by_view = found.scanner_error is not None and found.scanner_error.by_view
+        return "" if by_view else "At the machine: have the scanner calibrated."
     if found.verdict == "unknown_effect":
         follows = [plain_covariate(x.covariate) for x in found.depends_on if x.p_value < CLEAR_DEPENDENCE]
         if found.curves:
@@ -240,7 +243,7 @@ def suggested_command(found: Diagnosis, run: str) -> str:
             return f"Next, for views that would separate them: stitch next {run}"
         case "cannot_tell":
             return f"Next, to fit them as one group: stitch add {run} --group"
-        case "unknown_effect" if found.curves or found.time_curve is not None:
+        case "unknown_effect" if (found.curves or found.time_curve is not None) and not found.follows_field:
             return f"Next, to look for a formula: stitch explain {run} -o mine.py"
         case "unknown_effect":
             return f"Next, to see where the model fails: stitch review {run}"

@@ -216,7 +216,10 @@ def _headline(found: Diagnosis, why: EffectCourse | None, descriptions: dict[str
             return f"With {named} in the model, nothing more is missing." if named else "Nothing is missing."
         case "unknown_effect":
             follows = ""
-            if found.curves:
+            if found.follows_field:
+                by_view = found.scanner_error is not None and found.scanner_error.by_view
+                follows = ": each scan errs by itself" if by_view else ": the scanner errs over its field of view"
+            elif found.curves:
                 follows = f": the error follows joint {found.curves[0].joint}"
             elif found.depends_on and found.depends_on[0].p_value < CLEAR_DEPENDENCE:
                 follows = f": the error follows {plain_covariate(found.depends_on[0].covariate)}"

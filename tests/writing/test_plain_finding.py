@@ -28,7 +28,9 @@ def test_every_effect_of_the_library_has_words():
 
 @pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
 @pytest.mark.parametrize(("curves", "time_curve"), [((), None), (("of joint 3",), None), ((), "of the flange")])
-def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve):
+@pytest.mark.parametrize("follows_field", [False, True])
+def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve, follows_field):
+    """No formula is looked for of what the scanner itself errs by."""
     monkeypatch.setattr("stitch.writing.diagnosis_document.group_share", lambda linear, group: (0.7, 0.1))
     found = SimpleNamespace(
         verdict=verdict,
@@ -39,10 +41,12 @@ def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve)
         linear=None,
         candidates=(),
         likelier_than_not=True,
+        follows_field=follows_field,
     )
     command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
     assert command.startswith("stitch ") and refused(command) is None
-    assert ("explain" in command) == (verdict == "unknown_effect" and bool(curves or time_curve))
+    explained = verdict == "unknown_effect" and bool(curves or time_curve) and not follows_field
+    assert ("explain" in command) == explained
 
 
 @pytest.mark.parametrize("share", [0.949, 0.951])
@@ -235,8 +239,11 @@ def test_the_screen_says_how_sure_it_is(found, said):
 )
 def test_where_no_effect_is_named_the_machine_is_still_told_of(curves, said):
     follows = (SimpleNamespace(covariate="j2_deg", p_value=1e-9),)
-    found = SimpleNamespace(verdict="unknown_effect", curves=curves, depends_on=follows)
+    found = SimpleNamespace(verdict="unknown_effect", curves=curves, depends_on=follows, follows_field=False)
     assert remedy_at_machine(found) == f"At the machine: {said}"
+    for by_view, told in ((False, "At the machine: have the scanner calibrated."), (True, "")):
+        found.follows_field, found.scanner_error = True, SimpleNamespace(by_view=by_view)
+        assert remedy_at_machine(found) == told
 
 
 @pytest.mark.parametrize(("heldout", "shown"), [(0.5, 1), (1.1, 0)])
