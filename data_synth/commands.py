@@ -29,7 +29,8 @@ def synth(
 ) -> None:
     """Write a session made by a cell that behaves like a real one, and its truth beside it.
 
-    A scene is a session of scans. A cell is a folder for `base`, `drill`, `panel`, `calibrate`, `fit` or `seam`, or of two sessions.
+    A scene is a session of scans. A cell is a folder for `base`, `drill`, `panel`, `calibrate`, `fit` or `seam`, or of
+    two sessions.
 
     \b
     Examples:

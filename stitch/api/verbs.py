@@ -82,14 +82,14 @@ def run_rig(
     arm: ModelFile | runs.Run | None = None,
     register: str = DEFAULT,
 ) -> list[Run]:
-    """Stitch several sessions of one rig with one common hand-eye and common effects; one run a session.
+    """Stitch several sessions of one rig with common effects and, of scans, one hand-eye; one run a session.
 
     Args:
-        sessions: of one scanner on one mount, in one length_unit.
+        sessions: of one scanner on one mount, or labelled points of one arm, in one length_unit.
         model, recorders, effects, keep, arm, register: as `stitch.run` takes them, a recorder a session.
 
     Returns:
-        A run a session, shapes and frames as of `stitch.run`; their hand-eyes (4, 4) are the same.
+        A run a session, shapes and frames as of `stitch.run`; of scans their hand-eyes (4, 4) are the same.
 
     Raises:
         InputError: sessions of different rigs, and as `stitch.run`.

@@ -73,9 +73,15 @@ def next_measurement(
     elif len(found.effects) > 1:
         say(f"No pose within reach, and no artefact that is known here, separates {' from '.join(found.effects)}.")
     elif found.verdict == "missing_effect" and not found.likelier_than_not:
-        say(f"No alias of {found.effects[0]} is in these views: more views, at any poses, tell it from chance.")
+        say(f"{_none_alike(found.effects[0])}. More views, at any poses, tell it from chance.")
     else:
-        say("Nothing has to be told apart: no two candidate effects are aliases in these views.")
+        say(f"Nothing has to be told apart. {_none_alike('the likeliest')}.")
+
+
+def _none_alike(name: str) -> str:
+    from stitch.diagnosis.thresholds import ALIAS_CORRELATION
+
+    return f"No effect correlates with {name} by more than {ALIAS_CORRELATION} in these views"
 
 
 def _diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, object], str]:
