@@ -256,7 +256,7 @@ def plan(
         views: at most so many further ones.
         split: two effects that they are to tell apart.
         halve: they are to halve the uncertainty of the hand-eye and nothing else.
-        feature: (3,) at which the uncertainty counts, reference frame, length_unit.
+        feature: (3,) at which the uncertainty counts, reference frame, length_unit; or (6,) with a normal, along it.
         part: mesh, or cloud with normals, of a session's part.
         size: its longest side, mm, where nothing else is known.
         field: full angle of the scanner's field, degrees.
@@ -274,8 +274,9 @@ def plan(
     """
     for name in split or ():
         find_effect(name)
-    at = None if feature is None else np.asarray(feature, float).reshape(3)
-    wanted = PlanRequest(halve=halve or split is None, split=split, split_any=not halve, views=views, feature=at)
+    at = None if feature is None else np.asarray(feature, float).reshape(-1)
+    split_any = not halve and at is None
+    wanted = PlanRequest(halve=halve or split is None, split=split, split_any=split_any, views=views, feature=at)
     if isinstance(cell, runs.Run):
         return planning.plan_further_views(cell.session, _cell_of(cell), wanted)
     planned = cell_of_session(cell, None if part is None else Path(part), size, field)

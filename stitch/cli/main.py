@@ -92,7 +92,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         place = shortened(error.filename, 200).strip("'") if error.filename else "file system"
         _exit_with_message(f"{place}: {error.strerror or error}{fix}", 2)
     except MemoryError:
-        _exit_with_message("not enough memory; to fix: state --memory, leave out views, or thin the scans", 1)
+        _exit_with_message(
+            "not enough memory; to fix: leave out views, thin the scans, or state --memory (stitch run)", 1
+        )
     except Exception as error:
         _exit_with_message(_unexpected_message(error), 1)
 

@@ -107,7 +107,7 @@ def _twist_code(ingredients: Sequence[Ingredient], letters: Sequence[str]) -> li
 EFFECT_NAME = "explained"
 _TINY = 1e-12
 _TOO_FEW = (
-    "Nothing can be said from {} views. A formula is found in one half and tested in the other; each is too small."
+    "Nothing can be said from {} views. A formula is found in some of them and tested in the others; these are too few."
 )
 
 
@@ -157,7 +157,7 @@ def _try_sum(linear: LinearModel, terms: Dictionary, chosen: TestedSum, origin: 
     values = _coefficients(linear, own, scaled)
     text = formula_text(own, values)
     if not chosen.holds:
-        failed = f"{text}, found in one half of the views, fails in the other (p = {chosen.p_value:.2g})"
+        failed = f"{text}, found in some of the views, fails in the others (p = {chosen.p_value:.2g})"
         return Explanation(False, f"No formula holds: {failed}.")
     turns = [abs(v if i.quantity.bounded else x) for i, v, x in zip(own, values, scaled, strict=True)]
     if own[0].place == "robot" and max(turns) > LARGEST_JOINT_ADDEND:
@@ -193,9 +193,9 @@ def _test_sentence(p_value: float, text: str, tested: str) -> str:
     # As far as anybody can vouch for the tails of a distribution.
     p = f"p = {p_value:.1g}" if p_value > _TINY else f"p < {_TINY:g}"
     if tested == text:
-        return f"found in one half of the views, it holds in the other ({p})"
+        return f"found in some of the views, it holds in the others ({p})"
     return (
-        f"likeliest in all views, but not the one tested. Found in one half and holding in the other: {tested} "
+        f"likeliest in all views, but not the one tested. Found in some and holding in the others: {tested} "
         f"({p}, for this one alone)"
     )
 
