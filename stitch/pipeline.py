@@ -75,7 +75,7 @@ def run_rig(
     register: str = DEFAULT,
     captures: Sequence[Future[Capture]] | None = None,
 ) -> list[Run]:
-    """Stitch several sessions of one rig with one common hand-eye and common effects; one run per session.
+    """Stitch several sessions of one rig with common effects and, of scans, one hand-eye; one run per session.
 
     Args:
         captures: what `prepare_capture` makes of the sessions, where that has begun already.

@@ -125,7 +125,7 @@ def beyond_sentence(calibrated_arm: CalibratedRobot, in_table: Collection[str] =
         told.append(
             f"Not in it, because no table of links can hold it: {', '.join(calibrated_arm.beyond)}; model.toml has it."
         )
-    return " ".join(told) or "No other error of the arm was found."
+    return " ".join(told) or "The model has no other effect of the arm."
 
 
 def with_geometry(robot: Robot, terms: Sequence[Term]) -> Robot:

@@ -120,7 +120,7 @@ def _finish_batch(rows: list[SessionRow], output: Path, as_json: bool) -> None:
         show_files(output, (PAGE, DOCUMENT))
     if failed:
         kind = InputError if all(row.bad_input for row in failed) else NoResultError
-        raise kind(f"{len(failed)} of {len(rows)} sessions have no result; to fix: see the line of each above")
+        raise kind(f"no result of {len(failed)} of {len(rows)} sessions; to fix: see the line of each above")
 
 
 def _show_rows(rows: Sequence[SessionRow], sentence: str) -> None:

@@ -117,11 +117,11 @@ def _summary_rows(fact: dict[str, Any]) -> list[tuple[str, str]]:
         ("length unit", unit),
         ("views", str(fact["views"])),
         ("scanned points", f"{fact['points']:,}" if fact["points"] else ""),
-        ("labelled points", f"{fact['targets']} targets, seen {fact['sightings']} times" if fact["targets"] else ""),
+        ("labelled points", f"{fact['targets']}, in {fact['sightings']} sightings" if fact["targets"] else ""),
         ("distance from the scanner", "" if far is None else f"{far:g} {unit}, median"),
         ("arm", fact["robot"] or "not stated: poses of the flange only"),
         ("joint angles", "in views.csv" if fact["joints"] else "none: effects of joints cannot be tested"),
-        ("hand-eye", "a coarse one is stated" if fact["hand_eye_given"] else "not stated: found from the scans"),
+        ("hand-eye", "a coarse one is stated" if fact["hand_eye_given"] else "not stated: found from the views"),
         ("measured with each view", ", ".join(fact["covariates"]) or "nothing"),
         *(("note", note) for note in fact["notes"]),
     ]

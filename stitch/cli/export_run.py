@@ -181,7 +181,7 @@ def _export_moved_program(
         told = {"format": "stitch-program/1", "program": str(file), "controller": copy.program.controller}
         emit(to_json(told | {"targets": rows, "files": [str(place) for place in places]}))
         return
-    say(f"{len(rows)} targets follow the part to where it was found.", bold=True)
+    say(f"Moved with the part to where it was found: {len(rows)} of the program's targets.", bold=True)
     show_table(
         f"{file.name}: targets moved",
         ("target", "line", "moved", "turned"),

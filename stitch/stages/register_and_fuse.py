@@ -81,7 +81,7 @@ def finish_surfaces(
     model, own, overlaps = correction.geometry, correction.captures[index], correction.overlaps[index]
     scatter = correction.scatter[index]
     poses_model = own.poses(model.T_mount)
-    note = correct_note(before.rms, overlaps.gram.rms)
+    note = "" if correction.given else correct_note(before.rms, overlaps.gram.rms)
     corrected = _overlap_stage("correct", overlaps, len(correction.history), seconds, note)
     recorder.stage(corrected, poses_model)
     registration, taken = begun.registration.result()

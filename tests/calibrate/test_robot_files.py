@@ -84,6 +84,6 @@ def test_what_was_found_and_not_proved_is_named(tmp_path, capsys):
     found, text = written(session, tmp_path / "out", effects=())
     said = "Found, but not in it for want of proof: joint_offset; model.toml has it."
     assert f"# {said}\n" in text and said in capsys.readouterr().err
-    assert "No other error" not in text and "Take x" not in text
-    assert "No other error of the arm was found." in written(session, tmp_path / "proved")[1]
+    assert "no other effect" not in text and "Take x" not in text
+    assert "The model has no other effect of the arm." in written(session, tmp_path / "proved")[1]
     assert robot_document(found, LinkTable(session.robot, ()), [], "")["unproved"] == ["joint_offset"]
