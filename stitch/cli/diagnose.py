@@ -73,7 +73,7 @@ def next_measurement(
     elif len(found.effects) > 1:
         say(f"No pose within reach, and no artefact that is known here, separates {' from '.join(found.effects)}.")
     elif found.verdict == "missing_effect" and not found.likelier_than_not:
-        say(f"{_none_alike(found.effects[0])}. More views, at any poses, tell it from chance.")
+        say(f"{_none_alike(found.effects[0])}. More views, at any poses, can tell it from chance.")
     else:
         say(f"Nothing has to be told apart. {_none_alike('the likeliest')}.")
 

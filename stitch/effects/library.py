@@ -43,7 +43,7 @@ def link_geometry(links: Links, views: Views, da: Array, dd: Array, dalpha: Arra
 
 @effect("robot", needs=("torque",), c=per_torque("rad/(N m)", typical=5e-6, limit=2e-4))
 def joint_compliance(joints: Array, views: Views, c: Array) -> Array:
-    """q*_i = q_i + c_i τ_i(q), τ the gravity torque"""
+    """q*_i = q_i + c_i τ_i(q), τ the gravity torque or the measured one"""
     return joints + views.sag(c)
 
 

@@ -193,7 +193,7 @@ class _Progress:
         kept = iterations - self.stalled
         if self.stalled >= _PATIENCE:
             return (
-                f"stopped after {iterations} iterations, since the rms no longer fell; "
+                f"stopped after {iterations} iterations, since neither rms nor step fell any further; "
                 f"the poses of iteration {kept} are kept"
             )
         return f"did not come to rest in {iterations} iterations; the poses of iteration {kept} are kept"

@@ -182,7 +182,7 @@ def test_register_ends_where_neither_rms_nor_step_falls_and_says_so(cell):
     assert capture.spacing > 2.0
     swinging = register(capture, poses, SCATTER, 0.7)
     assert len(swinging.history) < 25
-    assert "no longer fell" in swinging.note
+    assert "fell any further" in swinging.note
     assert len(swinging.note.split()) <= 25
     assert register(capture, poses, SCATTER, 2.0).note == ""
 
