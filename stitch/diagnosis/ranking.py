@@ -76,9 +76,13 @@ def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: floa
     return tuple(replace(r, posterior=r.posterior / room) for r in ranked)
 
 
-def rank_one(linear: LinearModel, candidate: Candidate, tests: int) -> Ranked:
-    """One candidate that was chosen among so many."""
-    return rank([score(linear, candidate)], tests)[0][0]
+def rank_one(linear: LinearModel, candidate: Candidate, tests: int, near: LinearModel | None = None) -> Ranked:
+    """One candidate that was chosen among so many.
+
+    Args:
+        near: of `score`.
+    """
+    return rank([score(linear, candidate, near)], tests)[0][0]
 
 
 def is_contender(r: Ranked) -> bool:

@@ -99,22 +99,22 @@ def _scatter_degrees(linear: LinearModel, form: Form, rest: int) -> float:
     return max(linear.satterthwaite.degrees_of_freedom(linear.in_blocks(linear.residual(form.columns))), 1.0)
 
 
-def residual_form_columns(linear: LinearModel, candidate: Candidate) -> Iterator[Array]:
-    """(n, p) per form what its columns say beside the model; those of one joint are among those of all."""
+def information_by_form(linear: LinearModel, candidate: Candidate) -> Iterator[tuple[Array, Array]]:
+    """Per form what the views tell of its parameters (p,) beside the model, in plausible sizes (`log_evidence`): those
+    of one joint are among those of all."""
     whole = candidate.forms[0]
-    white = linear.residual(whole.columns)
+    told, vector = linear.information(whole.columns)
     for form in candidate.forms:
         if form.term is not whole.term:
-            whole, white = form, linear.residual(form.columns)
-        yield white[:, form.keep[whole.keep]]
+            whole, (told, vector) = form, linear.information(form.columns)
+        own = np.flatnonzero(form.keep[whole.keep])
+        yield told[np.ix_(own, own)] * np.outer(form.sizes, form.sizes), vector[own] * form.sizes
 
 
-def gain_at_null(linear: LinearModel, form: Form, white: Array) -> Gain:
-    """At the null's variances: cheap, and an upper hand for what cannot help."""
-    white = white * form.sizes
-    told, b = white.T @ white, white.T @ linear.white_residual
+def gain_at_null(linear: LinearModel, told: Array, vector: Array) -> Gain:
+    """Of what the views tell at the null's variances: cheap, and an upper hand for what cannot help."""
     shares = regime_of(linear).scales
-    found = log_evidence_at_scales(told, b, shares)
+    found = log_evidence_at_scales(told, vector, shares)
     return Gain(log_mixture(found, shares), list(shares)[int((found + np.log(list(shares.values()))).argmax())])
 
 
@@ -162,23 +162,27 @@ class Score:
         return bool(np.isfinite(self.covariance).all())
 
 
-def score(linear: LinearModel, candidate: Candidate) -> Score:
+def score(linear: LinearModel, candidate: Candidate, near: LinearModel | None = None) -> Score:
     """Try all forms of a candidate beside everything else that poses may err by.
 
     The candidate takes the place of its own share of the pose errors: it is asked for by name, all others remain of
     whatever size the views give them.
+
+    Args:
+        near: one that leaves about as much scatter as the candidate does, from which the search for it begins; of poses
+            without a prior.
     """
     base = linear.without([candidate.name])
     starts = (base, *base.alternative_starts)
     gained, shown = zip(*(_gains_at_null(base, at, candidate) for at in starts), strict=True)
     quick, seen = np.array([[gain.log_bayes_factor for gain in own] for own in gained]).T, any(shown)
-    likely = quick.max(axis=1)
+    likely, begin = quick.max(axis=1), [(near or start).null.variances for start in starts]
     # Under a scatter that holds an effect itself no plausible size is seen, and yet a gross one gains.
     seen = seen or bool(likely.max() > limits.LOG_BAYES_FACTOR)
     least = max(regime_of(base).least_quick_gain, likely.max() - limits.NEGLIGIBLE_NATS)
     worth = [i for i in np.argsort(-likely, kind="stable")[: regime_of(linear).forms_refitted] if likely[i] >= least]
     tried = [
-        try_form(base, form, starts[start].null.variances, gained[start][i].scale)
+        try_form(base, form, begin[start], gained[start][i].scale)
         if i in worth and candidate.forms[i].columns.any()
         else FormTrial(float(likely[i]))
         for i, (form, start) in enumerate(zip(candidate.forms, quick.argmax(axis=1), strict=True))
@@ -213,10 +217,10 @@ def _gains_at_null(base: LinearModel, at: LinearModel, candidate: Candidate) -> 
     """Return the gain of each form (F,) over the base at given variances, which a refit can only raise; and whether the
     first form, of all its parameters, is seen."""
     gains, seen = list[Gain](), False
-    for form, white in zip(candidate.forms, residual_form_columns(at, candidate), strict=True):
+    for told, vector in information_by_form(at, candidate):
         if not gains:
-            seen = bool((np.linalg.norm(white * form.sizes, axis=0) > limits.SEEN_SIGMAS).any())
-        gain, here = gain_at_null(at, form, white), 0.5 * (base.null.deviance - at.null.deviance)
+            seen = bool((np.diag(told) > limits.SEEN_SIGMAS**2).any())
+        gain, here = gain_at_null(at, told, vector), 0.5 * (base.null.deviance - at.null.deviance)
         gains.append(replace(gain, log_bayes_factor=gain.log_bayes_factor + here))
     return gains, seen
 
@@ -229,8 +233,7 @@ def promising(linear: LinearModel, candidates: Sequence[Candidate], count: int) 
     """
 
     def gain(c: Candidate) -> float:
-        pairs = zip(c.forms, residual_form_columns(linear, c), strict=True)
-        return max(gain_at_null(linear, form, white).log_bayes_factor for form, white in pairs)
+        return max(gain_at_null(linear, *told).log_bayes_factor for told in information_by_form(linear, c))
 
     gains = np.array(list(parallel(gain, candidates)))
     return [(candidates[k], float(gains[k])) for k in np.argsort(-gains, kind="stable")[:count]]

@@ -205,8 +205,9 @@ def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int)
     """
     chosen, idle = list(chosen), dict[str, str]()
     while True:
+        near = conditioned_on_effects(linear, chosen)
         objections = (
-            (r, cross_validate(conditioned_without(linear, chosen, r), r.score).rejection_reason(r.name))
+            (r, cross_validate(conditioned_without(linear, chosen, r, near), r.score).rejection_reason(r.name))
             for r in reversed(chosen)
         )
         first = next(((r, why) for r, why in objections if why is not None), None)
@@ -214,17 +215,21 @@ def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int)
             return chosen, idle
         gone, idle[first[0].name] = first
         rest = [r for r in chosen if r.name != gone.name]
-        again = [rank_one(conditioned_without(linear, rest, r), r.score.candidate, tests) for r in rest]
+        near = conditioned_on_effects(linear, rest, near)
+
+        def beside_rest(r: Ranked, rest: Sequence[Ranked] = rest, near: LinearModel = near) -> Ranked:
+            return rank_one(conditioned_without(linear, rest, r, near), r.score.candidate, tests, near)
+
+        again = list(parallel(beside_rest, rest))
         chosen = sorted(filter(is_certain, again), key=lambda r: -r.log_posterior)
 
 
 def _add_effects(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Ranked]:
     """Further effects, one by one, as long as one can be named beside those before."""
-    chosen = list(chosen)
+    chosen, base = list(chosen), linear
     while len(chosen) < MAX_JOINT_EFFECTS:
-        following = _next_effect(
-            conditioned_on_effects(linear, chosen), [c for c in candidates if c.name not in {r.name for r in chosen}]
-        )
+        base = conditioned_on_effects(linear, chosen, base)
+        following = _next_effect(base, [c for c in candidates if c.name not in {r.name for r in chosen}])
         if following is None:
             break
         chosen.append(following)
@@ -257,7 +262,7 @@ def _eliminate_backward(
 
     def extrapolated(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
         beside = conditioned_without(linear, among, r, near)
-        own = rank_one(beside, r.score.candidate, tests)
+        own = rank_one(beside, r.score.candidate, tests, near)
         return own, extrapolate(beside, own.score) if is_certain(own) else None
 
     # Mostly all hold their place: then none was asked beside one that goes, and the order is of no account.

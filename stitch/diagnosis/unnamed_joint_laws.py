@@ -191,9 +191,9 @@ def size_process(linear: LinearModel, process: SmoothProcess) -> SizedProcess:
     Over the eigenvalues k of the columns' information and the shares g of what was seen: log BF(s) =
     ½ Σ g²/(k + 1/s²) − ½ Σ log(1 + s²k).
     """
-    white = linear.residual(process.columns(linear))
-    k, vectors = np.linalg.eigh(white.T @ white)
-    k, g = np.maximum(k, 0.0), vectors.T @ (white.T @ linear.white_residual)
+    told, vector = linear.information(process.columns(linear))
+    k, vectors = np.linalg.eigh(told)
+    k, g = np.maximum(k, 0.0), vectors.T @ vector
     if not k[-1] > 0:
         return SizedProcess(process, 1.0, -np.inf)
     sizes = _SIZES / np.sqrt(k[-1])

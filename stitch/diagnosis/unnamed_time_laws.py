@@ -302,17 +302,16 @@ def unnamed_courses(linear: LinearModel) -> tuple[FittedProcess, ...]:
     """The likeliest of them beside a model; () where pose errors have a prior."""
     if regime_of(linear).prior:
         return ()
-    found = [size_process(linear, wandering_flange(linear))]
+    size = partial(size_process, linear)
+    found = [size(wandering_flange(linear))]
     if linear.measurement.views.has("joints"):
         motions = joint_motions(linear)
-        by_joint = [
-            [size_process(linear, process) for process in own] for own in single_joint_processes(linear, motions)
-        ]
+        by_joint = list(parallel(lambda own: list(map(size, own)), single_joint_processes(linear, motions)))
         found += [course for own in by_joint for course in own]
         first = sorted(range(len(by_joint)), key=lambda k: -max(course.gain for course in by_joint[k]))[
             : limits.PAIRED_JOINTS
         ]
-        found += [size_process(linear, process) for k in first for process in joint_pair_processes(linear, motions, k)]
+        found += parallel(size, [process for k in first for process in joint_pair_processes(linear, motions, k)])
     likeliest = sorted(found, key=lambda course: -course.gain)[: limits.COURSES_FITTED]
     courses = parallel(lambda c: fit_process(linear, c, len(found)), likeliest)
     return tuple(sorted(courses, key=lambda c: -c.log_bayes_factor))
@@ -337,7 +336,7 @@ def least_log_bayes_factor(linear: LinearModel, scored: Score) -> float:
 
 def _factor_with_course(linear: LinearModel, course: FittedProcess, scored: Score) -> float:
     both = linear.in_blocks(np.hstack([course.columns, scored.form.columns]))
-    own, start = np.full(course.columns.shape[1], course.size), linear.null.variances
+    own, start = np.full(course.columns.shape[1], course.size), course.fit.variances
     priors = [np.append(times * own, scored.sizes) for times in limits.COURSE_SIZES]
     return 0.5 * (course.fit.deviance - min(fit_variances(linear.mixed, both, p, start).deviance for p in priors))
 

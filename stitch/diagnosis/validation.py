@@ -72,13 +72,10 @@ def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     ends = linear.observation.joint_ends(linear.measurement.views.joints)
     if not ends:
         return None
-    a, X = linear.design.shape[1], np.hstack([linear.design, scored.form.response])
-    prior = _student_prior(linear, X, np.append(linear.sizes, scored.sizes))
-    trials = (
-        linear.trial(X, None, prior),
-        linear.trial(X[:, :a], None, CoefficientPrior(prior.precision[:a], prior.mean[:a])),
-    )
-    squares = [[t.squares(t.solve(end.views), end.views) for t in trials] for end in ends]
+    a, trial = linear.design.shape[1], linear.trial(_model_and_candidate_columns(linear, scored))
+    prior = _student_prior(linear, trial, np.append(linear.sizes, scored.sizes))
+    priors = prior, CoefficientPrior(prior.precision[:a], prior.mean[:a])
+    squares = [[trial.squares(x, end.views) for x in trial.solve_each(priors, end.views)] for end in ends]
     shares = [mean_square_share(with_it, without) for with_it, without in squares]
     worst = max(range(len(ends)), key=lambda k: (shares[k][0] - 1) / max(shares[k][1], 1e-300))
     total = mean_square_share(*np.array([[own.sum() for own in row] for row in squares]).T)
@@ -88,7 +85,7 @@ def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     return Extrapolation(*total, ends[worst], *shares[worst], likely)
 
 
-def _student_prior(linear: LinearModel, X: Array, sizes: Array) -> CoefficientPrior:
+def _student_prior(linear: LinearModel, trial: LinearTrial, sizes: Array) -> CoefficientPrior:
     """A prior of the parameters' plausible sizes with the tails of Student's t, for fits that lack an end.
 
     What the other views hardly see would otherwise be anything, and the end would judge that instead of the effect. The
@@ -97,7 +94,7 @@ def _student_prior(linear: LinearModel, X: Array, sizes: Array) -> CoefficientPr
     """
     middle = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
     free = 1 / (limits.END_PRIOR_SIZES * sizes) ** 2
-    found = linear.trial(X, None, CoefficientPrior(free, middle)).solve() - middle
+    found = trial.solve_each([CoefficientPrior(free, middle)])[0] - middle
     known = np.where(np.isfinite(sizes), found, 0.0)
     return CoefficientPrior((limits.END_PRIOR_FREEDOM + 1) / (limits.END_PRIOR_FREEDOM * sizes**2 + known**2), middle)
 
@@ -192,16 +189,18 @@ def _squares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, A
     and (2, G) scatter of its poses."""
     X, points = _model_and_candidate_columns(linear, scored), scored.candidate.points
     own = None if points is None else points.select(scored.form.keep)
-    trial, present = linear.trial(X, own), linear.baseline_trial
-    believed = linear.trial(X, own, prior_of_sizes(linear, scored))
+    trial, priors = linear.trial(X, own), (prior_of_sizes(linear, scored), _free_model(linear))
     squares, scatter = [], []
     for fold in linear.observation.folds():
-        touched = linear.observation.affected_squares(fold)
-        without = [t.solve(fold) for t in (believed, present)]
-        pairs = list(zip((trial, present), without, strict=True))
-        squares.append([t.squares(x, touched).sum() for t, x in pairs])
-        scatter.append([t.scatter(fold, x) for t, x in pairs])
+        touched, without = linear.observation.affected_squares(fold), trial.solve_each(priors, fold)
+        squares.append([trial.squares(x, touched).sum() for x in without])
+        scatter.append([trial.scatter(fold, x) for x in without])
     return trial, np.array(squares).reshape(-1, 2).T, np.array(scatter).reshape(-1, 2).T
+
+
+def _free_model(linear: LinearModel) -> CoefficientPrior:
+    """Nothing believed of the coefficients of the model as it is."""
+    return CoefficientPrior(np.zeros(linear.design.shape[1]), np.zeros(linear.design.shape[1]))
 
 
 def prior_of_sizes(linear: LinearModel, scored: Score) -> CoefficientPrior:
@@ -249,10 +248,10 @@ def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, flo
     a = linear.design.shape[1]
     precision = np.concatenate([np.zeros(a), *(prior_of_sizes(linear, own).precision[a:] for own in group)])
     prior = CoefficientPrior(precision, np.zeros(len(precision)))
-    trial = linear.trial(np.hstack([linear.design, *(own.form.response for own in group)]), None, prior)
-    pairs = [(t, t.solve(fold), fold) for fold in linear.observation.folds() for t in (trial, linear.baseline_trial)]
-    off = np.array([t.scatter(fold, found) for t, found, fold in pairs]).reshape(-1, 2)
-    return mean_square_share(off[:, 0], off[:, 1])
+    trial = linear.trial(np.hstack([linear.design, *(own.form.response for own in group)]))
+    priors, folds = (prior, _free_model(linear)), linear.observation.folds()
+    off = [[trial.scatter(fold, x) for x in trial.solve_each(priors, fold)] for fold in folds]
+    return mean_square_share(*np.array(off).reshape(-1, 2).T)
 
 
 # Whether an effect holds in halves of the views: found in one, judged in the other, which took no part in choosing it.

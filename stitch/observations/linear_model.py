@@ -226,6 +226,10 @@ class LinearTrial(Protocol):
         """(k,) coefficients by least squares, without some views."""
         ...
 
+    def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
+        """The same under each prior; one of fewer coefficients is of the first ones, and the others are zero."""
+        ...
+
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
         """(units,) sums of squares of what remains, in the terms of residual_rms; of all units or of some."""
         ...
@@ -282,14 +286,8 @@ class Observation(ABC):
         return columns
 
     @abstractmethod
-    def trial(
-        self,
-        linear: "LinearModel",
-        response: Array,
-        points: PointSums | None = None,
-        prior: CoefficientPrior | None = None,
-    ) -> LinearTrial:
-        """A model with the columns of a response (·, k); `points` belong to its last ones; prior of k coefficients."""
+    def trial(self, linear: "LinearModel", response: Array, points: PointSums | None = None) -> LinearTrial:
+        """A model with the columns of a response (·, k); `points` belong to its last ones."""
 
     @abstractmethod
     def affected_squares(self, views: Indices) -> Mask:
@@ -361,6 +359,12 @@ class LinearModel(ErrorModel):
         white = self.whiten(columns)
         return np.asarray(white - self._explained @ (self._explained.T @ white))
 
+    def information(self, columns: Array) -> tuple[Array, Array]:
+        """(P, P) and (P,): what the views tell of coefficients θ of such columns, log likelihood vᵀθ − ½ θᵀIθ."""
+        white = self.whiten(columns)
+        explained = self._explained.T @ white
+        return white.T @ white - explained.T @ explained, white.T @ self.white_residual
+
     def conditioned_on(self, columns: Array, sizes: Array, near: "LinearModel | None" = None) -> "LinearModel":
         """The linear model with further free columns (n, p) of the channel, of parameters of plausible sizes (p,).
 
@@ -388,11 +392,9 @@ class LinearModel(ErrorModel):
         """What `conditioned_on` has found last: effects are asked beside the same others several times."""
         return {}
 
-    def trial(
-        self, response: Array, points: PointSums | None = None, prior: CoefficientPrior | None = None
-    ) -> LinearTrial:
+    def trial(self, response: Array, points: PointSums | None = None) -> LinearTrial:
         """A model with the columns of a response (·, k)."""
-        return self.observation.trial(self, response, points, prior)
+        return self.observation.trial(self, response, points)
 
     @cached_property
     def baseline_trial(self) -> LinearTrial:

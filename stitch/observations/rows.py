@@ -125,17 +125,20 @@ class RowTrial:
     rows: Rows
     covariance: Array  # (B, m, m)
     X: Array
-    prior: CoefficientPrior | None = None
 
     @cached_property
     def blocks(self) -> BlockLeastSquares:
-        zero = np.zeros(self.X.shape[2])
-        precision, middle = (zero, zero) if self.prior is None else (self.prior.precision, self.prior.mean)
-        return BlockLeastSquares(-self.rows.residual, self.X, self.covariance, precision, precision * middle)
+        nothing = np.zeros(self.X.shape[2])
+        return BlockLeastSquares(-self.rows.residual, self.X, self.covariance, nothing, nothing)
 
     def solve(self, left_out: Indices | None = None) -> Array:
         """Coefficients (k,) without some views."""
         return self.blocks.solve(left_out)
+
+    def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
+        """Coefficients (k,) under each prior, without some views; zero beyond those that it is of."""
+        found = self.blocks.solve_each([(own.precision, own.precision * own.mean) for own in priors], left_out)
+        return [np.pad(x, (0, self.X.shape[2] - len(x))) for x in found]
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
         """(V,) sums of the squares of a view's distances, of all views or of some."""
@@ -195,15 +198,9 @@ class RowObservation(Observation):
         found = self.rows.effect_columns(measurement, model, terms)
         return [Response(c.reshape(self.rows.residual.size, c.shape[2])) for c in found]
 
-    def trial(
-        self,
-        linear: LinearModel,
-        response: Array,
-        points: PointSums | None = None,
-        prior: CoefficientPrior | None = None,
-    ) -> RowTrial:
+    def trial(self, linear: LinearModel, response: Array, points: PointSums | None = None) -> RowTrial:
         """A model with the columns of rows (n, k)."""
-        return RowTrial(self.rows, linear.covariance, linear.in_blocks(response), prior)
+        return RowTrial(self.rows, linear.covariance, linear.in_blocks(response))
 
     def affected_squares(self, views: Indices) -> Mask:
         """(V,) the views themselves."""

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, qr
-from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
 from scipy.special import ndtri
 
 from stitch.frames import Array, Indices, Mask
@@ -89,74 +89,81 @@ class BlockLeastSquares:
     prior_vector: Array  # (k,) precision times the prior's middle
 
     @cached_property
-    def weighted(self) -> Array:
-        """(B, m, k) W·X."""
-        return np.asarray(self.X / np.einsum("bii->bi", self.covariance)[..., None])
+    def _weights(self) -> Array:
+        """(B, m) W."""
+        return np.asarray(1 / np.einsum("bii->bi", self.covariance))
 
     @cached_property
+    def _rows(self) -> Array:
+        """(B, m, k + 1) columns and numbers in units of the numbers' own sigmas."""
+        return np.concatenate([self.X, self.z[..., None]], axis=2) * np.sqrt(self._weights)[..., None]
+
+    @cached_property
+    def _sums(self) -> Array:
+        """(k + 1, k + 1) of all blocks."""
+        return _summed(self._rows)
+
+    @property
     def information(self) -> Array:
         """(k, k) XᵀWX."""
-        return _product(self.weighted, self.X)
-
-    @cached_property
-    def vector(self) -> Array:
-        """(k,) XᵀWz."""
-        return _product(self.weighted, self.z[..., None])[:, 0]
+        return self._sums[:-1, :-1]
 
     def residual_vectors(self, estimates: Array) -> Array:
         """(B, k) XᵀW(z − X·x) of every block."""
-        return np.asarray(np.einsum("bmk,bm->bk", self.weighted, self.z - self.X @ estimates))
+        return np.asarray(np.einsum("bmk,bm->bk", self.X, self._weights * (self.z - self.X @ estimates)))
 
     def solve(self, left_out: Array | Indices | None = None) -> Array:
         """(k,) estimates, without some blocks."""
-        M, b = self.information, self.vector
-        if left_out is not None:
-            out = np.asarray(left_out, np.int64)
-            M = M - _product(self.weighted[out], self.X[out])
-            b = b - _product(self.weighted[out], self.z[out][..., None])[:, 0]
-        scaled = self._scaled(M)
+        return self.solve_each([(self.precision, self.prior_vector)], left_out)[0]
+
+    def solve_each(
+        self, priors: Sequence[tuple[Array, Array]], left_out: Array | Indices | None = None
+    ) -> list[Array]:
+        """The same under each of some priors; one of fewer than k columns is of the first ones, the others left out."""
+        sums = self._sums if left_out is None else self._sums - _summed(self._rows[np.asarray(left_out, np.int64)])
+        return [self._solve(sums, *prior) for prior in priors]
+
+    def _solve(self, sums: Array, precision: Array, prior_vector: Array) -> Array:
+        k = len(precision)
+        prior, vector = np.diag(precision), sums[:k, -1] + prior_vector
+        unit = equilibrated(self._sums[:k, :k] + prior)[1]
+        scaled = (sums[:k, :k] + prior) * np.outer(unit, unit)
         root, failed = dpotrf(scaled, lower=1, clean=0)
         if not failed and np.diag(root).min() > CLEARLY_KNOWN:
-            return np.asarray(dpotrs(root, (b + self.prior_vector) * self._unit, lower=1)[0] * self._unit)
-        return np.asarray(self._pseudo_inverse(scaled) @ (b + self.prior_vector))
+            return np.asarray(dpotrs(root, vector * unit, lower=1)[0] * unit)
+        return np.asarray(_pseudo_inverse(scaled, unit) @ vector)
 
     def estimates_covariance(self) -> Array:
         """(k, k) of the estimates under the blocks' full covariance."""
-        spread = np.einsum("bmk,bmn,bnl->kl", self.weighted, self.covariance, self.weighted, optimize=True)
+        weighted = self.X * self._weights[..., None]
+        spread = np.einsum("bmk,bmn,bnl->kl", weighted, self.covariance, weighted, optimize=True)
         inverse = self._inverse
         return np.asarray(inverse @ (spread + np.diag(self.precision)) @ inverse)
 
     def shift_by_errors(self, errors: Array) -> Array:
         """(k, q) how far errors (B, m, q) of the blocks, which nobody models, move the estimates."""
-        pulls = np.einsum("bmk,bmq->kq", self.weighted, errors)
+        pulls = np.einsum("bmk,bm,bmq->kq", self.X, self._weights, errors, optimize=True)
         return np.asarray(self._inverse @ pulls)
-
-    @cached_property
-    def _unit(self) -> Array:
-        """(k,) units in which all blocks leave a unit diagonal."""
-        return equilibrated(self.information + np.diag(self.precision))[1]
-
-    def _scaled(self, information: Array) -> Array:
-        """(k, k) information with the prior's, in those units."""
-        return np.asarray((information + np.diag(self.precision)) * np.outer(self._unit, self._unit))
-
-    def _pseudo_inverse(self, scaled: Array) -> Array:
-        """(k, k) of the information; what nothing shows is zero in it."""
-        return np.asarray(np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) * np.outer(self._unit, self._unit))
 
     @cached_property
     def _inverse(self) -> Array:
         """(k, k) with all blocks."""
-        return self._pseudo_inverse(self._scaled(self.information))
+        return _pseudo_inverse(*equilibrated(self.information + np.diag(self.precision)))
 
     def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
         """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""
         return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)
 
 
-def _product(X: Array, Y: Array) -> Array:
-    """(k, l) Σ_b XᵀY of (B, m, k) and (B, m, l)."""
-    return np.asarray(X.reshape(-1, X.shape[2]).T @ Y.reshape(-1, Y.shape[2]))
+def _summed(X: Array) -> Array:
+    """(k, k) Σ_b XᵀX of (B, m, k)."""
+    flat = X.reshape(-1, X.shape[2])
+    return np.asarray(flat.T @ flat)
+
+
+def _pseudo_inverse(scaled: Array, unit: Array) -> Array:
+    """(k, k) inverse of what is scaled (k, k) in some units (k,); what nothing shows is zero in it."""
+    return np.asarray(np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) * np.outer(unit, unit))
 
 
 @dataclass(frozen=True)
@@ -182,6 +189,10 @@ def generalised_fit(noise: Array, columns: Array, precision: Array) -> Generalis
 def column_space(columns: Array, relative: float = 1e-9) -> Array:
     """(n, r) orthonormal basis of the columns (n, K), whatever their units; combinations that say nothing drop out."""
     scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    if relative < CLEARLY_KNOWN**2:
+        root, failed = dpotrf(scaled.T @ scaled, lower=1, clean=1)
+        if not failed and np.diag(root).min(initial=1.0) > CLEARLY_KNOWN:
+            return np.asarray(scaled @ dtrtri(root, lower=1)[0].T)
     U, s, _ = np.linalg.svd(scaled, full_matrices=False)
     return np.asarray(U[:, s > relative * s[0]])
 

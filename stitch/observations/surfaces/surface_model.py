@@ -42,19 +42,28 @@ class SurfaceTrial:
     unconstrained: UnconstrainedPoses
     X: Array
     points: PointSums | None = None
-    prior: CoefficientPrior | None = None
 
     def solve(self, left_out: Indices | None = None) -> Array:
         """Coefficients (k,) by generalised least squares without some views."""
-        white, z = self._white(self.X), self.linear.white_z
-        if self.prior is not None:
-            half = np.sqrt(self.prior.precision)
-            white, z = np.vstack([white, np.diag(half)]), np.append(z, half * self.prior.mean)
+        return self._solve(self._white(self.X), self.linear.white_z, left_out)
+
+    def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
+        """The same under each prior; zero beyond the coefficients that it is of."""
+        every, found = self._white(self.X), []
+        for prior in priors:
+            half, k = np.sqrt(prior.precision), len(prior.precision)
+            z = np.append(self.linear.white_z, half * prior.mean)
+            own = self._solve(np.vstack([every[:, :k], np.diag(half)]), z, left_out)
+            found.append(np.pad(own, (0, every.shape[1] - k)))
+        return found
+
+    def _solve(self, white: Array, z: Array, left_out: Indices | None) -> Array:
+        k = white.shape[1]
         if left_out is not None:
             # A view is left out by letting it move freely: six more columns each.
             free = self._white(self._twists_of(left_out))
             white = np.hstack([white, np.vstack([free, np.zeros((len(z) - len(free), free.shape[1]))])])
-        return fit_columns(white, z)[: self.X.shape[1]]
+        return fit_columns(white, z)[:k]
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
         """(pairs,) Σ w e² after the model moved, of all pairs or of some."""
@@ -138,15 +147,9 @@ class SurfaceObservation(Observation):
         """(6V, P) the shortest twists that make numbers (n, P) of the channel."""
         return np.asarray(self.reduced_poses.expansion @ columns)
 
-    def trial(
-        self,
-        linear: LinearModel,
-        response: Array,
-        points: PointSums | None = None,
-        prior: CoefficientPrior | None = None,
-    ) -> SurfaceTrial:
+    def trial(self, linear: LinearModel, response: Array, points: PointSums | None = None) -> SurfaceTrial:
         """A model with the columns of twists (6V, k)."""
-        return SurfaceTrial(linear, self.unconstrained, response, points, prior)
+        return SurfaceTrial(linear, self.unconstrained, response, points)
 
     def affected_squares(self, views: Indices) -> Mask:
         """(pairs,) with one of the views."""

@@ -266,6 +266,5 @@ def fit_landmarks(own: Capture, T_mount: Array) -> tuple[Landmarks, BlockLeastSq
 
 def landmarks_covariance(blocks: BlockLeastSquares, rows: TargetRows, hand_eye: Array) -> Array:
     """(U, U) by the scatter of the poses, the sensor's noise and the uncertainty (6, 6) of the hand-eye."""
-    pull = np.einsum("bmk,bmi->ki", blocks.weighted, rows.hand_eye)
-    moved = np.linalg.solve(blocks.information + np.diag(blocks.precision), pull)
+    moved = blocks.shift_by_errors(rows.hand_eye)
     return np.asarray(blocks.estimates_covariance() + moved @ hand_eye @ moved.T)
