@@ -10,6 +10,7 @@ from scipy.special import logsumexp
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import Score, score
+from stitch.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import parallel
 
@@ -76,13 +77,13 @@ def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: floa
     return tuple(replace(r, posterior=r.posterior / room) for r in ranked)
 
 
-def rank_one(linear: LinearModel, candidate: Candidate, tests: int, near: LinearModel | None = None) -> Ranked:
+def rank_one(linear: LinearModel, candidate: Candidate, tests: int, start: Array | None = None) -> Ranked:
     """One candidate that was chosen among so many.
 
     Args:
-        near: of `score`.
+        start: of `score`.
     """
-    return rank([score(linear, candidate, near)], tests)[0][0]
+    return rank([score(linear, candidate, start)], tests)[0][0]
 
 
 def is_contender(r: Ranked) -> bool:
@@ -101,22 +102,25 @@ def is_certain(r: Ranked) -> bool:
 
 
 def conditioned_without(
-    linear: LinearModel, chosen: Sequence[Ranked], one: Ranked, near: LinearModel | None = None
+    linear: LinearModel, chosen: Sequence[Ranked], one: Ranked, start: Array | None = None
 ) -> LinearModel:
     """The evidence beside all effects but one.
 
     Args:
-        near: of `conditioned_on`.
+        start: of `conditioned_on`.
     """
-    return conditioned_on_effects(linear, [r for r in chosen if r.name != one.name], near)
+    return conditioned_on_effects(linear, [r for r in chosen if r.name != one.name], start)
 
 
-def conditioned_on_effects(
-    linear: LinearModel, chosen: Sequence[Ranked], near: LinearModel | None = None
-) -> LinearModel:
-    """The evidence beside some effects."""
+def conditioned_on_effects(linear: LinearModel, chosen: Sequence[Ranked], start: Array | None = None) -> LinearModel:
+    """The evidence beside some effects.
+
+    Args:
+        start: of `conditioned_on`; None: as the last of the effects was found, beside the others.
+    """
     if not chosen:
         return linear
+    start = chosen[-1].score.variances if start is None else start
     chosen = sorted(chosen, key=lambda r: r.name)
     columns = np.hstack([r.score.form.columns for r in chosen])
-    return linear.conditioned_on(columns, np.concatenate([r.score.sizes for r in chosen]), near)
+    return linear.conditioned_on(columns, np.concatenate([r.score.sizes for r in chosen]), start)

@@ -8,6 +8,7 @@ integrated over amplitudes of plausible size, so that more parameters cost what 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import groupby
 
 import numpy as np
 from scipy.special import logsumexp
@@ -102,13 +103,12 @@ def _scatter_degrees(linear: LinearModel, form: Form, rest: int) -> float:
 def information_by_form(linear: LinearModel, candidate: Candidate) -> Iterator[tuple[Array, Array]]:
     """Per form what the views tell of its parameters (p,) beside the model, in plausible sizes (`log_evidence`): those
     of one joint are among those of all."""
-    whole = candidate.forms[0]
-    told, vector = linear.information(whole.columns)
-    for form in candidate.forms:
-        if form.term is not whole.term:
-            whole, (told, vector) = form, linear.information(form.columns)
-        own = np.flatnonzero(form.keep[whole.keep])
-        yield told[np.ix_(own, own)] * np.outer(form.sizes, form.sizes), vector[own] * form.sizes
+    of_terms = [list(forms) for _, forms in groupby(candidate.forms, key=lambda form: id(form.term))]
+    every = linear.information([whole.columns for whole, *_ in of_terms])
+    for forms, (told, vector) in zip(of_terms, every, strict=True):
+        for form in forms:
+            own = np.flatnonzero(form.keep[forms[0].keep])
+            yield told[np.ix_(own, own)] * np.outer(form.sizes, form.sizes), vector[own] * form.sizes
 
 
 def gain_at_null(linear: LinearModel, told: Array, vector: Array) -> Gain:
@@ -138,6 +138,7 @@ class Score:
     values: Array  # (p,) of the best form, free fit
     covariance: Array  # (p, p); NaN where no form was worth a fit
     scale: float = 1.0  # of the plausible sizes of its parameters, the likeliest
+    variances: Array | None = None  # (c,) beside the best form; None where it was not worth a fit
     # with the pose errors that remain beside the best form, where these have a prior
     base_model: LinearModel | None = None
 
@@ -162,30 +163,29 @@ class Score:
         return bool(np.isfinite(self.covariance).all())
 
 
-def score(linear: LinearModel, candidate: Candidate, near: LinearModel | None = None) -> Score:
+def score(linear: LinearModel, candidate: Candidate, start: Array | None = None) -> Score:
     """Try all forms of a candidate beside everything else that poses may err by.
 
     The candidate takes the place of its own share of the pose errors: it is asked for by name, all others remain of
     whatever size the views give them.
 
     Args:
-        near: one that leaves about as much scatter as the candidate does, from which the search for it begins; of poses
-            without a prior.
+        start: (c,) variances to begin with; None: those of the null, or where else their maximum may lie.
     """
     base = linear.without([candidate.name])
     starts = (base, *base.alternative_starts)
     gained, shown = zip(*(_gains_at_null(base, at, candidate) for at in starts), strict=True)
     quick, seen = np.array([[gain.log_bayes_factor for gain in own] for own in gained]).T, any(shown)
-    likely, begin = quick.max(axis=1), [(near or start).null.variances for start in starts]
+    likely, begin = quick.max(axis=1), [at.null.variances if start is None else start for at in starts]
     # Under a scatter that holds an effect itself no plausible size is seen, and yet a gross one gains.
     seen = seen or bool(likely.max() > limits.LOG_BAYES_FACTOR)
     least = max(regime_of(base).least_quick_gain, likely.max() - limits.NEGLIGIBLE_NATS)
     worth = [i for i in np.argsort(-likely, kind="stable")[: regime_of(linear).forms_refitted] if likely[i] >= least]
     tried = [
-        try_form(base, form, begin[start], gained[start][i].scale)
+        try_form(base, form, begin[at], gained[at][i].scale)
         if i in worth and candidate.forms[i].columns.any()
         else FormTrial(float(likely[i]))
-        for i, (form, start) in enumerate(zip(candidate.forms, quick.argmax(axis=1), strict=True))
+        for i, (form, at) in enumerate(zip(candidate.forms, quick.argmax(axis=1), strict=True))
     ]
     weights = form_weights(candidate)
     k = max(range(len(tried)), key=lambda i: tried[i].log_bayes_factor)
@@ -209,6 +209,7 @@ def score(linear: LinearModel, candidate: Candidate, near: LinearModel | None = 
         values=values,
         covariance=covariance,
         scale=best.scale,
+        variances=best.variances,
         base_model=beside,
     )
 

@@ -205,9 +205,8 @@ def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int)
     """
     chosen, idle = list(chosen), dict[str, str]()
     while True:
-        near = conditioned_on_effects(linear, chosen)
         objections = (
-            (r, cross_validate(conditioned_without(linear, chosen, r, near), r.score).rejection_reason(r.name))
+            (r, cross_validate(conditioned_without(linear, chosen, r), r.score).rejection_reason(r.name))
             for r in reversed(chosen)
         )
         first = next(((r, why) for r, why in objections if why is not None), None)
@@ -215,21 +214,22 @@ def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int)
             return chosen, idle
         gone, idle[first[0].name] = first
         rest = [r for r in chosen if r.name != gone.name]
-        near = conditioned_on_effects(linear, rest, near)
-
-        def beside_rest(r: Ranked, rest: Sequence[Ranked] = rest, near: LinearModel = near) -> Ranked:
-            return rank_one(conditioned_without(linear, rest, r, near), r.score.candidate, tests, near)
-
-        again = list(parallel(beside_rest, rest))
+        again = parallel(partial(_beside_others, linear, rest, tests), rest)
         chosen = sorted(filter(is_certain, again), key=lambda r: -r.log_posterior)
+
+
+def _beside_others(linear: LinearModel, chosen: Sequence[Ranked], tests: int, r: Ranked) -> Ranked:
+    """One of the effects chosen, asked beside the others of them."""
+    return rank_one(conditioned_without(linear, chosen, r), r.score.candidate, tests, r.score.variances)
 
 
 def _add_effects(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Ranked]:
     """Further effects, one by one, as long as one can be named beside those before."""
-    chosen, base = list(chosen), linear
+    chosen = list(chosen)
     while len(chosen) < MAX_JOINT_EFFECTS:
-        base = conditioned_on_effects(linear, chosen, base)
-        following = _next_effect(base, [c for c in candidates if c.name not in {r.name for r in chosen}])
+        following = _next_effect(
+            conditioned_on_effects(linear, chosen), [c for c in candidates if c.name not in {r.name for r in chosen}]
+        )
         if following is None:
             break
         chosen.append(following)
@@ -258,7 +258,7 @@ def _eliminate_backward(
 ) -> tuple[list[Ranked], dict[str, Extrapolation | None]]:
     """The effects that can still be named beside all the others, and what each does beyond the measured poses."""
 
-    near = conditioned_on_effects(linear, chosen) if not regime_of(linear).prior else None
+    near = conditioned_on_effects(linear, chosen).null.variances if not regime_of(linear).prior else None
 
     def extrapolated(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
         beside = conditioned_without(linear, among, r, near)

@@ -9,7 +9,7 @@ a model with further columns is tried, and which views may be left out. A furthe
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, Self
@@ -43,6 +43,8 @@ _NEGLIGIBLE_SHARE = 1e-2
 # Models beside further columns that are kept: those of one round of a selection, but of so many numbers in all at most:
 # 2,773 poses of a probe take 40 MB each.
 _REMEMBERED, _REMEMBERED_NUMBERS = 12, 200_000
+# Sets of columns that are held against a model at once: enough for one large product, few for the memory.
+_SETS_AT_ONCE = 16
 # Among more numbers a search takes a second: one from the likeliest start must do.
 _SINGLE_START_SIZE = 250
 
@@ -359,17 +361,22 @@ class LinearModel(ErrorModel):
         white = self.whiten(columns)
         return np.asarray(white - self._explained @ (self._explained.T @ white))
 
-    def information(self, columns: Array) -> tuple[Array, Array]:
-        """(P, P) and (P,): what the views tell of coefficients θ of such columns, log likelihood vᵀθ − ½ θᵀIθ."""
-        white = self.whiten(columns)
-        explained = self._explained.T @ white
-        return white.T @ white - explained.T @ explained, white.T @ self.white_residual
+    def information(self, columns: Sequence[Array]) -> Iterator[tuple[Array, Array]]:
+        """Per set of columns (n, P) of the channel what the views tell of their coefficients θ beside the model: (P, P)
+        and (P,) of the log likelihood vᵀθ − ½ θᵀIθ."""
+        for start in range(0, len(columns), _SETS_AT_ONCE):
+            portion = columns[start : start + _SETS_AT_ONCE]
+            white = self.whiten(np.hstack(portion))
+            explained, vector = self._explained.T @ white, white.T @ self.white_residual
+            ends = np.cumsum([0, *(own.shape[1] for own in portion)])
+            for own in map(slice, ends[:-1], ends[1:]):
+                yield white[:, own].T @ white[:, own] - explained[:, own].T @ explained[:, own], vector[own]
 
-    def conditioned_on(self, columns: Array, sizes: Array, near: "LinearModel | None" = None) -> "LinearModel":
+    def conditioned_on(self, columns: Array, sizes: Array, start: Array | None = None) -> "LinearModel":
         """The linear model with further free columns (n, p) of the channel, of parameters of plausible sizes (p,).
 
         Args:
-            near: one that leaves about as much scatter, from which the search for it begins.
+            start: (c,) variances to begin with; None: those of the null.
         """
         key = hash(columns.tobytes()), hash(sizes.tobytes())
         found = self._conditioned.get(key)
@@ -379,7 +386,7 @@ class LinearModel(ErrorModel):
             own = np.append(self.sizes, sizes), np.append(self.values, np.zeros(len(sizes)))
             found = replace(self, design=design, sizes=own[0], values=own[1], mixed=mixed, full_model=None)
             if self.pose_errors is None:
-                found = replace(found, null=fit_variances(mixed, start=(near or self).null.variances))
+                found = replace(found, null=fit_variances(mixed, start=self.null.variances if start is None else start))
             else:
                 found = found.refit()
             if len(self._conditioned) >= min(_REMEMBERED, _REMEMBERED_NUMBERS // max(self.mixed.size, 1)):

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, qr
-from scipy.linalg.lapack import dpotrf, dpotrs, dtrtri
+from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.special import ndtri
 
 from stitch.frames import Array, Indices, Mask
@@ -37,6 +37,8 @@ def anderson_step(step: Array, last_step: Array, last_taken: Array) -> Array:
 # Where every column of a unit diagonal has more than this share of its root beside those before it, a Cholesky factor
 # is as good as eigenvectors, and takes a tenth of the time.
 CLEARLY_KNOWN = 1e-3
+# Above this one it solves as well as they do.
+_SOLVABLE = 1e-6
 
 
 def equilibrated(matrix: Array) -> tuple[Array, Array]:
@@ -116,9 +118,7 @@ class BlockLeastSquares:
         """(k,) estimates, without some blocks."""
         return self.solve_each([(self.precision, self.prior_vector)], left_out)[0]
 
-    def solve_each(
-        self, priors: Sequence[tuple[Array, Array]], left_out: Array | Indices | None = None
-    ) -> list[Array]:
+    def solve_each(self, priors: Sequence[tuple[Array, Array]], left_out: Array | Indices | None = None) -> list[Array]:
         """The same under each of some priors; one of fewer than k columns is of the first ones, the others left out."""
         sums = self._sums if left_out is None else self._sums - _summed(self._rows[np.asarray(left_out, np.int64)])
         return [self._solve(sums, *prior) for prior in priors]
@@ -129,7 +129,7 @@ class BlockLeastSquares:
         unit = equilibrated(self._sums[:k, :k] + prior)[1]
         scaled = (sums[:k, :k] + prior) * np.outer(unit, unit)
         root, failed = dpotrf(scaled, lower=1, clean=0)
-        if not failed and np.diag(root).min() > CLEARLY_KNOWN:
+        if not failed and np.diag(root).min() > _SOLVABLE:
             return np.asarray(dpotrs(root, vector * unit, lower=1)[0] * unit)
         return np.asarray(_pseudo_inverse(scaled, unit) @ vector)
 
@@ -186,13 +186,19 @@ def generalised_fit(noise: Array, columns: Array, precision: Array) -> Generalis
     return GeneralisedFit(np.asarray(covariance @ weighted.T), np.asarray(covariance))
 
 
+# Of so many rows singular values take ten times as long as eigenvalues of the columns' products. These, their squares,
+# tell as well which combinations say something, unless one lies between.
+_MANY_ROWS, _SAYS_SOMETHING, _SAYS_NOTHING = 1_000, 1e-8, 1e-12
+
+
 def column_space(columns: Array, relative: float = 1e-9) -> Array:
     """(n, r) orthonormal basis of the columns (n, K), whatever their units; combinations that say nothing drop out."""
     scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    if relative < CLEARLY_KNOWN**2:
-        root, failed = dpotrf(scaled.T @ scaled, lower=1, clean=1)
-        if not failed and np.diag(root).min(initial=1.0) > CLEARLY_KNOWN:
-            return np.asarray(scaled @ dtrtri(root, lower=1)[0].T)
+    if len(scaled) > _MANY_ROWS:
+        values, vectors = np.linalg.eigh(scaled.T @ scaled)
+        says = values > _SAYS_SOMETHING
+        if relative**2 <= _SAYS_NOTHING and (says | (values < _SAYS_NOTHING)).all():
+            return np.asarray(scaled @ (vectors[:, says] / np.sqrt(values[says])))
     U, s, _ = np.linalg.svd(scaled, full_matrices=False)
     return np.asarray(U[:, s > relative * s[0]])
 

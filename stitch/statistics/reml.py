@@ -345,7 +345,7 @@ def stack_mixed_models(mixed: Sequence[MixedModel], A: Array) -> MixedModel:
 _SCORINGS, _LEAP, _HALVINGS, _CONVERGED, _MANY_BLOCKS = 20, 2.0, 4, 1e-3, 50
 # Deviance gained by a step that is the last one: another would gain a fiftieth of it at the most, as
 # seen in the fits of 600 labelled poses; where a prior bends the slope it would gain more.
-_LAST = 0.2
+_LAST = 0.05
 # Change of a variance, as a share of it, beyond which little of it would be left; and the curvature in its logarithm of
 # one that is known to a tenth.
 _NEARLY_NONE, _WELL_KNOWN = -0.8, 200.0
@@ -367,8 +367,8 @@ def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> tuple[Arr
         variances = np.exp(x)
         shares = variances[:, None, None, None] * (here.inverse.matrix @ mixed.components)
         curvature = shares.reshape(len(x), -1) @ shares.transpose(0, 1, 3, 2).reshape(len(x), -1).T
-        curvature += np.diag(2 * prior_information(variances, mixed.further))
-        step = _scoring_step(curvature, here.slope, np.maximum(here.slope - log_prior(x, mixed.further)[1], 0))
+        prior = log_prior(x, mixed.further)[1], 2 * prior_information(variances, mixed.further)
+        step = _scoring_step(curvature, here.slope, *prior)
         gain = -0.5 * float(here.slope @ step)
         if gain < _CONVERGED:
             return x, here
@@ -385,17 +385,20 @@ def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> tuple[Arr
     return None
 
 
-def _scoring_step(curvature: Array, slope: Array, weak: Array) -> Array:
+def _scoring_step(curvature: Array, slope: Array, log_prior_slope: Array, log_prior_curvature: Array) -> Array:
     """(c,) in the log variances.
 
     In the variances themselves scoring is exact where one of them decides. One of which little would be left and that
     is hardly known, or that would be negative, is hardly seen: there the likelihood curves, in the logarithm, by its
     slope.
     """
-    share = -np.linalg.solve(curvature, slope)
-    if (share > np.where(np.diag(curvature) > _WELL_KNOWN, -1.0, _NEARLY_NONE)).all():
+    # In the variance itself a prior curves by its slope in the logarithm as well.
+    own = curvature + np.diag(np.maximum(log_prior_curvature - log_prior_slope, log_prior_curvature))
+    share = -np.linalg.solve(own, slope)
+    if (share > np.where(np.diag(own) > _WELL_KNOWN, -1.0, _NEARLY_NONE)).all():
         return np.asarray(np.maximum(np.log1p(share), -_LEAP))
-    step = -np.linalg.solve(curvature + np.diag(weak), slope)
+    weak = np.maximum(slope - log_prior_slope, 0)
+    step = -np.linalg.solve(curvature + np.diag(log_prior_curvature + weak), slope)
     return np.asarray(step * min(1.0, _LEAP / float(np.abs(step).max())))
 
 

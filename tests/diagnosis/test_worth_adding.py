@@ -15,7 +15,7 @@ def leaving(poses: float, sigma: float = 1e-3) -> CrossValidation:
 
 
 def ranked(name: str) -> Ranked:
-    score = SimpleNamespace(name=name, candidate=SimpleNamespace(name=name))
+    score = SimpleNamespace(name=name, candidate=SimpleNamespace(name=name), variances=None)
     return Ranked(score, adjusted=1e-9, log_posterior=9.0, posterior=0.99)
 
 
@@ -40,7 +40,7 @@ def test_what_is_missing_helps_and_what_is_idle_is_said(monkeypatch, left, named
         asked.append((score.name, beside))
         return leaving(left[score.name])
 
-    def again(beside, candidate, tests):
+    def again(beside, candidate, tests, start):
         scored.append((candidate.name, beside))
         return ranked(candidate.name)
 
