@@ -81,11 +81,12 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
             scale, integrated = best, fit_variances(mixed, G, best * form.sizes, start=integrated.variances)
             found[best] = integrated.deviance
     if regime.free_fit_keeps_variances:
-        free = at_variances(mixed, integrated.variances, G, wide)
+        mean, every = integrated.under_prior(wide)
     else:
         free = fit_variances(mixed, G, wide, integrated.variances)
+        mean, every = free.mean, free.covariance
     a = mixed.A.shape[2]
-    theta, covariance = free.mean[a:], free.covariance[a:, a:]
+    theta, covariance = mean[a:], every[a:, a:]
     rank, square = _wald(theta, covariance, form.sizes)
     p = f_tail(square / max(rank, 1), max(rank, 1), _scatter_degrees(linear, form, max(mixed.size - a - rank, 1)))
     gained = 0.5 * linear.null.deviance + log_mixture(-0.5 * np.array(list(found.values())), scales)

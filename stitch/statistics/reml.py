@@ -7,12 +7,13 @@ the θ have a prior of the size that is plausible (their integral is the evidenc
 block-diagonal in B blocks: one for the pose channel of scans, one a view for labelled points.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.linalg.lapack import dlauum, dpotrf, dtrtri
 from scipy.optimize import minimize
 from scipy.special import betainc, betaln, expit
@@ -191,21 +192,18 @@ class RemlProblem:
     """A mixed model with the further columns of its mean, and their prior."""
 
     mixed: MixedModel
-    X: Array  # (B, m, a + g)
+    Xz: Array  # (B, m, a + g + 1) with what was seen as the last column
     precision: Array  # (a + g,) of the prior
     offset: float  # log det of the prior covariance
 
 
 def reml_problem(mixed: MixedModel, G: Array | None, prior: Array | None) -> RemlProblem:
     """With further columns G (B, m, g) and the standard deviations (g,) of their coefficients, if these have any."""
-    a = mixed.A.shape[2]
-    if G is None:
-        return RemlProblem(mixed, mixed.A, np.zeros(a), 0.0)
-    X = np.concatenate([mixed.A, G], axis=2)
-    if prior is None:
-        return RemlProblem(mixed, X, np.zeros(X.shape[2]), 0.0)
-    precision = np.concatenate([np.zeros(a), 1 / prior**2])
-    return RemlProblem(mixed, X, precision, float(2 * np.log(prior).sum()))
+    Xz = np.concatenate([mixed.A, *(() if G is None else (G,)), mixed.z[..., None]], axis=2)
+    if G is None or prior is None:
+        return RemlProblem(mixed, Xz, np.zeros(Xz.shape[2] - 1), 0.0)
+    precision = np.concatenate([np.zeros(mixed.A.shape[2]), 1 / prior**2])
+    return RemlProblem(mixed, Xz, precision, float(2 * np.log(prior).sum()))
 
 
 @dataclass(frozen=True)
@@ -218,8 +216,7 @@ class Likelihood:
     mean: Array  # (a + g,) coefficients
     half: Array  # (a + g, r) square root of their covariance
     inverse: InverseCovariance  # of the numbers' covariance
-    white: Array  # (B·m, a + g) the mean's columns in units of the scatter
-    rest: Array  # (B·m,) what the mean leaves, in those units
+    sums: Array  # (a + g + 1, a + g + 1) XzᵀV⁻¹Xz of the mean's columns and what was seen
 
     @property
     def covariance(self) -> Array:
@@ -236,48 +233,52 @@ class Likelihood:
             return np.zeros(len(self.log_variances))
         variances, mixed = np.exp(self.log_variances), self.problem.mixed
         (blocks, m), own = mixed.z.shape, np.zeros(len(variances))
-        for start in range(0, blocks, _IN_CACHE):
-            at, rows = slice(start, start + _IN_CACHE), slice(m * start, m * (start + _IN_CACHE))
-            taken = np.column_stack([self.white[rows] @ self.half, self.rest[rows]])
-            back = np.ascontiguousarray(self.inverse.half[at].transpose(0, 2, 1))
-            unwhitened = back @ taken.reshape(-1, m, taken.shape[1])
-            against = self.inverse.matrix[at] - unwhitened @ unwhitened.transpose(0, 2, 1)
+        half_and_rest = block_diag(self.half, 1.0)
+        half_and_rest[:-1, -1] = -self.mean
+        for at in _portions(blocks):
+            W = self.inverse.matrix[at]
+            taken = (flatten_blocks(W @ self.problem.Xz[at]) @ half_and_rest).reshape(len(W), m, -1)
+            against = W - taken @ taken.transpose(0, 2, 1)
             own += mixed.components[:, at].reshape(len(own), -1) @ against.ravel()
         return np.asarray(variances * own + log_prior(self.log_variances, mixed.further)[1])
+
+
+def _portions(blocks: int) -> Iterator[slice]:
+    return (slice(start, start + _IN_CACHE) for start in range(0, blocks, _IN_CACHE))
 
 
 def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
     """Evaluate it; infinitely unlikely, flat, where the covariance has no inverse."""
     with np.errstate(over="ignore"):
         mixed, variances = problem.mixed, np.exp(log_variances)
-    inverse, k = invert_covariance(mixed.covariance(variances)), problem.X.shape[2]
+    inverse, k = invert_covariance(mixed.covariance(variances)), len(problem.precision)
     if not np.isfinite(inverse.logdet):
         mean, half = np.zeros(k), np.zeros((k, k))
-        return Likelihood(problem, log_variances, 1e300, mean, half, inverse, white=half, rest=mean)
-    white = flatten_blocks(inverse.half @ problem.X)
-    white_z = np.matmul(inverse.half, mixed.z[..., None]).ravel()
-    M = white.T @ white + np.diag(problem.precision)
-    scaled, unit = equilibrated(M)
-    own, of_information = _root_of_inverse(scaled)
-    half = unit[:, None] * own
-    mean = half @ (half.T @ (white.T @ white_z))
-    rest = white_z - white @ mean
+        return Likelihood(problem, log_variances, 1e300, mean, half, inverse, np.zeros((k + 1, k + 1)))
+    sums = np.zeros((k + 1, k + 1))
+    for at in _portions(len(mixed.z)):
+        white = flatten_blocks(inverse.half[at] @ problem.Xz[at])
+        sums += white.T @ white
+    half, of_information = _root_of_inverse(sums[:k, :k] + np.diag(problem.precision))
+    mean = half @ (half.T @ sums[:k, k])
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
-    square = float(rest @ rest) + float(mean @ (problem.precision * mean))
-    logdet = inverse.logdet + float(of_information - 2 * np.log(unit).sum()) + problem.offset
-    value = logdet + square + log_prior(log_variances, mixed.further)[0]
-    return Likelihood(problem, log_variances, value, mean, half, inverse, white=white, rest=rest)
+    rest = (flatten_blocks(problem.Xz) @ np.append(-mean, 1.0)).reshape(*mixed.z.shape, 1)
+    square = float(np.sum((inverse.half @ rest) ** 2)) + float(mean @ (problem.precision * mean))
+    value = inverse.logdet + of_information + problem.offset + square + log_prior(log_variances, mixed.further)[0]
+    return Likelihood(problem, log_variances, value, mean, half, inverse, sums)
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:
-    """R (k, r) with R Rᵀ = M⁻¹ for M (k, k) of unit diagonal, and log det M; both without directions that nothing
-    tells of."""
-    L, failed = dpotrf(M, lower=1, clean=1)
+    """R (k, r) with R Rᵀ = M⁻¹ for M (k, k), and log det M; both without directions that nothing tells of."""
+    scaled, unit = equilibrated(M)
+    L, failed = dpotrf(scaled, lower=1, clean=1)
     if not failed and len(L) and np.diag(L).min() > CLEARLY_KNOWN:
-        return np.asarray(dtrtri(L, lower=1)[0].T), 2 * float(np.log(np.diag(L)).sum())
-    values, vectors = np.linalg.eigh(M)
-    keep = values > _KNOWN
-    return vectors[:, keep] / np.sqrt(values[keep]), float(np.log(values[keep]).sum())
+        own, logdet = np.asarray(dtrtri(L, lower=1)[0].T), 2 * float(np.log(np.diag(L)).sum())
+    else:
+        values, vectors = np.linalg.eigh(scaled)
+        keep = values > _KNOWN
+        own, logdet = vectors[:, keep] / np.sqrt(values[keep]), float(np.log(values[keep]).sum())
+    return unit[:, None] * own, logdet - 2 * float(np.log(unit).sum())
 
 
 def deviance(log_variances: Array, problem: RemlProblem) -> tuple[float, Array]:
@@ -422,6 +423,13 @@ class VarianceFit:
     deviance: float
     mean: Array  # (a + g,)
     covariance: Array  # (a + g, a + g)
+    sums: Array  # (a + g + 1, a + g + 1) XᵀV⁻¹X of the mean's columns, and of what was seen as the last one
+
+    def under_prior(self, prior: Array) -> tuple[Array, Array]:
+        """Mean (a + g,) and covariance at the same variances, with standard deviations (g,) of further coefficients."""
+        precision = np.append(np.zeros(len(self.mean) - len(prior)), prior**-2.0)
+        half, _ = _root_of_inverse(self.sums[:-1, :-1] + np.diag(precision))
+        return half @ (half.T @ self.sums[:-1, -1]), half @ half.T
 
 
 def fit_variances(
@@ -479,7 +487,7 @@ def _fit_at(problem: RemlProblem, variances: Array) -> VarianceFit:
 
 
 def _as_variance_fit(variances: Array, solution: Likelihood) -> VarianceFit:
-    return VarianceFit(variances, solution.deviance, solution.mean, solution.covariance)
+    return VarianceFit(variances, solution.deviance, solution.mean, solution.covariance, solution.sums)
 
 
 def whitener(mixed: MixedModel, variances: Array) -> Array:

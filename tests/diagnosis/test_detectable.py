@@ -35,7 +35,7 @@ def test_the_smallest_size_shows_in_eight_of_ten():
     A = np.ones((n, 1))
     free = columns - A @ np.linalg.lstsq(A, columns, rcond=None)[0]
     plausible = MixedModel(np.zeros((1, n)), A[None], components[:, None])
-    unit = VarianceFit(np.array([1.0, 1e-9, 1.0]), 0.0, np.zeros(1), np.eye(1))
+    unit = VarianceFit(np.array([1.0, 1e-9, 1.0]), 0.0, np.zeros(1), np.eye(1), np.eye(2))
     degrees_of_freedom = satterthwaite(plausible, unit).degrees_of_freedom(free[None])
     least = least_noncentrality(free * 2.0, 1.0, tests, degrees_of_freedom, {1.0: 1.0})
     theta = np.ones(p) * np.sqrt(least) / np.linalg.norm(free.sum(axis=1))

@@ -15,7 +15,7 @@ def groups() -> tuple[MixedModel, VarianceFit]:
     components = np.array([np.diag((own == k).astype(float)) for k in range(3)])[:, None]
     A = (own == 0).astype(float)[None, :, None]
     evidence = MixedModel(np.zeros((1, own.size)), A, components)
-    return evidence, VarianceFit(np.array([4.0, 0.25, 1.0]), 0.0, np.zeros(1), np.eye(1))
+    return evidence, VarianceFit(np.array([4.0, 0.25, 1.0]), 0.0, np.zeros(1), np.eye(1), np.eye(2))
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.0, 29.0), (1.0, 20.0), (0.5, 1 / (0.25 / 29 + 0.25 / 20))])
