@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 
 import numpy as np
-from scipy.linalg import eigh
 from scipy.special import logsumexp
 
 from stitch.diagnosis import thresholds as limits
@@ -87,16 +86,13 @@ def joint_motions(linear: LinearModel) -> Array:
     return next(pose_derivatives(linear.measurement, linear.model, [offset], linear.observation.centre))[..., None]
 
 
-def single_joint_processes(linear: LinearModel, motions: Array) -> list[list[SmoothProcess]]:
-    """Per joint: that it follows all joints, its own angle closely, or its own and the one that it comes from."""
+def single_joint_processes(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProcess]:
+    """Joint k, counted from 0, that follows all joints, its own angle closely, or its own and the one that it comes
+    from."""
     views = linear.measurement.views
-    every = _smooth_courses(views.joints)
-    out = []
-    for k, motion in enumerate(motions):
-        own, came = views.joints[:, [k]], views.previous[:, [k]]
-        courses = (every, _smooth_courses(own, SHORT_REACH), _smooth_courses(np.hstack([own, came])))
-        out.append([SmoothProcess(k + 1, motion, shapes) for shapes in courses])
-    return out
+    own, came = views.joints[:, [k]], views.previous[:, [k]]
+    for angles, reach in ((views.joints, REACH), (own, SHORT_REACH), (np.hstack([own, came]), REACH)):
+        yield SmoothProcess(k + 1, motions[k], _smooth_courses(angles, reach))
 
 
 def joint_pair_processes(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProcess]:
@@ -136,9 +132,8 @@ def _knots(views: int) -> Indices:
 
 def _leading_courses(covariance: Array, most: int) -> Array:
     """(K, R) of which the courses with unit coefficients of a process are made, by its covariance with the knots."""
-    last = len(covariance) - 1
-    values, vectors = eigh(covariance, subset_by_index=(max(last + 1 - most, 0), last))
-    values, vectors = values[::-1], vectors[:, ::-1]
+    values, vectors = np.linalg.eigh(covariance)
+    values, vectors = values[::-1][:most], vectors[:, ::-1][:, :most]
     keep = values > limits.PROCESS_LEAST_VARIANCE * values[0]
     return np.asarray(vectors[:, keep] / np.sqrt(values[keep]))
 

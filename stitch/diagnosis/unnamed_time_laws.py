@@ -15,6 +15,7 @@ from stitch.diagnosis.unnamed_joint_laws import (
     JOINT_ANGLES,
     FittedProcess,
     JointLaw,
+    SizedProcess,
     SmoothProcess,
     fit_process,
     joint_motions,
@@ -302,16 +303,19 @@ def unnamed_courses(linear: LinearModel) -> tuple[FittedProcess, ...]:
     """The likeliest of them beside a model; () where pose errors have a prior."""
     if regime_of(linear).prior:
         return ()
-    size = partial(size_process, linear)
-    found = [size(wandering_flange(linear))]
+    found = [size_process(linear, wandering_flange(linear))]
     if linear.measurement.views.has("joints"):
         motions = joint_motions(linear)
-        by_joint = list(parallel(lambda own: list(map(size, own)), single_joint_processes(linear, motions)))
-        found += [course for own in by_joint for course in own]
-        first = sorted(range(len(by_joint)), key=lambda k: -max(course.gain for course in by_joint[k]))[
-            : limits.PAIRED_JOINTS
-        ]
-        found += parallel(size, [process for k in first for process in joint_pair_processes(linear, motions, k)])
+
+        def sized(
+            processes: Callable[[LinearModel, Array, int], Iterator[SmoothProcess]], k: int
+        ) -> list[SizedProcess]:
+            return [size_process(linear, process) for process in processes(linear, motions, k)]
+
+        by_joint = list(parallel(partial(sized, single_joint_processes), range(len(motions))))
+        clearest = sorted(range(len(by_joint)), key=lambda k: -max(course.gain for course in by_joint[k]))
+        pairs = parallel(partial(sized, joint_pair_processes), clearest[: limits.PAIRED_JOINTS])
+        found += [course for own in (*by_joint, *pairs) for course in own]
     likeliest = sorted(found, key=lambda course: -course.gain)[: limits.COURSES_FITTED]
     courses = parallel(lambda c: fit_process(linear, c, len(found)), likeliest)
     return tuple(sorted(courses, key=lambda c: -c.log_bayes_factor))

@@ -243,16 +243,19 @@ class _ChainJacobian:
 
     def is_about(self, errors: ChainErrors) -> bool:
         own, other = ((e.joints, *vars(e.links).values(), e.mount, e.part) for e in (self.errors, errors))
-        return all(np.array_equal(a, b) for a, b in zip(own, other, strict=True))
+        # Errors of the same effects, summed in another order, are the same.
+        return all(
+            np.array_equal(a, b) or np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in zip(own, other, strict=True)
+        )
 
     def twists(self, up: ChainErrors, down: ChainErrors, of_arm: bool) -> Array:
         """(V, 6) left twists of the views between two errors near these."""
         if of_arm and self.measurement.robot is not None:
             links = {name: own - getattr(down.links, name) for name, own in vars(up.links).items()}
             return _apply_matrices(self.of_flange, self.flange.twists(up.joints - down.joints, Links(**links)))
-        return _apply_matrices(self.of_mount, up.mount - down.mount) + _apply_matrices(
-            self.of_part, up.part - down.part
-        )
+        mount, part = up.mount - down.mount, up.part - down.part
+        moved = _apply_matrices(self.of_part, part) if part.any() else part
+        return moved + _apply_matrices(self.of_mount, mount) if mount.any() else moved
 
     @cached_property
     def flange(self) -> FlangeSlopes:
