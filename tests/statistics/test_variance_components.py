@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, minimize_scalar
 
+from stitch.statistics import reml
 from stitch.statistics.reml import (
     ALWAYS_PRESENT,
     MAY_BE_ABSENT,
     FurtherPrior,
+    Likelihood,
     MixedModel,
     at_variances,
     deviance,
@@ -133,3 +135,19 @@ def test_scoring_ends_where_a_search_ends(shape):
         assert found is not None or factor != 1.0
         if found is not None:
             assert found[1].deviance == deviance(found[0], problem)[0] == pytest.approx(looked.fun, abs=2e-3)
+
+
+def test_a_step_goes_as_far_as_the_prior_bends(monkeypatch):
+    """Noise far below the scatter, held up by its prior: a step that takes the prior's slope for nothing goes too far,
+    is halved and comes back, and the search takes half as many evaluations again."""
+    rng, evaluated, evaluate = np.random.default_rng(5), list[Likelihood](), reml.likelihood
+    half = rng.normal(size=(2, 400, 6, 3))
+    components = np.array([h @ h.transpose(0, 2, 1) for h in half] + [np.tile(0.03 * np.eye(6), (400, 1, 1))])
+    V = np.einsum("c,cbij->bij", [0.5, 0.3, 0.01], components)
+    z = np.einsum("bij,bj->bi", np.linalg.cholesky(V), rng.normal(size=(400, 6)))
+    problem = reml_problem(MixedModel(z, np.ones((400, 6, 1)), components), None, None)
+    monkeypatch.setattr(reml, "likelihood", lambda *args: evaluated.append(evaluate(*args)) or evaluated[-1])
+    found = fisher_scoring(problem, np.log([0.5, 0.3, 0.1]), 1e-3)
+    assert found is not None and found[1] is evaluated[-1] and len(evaluated) <= 4
+    deviances = [own.deviance for own in evaluated]
+    assert deviances == sorted(deviances, reverse=True)  # none was too far
