@@ -29,7 +29,7 @@ from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")
-DEVELOPMENT, HELD_OUT = (0, 1), (954, 955, 956, 957)
+DEVELOPMENT, HELD_OUT = (0, 1), (960, 961, 962, 963)
 USUAL = ScatterLimit(*IMPLAUSIBLE)
 # Worlds with several effects, asked again after each that is named.
 AGAIN, ASKED_AGAIN = ("beside", "two", "three"), 4
