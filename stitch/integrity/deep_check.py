@@ -263,8 +263,8 @@ def _check_views(session: Session, capture: Capture, found: Sequence[MotionFit])
         problems.append(SessionProblem("displaced", tuple(session.names), _unexplained_text(session, snooped)))
     for m in snooped.suspected:
         fix = (
-            f"the view {displacement_in_words(session, m)}, which an effect of the arm may cause too; to fix: run and diagnose, "
-            "and look at this scan"
+            f"the view {displacement_in_words(session, m)}, which an effect of the arm may cause too; to fix: run and "
+            "diagnose, and look at this scan"
         )
         problems.append(SessionProblem("displaced", (session.names[m.view],), fix, certain=False))
     return problems + background_problems(session, capture, T_mount, snooped), contradicted
