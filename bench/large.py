@@ -49,7 +49,7 @@ def measured(folder: Path, views: int, points: int) -> dict[str, Any]:
     ]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     begun = time.perf_counter()
-    process = subprocess.Popen([*command, "--memory", "4GB"], env=environment, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen([*command, "--memory", "3GB"], env=environment, stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)
     seconds = time.perf_counter() - begun
     assert status == 0, command
