@@ -73,12 +73,12 @@ def next_measurement(
     elif len(found.effects) > 1:
         say(f"No pose within reach, and no artefact that is known here, separates {' from '.join(found.effects)}.")
     elif found.verdict == "missing_effect" and not found.likelier_than_not:
-        say(f"{_none_alike(found.effects[0])}. More views, at any poses, can tell it from chance.")
+        say(f"{_no_correlation(found.effects[0])}. More views, at any poses, can tell it from chance.")
     else:
-        say(f"Nothing has to be told apart. {_none_alike('the likeliest')}.")
+        say(f"Nothing has to be told apart. {_no_correlation('the likeliest')}.")
 
 
-def _none_alike(name: str) -> str:
+def _no_correlation(name: str) -> str:
     from stitch.diagnosis.thresholds import ALIAS_CORRELATION
 
     return f"No effect correlates with {name} by more than {ALIAS_CORRELATION} in these views"

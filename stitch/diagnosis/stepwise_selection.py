@@ -214,11 +214,11 @@ def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int)
             return chosen, idle
         gone, idle[first[0].name] = first
         rest = [r for r in chosen if r.name != gone.name]
-        again = parallel(partial(_beside_others, linear, rest, tests), rest)
+        again = parallel(partial(_rank_given_others, linear, rest, tests), rest)
         chosen = sorted(filter(is_certain, again), key=lambda r: -r.log_posterior)
 
 
-def _beside_others(linear: LinearModel, chosen: Sequence[Ranked], tests: int, r: Ranked) -> Ranked:
+def _rank_given_others(linear: LinearModel, chosen: Sequence[Ranked], tests: int, r: Ranked) -> Ranked:
     """One of the effects chosen, asked beside the others of them."""
     return rank_one(conditioned_without(linear, chosen, r), r.score.candidate, tests, r.score.variances)
 
