@@ -26,7 +26,7 @@ from stitch.observations.linear_model import LinearModel
 from stitch.stages.results import linearise
 from stitch.statistics.distributions import chi2_limit, f_tail
 from stitch.statistics.parameter_selection import log_evidence_at_scales, log_mixture
-from stitch.statistics.reml import at_variances, fit_variances
+from stitch.statistics.reml import FurtherColumns, at_variances, fit_variances
 from stitch.statistics.variance_posterior import satterthwaite
 from stitch.system.threads import parallel
 from stitch.units import METRES
@@ -66,7 +66,8 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
         start: (c,) variances to begin with.
         scale: the one that is likeliest there.
     """
-    mixed, G, wide = linear.mixed, linear.in_blocks(form.columns), limits.FREE_SIZES * form.sizes
+    mixed, wide = linear.mixed, limits.FREE_SIZES * form.sizes
+    G = FurtherColumns(mixed, linear.in_blocks(form.columns))
     integrated = fit_variances(mixed, G, scale * form.sizes, start=start)
     regime = regime_of(linear)
     scales = regime.scales

@@ -25,6 +25,7 @@ from stitch.statistics.least_squares import column_space
 from stitch.statistics.reml import (
     ALWAYS_PRESENT,
     NOISE,
+    FurtherColumns,
     FurtherPrior,
     MixedModel,
     VarianceFit,
@@ -52,7 +53,7 @@ _SINGLE_START_SIZE = 250
 def with_pose_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
     """The mixed model of one block with scatter, noise, and what the poses err beside."""
     components = np.concatenate([mixed.components[: NOISE + 1], errors.components[:, None]])
-    return replace(mixed, components=components, further=errors.prior)
+    return replace(mixed, components=components, further=errors.prior, alike=None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,7 +160,7 @@ class ErrorModel:
             return self
         components = np.concatenate([self.mixed.components, (self.offsets @ self.offsets.transpose(0, 2, 1))[None]])
         further = FurtherPrior(np.array([USUAL_JOINT_SCATTER]), np.array([ALWAYS_PRESENT]), np.zeros(1, bool))
-        mixed = replace(self.mixed, components=components, further=further)
+        mixed = replace(self.mixed, components=components, further=further, alike=None)
         return replace(self, mixed=mixed, offsets=None, null=fit_variances(mixed, both_starts=True))
 
     @cached_property
@@ -381,7 +382,7 @@ class LinearModel(ErrorModel):
         key = hash(columns.tobytes()), hash(sizes.tobytes())
         found = self._conditioned.get(key)
         if found is None:
-            mixed = replace(self.mixed, A=np.concatenate([self.mixed.A, self.in_blocks(columns)], axis=2))
+            mixed = FurtherColumns(self.mixed, self.in_blocks(columns)).in_mean()
             design = np.hstack([self.design, self.observation.expand(columns)])
             own = np.append(self.sizes, sizes), np.append(self.values, np.zeros(len(sizes)))
             found = replace(self, design=design, sizes=own[0], values=own[1], mixed=mixed, full_model=None)

@@ -23,7 +23,7 @@ from stitch.observations.pose_errors import joint_offset_twists, mean_square_per
 from stitch.statistics.folds import JointEnd, joint_ends
 from stitch.statistics.least_squares import BlockLeastSquares, equilibrated, independent
 from stitch.statistics.parameter_selection import UNSEEN
-from stitch.statistics.reml import MixedModel, fit_variances, whitener
+from stitch.statistics.reml import AlikeBlocks, MixedModel, alike_blocks, fit_variances, whitener
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,18 +100,27 @@ class Rows:
     def mixed_model(self, A: Array) -> MixedModel:
         """Rows as blocks for the variance components; `A` (B, m, a) are the columns of the free mean."""
         V, (B, m) = len(self.lever), self.residual.shape
-        to_centre = frames.make(np.eye(3), -self.centre)
-        carried = self.lever @ frames.adjoint(to_centre @ self.capture.T_reference_flange)
         components = np.zeros((3, B, m, m))
-        for i, half in enumerate((slice(0, 3), slice(3, 6))):
-            components[i, :V] = carried[..., half] @ carried[..., half].transpose(0, 2, 1)
+        for i, scattered in enumerate(self._scattered):
+            components[i, :V] = scattered @ scattered.transpose(0, 2, 1)
         diagonal = np.arange(m)
         components[2][:, diagonal, diagonal] = self.noise
         fixed = np.zeros((B, m, m))
         fixed[:, diagonal, diagonal] = self.fixed
         # A view errs in six ways, whatever it shows; what it shows beyond that, the landmarks take up.
         independent = int(np.minimum(self.used.sum(axis=1), 6).sum()) + max(self.landmarks.shape[2] - 6, 0)
-        return MixedModel(-self.residual, A, components, fixed, independent)
+        return MixedModel(-self.residual, A, components, fixed, independent, alike=self._alike)
+
+    @cached_property
+    def _scattered(self) -> tuple[Array, Array]:
+        """(V, m, 3) rows per rotation, and per translation, of the flange in its own frame."""
+        to_centre = frames.make(np.eye(3), -self.centre)
+        carried = self.lever @ frames.adjoint(to_centre @ self.capture.T_reference_flange)
+        return carried[..., :3], carried[..., 3:]
+
+    @cached_property
+    def _alike(self) -> AlikeBlocks | None:
+        return alike_blocks(self._scattered, self.noise, self.fixed)
 
 
 # Views of largest influence on the estimates: if one alone carries them, it is among these.

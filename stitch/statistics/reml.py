@@ -14,61 +14,12 @@ from typing import Self
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.linalg.lapack import dlauum, dpotrf, dtrtri
+from scipy.linalg.lapack import dpotrf, dtrtri
 from scipy.optimize import minimize
 from scipy.special import betainc, betaln, expit
 
-from stitch.frames import Array, Mask
-from stitch.statistics.least_squares import CLEARLY_KNOWN, equilibrated
-
-# A covariance in blocks: its inverse, its factor and its determinant.
-
-
-@dataclass(frozen=True)
-class InverseCovariance:
-    """Of a covariance V in B blocks of m."""
-
-    matrix: Array  # (B, m, m) V⁻¹
-    half: Array  # (B, m, m) L⁻¹, lower, with V = L Lᵀ
-    logdet: float  # of V; infinite where it has no inverse
-
-
-def invert_covariance(V: Array) -> InverseCovariance:
-    """The inverse of (B, m, m); of a matrix that has none `logdet` is infinite."""
-    # A search or a leap that ran away ends among infinite variances.
-    if not np.isfinite(V).all():
-        return InverseCovariance(V, V, np.inf)
-    return _invert_blocks(V) if len(V) > 1 else _invert_single(V[0])
-
-
-def _invert_single(V: Array) -> InverseCovariance:
-    """Of one large block."""
-    L, failed = dpotrf(V, lower=1, clean=1)
-    if failed:
-        return InverseCovariance(V[None], V[None], np.inf)
-    half, _ = dtrtri(L, lower=1)
-    lower, _ = dlauum(half, lower=1)
-    # Above the diagonal all are zero.
-    inverse = lower + lower.T
-    np.fill_diagonal(inverse, np.diag(lower))
-    return InverseCovariance(inverse[None], half[None], 2 * float(np.log(np.diag(L)).sum()))
-
-
-def _invert_blocks(V: Array) -> InverseCovariance:
-    """Of many small blocks, by Cholesky factors of all at once: a library's loop over them takes five times as long."""
-    m = V.shape[1]
-    A = np.ascontiguousarray(V.transpose(1, 2, 0))
-    L, half = np.zeros_like(A), np.zeros_like(A)  # blocks last
-    for j in range(m):
-        below = A[j:, j] - np.einsum("ikb,kb->ib", L[j:, :j], L[j, :j])
-        if not (below[0] > 0).all():
-            return InverseCovariance(V, V, np.inf)
-        L[j:, j] = below / np.sqrt(below[0])
-        half[j, :j] = -np.einsum("kb,kib->ib", L[j, :j], half[:j, :j]) / L[j, j]
-        half[j, j] = 1 / L[j, j]
-    half = np.ascontiguousarray(half.transpose(2, 0, 1))
-    return InverseCovariance(half.transpose(0, 2, 1) @ half, half, 2 * float(np.log(np.einsum("iib->ib", L)).sum()))
-
+from stitch.frames import Array, Indices, Mask
+from stitch.statistics.least_squares import CLEARLY_KNOWN, InverseCovariance, equilibrated, invert_covariance
 
 # What is believed of variance components before anything was seen: scatter, noise, and what may well be absent.
 
@@ -159,6 +110,125 @@ def usual_variances(z: Array, components: Array) -> Array:
     return guess
 
 
+# Blocks whose covariances are alike: their columns are summed once, for all sets of variances.
+
+
+@dataclass(frozen=True)
+class AlikeGroup:
+    """n blocks whose covariances are one after a turn of their m numbers: r of these scatter, the rest is noise."""
+
+    blocks: Indices  # (n,)
+    turn: Array  # (n, r, m) orthonormal rows, of numbers in units of the sensor's noise
+    components: Array  # (c, r, r) of the covariance of the turned numbers
+
+
+@dataclass(frozen=True)
+class AlikeWeights:
+    """At some variances what every pair of turned numbers counts in sums over blocks, and what that gives."""
+
+    logdet: float  # of the covariance
+    pairs: Array  # (t,)
+    slopes: Array  # (c, t) of the pairs in the variances, negative
+    traces: Array  # (c,) tr(V⁻¹C_i)
+    curvature: Array  # (c, c) tr(V⁻¹C_iV⁻¹C_j)
+
+
+@dataclass(frozen=True)
+class AlikeBlocks:
+    """B blocks of which many are alike: a sum over them with V⁻¹ is one over a few pairs of their numbers.
+
+    Where every view shows the same targets on its flange, what the flange's scatter does to them is the same but for
+    the flange's orientation.
+    """
+
+    groups: Sequence[AlikeGroup]
+    per_noise: Array  # (B, m) one over the sensor's noise; 0 where the number has none
+    per_known: Array  # (B, m) one over a standard deviation that is known; 0 for all others
+    noise_alone: int  # numbers in all beyond those that scatter
+    logdet: float  # of the units
+
+    def turned(self, X: Array) -> list[Array]:
+        """Columns X (B, m, k): those of each group (n, r, k), the noise beyond them, and what is known (B·m, 1, k)."""
+        white, parts = self.per_noise[..., None] * X, []
+        for group in self.groups:
+            own = group.turn @ white[group.blocks]
+            white[group.blocks] -= group.turn.transpose(0, 2, 1) @ own
+            parts.append(own)
+        return [*parts, *(flatten_blocks(own)[:, None] for own in (white, self.per_known[..., None] * X))]
+
+    def weights(self, variances: Array) -> AlikeWeights:
+        """At variances (c,); of those that have no inverse `logdet` is infinite."""
+        noise, count = variances[NOISE], len(variances)
+        logdet, pairs, slopes = self.logdet + self.noise_alone * float(np.log(noise)), [], []
+        traces, curvature = np.zeros(count), np.zeros((count, count))
+        for group in self.groups:
+            inverse = invert_covariance(np.tensordot(variances, group.components, axes=1)[None])
+            W, n, upper = inverse.matrix[0], len(group.blocks), np.triu_indices(group.turn.shape[1])
+            shares = W @ group.components
+            logdet += n * inverse.logdet
+            pairs.append(W[upper])
+            slopes.append((shares @ W)[:, *upper])
+            traces += n * np.einsum("cii->c", shares)
+            curvature += n * np.einsum("cij,dji->cd", shares, shares)
+        of_noise = np.arange(count) == NOISE
+        traces[NOISE] += self.noise_alone / noise
+        curvature[NOISE, NOISE] += self.noise_alone / noise**2
+        slopes.append(np.column_stack([of_noise / noise**2, np.zeros(count)]))
+        return AlikeWeights(logdet, np.concatenate([*pairs, [1 / noise, 1.0]]), np.hstack(slopes), traces, curvature)
+
+
+def pair_products(X: Sequence[Array], Y: Sequence[Array]) -> Array:
+    """(t, k, l) sums over blocks of the products of every pair of turned numbers, of columns X and Y as `turned`."""
+    out = []
+    for x, y in zip(X, Y, strict=True):
+        (n, r, k), upper = x.shape, np.triu_indices(x.shape[1])
+        every = (x.reshape(n, -1).T @ y.reshape(n, -1)).reshape(r, k, r, y.shape[2])
+        i, j = upper
+        out.append(every[i, :, j] + (i != j)[:, None, None] * every[j, :, i])
+    return np.concatenate(out)
+
+
+# Matrices of blocks that are alike differ by rounding, as a share; directions with less than the second share of the
+# largest eigenvalue are none, and between that and the third a turn would be imprecise.
+_ALIKE, _NO_DIRECTION, _PRECISE = 1e-9, 1e-13, 1e-5
+# Blocks a group at least, on average, and in all: else sums of their own are as fast.
+_BLOCKS_A_GROUP, _MANY_BLOCKS = 20, 50
+
+
+def alike_blocks(scattered: Sequence[Array], noise: Array, known: Array) -> AlikeBlocks | None:
+    """Find groups of blocks that are alike; None where most are not.
+
+    Args:
+        scattered: per component of scatter (V, m, 3) what a unit of it does to the numbers of the first V blocks.
+        noise: (B, m) variance of a unit of sensor noise; 0 where a number has none.
+        known: (B, m) variance that is known; 0 elsewhere.
+    """
+    per_noise, per_known = (np.where(own > 0, own, np.inf) ** -0.5 for own in (noise, known))
+    whole = np.concatenate(scattered, axis=2)
+    J = whole * per_noise[: len(whole), :, None]
+    patterns, which = np.unique(noise[: len(J)], axis=0, return_inverse=True)
+    if len(J) < _MANY_BLOCKS or len(patterns) * _BLOCKS_A_GROUP > len(J) or whole[J == 0].any():
+        return None
+    owner, groups = np.repeat(np.arange(len(scattered)), [own.shape[2] for own in scattered]), []
+    for k in range(len(patterns)):
+        blocks = np.flatnonzero(which.ravel() == k)
+        every = J[blocks].transpose(0, 2, 1) @ J[blocks]
+        size = np.sqrt(np.maximum(np.diag(every[0]), 1e-300))
+        if (np.abs(every - every[0]) > _ALIKE * np.outer(size, size)).any():
+            return None
+        values, vectors = np.linalg.eigh(every[0] / np.outer(size, size))
+        keep = values > _NO_DIRECTION * values[-1]
+        if not (values[keep] > _PRECISE * values[-1]).all():
+            return None
+        root = np.sqrt(values[keep]) * vectors[:, keep]  # (6, r) of columns of unit size
+        of_sizes = [(root * (size**2 * (owner == i))[:, None]).T @ root for i in range(len(scattered))]
+        turn = (J[blocks] @ (vectors[:, keep] / np.sqrt(values[keep]) / size[:, None])).transpose(0, 2, 1)
+        groups.append(AlikeGroup(blocks, turn, np.array([*of_sizes, np.eye(keep.sum())])))
+    scatter = sum(len(group.blocks) * group.turn.shape[1] for group in groups)
+    log_units = float(np.log(noise[noise > 0]).sum() + np.log(known[known > 0]).sum())
+    return AlikeBlocks(groups, per_noise, per_known, int((noise > 0).sum()) - scatter, log_units)
+
+
 # Blocks that are held against the components at a time: as many as stay in a core's cache.
 _IN_CACHE = 256
 # Of the mean's information, columns of unit diagonal: directions below this share tell nothing.
@@ -175,6 +245,7 @@ class MixedModel:
     fixed: Array | None = None  # (B, m, m) what is known of the covariance, and 1 on the diagonal of absent numbers
     independent: int | None = None  # numbers that could err independently, if that is not all of them
     further: FurtherPrior | None = None  # of the c − 3 further components; None: there are none
+    alike: AlikeBlocks | None = None  # the same covariances, where many blocks are alike
 
     @property
     def size(self) -> int:
@@ -186,24 +257,80 @@ class MixedModel:
         V = np.einsum("c,cbij->bij", variances, self.components)
         return np.asarray(V if self.fixed is None else V + self.fixed)
 
+    @cached_property
+    def turned(self) -> list[Array]:
+        """Columns of the mean, and what was seen as the last one, as blocks that are alike take them."""
+        return [] if self.alike is None else self.alike.turned(np.concatenate([self.A, self.z[..., None]], axis=2))
+
+    @cached_property
+    def products(self) -> Array:
+        """(t, a + 1, a + 1) their `pair_products`."""
+        return pair_products(self.turned, self.turned)
+
+
+@dataclass(frozen=True)
+class FurtherColumns:
+    """A mixed model and g further columns of its mean, with what any prior of their coefficients has in common."""
+
+    mixed: MixedModel
+    G: Array  # (B, m, g)
+
+    @cached_property
+    def Xz(self) -> Array:
+        """(B, m, a + g + 1) all columns of the mean, and what was seen as the last one."""
+        return np.concatenate([self.mixed.A, self.G, self.mixed.z[..., None]], axis=2)
+
+    @cached_property
+    def turned(self) -> list[Array]:
+        """The further ones as blocks that are alike take them."""
+        assert self.mixed.alike is not None
+        return self.mixed.alike.turned(self.G)
+
+    @cached_property
+    def products(self) -> Array:
+        """(t, a + g + 1, a + g + 1) the `pair_products` of all: those of the model stand, whatever comes beside it."""
+        mixed, a, g = self.mixed, self.mixed.A.shape[2], self.G.shape[2]
+        old, new = np.append(np.arange(a), a + g), np.arange(a, a + g)
+        every = np.empty((len(mixed.products), a + g + 1, a + g + 1))
+        every[:, old[:, None], old] = mixed.products
+        every[:, old[:, None], new] = pair_products(mixed.turned, self.turned)
+        every[:, new[:, None], old] = every[:, old[:, None], new].transpose(0, 2, 1)
+        every[:, new[:, None], new] = pair_products(self.turned, self.turned)
+        return every
+
+    def in_mean(self) -> MixedModel:
+        """The model where they are columns of the free mean as well."""
+        whole = replace(self.mixed, A=np.concatenate([self.mixed.A, self.G], axis=2))
+        if self.mixed.alike is not None:
+            a = self.mixed.A.shape[2]
+            every = zip(self.mixed.turned, self.turned, strict=True)
+            turned = [np.concatenate([old[..., :a], new, old[..., a:]], axis=2) for old, new in every]
+            # What the new model would sum anew.
+            vars(whole).update(turned=turned, products=self.products)
+        return whole
+
 
 @dataclass(frozen=True)
 class RemlProblem:
-    """A mixed model with the further columns of its mean, and their prior."""
+    """A mixed model with further columns of its mean, and their prior."""
 
-    mixed: MixedModel
-    Xz: Array  # (B, m, a + g + 1) with what was seen as the last column
+    columns: FurtherColumns
     precision: Array  # (a + g,) of the prior
     offset: float  # log det of the prior covariance
 
+    @property
+    def mixed(self) -> MixedModel:
+        """The model without them."""
+        return self.columns.mixed
 
-def reml_problem(mixed: MixedModel, G: Array | None, prior: Array | None) -> RemlProblem:
+
+def reml_problem(mixed: MixedModel, G: Array | FurtherColumns | None, prior: Array | None) -> RemlProblem:
     """With further columns G (B, m, g) and the standard deviations (g,) of their coefficients, if these have any."""
-    Xz = np.concatenate([mixed.A, *(() if G is None else (G,)), mixed.z[..., None]], axis=2)
-    if G is None or prior is None:
-        return RemlProblem(mixed, Xz, np.zeros(Xz.shape[2] - 1), 0.0)
-    precision = np.concatenate([np.zeros(mixed.A.shape[2]), 1 / prior**2])
-    return RemlProblem(mixed, Xz, precision, float(2 * np.log(prior).sum()))
+    if not isinstance(G, FurtherColumns):
+        G = FurtherColumns(mixed, np.zeros((*mixed.z.shape, 0)) if G is None else G)
+    known = np.zeros(G.G.shape[2]) if prior is None else 1 / prior**2
+    offset = 0.0 if prior is None else float(2 * np.log(prior).sum())
+    return RemlProblem(G, np.append(np.zeros(mixed.A.shape[2]), known), offset)
 
 
 @dataclass(frozen=True)
@@ -215,7 +342,7 @@ class Likelihood:
     deviance: float  # −2 log of it, and of the prior of the log variances
     mean: Array  # (a + g,) coefficients
     half: Array  # (a + g, r) square root of their covariance
-    inverse: InverseCovariance  # of the numbers' covariance
+    errors: InverseCovariance | AlikeWeights  # of the numbers
     sums: Array  # (a + g + 1, a + g + 1) XzᵀV⁻¹Xz of the mean's columns and what was seen
 
     @property
@@ -229,18 +356,37 @@ class Likelihood:
 
         d/dλ_i = tr(P C_i) − rᵀWC_iWr with P = W − WX M⁻¹ XᵀW: one matrix against every component.
         """
-        if not np.isfinite(self.inverse.logdet):
+        if not np.isfinite(self.errors.logdet):
             return np.zeros(len(self.log_variances))
         variances, mixed = np.exp(self.log_variances), self.problem.mixed
-        (blocks, m), own = mixed.z.shape, np.zeros(len(variances))
         half_and_rest = block_diag(self.half, 1.0)
         half_and_rest[:-1, -1] = -self.mean
-        for at in _portions(blocks):
-            W = self.inverse.matrix[at]
-            taken = (flatten_blocks(W @ self.problem.Xz[at]) @ half_and_rest).reshape(len(W), m, -1)
-            against = W - taken @ taken.transpose(0, 2, 1)
-            own += mixed.components[:, at].reshape(len(own), -1) @ against.ravel()
+        if isinstance(self.errors, AlikeWeights):
+            taken = np.tensordot(self.problem.columns.products, half_and_rest @ half_and_rest.T)
+            own = self.errors.traces - self.errors.slopes @ taken
+        else:
+            own = self._block_slopes(self.errors.matrix, half_and_rest)
         return np.asarray(variances * own + log_prior(self.log_variances, mixed.further)[1])
+
+    def _block_slopes(self, W: Array, half_and_rest: Array) -> Array:
+        """(c,) tr(P C_i) − rᵀWC_iWr, blocks by blocks."""
+        mixed = self.problem.mixed
+        (blocks, m), own = mixed.z.shape, np.zeros(len(mixed.components))
+        for at in _portions(blocks):
+            taken = (flatten_blocks(W[at] @ self.problem.columns.Xz[at]) @ half_and_rest).reshape(len(W[at]), m, -1)
+            against = W[at] - taken @ taken.transpose(0, 2, 1)
+            own += mixed.components[:, at].reshape(len(own), -1) @ against.ravel()
+        return own
+
+    @property
+    def curvature(self) -> Array:
+        """(c, c) expected of the deviance, but for what the mean takes: λ_iλ_j tr(V⁻¹C_iV⁻¹C_j)."""
+        variances = np.exp(self.log_variances)
+        if isinstance(self.errors, AlikeWeights):
+            return np.asarray(np.outer(variances, variances) * self.errors.curvature)
+        shares = variances[:, None, None, None] * (self.errors.matrix @ self.problem.mixed.components)
+        count = len(variances)
+        return np.asarray(shares.reshape(count, -1) @ shares.transpose(0, 1, 3, 2).reshape(count, -1).T)
 
 
 def _portions(blocks: int) -> Iterator[slice]:
@@ -251,21 +397,45 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
     """Evaluate it; infinitely unlikely, flat, where the covariance has no inverse."""
     with np.errstate(over="ignore"):
         mixed, variances = problem.mixed, np.exp(log_variances)
-    inverse, k = invert_covariance(mixed.covariance(variances)), len(problem.precision)
-    if not np.isfinite(inverse.logdet):
+    k, errors = len(problem.precision), _errors_at(mixed, variances)
+    if not np.isfinite(errors.logdet):
         mean, half = np.zeros(k), np.zeros((k, k))
-        return Likelihood(problem, log_variances, 1e300, mean, half, inverse, np.zeros((k + 1, k + 1)))
-    sums = np.zeros((k + 1, k + 1))
-    for at in _portions(len(mixed.z)):
-        white = flatten_blocks(inverse.half[at] @ problem.Xz[at])
-        sums += white.T @ white
+        return Likelihood(problem, log_variances, 1e300, mean, half, errors, np.zeros((k + 1, k + 1)))
+    sums = _sums_of_columns(problem, errors)
     half, of_information = _root_of_inverse(sums[:k, :k] + np.diag(problem.precision))
     mean = half @ (half.T @ sums[:k, k])
     # zᵀP z with P = (V + G S Gᵀ)⁻¹ projected: (z − Xβ)ᵀV⁻¹(z − Xβ) + βᵀQβ.
-    rest = (flatten_blocks(problem.Xz) @ np.append(-mean, 1.0)).reshape(*mixed.z.shape, 1)
-    square = float(np.sum((inverse.half @ rest) ** 2)) + float(mean @ (problem.precision * mean))
-    value = inverse.logdet + of_information + problem.offset + square + log_prior(log_variances, mixed.further)[0]
-    return Likelihood(problem, log_variances, value, mean, half, inverse, sums)
+    square = _square_of_rest(problem, errors, sums, np.append(-mean, 1.0)) + float(mean @ (problem.precision * mean))
+    value = errors.logdet + of_information + problem.offset + square + log_prior(log_variances, mixed.further)[0]
+    return Likelihood(problem, log_variances, value, mean, half, errors, sums)
+
+
+def _errors_at(mixed: MixedModel, variances: Array) -> InverseCovariance | AlikeWeights:
+    if mixed.alike is not None and np.isfinite(variances).all():
+        return mixed.alike.weights(variances)
+    return invert_covariance(mixed.covariance(variances))
+
+
+def _sums_of_columns(problem: RemlProblem, errors: InverseCovariance | AlikeWeights) -> Array:
+    """(a + g + 1, a + g + 1) XzᵀV⁻¹Xz."""
+    k = len(problem.precision) + 1
+    if isinstance(errors, AlikeWeights):
+        return np.tensordot(errors.pairs, problem.columns.products, axes=1)
+    sums = np.zeros((k, k))
+    for at in _portions(len(problem.mixed.z)):
+        white = flatten_blocks(errors.half[at] @ problem.columns.Xz[at])
+        sums += white.T @ white
+    return sums
+
+
+def _square_of_rest(
+    problem: RemlProblem, errors: InverseCovariance | AlikeWeights, sums: Array, of_rest: Array
+) -> float:
+    """rᵀV⁻¹r of what the mean leaves, with its combination (a + g + 1,) of the columns."""
+    if isinstance(errors, AlikeWeights):
+        return float(of_rest @ sums @ of_rest)
+    rest = (flatten_blocks(problem.columns.Xz) @ of_rest).reshape(*problem.mixed.z.shape, 1)
+    return float(np.sum((errors.half @ rest) ** 2))
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:
@@ -292,58 +462,11 @@ def flatten_blocks(X: Array) -> Array:
     return X.reshape(X.shape[0] * X.shape[1], X.shape[2])
 
 
-# Blocks of several sessions as those of one: numbers that the smaller blocks lack are absent.
-
-
-def block_columns(columns: Sequence[Array]) -> Array:
-    """(ΣB, m, Σa) columns (B, m, a) of unknowns that every session has for itself."""
-    if len(columns) == 1:
-        return columns[0]
-    widths = np.cumsum([0, *(c.shape[2] for c in columns)])
-    every = []
-    for c, at in zip(columns, widths[:-1], strict=True):
-        wide = np.zeros((*c.shape[:2], widths[-1]))
-        wide[..., at : at + c.shape[2]] = c
-        every.append(wide)
-    return stack_blocks(every)
-
-
-def stack_blocks(blocks: Sequence[Array]) -> Array:
-    """(ΣB, m, …) blocks (B, m, …) of several sessions."""
-    if len(blocks) == 1:
-        return blocks[0]
-    m = max(b.shape[1] for b in blocks)
-    return np.concatenate([np.pad(b, [(0, 0), (0, m - b.shape[1]), *[(0, 0)] * (b.ndim - 2)]) for b in blocks])
-
-
-def stack_mixed_models(mixed: Sequence[MixedModel], A: Array) -> MixedModel:
-    """Mixed models of sessions that scatter alike, with columns A (ΣB, m, a) of the free mean of all."""
-    if len(mixed) == 1:
-        return mixed[0]
-    m = max(own.z.shape[1] for own in mixed)
-
-    def wide(matrices: Array, absent: float = 0.0) -> Array:
-        lacking = m - matrices.shape[-1]
-        out = np.pad(matrices, [*[(0, 0)] * (matrices.ndim - 2), (0, lacking), (0, lacking)])
-        more = np.arange(m - lacking, m)
-        out[..., more, more] = absent
-        return out
-
-    fixed = [np.zeros((*own.z.shape, own.z.shape[1])) if own.fixed is None else own.fixed for own in mixed]
-    return MixedModel(
-        z=stack_blocks([own.z for own in mixed]),
-        A=A,
-        components=np.concatenate([wide(own.components) for own in mixed], axis=1),
-        fixed=np.concatenate([wide(own, absent=1.0) for own in fixed]),
-        independent=sum(own.size for own in mixed),
-    )
-
-
 # Fisher scoring of variance components, where their maximum lies near.
 
 # Scoring steps, their largest leap in a log variance, how often one is halved, the deviance that is not worth another
-# (rounding alone moves that of thousands of numbers by a tenth of it), and the blocks from which they pay.
-_SCORINGS, _LEAP, _HALVINGS, _CONVERGED, _MANY_BLOCKS = 20, 2.0, 4, 1e-3, 50
+# (rounding alone moves that of thousands of numbers by a tenth of it).
+_SCORINGS, _LEAP, _HALVINGS, _CONVERGED = 20, 2.0, 4, 1e-3
 # Deviance gained by a step that is the last one: another would gain a fiftieth of it at the most, as
 # seen in the fits of 600 labelled poses; where a prior bends the slope it would gain more.
 _LAST = 0.05
@@ -366,10 +489,8 @@ def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> tuple[Arr
         if np.abs(here.slope).max() < flat:
             return x, here
         variances = np.exp(x)
-        shares = variances[:, None, None, None] * (here.inverse.matrix @ mixed.components)
-        curvature = shares.reshape(len(x), -1) @ shares.transpose(0, 1, 3, 2).reshape(len(x), -1).T
         prior = log_prior(x, mixed.further)[1], 2 * prior_information(variances, mixed.further)
-        step = _scoring_step(curvature, here.slope, *prior)
+        step = _scoring_step(here.curvature, here.slope, *prior)
         gain = -0.5 * float(here.slope @ step)
         if gain < _CONVERGED:
             return x, here
@@ -434,7 +555,7 @@ class VarianceFit:
 
 def fit_variances(
     mixed: MixedModel,
-    G: Array | None = None,
+    G: Array | FurtherColumns | None = None,
     prior: Array | None = None,
     start: Array | None = None,
     both_starts: bool = False,
@@ -442,7 +563,7 @@ def fit_variances(
     """Maximise over the variances.
 
     Args:
-        G: (B, m, g) further columns of the mean.
+        G: (B, m, g) further columns of the mean; of the same ones asked several times, `FurtherColumns`.
         prior: (g,) standard deviations of their coefficients; None leaves them free.
         start: (c,) variances to begin with; None starts from the spread of z.
         both_starts: also begin from noise alone, where the likelihood may have a second maximum.
@@ -476,7 +597,7 @@ def fit_variances(
 
 
 def at_variances(
-    mixed: MixedModel, variances: Array, G: Array | None = None, prior: Array | None = None
+    mixed: MixedModel, variances: Array, G: Array | FurtherColumns | None = None, prior: Array | None = None
 ) -> VarianceFit:
     """The same without searching: mean, covariance and deviance for given variances (c,)."""
     return _fit_at(reml_problem(mixed, G, prior), np.asarray(variances))

@@ -1,21 +1,26 @@
 """Variance components against what was drawn and the Gaussian integral."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize, minimize_scalar
+from scipy.spatial.transform import Rotation
 
 from stitch.statistics import reml
+from stitch.statistics.least_squares import invert_covariance
 from stitch.statistics.reml import (
     ALWAYS_PRESENT,
     MAY_BE_ABSENT,
+    FurtherColumns,
     FurtherPrior,
     Likelihood,
     MixedModel,
+    alike_blocks,
     at_variances,
     deviance,
     fisher_scoring,
     fit_variances,
-    invert_covariance,
     reml_problem,
 )
 
@@ -151,3 +156,59 @@ def test_a_step_goes_as_far_as_the_prior_bends(monkeypatch):
     assert found is not None and found[1] is evaluated[-1] and len(evaluated) <= 4
     deviances = [own.deviance for own in evaluated]
     assert deviances == sorted(deviances, reverse=True)  # none was too far
+
+
+def turned_blocks(rng, count=80, targets=3):
+    """Views of targets on a flange that is turned anew in each; some miss one, and numbers of known variance follow."""
+    at = rng.normal(0, 100, (targets, 3))
+    lever = np.concatenate([np.concatenate([np.cross(np.eye(3), p).T, np.eye(3)], axis=1) for p in at])
+    turns = Rotation.random(count, rng).as_matrix()
+    every = np.concatenate([turns @ lever[3 * i : 3 * i + 3] for i in range(targets)], axis=1)
+    noise, known = np.full((count + 2, 3 * targets), 0.04), np.zeros((count + 2, 3 * targets))
+    noise[:30, -3:] = noise[count:] = 0.0
+    known[:30, -3:] = 1.0
+    known[count:] = 0.3
+    every[:30, -3:] = 0.0
+    return [every[..., :3], every[..., 3:]], noise, known
+
+
+def alike_model(rng, scattered, noise, known):
+    """A mixed model of such blocks, and its three further columns."""
+    components = np.zeros((3, *noise.shape, noise.shape[1]))
+    for own, J in zip(components, scattered, strict=False):
+        own[: len(J)] = J @ J.transpose(0, 2, 1)
+    components[2] = noise[..., None] * np.eye(noise.shape[1])
+    there = (noise > 0) | (np.arange(len(noise)) >= len(scattered[0]))[:, None]
+    z, A, G = (rng.standard_normal((*noise.shape, k)) * there[..., None] for k in (1, 4, 3))
+    fixed = known[..., None] * np.eye(noise.shape[1])
+    return MixedModel(z[..., 0], A, components, fixed, alike=alike_blocks(scattered, noise, known)), G
+
+
+@pytest.mark.parametrize("prior", [None, np.array([0.3, 1.0, 2.0])])
+def test_sums_over_alike_blocks_are_those_of_every_block(prior):
+    """Likelihood, slope, curvature, mean and fit as of the blocks one by one; columns taken into the mean too."""
+    rng = np.random.default_rng(3)
+    mixed, G = alike_model(rng, *turned_blocks(rng))
+    assert mixed.alike is not None
+    assert len(mixed.alike.groups) == 2
+    x, single = np.log([1e-5, 0.02, 1.7]), replace(mixed, alike=None)
+    of_groups, of_blocks = (reml.likelihood(x, reml_problem(own, G, prior)) for own in (mixed, single))
+    for value in ("deviance", "slope", "curvature", "mean", "covariance", "sums"):
+        assert getattr(of_groups, value) == pytest.approx(getattr(of_blocks, value), rel=1e-8, abs=1e-8)
+    fits = [fit_variances(own, G, prior, start=np.exp(x)).variances for own in (mixed, single)]
+    assert fits[0] == pytest.approx(fits[1], rel=1e-6)
+    taken_in, anew = FurtherColumns(mixed, G).in_mean(), replace(single, A=np.concatenate([mixed.A, G], axis=2))
+    assert at_variances(taken_in, np.exp(x)).deviance == pytest.approx(
+        at_variances(anew, np.exp(x)).deviance, rel=1e-10
+    )
+
+
+def test_blocks_that_differ_are_summed_one_by_one():
+    """Targets elsewhere on one flange, or a number without noise that scatters: no groups."""
+    scattered, noise, known = turned_blocks(np.random.default_rng(4))
+    moved = [own.copy() for own in scattered]
+    moved[0][50] *= 1.001
+    assert alike_blocks(moved, noise, known) is None
+    quiet = noise.copy()
+    quiet[60, 0] = 0.0
+    assert alike_blocks(scattered, quiet, known) is None
