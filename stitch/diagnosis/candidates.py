@@ -21,6 +21,7 @@ from stitch.effects.empirical import empirical_effects
 from stitch.frames import Array, Mask
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel, PointSums, Response
+from stitch.statistics.alike_blocks import SelectedColumns
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,11 @@ class Form:
     def columns(self) -> Array:
         """(n, p) of the free ones in the channel."""
         return self._of_free(self.reduced)
+
+    @property
+    def selected(self) -> SelectedColumns:
+        """The same, of those whose sums are kept."""
+        return SelectedColumns(self.reduced, self.keep)
 
     def _of_free(self, columns: Array) -> Array:
         return columns if self.keep.all() else columns[:, self.keep]

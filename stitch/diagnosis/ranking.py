@@ -122,5 +122,5 @@ def conditioned_on_effects(linear: LinearModel, chosen: Sequence[Ranked], start:
         return linear
     start = chosen[-1].score.variances if start is None else start
     chosen = sorted(chosen, key=lambda r: r.name)
-    columns = np.hstack([r.score.form.columns for r in chosen])
+    columns = [r.score.form.selected for r in chosen]
     return linear.conditioned_on(columns, np.concatenate([r.score.sizes for r in chosen]), start)

@@ -67,7 +67,7 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
         scale: the one that is likeliest there.
     """
     mixed, wide = linear.mixed, limits.FREE_SIZES * form.sizes
-    G = FurtherColumns(mixed, linear.in_blocks(form.columns))
+    G = FurtherColumns(mixed, (form.selected,))
     integrated = fit_variances(mixed, G, scale * form.sizes, start=start)
     regime = regime_of(linear)
     scales = regime.scales
@@ -106,7 +106,7 @@ def information_by_form(linear: LinearModel, candidate: Candidate) -> Iterator[t
     """Per form what the views tell of its parameters (p,) beside the model, in plausible sizes (`log_evidence`): those
     of one joint are among those of all."""
     of_terms = [list(forms) for _, forms in groupby(candidate.forms, key=lambda form: id(form.term))]
-    every = linear.information([whole.columns for whole, *_ in of_terms])
+    every = linear.information([whole.selected for whole, *_ in of_terms])
     for forms, (told, vector) in zip(of_terms, every, strict=True):
         for form in forms:
             own = np.flatnonzero(form.keep[forms[0].keep])

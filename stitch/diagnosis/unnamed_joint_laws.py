@@ -43,6 +43,7 @@ from stitch.observations.pose_errors import (
     usual_time_step,
 )
 from stitch.statistics import parameter_selection
+from stitch.statistics.alike_blocks import SelectedColumns
 from stitch.statistics.kernels import (
     REACH,
     SHORT_REACH,
@@ -186,7 +187,7 @@ def size_process(linear: LinearModel, process: SmoothProcess) -> SizedProcess:
     Over the eigenvalues k of the columns' information and the shares g of what was seen: log BF(s) =
     ½ Σ g²/(k + 1/s²) − ½ Σ log(1 + s²k).
     """
-    told, vector = next(linear.information([process.columns(linear)]))
+    told, vector = next(linear.information([SelectedColumns(process.columns(linear))]))
     k, vectors = np.linalg.eigh(told)
     k, g = np.maximum(k, 0.0), vectors.T @ vector
     if not k[-1] > 0:

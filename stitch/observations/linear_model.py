@@ -20,6 +20,7 @@ from stitch.frames import Array, Indices, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model, Term
 from stitch.observations.pose_errors import JOINT_SCATTER, USUAL_JOINT_SCATTER, PoseErrors
+from stitch.statistics.alike_blocks import SelectedColumns
 from stitch.statistics.folds import JointEnd, grouped_folds
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.reml import (
@@ -28,9 +29,11 @@ from stitch.statistics.reml import (
     FurtherColumns,
     FurtherPrior,
     MixedModel,
+    ModelInformation,
     VarianceFit,
     at_variances,
     fit_variances,
+    model_information,
     whitener,
 )
 from stitch.statistics.variance_posterior import Satterthwaite, satterthwaite
@@ -362,28 +365,42 @@ class LinearModel(ErrorModel):
         white = self.whiten(columns)
         return np.asarray(white - self._explained @ (self._explained.T @ white))
 
-    def information(self, columns: Sequence[Array]) -> Iterator[tuple[Array, Array]]:
+    def information(self, columns: Sequence[SelectedColumns]) -> Iterator[tuple[Array, Array]]:
         """Per set of columns (n, P) of the channel what the views tell of their coefficients θ beside the model: (P, P)
         and (P,) of the log likelihood vᵀθ − ½ θᵀIθ."""
+        if self.mixed.alike is not None and all(own.keep is not None for own in columns):
+            yield from (FurtherColumns(self.mixed, (own,)).information(self._own_information) for own in columns)
+            return
         for start in range(0, len(columns), _SETS_AT_ONCE):
-            portion = columns[start : start + _SETS_AT_ONCE]
+            portion = [own.columns for own in columns[start : start + _SETS_AT_ONCE]]
             white = self.whiten(np.hstack(portion))
             explained, vector = self._explained.T @ white, white.T @ self.white_residual
             ends = np.cumsum([0, *(own.shape[1] for own in portion)])
             for own in map(slice, ends[:-1], ends[1:]):
                 yield white[:, own].T @ white[:, own] - explained[:, own].T @ explained[:, own], vector[own]
 
-    def conditioned_on(self, columns: Array, sizes: Array, start: Array | None = None) -> "LinearModel":
+    @cached_property
+    def _own_information(self) -> ModelInformation:
+        return model_information(self.mixed, self.null)
+
+    def conditioned_on(
+        self, columns: Array | Sequence[SelectedColumns], sizes: Array, start: Array | None = None
+    ) -> "LinearModel":
         """The linear model with further free columns (n, p) of the channel, of parameters of plausible sizes (p,).
 
         Args:
             start: (c,) variances to begin with; None: those of the null.
         """
-        key = hash(columns.tobytes()), hash(sizes.tobytes())
+        sets = [SelectedColumns(columns)] if isinstance(columns, np.ndarray) else columns
+        if self.mixed.alike is None:
+            # Nothing holds the whole sets: asked as columns.
+            sets = [SelectedColumns(np.hstack([own.columns for own in sets]))]
+        key = hash(tuple(own.key for own in sets)), hash(sizes.tobytes())
         found = self._conditioned.get(key)
         if found is None:
-            mixed = FurtherColumns(self.mixed, self.in_blocks(columns)).in_mean()
-            design = np.hstack([self.design, self.observation.expand(columns)])
+            further = FurtherColumns(self.mixed, sets)
+            mixed, new = further.in_mean(), further.G.reshape(self.mixed.z.size, -1)
+            design = np.hstack([self.design, self.observation.expand(new)])
             own = np.append(self.sizes, sizes), np.append(self.values, np.zeros(len(sizes)))
             found = replace(self, design=design, sizes=own[0], values=own[1], mixed=mixed, full_model=None)
             if self.pose_errors is None:

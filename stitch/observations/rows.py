@@ -20,10 +20,11 @@ from stitch.model.forward import PointSlopes, moves_points, pose_derivatives
 from stitch.model.model import Model, Term, sizes_of, stack_parameters, values_of
 from stitch.observations.linear_model import CoefficientPrior, LinearModel, Observation, PointSums, Response
 from stitch.observations.pose_errors import joint_offset_twists, mean_square_per_axis
+from stitch.statistics.alike_blocks import AlikeBlocks, alike_blocks
 from stitch.statistics.folds import JointEnd, joint_ends
 from stitch.statistics.least_squares import BlockLeastSquares, equilibrated, independent
 from stitch.statistics.parameter_selection import UNSEEN
-from stitch.statistics.reml import AlikeBlocks, MixedModel, alike_blocks, fit_variances, whitener
+from stitch.statistics.reml import MixedModel, fit_variances, whitener
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@
 
 The α are free (integrated out with a flat prior: that is REML, Patterson & Thompson 1971, Harville 1977);
 the θ have a prior of the size that is plausible (their integral is the evidence for the columns G). V is
-block-diagonal in B blocks: one for the pose channel of scans, one a view for labelled points.
+block-diagonal in B blocks: one for the pose channel of scans, one a view for labelled points (`alike_blocks`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,8 @@ from scipy.linalg.lapack import dpotrf, dtrtri
 from scipy.optimize import minimize
 from scipy.special import betainc, betaln, expit
 
-from stitch.frames import Array, Indices, Mask
+from stitch.frames import Array, Mask
+from stitch.statistics.alike_blocks import MANY_BLOCKS, AlikeBlocks, AlikeWeights, SelectedColumns, pair_products
 from stitch.statistics.least_squares import CLEARLY_KNOWN, InverseCovariance, equilibrated, invert_covariance
 
 # What is believed of variance components before anything was seen: scatter, noise, and what may well be absent.
@@ -110,125 +111,6 @@ def usual_variances(z: Array, components: Array) -> Array:
     return guess
 
 
-# Blocks whose covariances are alike: their columns are summed once, for all sets of variances.
-
-
-@dataclass(frozen=True)
-class AlikeGroup:
-    """n blocks whose covariances are one after a turn of their m numbers: r of these scatter, the rest is noise."""
-
-    blocks: Indices  # (n,)
-    turn: Array  # (n, r, m) orthonormal rows, of numbers in units of the sensor's noise
-    components: Array  # (c, r, r) of the covariance of the turned numbers
-
-
-@dataclass(frozen=True)
-class AlikeWeights:
-    """At some variances what every pair of turned numbers counts in sums over blocks, and what that gives."""
-
-    logdet: float  # of the covariance
-    pairs: Array  # (t,)
-    slopes: Array  # (c, t) of the pairs in the variances, negative
-    traces: Array  # (c,) tr(V⁻¹C_i)
-    curvature: Array  # (c, c) tr(V⁻¹C_iV⁻¹C_j)
-
-
-@dataclass(frozen=True)
-class AlikeBlocks:
-    """B blocks of which many are alike: a sum over them with V⁻¹ is one over a few pairs of their numbers.
-
-    Where every view shows the same targets on its flange, what the flange's scatter does to them is the same but for
-    the flange's orientation.
-    """
-
-    groups: Sequence[AlikeGroup]
-    per_noise: Array  # (B, m) one over the sensor's noise; 0 where the number has none
-    per_known: Array  # (B, m) one over a standard deviation that is known; 0 for all others
-    noise_alone: int  # numbers in all beyond those that scatter
-    logdet: float  # of the units
-
-    def turned(self, X: Array) -> list[Array]:
-        """Columns X (B, m, k): those of each group (n, r, k), the noise beyond them, and what is known (B·m, 1, k)."""
-        white, parts = self.per_noise[..., None] * X, []
-        for group in self.groups:
-            own = group.turn @ white[group.blocks]
-            white[group.blocks] -= group.turn.transpose(0, 2, 1) @ own
-            parts.append(own)
-        return [*parts, *(flatten_blocks(own)[:, None] for own in (white, self.per_known[..., None] * X))]
-
-    def weights(self, variances: Array) -> AlikeWeights:
-        """At variances (c,); of those that have no inverse `logdet` is infinite."""
-        noise, count = variances[NOISE], len(variances)
-        logdet, pairs, slopes = self.logdet + self.noise_alone * float(np.log(noise)), [], []
-        traces, curvature = np.zeros(count), np.zeros((count, count))
-        for group in self.groups:
-            inverse = invert_covariance(np.tensordot(variances, group.components, axes=1)[None])
-            W, n, upper = inverse.matrix[0], len(group.blocks), np.triu_indices(group.turn.shape[1])
-            shares = W @ group.components
-            logdet += n * inverse.logdet
-            pairs.append(W[upper])
-            slopes.append((shares @ W)[:, *upper])
-            traces += n * np.einsum("cii->c", shares)
-            curvature += n * np.einsum("cij,dji->cd", shares, shares)
-        of_noise = np.arange(count) == NOISE
-        traces[NOISE] += self.noise_alone / noise
-        curvature[NOISE, NOISE] += self.noise_alone / noise**2
-        slopes.append(np.column_stack([of_noise / noise**2, np.zeros(count)]))
-        return AlikeWeights(logdet, np.concatenate([*pairs, [1 / noise, 1.0]]), np.hstack(slopes), traces, curvature)
-
-
-def pair_products(X: Sequence[Array], Y: Sequence[Array]) -> Array:
-    """(t, k, l) sums over blocks of the products of every pair of turned numbers, of columns X and Y as `turned`."""
-    out = []
-    for x, y in zip(X, Y, strict=True):
-        (n, r, k), upper = x.shape, np.triu_indices(x.shape[1])
-        every = (x.reshape(n, -1).T @ y.reshape(n, -1)).reshape(r, k, r, y.shape[2])
-        i, j = upper
-        out.append(every[i, :, j] + (i != j)[:, None, None] * every[j, :, i])
-    return np.concatenate(out)
-
-
-# Matrices of blocks that are alike differ by rounding, as a share; directions with less than the second share of the
-# largest eigenvalue are none, and between that and the third a turn would be imprecise.
-_ALIKE, _NO_DIRECTION, _PRECISE = 1e-9, 1e-13, 1e-5
-# Blocks a group at least, on average, and in all: else sums of their own are as fast.
-_BLOCKS_A_GROUP, _MANY_BLOCKS = 20, 50
-
-
-def alike_blocks(scattered: Sequence[Array], noise: Array, known: Array) -> AlikeBlocks | None:
-    """Find groups of blocks that are alike; None where most are not.
-
-    Args:
-        scattered: per component of scatter (V, m, 3) what a unit of it does to the numbers of the first V blocks.
-        noise: (B, m) variance of a unit of sensor noise; 0 where a number has none.
-        known: (B, m) variance that is known; 0 elsewhere.
-    """
-    per_noise, per_known = (np.where(own > 0, own, np.inf) ** -0.5 for own in (noise, known))
-    whole = np.concatenate(scattered, axis=2)
-    J = whole * per_noise[: len(whole), :, None]
-    patterns, which = np.unique(noise[: len(J)], axis=0, return_inverse=True)
-    if len(J) < _MANY_BLOCKS or len(patterns) * _BLOCKS_A_GROUP > len(J) or whole[J == 0].any():
-        return None
-    owner, groups = np.repeat(np.arange(len(scattered)), [own.shape[2] for own in scattered]), []
-    for k in range(len(patterns)):
-        blocks = np.flatnonzero(which.ravel() == k)
-        every = J[blocks].transpose(0, 2, 1) @ J[blocks]
-        size = np.sqrt(np.maximum(np.diag(every[0]), 1e-300))
-        if (np.abs(every - every[0]) > _ALIKE * np.outer(size, size)).any():
-            return None
-        values, vectors = np.linalg.eigh(every[0] / np.outer(size, size))
-        keep = values > _NO_DIRECTION * values[-1]
-        if not (values[keep] > _PRECISE * values[-1]).all():
-            return None
-        root = np.sqrt(values[keep]) * vectors[:, keep]  # (6, r) of columns of unit size
-        of_sizes = [(root * (size**2 * (owner == i))[:, None]).T @ root for i in range(len(scattered))]
-        turn = (J[blocks] @ (vectors[:, keep] / np.sqrt(values[keep]) / size[:, None])).transpose(0, 2, 1)
-        groups.append(AlikeGroup(blocks, turn, np.array([*of_sizes, np.eye(keep.sum())])))
-    scatter = sum(len(group.blocks) * group.turn.shape[1] for group in groups)
-    log_units = float(np.log(noise[noise > 0]).sum() + np.log(known[known > 0]).sum())
-    return AlikeBlocks(groups, per_noise, per_known, int((noise > 0).sum()) - scatter, log_units)
-
-
 # Blocks that are held against the components at a time: as many as stay in a core's cache.
 _IN_CACHE = 256
 # Of the mean's information, columns of unit diagonal: directions below this share tell nothing.
@@ -257,15 +139,30 @@ class MixedModel:
         V = np.einsum("c,cbij->bij", variances, self.components)
         return np.asarray(V if self.fixed is None else V + self.fixed)
 
+    # Where blocks are alike: sums over them of everything in the mean, and of what was seen as the last one.
+
     @cached_property
-    def turned(self) -> list[Array]:
-        """Columns of the mean, and what was seen as the last one, as blocks that are alike take them."""
-        return [] if self.alike is None else self.alike.turned(np.concatenate([self.A, self.z[..., None]], axis=2))
+    def sets(self) -> list[SelectedColumns]:
+        """Columns of the mean, and what was seen as the last one."""
+        every = flatten_blocks(self.A), self.z.reshape(-1, 1)
+        return [SelectedColumns(own, np.ones(own.shape[1], bool)) for own in every]
 
     @cached_property
     def products(self) -> Array:
-        """(t, a + 1, a + 1) their `pair_products`."""
-        return pair_products(self.turned, self.turned)
+        """(t, a + 1, a + 1) products of all of them."""
+        return np.concatenate([self.products_with(own) for own in self.sets], axis=2)
+
+    def products_with(self, own: SelectedColumns) -> Array:
+        """(t, a + 1, p) their products with other columns."""
+        assert self.alike is not None
+        if own.keep is None:
+            return pair_products(self._turned, self.alike.turned(own))
+        return np.concatenate([self.alike.products(held, own) for held in self.sets], axis=1)
+
+    @cached_property
+    def _turned(self) -> list[Array]:
+        assert self.alike is not None
+        return [np.concatenate(parts) for parts in zip(*map(self.alike.turned, self.sets), strict=True)]
 
 
 @dataclass(frozen=True)
@@ -273,7 +170,13 @@ class FurtherColumns:
     """A mixed model and g further columns of its mean, with what any prior of their coefficients has in common."""
 
     mixed: MixedModel
-    G: Array  # (B, m, g)
+    sets: Sequence[SelectedColumns]
+
+    @cached_property
+    def G(self) -> Array:
+        """(B, m, g) all of them."""
+        every = [own.columns for own in self.sets]
+        return np.hstack([np.zeros((self.mixed.z.size, 0)), *every]).reshape(*self.mixed.z.shape, -1)
 
     @cached_property
     def Xz(self) -> Array:
@@ -281,33 +184,69 @@ class FurtherColumns:
         return np.concatenate([self.mixed.A, self.G, self.mixed.z[..., None]], axis=2)
 
     @cached_property
-    def turned(self) -> list[Array]:
-        """The further ones as blocks that are alike take them."""
-        assert self.mixed.alike is not None
-        return self.mixed.alike.turned(self.G)
+    def beside(self) -> Array:
+        """(t, a + 1, g) products of the model's columns, and of what was seen, with the further ones."""
+        if not self.sets:
+            return self.mixed.products[:, :, :0]
+        return np.concatenate([self.mixed.products_with(own) for own in self.sets], axis=2)
+
+    @cached_property
+    def among(self) -> Array:
+        """(t, g, g) products of the further ones."""
+        alike, sets = self.mixed.alike, self.sets
+        assert alike is not None
+        if not sets:
+            return self.mixed.products[:, :0, :0]
+        rows = [np.concatenate([alike.products(one, other) for other in sets], axis=2) for one in sets]
+        return np.concatenate(rows, axis=1)
 
     @cached_property
     def products(self) -> Array:
-        """(t, a + g + 1, a + g + 1) the `pair_products` of all: those of the model stand, whatever comes beside it."""
-        mixed, a, g = self.mixed, self.mixed.A.shape[2], self.G.shape[2]
-        old, new = np.append(np.arange(a), a + g), np.arange(a, a + g)
-        every = np.empty((len(mixed.products), a + g + 1, a + g + 1))
-        every[:, old[:, None], old] = mixed.products
-        every[:, old[:, None], new] = pair_products(mixed.turned, self.turned)
-        every[:, new[:, None], old] = every[:, old[:, None], new].transpose(0, 2, 1)
-        every[:, new[:, None], new] = pair_products(self.turned, self.turned)
+        """(t, a + g + 1, a + g + 1) products of all, in the order of `Xz`."""
+        if not self.sets:
+            return self.mixed.products
+        a, g = self.mixed.A.shape[2], self.beside.shape[2]
+        old, new = np.append(np.arange(a), a + g), slice(a, a + g)
+        every = np.empty((len(self.beside), a + g + 1, a + g + 1))
+        every[:, old[:, None], old] = self.mixed.products
+        every[:, old, new] = self.beside
+        every[:, new, old] = self.beside.transpose(0, 2, 1)
+        every[:, new, new] = self.among
         return every
+
+    def information(self, at: "ModelInformation") -> tuple[Array, Array]:
+        """What is told of their coefficients θ beside the model: (g, g) and (g,) of the log likelihood vᵀθ − ½ θᵀIθ."""
+        beside, among = (np.tensordot(at.pairs, own, axes=1) for own in (self.beside, self.among))
+        known = at.half.T @ beside[:-1]
+        return among - known.T @ known, beside[-1] - known.T @ at.seen
 
     def in_mean(self) -> MixedModel:
         """The model where they are columns of the free mean as well."""
         whole = replace(self.mixed, A=np.concatenate([self.mixed.A, self.G], axis=2))
         if self.mixed.alike is not None:
-            a = self.mixed.A.shape[2]
-            every = zip(self.mixed.turned, self.turned, strict=True)
-            turned = [np.concatenate([old[..., :a], new, old[..., a:]], axis=2) for old, new in every]
+            new = [
+                replace(own, keep=np.ones(own.whole.shape[1], bool)) if own.keep is None else own for own in self.sets
+            ]
             # What the new model would sum anew.
-            vars(whole).update(turned=turned, products=self.products)
+            vars(whole).update(sets=[*self.mixed.sets[:-1], *new, self.mixed.sets[-1]], products=self.products)
         return whole
+
+
+@dataclass(frozen=True)
+class ModelInformation:
+    """What a model whose blocks are alike holds against further columns, at the variances of a fit of it."""
+
+    pairs: Array  # (t,) what every pair of turned numbers counts
+    half: Array  # (a, r) square root of the covariance of its own coefficients
+    seen: Array  # (r,) halfᵀXᵀV⁻¹z
+
+
+def model_information(mixed: MixedModel, fit: "VarianceFit") -> ModelInformation:
+    """At the variances of a fit, with or without further columns."""
+    assert mixed.alike is not None
+    a = mixed.A.shape[2]
+    half, _ = _root_of_inverse(fit.sums[:a, :a])
+    return ModelInformation(mixed.alike.weights(fit.variances).pairs, half, half.T @ fit.sums[:a, -1])
 
 
 @dataclass(frozen=True)
@@ -327,8 +266,8 @@ class RemlProblem:
 def reml_problem(mixed: MixedModel, G: Array | FurtherColumns | None, prior: Array | None) -> RemlProblem:
     """With further columns G (B, m, g) and the standard deviations (g,) of their coefficients, if these have any."""
     if not isinstance(G, FurtherColumns):
-        G = FurtherColumns(mixed, np.zeros((*mixed.z.shape, 0)) if G is None else G)
-    known = np.zeros(G.G.shape[2]) if prior is None else 1 / prior**2
+        G = FurtherColumns(mixed, () if G is None else (SelectedColumns(flatten_blocks(G)),))
+    known = np.zeros(sum(own.count for own in G.sets)) if prior is None else 1 / prior**2
     offset = 0.0 if prior is None else float(2 * np.log(prior).sum())
     return RemlProblem(G, np.append(np.zeros(mixed.A.shape[2]), known), offset)
 
@@ -482,7 +421,7 @@ def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> tuple[Arr
     numbers in small blocks three steps do what a search without curvature needs sixteen for.
     """
     mixed = problem.mixed
-    if len(mixed.z) < _MANY_BLOCKS:
+    if len(mixed.z) < MANY_BLOCKS:
         return None
     x, here = start, likelihood(start, problem)
     for _ in range(_SCORINGS):

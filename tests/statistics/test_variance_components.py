@@ -8,6 +8,7 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from stitch.statistics import reml
+from stitch.statistics.alike_blocks import SelectedColumns, alike_blocks
 from stitch.statistics.least_squares import invert_covariance
 from stitch.statistics.reml import (
     ALWAYS_PRESENT,
@@ -16,11 +17,11 @@ from stitch.statistics.reml import (
     FurtherPrior,
     Likelihood,
     MixedModel,
-    alike_blocks,
     at_variances,
     deviance,
     fisher_scoring,
     fit_variances,
+    model_information,
     reml_problem,
 )
 
@@ -197,10 +198,21 @@ def test_sums_over_alike_blocks_are_those_of_every_block(prior):
         assert getattr(of_groups, value) == pytest.approx(getattr(of_blocks, value), rel=1e-8, abs=1e-8)
     fits = [fit_variances(own, G, prior, start=np.exp(x)).variances for own in (mixed, single)]
     assert fits[0] == pytest.approx(fits[1], rel=1e-6)
-    taken_in, anew = FurtherColumns(mixed, G).in_mean(), replace(single, A=np.concatenate([mixed.A, G], axis=2))
-    assert at_variances(taken_in, np.exp(x)).deviance == pytest.approx(
-        at_variances(anew, np.exp(x)).deviance, rel=1e-10
-    )
+    # Columns taken into the mean, held for further ones or not; and what is told of others beside them.
+    anew = replace(single, A=np.concatenate([mixed.A, G], axis=2))
+    flat, other = G.reshape(mixed.z.size, -1), SelectedColumns(rng.standard_normal((mixed.z.size, 2)))
+    for columns in (SelectedColumns(flat), SelectedColumns(np.hstack([flat, flat]), np.arange(6) < 3)):
+        taken_in = FurtherColumns(mixed, (columns,)).in_mean()
+        fits = [at_variances(own, np.exp(x)) for own in (taken_in, anew)]
+        assert fits[0].deviance == pytest.approx(fits[1].deviance, rel=1e-10)
+        told, vector = FurtherColumns(taken_in, (other,)).information(model_information(taken_in, fits[0]))
+        half = np.linalg.inv(np.linalg.cholesky(single.covariance(np.exp(x))))
+        A, X, z = (
+            (half @ own.reshape(*mixed.z.shape, -1)).reshape(mixed.z.size, -1) for own in (anew.A, other.whole, mixed.z)
+        )
+        left = X - A @ np.linalg.lstsq(A, X)[0]
+        assert told == pytest.approx(left.T @ left, rel=1e-8)
+        assert vector == pytest.approx(left.T @ z[:, 0], rel=1e-8)
 
 
 def test_blocks_that_differ_are_summed_one_by_one():

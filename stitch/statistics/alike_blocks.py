@@ -1,0 +1,201 @@
+"""Sums over blocks whose covariances are alike: made once for all sizes of the errors, and for every set of columns.
+
+Where every view shows the same targets on its flange, what the flange's scatter does to them is the same but for the
+flange's orientation. In numbers turned accordingly all these views have one covariance of a few numbers, and a sum
+XᵀV⁻¹Y over the views is a sum over pairs of those numbers, each times what V⁻¹ says of the pair.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stitch.frames import Array, Indices, Mask
+from stitch.statistics.least_squares import invert_covariance
+
+# Numbers of turned columns that are kept: 160 MB. Their products are small.
+_KEPT_NUMBERS = 20_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class SelectedColumns:
+    """Some of P columns of the n numbers of all blocks."""
+
+    whole: Array  # (n, P); what is summed of it is kept: the same object each time
+    keep: Mask | None = None  # (P,); None: all of them, asked once, so that nothing of them is kept
+
+    @property
+    def columns(self) -> Array:
+        """(n, p) those that are selected."""
+        return self.whole if self.keep is None or self.keep.all() else self.whole[:, self.keep]
+
+    @property
+    def count(self) -> int:
+        """How many are selected."""
+        return self.whole.shape[1] if self.keep is None else int(self.keep.sum())
+
+    @property
+    def key(self) -> tuple[int, bytes]:
+        """What tells them from others; for as long as something holds the whole set, where sums of it are kept."""
+        return (hash(self.whole.tobytes()), b"") if self.keep is None else (id(self.whole), self.keep.tobytes())
+
+    def of(self, values: Array, axis: int) -> Array:
+        """What is selected of values for all of them, along an axis."""
+        return values if self.keep is None or self.keep.all() else values.compress(self.keep, axis)
+
+
+@dataclass(frozen=True)
+class AlikeGroup:
+    """n blocks whose covariances are one after a turn of their m numbers: r of these scatter, the rest is noise."""
+
+    blocks: Indices  # (n,)
+    turn: Array  # (n, r, m) orthonormal rows, of numbers in units of the sensor's noise
+    components: Array  # (c, r, r) of the covariance of the turned numbers, the sensor's noise last
+
+
+@dataclass(frozen=True)
+class AlikeWeights:
+    """At some variances what every pair of turned numbers counts in sums over blocks, and what that gives."""
+
+    logdet: float  # of the covariance
+    pairs: Array  # (t,)
+    slopes: Array  # (c, t) of the pairs in the variances, negative
+    traces: Array  # (c,) tr(V⁻¹C_i)
+    curvature: Array  # (c, c) tr(V⁻¹C_iV⁻¹C_j)
+
+
+@dataclass(frozen=True)
+class AlikeBlocks:
+    """B blocks of m numbers in groups that are alike, and the sums over them that were asked for."""
+
+    groups: Sequence[AlikeGroup]
+    per_noise: Array  # (B, m) one over the sensor's noise; 0 where the number has none
+    per_known: Array  # (B, m) one over a standard deviation that is known; 0 for all others
+    noise_alone: int  # numbers in all beyond those that scatter
+    logdet: float  # of the units
+    # What is kept, by the identity of the whole set of columns, which is kept with it.
+    _wholes: dict[int, Array] = field(default_factory=dict, repr=False)
+    _turned: dict[int, list[Array]] = field(default_factory=dict, repr=False)
+    _products: dict[tuple[int, int], Array] = field(default_factory=dict, repr=False)
+
+    def weights(self, variances: Array) -> AlikeWeights:
+        """At variances (c,), the sensor's noise last; of those that have no inverse `logdet` is infinite."""
+        noise, count = variances[-1], len(variances)
+        logdet, pairs, slopes = self.logdet + self.noise_alone * float(np.log(noise)), [], []
+        traces, curvature = np.zeros(count), np.zeros((count, count))
+        for group in self.groups:
+            inverse = invert_covariance(np.tensordot(variances, group.components, axes=1)[None])
+            W, n, upper = inverse.matrix[0], len(group.blocks), np.triu_indices(group.turn.shape[1])
+            shares = W @ group.components
+            logdet += n * inverse.logdet
+            pairs.append(W[upper])
+            slopes.append((shares @ W)[:, *upper])
+            traces += n * np.einsum("cii->c", shares)
+            curvature += n * np.einsum("cij,dji->cd", shares, shares)
+        of_noise = np.arange(count) == count - 1
+        traces[-1] += self.noise_alone / noise
+        curvature[-1, -1] += self.noise_alone / noise**2
+        slopes.append(np.column_stack([of_noise / noise**2, np.zeros(count)]))
+        return AlikeWeights(logdet, np.concatenate([*pairs, [1 / noise, 1.0]]), np.hstack(slopes), traces, curvature)
+
+    def products(self, a: SelectedColumns, b: SelectedColumns) -> Array:
+        """(t, p, q) sums over blocks of the products of two sets of columns, for every pair of turned numbers."""
+        if a.keep is None or b.keep is None:
+            return pair_products(self.turned(a), self.turned(b))
+        key = id(a.whole), id(b.whole)
+        found = self._products.get(key)
+        if found is None:
+            found = pair_products(self._kept(a.whole), self._kept(b.whole))
+            self._products.update({key: found, key[::-1]: found.transpose(0, 2, 1)})
+        return b.of(a.of(found, 1), 2)
+
+    def turned(self, columns: SelectedColumns) -> list[Array]:
+        """The columns (k, r, n) of each group, the noise beyond them, and what is known, both (k, 1, B·m)."""
+        if columns.keep is None:
+            return self._turn(columns.whole)
+        return [columns.of(own, 0) for own in self._kept(columns.whole)]
+
+    def _kept(self, whole: Array) -> list[Array]:
+        found = self._turned.get(id(whole))
+        if found is None:
+            found = self._turn(whole)
+            if sum(own.size for every in list(self._turned.values()) for own in every) > _KEPT_NUMBERS:
+                self._turned.clear()
+            self._wholes[id(whole)] = whole
+            self._turned[id(whole)] = found
+        return found
+
+    def _turn(self, columns: Array) -> list[Array]:
+        X = columns.reshape(*self.per_noise.shape, -1)
+        white, parts = self.per_noise[..., None] * X, []
+        for group in self.groups:
+            own = group.turn @ white[group.blocks]
+            white[group.blocks] -= group.turn.transpose(0, 2, 1) @ own
+            parts.append(own.transpose(2, 1, 0))
+        rest = [white] if self.noise_alone else [white[:0]]
+        rest.append((self.per_known[..., None] * X)[self.per_known.any(axis=1)])
+        return [np.ascontiguousarray(own) for own in (*parts, *(r.reshape(-1, 1, X.shape[2]).T for r in rest))]
+
+
+def pair_products(X: Sequence[Array], Y: Sequence[Array]) -> Array:
+    """(t, k, q) sums over blocks of the products of every pair of turned numbers, of columns X and Y as `turned`."""
+    out = []
+    for x, y in zip(X, Y, strict=True):
+        k, r, n = x.shape
+        every = (x.reshape(k * r, n) @ y.reshape(len(y) * r, n).T).reshape(k, r, len(y), r)
+        i, j = np.triu_indices(r)
+        out.append(every[:, i, :, j] + (i != j)[:, None, None] * every[:, j, :, i])
+    return np.concatenate(out)
+
+
+# Matrices of blocks that are alike differ by rounding, as a share; directions with less than the second share of the
+# largest eigenvalue are none, and between that and the third a turn would be imprecise.
+_ALIKE, _NO_DIRECTION, _PRECISE = 1e-9, 1e-13, 1e-5
+# Blocks a group at least, on average, and in all: else sums of their own are as fast.
+_BLOCKS_A_GROUP, MANY_BLOCKS = 20, 50
+
+
+def alike_blocks(scattered: Sequence[Array], noise: Array, known: Array) -> AlikeBlocks | None:
+    """Find groups of blocks that are alike; None where most are not.
+
+    Args:
+        scattered: per component of scatter (V, m, 3) what a unit of it does to the numbers of the first V blocks.
+        noise: (B, m) variance of a unit of sensor noise; 0 where a number has none.
+        known: (B, m) variance that is known; 0 elsewhere.
+    """
+    per_noise, per_known = (np.where(own > 0, own, np.inf) ** -0.5 for own in (noise, known))
+    whole = np.concatenate(scattered, axis=2)
+    J = whole * per_noise[: len(whole), :, None]
+    patterns, which = np.unique(noise[: len(J)], axis=0, return_inverse=True)
+    # A number without noise that scatters all the same fits into no group.
+    if len(J) < MANY_BLOCKS or len(patterns) * _BLOCKS_A_GROUP > len(J) or whole[J == 0].any():
+        return None
+    owner = np.repeat(np.arange(len(scattered)), [own.shape[2] for own in scattered])
+    groups = [_group_of(J, np.flatnonzero(which.ravel() == k), owner) for k in range(len(patterns))]
+    found = [group for group in groups if group is not None]
+    if len(found) < len(groups):
+        return None
+    scatter = sum(len(group.blocks) * group.turn.shape[1] for group in found)
+    log_units = float(np.log(noise[noise > 0]).sum() + np.log(known[known > 0]).sum())
+    return AlikeBlocks(found, per_noise, per_known, int((noise > 0).sum()) - scatter, log_units)
+
+
+def _group_of(J: Array, blocks: Indices, owner: Indices) -> AlikeGroup | None:
+    """Some blocks as a group, if they are alike.
+
+    Args:
+        J: (V, m, s) what a unit of scatter along each of s axes does to their numbers, in units of the noise.
+        owner: (s,) the component of each axis.
+    """
+    every = J[blocks].transpose(0, 2, 1) @ J[blocks]
+    size = np.sqrt(np.maximum(np.diag(every[0]), 1e-300))
+    if (np.abs(every - every[0]) > _ALIKE * np.outer(size, size)).any():
+        return None
+    values, vectors = np.linalg.eigh(every[0] / np.outer(size, size))
+    keep = values > _NO_DIRECTION * max(values[-1], 1e-300)
+    if not (values[keep] > _PRECISE * values[-1]).all():
+        return None
+    root = np.sqrt(values[keep]) * vectors[:, keep]  # (s, r), axes of unit size
+    of_components = [(root * (size**2 * (owner == i))[:, None]).T @ root for i in range(owner[-1] + 1)]
+    turn = J[blocks] @ (vectors[:, keep] / np.sqrt(values[keep]) / size[:, None])
+    return AlikeGroup(blocks, turn.transpose(0, 2, 1), np.array([*of_components, np.eye(int(keep.sum()))]))
