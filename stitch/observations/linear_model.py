@@ -369,7 +369,7 @@ class LinearModel(ErrorModel):
         """Per set of columns (n, P) of the channel what the views tell of their coefficients θ beside the model: (P, P)
         and (P,) of the log likelihood vᵀθ − ½ θᵀIθ."""
         if self.mixed.alike is not None and all(own.keep is not None for own in columns):
-            yield from (FurtherColumns(self.mixed, (own,)).information(self._own_information) for own in columns)
+            yield from map(self._own_information.of, columns)
             return
         for start in range(0, len(columns), _SETS_AT_ONCE):
             portion = [own.columns for own in columns[start : start + _SETS_AT_ONCE]]

@@ -102,12 +102,20 @@ class AlikeBlocks:
         """(t, p, q) sums over blocks of the products of two sets of columns, for every pair of turned numbers."""
         if a.keep is None or b.keep is None:
             return pair_products(self.turned(a), self.turned(b))
-        key = id(a.whole), id(b.whole)
-        found = self._products.get(key)
+        return b.of(a.of(self._kept_products(a.whole, b.whole), 1), 2)
+
+    def weighted(self, pairs: Array, a: SelectedColumns, b: SelectedColumns) -> Array:
+        """(p, q) sum over the pairs (t,) of kept products, each times its weight."""
+        every = self._kept_products(a.whole, b.whole)
+        return b.of(a.of((pairs @ every.reshape(len(pairs), -1)).reshape(every.shape[1:]), 0), 1)
+
+    def _kept_products(self, a: Array, b: Array) -> Array:
+        found = self._products.get((id(a), id(b)))
         if found is None:
-            found = pair_products(self._kept(a.whole), self._kept(b.whole))
-            self._products.update({key: found, key[::-1]: found.transpose(0, 2, 1)})
-        return b.of(a.of(found, 1), 2)
+            found = pair_products(self._kept(a), self._kept(b))
+            back = np.ascontiguousarray(found.transpose(0, 2, 1))
+            self._products.update({(id(a), id(b)): found, (id(b), id(a)): back})
+        return found
 
     def turned(self, columns: SelectedColumns) -> list[Array]:
         """The columns (k, r, n) of each group, the noise beyond them, and what is known, both (k, 1, B·m)."""

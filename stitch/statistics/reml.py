@@ -214,12 +214,6 @@ class FurtherColumns:
         every[:, new, new] = self.among
         return every
 
-    def information(self, at: "ModelInformation") -> tuple[Array, Array]:
-        """What is told of their coefficients θ beside the model: (g, g) and (g,) of the log likelihood vᵀθ − ½ θᵀIθ."""
-        beside, among = (np.tensordot(at.pairs, own, axes=1) for own in (self.beside, self.among))
-        known = at.half.T @ beside[:-1]
-        return among - known.T @ known, beside[-1] - known.T @ at.seen
-
     def in_mean(self) -> MixedModel:
         """The model where they are columns of the free mean as well."""
         whole = replace(self.mixed, A=np.concatenate([self.mixed.A, self.G], axis=2))
@@ -236,9 +230,19 @@ class FurtherColumns:
 class ModelInformation:
     """What a model whose blocks are alike holds against further columns, at the variances of a fit of it."""
 
+    mixed: MixedModel
     pairs: Array  # (t,) what every pair of turned numbers counts
     half: Array  # (a, r) square root of the covariance of its own coefficients
     seen: Array  # (r,) halfᵀXᵀV⁻¹z
+
+    def of(self, own: SelectedColumns) -> tuple[Array, Array]:
+        """What is told of the coefficients θ of further columns that are kept, beside the model: (g, g) and (g,) of the
+        log likelihood vᵀθ − ½ θᵀIθ."""
+        alike = self.mixed.alike
+        assert alike is not None
+        *mean, seen = (alike.weighted(self.pairs, held, own) for held in self.mixed.sets)
+        known = self.half.T @ np.concatenate(mean)
+        return alike.weighted(self.pairs, own, own) - known.T @ known, seen[0] - known.T @ self.seen
 
 
 def model_information(mixed: MixedModel, fit: "VarianceFit") -> ModelInformation:
@@ -246,7 +250,7 @@ def model_information(mixed: MixedModel, fit: "VarianceFit") -> ModelInformation
     assert mixed.alike is not None
     a = mixed.A.shape[2]
     half, _ = _root_of_inverse(fit.sums[:a, :a])
-    return ModelInformation(mixed.alike.weights(fit.variances).pairs, half, half.T @ fit.sums[:a, -1])
+    return ModelInformation(mixed, mixed.alike.weights(fit.variances).pairs, half, half.T @ fit.sums[:a, -1])
 
 
 @dataclass(frozen=True)

@@ -200,12 +200,12 @@ def test_sums_over_alike_blocks_are_those_of_every_block(prior):
     assert fits[0] == pytest.approx(fits[1], rel=1e-6)
     # Columns taken into the mean, held for further ones or not; and what is told of others beside them.
     anew = replace(single, A=np.concatenate([mixed.A, G], axis=2))
-    flat, other = G.reshape(mixed.z.size, -1), SelectedColumns(rng.standard_normal((mixed.z.size, 2)))
+    flat, other = G.reshape(mixed.z.size, -1), SelectedColumns(rng.standard_normal((mixed.z.size, 2)), np.ones(2, bool))
     for columns in (SelectedColumns(flat), SelectedColumns(np.hstack([flat, flat]), np.arange(6) < 3)):
         taken_in = FurtherColumns(mixed, (columns,)).in_mean()
         fits = [at_variances(own, np.exp(x)) for own in (taken_in, anew)]
         assert fits[0].deviance == pytest.approx(fits[1].deviance, rel=1e-10)
-        told, vector = FurtherColumns(taken_in, (other,)).information(model_information(taken_in, fits[0]))
+        told, vector = model_information(taken_in, fits[0]).of(other)
         half = np.linalg.inv(np.linalg.cholesky(single.covariance(np.exp(x))))
         A, X, z = (
             (half @ own.reshape(*mixed.z.shape, -1)).reshape(mixed.z.size, -1) for own in (anew.A, other.whole, mixed.z)
