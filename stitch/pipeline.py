@@ -267,7 +267,9 @@ def diagnose(run: Run) -> Diagnosis:
     return replace(found, next=propose_measurements(found))
 
 
-def suggest(state: Run, at_most: int, known: Finding | None = None) -> tuple[Run | None, list[str], Diagnosis]:
+def suggest(
+    state: Run, at_most: int, known: Finding | None = None, recorder: Recorder | None = None
+) -> tuple[Run | None, list[str], Diagnosis]:
     """Return the run with everything that the diagnosis names, what happened in lines, and the last diagnosis.
 
     The run is None where nothing is named. What was found together is added together, and what does not hold its place
@@ -278,6 +280,7 @@ def suggest(state: Run, at_most: int, known: Finding | None = None) -> tuple[Run
 
     Args:
         known: what a diagnosis of this state has named to be added; None: it is diagnosed.
+        recorder: told of every run that is tried, one after the other.
     """
     lines, given, left = list[str](), set(state.model.effects), at_most
     result: Run | None = None
@@ -289,13 +292,13 @@ def suggest(state: Run, at_most: int, known: Finding | None = None) -> tuple[Run
         if found is not None and (why := _reason_to_stop(found, left, at_most)) is not None:
             return result, [*lines, *why], found
         before, known = result, None
-        result, told = _add_found(state, finding, left, given)
+        result, told = _add_found(state, finding, left, given, recorder)
         lines += told
         if not set(result.effects) - set(state.effects):
             return before, lines, replace(found or diagnose(state), tried=result.tried)
         left -= min(len(set(result.effects) - set(state.effects)), left)
         if set(state.effects) - given:
-            result, told = _exchange_added(result, given)
+            result, told = _exchange_added(result, given, recorder)
             lines += told
         state = result
         # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
@@ -323,7 +326,9 @@ def _reason_to_stop(found: Diagnosis, left: int, at_most: int) -> list[str] | No
     return None if left else [f"Stopped after {effects}; run it again to go on."]
 
 
-def _add_found(state: Run, found: Finding, at_most: int, given: set[str]) -> tuple[Run, list[str]]:
+def _add_found(
+    state: Run, found: Finding, at_most: int, given: set[str], recorder: Recorder | None
+) -> tuple[Run, list[str]]:
     """Return the run with what was found together, as far as it earns its place, and what happened.
 
     Args:
@@ -333,7 +338,7 @@ def _add_found(state: Run, found: Finding, at_most: int, given: set[str]) -> tup
 
     names = [name for name in found.names if name not in state.tried][:at_most]
     while names:
-        tried, lines = _drop_unneeded(change(state, [*state.effects, *names]), given)
+        tried, lines = _drop_unneeded(change(state, [*state.effects, *names], recorder), given, recorder)
         kept = [name for name in names if name in tried.effects]
         share = (tried.heldout_rms / state.heldout_or_fit_rms) ** 2
         validation = found.validations.get(names[0])
@@ -350,7 +355,7 @@ def _add_found(state: Run, found: Finding, at_most: int, given: set[str]) -> tup
     return state, []
 
 
-def _exchange_added(state: Run, given: set[str]) -> tuple[Run, list[str]]:
+def _exchange_added(state: Run, given: set[str], recorder: Recorder | None = None) -> tuple[Run, list[str]]:
     """Return the run with others in place of effects that were added in several rounds, where these do better, and
     what happened: what was found first may hold the parameters of what would have come later.
 
@@ -363,14 +368,14 @@ def _exchange_added(state: Run, given: set[str]) -> tuple[Run, list[str]]:
     names = [] if state.session.has_clouds else find_better_effects(state, added)
     if not names:
         return state, []
-    tried = change(state, [*(name for name in state.effects if name in given), *names])
+    tried = change(state, [*(name for name in state.effects if name in given), *names], recorder)
     if tried.heldout_rms >= HELDOUT_FALL * state.heldout_or_fit_rms:
         return state, []
     gone = " and ".join(name for name in added if name not in names)
     return tried, [f"{' and '.join(names)}: views left out are predicted better than with {gone}, which went."]
 
 
-def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:
+def suggest_group(state: Run, recorder: Recorder | None = None) -> tuple[Run | None, list[str], Diagnosis]:
     """Return the run with all effects of an undecided group, what to say of it, and the diagnosis.
 
     The run is None where the diagnosis names no such group, or where the group does not help on views left out.
@@ -394,7 +399,7 @@ def suggest_group(state: Run) -> tuple[Run | None, list[str], Diagnosis]:
             [*_finding_and_evidence(found), f"{names} together do not help on views left out: {judged}."],
             found,
         )
-    tried = change(state, [*state.model.effects, *found.effects])
+    tried = change(state, [*state.model.effects, *found.effects], recorder)
     told = (
         f"{names} are fitted as one group: {judged}, and together they stand for what is missing; these views do not "
         "tell its parts apart, so that none of their values means anything alone"
@@ -410,7 +415,7 @@ def _finding_and_evidence(found: Diagnosis) -> list[str]:
     return [plain_finding(found, found.linear.measurement.length_unit), found.sentence]
 
 
-def _drop_unneeded(result: Run, given: set[str]) -> tuple[Run, list[str]]:
+def _drop_unneeded(result: Run, given: set[str], recorder: Recorder | None) -> tuple[Run, list[str]]:
     """Return the run without added effects that others made idle, which it remembers, and why each was dropped.
 
     Of labelled points alone: scans are matched anew for every effect that is asked.
@@ -424,6 +429,6 @@ def _drop_unneeded(result: Run, given: set[str]) -> tuple[Run, list[str]]:
             break
         name, reason = idle
         lines.append(f"{reason}; it was dropped.")
-        fewer = change(result, [other for other in result.effects if other != name])
+        fewer = change(result, [other for other in result.effects if other != name], recorder)
         result = replace(fewer, tried=result.tried | {name: reason})
     return result, lines

@@ -112,8 +112,8 @@ def test_what_was_added_first_gives_way_to_what_does_more_together(first):
 def test_what_was_tried_and_dropped_is_remembered_and_not_proposed_again(monkeypatch, tmp_path):
     session, *_ = labelled_cell(1, views=24, offset=OFFSET)
     first = run(load_session(write_labelled(tmp_path / "session", session)))
-    monkeypatch.setattr(stepwise, "change", lambda state, effects: replace(first, heldout_rms=9.0))
-    monkeypatch.setattr(stepwise, "_drop_unneeded", lambda run, given: (with_effect(run), []))
+    monkeypatch.setattr(stepwise, "change", lambda state, effects, recorder: replace(first, heldout_rms=9.0))
+    monkeypatch.setattr(stepwise, "_drop_unneeded", lambda run, given, recorder: (with_effect(run), []))
     result, lines, found = stepwise.suggest(first, at_most=3)
     assert result is None and "joint_offset was tried and dropped: with joint_offset the error" in lines[-1]
     assert list(found.tried) == ["joint_offset"] and "It was tried in this run and dropped: with" in said(found)
@@ -124,7 +124,7 @@ def test_what_was_tried_and_dropped_is_remembered_and_not_proposed_again(monkeyp
     write_json(diagnosis_document(found), tmp_path / "run" / "diagnosis.json")
     again = load_run(tmp_path / "run")
     assert again.tried == found.tried
-    monkeypatch.setattr(stepwise, "change", lambda state, effects: pytest.fail("it is fitted again"))
+    monkeypatch.setattr(stepwise, "change", lambda state, effects, recorder: pytest.fail("it is fitted again"))
     result, lines, later = stepwise.suggest(again, at_most=3)
     assert result is None and "was dropped in this run before" in lines[-1] and later.tried == found.tried
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -125,11 +124,13 @@ def _add_diagnosed(
 ) -> None:
     """Add what a diagnosis chooses: at most so many effects one by one, or None: a group that it cannot tell apart."""
     from stitch.cli.diagnose import write_diagnosis
-    from stitch.pipeline import change, suggest, suggest_group
+    from stitch.pipeline import suggest, suggest_group
+    from stitch.runs.recorder import RunMemory
     from stitch.stored.stored_run import load_run, named_before, standing_diagnosis
     from stitch.writing import run_folder
     from stitch.writing.diagnosis_document import plain_finding, suggested_command
 
+    memory = RunMemory()
     with run_folder.lock_run_folder(run):
         with show_activity("diagnosing"):
             state = load_run(run, effects_file, trust=trust)
@@ -139,19 +140,14 @@ def _add_diagnosed(
                 return
             run_folder.preload_entry_points("stitch.reports")
             if at_most is None:
-                result, lines, found = suggest_group(state)
+                result, lines, found = suggest_group(state, memory)
             else:
-                result, lines, found = suggest(state, at_most, named_before(state, told))
+                result, lines, found = suggest(state, at_most, named_before(state, told), memory)
         for line in lines if in_full() else ():
             say(line)
         if result is not None:
             with show_activity("writing cloud and page"), run_folder.replace_run_files(run) as scratch:
-                if recording:
-                    # What was tried on the way leaves no recording: the same fit once more from where it ended, in
-                    # the last step's place.
-                    before = replace(result, ledger=result.ledger[:-1])
-                    again = change(before, result.effects, recorder_for(scratch, recording))
-                    result = again.with_fit(notes=result.notes)
+                memory.tell(recorder_for(scratch, recording), result)
                 run_folder.write_with_page(result, scratch)
             _show_changed(result, run, as_json)
         else:

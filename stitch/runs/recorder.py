@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from concurrent.futures import CancelledError
-from typing import Protocol
+from typing import Any, Protocol
 
 from stitch.frames import Array
 from stitch.measurement.session import Session
+from stitch.model.model import Model
 from stitch.runs.run import Run, StageResult
 
 
@@ -55,6 +56,37 @@ class IterationMemory(SilentRecorder):
         """Pass on all that was kept."""
         for kept in self._kept:
             recorder.iteration(*kept)
+
+
+class RunMemory:
+    """Keeps what is told of runs that are tried one after the other, to tell it of the one that counts."""
+
+    def __init__(self) -> None:
+        self._kept: list[tuple[str, tuple[Any, ...]]] = []
+        self._finished: list[tuple[Model, list[tuple[str, tuple[Any, ...]]]]] = []
+
+    def start(self, session: Session) -> None:
+        """Begin to keep a run."""
+        self._kept = [("start", (session,))]
+
+    def iteration(self, *told: Any) -> None:
+        """Keep one iteration."""
+        self._kept.append(("iteration", told))
+
+    def stage(self, *told: Any) -> None:
+        """Keep the end of a stage."""
+        self._kept.append(("stage", told))
+
+    def finish(self, run: Run) -> None:
+        """Keep what was told as that of a run."""
+        self._finished.append((run.model, self._kept))
+
+    def tell(self, recorder: Recorder, run: Run) -> None:
+        """Pass on all that was told of a run, and the run as it is now."""
+        kept = next((kept for model, kept in self._finished if model is run.model), [])
+        for what, told in kept:
+            getattr(recorder, what)(*told)
+        recorder.finish(run)
 
 
 class RecorderGroup:

@@ -134,7 +134,7 @@ def test_titles_and_words_say_what_the_result_says(recorded):
 
 @pytest.mark.slow
 def test_what_was_suggested_shows_another_map_before_than_after(few_effects, tmp_path, stitch_command):
-    """The end of `add --suggested` is fitted once more for the recording: that must not count as the change."""
+    """What `add --suggested` tried on the way must not count as the change."""
     cell = measured_blade(3, views=10, pixels=90, hidden={"joint_compliance": 2.0}, repeatability=(5e-6, 0.005))
     write_session(tmp_path / "s", cell, "s")
     stitch_command("run", tmp_path / "s", "-o", tmp_path / "r", "--no-recording")

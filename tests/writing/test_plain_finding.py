@@ -67,7 +67,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
         linear=SimpleNamespace(measurement=SimpleNamespace(length_unit="mm")),
     )
     monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
-    monkeypatch.setattr(stepwise, "change", lambda state, effects: pytest.fail("it is added"))
+    monkeypatch.setattr(stepwise, "change", lambda state, effects, recorder: pytest.fail("it is added"))
     command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
     assert refused(command) is None and ("--group" in command) == (share < 0.95)
     if share > 0.95:

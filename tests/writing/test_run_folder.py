@@ -15,6 +15,7 @@ from stitch.errors import NoResultError
 from stitch.model.model_toml import read_model
 from stitch.pipeline import run_rig
 from stitch.reading.session_folder import load_session
+from stitch.runs.recorder import SilentRecorder
 from stitch.runs.run import LedgerStep
 from stitch.stored.stored_run import diagnosed_state, load_run
 from stitch.writing.run_folder import restore_fit, write_with_page
@@ -191,16 +192,34 @@ def test_a_change_that_fails_leaves_the_run_as_it_was(changing, monkeypatch, err
     assert files(run) == before and not list(run.parent.glob(f".{run.name}.*"))
 
 
-def test_the_last_step_of_what_was_suggested_is_the_result(changing, monkeypatch, stitch_command):
-    """The fit is made once more for the recording; history and result speak of the same one."""
+def test_of_what_was_suggested_the_run_that_stays_is_recorded_and_not_fitted_again(
+    changing, monkeypatch, stitch_command
+):
+    """Two runs are tried and the first stays: recording, history and result speak of that one."""
     run, result = changing
     step, last = LedgerStep((), 0.1, 0.1, 0.1, np.eye(4)), LedgerStep((), 0.1, result.heldout_rms, 0.1, result.T_mount)
-    fitted = replace(result, ledger=(step, step))
-    monkeypatch.setattr(pipeline, "change", lambda s, *_: replace(result, ledger=(*s.ledger, last)))
-    monkeypatch.setattr(pipeline, "suggest", lambda *_: (fitted, [], None))
+    fitted, told_of = replace(result, ledger=(step, last)), []
+
+    def suggest(state, at_most, known, recorder):
+        for number, tried in enumerate((fitted, replace(result, model=replace(result.model)))):
+            recorder.start(tried.session)
+            recorder.iteration("fit", number, result.poses, 0.1, np.nan)
+            recorder.finish(tried)
+        return replace(fitted, tried={"backlash": "idle"}), [], None
+
+    def told_to(folder, recording):
+        own = SilentRecorder()
+        own.iteration = lambda stage, index, *_: told_of.append((stage, index))
+        own.finish = lambda run: told_of.append(run.tried)
+        return own
+
+    monkeypatch.setattr(pipeline, "change", None)
+    monkeypatch.setattr(pipeline, "suggest", suggest)
+    monkeypatch.setattr("stitch.cli.change.recorder_for", told_to)
     monkeypatch.setattr("stitch.cli.diagnose.write_diagnosis", lambda found, state, run: {})
     monkeypatch.setattr("stitch.writing.diagnosis_document.suggested_command", lambda found, run: "")
     stitch_command("add", run, "--suggested")
+    assert told_of == [("fit", 0), {"backlash": "idle"}]
     steps = json.loads((run / "ledger.json").read_text())
     assert len(steps) == len(fitted.ledger)
     assert steps[-1]["hand_eye"] == told(run)["hand_eye"] and steps[-1]["heldout_rms"] == told(run)["heldout_rms"]
