@@ -117,9 +117,10 @@ def target_correction(
     if not moves_points(terms):
         return np.zeros(sightings.points.shape)
     places = target_places(measurement, terms, poses) if places is None else places
-    views = zip(measurement.target_views, poses, places, strict=True)
-    moved = [_displaced(terms, place, view, pose) for view, pose, place in views]
-    apart = frames.transform(frames.inverse(poses), places) - np.array(moved)
+    to_sensor = frames.inverse(poses)
+    views = zip(measurement.target_views, to_sensor, places, strict=True)
+    moved = [_displaced(terms, place, view, own) for view, own, place in views]
+    apart = frames.transform(to_sensor, places) - np.array(moved)
     return np.where((sightings.target >= 0)[..., None], apart, 0.0)
 
 
@@ -150,11 +151,15 @@ def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array,
     return places
 
 
-def _displaced(terms: Sequence[Term], places: Array, view: ScanView, pose: Array) -> Array:
-    """(N, 3) where the sensor of a view reports points that lie at places (N, 3) of the reference frame, its frame."""
+def _displaced(terms: Sequence[Term], places: Array, view: ScanView, to_sensor: Array) -> Array:
+    """(N, 3) where the sensor of a view reports points that lie at places (N, 3) of the reference frame, its frame.
+
+    Args:
+        to_sensor: (4, 4) T_scanner_reference of the view.
+    """
     for term in (t for t in reversed(terms) if t.effect.place == "shape"):
         places = term.effect.function(places, view, **term.arguments)
-    points = frames.transform(frames.inverse(pose), places)
+    points = frames.transform(to_sensor, places)
     for term in (t for t in reversed(terms) if t.effect.place == "sensor"):
         points = term.effect.function(points, view, **term.arguments)
     return points
@@ -209,27 +214,26 @@ def pose_derivatives(measurement: Measurement, model: Model, terms: Sequence[Ter
     About the model with the term in place of its own, or added at its values. Differences are taken of what an effect
     does to joints, links, mount and part alone; from there the chain of frames carries them.
     """
-    chain = None
+    chain, in_use = None, chain_errors(measurement, model.terms)
     for term in terms:
-        about = model.with_term(term)
-        others = chain_errors(measurement, model.without(term.name).terms)
+        others = in_use
+        if term.name in model.effects:
+            others = chain_errors(measurement, model.without(term.name).terms)
         errors = chain_errors(measurement, [term], others)
         if chain is None or not chain.is_about(errors):
-            chain = _ChainJacobian(measurement, about, errors, centre)
-        moved = [_pose_derivative(measurement, others, term, i, chain) for i in range(len(term.parameters))]
-        yield np.array(moved).reshape(len(moved), measurement.views.count, 6)
+            chain = _ChainJacobian(measurement, model.with_term(term), errors, centre)
+        yield _pose_derivatives(measurement, others, term, chain)
 
 
-def _pose_derivative(
-    measurement: Measurement, others: ChainErrors, term: Term, i: int, chain: "_ChainJacobian"
-) -> Array:
-    """(V, 6) of one parameter beside what all other terms do."""
-    parameter = term.parameters[i]
-    if parameter.discrete:
-        return np.zeros((measurement.views.count, 6))
-    size = (_STEP_GRIDDED if parameter.grid else STEP) * parameter.typical
-    up, down = (chain_errors(measurement, [t], others) for t in step_parameter(term, i, size))
-    return chain.twists(up, down, moves_arm(term)) / (2 * size)
+def _pose_derivatives(measurement: Measurement, others: ChainErrors, term: Term, chain: "_ChainJacobian") -> Array:
+    """(P, V, 6) of every parameter beside what all other terms do; the view of an event moves nothing."""
+    out = np.zeros((len(term.parameters), measurement.views.count, 6))
+    sizes = [(_STEP_GRIDDED if p.grid else STEP) * p.typical for p in term.parameters]
+    stepped = [i for i, p in enumerate(term.parameters) if not p.discrete]
+    steps = [[chain_errors(measurement, [t], others) for t in step_parameter(term, i, sizes[i])] for i in stepped]
+    if steps:
+        out[stepped] = chain.twists(steps, moves_arm(term)) / (2 * np.array(sizes)[stepped, None, None])
+    return out
 
 
 @dataclass(frozen=True)
@@ -248,12 +252,16 @@ class _ChainJacobian:
             np.array_equal(a, b) or np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in zip(own, other, strict=True)
         )
 
-    def twists(self, up: ChainErrors, down: ChainErrors, of_arm: bool) -> Array:
-        """(V, 6) left twists of the views between two errors near these."""
+    def twists(self, steps: Sequence[Sequence[ChainErrors]], of_arm: bool) -> Array:
+        """(P, V, 6) left twists of the views between the two errors of each step, near these."""
         if of_arm and self.measurement.robot is not None:
-            links = {name: own - getattr(down.links, name) for name, own in vars(up.links).items()}
-            return _apply_matrices(self.of_flange, self.flange.twists(up.joints - down.joints, Links(**links)))
-        mount, part = up.mount - down.mount, up.part - down.part
+            moved = []
+            for up, down in steps:
+                links = {name: own - getattr(down.links, name) for name, own in vars(up.links).items()}
+                moved.append(self.flange.twists(up.joints - down.joints, Links(**links)))
+            return _apply_matrices(self.of_flange, np.array(moved))
+        mount = np.array([up.mount - down.mount for up, down in steps])
+        part = np.array([up.part - down.part for up, down in steps])
         moved = _apply_matrices(self.of_part, part) if part.any() else part
         return moved + _apply_matrices(self.of_mount, mount) if mount.any() else moved
 
@@ -293,14 +301,18 @@ class _ChainJacobian:
 
 
 def _apply_matrices(matrix: Array, vectors: Array) -> Array:
-    """(V, 6) of (V, 6, 6) and (V, 6)."""
-    return np.asarray((matrix @ vectors[..., None])[..., 0])
+    """(P, V, 6) of (V, 6, 6) and (P, V, 6)."""
+    return np.asarray((matrix @ vectors.transpose(1, 2, 0)).transpose(2, 0, 1))
 
 
 def step_parameter(term: Term, i: int, size: float) -> tuple[Term, Term]:
     """The term with parameter i larger and smaller by a step."""
-    step = size * np.eye(len(term.parameters))[i]
-    return term.at(term.values + step), term.at(term.values - step)
+
+    def moved(by: float) -> Term:
+        own = replace(term.parameters[i], value=float(term.parameters[i].value + by))
+        return replace(term, parameters=(*term.parameters[:i], own, *term.parameters[i + 1 :]))
+
+    return moved(size), moved(-size)
 
 
 # How points answer to the parameters of terms, by central differences about a model.
