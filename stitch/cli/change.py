@@ -138,7 +138,7 @@ def _add_diagnosed(
             if told.get("verdict", "missing_effect") != "missing_effect" and "next_command" in told:
                 _show_nothing_missing(told, run, as_json)
                 return
-            run_folder.preload_entry_points("stitch.reports")
+            run_folder.preload_entry_points("stitch.reports", *(["stitch.recorders"] if recording else []))
             if at_most is None:
                 result, lines, found = suggest_group(state, memory)
             else:

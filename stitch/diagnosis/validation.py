@@ -223,12 +223,9 @@ def _steadiness(linear: LinearModel, trial: LinearTrial, X: Array, whole: Array)
     if not theta.any():
         return 0.0
     white = linear.residual(linear.reduce(X[:, -size:]))
-    strength = float(np.sum((white @ theta) ** 2))
-    shares = [
-        float((white @ theta) @ (white @ trial.solve(np.array([v]))[-size:])) / max(strength, 1e-300)
-        for v in trial.influential_views(whole)
-    ]
-    return min(shares)
+    along = white.T @ (white @ theta)
+    strength = max(float(along @ theta), 1e-300)
+    return min(float(along @ trial.solve(np.array([v]))[-size:]) / strength for v in trial.influential_views(whole))
 
 
 # Whether effects that cannot be told apart predict views left out, all of them together.

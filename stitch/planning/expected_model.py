@@ -1,12 +1,13 @@
 """Planned views as a linear model: what their scans would say, with the scatter that is expected of them."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
-import trimesh
 
 from stitch import frames
 from stitch.diagnosis.diagnose import linear_model_of
@@ -31,6 +32,11 @@ from stitch.statistics.least_squares import equilibrated, generalised_fit
 from stitch.statistics.reml import NOISE, USUAL_NOISE_FACTOR, at_variances, fit_variances
 from stitch.statistics.variance_posterior import mean_variances
 from stitch.units import METRES, angle_text, length_text
+
+if TYPE_CHECKING:
+    import trimesh
+
+# Few diagnoses look at a mesh: trimesh is loaded where one is read or made.
 
 # The surface of a part that views would see: of a mesh, of a cloud with normals, or a block as large as the part.
 
@@ -57,7 +63,7 @@ class PlannedPart:
         """Diagonal of its box."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
-    def moved(self, T: Array) -> "PlannedPart":
+    def moved(self, T: Array) -> PlannedPart:
         """The surface in another frame, T (4, 4)."""
         return PlannedPart(frames.transform(T, self.points), frames.rotate(T, self.normals))
 
@@ -87,6 +93,8 @@ def thinned_surface(points: Array, normals: Array, at_most: int = _POINTS) -> Pl
 
 def block_surface(size: float) -> PlannedPart:
     """Return a block of 1 : 0.7 : 0.5 about the origin, for a part of which only the largest side is known."""
+    import trimesh
+
     return surface_of_mesh(trimesh.creation.box(extents=size * _SIDES))
 
 
@@ -94,6 +102,8 @@ def _read_mesh(file: Path) -> trimesh.Trimesh | None:
     """None where the file holds no triangles."""
     if file.suffix.lower() not in (".stl", ".obj", ".off", ".glb", ".gltf", ".ply"):
         return None
+    import trimesh
+
     try:
         mesh = trimesh.load_mesh(file)
     except Exception as error:  # whatever a library raises at bytes that are no mesh
@@ -103,6 +113,8 @@ def _read_mesh(file: Path) -> trimesh.Trimesh | None:
 
 def surface_of_mesh(mesh: trimesh.Trimesh) -> PlannedPart:
     """Points spread over a mesh at random, the same every time."""
+    import trimesh
+
     points, faces = trimesh.sample.sample_surface(mesh, _POINTS, seed=0)
     return PlannedPart(np.asarray(points), np.asarray(mesh.face_normals[faces]))
 

@@ -80,9 +80,8 @@ def joint_ends(joints: Array, observed: Indices) -> list[JointEnd]:
         joints: (V, n) rad.
         observed: indices of the views that show something.
     """
-    out = []
-    for joint, q in enumerate(joints[observed].T):
-        low, high = np.quantile(q, [_END, 1 - _END])
+    out, every = [], joints[observed]
+    for joint, (q, low, high) in enumerate(zip(every.T, *np.quantile(every, [_END, 1 - _END], axis=0), strict=True)):
         for upper, views in ((False, observed[q <= low]), (True, observed[q >= high])):
             # Where many views share one angle, an end may be most of them.
             if _VIEWS_PER_END <= len(views) <= len(observed) // 2:

@@ -29,8 +29,9 @@ def rbf_joints(joints: Array, others: Array | None = None, reach: float = REACH)
 
 def joint_kernel_factors(some: Array, others: Array, reach: float = REACH) -> Array:
     """(S, O, n) factors of that product between joints (S, n) and (O, n), rad; alike as far as `reach`, rad."""
-    apart = some[:, None, :] - others[None, :, :]
-    return np.asarray((1 + np.exp(-2 * np.sin(apart / 2) ** 2 / reach**2)) / 2)
+    # cos(a − b) = 1 − 2 sin²((a − b)/2), from sines and cosines of each angle alone.
+    alike = np.cos(some)[:, None] * np.cos(others) + np.sin(some)[:, None] * np.sin(others)
+    return np.asarray((1 + np.exp((alike - 1) / reach**2)) / 2)
 
 
 def short_range_kernel(some: Array, others: Array) -> Array:

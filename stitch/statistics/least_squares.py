@@ -212,7 +212,10 @@ def _summed(X: Array) -> Array:
 
 def _pseudo_inverse(scaled: Array, unit: Array) -> Array:
     """(k, k) inverse of what is scaled (k, k) in some units (k,); what nothing shows is zero in it."""
-    return np.asarray(np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) * np.outer(unit, unit))
+    values, vectors = np.linalg.eigh(scaled)
+    shown = np.abs(values) > 1e-14 * np.abs(values).max(initial=0.0)
+    vectors = vectors[:, shown] * unit[:, None]
+    return np.asarray((vectors / values[shown]) @ vectors.T)
 
 
 @dataclass(frozen=True)

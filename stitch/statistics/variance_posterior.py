@@ -53,7 +53,8 @@ class Satterthwaite:
         directions = column_space(white.reshape(-1, white.shape[2])).reshape(*white.shape[:2], -1)
         if not directions.shape[2]:
             return _MANY
-        shares = np.einsum("bik,cbij,bjk->c", directions, self.white, directions, optimize=True) / directions.shape[2]
+        along = (directions @ directions.transpose(0, 2, 1)).ravel()
+        shares = self.white.reshape(len(self.white), -1) @ along / directions.shape[2]
         return float(min(2 / max(shares @ self.spread @ shares, 2 / _MANY), _MANY))
 
 

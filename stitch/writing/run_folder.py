@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.metadata import entry_points, version
+from itertools import chain
 from pathlib import Path
 from threading import Thread
 from typing import Any, TypeVar
@@ -260,13 +261,13 @@ def call_entry_points(group: str, *arguments: Any) -> None:
         entry.load()(*arguments)
 
 
-def preload_entry_points(group: str) -> None:
+def preload_entry_points(*groups: str) -> None:
     """Load beside the fit what `extend` calls after it: it leaves a core idle, and drawing takes a second to load."""
 
     def load() -> None:
         # What fails here fails again where it is called, and is said there.
         with suppress(Exception):
-            for entry in entry_points(group=group):
+            for entry in chain.from_iterable(entry_points(group=group) for group in groups):
                 entry.load()
 
     Thread(target=load, daemon=True).start()
