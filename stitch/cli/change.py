@@ -12,6 +12,7 @@ from stitch.cli.options import EffectsFile, Json, Trust
 from stitch.cli.progress import recorder_for, show_activity
 from stitch.cli.terminal import emit, in_full, say, show_next
 from stitch.errors import InputError
+from stitch.system.process import end_at_once
 
 if TYPE_CHECKING:
     from stitch.runs.run import Run
@@ -47,6 +48,7 @@ def add(
     else:
         limit = at_most if suggested else None
         _add_diagnosed(run, limit, effects_file, trust=trust, recording=recording, as_json=as_json)
+    end_at_once()
 
 
 def drop(
@@ -64,6 +66,7 @@ def drop(
       stitch drop runs/blade-17 backlash
     """
     drop_effects(run, effects, effects_file, trust=trust, recording=recording, as_json=as_json)
+    end_at_once()
 
 
 def add_effects(
@@ -145,13 +148,17 @@ def _add_diagnosed(
                 result, lines, found = suggest(state, at_most, named_before(state, told), memory)
         for line in lines if in_full() else ():
             say(line)
-        if result is not None:
+        if result is None:
+            _show_unchanged(run, as_json)
+        else:
+            # Who reads it waits for no files; a program that reads JSON takes it for the end.
+            if not as_json:
+                _show_changed(result, run, as_json)
             with show_activity("writing cloud and page"), run_folder.replace_run_files(run) as scratch:
                 memory.tell(recorder_for(scratch, recording), result)
                 run_folder.write_with_page(result, scratch)
-            _show_changed(result, run, as_json)
-        else:
-            _show_unchanged(run, as_json)
+            if as_json:
+                _show_changed(result, run, as_json)
         write_diagnosis(found, result or state, run)
     if not in_full():
         say(plain_finding(found, state.session.length_unit))

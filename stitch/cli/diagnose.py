@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.progress import show_activity
 from stitch.cli.terminal import emit, in_full, say, show_next, show_table
+from stitch.system.process import end_at_once
 
 if TYPE_CHECKING:
     from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
@@ -46,6 +47,7 @@ def diagnose_run(
     else:
         show_diagnosis(found, unit)
         show_next(suggested_command(found, shlex.quote(str(run))))
+    end_at_once()
 
 
 def next_measurement(
@@ -76,6 +78,7 @@ def next_measurement(
         say(f"{_no_correlation(found.effects[0])}. More views, at any poses, can tell it from chance.")
     else:
         say(f"Nothing has to be told apart. {_no_correlation('the likeliest')}.")
+    end_at_once()
 
 
 def _no_correlation(name: str) -> str:
