@@ -20,6 +20,7 @@ from stitch.system.threads import take_mapped
 from stitch.units import MICROMETRES, length_text
 from viz.colours import UNSEEN, robust_limit, unsigned_colours, view_colours
 from viz.model_timeline import FRAMES
+from viz.page_parts import unbroken
 from viz.rrd_file import words
 from viz.run_numbers import shown_points
 
@@ -222,15 +223,16 @@ def _log_words(rec: rr.RecordingStream, run: Run, moments: Sequence[Moment], bou
             lines += [f"Colours: rms distance of the views; darkest from {length_text(_full(run), unit)} on.", ""]
         rec.log("moment", words("\n".join([*lines, moment.told, "", bound])))
         rec.reset_time()
+    texts = []
     for v, (view, rms) in enumerate(zip(run.session.views, run.view_rms, strict=True)):
-        rec.set_time("view", sequence=v)
         lies = f" It lies {length_text(float(rms), unit)} rms off the others." if np.isfinite(rms) else ""
         lines = [
             f"## {view.name}",
             f"View {v + 1} of {len(run.session.views)}, {len(shown_points(view)):,} points.{lies}",
         ]
-        rec.log("moment", words("\n".join([*lines, "", bound])))
-        rec.reset_time()
+        texts.append(unbroken("\n".join([*lines, "", bound])))
+    of_views = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
+    rec.send_columns("moment", [rr.TimeColumn("view", sequence=range(len(texts)))], of_views)
     rows = [
         f"| {i} | {m.title} | {len(m.names)} | {_number(m.rms, unit)} | {_number(m.gate, unit)} |"
         for i, m in enumerate(moments)

@@ -118,12 +118,18 @@ def _log_names(recording: rr.RecordingStream, places: dict[str, Array]) -> None:
 
 def _log_reached(recording: rr.RecordingStream, arm: Array, names: list[str]) -> None:
     """Where each view has the arm (V, P, 3), or its flange alone, on the timeline `view`."""
-    for v in even_indices(len(names), _VIEWS):
-        recording.set_time("view", sequence=v)
-        recording.log("robot/reached", rr.LineStrips3D([arm[v]], colors=[_SCANNER], radii=_THICK))
-        end = rr.Points3D(arm[v, -1:], colors=[_SCANNER], radii=_DOT, labels=[names[v]], show_labels=True)
-        recording.log("robot/reached/flange", end)
-    recording.reset_time()
+    shown = even_indices(len(names), _VIEWS)
+    at, colours = [rr.TimeColumn("view", sequence=shown)], [_SCANNER] * len(shown)
+    arms = rr.LineStrips3D.columns(strips=list(arm[shown]), colors=colours, radii=[_THICK] * len(shown))
+    recording.send_columns("robot/reached", at, arms)
+    ends = rr.Points3D.columns(
+        positions=arm[shown, -1],
+        colors=colours,
+        radii=[_DOT] * len(shown),
+        labels=[names[v] for v in shown],
+        show_labels=[True] * len(shown),
+    )
+    recording.send_columns("robot/reached/flange", at, ends)
 
 
 def _log_arm(recording: rr.RecordingStream, run: Run, flange: Array) -> Array:
