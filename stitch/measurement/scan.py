@@ -58,6 +58,11 @@ class Scan:
     eye: Array  # (3,) from where the scanner looks
 
     @cached_property
+    def box(self) -> Array:
+        """(2, 3) lowest and highest corner of the points."""
+        return bounding_box(self.points)
+
+    @cached_property
     def size(self) -> float:
         """Diameter of the points, length_unit: twice their rms distance from their centroid."""
         return 2 * float(np.sqrt(self.points.var(axis=0).sum()))

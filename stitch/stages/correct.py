@@ -198,9 +198,10 @@ def correct(
     # Where the hand-eye is says least squares at once; how certain it is may wait until the end of the run.
     begun = begin(statistics)
     announce("correct: what the corrected hand-eye leaves")
+    samples = [[sample_points(scan, FINE_SAMPLES) for scan in c.scans] for c in captures]
     final = tuple(
-        collect_overlaps(c, c.poses(solved.T_mount), gate, [sample_points(s, FINE_SAMPLES) for s in c.scans])
-        for c, gate in zip(captures, gates, strict=True)
+        collect_overlaps(c, c.poses(solved.T_mount), gate, own, f.overlaps)
+        for c, f, gate, own in zip(captures, freed, gates, samples, strict=True)
     )
     return Correction(
         geometry=Model(solved.T_mount),

@@ -154,7 +154,7 @@ def _match_last(capture: Capture, poses: Array, gate: float, samples: Sequence[I
     last = len(poses) - 1
     pairs = [pair for pair in near_pairs(capture.scans, poses, gate) if pair[1] == last]
     least = MINIMUM_OVERLAP * len(samples[last])
-    found = [m for m in match_pairs(capture.scans, poses, pairs, gate, samples) if len(m.residual) > least]
+    found = [m for m in match_pairs(capture.scans, poses, pairs, gate, samples)[0] if len(m.residual) > least]
     if not found:
         raise NoResultError(f"{capture.scans[last].name}: it shares no surface with the other views")
     return found

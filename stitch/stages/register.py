@@ -133,6 +133,7 @@ def register(
     recorder: Recorder | None = None,
     start: Array | None = None,
     method: Method = METHODS[DEFAULT],
+    before: Overlaps | None = None,
 ) -> Registration:
     """Move every view by its own twist until the overlaps agree, or until neither rms nor step falls any more.
 
@@ -142,6 +143,7 @@ def register(
         gate: first distance between partners, length_unit.
         start: (V, 4, 4) poses to begin with, if a better guess than the model's is at hand.
         method: what every correspondence counts.
+        before: of the same points at poses near by: what cannot have changed is not searched again.
 
     Raises:
         NoResultError: no two views overlap.
@@ -149,7 +151,7 @@ def register(
     recorder = recorder or SilentRecorder()
     picked = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
     poses, history = np.array(model_poses if start is None else _without_mean_motion(start, model_poses)), list[float]()
-    overlaps = collect_overlaps(capture, poses, gate, picked)
+    overlaps = collect_overlaps(capture, poses, gate, picked, before)
     last: LastStep = None
     progress = _Progress()
     for index in range(_MAXIMUM_ITERATIONS):

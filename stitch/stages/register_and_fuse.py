@@ -51,9 +51,9 @@ def begin_to_register_views(correction: Correction, method: Method) -> tuple[Beg
     def register_all() -> None:
         for i, (own, found) in enumerate(zip(correction.captures, coming, strict=True)):
             clock, poses = Clock(), own.poses(correction.geometry.T_mount)
-            scatter, gate, start = correction.scatter[i], correction.overlaps[i].gate, correction.unconstrained[i].poses
+            scatter, overlaps, start = correction.scatter[i], correction.overlaps[i], correction.unconstrained[i].poses
             try:
-                registration = register(own, poses, scatter, gate, memories[i], start, method)
+                registration = register(own, poses, scatter, overlaps.gate, memories[i], start, method, overlaps)
                 found.set_result((registration, clock.lap()))
             except BaseException as error:
                 found.set_exception(error)
@@ -107,8 +107,9 @@ def finish_surfaces(
         repeatability=scatter,
         verdict=surface_sentence(corrected.rms, registered.rms, floor, scatter, session.length_unit, model.effects),
         convergence={"correct": list(correction.history), "register": list(registration.history)},
-        overlaps=overlaps,
-        registered=registration.overlaps,
+        # A search that nobody goes on from takes room.
+        overlaps=replace(overlaps, searched=None),
+        registered=replace(registration.overlaps, searched=None),
     )
     return found, _ledger_step(model, corrected.rms, corrected.rms * correction.hand_eye.heldout_ratio, floor)
 

@@ -244,4 +244,4 @@ def _final_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
     """Correspondences of the model's own poses; the gate follows what they leave."""
     samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
     overlaps = collect_overlaps(capture, capture.poses(T_mount), gate, samples)
-    return collect_overlaps(capture, capture.poses(T_mount), min(gate, next_gate(overlaps, capture)), samples)
+    return collect_overlaps(capture, capture.poses(T_mount), min(gate, next_gate(overlaps, capture)), samples, overlaps)

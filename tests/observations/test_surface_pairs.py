@@ -25,7 +25,7 @@ def test_partners_are_the_nearest_points_by_another_tree(blade_capture):
     measured, capture = blade_capture
     poses = capture.poses(measured.T_mount)
     samples = [sample_points(s, 200) for s in capture.scans]
-    found = next(match_pairs(capture.scans, poses, [(0, 1)], 3.0, samples))
+    found = match_pairs(capture.scans, poses, [(0, 1)], 3.0, samples)[0][0]
     p = frames.transform(poses[0], capture.scans[0].points)
     q = frames.transform(poses[1], capture.scans[1].points)
     from_v, from_w = np.isin(found.index_v, samples[0]), np.isin(found.index_w, samples[1])
@@ -40,7 +40,7 @@ def test_points_take_turns_where_many_views_overlap(blade_capture, views, turns)
     """One scan so often: every point is its own partner, in 20 views or all the 25 others shared by two halves."""
     scan = blade_capture[1].scans[0]
     picked, pairs = sample_points(scan, 300), list(combinations(range(views), 2))
-    found = list(match_pairs([scan] * views, np.tile(np.eye(4), (views, 1, 1)), pairs, 0.5, [picked] * views))
+    found = match_pairs([scan] * views, np.tile(np.eye(4), (views, 1, 1)), pairs, 0.5, [picked] * views)[0]
     of_first = [m.index_v for m in found if m.v == 0]
     assert len(of_first) == views - 1 and set(np.concatenate(of_first)) == set(picked)
     # Both search directions.
@@ -82,6 +82,21 @@ def test_pairs_serve_again_until_something_has_moved(blade_capture, overlaps):
     apart[2, :3, 3] += 1e4
     assert all(2 not in pair for pair in collect_overlaps(capture, apart, 2.0, samples, overlaps).pairs)
     assert collect_overlaps(capture, near, 4.0, samples, overlaps).probed[1] == 4.0
+
+
+@pytest.mark.parametrize(("motion", "gate", "reused"), [(0.01, 2.0, True), (0.05, 1.9, True), (1.0, 1.9, False)])
+def test_what_is_not_searched_again_is_what_a_search_finds(blade_capture, overlaps, motion, gate, reused):
+    """Every view moved by itself, mm: the same correspondences to the last bit, whether few or all points look again."""
+    measured, capture = blade_capture
+    samples = [sample_points(s, 400) for s in capture.scans]
+    poses = capture.poses(measured.T_mount)
+    twists = motion * np.random.default_rng(5).normal(size=(len(poses), 6)) * [1e-3, 1e-3, 1e-3, 1, 1, 1]
+    moved = frames.moved_about(overlaps.gram.centre, twists, poses)
+    again, anew = (collect_overlaps(capture, moved, gate, samples, before) for before in (overlaps, None))
+    assert (again.searched is overlaps.searched) == reused and again.pairs == anew.pairs
+    assert any(not np.array_equal(a.index_w, b.index_w) for a, b in zip(again.matches, overlaps.matches, strict=True))
+    for a, b in zip(again.matches, anew.matches, strict=True):
+        assert all(np.array_equal(own, other) for own, other in zip(a.columns, b.columns, strict=True))
 
 
 def test_pair_equations_against_finite_differences(blade_capture, overlaps):

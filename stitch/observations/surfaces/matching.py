@@ -1,7 +1,7 @@
 """Correspondences between views: KD-tree search in both directions, gated by distance and normal."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,15 +10,27 @@ from numpy.typing import NDArray
 
 from stitch import frames
 from stitch.frames import Array, Indices
-from stitch.measurement.scan import Scan, bounding_box, box_corners, even_indices
+from stitch.measurement.scan import Scan, box_corners, even_indices
 from stitch.system.threads import parallel
 
 # Sampled points of all views, placed in the reference frame once, and their search for nearest points of a view.
 
+# A search goes on so much farther than the gate: what comes nearer with little motion is known already.
+_REACH = 1.1
+# Of so large a share of the queries that may have another partner, all are asked: then it costs no more.
+_MOST_OPEN = 0.5
 # Two patches whose normals differ by more than 45° are not the same surface.
 _NORMAL_COSINE = np.cos(np.radians(45.0))
 # Some of a view's sampled points.
 QueryPart = tuple[int, slice]
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """What N points found in one view."""
+
+    partner: Array  # (N,) int32 usable point of the view; -1 where none lies within reach
+    lead: Array  # (N,) float32: with less than half of it as motion no other point comes nearer within the gate
 
 
 @dataclass(frozen=True)
@@ -39,6 +51,25 @@ class NeighbourQueries:
     def counts(self, parts: Sequence[QueryPart]) -> list[int]:
         """How many points each part holds."""
         return [len(range(*at.indices(len(self.index[v])))) for v, at in parts]
+
+    def nearest(self, w: int, points: Array, gate: float) -> Nearest:
+        """What points (N, 3) of the reference frame find in view w, and how certain it is after motion."""
+        tree, reach = self.scans[w].tree, _REACH * gate
+        query = np.ascontiguousarray(frames.transform(frames.inverse(self.poses[w]), points))
+        distance, index = tree.query(query, k=min(2, tree.n), distance_upper_bound=reach)
+        first, second = distance.reshape(len(query), -1).T[[0, -1]]
+        # What is beyond the gate anyway has to come all the way back.
+        lead = np.maximum(np.minimum(second, reach) - first, 2 * (first - gate))
+        return Nearest(self._usable(w, index.reshape(len(query), -1)[:, 0]), lead.astype(np.float32))
+
+    def partners(self, w: int, points: Array, gate: float) -> Array:
+        """(N,) int32 usable points of view w that are nearest to points (N, 3) of the reference frame, -1 for none."""
+        query = np.ascontiguousarray(frames.transform(frames.inverse(self.poses[w]), points))
+        return self._usable(w, self.scans[w].tree.query(query, k=1, distance_upper_bound=gate)[1])
+
+    def _usable(self, w: int, index: Array) -> Array:
+        # Where none is found its number is one beyond the last.
+        return np.where(np.append(self.scans[w].usable, False)[index], index.astype(np.int32), np.int32(-1))
 
     def search(self, w: int, points: Array, normals: Array, gate: float) -> tuple[Array, Indices, NDArray[np.bool_]]:
         """Of N points each (N,): distance (inf where none), index of the partner and whether it may be used.
@@ -64,14 +95,45 @@ class NeighbourQueries:
 def neighbour_queries(scans: Sequence[Scan], poses: Array, samples: Sequence[Indices]) -> NeighbourQueries:
     """Sampled points of every view under T_reference_scanner (V, 4, 4)."""
     every = list(zip(scans, poses, samples, strict=True))
-    points = [frames.transform(T, scan.points[index]) for scan, T, index in every]
-    return NeighbourQueries(
-        scans, poses, samples, points, [frames.rotate(T, scan.normals[index]) for scan, T, index in every]
-    )
+    points = [frames.transform(T, scan.points.take(index, axis=0)) for scan, T, index in every]
+    normals = [frames.rotate(T, scan.normals.take(index, axis=0)) for scan, T, index in every]
+    return NeighbourQueries(scans, poses, samples, points, normals)
 
 
 # Views in which one point of another view is asked for.
 _MOST_PARTNERS = 20
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What the points of all views found in the others, so that after little motion few have to look again."""
+
+    poses: Array  # (V, 4, 4) T_reference_scanner
+    index: Sequence[Indices]  # per view the points that look
+    parts: list[list[QueryPart]]  # per view those that ask it
+    gate: float  # largest distance between partners, length_unit
+    nearest: list[Nearest]  # per view asked
+
+    def still_open(self, every: NeighbourQueries, parts: list[list[QueryPart]], gate: float) -> list[Indices] | None:
+        """Per view asked, the queries for which under new poses another point may be nearest; None: ask all anew.
+
+        Distances change by no more than the motion of the point that asks, seen from the view that is asked.
+        """
+        same = all(np.array_equal(a, b) for a, b in zip(self.index, every.index, strict=True))
+        if parts != self.parts or gate > self.gate or not same:
+            return None
+        corners = np.array([box_corners(scan.box) for scan in every.scans])
+        out, total = list[Indices](), 0
+        for w, (own, near) in enumerate(zip(parts, self.nearest, strict=True)):
+            v = [v for v, _ in own]
+            # A point between the corners moves no more than one of them.
+            was, now = (frames.transform(frames.inverse(T[w]) @ T[v], corners[v]) for T in (self.poses, every.poses))
+            moved = np.linalg.norm(now - was, axis=2).max(axis=1)
+            if gate + moved.max(initial=0.0) > _REACH * self.gate:
+                return None
+            out.append(np.flatnonzero(near.lead < np.repeat(2 * moved, every.counts(own))))
+            total += len(near.lead)
+        return out if sum(map(len, out)) < _MOST_OPEN * total else None
 
 
 @dataclass(frozen=True)
@@ -116,8 +178,9 @@ def match_pairs(
     pairs: Sequence[tuple[int, int]],
     gate: float,
     samples: Sequence[Indices],
-) -> Iterator[Match]:
-    """Stream the correspondences of `pairs`: each sampled point with its nearest point of the other.
+    before: Searched | None = None,
+) -> tuple[list[Match], Searched]:
+    """Correspondences of `pairs`, each sampled point with its nearest point of the other, and what was searched.
 
     Where a view overlaps with more than 20 others, its points take turns: each is asked for in 20 of them. What a point
     says of its own view it says to the first few already, so that many views cost what they are and not their square.
@@ -126,6 +189,7 @@ def match_pairs(
         poses: T_reference_scanner, (V, 4, 4).
         gate: largest distance between partners, length_unit.
         samples: per view the indices that search (see `sample`).
+        before: a search under other poses; what cannot have changed since then is not looked for again.
     """
     turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
     parts = [list[QueryPart]() for _ in scans]
@@ -133,11 +197,30 @@ def match_pairs(
         for a, b in ((v, w), (w, v)):
             parts[b].append((a, slice(b % turns[a], None, turns[a])))
     every = neighbour_queries(scans, poses, samples)
-    answers = list(parallel(lambda w: _partners_by_view(every, w, parts[w], gate), range(len(scans))))
+    again = None if before is None else before.still_open(every, parts, gate)
+
+    def asked(w: int) -> tuple[Nearest, dict[int, Match]]:
+        """What is nearest in one view, and by view that asks what of it lies within the gate."""
+        if not parts[w]:
+            return Nearest(np.zeros(0, np.int32), np.zeros(0, np.float32)), {}
+        index, p, n = every.gather(parts[w])
+        if before is None or again is None:
+            near = every.nearest(w, p, gate)
+            return near, _partners_by_view(every, w, parts[w], gate, near.partner, (index, p, n))
+        partner = before.nearest[w].partner.copy()
+        partner[again[w]] = every.partners(w, p.take(again[w], axis=0), gate)
+        return before.nearest[w], _partners_by_view(every, w, parts[w], gate, partner, (index, p, n))
+
+    nearest, answers = zip(*parallel(asked, range(len(scans))), strict=True)
+    matches = []
     for v, w in pairs:
         found = [of for of in (answers[w].pop(v), answers[v].pop(w).swapped()) if len(of.residual)]
         if found:
-            yield Match(v, w, *(np.concatenate(own) for own in zip(*(of.columns for of in found), strict=True)))
+            columns = zip(*(of.columns for of in found), strict=True)
+            matches.append(Match(v, w, *(np.concatenate(own) for own in columns)))
+    if before is None or again is None:
+        before = Searched(np.array(poses), samples, parts, gate, list(nearest))
+    return matches, before
 
 
 def signed_distances(matches: Sequence[Match], poses: Array, points: Sequence[Array]) -> Array:
@@ -152,24 +235,38 @@ def signed_distances(matches: Sequence[Match], poses: Array, points: Sequence[Ar
     return np.concatenate(along)
 
 
-def _partners_by_view(every: NeighbourQueries, w: int, parts: Sequence[QueryPart], gate: float) -> dict[int, Match]:
-    """Per view v that asks, what its points found in view w: all that ask one view are looked for at once."""
-    if not parts:
-        return {}
-    index, p, n = every.gather(parts)
-    _, partner, accept = every.search(w, p, n, gate)
-    bounds = np.append(0, np.cumsum(accept))[np.append(0, np.cumsum(every.counts(parts)))]
-    index, p, partner, scan, T = index[accept], p[accept], partner[accept], every.scans[w], every.poses[w]
-    q = frames.transform(T, scan.points[partner])
-    normal = n[accept] + frames.rotate(T, scan.normals[partner])
+def _partners_by_view(
+    every: NeighbourQueries,
+    w: int,
+    parts: Sequence[QueryPart],
+    gate: float,
+    partner: Array,
+    queries: tuple[Indices, Array, Array],
+) -> dict[int, Match]:
+    """Per view v that asks, what its points found in view w within the gate: all that ask one view at once.
+
+    Args:
+        partner: (N,) nearest points of view w, -1 where there is none.
+        queries: index, point and normal of all that ask, in the order of `parts`.
+    """
+    scan, T, some = every.scans[w], every.poses[w], np.flatnonzero(partner >= 0)
+    # Rows of three by `take`: an index in brackets takes four times as long.
+    index, p, n = (own.take(some, axis=0) for own in queries)
+    partner = partner[some].astype(np.int64)
+    q = frames.transform(T, scan.points.take(partner, axis=0))
+    other = frames.rotate(T, scan.normals.take(partner, axis=0))
+    apart, normal, cosine = p - q, n + other, np.einsum("ij,ij->i", n, other)
     normal /= np.sqrt(np.einsum("ij,ij->i", normal, normal))[:, None]
-    middle, residual, weight = (p + q) / 2, np.einsum("ij,ij->i", p - q, normal), scan.confidence[partner]
+    middle, residual = (p + q) / 2, np.einsum("ij,ij->i", apart, normal)
+    keep = np.flatnonzero((np.einsum("ij,ij->i", apart, apart) < gate**2) & (cosine > _NORMAL_COSINE))
+    bounds = np.searchsorted(some[keep], np.append(0, np.cumsum(every.counts(parts))))
     found = {}
     for (v, _), start, end in zip(parts, bounds[:-1], bounds[1:], strict=True):
-        # Copies: a part of a whole would keep all of it.
-        i, j = index[start:end].copy(), partner[start:end].copy()
-        m, n, r = (own[start:end].copy() for own in (middle, normal, residual))
-        found[v] = Match(v, w, m, n, r, weight=weight[start:end] * every.scans[v].confidence[i], index_v=i, index_w=j)
+        at = keep[start:end]
+        i, j = index[at], partner[at]
+        m, n, r = middle.take(at, axis=0), normal.take(at, axis=0), residual[at]
+        weight = scan.confidence[j] * every.scans[v].confidence[i]
+        found[v] = Match(v, w, m, n, r, weight=weight, index_v=i, index_w=j)
     return found
 
 
@@ -215,7 +312,7 @@ def overlapping_pairs(
 
 def near_pairs(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
     """Pairs (v < w) whose bounding boxes come within `gate`: no others can have partners."""
-    placed = [frames.transform(T, box_corners(bounding_box(scan.points))) for scan, T in zip(scans, poses, strict=True)]
+    placed = [frames.transform(T, box_corners(scan.box)) for scan, T in zip(scans, poses, strict=True)]
     low, high = np.min(placed, axis=1), np.max(placed, axis=1)
     apart = (low[:, None] - high[None] > gate).any(axis=2)
     v, w = np.nonzero(np.triu(~(apart | apart.T), 1))

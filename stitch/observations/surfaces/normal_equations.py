@@ -21,7 +21,7 @@ from stitch.errors import NoResultError
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture, Sightings
 from stitch.measurement.scan import Scan
-from stitch.observations.surfaces.matching import Match, match_pairs, overlapping_pairs, sample_points
+from stitch.observations.surfaces.matching import Match, Searched, match_pairs, overlapping_pairs, sample_points
 from stitch.statistics.distributions import mad_sigma, tukey
 
 # Residuals beyond 4 robust sigmas are not surface distances; for normal errors that cuts 0.006 %.
@@ -312,6 +312,7 @@ class Overlaps:
     gate: float
     targets: TargetPairs | None = None
     probed: tuple[Array, float] | None = None  # poses (V, 4, 4) and gate under which the pairs were found
+    searched: Searched | None = None  # where an iteration may go on from it
 
 
 def collect_overlaps(
@@ -325,17 +326,17 @@ def collect_overlaps(
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
-        before: of an iteration before; its pairs serve again where little has moved since they were found.
+        before: of an iteration before; its pairs and its search serve again where little has moved since then.
 
     Raises:
         NoResultError: no two views overlap.
     """
     if before is not None and before.probed is not None and _pairs_still_valid(before, poses, gate):
-        pairs, probed = before.pairs, before.probed
+        pairs, probed, searched = before.pairs, before.probed, before.searched
     else:
         pairs = overlapping_pairs(capture.scans, poses, gate, at_most=max(map(len, samples)))
-        probed = np.array(poses), gate
-    matches = list(match_pairs(capture.scans, poses, pairs, gate, samples))
+        probed, searched = (np.array(poses), gate), None
+    matches, searched = match_pairs(capture.scans, poses, pairs, gate, samples, searched)
     if not matches:
         raise NoResultError(
             f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "
@@ -343,7 +344,8 @@ def collect_overlaps(
         )
     surfaces = sum_matches(matches, len(capture.scans))
     targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
-    return Overlaps(pairs, matches, append_targets(surfaces, targets, capture.noise_factor), gate, targets, probed)
+    g = append_targets(surfaces, targets, capture.noise_factor)
+    return Overlaps(pairs, matches, g, gate, targets, probed, searched)
 
 
 def carry_overlaps(capture: Capture, before: Overlaps, start: Array, poses: Array) -> Overlaps:
