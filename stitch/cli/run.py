@@ -26,7 +26,7 @@ from stitch.cli.options import (
 from stitch.cli.progress import live_line, recorder_for, show_activity
 from stitch.cli.terminal import emit, in_full, say, show_block, show_files, show_next
 from stitch.errors import InputError
-from stitch.system.process import end_at_once
+from stitch.system.process import end_at_once, load_on_use
 
 if TYPE_CHECKING:
     from stitch.api.live import LiveSession
@@ -102,6 +102,8 @@ def run(
       stitch run fuselage --memory 4GB
       stitch run blade-19 --follow
     """
+    # A tenth of a second: scipy imports all that numpy has, also what compiles and tests.
+    load_on_use("numpy.f2py", "numpy.testing")
     _require_mesh_kind(mesh)
     named = [name for name in split_names(effects) if name]
     _require_known(tolerance, named, effects_file, register)

@@ -16,7 +16,6 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.reading.text_files import import_extra, read_text, shortened
-from stitch.reading.yaml_file import parse_yaml
 
 # What a depth image's pixels look along: the camera's intrinsics from the file that lies beside it.
 #
@@ -82,6 +81,8 @@ def _read_intrinsics(file: Path) -> Intrinsics | None:
         elif file.suffix.lower() == ".json":
             document = json.loads(told)
         else:
+            from stitch.reading.yaml_file import parse_yaml
+
             documents = parse_yaml(file, told)
             document = documents[0] if documents else None
     except (ValueError, RecursionError, InputError):

@@ -280,7 +280,7 @@ def _looked_through(
     contradicted[asked] = past + missed > 0
     loose = np.zeros(len(held), bool)
     ends = np.cumsum([0, *(len(scan.points) for scan in scans)])
-    for v in np.unique(own[contradicted[asked]]):
+    for v in np.flatnonzero(np.bincount(own[contradicted[asked]]) > _WITNESSES):
         # What stands in the way of one view may stand near what others show.
         every = ends[v] + np.flatnonzero(kept[v])
         loose[every] = _in_loose_body(placed.points[every], settled[every], contradicted[every], cell)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import LazyLoader, find_spec, module_from_spec
 from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 from stitch.errors import InputError
@@ -110,6 +111,19 @@ def may_end_process() -> None:
     """A call that cannot be interrupted ends the process: right for a command, not for a program that uses stitch."""
     global _ends_process
     _ends_process = True
+
+
+def load_on_use(*names: str) -> None:
+    """Let modules of packages be loaded when something of them is asked for, whoever imports them before."""
+    for name in names:
+        spec = find_spec(name)
+        if name in sys.modules or spec is None or spec.loader is None:
+            continue
+        spec.loader = LazyLoader(spec.loader)
+        module = sys.modules[name] = module_from_spec(spec)
+        spec.loader.exec_module(module)
+        package, _, own = name.rpartition(".")
+        setattr(sys.modules[package], own, module)
 
 
 def end_at_once() -> None:

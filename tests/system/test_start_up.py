@@ -29,11 +29,13 @@ def test_dear_libraries_are_loaded_when_they_are_needed(module, also_without):
 
 def test_a_run_loads_nothing_of_the_diagnosis():
     """Nor of plans, pictures and meshes: all that it needs from the first file to the page."""
-    modules = loaded("import stitch.cli.run, stitch.pipeline, stitch.writing.run_folder, viz.run_page")
-    assert "stitch.stages.register" in modules
-    assert not modules & (
-        DEAR | {"stitch.diagnosis", "stitch.planning", "stitch.explanation", "scipy.cluster", "scipy.interpolate"}
-    )
+    on_use = "from stitch.system.process import load_on_use; load_on_use('numpy.f2py', 'numpy.testing')\n"
+    modules = loaded(f"{on_use}import stitch.cli.run, stitch.pipeline, stitch.writing.run_folder, viz.run_page")
+    assert {"stitch.stages.register", "scipy.optimize", "numpy.f2py"} <= modules
+    without = {"scipy.cluster", "scipy.interpolate", "scipy.ndimage", "yaml", "numpy.f2py.rules", "unittest"}
+    assert not modules & (DEAR | without | {"stitch.diagnosis", "stitch.planning", "stitch.explanation"})
+    asked = "import scipy.optimize, numpy; numpy.testing.assert_allclose(1, 1); numpy.f2py.run_main"
+    assert {"numpy.f2py.rules", "unittest"} <= loaded(on_use + asked)
 
 
 def test_scans_are_read_and_prepared_while_scipy_is_loaded():
