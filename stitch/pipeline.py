@@ -132,20 +132,20 @@ def run_rig(
 
 def _fit_and_report(
     fit: Callable[[Sequence[Session], Sequence[Measurement]], FittedRig],
-    begin_to_register: Callable[[FittedRig], FittedRig],
+    begin_to_register: Callable[[FittedRig, Sequence[Session]], FittedRig],
     whole: Sequence[Session],
     recorders: Sequence[Recorder],
     sessions: Sequence[Session],
     measurements: Sequence[Measurement],
 ) -> FittedRig:
-    """Fit the views that are left, tell the recorders where these are fewer, and begin to register.
+    """Fit the views that are left, tell the recorders where these are fewer, and begin to register and to fuse.
 
-    Nearly always all views belong: they are registered while they are screened.
+    Nearly always all views belong: they are registered and fused while they are screened.
     """
     for before, session, recorder in zip(whole, sessions, recorders, strict=True):
         if len(session.views) < len(before.views):
             recorder.start(session)
-    return begin_to_register(fit(sessions, measurements))
+    return begin_to_register(fit(sessions, measurements), sessions)
 
 
 def _note_arm_transfer(end: FitSummary, here: ArmTransfer, length_unit: str) -> FitSummary:
@@ -238,7 +238,7 @@ def change(state: Run, effects: Sequence[str], recorder: Recorder | None = None)
         before = steps.initial_stage(measurement, begun, clock.lap(), recorder)
         clock.lap()
         fitted = steps.refit([session], [measurement], model, [state.gate], recorder)
-        fitted = steps.begin_to_register(fitted, state.register_method or DEFAULT)
+        fitted = steps.begin_to_register(fitted, [session], state.register_method or DEFAULT)
         own = fitted.sessions[0].measurement
         end = FitSummary(
             starts=[begun],

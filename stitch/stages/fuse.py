@@ -141,6 +141,11 @@ class RegisteredSession:
         return intensity_scale(self.session)
 
 
+def has_whole_clouds(session: Session) -> bool:
+    """True if memory holds only some of the points that were scanned."""
+    return any(view.cloud is not None and view.cloud.whole is not None for view in session.views)
+
+
 def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[FusedCloud, Unsupported]:
     """Fuse all supported points that were scanned, those in memory and those in files; return what was dropped as well.
 
@@ -150,9 +155,9 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     Raises:
         InputError: a scan is not what it was when it was read, or there is no room for the fused cloud.
     """
-    session, own, poses = registered.session, registered.own, registered.poses
+    own, poses = registered.own, registered.poses
     cell = float(np.median([scan.scanned_spacing for scan in own.scans]))
-    whole = any(view.cloud is not None and view.cloud.whole is not None for view in session.views)
+    whole = has_whole_clouds(registered.session)
     # Points in memory may stand in rows: not their spacing says what place one has, but its surface.
     place = float(np.sqrt(np.median([np.median(scan.area) for scan in own.scans]))) if whole else own.spacing
     placed = place_scans(own.scans, poses)

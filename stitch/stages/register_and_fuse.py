@@ -1,9 +1,10 @@
 """The last steps of a run: register single views, fuse them, collect the result."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -20,10 +21,10 @@ from stitch.observations.surfaces.normal_equations import RMS_GATE, Overlaps
 from stitch.observations.surfaces.view_poses import noise_floor
 from stitch.observations.targets.target_model import TargetModelFit, rms_of
 from stitch.runs.recorder import IterationMemory, Recorder
-from stitch.runs.run import Fit, FusedCloud, LedgerStep, StageResult
+from stitch.runs.run import Fit, FusedCloud, LedgerStep, StageResult, Unsupported
 from stitch.stages.coarse import CoarseHandEye
 from stitch.stages.correct import Correction
-from stitch.stages.fuse import RegisteredSession, fuse_every_point
+from stitch.stages.fuse import RegisteredSession, fuse_every_point, has_whole_clouds
 from stitch.stages.register import Method, Registration, register, register_targets, unseen_moves
 from stitch.stages.sentences import correct_note, register_note, support_note, surface_sentence, target_sentence
 from stitch.stages.target_fit import FittedSession
@@ -40,26 +41,57 @@ class BegunRegistration:
 
     method: str
     registration: Future[tuple[Registration, float]]  # and its seconds
+    # The same, where all points are in memory; None where they are read again, which takes time and room.
+    fused: Future[tuple[FusedCloud, Unsupported, float]] | None
     iterations: IterationMemory
 
 
-def begin_to_register_views(correction: Correction, method: Method) -> tuple[BegunRegistration, ...]:
-    """Begin to register the views of every session under the common model, one session after the other."""
-    memories = [IterationMemory() for _ in correction.captures]
-    coming = [Future[tuple[Registration, float]]() for _ in correction.captures]
+def begin_to_register_views(
+    fitted: "FittedRig", sessions: Sequence[Session], method: Method
+) -> tuple[BegunRegistration, ...]:
+    """Begin to register and to fuse the views of every session under the common model, one session after the other."""
+    correction = fitted.correction
+    assert correction is not None
+    coming = [
+        BegunRegistration(method.name, Future(), None if has_whole_clouds(session) else Future(), IterationMemory())
+        for session in sessions
+    ]
+
+    def register_one(i: int, session: Session, begun: BegunRegistration) -> None:
+        clock, model, own = Clock(), correction.geometry, correction.captures[i]
+        overlaps, start = correction.overlaps[i], correction.unconstrained[i].poses
+        with _errors_told_to(begun.registration):
+            found = register(
+                own,
+                own.poses(model.T_mount),
+                correction.scatter[i],
+                overlaps.gate,
+                begun.iterations,
+                start,
+                method,
+                overlaps,
+            )
+            begun.registration.set_result((found, clock.lap()))
+            if begun.fused is not None and not begun.iterations.stopped:
+                with _errors_told_to(begun.fused):
+                    registered = RegisteredSession(session, fitted.sessions[i].measurement, model, own, found.poses)
+                    begun.fused.set_result((*fuse_every_point(registered), clock.lap()))
 
     def register_all() -> None:
-        for i, (own, found) in enumerate(zip(correction.captures, coming, strict=True)):
-            clock, poses = Clock(), own.poses(correction.geometry.T_mount)
-            scatter, overlaps, start = correction.scatter[i], correction.overlaps[i], correction.unconstrained[i].poses
-            try:
-                registration = register(own, poses, scatter, overlaps.gate, memories[i], start, method, overlaps)
-                found.set_result((registration, clock.lap()))
-            except BaseException as error:
-                found.set_exception(error)
+        for i, (session, begun) in enumerate(zip(sessions, coming, strict=True)):
+            register_one(i, session, begun)
 
     begin(register_all)
-    return tuple(BegunRegistration(method.name, *both) for both in zip(coming, memories, strict=True))
+    return tuple(coming)
+
+
+@contextmanager
+def _errors_told_to(future: Future[Any]) -> Iterator[None]:
+    """Errors of the block are raised where the result is asked for."""
+    try:
+        yield
+    except BaseException as error:
+        future.set_exception(error)
 
 
 def finish_surfaces(
@@ -73,7 +105,7 @@ def finish_surfaces(
     seconds: float,
     begun: BegunRegistration,
 ) -> tuple[Fit, LedgerStep]:
-    """Wait for session `index` of a rig to be registered, fuse it, and show it to the recorder.
+    """Wait for session `index` of a rig to be registered and fused, and show it to the recorder.
 
     Raises:
         InputError: a scan changed on disk since it was read.
@@ -90,10 +122,14 @@ def finish_surfaces(
     registered = _overlap_stage("register", registration.overlaps, len(registration.history), taken, note)
     registered = replace(registered, method=begun.method)
     recorder.stage(registered, registration.poses)
-    clock = Clock()
-    fused, unsupported = fuse_every_point(RegisteredSession(session, measurement, model, own, registration.poses))
+    if begun.fused is not None:
+        fused, unsupported, taken = begun.fused.result()
+    else:
+        clock = Clock()
+        fused, unsupported = fuse_every_point(RegisteredSession(session, measurement, model, own, registration.poses))
+        taken = clock.lap()
     dropped = support_note(unsupported)
-    last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, clock.lap(), dropped)
+    last = StageResult("fuse", _fused_rms(fused.residual), int((fused.count > 1).sum()), 1, taken, dropped)
     recorder.stage(last, registration.poses)
     floor = noise_floor(own, registration.overlaps, session.scanner.noise)
     found = Fit(
@@ -266,8 +302,8 @@ class Pipeline(Protocol):
         """What was observed, as one linear model about a model."""
         ...
 
-    def begin_to_register(self, fitted: FittedRig, register: str) -> FittedRig:
-        """The same, with single views being registered by a method while other things go on."""
+    def begin_to_register(self, fitted: FittedRig, sessions: Sequence[Session], register: str) -> FittedRig:
+        """The same, with single views being registered by a method, and fused, while other things go on."""
         ...
 
     def finish(

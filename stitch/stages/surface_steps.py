@@ -119,10 +119,9 @@ def linearise(session: Session, measurement: Measurement, model: Model, gate: fl
     return surface_model(measurement, model, own, unconstrained_poses(own, own.poses(model.T_mount), gate))
 
 
-def begin_to_register(fitted: FittedRig, register: str) -> FittedRig:
-    """The same, with the views of all sessions being registered by a method."""
-    assert fitted.correction is not None
-    return replace(fitted, begun=begin_to_register_views(fitted.correction, METHODS[register]))
+def begin_to_register(fitted: FittedRig, sessions: Sequence[Session], register: str) -> FittedRig:
+    """The same, with the views of all sessions being registered by a method, and fused."""
+    return replace(fitted, begun=begin_to_register_views(fitted, sessions, METHODS[register]))
 
 
 def finish(

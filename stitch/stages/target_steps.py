@@ -120,7 +120,7 @@ def linearise(session: Session, measurement: Measurement, model: Model, gate: fl
     return target_model(measurement, model, drawing_of(session.nominal, _sightings(measurement)))
 
 
-def begin_to_register(fitted: FittedRig, register: str) -> FittedRig:
+def begin_to_register(fitted: FittedRig, sessions: Sequence[Session], register: str) -> FittedRig:
     """The same: `register` names a method of surfaces, which labelled points do not need."""
     return fitted
 

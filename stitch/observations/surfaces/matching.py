@@ -29,7 +29,7 @@ QueryPart = tuple[int, slice]
 class Nearest:
     """What N points found in one view."""
 
-    partner: Array  # (N,) int32 usable point of the view; -1 where none lies within reach
+    partner: NDArray[np.int32]  # (N,) usable point of the view; -1 where none lies within reach
     lead: Array  # (N,) float32: with less than half of it as motion no other point comes nearer within the gate
 
 
@@ -62,12 +62,12 @@ class NeighbourQueries:
         lead = np.maximum(np.minimum(second, reach) - first, 2 * (first - gate))
         return Nearest(self._usable(w, index.reshape(len(query), -1)[:, 0]), lead.astype(np.float32))
 
-    def partners(self, w: int, points: Array, gate: float) -> Array:
-        """(N,) int32 usable points of view w that are nearest to points (N, 3) of the reference frame, -1 for none."""
+    def partners(self, w: int, points: Array, gate: float) -> NDArray[np.int32]:
+        """(N,) usable points of view w that are nearest to points (N, 3) of the reference frame, -1 for none."""
         query = np.ascontiguousarray(frames.transform(frames.inverse(self.poses[w]), points))
         return self._usable(w, self.scans[w].tree.query(query, k=1, distance_upper_bound=gate)[1])
 
-    def _usable(self, w: int, index: Array) -> Array:
+    def _usable(self, w: int, index: NDArray[np.uint32]) -> NDArray[np.int32]:
         # Where none is found its number is one beyond the last.
         return np.where(np.append(self.scans[w].usable, False)[index], index.astype(np.int32), np.int32(-1))
 
@@ -240,19 +240,19 @@ def _partners_by_view(
     w: int,
     parts: Sequence[QueryPart],
     gate: float,
-    partner: Array,
+    nearest: NDArray[np.int32],
     queries: tuple[Indices, Array, Array],
 ) -> dict[int, Match]:
     """Per view v that asks, what its points found in view w within the gate: all that ask one view at once.
 
     Args:
-        partner: (N,) nearest points of view w, -1 where there is none.
+        nearest: (N,) points of view w, -1 where there is none.
         queries: index, point and normal of all that ask, in the order of `parts`.
     """
-    scan, T, some = every.scans[w], every.poses[w], np.flatnonzero(partner >= 0)
+    scan, T, some = every.scans[w], every.poses[w], np.flatnonzero(nearest >= 0)
+    index, partner = queries[0][some], nearest[some].astype(np.int64)
     # Rows of three by `take`: an index in brackets takes four times as long.
-    index, p, n = (own.take(some, axis=0) for own in queries)
-    partner = partner[some].astype(np.int64)
+    p, n = (own.take(some, axis=0) for own in queries[1:])
     q = frames.transform(T, scan.points.take(partner, axis=0))
     other = frames.rotate(T, scan.normals.take(partner, axis=0))
     apart, normal, cosine = p - q, n + other, np.einsum("ij,ij->i", n, other)
