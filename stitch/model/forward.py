@@ -262,8 +262,8 @@ class _ChainJacobian:
             return _apply_matrices(self.of_flange, np.array(moved))
         mount = np.array([up.mount - down.mount for up, down in steps])
         part = np.array([up.part - down.part for up, down in steps])
-        moved = _apply_matrices(self.of_part, part) if part.any() else part
-        return moved + _apply_matrices(self.of_mount, mount) if mount.any() else moved
+        of_part = _apply_matrices(self.of_part, part) if part.any() else part
+        return of_part + _apply_matrices(self.of_mount, mount) if mount.any() else of_part
 
     @cached_property
     def flange(self) -> FlangeSlopes:
