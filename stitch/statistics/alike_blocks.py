@@ -7,6 +7,7 @@ XᵀV⁻¹Y over the views is a sum over pairs of those numbers, each times what
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -52,6 +53,12 @@ class AlikeGroup:
     turn: Array  # (n, r, m) orthonormal rows, of numbers in units of the sensor's noise
     components: Array  # (c, r, r) of the covariance of the turned numbers, the sensor's noise last
 
+    @cached_property
+    def pairs(self) -> tuple[Indices, Indices]:
+        """The numbers of every pair, and of each with itself, in the order of `pair_products`."""
+        first, second = np.triu_indices(self.turn.shape[1])
+        return first, second
+
 
 @dataclass(frozen=True)
 class AlikeWeights:
@@ -85,13 +92,13 @@ class AlikeBlocks:
         traces, curvature = np.zeros(count), np.zeros((count, count))
         for group in self.groups:
             inverse = invert_covariance(np.tensordot(variances, group.components, axes=1)[None])
-            W, n, upper = inverse.matrix[0], len(group.blocks), np.triu_indices(group.turn.shape[1])
+            W, n, upper = inverse.matrix[0], len(group.blocks), group.pairs
             shares = W @ group.components
             logdet += n * inverse.logdet
             pairs.append(W[upper])
             slopes.append((shares @ W)[:, *upper])
-            traces += n * np.einsum("cii->c", shares)
-            curvature += n * np.einsum("cij,dji->cd", shares, shares)
+            traces += n * shares.trace(axis1=1, axis2=2)
+            curvature += n * shares.reshape(count, -1) @ shares.transpose(0, 2, 1).reshape(count, -1).T
         of_noise = np.arange(count) == count - 1
         traces[-1] += self.noise_alone / noise
         curvature[-1, -1] += self.noise_alone / noise**2
@@ -146,13 +153,18 @@ class AlikeBlocks:
 
 
 def pair_products(X: Sequence[Array], Y: Sequence[Array]) -> Array:
-    """(t, k, q) sums over blocks of the products of every pair of turned numbers, of columns X and Y as `turned`."""
+    """(t, k, q) sums over blocks of the products of every pair of turned numbers, of columns X and Y as `turned`.
+
+    Both orders of a pair count as one: V⁻¹ says the same of them.
+    """
     out = []
     for x, y in zip(X, Y, strict=True):
-        k, r, n = x.shape
-        every = (x.reshape(k * r, n) @ y.reshape(len(y) * r, n).T).reshape(k, r, len(y), r)
-        i, j = np.triu_indices(r)
-        out.append(every[:, i, :, j] + (i != j)[:, None, None] * every[:, j, :, i])
+        (k, r, n), q = x.shape, len(y)
+        every = (x.reshape(k * r, n) @ y.reshape(q * r, n).T).reshape(k, r, q, r).transpose(1, 3, 0, 2)
+        for i in range(r):
+            own = every[i, i:].copy()
+            own[1:] += every[i + 1 :, i]
+            out.append(own)
     return np.concatenate(out)
 
 
