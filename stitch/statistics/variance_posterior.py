@@ -16,7 +16,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from stitch.frames import Array, Mask
 from stitch.statistics.least_squares import column_space
@@ -105,9 +106,19 @@ class _MeanFreeData:
     roots: list[Array]  # per component (n, rank)
     fixed: Array  # (n, n)
 
-    def half(self, variances: Array) -> Array:
-        """(n, n) lower Cholesky factor of the covariance."""
-        return np.asarray(np.linalg.cholesky(self.fixed + np.tensordot(variances, self.components, axes=1)))
+    def whitened(self, variances: Array, i: int) -> tuple[Array, Array]:
+        """The square root of component i and the numbers, L⁻¹ times both, with L Lᵀ the covariance.
+
+        Raises:
+            LinAlgError: the covariance is not positive.
+        """
+        covariance = self.fixed + np.tensordot(variances, self.components, axes=1)
+        # What surrounds these routines in scipy takes longer than they do.
+        half, failed = dpotrf(covariance, lower=1, clean=0, overwrite_a=1)
+        if failed:
+            raise np.linalg.LinAlgError("covariance is not positive")
+        both = dtrtrs(half, np.column_stack([self.roots[i], self.z]), lower=1)[0]
+        return both[:, :-1], both[:, -1]
 
 
 def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
@@ -192,11 +203,10 @@ def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, dens
 
     V(λ) = V + (λ − λ_i) C = L (1 + (λ − λ_i) M) Lᵀ with M = L⁻¹ C L⁻ᵀ: one decomposition for the whole grid.
     """
-    half = data.half(current)
-    root = solve_triangular(half, data.roots[i], lower=True)
+    root, z = data.whitened(current, i)
     values, vectors = np.linalg.eigh(root.T @ root)
     values = np.maximum(values, 1e-300)
-    along = vectors.T @ (root.T @ solve_triangular(half, data.z, lower=True))
+    along = vectors.T @ (root.T @ z)
     # Rounding must not take away more than there is.
     times = np.maximum(1 + (grid[:, None] - current[i]) * values, 1e-12)
     logs = density - 0.5 * (np.log(times) + along**2 / values * (1 / times - 1)).sum(axis=1)

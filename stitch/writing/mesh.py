@@ -22,7 +22,8 @@ _NEIGHBOURS = 16
 _REACH = 2.5
 # The mesh reaches at most so many cells beyond the last points: holes between points are narrower.
 _OVERHANG = 1.0
-_BLOCK = 20_000
+# Points that tell the spacing; places that are worked on at a time, as many as stay in a core's cache.
+_SAMPLES, _IN_CACHE = 20_000, 4096
 # Ends where the points do; closed; with a tenth of the triangles. Open3D makes the latter two.
 OPEN, WATERTIGHT, LIGHT = KINDS = ("open", "watertight", "light")
 NO_SURFACE = "no mesh: the fused points span no surface; run without --mesh"
@@ -84,7 +85,7 @@ def mesh_of(points: Array, normals: Array, outside: float = 0.0) -> TriangleMesh
 
 def spacing(points: Array, tree: Any) -> float:
     """Return the edge of the square that one point has for itself: the disc to the 8th neighbour holds 8 of them."""
-    distance, _ = tree.query(points[:: max(1, len(points) // _BLOCK)], k=9)
+    distance, _ = tree.query(points[:: max(1, len(points) // _SAMPLES)], k=9)
     return float(np.median(distance[:, -1]) * np.sqrt(np.pi / 8))
 
 
@@ -104,20 +105,24 @@ def _cells_about(points: Array, size: float) -> tuple[Array, Indices]:
 def _heights(places: Array, points: Array, normals: Array, tree: Any, size: float) -> tuple[Array, Array]:
     """Signed distance (P,) of places (P, 3) from the surface, and distance (P,) from the nearest point."""
 
+    # Coordinates first, then neighbours, each in one piece: sums over rows of three or sixteen take three times as long.
+    columns, facing = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T)
+
     def of(block: Array) -> tuple[Array, Array]:
-        distance, index = tree.query(block, k=_NEIGHBOURS)
-        n = normals[index]
+        distance, index = (np.ascontiguousarray(x.T) for x in tree.query(block, k=_NEIGHBOURS))
+        n = np.array([column.take(index) for column in facing])
+        away = np.array([at - column.take(index) for column, at in zip(columns, block.T, strict=True)])
         # Of a thin sheet only the nearer side counts.
-        agree = np.maximum(np.einsum("pki,pi->pk", n, n[:, 0]), 0)
-        weight = agree * np.exp((distance[:, :1] ** 2 - distance**2) / size**2)
-        weight /= weight.sum(axis=1, keepdims=True)
-        here = np.einsum("pk,pki->pi", weight, n)
-        here /= np.linalg.norm(here, axis=1, keepdims=True)
+        agree = np.maximum(np.einsum("ikp,ip->kp", n, n[:, 0]), 0)
+        weight = agree * np.exp((distance[0] ** 2 - distance**2) / size**2)
+        weight /= weight.sum(axis=0)
+        here = np.einsum("kp,ikp->ip", weight, n)
+        here /= np.sqrt(np.einsum("ip,ip->p", here, here))
         # Tangent planes at the points lie above a convex surface, one at the place itself below it: on a ball the
         # mean of both normals is exact, as in symmetric ICP (Rusinkiewicz 2019).
-        above = np.einsum("pki,pki->pk", (n + here[:, None]) / 2, block[:, None] - points[index])
-        return (weight * above).sum(axis=1), distance[:, 0]
+        n += here[:, None]
+        return np.einsum("kp,kp->p", weight, np.einsum("ikp,ikp->kp", n, away)) / 2, distance[0]
 
-    blocks = parallel(of, np.array_split(places, len(places) // _BLOCK + 1), "blocks of the mesh")
+    blocks = parallel(of, np.array_split(places, len(places) // _IN_CACHE + 1), "blocks of the mesh")
     heights, nearest = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     return heights, nearest
