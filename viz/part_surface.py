@@ -111,7 +111,7 @@ def part_surface(fused: FusedCloud, patches: Patches, shape: PartShape | None = 
     distance, index = KDTree(np.ascontiguousarray(patches.points)).query(points, k=count)
     distance, index = distance.reshape(len(points), -1), index.reshape(len(points), -1).astype(np.int64)
     # A thin sheet has two sides, each with patches of its own.
-    facing = np.einsum("nki,ni->nk", patches.normals[index], normals) > _SAME_SIDE
+    facing = np.einsum("nki,ni->nk", patches.normals.take(index, axis=0), normals) > _SAME_SIDE
     weight = np.where(facing, 1.0, 1e-6) / (distance**2 + (0.2 * patches.radius) ** 2)
     best = np.argsort(-weight, axis=1)[:, :_NEAREST]
     index, weight = (np.take_along_axis(x, best, axis=1) for x in (index, weight))

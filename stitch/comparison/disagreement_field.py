@@ -160,8 +160,8 @@ def patches_of(matches: Sequence[Match], views: int, scale: float, model_distanc
     """
     quiet = np.concatenate([m.residual for m in matches])
     inside = np.abs(quiet) < RMS_GATE * scale
-    middle = np.concatenate([m.middle for m in matches])[inside]
-    normal = np.concatenate([m.normal for m in matches])[inside]
+    middle = np.concatenate([m.middle for m in matches]).compress(inside, axis=0)
+    normal = np.concatenate([m.normal for m in matches]).compress(inside, axis=0)
     pair = [np.concatenate([np.full(len(m.residual), getattr(m, side)) for m in matches])[inside] for side in "vw"]
     view = np.concatenate(pair).astype(np.int64)
     size = float(np.ptp(np.quantile(middle, [0.005, 0.995], axis=0), axis=0).max())
@@ -205,7 +205,7 @@ def _kernel(place: Array, outwards: Array, centre: Array, facing: Array, radius:
     distance, index = distance.reshape(len(place), -1), index.reshape(len(place), -1)
     found = np.isfinite(distance)
     index = np.where(found, index, 0).astype(np.int64)
-    found &= np.einsum("kni,ki->kn", facing[index], outwards) > _SAME_SIDE
+    found &= np.einsum("kni,ki->kn", facing.take(index, axis=0), outwards) > _SAME_SIDE
     row = np.broadcast_to(np.arange(len(place))[:, None], index.shape)[found]
     weights = np.exp(-((distance[found] / radius) ** 2) / 2)
     return csr_matrix((weights, (row, index[found])), shape=(len(place), len(centre)))

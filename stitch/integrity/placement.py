@@ -60,8 +60,8 @@ def nearest_partners(scan: Scan, points: Array, normals: Array, reach: float) ->
     distance, partner = scan.tree.query(np.ascontiguousarray(points), distance_upper_bound=reach)
     found = np.isfinite(distance)
     partner = np.where(found, partner, 0).astype(np.int64)
-    own = scan.normals[partner]
-    along = np.einsum("ni,ni->n", points - scan.points[partner], own)
+    own = scan.normals.take(partner, axis=0)
+    along = np.einsum("ni,ni->n", points - scan.points.take(partner, axis=0), own)
     found &= scan.usable[partner] & (np.einsum("ni,ni->n", normals, own) > _SAME_SIDE)
     beside = np.sqrt(np.maximum(distance**2 - along**2, 0.0), where=found, out=np.full(len(points), np.inf))
     return partner, along, beside
@@ -137,8 +137,8 @@ def _point_visibility(
         shown = {w: np.zeros(len(index), np.int8) for w in near[v]}
         for k, w in enumerate(near[v]):
             asked, T_w_v = slice(k % turns, None, turns), frames.inverse(poses[w]) @ poses[v]
-            points = frames.transform(T_w_v, scan.points[index[asked]])
-            normals = frames.rotate(T_w_v, scan.normals[index[asked]])
+            points = frames.transform(T_w_v, scan.points.take(index[asked], axis=0))
+            normals = frames.rotate(T_w_v, scan.normals.take(index[asked], axis=0))
             shown[w][asked] = classify_visibility(scans[w], points, normals, (tolerance, reach))
         return shown
 

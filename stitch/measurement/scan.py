@@ -19,6 +19,16 @@ def bounding_box(points: Array) -> Array:
     return np.array([[f(column) for column in points.T] for f in (np.min, np.max)])
 
 
+def centroid(points: Array) -> Array:
+    """(3,) mean of points (N, 3)."""
+    return np.array([column.mean() for column in points.T])
+
+
+def spread(points: Array) -> float:
+    """Rms distance of points (N, 3) from their centroid."""
+    return float(np.sqrt(sum(column.var() for column in points.T)))
+
+
 def box_corners(box: Array) -> Array:
     """(8, 3) of a box (2, 3)."""
     return np.array(np.meshgrid(*box.T)).reshape(3, 8).T
@@ -65,7 +75,7 @@ class Scan:
     @cached_property
     def size(self) -> float:
         """Diameter of the points, length_unit: twice their rms distance from their centroid."""
-        return 2 * float(np.sqrt(self.points.var(axis=0).sum()))
+        return 2 * spread(self.points)
 
     @cached_property
     def solid_angle(self) -> float:

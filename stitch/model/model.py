@@ -71,7 +71,8 @@ class Term:
             >>> better.terms[0].at(np.zeros(1)).values
             array([0.])
         """
-        own = [replace(p, value=float(v)) for p, v in zip(self.parameters, values, strict=True)]
+        every = zip(self.parameters, values, strict=True)
+        own = [p if p.value == v else replace(p, value=float(v)) for p, v in every]
         if sigmas is not None:
             own = [replace(p, sigma=float(s)) for p, s in zip(own, sigmas, strict=True)]
         return replace(self, parameters=tuple(own))

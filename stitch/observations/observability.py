@@ -16,6 +16,7 @@ from stitch.frames import Array
 from stitch.measurement import robot as kinematics
 from stitch.measurement.capture import Capture
 from stitch.measurement.robot import Robot
+from stitch.measurement.scan import centroid, spread
 
 # Names of the hand-eye's numbers: position, then rotation vector.
 NUMBERS = ("x", "y", "z", "rx", "ry", "rz")
@@ -29,8 +30,11 @@ _TURNED = np.radians(0.5)
 
 def seen_part(captures: Sequence[Capture]) -> tuple[Array, float]:
     """Return the centre (3,) of what the scanner saw, scanner frame, and the size of the part, length_unit."""
-    centre = np.asarray(np.mean([p.mean(axis=0) for c in captures for p in c.point_sets], axis=0))
-    size = float(np.median([np.sqrt(p.var(axis=0).sum()) for c in captures for p in c.point_sets]))
+    every = [points for c in captures for points in c.point_sets]
+    centre, size = (
+        np.asarray(np.mean([centroid(p) for p in every], axis=0)),
+        float(np.median([spread(p) for p in every])),
+    )
     # A probe is a point: a tenth of its distance stands in for its size.
     return centre, size or 0.1 * float(np.linalg.norm(centre))
 

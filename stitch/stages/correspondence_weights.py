@@ -51,8 +51,8 @@ def agreement(m: Match, capture: Capture, poses: Array) -> Array:
     silhouette, counts little even where the distance happens to be small.
     """
     T_w_v = frames.inverse(poses[m.w]) @ poses[m.v]
-    normals = frames.rotate(T_w_v, capture.scans[m.v].normals[m.index_v])
-    cosine = np.einsum("ij,ij->i", normals, capture.scans[m.w].normals[m.index_w])
+    normals = frames.rotate(T_w_v, capture.scans[m.v].normals.take(m.index_v, axis=0))
+    cosine = np.einsum("ij,ij->i", normals, capture.scans[m.w].normals.take(m.index_w, axis=0))
     sine2 = np.clip(1 - cosine, 0.0, 2.0) / 2
     return np.asarray(1 / (1 - sine2 + sine2 / _EPSILON))
 

@@ -94,7 +94,7 @@ def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> Ra
     """
 
     def rays(scan: Scan, keep: Mask) -> tuple[Array, Array]:
-        away = scan.points[keep] - scan.eye
+        away = scan.points.compress(keep, axis=0) - scan.eye
         far = np.linalg.norm(away, axis=1)
         return far, away / far[:, None]
 

@@ -66,7 +66,7 @@ class PlacedPoints:
 
     def take(self, keep: Mask) -> "PlacedPoints":
         """Some of them."""
-        return PlacedPoints(*(getattr(self, f.name)[keep] for f in fields(PlacedPoints)))
+        return PlacedPoints(*(getattr(self, f.name).compress(keep, axis=0) for f in fields(PlacedPoints)))
 
 
 @dataclass(frozen=True)
@@ -194,11 +194,11 @@ def _held_by_own_view(scan: Scan, settled: Mask, noise: float, angle_each: float
     junk = float(alone.sum()) / len(scan.points)
     credit = edge_credit(junk)
     vote = np.where(scan.usable[index], 1.0, _EDGE_VOTE)
-    around = scan.points[index] - scan.points[asked][:, None]
-    centroid = around.mean(axis=1)
+    around = scan.points.take(index, axis=0) - scan.points.take(asked, axis=0)[:, None]
+    centroid, normals = around.mean(axis=1), scan.normals.take(index, axis=0)
     # What the first round throws out supports nothing in the second.
     for _ in range(2):
-        local = _LocalSurface(around, scan.normals[index], vote * held[index])
+        local = _LocalSurface(around, normals, vote * held[index])
         aside = np.linalg.norm(centroid - np.einsum("ij,ij->i", centroid, local.normal)[:, None] * local.normal, axis=1)
         rounded = np.minimum(credit * np.maximum(aside - _AROUND * radius, 0), _ROUNDED * radius)
         within = _SIGMAS * noise + local.bend * radius / 2 + np.where(share < _EDGE_ALONE, rounded, 0.0)
@@ -240,8 +240,8 @@ def _held_by_all_views(placed: PlacedPoints, held: Mask, scatter: float, cell: f
     distance, index = tree.query(placed.points[asked], k=_NEIGHBOURS, distance_upper_bound=_NEAR * cell)
     near = np.isfinite(distance[:, -1])
     asked, index, radius = asked[near], base[index[near]], distance[near, -1]
-    around = placed.points[index] - placed.points[asked][:, None]
-    local = _LocalSurface(around, placed.normals[index], np.ones(index.shape))
+    around = placed.points.take(index, axis=0) - placed.points[asked][:, None]
+    local = _LocalSurface(around, placed.normals.take(index, axis=0), np.ones(index.shape))
     within = _SIGMAS * scatter + local.bend * radius / 2
     found[asked] = (local.votes > _NEIGHBOURS / 2 - 1) & (np.abs(local.height) < within)
     return found

@@ -105,7 +105,7 @@ def _cells_about(points: Array, size: float) -> tuple[Array, Indices]:
 def _heights(places: Array, points: Array, normals: Array, tree: Any, size: float) -> tuple[Array, Array]:
     """Signed distance (P,) of places (P, 3) from the surface, and distance (P,) from the nearest point."""
 
-    # Coordinates first, then neighbours, each in one piece: sums over rows of three or sixteen take three times as long.
+    # Coordinates first, then neighbours, each in one piece: sums over rows of three or sixteen take longer.
     columns, facing = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T)
 
     def of(block: Array) -> tuple[Array, Array]:

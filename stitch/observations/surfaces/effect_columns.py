@@ -120,7 +120,7 @@ def _distance_changes(matches: Sequence[Match], slopes: Callable[[int, Indices, 
     for view in sorted({side[0] for side in sides}):
         index, at = (np.concatenate([side[i] for side in sides if side[0] == view]) for i in (1, 2))
         second = np.concatenate([np.full(len(side[2]), side[3]) for side in sides if side[0] == view])
-        moved = slopes(view, index, normal[at])
+        moved = slopes(view, index, normal.take(at, axis=0))
         out = out if out.shape[2] else np.zeros((len(normal), 2, moved.shape[1]))
         out[at, second] = np.where(second[:, None] == 1, -moved, moved)
     return out

@@ -231,8 +231,12 @@ def signed_distances(matches: Sequence[Match], poses: Array, points: Sequence[Ar
         points: (N, 3) of every scan, scanner frame.
     """
     placed = [frames.transform(T, own) for T, own in zip(poses, points, strict=True)]
-    along = [np.einsum("ij,ij->i", placed[m.v][m.index_v] - placed[m.w][m.index_w], m.normal) for m in matches]
-    return np.concatenate(along)
+
+    def along(m: Match) -> Array:
+        apart = placed[m.v].take(m.index_v, axis=0) - placed[m.w].take(m.index_w, axis=0)
+        return np.einsum("ij,ij->i", apart, m.normal)
+
+    return np.concatenate([along(m) for m in matches])
 
 
 def _partners_by_view(

@@ -20,7 +20,7 @@ from stitch import frames
 from stitch.errors import NoResultError
 from stitch.frames import Array, Indices, Mask
 from stitch.measurement.capture import Capture, Sightings
-from stitch.measurement.scan import Scan
+from stitch.measurement.scan import Scan, centroid
 from stitch.observations.surfaces.matching import Match, Searched, match_pairs, overlapping_pairs, sample_points
 from stitch.statistics.distributions import mad_sigma, tukey
 
@@ -155,7 +155,7 @@ def gram(
 
 def sum_matches(matches: Sequence[Match], views: int) -> Gram:
     """Accumulate the pairs about the middle of their correspondences, at their own robust scale."""
-    centre = np.mean([m.middle.mean(axis=0) for m in matches], axis=0)
+    centre = np.mean([centroid(m.middle) for m in matches], axis=0)
     return gram(matches, views, centre, robust_scale(matches))
 
 

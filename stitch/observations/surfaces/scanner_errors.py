@@ -56,7 +56,7 @@ def sum_smooth_errors(
 
     def of_points(v: int, index: Indices) -> Array:
         scan = capture.scans[v]
-        smooth = corrections(scan.points[index] - scan.eye, measurement.scan_views[v].cosine[index])
+        smooth = corrections(scan.points.take(index, axis=0) - scan.eye, measurement.scan_views[v].cosine[index])
         return np.concatenate([smooth, further.at(v, unconstrained.poses[v], index)])
 
     def of_targets() -> Array:
