@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -201,6 +202,13 @@ def _read_checked(file: Path, schema: dict[str, Any]) -> Any:
     # Loaded by who reads a run: most that only write one do not.
     from jsonschema import Draft202012Validator
     from jsonschema.exceptions import best_match
+    from jsonschema.validators import extend
+
+    def items(validator: Any, items: Any, values: Any, schema: Any) -> Iterator[Any]:
+        # Nearly all of a result are numbers in lists: one by one they take as long as the session takes to be read.
+        plain = items == _NUMBER and isinstance(values, list) and all(type(v) in (int, float) for v in values)
+        if not plain:
+            yield from Draft202012Validator.VALIDATORS["items"](validator, items, values, schema)
 
     hint = "name a run folder that `stitch run` wrote"
     if (file.parent / "session.toml").is_file():
@@ -210,7 +218,7 @@ def _read_checked(file: Path, schema: dict[str, Any]) -> Any:
         document = json.loads(told, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{file}: damaged ({shortened(str(error))}); to fix: run `stitch run` again") from None
-    wrong = best_match(Draft202012Validator(schema).iter_errors(document))
+    wrong = best_match(extend(Draft202012Validator, {"items": items})(schema).iter_errors(document))
     if wrong is not None:
         place = ".".join(str(step) for step in wrong.absolute_path) or "the document"
         raise InputError(f"{file}: damaged ({place}: {shortened(wrong.message, 160)}); to fix: run `stitch run` again")
