@@ -22,7 +22,7 @@ from stitch.model.model import Model, Term
 from stitch.observations.pose_errors import JOINT_SCATTER, USUAL_JOINT_SCATTER, PoseErrors
 from stitch.statistics.alike_blocks import SelectedColumns
 from stitch.statistics.folds import JointEnd, grouped_folds
-from stitch.statistics.least_squares import column_space, invert_covariance
+from stitch.statistics.least_squares import column_space
 from stitch.statistics.reml import (
     ALWAYS_PRESENT,
     NOISE,
@@ -34,6 +34,7 @@ from stitch.statistics.reml import (
     at_variances,
     fit_variances,
     model_information,
+    whitener,
 )
 from stitch.statistics.variance_posterior import Satterthwaite, satterthwaite
 
@@ -104,7 +105,7 @@ class ErrorModel:
     @cached_property
     def _whitening(self) -> Array:
         """(B, m, m) inverse Cholesky factors of the null's covariance."""
-        return invert_covariance(self.covariance).half
+        return whitener(self.mixed, self.null.variances)
 
     def whiten(self, columns: Array, blocks: Indices | None = None) -> Array:
         """(n, P) columns of the channel in units of the null's scatter; of some of its blocks alone, if named."""

@@ -141,15 +141,16 @@ class AlikeBlocks:
         return found
 
     def _turn(self, columns: Array) -> list[Array]:
-        X = columns.reshape(*self.per_noise.shape, -1)
+        X = columns.reshape(*self.per_noise.shape, columns.shape[1])
         white, parts = self.per_noise[..., None] * X, []
         for group in self.groups:
             own = group.turn @ white[group.blocks]
             white[group.blocks] -= group.turn.transpose(0, 2, 1) @ own
-            parts.append(own.transpose(2, 1, 0))
-        rest = [white] if self.noise_alone else [white[:0]]
-        rest.append((self.per_known[..., None] * X)[self.per_known.any(axis=1)])
-        return [np.ascontiguousarray(own) for own in (*parts, *(r.reshape(-1, 1, X.shape[2]).T for r in rest))]
+            parts.append(own)
+        alone = white if self.noise_alone else white[:0]
+        known = (self.per_known[..., None] * X)[self.per_known.any(axis=1)]
+        parts += [own.reshape(len(own) * own.shape[1], 1, own.shape[2]) for own in (alone, known)]
+        return [np.ascontiguousarray(own.transpose(2, 1, 0)) for own in parts]
 
 
 def pair_products(X: Sequence[Array], Y: Sequence[Array]) -> Array:

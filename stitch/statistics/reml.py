@@ -556,4 +556,4 @@ def _as_variance_fit(variances: Array, solution: Likelihood) -> VarianceFit:
 
 def whitener(mixed: MixedModel, variances: Array) -> Array:
     """(B, m, m) inverse Cholesky factors of the blocks' covariance."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(mixed.covariance(variances))))
+    return invert_covariance(mixed.covariance(variances)).half
