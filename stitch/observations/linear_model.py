@@ -368,7 +368,8 @@ class LinearModel(ErrorModel):
     def information(self, columns: Sequence[SelectedColumns]) -> Iterator[tuple[Array, Array]]:
         """Per set of columns (n, P) of the channel what the views tell of their coefficients θ beside the model: (P, P)
         and (P,) of the log likelihood vᵀθ − ½ θᵀIθ."""
-        if self.mixed.alike is not None and all(own.keep is not None for own in columns):
+        kept = self.mixed.alike is not None and self.mixed.are_kept
+        if kept and all(own.keep is not None for own in columns):
             yield from map(self._own_information.of, columns)
             return
         for start in range(0, len(columns), _SETS_AT_ONCE):

@@ -147,6 +147,11 @@ class MixedModel:
         every = flatten_blocks(self.A), self.z.reshape(-1, 1)
         return [SelectedColumns(own, np.ones(own.shape[1], bool)) for own in every]
 
+    @property
+    def are_kept(self) -> bool:
+        """True if sums of all of them are kept."""
+        return all(own.keep is not None for own in self.sets)
+
     @cached_property
     def products(self) -> Array:
         """(t, a + 1, a + 1) products of all of them."""
@@ -155,7 +160,7 @@ class MixedModel:
     def products_with(self, own: SelectedColumns) -> Array:
         """(t, a + 1, p) their products with other columns."""
         assert self.alike is not None
-        if own.keep is None:
+        if own.keep is None or not self.are_kept:
             return pair_products(self._turned, self.alike.turned(own))
         return np.concatenate([self.alike.products(held, own) for held in self.sets], axis=1)
 
@@ -218,11 +223,9 @@ class FurtherColumns:
         """The model where they are columns of the free mean as well."""
         whole = replace(self.mixed, A=np.concatenate([self.mixed.A, self.G], axis=2))
         if self.mixed.alike is not None:
-            new = [
-                replace(own, keep=np.ones(own.whole.shape[1], bool)) if own.keep is None else own for own in self.sets
-            ]
             # What the new model would sum anew.
-            vars(whole).update(sets=[*self.mixed.sets[:-1], *new, self.mixed.sets[-1]], products=self.products)
+            *mean, seen = self.mixed.sets
+            vars(whole).update(sets=[*mean, *self.sets, seen], products=self.products)
         return whole
 
 

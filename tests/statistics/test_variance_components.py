@@ -205,6 +205,11 @@ def test_sums_over_alike_blocks_are_those_of_every_block(prior):
         taken_in = FurtherColumns(mixed, (columns,)).in_mean()
         fits = [at_variances(own, np.exp(x)) for own in (taken_in, anew)]
         assert fits[0].deviance == pytest.approx(fits[1].deviance, rel=1e-10)
+        more = [at_variances(taken_in, np.exp(x), FurtherColumns(taken_in, (other,)))]
+        more.append(at_variances(anew, np.exp(x), other.whole.reshape(*mixed.z.shape, -1)))
+        assert more[0].deviance == pytest.approx(more[1].deviance, rel=1e-10)
+        if not taken_in.are_kept:
+            continue
         told, vector = model_information(taken_in, fits[0]).of(other)
         half = np.linalg.inv(np.linalg.cholesky(single.covariance(np.exp(x))))
         A, X, z = (
