@@ -14,8 +14,8 @@ import numpy as np
 from stitch.frames import Array, Indices, Mask
 from stitch.statistics.least_squares import invert_covariance
 
-# Numbers of turned columns that are kept: 160 MB. Their products are small.
-_KEPT_NUMBERS = 20_000_000
+# Numbers of turned columns that are kept: 50 MB. Their products are small.
+_KEPT_NUMBERS = 6_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,13 +131,17 @@ class AlikeBlocks:
         return [columns.of(own, 0) for own in self._kept(columns.whole)]
 
     def _kept(self, whole: Array) -> list[Array]:
-        found = self._turned.get(id(whole))
-        if found is None:
-            found = self._turn(whole)
-            if sum(own.size for every in list(self._turned.values()) for own in every) > _KEPT_NUMBERS:
-                self._turned.clear()
-            self._wholes[id(whole)] = whole
-            self._turned[id(whole)] = found
+        found = self._turned.pop(id(whole), None) or self._turn(whole)
+        self._wholes[id(whole)] = whole
+        self._turned[id(whole)] = found
+        # Those that were asked for last stay. Other threads ask as well.
+        every = list(self._turned.items())
+        left = sum(own.size for _, parts in every for own in parts) - _KEPT_NUMBERS
+        for key, parts in every[:-1]:
+            if left <= 0:
+                break
+            self._turned.pop(key, None)
+            left -= sum(own.size for own in parts)
         return found
 
     def _turn(self, columns: Array) -> list[Array]:
