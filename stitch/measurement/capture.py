@@ -1,6 +1,6 @@
 """Scans and labelled points of one session with the robot's poses: what every stage after reading works on."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -9,7 +9,16 @@ import numpy as np
 from stitch import frames
 from stitch.errors import InputError
 from stitch.frames import Array, Indices, Mask
-from stitch.measurement.scan import GRAZING_COSINE, Scan, bounding_box, even_indices, prepare_scan, subsample
+from stitch.measurement.scan import (
+    GRAZING_COSINE,
+    Neighbourhoods,
+    Scan,
+    bounding_box,
+    even_indices,
+    find_neighbourhoods,
+    prepare_scan,
+    subsample,
+)
 from stitch.measurement.session import Cloud, Scanner, Session, View, WholeCloud
 from stitch.system.threads import parallel
 from stitch.units import METRES
@@ -150,6 +159,10 @@ class Capture:
         )
 
 
+# Points of a session whose neighbours may all be held at once, 70 bytes each.
+_AT_ONCE = 1_000_000
+
+
 def prepare_capture(session: Session) -> Capture:
     """Prepare the scans and labelled points of a session and place them on the chain of frames.
 
@@ -158,8 +171,7 @@ def prepare_capture(session: Session) -> Capture:
         NoResultError: labelled points of which no target is seen twice.
     """
     T_base_flange = np.array([view.T_base_flange for view in session.views])
-    prepared = partial(_prepare_scan, scanner=session.scanner)
-    scans = tuple(parallel(prepared, session.views, "preparing scans")) if session.has_clouds else ()
+    scans = _prepare_scans(session) if session.has_clouds else ()
     if scans and not any((scan.confidence > GRAZING_COSINE).any() for scan in scans):
         raise InputError(
             f"{session.name}: every cloud is one profile, all its points in a plane through the scanner, and shows no "
@@ -168,11 +180,26 @@ def prepare_capture(session: Session) -> Capture:
     return build_capture(session.name, scans, T_base_flange, session.mount, sightings_of(session))
 
 
-def _prepare_scan(view: View, scanner: Scanner) -> Scan:
+def _prepare_scans(session: Session) -> tuple[Scan, ...]:
+    """The scans of all views.
+
+    Where room is no matter, all neighbours first: a library finds them without Python, for which the rest waits again
+    and again while another thread still loads modules.
+    """
+    held = [None if view.cloud is None or view.cloud.whole is not None else view.cloud.points for view in session.views]
+    around: Iterable[Neighbourhoods | None] = [None] * len(held)
+    if sum(len(points) for points in held if points is not None) <= _AT_ONCE:
+        around = list(parallel(lambda points: None if points is None else find_neighbourhoods(points), held))
+    prepared = partial(_prepare_scan, scanner=session.scanner)
+    return tuple(parallel(prepared, zip(session.views, around, strict=True), "preparing scans"))
+
+
+def _prepare_scan(item: tuple[View, Neighbourhoods | None], scanner: Scanner) -> Scan:
+    view, around = item
     assert view.cloud is not None
     if view.cloud.whole is not None:
         return view.cloud.whole.scan
-    return prepare_scan(view.name, view.cloud.points, eye=scanner.eye(view.cloud.points))
+    return prepare_scan(view.name, view.cloud.points, eye=scanner.eye(view.cloud.points), around=around)
 
 
 def build_capture(

@@ -96,19 +96,43 @@ def rays_to(points: Array, eye: Array) -> Array:
     return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300))
 
 
-def prepare_scan(name: str, points: Array, picked: Indices | None = None, eye: Array | None = None) -> Scan:
+@dataclass(frozen=True)
+class Neighbourhoods:
+    """The points that are nearest to each of n points, itself the first."""
+
+    tree: Any  # pykdtree KDTree over all points
+    index: Indices  # (n, k)
+    radius: Array  # (n,) distance to the farthest of them
+    spacing: float  # median distance to the nearest one, length_unit
+
+
+def find_neighbourhoods(points: Array, picked: Indices | None = None) -> Neighbourhoods:
+    """Neighbourhoods of all points of a scan, or of those that are picked."""
+    points = np.ascontiguousarray(points, float)
+    tree = KDTree(points, leafsize=16)
+    own = points if picked is None or len(picked) == len(points) else points[picked]
+    distance, index = tree.query(own, k=min(_NEIGHBOURS, len(points)))
+    return Neighbourhoods(tree, index, np.array(distance[:, -1]), float(np.median(distance[:, 1])))
+
+
+def prepare_scan(
+    name: str,
+    points: Array,
+    picked: Indices | None = None,
+    eye: Array | None = None,
+    around: Neighbourhoods | None = None,
+) -> Scan:
     """KD-tree, normals (local plane of 16 neighbours, quadric where that bends), edges, spacing and noise of one scan.
 
     Args:
         picked: indices of the points that the scan keeps; normals, edges and noise are those of all points.
         eye: (3,) from where the scanner looks, its own frame; the origin unless stated.
+        around: what `find_neighbourhoods` makes of the points, where that has been asked already.
     """
     points = np.ascontiguousarray(points, float)
-    tree = KDTree(points, leafsize=16)
     own = points if picked is None or len(picked) == len(points) else points[picked]
-    neighbours = min(_NEIGHBOURS, len(points))
-    distance, index = tree.query(own, k=neighbours)
-    radius = distance[:, -1]
+    around = around or find_neighbourhoods(points, picked)
+    tree, index, radius = around.tree, around.index, around.radius
     centroid, normals, variation, left = fit_planes(points, index)
     eye = np.zeros(3) if eye is None else eye
     rays = rays_to(own, eye)
@@ -123,11 +147,11 @@ def prepare_scan(name: str, points: Array, picked: Indices | None = None, eye: A
     normals *= -np.sign(cosine)[:, None]
     confidence = np.abs(cosine)
     usable &= confidence > GRAZING_COSINE
-    spacing = scanned_spacing = float(np.median(distance[:, 1]))
+    spacing = scanned_spacing = around.spacing
     if len(own) < len(points):
         tree = KDTree(own, leafsize=16)
         spacing = _estimate_spacing(own, tree)
-    area = np.pi * radius**2 / neighbours * (len(points) / len(own))
+    area = np.pi * radius**2 / index.shape[1] * (len(points) / len(own))
     return Scan(
         name=name,
         points=own,

@@ -11,6 +11,7 @@ from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need
 from stitch.errors import InputError
+from stitch.measurement import capture
 from stitch.measurement.capture import distinct_points, prepare_capture
 from stitch.measurement.measurement import measurement_of
 from stitch.measurement.scan import fit_planes, prepare_scan
@@ -143,6 +144,15 @@ def test_profiles_show_no_surface(recwarn):
     with pytest.raises(InputError, match="every cloud is one profile.*to fix.*stitch calibrate sphere"):
         prepare_capture(session_of(replace(measured, clouds=clouds)))
     assert not recwarn
+
+
+def test_scans_are_the_same_where_neighbours_do_not_fit_in_memory_at_once(monkeypatch):
+    session = session_of(measured_blade(3, views=2, pixels=40))
+    at_once = prepare_capture(session).scans
+    monkeypatch.setattr(capture, "_AT_ONCE", 100)
+    for own, other in zip(prepare_capture(session).scans, at_once, strict=True):
+        for name in ("points", "normals", "usable", "area", "spacing", "noise"):
+            assert np.array_equal(getattr(own, name), getattr(other, name)), name
 
 
 def test_a_scan_that_holds_every_point_twice_is_the_scan_without_copies():
