@@ -48,12 +48,12 @@ class Rows:
         """(B, m) variance that is known: 1 in absent rows."""
         return np.asarray(self.noise == 0, float)
 
-    @property
+    @cached_property
     def used(self) -> Mask:
         """(V, m) bool: rows of the views that were measured."""
         return np.asarray(self.noise[: len(self.lever)] > 0)
 
-    @property
+    @cached_property
     def distances_used(self) -> Mask:
         """(V, m) bool: those of them that are lengths, as what remains is told."""
         return self.used
@@ -148,7 +148,8 @@ class RowTrial:
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
         """Coefficients (k,) under each prior, without some views; zero beyond those that it is of."""
         found = self.blocks.solve_each([(own.precision, own.precision * own.mean) for own in priors], left_out)
-        return [np.pad(x, (0, self.X.shape[2] - len(x))) for x in found]
+        nothing = np.zeros(self.X.shape[2])
+        return [np.concatenate([x, nothing[len(x) :]]) for x in found]
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
         """(V,) sums of the squares of a view's distances, of all views or of some."""

@@ -6,6 +6,7 @@ are further blocks of three rows: the target less its place in the drawing.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -141,7 +142,7 @@ class TargetRows(Rows):
         assert self.capture.sightings is not None
         return self.capture.sightings
 
-    @property
+    @cached_property
     def distances_used(self) -> Mask:
         """(V, m) bool: coordinates that were measured; a probe's turn is no length."""
         return np.asarray(self.used & (np.arange(self.residual.shape[1]) < self.positions))
