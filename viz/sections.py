@@ -1,6 +1,7 @@
 """Add diagnosis and comparison to a run folder: the screen and the evidence of its page, a tab of its recording."""
 
 import shlex
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,16 @@ _NAMING = ("missing_effect", "cannot_tell")
 
 def write_diagnosis(found: Diagnosis, state: Run, folder: Path) -> None:
     """Put a diagnosis on the screen and into the evidence of report.html, and into the recording."""
-    unit, screen = state.session.length_unit, diagnosis_screen(found)
+    screen = diagnosis_screen(found)
+    # Rerun's program writes the recording anew while the page is made.
+    with ThreadPoolExecutor(1) as beside:
+        recorded = beside.submit(add_diagnosis, found, screen, state.session, folder / "recording.rrd")
+        _insert(folder / "report.html", _sections(found, screen, state.session.length_unit, folder))
+        recorded.result()
+
+
+def _sections(found: Diagnosis, screen: dict[str, Any], unit: str, folder: Path) -> dict[str, str]:
+    """Return what a diagnosis says on the page of a run, by section."""
     shown = {"verdict": found.verdict, "named": list(found.effects), "um": MICROMETRES[unit], "colours": colour_stops()}
     data = script_json({key: screen[key] for key in ("now", "why", "candidates", "places")} | shown)
     parts = {
@@ -52,8 +62,7 @@ def write_diagnosis(found: Diagnosis, state: Run, folder: Path) -> None:
     }
     if found.verdict in _NAMING and screen["candidates"]:
         parts["numbers"] = render("tiles.html.j2", tiles=_tiles(screen, unit))
-    _insert(folder / "report.html", parts)
-    add_diagnosis(found, screen, state.session, folder / "recording.rrd")
+    return parts
 
 
 def _words(text: str) -> str:
