@@ -7,6 +7,7 @@ integrated over amplitudes of plausible size, exceeds that of leaving it at zero
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
@@ -103,10 +104,13 @@ def select_supported(
     y = project_out(whitened.base, whitened.z[:, None])[:, 0]
     M, v = G.T @ G, G.T @ y
 
-    def gain(chosen: Sequence[int]) -> float:
-        index = sorted({i for k in chosen for i in groups[k]})
-        told, b = M[np.ix_(index, index)], v[index]
+    @cache
+    def gain_of(*index: int) -> float:
+        told, b = M[np.ix_(index, index)], v[list(index)]
         return log_mixture(log_evidence_at_scales(told, b, PLAUSIBLE), PLAUSIBLE)
+
+    def gain(chosen: Sequence[int]) -> float:
+        return gain_of(*sorted({i for k in chosen for i in groups[k]}))
 
     every = list(range(len(groups)))
     # Two joints may explain together what neither does alone: adding one by one never meets them, leaving out does.
