@@ -81,9 +81,7 @@ def scan_points(measurement: Measurement, v: int, index: Indices | slice) -> tup
     """Some points (N, 3) of view v, scanner frame, and what effects may know of them."""
     view = measurement.scan_views[v]
     intensity = None if view.intensity is None else view.intensity[index]
-    return measurement.capture.scans[v].points[index], replace(
-        view, cosine=view.cosine[index], intensity=intensity
-    )
+    return measurement.capture.scans[v].points[index], replace(view, cosine=view.cosine[index], intensity=intensity)
 
 
 def point_correction(terms: Sequence[Term], points: Array, view: ScanView, pose: Array, steps: int = 2) -> Array:

@@ -183,7 +183,10 @@ def correct(
     T_mount, overlaps, history = icp_hand_eye(captures, T_mount, [gate] * len(captures), first=met, recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
     announce("correct: what every view tells of its pose")
-    freed = tuple(unconstrained_poses(c, c.poses(T_mount), gate) for c, gate in zip(captures, gates, strict=True))
+    freed = tuple(
+        unconstrained_poses(c, c.poses(T_mount), gate, own)
+        for c, gate, own in zip(captures, gates, overlaps, strict=True)
+    )
     T_first, scatters = step_hand_eye(captures, freed, T_mount)
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
     captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]

@@ -11,7 +11,8 @@ import numpy as np
 
 from stitch import frames
 from stitch.frames import Array, Indices, Mask
-from stitch.measurement.scan import Scan
+from stitch.measurement.scan import Scan, centroid
+from stitch.system.threads import parallel
 
 # Edge of a bin in spacings between rays: few bins of a surface stay empty.
 _BIN = 1.5
@@ -98,31 +99,36 @@ def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> Ra
         far = np.linalg.norm(away, axis=1)
         return far, away / far[:, None]
 
-    # The rays of one view at a time: those of hundreds are hundreds of megabytes.
-    middles, ranges = zip(*((d.mean(axis=0), far) for far, d in map(rays, scans, kept)), strict=True)
+    def middle_and_ranges(item: tuple[Scan, Mask]) -> tuple[Array, Array]:
+        far, direction = rays(*item)
+        return centroid(direction), far
+
+    # The rays of few views at a time: those of hundreds are hundreds of megabytes.
+    views = list(zip(scans, kept, strict=True))
+    middles, ranges = zip(*parallel(middle_and_ranges, views), strict=True)
     axes = _axes_about(np.sum(middles, axis=0))
-    maps = [_on_map(rays(scan, keep)[1], axes) for scan, keep in zip(scans, kept, strict=True)]
+    maps = list(parallel(lambda item: _on_map(rays(*item)[1], axes), views))
     # On the map lengths are half the angles, in the middle of the field.
     angle = np.sqrt(np.median([scan.solid_angle for scan in scans]))
     size = max(_BIN * angle, cell / float(np.median(np.concatenate(ranges)))) / 2
     low = np.min([m.min(axis=0) for m in maps], axis=0) - 2 * size
     shape = tuple(((np.max([m.max(axis=0) for m in maps], axis=0) - low) / size).astype(int) + 3)
-    nearest, empty, trusted = [], [], []
-    seen = np.zeros(shape, np.int64)
-    for m, far in zip(maps, ranges, strict=True):
+
+    def image_of(item: tuple[Array, Array]) -> tuple[Array, Mask, bool, Mask]:
+        """Nearest surface of closed bins, empty bins, whether the view is trusted, and bins that hold something."""
+        m, far = item
         i, j = ((m - low) / size).astype(np.int64).T
         image, order = np.full(shape, np.inf), np.argsort(-far)
         image[i[order], j[order]] = far[order]
-        seen += np.isfinite(image)
         least, filled = _of_nine_bins(image)
-        nearest.append(np.where(np.isfinite(image) & (filled >= _CLOSED), least, -np.inf))
-        empty.append(filled == 0)
-        trusted.append(np.mean(far > image[i, j] + 2 * _STEEPEST * size * far) < _MOST_BEHIND)
+        held = np.isfinite(image)
+        trusted = np.mean(far > image[i, j] + 2 * _STEEPEST * size * far) < _MOST_BEHIND
+        return np.where(held & (filled >= _CLOSED), least, -np.inf), filled == 0, bool(trusted), held
+
+    nearest, empty, trusted, held = map(np.array, zip(*parallel(image_of, zip(maps, ranges, strict=True)), strict=True))
     limits = np.array([np.quantile(far, (0.01, 0.99)) for far in ranges])
     reach = float(limits[:, 0].min()), float(limits[:, 1].max())
-    return RangeImages(
-        axes, low, size, np.array(nearest), np.array(empty), field=seen >= 2, reach=reach, trusted=np.array(trusted)
-    )
+    return RangeImages(axes, low, size, nearest, empty, field=held.sum(axis=0) >= 2, reach=reach, trusted=trusted)
 
 
 def _axes_about(middle: Array) -> Array:

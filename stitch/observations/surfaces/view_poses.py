@@ -89,19 +89,22 @@ class UnconstrainedPoses:
         return replace(self, twists=frames.log(to_centre @ self.poses @ frames.inverse(to_centre @ model_poses)))
 
 
-def unconstrained_poses(capture: Capture, model_poses: Array, gate: float) -> UnconstrainedPoses:
+def unconstrained_poses(
+    capture: Capture, model_poses: Array, gate: float, before: Overlaps | None = None
+) -> UnconstrainedPoses:
     """Move all views until overlaps and common targets agree, without regard to the robot.
 
     Args:
         model_poses: T_reference_scanner (V, 4, 4).
         gate: first distance between partners, length_unit.
+        before: at poses near by; its pairs of views serve again.
 
     Raises:
         NoResultError: no two views overlap.
     """
     picked = [sample_points(scan, SAMPLES) for scan in capture.scans]
     poses = np.array(model_poses)
-    overlaps = collect_overlaps(capture, poses, gate, picked)
+    overlaps = collect_overlaps(capture, poses, gate, picked, before)
     last: LastStep = None
     for _ in range(_MAXIMUM_ITERATIONS):
         step = visible_step(overlaps.gram)
