@@ -1,11 +1,18 @@
 """What goes on beside other work: told in its turn, ended where nobody wants it, its errors raised where it is asked."""
 
 from concurrent.futures import CancelledError
+from threading import current_thread
 
 import numpy as np
 import pytest
 
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.in_memory import session_of
+from stitch.errors import InputError
+from stitch.pipeline import run
 from stitch.runs.recorder import IterationMemory, SilentRecorder
+from stitch.stages import register_and_fuse
+from stitch.stages.fuse import RegisteredSession, fuse_every_point
 from stitch.system.threads import begin
 
 
@@ -42,3 +49,24 @@ def test_a_stage_that_nobody_wants_ends_with_its_next_iteration():
 def test_an_error_is_raised_where_the_result_is_asked():
     with pytest.raises(ZeroDivisionError):
         begin(lambda: 1 / 0).result(timeout=10)
+
+
+def test_views_are_fused_while_they_are_screened_and_errors_are_told(monkeypatch):
+    session, threads = session_of(measured_blade(2, views=3, pixels=40)), []
+
+    def fused(registered):
+        threads.append(current_thread().name)
+        return fuse_every_point(registered)
+
+    monkeypatch.setattr(register_and_fuse, "fuse_every_point", fused)
+    found = run(session)
+    own = RegisteredSession(session, found.measurement, found.model, found.measurement.capture, found.poses)
+    assert threads == ["stitch-beside"]
+    assert np.array_equal(found.fused.points, fuse_every_point(own)[0].points)
+
+    def without_room(registered):
+        raise InputError("no room")
+
+    monkeypatch.setattr(register_and_fuse, "fuse_every_point", without_room)
+    with pytest.raises(InputError, match="no room"):
+        run(session)
