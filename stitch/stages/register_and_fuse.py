@@ -59,18 +59,10 @@ def begin_to_register_views(
 
     def register_one(i: int, session: Session, begun: BegunRegistration) -> None:
         clock, model, own = Clock(), correction.geometry, correction.captures[i]
+        poses, scatter = own.poses(model.T_mount), correction.scatter[i]
         overlaps, start = correction.overlaps[i], correction.unconstrained[i].poses
         with _errors_told_to(begun.registration):
-            found = register(
-                own,
-                own.poses(model.T_mount),
-                correction.scatter[i],
-                overlaps.gate,
-                begun.iterations,
-                start,
-                method,
-                overlaps,
-            )
+            found = register(own, poses, scatter, overlaps.gate, begun.iterations, start, method, overlaps)
             begun.registration.set_result((found, clock.lap()))
             if begun.fused is not None and not begun.iterations.stopped:
                 with _errors_told_to(begun.fused):

@@ -108,6 +108,7 @@ _MOST_PARTNERS = 20
 class Searched:
     """What the points of all views found in the others, so that after little motion few have to look again."""
 
+    scans: Sequence[Scan]
     poses: Array  # (V, 4, 4) T_reference_scanner
     index: Sequence[Indices]  # per view the points that look
     parts: list[list[QueryPart]]  # per view those that ask it
@@ -119,8 +120,11 @@ class Searched:
 
         Distances change by no more than the motion of the point that asks, seen from the view that is asked.
         """
-        same = all(np.array_equal(a, b) for a, b in zip(self.index, every.index, strict=True))
-        if parts != self.parts or gate > self.gate or not same:
+        if gate > self.gate or parts != self.parts or len(every.scans) != len(self.scans):
+            return None
+        same = (a.tree is b.tree for a, b in zip(self.scans, every.scans, strict=True))
+        alike = (np.array_equal(a, b) for a, b in zip(self.index, every.index, strict=True))
+        if not (all(same) and all(alike)):
             return None
         corners = np.array([box_corners(scan.box) for scan in every.scans])
         out, total = list[Indices](), 0
@@ -219,7 +223,7 @@ def match_pairs(
             columns = zip(*(of.columns for of in found), strict=True)
             matches.append(Match(v, w, *(np.concatenate(own) for own in columns)))
     if before is None or again is None:
-        before = Searched(np.array(poses), samples, parts, gate, list(nearest))
+        before = Searched(scans, np.array(poses), samples, parts, gate, list(nearest))
     return matches, before
 
 
