@@ -13,7 +13,6 @@ from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.linalg.lapack import dpotrf, dtrtri
 from scipy.optimize import minimize
 from scipy.special import betainc, betaln, expit
@@ -305,8 +304,9 @@ class Likelihood:
         if not np.isfinite(self.errors.logdet):
             return np.zeros(len(self.log_variances))
         variances, mixed = np.exp(self.log_variances), self.problem.mixed
-        half_and_rest = block_diag(self.half, 1.0)
-        half_and_rest[:-1, -1] = -self.mean
+        k, r = self.half.shape
+        half_and_rest = np.zeros((k + 1, r + 1))
+        half_and_rest[:-1, :-1], half_and_rest[:-1, -1], half_and_rest[-1, -1] = self.half, -self.mean, 1.0
         if isinstance(self.errors, AlikeWeights):
             taken = np.tensordot(self.problem.columns.products, half_and_rest @ half_and_rest.T)
             own = self.errors.traces - self.errors.slopes @ taken
