@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 
 import numpy as np
+from scipy.linalg.lapack import dpstrf
 from scipy.special import logsumexp
 
 from stitch.diagnosis import thresholds as limits
@@ -62,6 +63,8 @@ from stitch.statistics.reml import MixedModel, VarianceFit, at_variances, fit_va
 # Smooth processes by which a joint or the flange may err, as columns of the channel with unit coefficients: the
 # leading eigenvectors of their covariance between views.
 
+# Below this share of the largest variance nothing is left of a covariance.
+_ROUNDING = 1e-8
 # Of so many processes the courses are kept: those of a session with six or seven joints. Of thousands of poses each
 # takes a megabyte or two.
 _KEPT = 40
@@ -133,10 +136,16 @@ def _knots(views: int) -> Indices:
 
 def _leading_courses(covariance: Array, most: int) -> Array:
     """(K, R) of which the courses with unit coefficients of a process are made, by its covariance with the knots."""
-    values, vectors = np.linalg.eigh(covariance)
+    # What is smooth is a product of few columns: theirs are its courses, found in a third of the time.
+    factor, order, rank, _ = dpstrf(covariance, lower=1, tol=_ROUNDING * covariance.diagonal().max())
+    root = np.zeros((len(covariance), rank))
+    root[order - 1] = np.tril(factor[:, :rank])
+    few = rank < len(covariance) / 2
+    values, vectors = np.linalg.eigh(root.T @ root if few else covariance)
     values, vectors = values[::-1][:most], vectors[:, ::-1][:, :most]
     keep = values > limits.PROCESS_LEAST_VARIANCE * values[0]
-    return np.asarray(vectors[:, keep] / np.sqrt(values[keep]))
+    courses = vectors[:, keep] / np.sqrt(values[keep])
+    return np.asarray(root @ (courses / np.sqrt(values[keep])) if few else courses)
 
 
 # How large a smooth process without a name is beside a model, and how much likelier the views are with it.
