@@ -21,7 +21,7 @@ from stitch.effects.empirical import empirical_effects
 from stitch.frames import Array, Mask
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel, PointSums, Response
-from stitch.statistics.alike_blocks import SelectedColumns
+from stitch.statistics.common_covariance import SelectedColumns
 
 
 @dataclass(frozen=True)

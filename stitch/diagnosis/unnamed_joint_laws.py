@@ -44,7 +44,7 @@ from stitch.observations.pose_errors import (
     usual_time_step,
 )
 from stitch.statistics import parameter_selection
-from stitch.statistics.alike_blocks import SelectedColumns
+from stitch.statistics.common_covariance import SelectedColumns
 from stitch.statistics.kernels import (
     REACH,
     SHORT_REACH,

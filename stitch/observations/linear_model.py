@@ -20,7 +20,7 @@ from stitch.frames import Array, Indices, Mask
 from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model, Term
 from stitch.observations.pose_errors import JOINT_SCATTER, USUAL_JOINT_SCATTER, PoseErrors
-from stitch.statistics.alike_blocks import SelectedColumns
+from stitch.statistics.common_covariance import SelectedColumns
 from stitch.statistics.folds import JointEnd, grouped_folds
 from stitch.statistics.least_squares import column_space
 from stitch.statistics.reml import (
@@ -56,7 +56,7 @@ _SINGLE_START_SIZE = 250
 def with_pose_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
     """The mixed model of one block with scatter, noise, and what the poses err beside."""
     components = np.concatenate([mixed.components[: NOISE + 1], errors.components[:, None]])
-    return replace(mixed, components=components, further=errors.prior, alike=None)
+    return replace(mixed, components=components, further=errors.prior, common=None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,7 +163,7 @@ class ErrorModel:
             return self
         components = np.concatenate([self.mixed.components, (self.offsets @ self.offsets.transpose(0, 2, 1))[None]])
         further = FurtherPrior(np.array([USUAL_JOINT_SCATTER]), np.array([ALWAYS_PRESENT]), np.zeros(1, bool))
-        mixed = replace(self.mixed, components=components, further=further, alike=None)
+        mixed = replace(self.mixed, components=components, further=further, common=None)
         return replace(self, mixed=mixed, offsets=None, null=fit_variances(mixed, both_starts=True))
 
     @cached_property
@@ -368,7 +368,7 @@ class LinearModel(ErrorModel):
     def information(self, columns: Sequence[SelectedColumns]) -> Iterator[tuple[Array, Array]]:
         """Per set of columns (n, P) of the channel what the views tell of their coefficients θ beside the model: (P, P)
         and (P,) of the log likelihood vᵀθ − ½ θᵀIθ."""
-        kept = self.mixed.alike is not None and self.mixed.are_kept
+        kept = self.mixed.common is not None and self.mixed.are_kept
         if kept and all(own.keep is not None for own in columns):
             yield from map(self._own_information.of, columns)
             return
@@ -393,7 +393,7 @@ class LinearModel(ErrorModel):
             start: (c,) variances to begin with; None: those of the null.
         """
         sets = [SelectedColumns(columns)] if isinstance(columns, np.ndarray) else columns
-        if self.mixed.alike is None:
+        if self.mixed.common is None:
             # Nothing holds the whole sets: asked as columns.
             sets = [SelectedColumns(np.hstack([own.columns for own in sets]))]
         key = hash(tuple(own.key for own in sets)), hash(sizes.tobytes())

@@ -20,7 +20,7 @@ from stitch.model.forward import PointSlopes, moves_points, pose_derivatives
 from stitch.model.model import Model, Term, sizes_of, stack_parameters, values_of
 from stitch.observations.linear_model import CoefficientPrior, LinearModel, Observation, PointSums, Response
 from stitch.observations.pose_errors import joint_offset_twists, mean_square_per_axis
-from stitch.statistics.alike_blocks import AlikeBlocks, alike_blocks
+from stitch.statistics.common_covariance import CommonCovariance, common_covariance
 from stitch.statistics.folds import JointEnd, joint_ends
 from stitch.statistics.least_squares import BlockLeastSquares, equilibrated, independent
 from stitch.statistics.parameter_selection import UNSEEN
@@ -110,7 +110,7 @@ class Rows:
         fixed[:, diagonal, diagonal] = self.fixed
         # A view errs in six ways, whatever it shows; what it shows beyond that, the landmarks take up.
         independent = int(np.minimum(self.used.sum(axis=1), 6).sum()) + max(self.landmarks.shape[2] - 6, 0)
-        return MixedModel(-self.residual, A, components, fixed, independent, alike=self._alike)
+        return MixedModel(-self.residual, A, components, fixed, independent, common=self._common_covariance)
 
     @cached_property
     def _scattered(self) -> tuple[Array, Array]:
@@ -120,8 +120,8 @@ class Rows:
         return carried[..., :3], carried[..., 3:]
 
     @cached_property
-    def _alike(self) -> AlikeBlocks | None:
-        return alike_blocks(self._scattered, self.noise, self.fixed)
+    def _common_covariance(self) -> CommonCovariance | None:
+        return common_covariance(self._scattered, self.noise, self.fixed)
 
 
 # Views of largest influence on the estimates: if one alone carries them, it is among these.

@@ -61,11 +61,13 @@ def begin_to_register_views(
         clock, model, own = Clock(), correction.geometry, correction.captures[i]
         poses, scatter = own.poses(model.T_mount), correction.scatter[i]
         overlaps, start = correction.overlaps[i], correction.unconstrained[i].poses
-        with _errors_told_to(begun.registration):
-            found = register(own, poses, scatter, overlaps.gate, begun.iterations, start, method, overlaps)
+        with _pass_errors_to(begun.registration):
+            found = register(
+                own, poses, scatter, overlaps.gate, begun.iterations, start, method=method, before=overlaps
+            )
             begun.registration.set_result((found, clock.lap()))
             if begun.fused is not None and not begun.iterations.stopped:
-                with _errors_told_to(begun.fused):
+                with _pass_errors_to(begun.fused):
                     registered = RegisteredSession(session, fitted.sessions[i].measurement, model, own, found.poses)
                     begun.fused.set_result((*fuse_every_point(registered), clock.lap()))
 
@@ -78,8 +80,8 @@ def begin_to_register_views(
 
 
 @contextmanager
-def _errors_told_to(future: Future[Any]) -> Iterator[None]:
-    """Errors of the block are raised where the result is asked for."""
+def _pass_errors_to(future: Future[Any]) -> Iterator[None]:
+    """Errors of the block are raised where the result is waited for."""
     try:
         yield
     except BaseException as error:

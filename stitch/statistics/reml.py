@@ -4,7 +4,7 @@
 
 The α are free (integrated out with a flat prior: that is REML, Patterson & Thompson 1971, Harville 1977);
 the θ have a prior of the size that is plausible (their integral is the evidence for the columns G). V is
-block-diagonal in B blocks: one for the pose channel of scans, one a view for labelled points (`alike_blocks`).
+block-diagonal in B blocks: one for the pose channel of scans, one a view for labelled points (`common_covariance`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,13 @@ from scipy.optimize import minimize
 from scipy.special import betainc, betaln, expit
 
 from stitch.frames import Array, Mask
-from stitch.statistics.alike_blocks import MANY_BLOCKS, AlikeBlocks, AlikeWeights, SelectedColumns, pair_products
+from stitch.statistics.common_covariance import (
+    MANY_BLOCKS,
+    CommonCovariance,
+    PairWeights,
+    SelectedColumns,
+    pair_products,
+)
 from stitch.statistics.least_squares import CLEARLY_KNOWN, InverseCovariance, equilibrated, invert_covariance
 
 # What is believed of variance components before anything was seen: scatter, noise, and what may well be absent.
@@ -126,7 +132,7 @@ class MixedModel:
     fixed: Array | None = None  # (B, m, m) what is known of the covariance, and 1 on the diagonal of absent numbers
     independent: int | None = None  # numbers that could err independently, if that is not all of them
     further: FurtherPrior | None = None  # of the c − 3 further components; None: there are none
-    alike: AlikeBlocks | None = None  # the same covariances, where many blocks are alike
+    common: CommonCovariance | None = None  # of the same covariances, where many blocks have one but for a turn
 
     @property
     def size(self) -> int:
@@ -138,7 +144,7 @@ class MixedModel:
         V = np.einsum("c,cbij->bij", variances, self.components)
         return np.asarray(V if self.fixed is None else V + self.fixed)
 
-    # Where blocks are alike: sums over them of everything in the mean, and of what was seen as the last one.
+    # Where blocks have one covariance: sums over them of everything in the mean, and of what was seen as the last one.
 
     @cached_property
     def sets(self) -> list[SelectedColumns]:
@@ -158,15 +164,15 @@ class MixedModel:
 
     def products_with(self, own: SelectedColumns) -> Array:
         """(t, a + 1, p) their products with other columns."""
-        assert self.alike is not None
+        assert self.common is not None
         if own.keep is None or not self.are_kept:
-            return pair_products(self._turned, self.alike.turned(own))
-        return np.concatenate([self.alike.products(held, own) for held in self.sets], axis=1)
+            return pair_products(self._turned, self.common.turned(own))
+        return np.concatenate([self.common.products(held, own) for held in self.sets], axis=1)
 
     @cached_property
     def _turned(self) -> list[Array]:
-        assert self.alike is not None
-        return [np.concatenate(parts) for parts in zip(*map(self.alike.turned, self.sets), strict=True)]
+        assert self.common is not None
+        return [np.concatenate(parts) for parts in zip(*map(self.common.turned, self.sets), strict=True)]
 
 
 @dataclass(frozen=True)
@@ -188,20 +194,20 @@ class FurtherColumns:
         return np.concatenate([self.mixed.A, self.G, self.mixed.z[..., None]], axis=2)
 
     @cached_property
-    def beside(self) -> Array:
+    def with_model(self) -> Array:
         """(t, a + 1, g) products of the model's columns, and of what was seen, with the further ones."""
         if not self.sets:
             return self.mixed.products[:, :, :0]
         return np.concatenate([self.mixed.products_with(own) for own in self.sets], axis=2)
 
     @cached_property
-    def among(self) -> Array:
+    def with_each_other(self) -> Array:
         """(t, g, g) products of the further ones."""
-        alike, sets = self.mixed.alike, self.sets
-        assert alike is not None
+        common, sets = self.mixed.common, self.sets
+        assert common is not None
         if not sets:
             return self.mixed.products[:, :0, :0]
-        rows = [np.concatenate([alike.products(one, other) for other in sets], axis=2) for one in sets]
+        rows = [np.concatenate([common.products(one, other) for other in sets], axis=2) for one in sets]
         return np.concatenate(rows, axis=1)
 
     @cached_property
@@ -209,19 +215,19 @@ class FurtherColumns:
         """(t, a + g + 1, a + g + 1) products of all, in the order of `Xz`."""
         if not self.sets:
             return self.mixed.products
-        a, g = self.mixed.A.shape[2], self.beside.shape[2]
+        a, g = self.mixed.A.shape[2], self.with_model.shape[2]
         old, new = np.append(np.arange(a), a + g), slice(a, a + g)
-        every = np.empty((len(self.beside), a + g + 1, a + g + 1))
+        every = np.empty((len(self.with_model), a + g + 1, a + g + 1))
         every[:, old[:, None], old] = self.mixed.products
-        every[:, old, new] = self.beside
-        every[:, new, old] = self.beside.transpose(0, 2, 1)
-        every[:, new, new] = self.among
+        every[:, old, new] = self.with_model
+        every[:, new, old] = self.with_model.transpose(0, 2, 1)
+        every[:, new, new] = self.with_each_other
         return every
 
     def in_mean(self) -> MixedModel:
         """The model where they are columns of the free mean as well."""
         whole = replace(self.mixed, A=np.concatenate([self.mixed.A, self.G], axis=2))
-        if self.mixed.alike is not None:
+        if self.mixed.common is not None:
             # What the new model would sum anew.
             *mean, seen = self.mixed.sets
             vars(whole).update(sets=[*mean, *self.sets, seen], products=self.products)
@@ -230,7 +236,7 @@ class FurtherColumns:
 
 @dataclass(frozen=True)
 class ModelInformation:
-    """What a model whose blocks are alike holds against further columns, at the variances of a fit of it."""
+    """What a model whose blocks have one covariance holds against further columns, at the variances of a fit of it."""
 
     mixed: MixedModel
     pairs: Array  # (t,) what every pair of turned numbers counts
@@ -240,19 +246,19 @@ class ModelInformation:
     def of(self, own: SelectedColumns) -> tuple[Array, Array]:
         """What is told of the coefficients θ of further columns that are kept, beside the model: (g, g) and (g,) of the
         log likelihood vᵀθ − ½ θᵀIθ."""
-        alike = self.mixed.alike
-        assert alike is not None
-        *mean, seen = (alike.weighted(self.pairs, held, own) for held in self.mixed.sets)
+        common = self.mixed.common
+        assert common is not None
+        *mean, seen = (common.weighted(self.pairs, held, own) for held in self.mixed.sets)
         known = self.half.T @ np.concatenate(mean)
-        return alike.weighted(self.pairs, own, own) - known.T @ known, seen[0] - known.T @ self.seen
+        return common.weighted(self.pairs, own, own) - known.T @ known, seen[0] - known.T @ self.seen
 
 
 def model_information(mixed: MixedModel, fit: "VarianceFit") -> ModelInformation:
     """At the variances of a fit, with or without further columns."""
-    assert mixed.alike is not None
+    assert mixed.common is not None
     a = mixed.A.shape[2]
     half, _ = _root_of_inverse(fit.sums[:a, :a])
-    return ModelInformation(mixed, mixed.alike.weights(fit.variances).pairs, half, half.T @ fit.sums[:a, -1])
+    return ModelInformation(mixed, mixed.common.weights(fit.variances).pairs, half, half.T @ fit.sums[:a, -1])
 
 
 @dataclass(frozen=True)
@@ -287,7 +293,7 @@ class Likelihood:
     deviance: float  # −2 log of it, and of the prior of the log variances
     mean: Array  # (a + g,) coefficients
     half: Array  # (a + g, r) square root of their covariance
-    errors: InverseCovariance | AlikeWeights  # of the numbers
+    errors: InverseCovariance | PairWeights  # of the numbers
     sums: Array  # (a + g + 1, a + g + 1) XzᵀV⁻¹Xz of the mean's columns and what was seen
 
     @property
@@ -307,7 +313,7 @@ class Likelihood:
         k, r = self.half.shape
         half_and_rest = np.zeros((k + 1, r + 1))
         half_and_rest[:-1, :-1], half_and_rest[:-1, -1], half_and_rest[-1, -1] = self.half, -self.mean, 1.0
-        if isinstance(self.errors, AlikeWeights):
+        if isinstance(self.errors, PairWeights):
             taken = np.tensordot(self.problem.columns.products, half_and_rest @ half_and_rest.T)
             own = self.errors.traces - self.errors.slopes @ taken
         else:
@@ -328,7 +334,7 @@ class Likelihood:
     def curvature(self) -> Array:
         """(c, c) expected of the deviance, but for what the mean takes: λ_iλ_j tr(V⁻¹C_iV⁻¹C_j)."""
         variances = np.exp(self.log_variances)
-        if isinstance(self.errors, AlikeWeights):
+        if isinstance(self.errors, PairWeights):
             return np.asarray(np.outer(variances, variances) * self.errors.curvature)
         shares = variances[:, None, None, None] * (self.errors.matrix @ self.problem.mixed.components)
         count = len(variances)
@@ -356,16 +362,16 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
     return Likelihood(problem, log_variances, value, mean, half, errors, sums)
 
 
-def _errors_at(mixed: MixedModel, variances: Array) -> InverseCovariance | AlikeWeights:
-    if mixed.alike is not None and np.isfinite(variances).all():
-        return mixed.alike.weights(variances)
+def _errors_at(mixed: MixedModel, variances: Array) -> InverseCovariance | PairWeights:
+    if mixed.common is not None and np.isfinite(variances).all():
+        return mixed.common.weights(variances)
     return invert_covariance(mixed.covariance(variances))
 
 
-def _sums_of_columns(problem: RemlProblem, errors: InverseCovariance | AlikeWeights) -> Array:
+def _sums_of_columns(problem: RemlProblem, errors: InverseCovariance | PairWeights) -> Array:
     """(a + g + 1, a + g + 1) XzᵀV⁻¹Xz."""
     k = len(problem.precision) + 1
-    if isinstance(errors, AlikeWeights):
+    if isinstance(errors, PairWeights):
         return np.tensordot(errors.pairs, problem.columns.products, axes=1)
     sums = np.zeros((k, k))
     for at in _portions(len(problem.mixed.z)):
@@ -375,10 +381,10 @@ def _sums_of_columns(problem: RemlProblem, errors: InverseCovariance | AlikeWeig
 
 
 def _square_of_rest(
-    problem: RemlProblem, errors: InverseCovariance | AlikeWeights, sums: Array, of_rest: Array
+    problem: RemlProblem, errors: InverseCovariance | PairWeights, sums: Array, of_rest: Array
 ) -> float:
     """rᵀV⁻¹r of what the mean leaves, with its combination (a + g + 1,) of the columns."""
-    if isinstance(errors, AlikeWeights):
+    if isinstance(errors, PairWeights):
         return float(of_rest @ sums @ of_rest)
     rest = (flatten_blocks(problem.columns.Xz) @ of_rest).reshape(*problem.mixed.z.shape, 1)
     return float(np.sum((errors.half @ rest) ** 2))

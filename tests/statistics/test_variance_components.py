@@ -8,7 +8,7 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from stitch.statistics import reml
-from stitch.statistics.alike_blocks import SelectedColumns, alike_blocks
+from stitch.statistics.common_covariance import SelectedColumns, common_covariance
 from stitch.statistics.least_squares import invert_covariance
 from stitch.statistics.reml import (
     ALWAYS_PRESENT,
@@ -173,7 +173,7 @@ def turned_blocks(rng, count=80, targets=3):
     return [every[..., :3], every[..., 3:]], noise, known
 
 
-def alike_model(rng, scattered, noise, known):
+def model_of_turned_blocks(rng, scattered, noise, known):
     """A mixed model of such blocks, and its three further columns."""
     components = np.zeros((3, *noise.shape, noise.shape[1]))
     for own, J in zip(components, scattered, strict=False):
@@ -182,17 +182,17 @@ def alike_model(rng, scattered, noise, known):
     there = (noise > 0) | (np.arange(len(noise)) >= len(scattered[0]))[:, None]
     z, A, G = (rng.standard_normal((*noise.shape, k)) * there[..., None] for k in (1, 4, 3))
     fixed = known[..., None] * np.eye(noise.shape[1])
-    return MixedModel(z[..., 0], A, components, fixed, alike=alike_blocks(scattered, noise, known)), G
+    return MixedModel(z[..., 0], A, components, fixed, common=common_covariance(scattered, noise, known)), G
 
 
 @pytest.mark.parametrize("prior", [None, np.array([0.3, 1.0, 2.0])])
-def test_sums_over_alike_blocks_are_those_of_every_block(prior):
+def test_sums_over_common_covariance_are_those_of_every_block(prior):
     """Likelihood, slope, curvature, mean and fit as of the blocks one by one; columns taken into the mean too."""
     rng = np.random.default_rng(3)
-    mixed, G = alike_model(rng, *turned_blocks(rng))
-    assert mixed.alike is not None
-    assert len(mixed.alike.groups) == 2
-    x, single = np.log([1e-5, 0.02, 1.7]), replace(mixed, alike=None)
+    mixed, G = model_of_turned_blocks(rng, *turned_blocks(rng))
+    assert mixed.common is not None
+    assert len(mixed.common.groups) == 2
+    x, single = np.log([1e-5, 0.02, 1.7]), replace(mixed, common=None)
     of_groups, of_blocks = (reml.likelihood(x, reml_problem(own, G, prior)) for own in (mixed, single))
     for value in ("deviance", "slope", "curvature", "mean", "covariance", "sums"):
         assert getattr(of_groups, value) == pytest.approx(getattr(of_blocks, value), rel=1e-8, abs=1e-8)
@@ -225,7 +225,7 @@ def test_blocks_that_differ_are_summed_one_by_one():
     scattered, noise, known = turned_blocks(np.random.default_rng(4))
     moved = [own.copy() for own in scattered]
     moved[0][50] *= 1.001
-    assert alike_blocks(moved, noise, known) is None
+    assert common_covariance(moved, noise, known) is None
     quiet = noise.copy()
     quiet[60, 0] = 0.0
-    assert alike_blocks(scattered, quiet, known) is None
+    assert common_covariance(scattered, quiet, known) is None

@@ -203,7 +203,7 @@ def match_pairs(
     every = neighbour_queries(scans, poses, samples)
     again = None if before is None else before.still_open(every, parts, gate)
 
-    def asked(w: int) -> tuple[Nearest, dict[int, Match]]:
+    def search_view(w: int) -> tuple[Nearest, dict[int, Match]]:
         """What is nearest in one view, and by view that asks what of it lies within the gate."""
         if not parts[w]:
             return Nearest(np.zeros(0, np.int32), np.zeros(0, np.float32)), {}
@@ -215,7 +215,7 @@ def match_pairs(
         partner[again[w]] = every.partners(w, p.take(again[w], axis=0), gate)
         return before.nearest[w], _partners_by_view(every, w, parts[w], gate, partner, (index, p, n))
 
-    nearest, answers = zip(*parallel(asked, range(len(scans))), strict=True)
+    nearest, answers = zip(*parallel(search_view, range(len(scans))), strict=True)
     matches = []
     for v, w in pairs:
         found = [of for of in (answers[w].pop(v), answers[v].pop(w).swapped()) if len(of.residual)]

@@ -1,4 +1,4 @@
-"""Sums over blocks whose covariances are alike: made once for all sizes of the errors, and for every set of columns.
+"""Sums over blocks that have one covariance but for a turn: made once for all variances, and for every set of columns.
 
 Where every view shows the same targets on its flange, what the flange's scatter does to them is the same but for the
 flange's orientation. In numbers turned accordingly all these views have one covariance of a few numbers, and a sum
@@ -46,7 +46,7 @@ class SelectedColumns:
 
 
 @dataclass(frozen=True)
-class AlikeGroup:
+class CovarianceGroup:
     """n blocks whose covariances are one after a turn of their m numbers: r of these scatter, the rest is noise."""
 
     blocks: Indices  # (n,)
@@ -61,7 +61,7 @@ class AlikeGroup:
 
 
 @dataclass(frozen=True)
-class AlikeWeights:
+class PairWeights:
     """At some variances what every pair of turned numbers counts in sums over blocks, and what that gives."""
 
     logdet: float  # of the covariance
@@ -72,10 +72,10 @@ class AlikeWeights:
 
 
 @dataclass(frozen=True)
-class AlikeBlocks:
-    """B blocks of m numbers in groups that are alike, and the sums over them that were asked for."""
+class CommonCovariance:
+    """B blocks of m numbers in groups of one covariance each, and the sums over them that were asked for."""
 
-    groups: Sequence[AlikeGroup]
+    groups: Sequence[CovarianceGroup]
     per_noise: Array  # (B, m) one over the sensor's noise; 0 where the number has none
     per_known: Array  # (B, m) one over a standard deviation that is known; 0 for all others
     noise_alone: int  # numbers in all beyond those that scatter
@@ -85,7 +85,7 @@ class AlikeBlocks:
     _turned: dict[int, list[Array]] = field(default_factory=dict, repr=False)
     _products: dict[tuple[int, int], Array] = field(default_factory=dict, repr=False)
 
-    def weights(self, variances: Array) -> AlikeWeights:
+    def weights(self, variances: Array) -> PairWeights:
         """At variances (c,), the sensor's noise last; of those that have no inverse `logdet` is infinite."""
         noise, count = variances[-1], len(variances)
         logdet, pairs, slopes = self.logdet + self.noise_alone * float(np.log(noise)), [], []
@@ -103,7 +103,7 @@ class AlikeBlocks:
         traces[-1] += self.noise_alone / noise
         curvature[-1, -1] += self.noise_alone / noise**2
         slopes.append(np.column_stack([of_noise / noise**2, np.zeros(count)]))
-        return AlikeWeights(logdet, np.concatenate([*pairs, [1 / noise, 1.0]]), np.hstack(slopes), traces, curvature)
+        return PairWeights(logdet, np.concatenate([*pairs, [1 / noise, 1.0]]), np.hstack(slopes), traces, curvature)
 
     def products(self, a: SelectedColumns, b: SelectedColumns) -> Array:
         """(t, p, q) sums over blocks of the products of two sets of columns, for every pair of turned numbers."""
@@ -173,15 +173,15 @@ def pair_products(X: Sequence[Array], Y: Sequence[Array]) -> Array:
     return np.concatenate(out)
 
 
-# Matrices of blocks that are alike differ by rounding, as a share; directions with less than the second share of the
+# Matrices of blocks of one covariance differ by rounding, as a share; directions with less than the second share of the
 # largest eigenvalue are none, and between that and the third a turn would be imprecise.
-_ALIKE, _NO_DIRECTION, _PRECISE = 1e-9, 1e-13, 1e-5
+_SAME, _NO_DIRECTION, _PRECISE = 1e-9, 1e-13, 1e-5
 # Blocks a group at least, on average, and in all: else sums of their own are as fast.
 _BLOCKS_A_GROUP, MANY_BLOCKS = 20, 50
 
 
-def alike_blocks(scattered: Sequence[Array], noise: Array, known: Array) -> AlikeBlocks | None:
-    """Find groups of blocks that are alike; None where most are not.
+def common_covariance(scattered: Sequence[Array], noise: Array, known: Array) -> CommonCovariance | None:
+    """Find groups of blocks that have one covariance but for a turn; None where there are none.
 
     Args:
         scattered: per component of scatter (V, m, 3) what a unit of it does to the numbers of the first V blocks.
@@ -202,11 +202,11 @@ def alike_blocks(scattered: Sequence[Array], noise: Array, known: Array) -> Alik
         return None
     scatter = sum(len(group.blocks) * group.turn.shape[1] for group in found)
     log_units = float(np.log(noise[noise > 0]).sum() + np.log(known[known > 0]).sum())
-    return AlikeBlocks(found, per_noise, per_known, int((noise > 0).sum()) - scatter, log_units)
+    return CommonCovariance(found, per_noise, per_known, int((noise > 0).sum()) - scatter, log_units)
 
 
-def _group_of(J: Array, blocks: Indices, owner: Indices) -> AlikeGroup | None:
-    """Some blocks as a group, if they are alike.
+def _group_of(J: Array, blocks: Indices, owner: Indices) -> CovarianceGroup | None:
+    """Some blocks as a group, if they have one covariance.
 
     Args:
         J: (V, m, s) what a unit of scatter along each of s axes does to their numbers, in units of the noise.
@@ -214,7 +214,7 @@ def _group_of(J: Array, blocks: Indices, owner: Indices) -> AlikeGroup | None:
     """
     every = J[blocks].transpose(0, 2, 1) @ J[blocks]
     size = np.sqrt(np.maximum(np.diag(every[0]), 1e-300))
-    if (np.abs(every - every[0]) > _ALIKE * np.outer(size, size)).any():
+    if (np.abs(every - every[0]) > _SAME * np.outer(size, size)).any():
         return None
     values, vectors = np.linalg.eigh(every[0] / np.outer(size, size))
     keep = values > _NO_DIRECTION * max(values[-1], 1e-300)
@@ -223,4 +223,4 @@ def _group_of(J: Array, blocks: Indices, owner: Indices) -> AlikeGroup | None:
     root = np.sqrt(values[keep]) * vectors[:, keep]  # (s, r), axes of unit size
     of_components = [(root * (size**2 * (owner == i))[:, None]).T @ root for i in range(owner[-1] + 1)]
     turn = J[blocks] @ (vectors[:, keep] / np.sqrt(values[keep]) / size[:, None])
-    return AlikeGroup(blocks, turn.transpose(0, 2, 1), np.array([*of_components, np.eye(int(keep.sum()))]))
+    return CovarianceGroup(blocks, turn.transpose(0, 2, 1), np.array([*of_components, np.eye(int(keep.sum()))]))
