@@ -12,15 +12,14 @@ from stitch.errors import InputError
 from stitch.frames import Array
 from stitch.watch.history import (
     TWIST_NAMES,
-    Estimate,
     History,
-    RunRecord,
     insert_run,
     matrix_json,
     mount_twist,
     scanned_middle,
     twist_covariance,
 )
+from stitch.watch.run_record import Estimate, RunRecord
 from stitch.watch.tracking import (
     Alarm,
     Bank,
