@@ -37,20 +37,17 @@ class Form:
     @property
     def response(self) -> Array:
         """(·, p) of the observation to the free ones."""
-        return self._of_free(self.whole)
+        return SelectedColumns(self.whole, self.keep).columns
 
     @property
     def columns(self) -> Array:
         """(n, p) of the free ones in the channel."""
-        return self._of_free(self.reduced)
+        return self.selected.columns
 
     @property
     def selected(self) -> SelectedColumns:
         """The same, of those whose sums are kept."""
         return SelectedColumns(self.reduced, self.keep)
-
-    def _of_free(self, columns: Array) -> Array:
-        return columns if self.keep.all() else columns[:, self.keep]
 
     @property
     def free(self) -> list[Parameter]:

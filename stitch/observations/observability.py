@@ -31,10 +31,8 @@ _TURNED = np.radians(0.5)
 def seen_part(captures: Sequence[Capture]) -> tuple[Array, float]:
     """Return the centre (3,) of what the scanner saw, scanner frame, and the size of the part, length_unit."""
     every = [points for c in captures for points in c.point_sets]
-    centre, size = (
-        np.asarray(np.mean([centroid(p) for p in every], axis=0)),
-        float(np.median([spread(p) for p in every])),
-    )
+    centre = np.asarray(np.mean([centroid(p) for p in every], axis=0))
+    size = float(np.median([spread(p) for p in every]))
     # A probe is a point: a tenth of its distance stands in for its size.
     return centre, size or 0.1 * float(np.linalg.norm(centre))
 

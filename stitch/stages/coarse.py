@@ -117,7 +117,7 @@ def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) 
             if not parts:
                 return []
             _, points, normals = every.gather(parts)
-            distance, _, facing = every.search(w, points, normals, limit)
+            distance, facing = every.search(w, points, normals, limit)
             by_view = np.split(np.where(facing, distance, limit) ** 2, np.cumsum(every.counts(parts))[:-1])
             return [float(np.mean(own)) for own in by_view]
 

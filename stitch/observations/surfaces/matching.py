@@ -54,8 +54,7 @@ class NeighbourQueries:
 
     def nearest(self, w: int, points: Array, gate: float) -> Nearest:
         """What points (N, 3) of the reference frame find in view w, and how certain it is after motion."""
-        tree, reach = self.scans[w].tree, _REACH * gate
-        query = np.ascontiguousarray(frames.transform(frames.inverse(self.poses[w]), points))
+        tree, reach, query = self.scans[w].tree, _REACH * gate, self._seen_from(w, points)
         distance, index = tree.query(query, k=min(2, tree.n), distance_upper_bound=reach)
         first, second = distance.reshape(len(query), -1).T[[0, -1]]
         # What is beyond the gate anyway has to come all the way back.
@@ -64,32 +63,32 @@ class NeighbourQueries:
 
     def partners(self, w: int, points: Array, gate: float) -> NDArray[np.int32]:
         """(N,) usable points of view w that are nearest to points (N, 3) of the reference frame, -1 for none."""
-        query = np.ascontiguousarray(frames.transform(frames.inverse(self.poses[w]), points))
-        return self._usable(w, self.scans[w].tree.query(query, k=1, distance_upper_bound=gate)[1])
+        return self._usable(w, self.scans[w].tree.query(self._seen_from(w, points), distance_upper_bound=gate)[1])
 
     def _usable(self, w: int, index: NDArray[np.uint32]) -> NDArray[np.int32]:
         # Where none is found its number is one beyond the last.
         return np.where(np.append(self.scans[w].usable, False)[index], index.astype(np.int32), np.int32(-1))
 
-    def search(self, w: int, points: Array, normals: Array, gate: float) -> tuple[Array, Indices, NDArray[np.bool_]]:
-        """Of N points each (N,): distance (inf where none), index of the partner and whether it may be used.
+    def search(self, w: int, points: Array, normals: Array, gate: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Of N points each (N,): distance (inf where none), and whether the partner may be used.
 
         Args:
             w: the view in which partners are sought.
             points, normals: (N, 3) reference frame.
             gate: farthest partner, length_unit.
         """
-        scan, T = self.scans[w], frames.inverse(self.poses[w])
-        # The trees stay in their scanner's frame; the queries travel.
-        query = np.ascontiguousarray(frames.transform(T, points))
-        distance, partner = scan.tree.query(query, k=1, distance_upper_bound=gate)
-        found = np.isfinite(distance)
-        partner = np.where(found, partner, 0).astype(np.int64)
-        accept = found & scan.usable[partner]
+        scan = self.scans[w]
+        distance, index = scan.tree.query(self._seen_from(w, points), distance_upper_bound=gate)
+        partner = self._usable(w, index)
+        accept = partner >= 0
         near = np.flatnonzero(accept)
-        cosine = np.einsum("ij,ij->i", frames.rotate(T, normals[near]), scan.normals[partner[near]])
-        accept[near] = cosine > _NORMAL_COSINE
-        return distance, partner, accept
+        facing = frames.rotate(frames.inverse(self.poses[w]), normals[near])
+        accept[near] = np.einsum("ij,ij->i", facing, scan.normals[partner[near]]) > _NORMAL_COSINE
+        return distance, accept
+
+    def _seen_from(self, w: int, points: Array) -> Array:
+        # The trees stay in their scanner's frame; the queries travel.
+        return np.ascontiguousarray(frames.transform(frames.inverse(self.poses[w]), points))
 
 
 def neighbour_queries(scans: Sequence[Scan], poses: Array, samples: Sequence[Indices]) -> NeighbourQueries:
@@ -302,7 +301,7 @@ def overlapping_pairs(
         if not parts:
             return []
         _, points, normals = every.gather(parts)
-        agree = np.split(every.search(w, points, normals, gate)[2], np.cumsum(every.counts(parts))[:-1])
+        agree = np.split(every.search(w, points, normals, gate)[1], np.cumsum(every.counts(parts))[:-1])
         return [v for (v, _), own in zip(parts, agree, strict=True) if np.mean(own) >= MINIMUM_OVERLAP]
 
     def met(pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
