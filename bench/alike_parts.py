@@ -21,9 +21,9 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated
 from data_synth.scene import Scene, load_scene
 from data_synth.shapes.solid import circle, extrude, to_mesh, union
+from stitch.api.pipeline import run
 from stitch.errors import StitchError
-from stitch.measurement.session import Session
-from stitch.pipeline import run
+from stitch.session.session import Session
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "integrity.md"
 SCENES = ("blade", "blade-table")

@@ -18,12 +18,12 @@ from data_synth.cells import window_scans
 from data_synth.scanning import scan
 from data_synth.shapes import build_shape
 from data_synth.shapes.casting import around, with_stock
-from stitch import frames
-from stitch.cells.cad import CadSurface, cad_surface
-from stitch.cells.placed_scans import JoinedScans, join_scans
-from stitch.cells.scan_to_cad import AllowancePrior, CadFit, fit_cad
-from stitch.frames import Array
-from stitch.measurement.scan import prepare_scan
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.plugins.cells.cad import CadSurface, cad_surface
+from stitch.plugins.cells.placed_scans import JoinedScans, join_scans
+from stitch.plugins.cells.scan_to_cad import AllowancePrior, CadFit, fit_cad
+from stitch.session.scan import prepare_scan
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "window.md"
 BEGIN, END = "<!-- allowance: begin -->", "<!-- allowance: end -->"

@@ -18,11 +18,11 @@ import numpy as np
 from scipy.stats import binomtest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.frames import Array
-from stitch.measurement.session import Session
+from stitch.api.pipeline import run
 from stitch.model.model_toml import ModelFile, keep_arm_effects
-from stitch.pipeline import run
-from stitch.writing.result_document import model_of
+from stitch.numerics.frames import Array
+from stitch.output.result_document import model_of
+from stitch.session.session import Session
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
 MARKS = ("<!-- arm doubt: begin -->", "<!-- arm doubt: end -->")

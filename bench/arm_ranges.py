@@ -17,12 +17,12 @@ from scipy.spatial.transform import Rotation
 from data_synth.arms import ARMS
 from data_synth.kinematics import gravity_torques
 from data_synth.ordinary_arm import draw_arm
-from stitch import frames
-from stitch.calibrate.robot import LINK_TRUSTS, link_table, observe_links
-from stitch.frames import Array
-from stitch.measurement.robot import Robot, forward
-from stitch.measurement.session import Scanner, Session, Sighting, View
-from stitch.reading.robot_description import robot_from_dh
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.plugins.metrology.calibrate.robot import LINK_TRUSTS, link_table, observe_links
+from stitch.session.reading.robot_description import robot_from_dh
+from stitch.session.robot import Robot, forward
+from stitch.session.session import Scanner, Session, Sighting, View
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
 _TARGETS = np.array([[60.0, 10.0, 30.0], [-40.0, 55.0, 25.0], [-20.0, -60.0, 40.0]])

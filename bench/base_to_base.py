@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch import frames
-from stitch.cells.stand import Stand, TouchedPoints, compare_distances, cylinder_points, fit_stand, project
+from stitch.numerics import frames
+from stitch.plugins.cells.stand import Stand, TouchedPoints, compare_distances, cylinder_points, fit_stand, project
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "base-to-base.md"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"

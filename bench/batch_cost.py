@@ -14,7 +14,7 @@ _SECONDS_A_DAY = 86_400
 _CODE = """
 import os, resource, sys
 from pathlib import Path
-from stitch.batch.run_batch import BatchJob, run_session
+from stitch.plugins.watch.batch.run_batch import BatchJob, run_session
 from stitch.system.threads import share_cores
 
 def spent():

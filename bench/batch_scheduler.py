@@ -12,7 +12,7 @@ import psutil
 from distributed import Client
 from distributed.utils import open_port
 
-from stitch.batch.run_batch import BatchJob, SessionRow, rows_from
+from stitch.plugins.watch.batch.run_batch import BatchJob, SessionRow, rows_from
 
 SIZES = (1_000, 10_000, 100_000)
 _SENTENCE = (

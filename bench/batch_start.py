@@ -8,13 +8,13 @@ from batch_sessions import ROOT
 
 _TIMES = 5
 _MAIN = "from stitch.cli.main import main\ntry:\n    main({})\nexcept SystemExit:\n    pass\n"
-_ALL = "import stitch.cli.run, stitch.cli.change, stitch.cli.watch_command, viz.review.review_command\n"
+_ALL = "import stitch.cli.run, stitch.cli.change, stitch.plugins.watch.watch_command, viz.review.review_command\n"
 # What is loaded now, and what would be if it were not put off.
 _COMMANDS = {
     "stitch --version": ("--version", ""),
     "stitch --help": ("--help", _ALL),
     "stitch run --help": ("run --help", "import stitch.cli.run\n"),
-    "stitch batch --help": ("batch --help", "import stitch.cli.batch\n"),
+    "stitch batch --help": ("batch --help", "import stitch.plugins.watch.batch.command\n"),
 }
 _STEPS = {
     "before the first stage": "import stitch.cli.run\n",

@@ -18,13 +18,13 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.scene import Scene
 from data_synth.simulate import Measured
-from stitch.measurement import scan
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
 from stitch.observations.surfaces.effect_columns import apparent_twists
 from stitch.observations.surfaces.hand_eye_fit import solve_hand_eye
 from stitch.observations.surfaces.scanner_errors import SHARE_BOUNDS, shared_error_likelihood, sum_smooth_errors
 from stitch.observations.surfaces.view_poses import unconstrained_poses
+from stitch.session import scan
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "method.md"
 PARTS, VIEWS, GATE = ("spheres", "blade", "drill-plate"), 8, 5.0

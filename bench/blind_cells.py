@@ -11,7 +11,6 @@ from data_synth.fixtures.quiet_scenes import plan_for
 from data_synth.moment import Plan
 from data_synth.scene import Scene, load_scene
 from data_synth.simulate import Measured, simulate
-from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import form_weights
@@ -19,10 +18,11 @@ from stitch.diagnosis.sensitivity import least_noncentrality
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need
 from stitch.effects.user_file import load
-from stitch.frames import Array
-from stitch.measurement.measurement import Measurement
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.runs.run import Run
+from stitch.run_data import Run
+from stitch.session.measurement import Measurement
 
 # Evidence counts in views: a few thousand points a view show what millions would.
 _PIXELS = {"blade": 110, "blade-table": 110, "drill-plate": 80, "spheres": 80}

@@ -25,14 +25,14 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.moment import Plan
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
+from stitch.api.pipeline import change, diagnose, run, suggest
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.errors import StitchError
 from stitch.observations.linear_model import LinearModel
-from stitch.pipeline import change, diagnose, run, suggest
-from stitch.runs.run import Run
+from stitch.run_data import Run
 from stitch.system.threads import library_threads_off
 
 Row = dict[str, Any]

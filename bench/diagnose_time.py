@@ -28,7 +28,7 @@ from stitch.observations.surfaces.effect_columns import view_responses
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.stored.stored_run import load_run
+from stitch.output.stored_run import load_run
 from stitch.system.threads import library_threads_off
 
 # Points of a view of the blade scene with 280 × 280 rays.

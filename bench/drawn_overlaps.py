@@ -8,12 +8,12 @@ from data_synth.moment import Moment
 from data_synth.nature import Nature
 from data_synth.scanner import Cloud
 from data_synth.scene import Scene
-from stitch import frames
-from stitch.frames import Array, Indices
-from stitch.measurement.measurement import Measurement
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
 from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import gram, robust_scale
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, visible_step
+from stitch.session.measurement import Measurement
 
 _PLACES = ("points", "surface")
 # Weights follow the distances; after these steps both stand still.

@@ -11,7 +11,7 @@ from drilling_loop import calibrate_sensors, drive_pose, measure_hole, run_group
 
 from data_synth.cells.drilling import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.cells.drilling_image import render_plate
-from stitch.cells.drilling_sensors import (
+from stitch.plugins.cells.drilling_sensors import (
     HoleObservations,
     fit_homography,
     leave_one_out,
@@ -113,7 +113,7 @@ def _size(found: np.ndarray, seeds: int) -> str:
 
 def image_table(seeds: int) -> list[str]:
     """Needs OpenCV."""
-    from stitch.cells.drilling_sensors import find_holes, order_grid
+    from stitch.plugins.cells.drilling_sensors import find_holes, order_grid
 
     errors, left_out = [], []
     for seed in range(seeds):

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch import frames
-from stitch.cells.drilling_sensors import (
+from stitch.errors import NoResultError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.plugins.cells.drilling_sensors import (
     GroupCompensation,
     compensate_group,
     fit_homography,
@@ -18,8 +20,6 @@ from stitch.cells.drilling_sensors import (
     hole_rotation,
     to_plane,
 )
-from stitch.errors import NoResultError
-from stitch.frames import Array
 
 
 def drive_pose(position: Array, direction: Array) -> Array:

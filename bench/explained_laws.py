@@ -22,9 +22,9 @@ from data_synth.laws.blind_first import FOREIGN
 from data_synth.laws.blind_second import FURTHER
 from data_synth.laws.blind_third import LATER
 from data_synth.laws.unnamed import UNNAMED
-from stitch.explanation.explain import explain
-from stitch.frames import Array
+from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
+from stitch.plugins.explain.explain import explain
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")

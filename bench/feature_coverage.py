@@ -28,14 +28,14 @@ from data_synth.ordinary_arm import draw_arm
 from data_synth.scene import load_scene
 from data_synth.shapes.spheres import SpherePlate, build_plate, centres
 from data_synth.simulate import Measured, simulate
-from stitch import frames
-from stitch.frames import Array
-from stitch.measuring.budget import MeasuredFeatures, measure_features, monte_carlo
-from stitch.measuring.error_sources import place_errors
-from stitch.measuring.feature_file import FeatureList
-from stitch.measuring.features import Feature
-from stitch.measuring.place_errors import PlaceErrors
-from stitch.pipeline import run
+from stitch.api.pipeline import run
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.plugins.metrology.budget import MeasuredFeatures, measure_features, monte_carlo
+from stitch.plugins.metrology.error_sources import place_errors
+from stitch.plugins.metrology.feature_file import FeatureList
+from stitch.plugins.metrology.features import Feature
+from stitch.plugins.metrology.place_errors import PlaceErrors
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "measure.md"
 BEGIN, END = "<!-- coverage: begin -->", "<!-- coverage: end -->"

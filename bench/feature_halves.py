@@ -13,16 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.calibrate.sphere import calibrate_sphere
+from stitch.api.pipeline import run
 from stitch.errors import NoResultError
-from stitch.frames import Array
-from stitch.measuring.budget import fit_features, measure_features
-from stitch.measuring.error_sources import place_errors
-from stitch.measuring.feature_file import FeatureList
-from stitch.measuring.features import Feature
-from stitch.measuring.place_errors import PlaceErrors
-from stitch.pipeline import run
-from stitch.reading.session_folder import load_session
+from stitch.numerics.frames import Array
+from stitch.plugins.metrology.budget import fit_features, measure_features
+from stitch.plugins.metrology.calibrate.sphere import calibrate_sphere
+from stitch.plugins.metrology.error_sources import place_errors
+from stitch.plugins.metrology.feature_file import FeatureList
+from stitch.plugins.metrology.features import Feature
+from stitch.plugins.metrology.place_errors import PlaceErrors
+from stitch.session.reading.session_folder import load_session
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "measure.md"
 BEGIN, END = "<!-- halves: begin -->", "<!-- halves: end -->"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.feature_coverage import Sizes, measured_cell
-from stitch.measuring.error_sources import ARM, SCANNER, SCATTER, WANDERING
+from stitch.plugins.metrology.error_sources import ARM, SCANNER, SCATTER, WANDERING
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "measure.md"
 BEGIN, END = "<!-- shares: begin -->", "<!-- shares: end -->"

@@ -25,15 +25,15 @@ from data_synth.fixtures.quiet_scenes import plan_for
 from data_synth.ordinary_arm import draw_arm
 from data_synth.scene import load_scene
 from data_synth.simulate import on_rail, simulate
-from stitch import frames
-from stitch.frames import Array
-from stitch.measurement.capture import part_size, prepare_capture
-from stitch.measurement.measurement import measurement_of
+from stitch.fit.correct import correct
 from stitch.model.model import COVERAGE_FACTOR, Model
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
 from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
 from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.stages.correct import correct
+from stitch.session.capture import part_size, prepare_capture
+from stitch.session.measurement import measurement_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "method.md"
 SCENES = ("blade", "drill-plate", "blade-table")

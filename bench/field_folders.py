@@ -30,12 +30,12 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.field_drawn import draw_kinds
 from data_synth.fixtures.field_folders import KINDS, Campaign, Kind, rescale
 from data_synth.write import write_session
-from stitch import frames
 from stitch.cli.main import main as stitch
-from stitch.frames import Array
-from stitch.measurement.session import Session
-from stitch.reading.session_folder import load_session
-from stitch.writing.urdf_file import to_urdf
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.output.urdf_file import to_urdf
+from stitch.session.reading.session_folder import load_session
+from stitch.session.session import Session
 
 ROOT = Path(__file__).resolve().parents[1]
 CASES = Path(os.environ.get("STITCH_SHARED_CASES") or ROOT.parent / "shared" / "cases")

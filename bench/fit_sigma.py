@@ -20,12 +20,12 @@ from data_synth.scanner import field_map
 from data_synth.scanning import scan
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
-from stitch import frames
-from stitch.cells.cad import cad_surface
-from stitch.cells.placed_scans import PlacingErrors, join_scans
-from stitch.cells.scan_to_cad import fit_cad
 from stitch.errors import NoResultError
-from stitch.measurement.scan import prepare_scan
+from stitch.numerics import frames
+from stitch.plugins.cells.cad import cad_surface
+from stitch.plugins.cells.placed_scans import PlacingErrors, join_scans
+from stitch.plugins.cells.scan_to_cad import fit_cad
+from stitch.session.scan import prepare_scan
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "window.md"
 BEGIN, END = "<!-- sigma: begin -->", "<!-- sigma: end -->"

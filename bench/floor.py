@@ -13,8 +13,8 @@ from batch import into_page
 from large import PAGE
 
 import stitch
-from stitch import frames
-from stitch.measurement.capture import Capture, prepare_capture
+from stitch.numerics import frames
+from stitch.session.capture import Capture, prepare_capture
 from stitch.system.threads import library_threads_off, parallel
 
 

@@ -17,16 +17,16 @@ from pathlib import Path
 import numpy as np
 
 from data_synth.fixtures.raw_folders import Convention, session_poses, table_of
-from stitch import frames
-from stitch.intake.cloud_pairs import pairings
-from stitch.intake.convention_choice import choose_convention, choose_mounting
-from stitch.intake.first_session import capture_of
-from stitch.intake.raw_poses import RawPoses
-from stitch.intake.readings import StatedTable, all_readings, candidate_units
-from stitch.integrity.conventions import register_scan_pairs
-from stitch.integrity.hypotheses import ORDERS
-from stitch.measurement.capture import Capture
-from stitch.reading.clouds import read_cloud
+from stitch.numerics import frames
+from stitch.plugins.intake.cloud_pairs import pairings
+from stitch.plugins.intake.convention_choice import choose_convention, choose_mounting
+from stitch.plugins.intake.first_session import capture_of
+from stitch.plugins.intake.raw_poses import RawPoses
+from stitch.plugins.intake.readings import StatedTable, all_readings, candidate_units
+from stitch.screening.conventions import register_scan_pairs
+from stitch.screening.hypotheses import ORDERS
+from stitch.session.capture import Capture
+from stitch.session.reading.clouds import read_cloud
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "conventions-told.md"

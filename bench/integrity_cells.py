@@ -12,17 +12,17 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated, with_part
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured
+from stitch.api.pipeline import run
 from stitch.errors import StitchError
-from stitch.integrity.deep_check import apply_displacement_limits, deep_check
-from stitch.integrity.snooping import Snooping, snoop_views
-from stitch.integrity.view_model import UsualEffects
-from stitch.measurement.capture import Capture, prepare_capture
-from stitch.measurement.measurement import measurement_of
-from stitch.measurement.session import Session
+from stitch.fit.correct import icp_hand_eye
 from stitch.model.model import Model
 from stitch.observations.surfaces.view_poses import unconstrained_poses
-from stitch.pipeline import run
-from stitch.stages.correct import icp_hand_eye
+from stitch.screening.deep_check import apply_displacement_limits, deep_check
+from stitch.screening.snooping import Snooping, snoop_views
+from stitch.screening.view_model import UsualEffects
+from stitch.session.capture import Capture, prepare_capture
+from stitch.session.measurement import measurement_of
+from stitch.session.session import Session
 
 PARTS: dict[str, dict[str, Any]] = {
     "blade": {},

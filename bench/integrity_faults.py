@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stitch import frames
-from stitch.measurement.robot import forward
-from stitch.measurement.session import Cloud, Session
+from stitch.numerics import frames
+from stitch.session.robot import forward
+from stitch.session.session import Cloud, Session
 
 Array = NDArray[np.float64]
 _OTHER = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}

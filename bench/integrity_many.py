@@ -9,9 +9,9 @@ from integrity_cells import VIEWS, measured
 from integrity_faults import displaced, moved_clouds, shown, with_clouds
 
 from data_synth.fixtures.in_memory import session_of
+from stitch.api.pipeline import run
 from stitch.errors import StitchError
-from stitch.measurement.session import Session
-from stitch.pipeline import run
+from stitch.session.session import Session
 
 WRONG = (5, 6, 7, 8)  # of 14 views
 

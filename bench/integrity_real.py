@@ -8,9 +8,9 @@ import numpy as np
 from integrity_cells import judged
 from integrity_faults import Fault, faults
 
+from stitch.api.pipeline import run
 from stitch.errors import StitchError
-from stitch.pipeline import run
-from stitch.reading.session_folder import load_session
+from stitch.session.reading.session_folder import load_session
 
 REAL = (
     "two exchanged",

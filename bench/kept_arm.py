@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.measurement.session import Session
+from stitch.api.pipeline import run, run_rig, suggest
 from stitch.model.model_toml import keep_arm_effects
-from stitch.pipeline import run, run_rig, suggest
-from stitch.reading.session_folder import load_session
-from stitch.runs.run import Run
-from stitch.writing.result_document import model_of
+from stitch.output.result_document import model_of
+from stitch.run_data import Run
+from stitch.session.reading.session_folder import load_session
+from stitch.session.session import Session
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or ROOT.parent / "shared" / "data")

@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch import frames
-from stitch.integrity.deep_check import deep_check
-from stitch.measurement.robot import forward
-from stitch.measurement.session import Session
+from stitch.numerics import frames
+from stitch.screening.deep_check import deep_check
+from stitch.session.robot import forward
+from stitch.session.session import Session
 
 VIEWS = (100, 1_000, 10_000)
 KNOCK = frames.exp(np.array([0.02, -0.03, 0.05, 40.0, -25.0, 10.0]))

@@ -10,8 +10,8 @@ from pathlib import Path
 from batch import into_page
 from kept_arm import SHARED, every
 
-from stitch.calibrate.robot import link_table
-from stitch.reading.session_folder import load_session
+from stitch.plugins.metrology.calibrate.robot import link_table
+from stitch.session.reading.session_folder import load_session
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
 # Every how manieth pose: about 600 of each arm.

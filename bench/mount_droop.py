@@ -20,15 +20,15 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated
 from data_synth.laws.brackets import end_twist
 from data_synth.simulate import Measured
-from stitch import frames
+from stitch.api.pipeline import change, diagnose, run
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.thresholds import ODDS
 from stitch.effects import EFFECTS, effect, twist
 from stitch.errors import StitchError
-from stitch.frames import Array
-from stitch.measurement.measurement import Views
-from stitch.pipeline import change, diagnose, run
-from stitch.runs.run import Run
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.run_data import Run
+from stitch.session.measurement import Views
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade-table", "drill-plate", "spheres")

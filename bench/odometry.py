@@ -17,10 +17,10 @@ import numpy as np
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
 from data_synth.write import write_session
-from stitch.closed_form.odometry import hand_eye_of_stream, is_stream, motions_between, size_of_scan
-from stitch.frames import Array
-from stitch.pipeline import run
-from stitch.reading.session_folder import load_session
+from stitch.api.pipeline import run
+from stitch.numerics.frames import Array
+from stitch.numerics.odometry import hand_eye_of_stream, is_stream, motions_between, size_of_scan
+from stitch.session.reading.session_folder import load_session
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "session.md"
 BEGIN, END = "<!-- odometry: begin -->", "<!-- odometry: end -->"

@@ -20,11 +20,11 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
-from stitch import frames
 from stitch.api.session import Session
-from stitch.export import ARM, CLOUD, HAND_EYE
-from stitch.frames import Array
-from stitch.measurement.robot import Robot, forward
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.plugins.export.formats import ARM, CLOUD, HAND_EYE
+from stitch.session.robot import Robot, forward
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "integrity.md"
 X = frames.make(Rotation.from_rotvec([0.08, -0.12, 0.75]).as_matrix(), np.array([62.0, -38.0, 95.0]))

@@ -20,8 +20,8 @@ import numpy as np
 from blind_trials import pin
 from ordinary_cells import SCANS_A_STOP, Cell, cell_of, erring, seen
 
-from stitch import frames
 from stitch.model.model import Model
+from stitch.numerics import frames
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
 

@@ -12,15 +12,15 @@ from data_synth.moment import Plan
 from data_synth.ordinary_arm import coupled, draw_arm, with_memory
 from data_synth.scene import load_scene
 from data_synth.simulate import on_rail, simulate
-from stitch import frames
-from stitch.frames import Array
-from stitch.measurement.capture import part_size, prepare_capture
-from stitch.measurement.measurement import Measurement, measurement_of, with_part_origin
+from stitch.fit.correct import COARSE_SAMPLES
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
 from stitch.observations.surfaces.hand_eye_fit import capture_repeatability
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps, next_gate
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
-from stitch.stages.correct import COARSE_SAMPLES
+from stitch.session.capture import part_size, prepare_capture
+from stitch.session.measurement import Measurement, measurement_of, with_part_origin
 
 SCATTER = np.repeat([20e-6, 0.02], 3)  # of the flange, rad and mm
 # Poses of a session in which every stop is scanned so often.

@@ -21,10 +21,10 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured
-from stitch import frames
-from stitch.measurement.capture import prepare_capture
-from stitch.stages.fuse import fuse_points, place_scans
-from stitch.stages.support import PlacedPoints, find_support
+from stitch.fusion.fuse import fuse_points, place_scans
+from stitch.fusion.support import PlacedPoints, find_support
+from stitch.numerics import frames
+from stitch.session.capture import prepare_capture
 
 Array = NDArray[np.float64]
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "junk.md"

@@ -14,8 +14,9 @@ from panel_ready import MASTER, POSES, TOLERANCE, pose_error, read, ready, ready
 
 from data_synth.cells import hexapod, panel_job
 from data_synth.cells.panel import NAMES, PanelCell, Sizes
-from stitch import frames
-from stitch.cells.panel_model import (
+from stitch.errors import NoResultError
+from stitch.numerics import frames
+from stitch.plugins.cells.panel_model import (
     SHAPE_AXES,
     LaserTracker,
     Legs,
@@ -24,7 +25,6 @@ from stitch.cells.panel_model import (
     find_leg_offset,
     true_flanges,
 )
-from stitch.errors import NoResultError
 from viz.cells.panel import errors_figure, shape_figure
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -6,8 +6,8 @@ from itertools import product
 import numpy as np
 from panel_ready import MASTER, ready_without_panel
 
-from stitch import frames
-from stitch.cells.panel_model import errors_along_motion, follow
+from stitch.numerics import frames
+from stitch.plugins.cells.panel_model import errors_along_motion, follow
 
 
 def drift_table() -> list[str]:

@@ -9,8 +9,10 @@ from typing import Protocol
 
 import numpy as np
 
-from stitch import frames
-from stitch.cells.panel_model import (
+from stitch.errors import NoResultError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.plugins.cells.panel_model import (
     SHAPE_AXES,
     ControlPoints,
     LaserTracker,
@@ -21,8 +23,6 @@ from stitch.cells.panel_model import (
     rigid_fit,
     shape_step,
 )
-from stitch.errors import NoResultError
-from stitch.frames import Array
 
 _MOST_CORRECTIONS = 10
 

@@ -7,8 +7,8 @@ from panel_loops import PanelSetup, ShapeRun, run_pose, run_shape
 
 from data_synth.cells import panel_job
 from data_synth.cells.panel import NAMES, PanelCell
-from stitch import frames
-from stitch.cells.panel_model import (
+from stitch.numerics import frames
+from stitch.plugins.cells.panel_model import (
     ClampLayout,
     ControlPoints,
     LaserTracker,

@@ -25,9 +25,9 @@ from plyfile import PlyData
 
 from data_synth.fixtures.part_distance import off_surface
 from data_synth.fixtures.quiet_scenes import mesh_of
-from stitch import frames
-from stitch.measurement.capture import build_capture
-from stitch.reading.session_folder import load_session
+from stitch.numerics import frames
+from stitch.session.capture import build_capture
+from stitch.session.reading.session_folder import load_session
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]

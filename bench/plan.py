@@ -22,19 +22,18 @@ from scipy.stats import binomtest
 from data_synth.fixtures.blade_cells import captured, measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.simulate import Measured
-from stitch import frames
 from stitch.diagnosis.candidates import Candidate, candidates_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit
-from stitch.frames import Array
-from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.model.model import Model
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.surfaces.view_poses import unconstrained_poses
-from stitch.planning.detection_chances import DRAWS, ExpectedDiagnosis
-from stitch.planning.expected_model import (
+from stitch.plugins.metrology.planning.detection_chances import DRAWS, ExpectedDiagnosis
+from stitch.plugins.metrology.planning.expected_model import (
     CellModel,
     FieldOfView,
     expected_hand_eye,
@@ -45,6 +44,7 @@ from stitch.planning.expected_model import (
     surface_of_mesh,
     with_scatter,
 )
+from stitch.session.measurement import measurement_of, with_part_origin
 from stitch.system.threads import library_threads_off
 
 Row = dict[str, Any]

@@ -25,22 +25,22 @@ from data_synth import kinematics
 from data_synth.fixtures.in_memory import session_of
 from data_synth.moment import Plan
 from data_synth.simulate import Measured
-from stitch.frames import Array
-from stitch.measurement.session import Session
-from stitch.measuring import error_sources
-from stitch.measuring.budget import Number, measure_features
-from stitch.measuring.error_sources import place_errors
-from stitch.measuring.feature_file import FeatureList
-from stitch.measuring.features import Feature
-from stitch.pipeline import run
-from stitch.planning import plan
-from stitch.planning.candidate_views import candidate_joints, with_views
-from stitch.planning.detection_chances import view_outlook
-from stitch.planning.expected_model import CellModel, PlannedCell, Scatter, cell_of_state
-from stitch.planning.plan import KnownPlace, PlanRequest
-from stitch.runs.run import Run
-from stitch.statistics.reml import MixedModel, VarianceFit
-from stitch.statistics.variance_posterior import mean_variances
+from stitch.api.pipeline import run
+from stitch.diagnosis.candidate_views import candidate_joints, with_views
+from stitch.numerics.frames import Array
+from stitch.numerics.reml import MixedModel, VarianceFit
+from stitch.numerics.variance_posterior import mean_variances
+from stitch.plugins.metrology import error_sources
+from stitch.plugins.metrology.budget import Number, measure_features
+from stitch.plugins.metrology.error_sources import place_errors
+from stitch.plugins.metrology.feature_file import FeatureList
+from stitch.plugins.metrology.features import Feature
+from stitch.plugins.metrology.planning import plan
+from stitch.plugins.metrology.planning.detection_chances import view_outlook
+from stitch.plugins.metrology.planning.expected_model import CellModel, PlannedCell, Scatter, cell_of_state
+from stitch.plugins.metrology.planning.plan import KnownPlace, PlanRequest
+from stitch.run_data import Run
+from stitch.session.session import Session
 from stitch.system.threads import library_threads_off
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "measure.md"

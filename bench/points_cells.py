@@ -18,11 +18,11 @@ from blind_trials import pin
 from scipy.spatial.transform import Rotation
 
 from data_synth.kinematics import flange, gravity_torques
-from stitch import frames
-from stitch.frames import Array
-from stitch.measurement.robot import forward
-from stitch.measurement.session import Session, Sighting, View
-from stitch.pipeline import diagnose, run, suggest
+from stitch.api.pipeline import diagnose, run, suggest
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.session.robot import forward
+from stitch.session.session import Session, Sighting, View
 
 _VIEWS, _OFFSET, _SIGMAS = 48, 6e-4, 3.0
 _PROBE_TURN = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()

@@ -28,11 +28,11 @@ from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit
 from stitch.diagnosis.verdict import Evidence
-from stitch.frames import Array
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
+from stitch.numerics.frames import Array
 from stitch.observations.targets.target_model import target_model
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
 MARKS = ("<!-- names: begin -->", "<!-- names: end -->")

@@ -27,8 +27,8 @@ from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import ALPHA_NAME, IMPLAUSIBLE, POWER
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need
+from stitch.numerics.reml import at_variances
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.reml import at_variances
 from stitch.system.threads import library_threads_off
 
 SCENES = ("blade", "drill-plate", "blade-table")

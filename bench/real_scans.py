@@ -14,14 +14,14 @@ import numpy as np
 from data_synth.fixtures.blade_cells import SCENE_OF_MOUNT, captured, disturbed
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
-from stitch import frames
-from stitch.measurement.capture import part_size, prepare_capture
+from stitch.api.pipeline import run, run_rig
+from stitch.fit.correct import correct
+from stitch.fusion.register import register
+from stitch.numerics import frames
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps
-from stitch.pipeline import run, run_rig
-from stitch.reading.session_folder import load_session
-from stitch.stages.correct import correct
-from stitch.stages.register import register
+from stitch.session.capture import part_size, prepare_capture
+from stitch.session.reading.session_folder import load_session
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 BEGIN, END = "<!-- scans: begin -->", "<!-- scans: end -->"

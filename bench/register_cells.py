@@ -13,10 +13,10 @@ from data_synth.scanner import Scanner, half_field
 from data_synth.scene import Scene, load_scene
 from data_synth.shapes.casting import with_stock
 from data_synth.simulate import Measured, simulate
-from stitch.frames import Array
-from stitch.measurement.capture import Capture
+from stitch.fit.correct import correct
+from stitch.numerics.frames import Array
 from stitch.observations.surfaces.hand_eye_fit import Repeatability
-from stitch.stages.correct import correct
+from stitch.session.capture import Capture
 
 PIXELS, VIEWS = 150, 14
 # Of 24 views around the part: eight neighbours, 15° apart, and six that are 45° apart or a little less.

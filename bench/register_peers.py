@@ -17,7 +17,7 @@ from register_cells import cell_of
 from register_weights import collected, pose_error, table, write
 from weighings import CLOSED, DPWVM_STYLE, METHODS
 
-from stitch.stages.register import register
+from stitch.fusion.register import register
 
 FIRST = 4800
 BEGIN, END = "<!-- peers: begin -->", "<!-- peers: end -->"

@@ -18,18 +18,18 @@ from weighings import METHODS
 from data_synth.fixtures.in_memory import session_of
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
-from stitch import frames
-from stitch.frames import Array, Indices
-from stitch.measurement.capture import Capture, part_size, prepare_capture
-from stitch.measurement.scan import Scan
-from stitch.measurement.session import Session
+from stitch.fit.coarse import find_coarse_hand_eye
+from stitch.fit.correct import correct
+from stitch.fusion.register import Method, Registration, normal_equations, register
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
 from stitch.observations.surfaces.hand_eye_fit import Repeatability
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, collect_overlaps
-from stitch.reading.session_folder import load_session
-from stitch.stages.coarse import find_coarse_hand_eye
-from stitch.stages.correct import correct
-from stitch.stages.register import Method, Registration, normal_equations, register
+from stitch.session.capture import Capture, part_size, prepare_capture
+from stitch.session.reading.session_folder import load_session
+from stitch.session.scan import Scan
+from stitch.session.session import Session
 
 OBJECTS = ("cone", "gripperopen", "rubik", "sphere", "david")
 SHOWN = ("DPWVM-style", "GICP inside Tukey", "Tukey", "sign classes")

@@ -20,9 +20,9 @@ from register_cells import KINDS, STOCK, Cell, cell_of, view_with_stock
 from scipy.stats import t as student
 from weighings import CLOSED, DPWVM_STYLE, METHODS
 
-from stitch import frames
-from stitch.frames import Array
-from stitch.stages.register import Method, Registration, normal_equations, register
+from stitch.fusion.register import Method, Registration, normal_equations, register
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "register.md"
 BEGIN, END = "<!-- weights: begin -->", "<!-- weights: end -->"

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from stitch import frames
+from stitch.numerics import frames
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "results.md"

@@ -18,18 +18,18 @@ from pathlib import Path
 import numpy as np
 from blind_trials import pin
 
-from stitch import frames
-from stitch.frames import Array
-from stitch.measurement.capture import Capture, prepare_capture
-from stitch.measurement.measurement import Measurement, measurement_of, with_part_origin
+from stitch.fit.coarse import find_coarse_hand_eye
+from stitch.fit.correct import correct
 from stitch.model.model import Model
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD, HandEyeFit, fit_hand_eye
 from stitch.observations.surfaces.scanner_errors import field_scatter
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.reading.session_folder import load_session
-from stitch.stages.coarse import find_coarse_hand_eye
-from stitch.stages.correct import correct
+from stitch.session.capture import Capture, prepare_capture
+from stitch.session.measurement import Measurement, measurement_of, with_part_origin
+from stitch.session.reading.session_folder import load_session
 
 IN_HAND = ("david", "cone", "sphere", "rubik")
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "method.md"

@@ -19,9 +19,9 @@ from integrity_cells import MOUNTS, PARTS, measured
 
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import Measured
+from stitch.api.pipeline import run
 from stitch.diagnosis.diagnose import diagnose_state
 from stitch.errors import StitchError
-from stitch.pipeline import run
 from stitch.system.threads import library_threads_off
 
 # Of the points (N, 3) of one view, scanner frame, the view's number and the cell.

@@ -20,11 +20,8 @@ import stitch
 from data_synth.fixtures.in_memory import session_of
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
-from stitch.closed_form.hand_eye import AXXB_SOLVERS
 from stitch.errors import NoResultError
-from stitch.frames import Array
-from stitch.measurement.capture import Capture, part_size, prepare_capture
-from stitch.stages.coarse import (
+from stitch.fit.coarse import (
     HandEyeCandidate,
     consistent_motions,
     distinct_hand_eyes,
@@ -35,6 +32,9 @@ from stitch.stages.coarse import (
     robot_motions,
     same_hand_eye,
 )
+from stitch.numerics.frames import Array
+from stitch.numerics.hand_eye import AXXB_SOLVERS
+from stitch.session.capture import Capture, part_size, prepare_capture
 from stitch.system.open3d_library import import_open3d
 from stitch.system.threads import library_threads_off
 

@@ -19,7 +19,7 @@ from data_synth.nature import LAWS
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
 from data_synth.write import write_session
-from stitch import frames
+from stitch.numerics import frames
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "synth.md"
 SEEDS = range(4)

@@ -12,11 +12,11 @@ import numpy as np
 
 from data_synth.fixtures.tracker_folders import FOLDERS, tracked_arm
 from stitch.errors import InputError
-from stitch.intake.first_session import StatedFolder
-from stitch.intake.measured_points import measured_session, write_measured
-from stitch.measurement.capture import prepare_capture
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
-from stitch.reading.session_folder import load_session
+from stitch.plugins.intake.first_session import StatedFolder
+from stitch.plugins.intake.measured_points import measured_session, write_measured
+from stitch.session.capture import prepare_capture
+from stitch.session.reading.session_folder import load_session
 
 _NEAR_MM = 2.0
 _RAIL = "URDF with a rail"  # whose base lies 100 mm below the arm's

@@ -12,14 +12,14 @@ from data_synth.moment import Moment
 from data_synth.ordinary_arm import OrdinaryArm
 from data_synth.scene import Scene
 from data_synth.simulate import moments_of, on_rail
-from stitch import frames
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.frames import Array
 from stitch.model.model import Model
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.reml import fit_variances
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import SurfaceObservation, surface_model
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.statistics.reml import fit_variances
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from data_synth.laws.unnamed import IN_TIME, UNNAMED
 from data_synth.ordinary_arm import draw_arm, with_memory
 from stitch.diagnosis.sensitivity import least_noncentrality
 from stitch.effects import EFFECTS
-from stitch.frames import Array
+from stitch.numerics.frames import Array
 
 MULTIPLES = (1, 2, 3, 4, 6)
 # Usual sizes of a law, 0.15 mrad or 0.05 mm rms: what errs by more is broken.

@@ -7,9 +7,9 @@ import numpy as np
 
 from data_synth.cell_history import HAND_EYE, CellHistory, CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
-from stitch.watch.history import open_history
-from stitch.watch.report import CellReport, cell_report, cell_trend
-from stitch.watch.update import append_runs
+from stitch.plugins.watch.history import open_history
+from stitch.plugins.watch.report import CellReport, cell_report, cell_trend
+from stitch.plugins.watch.update import append_runs
 
 CELLS = 8
 _Z95 = 1.96

@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from stitch.measurement.session import Session
-from stitch.pipeline import run
-from stitch.reading.session_folder import load_session
-from stitch.runs.run import Run
-from stitch.units import length_text
-from stitch.watch.history import open_history, read_record
-from stitch.watch.report import CellReport, cell_report
-from stitch.watch.update import append_runs
-from stitch.writing.result_document import model_of
-from stitch.writing.run_folder import write_with_page
+from stitch.api.pipeline import run
+from stitch.numerics.units import length_text
+from stitch.output.result_document import model_of
+from stitch.output.run_folder import write_with_page
+from stitch.plugins.watch.history import open_history, read_record
+from stitch.plugins.watch.report import CellReport, cell_report
+from stitch.plugins.watch.update import append_runs
+from stitch.run_data import Run
+from stitch.session.reading.session_folder import load_session
+from stitch.session.session import Session
 
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 BLOCKS, POSES, EFFECTS = 24, 120, ["joint_offset", "link_geometry"]

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from data_synth.cell_history import CellPlan, cell_history
-from stitch.watch.tracking import (
+from stitch.plugins.watch.tracking import (
     MEMBERS,
     STEADY,
     STILL,
@@ -19,7 +19,7 @@ from stitch.watch.tracking import (
     updated_charts,
     with_parameters,
 )
-from stitch.watch.update import DAY_SECONDS, RUN_LENGTH, regressor_prior_sigmas, regressors
+from stitch.plugins.watch.update import DAY_SECONDS, RUN_LENGTH, regressor_prior_sigmas, regressors
 
 HALLS, CELLS = 100, 50
 _PARAMETERS = 12

@@ -9,9 +9,9 @@ import numpy as np
 
 from data_synth.cell_history import CellPlan, cell_history
 from data_synth.fixtures.cell_records import records_of
-from stitch.watch.history import HISTORY_FILE, open_history
-from stitch.watch.report import cell_report, cell_trend
-from stitch.watch.update import append_runs
+from stitch.plugins.watch.history import HISTORY_FILE, open_history
+from stitch.plugins.watch.report import cell_report, cell_trend
+from stitch.plugins.watch.update import append_runs
 from viz.watch.cell_page import write_page
 
 SIZES = (100, 1_000, 10_000)

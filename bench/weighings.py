@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from stitch.frames import Array
-from stitch.measurement.capture import Capture
+from stitch.fusion.correspondence_weights import agreement
+from stitch.fusion.register import DPWVM, GICP, Method
+from stitch.numerics.distributions import MAD_TO_SIGMA, mad_sigma, tukey
+from stitch.numerics.frames import Array
 from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import robust_scale
-from stitch.stages.correspondence_weights import agreement
-from stitch.stages.register import DPWVM, GICP, Method
-from stitch.statistics.distributions import MAD_TO_SIGMA, mad_sigma, tukey
+from stitch.session.capture import Capture
 
 _HUBER = 1.345  # 95 % efficient on normal errors (Holland & Welsch 1977)
 # A pair's own noise counts as if so many correspondences had shown the noise of all.

@@ -14,12 +14,12 @@ from data_synth.cells import window_scans, window_views
 from data_synth.cells.window_scans import Weld, warp
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import CarDoor, Pane
-from stitch import frames
-from stitch.cells.cad import Box, Regions, cad_surface
-from stitch.cells.placed_scans import join_scans
-from stitch.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations
-from stitch.cells.seam import Limits, Station, measure_seam
-from stitch.measurement.scan import prepare_scan
+from stitch.numerics import frames
+from stitch.plugins.cells.cad import Box, Regions, cad_surface
+from stitch.plugins.cells.placed_scans import join_scans
+from stitch.plugins.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations
+from stitch.plugins.cells.seam import Limits, Station, measure_seam
+from stitch.session.scan import prepare_scan
 from viz.cells.window_fit import deviation_map
 
 ROOT = Path(__file__).resolve().parents[1]

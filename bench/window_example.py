@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from data_synth.cells import window_job, window_scans, window_views
 from data_synth.shapes import car_door
 from data_synth.shapes.car_door import Pane
-from stitch import frames
+from stitch.numerics import frames
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "window"
 NOISE = 0.05

@@ -19,10 +19,10 @@ import numpy as np
 from data_synth.cells.window_line import EXACT, Errors, WindowLine
 from data_synth.cells.window_line_job import write_line, write_seam
 from data_synth.cells.window_scans import true_seam
-from stitch import frames
-from stitch.cells.job_files import poses_from_columns, read_columns
-from stitch.cells.seam import Station
 from stitch.cli.main import main as stitch
+from stitch.numerics import frames
+from stitch.plugins.cells.job_files import poses_from_columns, read_columns
+from stitch.plugins.cells.seam import Station
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "window.md"
 BEGIN, END = "<!-- line: begin -->", "<!-- line: end -->"

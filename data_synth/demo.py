@@ -65,10 +65,10 @@ def demo(
 def _demo_verify(folder: Path, seed: int) -> None:
     """Fit a cell on a part, measure the part with U, and verify the fit by a calibrated sphere plate."""
     from data_synth.cells.verified_cell import write_verified_cell
-    from stitch.cli.measure import measure
     from stitch.cli.run import run
     from stitch.cli.terminal import headlines_only, say, show_files
-    from stitch.cli.verify import verify as verify_run
+    from stitch.plugins.metrology.measure import measure
+    from stitch.plugins.metrology.verify import verify as verify_run
 
     if folder.exists() and not (folder / "artefact.truth.json").is_file():
         raise InputError(f"{folder}: exists and is no demo of a verification; to fix: name another folder")

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from data_synth.nature import LAWS
-from stitch import frames
 from stitch.errors import InputError
-from stitch.units import format_amount
+from stitch.numerics import frames
+from stitch.numerics.units import format_amount
 
 
 def judge(run: Path, truth: Path) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from data_synth.moment import Plan
 from data_synth.scanner import Scanner, rays
 from data_synth.scanning import cast
 from data_synth.scene import Scene, ViewPlan
-from stitch import frames
 from stitch.errors import NoResultError
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 _ATTEMPTS = 40

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from data_synth.arms import ARMS, Arm, with_payload
 from data_synth.scanner import Scanner
 from data_synth.scene_tables import read_dataclass, take_vector
-from stitch import frames
 from stitch.errors import InputError
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 SCENES = Path(__file__).parent / "scenes"

@@ -14,7 +14,7 @@ from data_synth.scanner import Cloud, field_map
 from data_synth.scene import Scene
 from data_synth.shapes import build_shape, load_mesh
 from data_synth.take_view import Cell, Taken, on_rail, take_view
-from stitch import frames
+from stitch.numerics import frames
 from stitch.system.threads import parallel
 
 Array = NDArray[np.float64]

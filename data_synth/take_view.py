@@ -12,7 +12,7 @@ from data_synth.nature import Nature
 from data_synth.scanner import Cloud, half_field, profile_times
 from data_synth.scanning import scan
 from data_synth.scene import Scene
-from stitch import frames
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 

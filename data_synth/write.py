@@ -13,9 +13,9 @@ from data_synth.arms import Arm
 from data_synth.kinematics import GRAVITY
 from data_synth.shapes import write_mesh
 from data_synth.simulate import Measured
-from stitch.measurement.session import Cloud
-from stitch.writing import session_files
-from stitch.writing.session_files import SessionFiles, TableColumns, pose_columns
+from stitch.output import session_files
+from stitch.output.session_files import SessionFiles, TableColumns, pose_columns
+from stitch.session.session import Cloud
 
 Array = NDArray[np.float64]
 

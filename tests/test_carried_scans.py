@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stitch import frames
-from stitch.pipeline import run
-from stitch.reading.session_folder import load_session
+from stitch.api.pipeline import run
+from stitch.numerics import frames
+from stitch.session.reading.session_folder import load_session
 
 CARRIED = Path(__file__).parent / "data" / "reghec-rubik"
 # Of the same rig, from all points of another object, a bust: T_flange_scanner, mm, and sigmas, rad and mm.

@@ -11,9 +11,9 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch import frames
-from stitch.pipeline import run
-from stitch.reading.session_folder import load_session
+from stitch.api.pipeline import run
+from stitch.numerics import frames
+from stitch.session.reading.session_folder import load_session
 
 SAME = 1e-6  # mm, rad, and shares of an effect or an rms
 B = frames.make(Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix(), np.array([300.0, -200.0, 150.0]))

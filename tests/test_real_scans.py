@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stitch import frames
+from stitch.api.pipeline import diagnose, run, run_rig
 from stitch.cli.main import main
-from stitch.measurement.capture import prepare_capture
 from stitch.model.model_toml import read_model
+from stitch.numerics import frames
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps
-from stitch.pipeline import diagnose, run, run_rig
-from stitch.reading.session_folder import load_session
+from stitch.session.capture import prepare_capture
+from stitch.session.reading.session_folder import load_session
 
 # Minutes of work: `make check` runs it, `make test` does not.
 pytestmark = pytest.mark.slow

@@ -8,16 +8,16 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch import pipeline as stepwise
+from stitch.api import pipeline as stepwise
+from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.validation import CrossValidation, _squares_by_fold
 from stitch.effects.contract import find_effect, parameters_in
 from stitch.model.model import Term
-from stitch.pipeline import diagnose, run
-from stitch.reading.session_folder import load_session
-from stitch.stored.stored_run import diagnosed_state, load_run, named_before, standing_diagnosis
-from stitch.writing.diagnosis_document import diagnosis_document, suggested_command
-from stitch.writing.json_file import write_json
-from stitch.writing.run_folder import write_with_page
+from stitch.output.diagnosis_document import diagnosis_document, suggested_command
+from stitch.output.json_file import write_json
+from stitch.output.run_folder import write_with_page
+from stitch.output.stored_run import diagnosed_state, load_run, named_before, standing_diagnosis
+from stitch.session.reading.session_folder import load_session
 
 OFFSET = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
 

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from os.path import relpath
 from pathlib import Path
 
-from stitch.batch.run_batch import SessionRow, batch_sentence
+from stitch.numerics.units import length_text
+from stitch.plugins.watch.batch.run_batch import SessionRow, batch_sentence
 from stitch.system.files import whole_file
-from stitch.units import length_text
 from viz.page_parts import render
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from stitch.frames import Array
+from stitch.numerics.frames import Array
 from viz.colours import UNSEEN, unsigned_colours
 from viz.course_recording import WHERE, X_RANGE, Y_RANGE
 from viz.model_timeline import FRAMES, ModelScene, shown_steps

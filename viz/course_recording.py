@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from stitch.frames import Array
-from stitch.units import covariate_text
+from stitch.numerics.frames import Array
+from stitch.numerics.units import covariate_text
 from viz.colours import signed_colours
 
 # Width and height of the drawing, in its own units; y points downwards. As long as an ordinary window has room.

@@ -6,16 +6,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stitch.comparison.residual_tables import ResidualTable, ResidualTables
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import NOT_REPEATING, BudgetLine
 from stitch.diagnosis.unnamed_joint_laws import JointCurve
 from stitch.diagnosis.unnamed_time_laws import ROTATION_PART, TRANSLATION_PART, TimeCurve
-from stitch.frames import Array
+from stitch.numerics.frames import Array
+from stitch.numerics.units import MICROMETRES, covariate_text, length_text
 from stitch.observations.pose_errors import time_in_steps
 from stitch.observations.surfaces.scanner_errors import FieldMap
-from stitch.units import MICROMETRES, covariate_text, length_text
-from stitch.writing.diagnosis_document import OTHER_SOURCES, largest_error_sources, share_text
+from stitch.output.comparison.residual_tables import ResidualTable, ResidualTables
+from stitch.output.diagnosis_document import OTHER_SOURCES, largest_error_sources, share_text
 from viz import captions
 
 _HOURS_FROM = 7200.0  # s that are better told in hours than in minutes

@@ -10,10 +10,10 @@ import rerun as rr
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
-from stitch.measurement.session import Session
+from stitch.numerics.units import MICROMETRES
+from stitch.output.diagnosis_document import effect_description, effect_in_words, plain_finding, suggested_command
+from stitch.session.session import Session
 from stitch.system.files import whole_file
-from stitch.units import MICROMETRES
-from stitch.writing.diagnosis_document import effect_description, effect_in_words, plain_finding, suggested_command
 from viz.colours import COLOURS_OF_FEW
 from viz.course_recording import log_course
 from viz.rrd_file import RecordingFile, id_of, words

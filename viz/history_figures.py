@@ -6,9 +6,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from stitch.comparison.disagreement_field import effect_changes, full_colour_distance, model_history
-from stitch.runs.run import Run
-from stitch.units import MICROMETRES, length_text
+from stitch.numerics.units import MICROMETRES, length_text
+from stitch.output.comparison.disagreement_field import effect_changes, full_colour_distance, model_history
+from stitch.run_data import Run
 from viz.colours import BLUE, FIELD, GREEN, unsigned_colours
 from viz.figures import colormap
 from viz.part_picture import painted, visible

@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import rerun as rr
 
-from stitch import frames
-from stitch.comparison.disagreement_field import COARSE, REGISTER, ModelHistory
-from stitch.frames import Array
-from stitch.measurement.scan import even_indices
-from stitch.measurement.session import Session
-from stitch.runs.run import Run, StageResult
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import MICROMETRES, length_text
+from stitch.output.comparison.disagreement_field import COARSE, REGISTER, ModelHistory
+from stitch.run_data import Run, StageResult
+from stitch.session.scan import even_indices
+from stitch.session.session import Session
 from stitch.system.threads import take_mapped
-from stitch.units import MICROMETRES, length_text
 from viz.colours import UNSEEN, robust_limit, unsigned_colours, view_colours
 from viz.model_timeline import FRAMES
 from viz.page_parts import unbroken

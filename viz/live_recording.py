@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from stitch.api.live import LiveView
-from stitch.measurement.session import Session, View
+from stitch.session.session import Session, View
 from viz.rrd_file import id_of
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")

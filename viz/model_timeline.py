@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from stitch import frames
-from stitch.comparison.disagreement_field import ModelHistory, ModelStep, full_colour_distance
-from stitch.frames import Array
-from stitch.measurement.scan import even_indices
-from stitch.runs.run import Run
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import MICROMETRES, length_text
+from stitch.output.comparison.disagreement_field import ModelHistory, ModelStep, full_colour_distance
+from stitch.run_data import Run
+from stitch.session.scan import even_indices
 from stitch.system.threads import take_mapped
-from stitch.units import MICROMETRES, length_text
 from viz.colours import COLOURS_OF_FEW, GREY, unsigned_colours
 from viz.part_surface import PartSurface
 from viz.rrd_file import words

@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from stitch.comparison.disagreement_field import full_colour_distance, model_history
-from stitch.comparison.run_verdict import run_headline
-from stitch.runs.run import Run
-from stitch.units import MICROMETRES
+from stitch.numerics.units import MICROMETRES
+from stitch.output.comparison.disagreement_field import full_colour_distance, model_history
+from stitch.output.comparison.run_verdict import run_headline
+from stitch.run_data import Run
 from viz.colours import BLUE, ORANGE
 from viz.figures import plain
 from viz.page_parts import render

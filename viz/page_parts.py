@@ -12,12 +12,12 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, select_autoescape
 from markupsafe import Markup
 
-from stitch.comparison.run_verdict import ToleranceVerdict
-from stitch.measurement.session import Session
-from stitch.reading.session_folder import session_hash
-from stitch.runs.run import Run
+from stitch.numerics.units import MICROMETRES, length_text
+from stitch.output.comparison.run_verdict import ToleranceVerdict
+from stitch.run_data import Run
+from stitch.session.reading.session_folder import session_hash
+from stitch.session.session import Session
 from stitch.system.files import whole_file
-from stitch.units import MICROMETRES, length_text
 
 # Numbers and their units stay on one line.
 
@@ -85,7 +85,7 @@ def _effects_in_words(run: Run) -> list[str]:
     """Of a run without effects nothing of a diagnosis is loaded."""
     if not run.effects:
         return []
-    from stitch.writing.diagnosis_document import effect_in_words
+    from stitch.output.diagnosis_document import effect_in_words
 
     return [effect_in_words(name) for name in run.effects]
 

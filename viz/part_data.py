@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.comparison.disagreement_field import ModelHistory, full_colour_distance
-from stitch.frames import Array
-from stitch.units import MICROMETRES
+from stitch.numerics.frames import Array
+from stitch.numerics.units import MICROMETRES
+from stitch.output.comparison.disagreement_field import ModelHistory, full_colour_distance
 from viz.colours import signed_colours, unsigned_colours
 from viz.part_surface import Camera, PartSurface
 

@@ -8,13 +8,13 @@ from pykdtree.kdtree import KDTree
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from stitch.comparison.disagreement_field import Patches
 from stitch.errors import NoResultError
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.scan import even_indices
-from stitch.runs.run import FusedCloud
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.output.comparison.disagreement_field import Patches
+from stitch.output.mesh import TriangleMesh, mesh_of, spacing
+from stitch.run_data import FusedCloud
+from stitch.session.scan import even_indices
 from stitch.system.threads import take_mapped
-from stitch.writing.mesh import TriangleMesh, mesh_of, spacing
 
 # From where the part is looked at: what is long stands upright, and the side that shows most comes to the front.
 

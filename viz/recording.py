@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from stitch.comparison.disagreement_field import ModelHistory, effect_changes, model_history
-from stitch.comparison.run_verdict import run_headline
-from stitch.frames import Array
-from stitch.measurement.session import Session
-from stitch.runs.run import Run, StageResult
-from stitch.units import MICROMETRES, length_text
+from stitch.numerics.frames import Array
+from stitch.numerics.units import MICROMETRES, length_text
+from stitch.output.comparison.disagreement_field import ModelHistory, effect_changes, model_history
+from stitch.output.comparison.run_verdict import run_headline
+from stitch.run_data import Run, StageResult
+from stitch.session.session import Session
 from viz.blueprint import log_colour_bar, model_blueprint, target_blueprint
 from viz.colours import robust_limit, unsigned_colours
 from viz.course_recording import log_no_course
@@ -32,7 +32,7 @@ def run_markdown(run: Run, history: ModelHistory | None) -> str:
     for doubt in run.doubts:
         lines += [doubt, ""]
     if run.effects:
-        from stitch.writing.diagnosis_document import effect_in_words
+        from stitch.output.diagnosis_document import effect_in_words
 
         lines += [f"In the model: {', '.join(map(effect_in_words, run.effects))}.", ""]
     lines += [run.verdict, ""]
@@ -56,7 +56,7 @@ os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 
 class RerunRecorder:
-    """A `stitch.runs.recorder.Recorder` that writes one .rrd file when the run has ended."""
+    """A `stitch.recorder.Recorder` that writes one .rrd file when the run has ended."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

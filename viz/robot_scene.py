@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import rerun as rr
 
-from stitch import frames
-from stitch.frames import Array
-from stitch.measurement.robot import LinkMesh, Robot, link_frames
-from stitch.measurement.scan import even_indices
-from stitch.runs.run import Run
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.run_data import Run
+from stitch.session.robot import LinkMesh, Robot, link_frames
+from stitch.session.scan import even_indices
 from stitch.system.threads import take_mapped
 from viz.colours import view_colours
 from viz.run_numbers import shown_points

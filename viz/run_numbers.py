@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from stitch.frames import Array
-from stitch.measurement.session import View
-from stitch.runs.run import Run
+from stitch.numerics.frames import Array
+from stitch.run_data import Run
+from stitch.session.session import View
 
 
 def view_shifts(run: Run) -> Array:

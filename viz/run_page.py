@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch.comparison.disagreement_field import ModelHistory, effect_changes, model_history
-from stitch.comparison.run_verdict import run_headline, run_light
 from stitch.model.model import expanded_uncertainty, uncertainty_scope
+from stitch.numerics.units import MICROMETRES, value_uncertainty_text
 from stitch.observations.observability import NUMBERS
-from stitch.runs.run import Run, doubt_headline
-from stitch.units import MICROMETRES, value_uncertainty_text
+from stitch.output.comparison.disagreement_field import ModelHistory, effect_changes, model_history
+from stitch.output.comparison.run_verdict import run_headline, run_light
+from stitch.run_data import Run, doubt_headline
 from viz import captions
 from viz.page_parts import Head, Subject, Tile, identity, page_written, script_json, sections_of, write_page
 from viz.part_data import part_data
@@ -169,7 +169,7 @@ def _is_diagnosed(run: Run, folder: Path) -> bool:
     """Whether the diagnosis in a folder is of this very model; where there is none nothing is loaded to ask."""
     if not (folder / "diagnosis.json").is_file():
         return False
-    from stitch.stored.stored_run import standing_diagnosis
+    from stitch.output.stored_run import standing_diagnosis
 
     return bool(standing_diagnosis(folder, run))
 

@@ -7,14 +7,12 @@ from typing import Any
 
 from markupsafe import escape
 
-from stitch.comparison.residual_tables import ResidualTables
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.sentences import fitted_amounts
 from stitch.model.model import uncertainty_scope
-from stitch.runs.run import Run
-from stitch.system.files import whole_file
-from stitch.units import MICROMETRES, length_text
-from stitch.writing.diagnosis_document import (
+from stitch.numerics.units import MICROMETRES, length_text
+from stitch.output.comparison.residual_tables import ResidualTables
+from stitch.output.diagnosis_document import (
     diagnosis_screen,
     effect_description,
     largest_error_sources,
@@ -22,7 +20,9 @@ from stitch.writing.diagnosis_document import (
     remedy_at_machine,
     suggested_command,
 )
-from stitch.writing.finding_screen import CandidateFields, candidate_fields
+from stitch.output.finding_screen import CandidateFields, candidate_fields
+from stitch.run_data import Run
+from stitch.system.files import whole_file
 from viz import captions
 from viz.diagnosis_plots import Plots, alias_rows, budget_rows, comparison_plots, diagnosis_plots
 from viz.diagnosis_recording import add_diagnosis

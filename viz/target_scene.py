@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stitch import frames
-from stitch.comparison.disagreement_field import TargetStep, target_history
-from stitch.frames import Array, Indices
-from stitch.runs.run import Run
-from stitch.units import MICROMETRES
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+from stitch.numerics.units import MICROMETRES
+from stitch.output.comparison.disagreement_field import TargetStep, target_history
+from stitch.run_data import Run
 from viz.colours import robust_limit
 from viz.part_data import colour_stops, extent_of, packed_surface, packed_values
 from viz.part_surface import Camera, PartSurface, camera_for

@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stitch.comparison.disagreement_field import full_colour_distance
-from stitch.comparison.run_verdict import ToleranceVerdict, run_light, run_verdict
-from stitch.comparison.two_runs import ComparedRun, TwoRuns, comparison_sentence
-from stitch.frames import Array
-from stitch.runs.run import Run
-from stitch.units import MICROMETRES, length_text, value_uncertainty_text
+from stitch.numerics.frames import Array
+from stitch.numerics.units import MICROMETRES, length_text, value_uncertainty_text
+from stitch.output.comparison.disagreement_field import full_colour_distance
+from stitch.output.comparison.run_verdict import ToleranceVerdict, run_light, run_verdict
+from stitch.output.comparison.two_runs import ComparedRun, TwoRuns, comparison_sentence
+from stitch.run_data import Run
 from viz import captions
 from viz.page_parts import Head, Subject, identity, script_json, write_page
 from viz.part_data import Extent, extent_of, part_data

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from stitch.comparison.open3d_witness import Witness
-from stitch.runs.run import Run
-from stitch.units import MICROMETRES
+from stitch.numerics.units import MICROMETRES
+from stitch.output.comparison.open3d_witness import Witness
+from stitch.run_data import Run
 
 _DPI = 110
 _SPAN_QUANTILE = 0.98

@@ -9,12 +9,12 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from bench.docs.report_pictures import call, shot
-from stitch.cells.base_to_base import read_stand, solve_stand
-from stitch.cells.drilling import read_drill_job as read_drilling
-from stitch.cells.drilling import solve_drill_job as solve_drilling
-from stitch.cells.panel import read_panel_job as read_panel
-from stitch.cells.panel import solve_panel_job as solve_panel
-from stitch.cells.window import read_seam_job, solve_seam
+from stitch.plugins.cells.base_to_base import read_stand, solve_stand
+from stitch.plugins.cells.drilling import read_drill_job as read_drilling
+from stitch.plugins.cells.drilling import solve_drill_job as solve_drilling
+from stitch.plugins.cells.panel import read_panel_job as read_panel
+from stitch.plugins.cells.panel import solve_panel_job as solve_panel
+from stitch.plugins.cells.window import read_seam_job, solve_seam
 from viz.cells import base_to_base, window_seam
 from viz.cells.drilling import holes
 from viz.cells.panel import shape

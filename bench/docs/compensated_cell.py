@@ -12,8 +12,8 @@ from data_synth.commands import synth
 from data_synth.fixtures.true_arm import true_flanges
 from data_synth.scene import load_scene
 from stitch.cli.main import main as stitch
-from stitch.controllers.program import read_program
-from stitch.frames import Array
+from stitch.numerics.frames import Array
+from stitch.plugins.intake.controllers.program import read_program
 
 BASE, TOOL = "0,0,0,0,0,0", "0,0,150,0,0,0"
 PROGRAM = """DEF SCAN ( )

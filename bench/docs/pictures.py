@@ -14,7 +14,7 @@ from data_synth.picture import render
 from data_synth.planning import plan_views
 from data_synth.scene import load_scene, names
 from data_synth.simulate import part_mesh
-from stitch import frames
+from stitch.numerics import frames
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 # Azimuth and elevation of the camera in degrees: where scanners hide least of the part.

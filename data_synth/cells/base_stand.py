@@ -12,7 +12,7 @@ import tomli_w
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stitch import frames
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch import frames
+from stitch.numerics import frames
 
 HEIGHT = 186.61
 IMAGE = (2448, 2050)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from data_synth.cells.drilling import FOCAL, HEIGHT, HOLE_DIAMETER, IMAGE, NINE, DrillingCell
-from stitch import frames
+from stitch.numerics import frames
 
 _FINE = 4  # rays per pixel and direction
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.cells.drilling import GROUPS, HEIGHT, HOLE_DIAMETER, IMAGE, DrillingCell
 from data_synth.csv_rows import POSE, pose_numbers, write_rows
-from stitch import frames
+from stitch.numerics import frames
 
 _JOB = f"""# A drilling job: where must the robot be sent so that the holes come where they belong?
 #   stitch drill job.toml -o drives.csv

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch import frames
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 

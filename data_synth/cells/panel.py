@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.cells import hexapod
 from data_synth.shell import HeldShell, Laminate, Shell
-from stitch import frames
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 

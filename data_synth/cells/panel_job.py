@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from data_synth.cells import hexapod
 from data_synth.cells.panel import LENGTH, NAMES, RADIUS, PanelCell
 from data_synth.csv_rows import POSE, pose_numbers, write_rows
-from stitch import frames
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 

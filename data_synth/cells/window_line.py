@@ -18,7 +18,7 @@ from data_synth.scanner import Cloud, Scanner, profile_times
 from data_synth.scanning import scan
 from data_synth.shapes import car_door, spheres
 from data_synth.shapes.car_door import CarDoor, Pane
-from stitch import frames
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 

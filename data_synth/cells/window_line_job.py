@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from data_synth.cells.window_job import pose_table, write_path, write_stations
 from data_synth.cells.window_line import RADIUS, Scans, WindowLine
 from data_synth.write import cloud_file
-from stitch.writing.session_files import SessionFiles, pose_columns, write_session
+from stitch.output.session_files import SessionFiles, pose_columns, write_session
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from data_synth.cells.window_views import across_seam, along_edges, over
 from data_synth.scanner import Scanner
 from data_synth.scanning import scan
 from data_synth.shapes.car_door import CarDoor
-from stitch import frames
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 

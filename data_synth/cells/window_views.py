@@ -5,7 +5,7 @@ from manifold3d import CrossSection
 from numpy.typing import NDArray
 
 from data_synth.shapes.car_door import CarDoor, Pane, door_outline, outer_surface, window_outline
-from stitch import frames
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_synth.moment import Moment, Plan
-from stitch import frames
+from stitch.numerics import frames
 
 Array = NDArray[np.float64]
 Parameters = dict[str, float]

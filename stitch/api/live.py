@@ -11,32 +11,32 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch import frames
 from stitch.api.run import FittedHandEye, Run, fitted_hand_eye
 from stitch.api.session import Session, check_convention, public_session
 from stitch.api.verbs import run
 from stitch.errors import InputError, NoResultError
-from stitch.frames import Array
-from stitch.integrity.pose_tests import BlunderSearch, find_blunders, least_displacement
-from stitch.integrity.view_model import UsualEffects, ViewModel, view_model
-from stitch.integrity.view_screening import fit_screened_views
-from stitch.measurement import session as measured
-from stitch.measurement.capture import Capture, build_capture, prepare_capture
-from stitch.measurement.measurement import measurement_of
-from stitch.measurement.robot import Robot
-from stitch.measurement.session import Scanner, View
+from stitch.fit import surface_steps
+from stitch.fit.coarse import turn_about
+from stitch.fit.live_fit import LiveFit, fit_live_hand_eye, place_view, start_live_fit, without_view
 from stitch.model.model import Model
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import length_text
 from stitch.observations.observability import unknown_numbers
 from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
 from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.planning.expected_model import displacement
-from stitch.runs.recorder import Recorder, SilentRecorder
-from stitch.stages import surface_steps
-from stitch.stages.coarse import turn_about
-from stitch.stages.live_fit import LiveFit, fit_live_hand_eye, place_view, start_live_fit, without_view
+from stitch.plugins.metrology.planning.expected_model import displacement
+from stitch.recorder import Recorder, SilentRecorder
+from stitch.screening.pose_tests import BlunderSearch, find_blunders, least_displacement
+from stitch.screening.view_model import UsualEffects, ViewModel, view_model
+from stitch.screening.view_screening import fit_screened_views
+from stitch.session import session as measured
+from stitch.session.capture import Capture, build_capture, prepare_capture
+from stitch.session.measurement import measurement_of
+from stitch.session.robot import Robot
+from stitch.session.session import Scanner, View
 from stitch.system.threads import library_threads_off
-from stitch.units import length_text
 
 Verdict = Literal["waiting", "fits", "does_not_belong", "adds_nothing"]
 

@@ -11,24 +11,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stitch import run_data as runs
 from stitch.api.session import Session, public_session
 from stitch.errors import InputError
-from stitch.export.cloud_formats import Colours, coloured
-from stitch.frames import Array
-from stitch.measurement import session as measured
-from stitch.measurement.capture import Capture
 from stitch.model.model import COVERAGE_FACTOR
-from stitch.planning.expected_model import displacement
-from stitch.reading.session_folder import content_hash, measured_files
-from stitch.runs import run as runs
-from stitch.runs.recorder import Recorder
-from stitch.runs.run import FusedCloud, StageResult
+from stitch.numerics.frames import Array
+from stitch.numerics.units import METRES
+from stitch.output import run_folder
+from stitch.output.fit_report import fit_report
+from stitch.output.result_document import points_of
+from stitch.output.run_folder import recordings, residual_table
+from stitch.plugins.export.cloud_formats import Colours, coloured
+from stitch.plugins.metrology.planning.expected_model import displacement
+from stitch.recorder import Recorder
+from stitch.run_data import FusedCloud, StageResult
+from stitch.session import session as measured
+from stitch.session.capture import Capture
+from stitch.session.reading.session_folder import content_hash, measured_files
 from stitch.system.open3d_library import import_open3d
-from stitch.units import METRES
-from stitch.writing import run_folder
-from stitch.writing.fit_report import fit_report
-from stitch.writing.result_document import points_of
-from stitch.writing.run_folder import recordings, residual_table
 
 
 class AtPart(NamedTuple):

@@ -11,30 +11,36 @@ from typing import Any, cast, get_args
 
 import numpy as np
 
-from stitch.api.arrays import cloud_of, per_view, poses_of, sighting_of
-from stitch.calibrate.robot import repeatability_table, robot_toml
 from stitch.errors import InputError, NoResultError, StitchError
-from stitch.frames import Array
-from stitch.intake.cloud_pairs import pairings
-from stitch.intake.convention_choice import choose_convention, require_own_frames
-from stitch.intake.first_session import StatedFolder, capture_of
-from stitch.intake.layouts import MM
-from stitch.intake.raw_poses import RawPoses
-from stitch.intake.readings import all_readings
-from stitch.integrity.conventions import register_scan_pairs
-from stitch.integrity.deep_check import refuse_whole
-from stitch.measurement import session as measured
-from stitch.measurement.capture import MAX_POINTS
-from stitch.measurement.robot import Robot, forward
-from stitch.measurement.session import Cloud, Mount, Scanner, StatedRepeatability, View
-from stitch.reading import session_folder
-from stitch.reading.session_folder import check_scale, checked_scan, read_repeatability, read_robot, read_scanner
-from stitch.reading.session_tables import require_agreement
-from stitch.reading.text_files import require_folder_name, require_name, table_choice
+from stitch.numerics.frames import Array
+from stitch.numerics.units import METRES
+from stitch.output.session_files import SessionFiles, pose_columns, table_text, write_session
+from stitch.output.urdf_file import to_urdf
+from stitch.plugins.intake.arrays import cloud_of, per_view, poses_of, sighting_of
+from stitch.plugins.intake.cloud_pairs import pairings
+from stitch.plugins.intake.convention_choice import choose_convention, require_own_frames
+from stitch.plugins.intake.first_session import StatedFolder, capture_of
+from stitch.plugins.intake.layouts import MM
+from stitch.plugins.intake.raw_poses import RawPoses
+from stitch.plugins.intake.readings import all_readings
+from stitch.plugins.metrology.calibrate.robot import repeatability_table, robot_toml
+from stitch.screening.conventions import register_scan_pairs
+from stitch.screening.deep_check import refuse_whole
+from stitch.session import session as measured
+from stitch.session.capture import MAX_POINTS
+from stitch.session.reading import session_folder
+from stitch.session.reading.session_folder import (
+    check_scale,
+    checked_scan,
+    read_repeatability,
+    read_robot,
+    read_scanner,
+)
+from stitch.session.reading.session_tables import require_agreement
+from stitch.session.reading.text_files import require_folder_name, require_name, table_choice
+from stitch.session.robot import Robot, forward
+from stitch.session.session import Cloud, Mount, Scanner, StatedRepeatability, View
 from stitch.system.threads import parallel
-from stitch.units import METRES
-from stitch.writing.session_files import SessionFiles, pose_columns, table_text, write_session
-from stitch.writing.urdf_file import to_urdf
 
 # Two motions, the fewest that tell a reading.
 _FEWEST = 3

@@ -7,35 +7,35 @@ from typing import Any
 
 import numpy as np
 
-from stitch import pipeline
+from stitch import run_data as runs
+from stitch.api import pipeline
 from stitch.api.run import ReplayRecorder, Run, public_run
 from stitch.api.session import Session, public_session
-from stitch.comparison.residual_tables import ResidualTables, compare_surfaces, compare_targets
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.effects.contract import find_effect
 from stitch.errors import InputError
-from stitch.explanation import explain as explanation
-from stitch.explanation.explain import EFFECT_NAME, Explanation
-from stitch.export.arm_model import ARM_FORMATS, arm_from
-from stitch.export.cloud_formats import CLOUD_FORMATS, coloured
-from stitch.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_from
-from stitch.frames import Array
-from stitch.measurement import session as measured
+from stitch.fit.correct import gate_of_model
+from stitch.fusion.register import DEFAULT
 from stitch.model.forward import corrected_capture
 from stitch.model.model_toml import ModelFile, keep_arm_effects
-from stitch.planning import plan as planning
-from stitch.planning.expected_model import PlannedCell, cell_of_session, cell_of_state
-from stitch.planning.plan import Plan, PlanRequest
-from stitch.runs import run as runs
-from stitch.runs.recorder import Recorder
-from stitch.stages.correct import gate_of_model
-from stitch.stages.register import DEFAULT
-from stitch.stored import stored_run
+from stitch.numerics.frames import Array
+from stitch.output import stored_run
+from stitch.output.comparison.residual_tables import ResidualTables, compare_surfaces, compare_targets
+from stitch.output.diagnosis_document import diagnosis_document
+from stitch.output.result_document import model_of, result_document
+from stitch.plugins.explain import explain as explanation
+from stitch.plugins.explain.explain import EFFECT_NAME, Explanation
+from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured
+from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_from
+from stitch.plugins.metrology.calibrate.arm_model import ARM_FORMATS, arm_from
+from stitch.plugins.metrology.planning import plan as planning
+from stitch.plugins.metrology.planning.expected_model import PlannedCell, cell_of_session, cell_of_state
+from stitch.plugins.metrology.planning.plan import Plan, PlanRequest
+from stitch.recorder import Recorder
+from stitch.session import session as measured
 from stitch.system.files import whole_file
 from stitch.system.threads import library_threads_off
-from stitch.writing.diagnosis_document import diagnosis_document
-from stitch.writing.result_document import model_of, result_document
 
 
 def run(

@@ -15,7 +15,7 @@ from stitch.errors import InputError
 from stitch.system.process import end_at_once
 
 if TYPE_CHECKING:
-    from stitch.runs.run import Run
+    from stitch.run_data import Run
 
 _AT_MOST = 5  # effects that --suggested adds one by one
 _RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; changed in place.")]
@@ -77,9 +77,9 @@ def add_effects(
     Raises:
         InputError, NoResultError: as `stitch add` ends.
     """
-    from stitch.pipeline import effects_with
-    from stitch.stored.stored_run import load_run
-    from stitch.writing import run_folder
+    from stitch.api.pipeline import effects_with
+    from stitch.output import run_folder
+    from stitch.output.stored_run import load_run
 
     with run_folder.lock_run_folder(run):
         state = load_run(run, effects_file, trust=trust)
@@ -94,9 +94,9 @@ def drop_effects(
     Raises:
         InputError, NoResultError: as `stitch drop` ends.
     """
-    from stitch.pipeline import effects_without
-    from stitch.stored.stored_run import load_run
-    from stitch.writing import run_folder
+    from stitch.api.pipeline import effects_without
+    from stitch.output import run_folder
+    from stitch.output.stored_run import load_run
 
     with run_folder.lock_run_folder(run):
         state = load_run(run, effects_file, trust=trust)
@@ -105,9 +105,9 @@ def drop_effects(
 
 def _refit_run(run: Path, state: Run, effects: list[str], recording: bool, as_json: bool) -> None:
     """Give the run folder the model with these effects, and show it; what was fitted before is not fitted anew."""
-    from stitch.pipeline import change
-    from stitch.stored.stored_run import load_run
-    from stitch.writing import run_folder
+    from stitch.api.pipeline import change
+    from stitch.output import run_folder
+    from stitch.output.stored_run import load_run
 
     if run_folder.restore_fit(run, effects, recording):
         with show_activity("reading the fit that was kept"):
@@ -126,12 +126,12 @@ def _add_diagnosed(
     run: Path, at_most: int | None, effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
 ) -> None:
     """Add what a diagnosis chooses: at most so many effects one by one, or None: a group that it cannot tell apart."""
+    from stitch.api.pipeline import suggest, suggest_group
     from stitch.cli.diagnose import write_diagnosis
-    from stitch.pipeline import suggest, suggest_group
-    from stitch.runs.recorder import RunMemory
-    from stitch.stored.stored_run import load_run, named_before, standing_diagnosis
-    from stitch.writing import run_folder
-    from stitch.writing.diagnosis_document import plain_finding, suggested_command
+    from stitch.output import run_folder
+    from stitch.output.diagnosis_document import plain_finding, suggested_command
+    from stitch.output.stored_run import load_run, named_before, standing_diagnosis
+    from stitch.recorder import RunMemory
 
     memory = RunMemory()
     with run_folder.lock_run_folder(run):
@@ -185,8 +185,8 @@ def _show_unchanged(run: Path, as_json: bool) -> None:
 
 def _show_changed(result: Run, run: Path, as_json: bool) -> None:
     from stitch.cli.run import show_report
-    from stitch.writing.json_file import others_of_rig, to_json
-    from stitch.writing.result_document import result_document
+    from stitch.output.json_file import others_of_rig, to_json
+    from stitch.output.result_document import result_document
 
     if as_json:
         emit(to_json(result_document(result)))

@@ -14,7 +14,7 @@ from stitch.cli.terminal import emit, say, show_block
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
-    from stitch.measurement.session import Session
+    from stitch.session.session import Session
 
 
 def check(
@@ -39,7 +39,7 @@ def check(
 
 def _check_readable(sessions: list[Path], as_json: bool) -> None:
     """Say what sessions hold; exit code 2 where one cannot be read."""
-    from stitch.reading.session_folder import load_session
+    from stitch.session.reading.session_folder import load_session
 
     facts, errors = [], []
     for path in sessions:
@@ -61,9 +61,9 @@ def _check_readable(sessions: list[Path], as_json: bool) -> None:
 
 def _check_deeply(sessions: list[Path], as_json: bool) -> None:
     """Try every usual mistake on each session; exit code 2 where something is wrong for certain."""
-    from stitch.integrity.deep_check import deep_check
-    from stitch.reading.session_folder import load_session
-    from stitch.writing.json_file import to_json
+    from stitch.output.json_file import to_json
+    from stitch.screening.deep_check import deep_check
+    from stitch.session.reading.session_folder import load_session
 
     with show_activity("trying the usual mistakes"):
         loaded = {str(path): load_session(path) for path in sessions}
@@ -86,7 +86,7 @@ def session_summary(session: Session) -> dict[str, object]:
     """Return what a session holds, in plain numbers."""
     import numpy as np
 
-    from stitch.measurement.measurement import session_notes
+    from stitch.session.measurement import session_notes
 
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
     sighted = [view.sighting.points for view in session.views if view.sighting is not None]

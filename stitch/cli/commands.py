@@ -20,8 +20,8 @@ from stitch.cli.terminal import stdout_for_results
 
 GROUP = "stitch.commands"
 _OWN_COMMANDS = {
-    "init": "stitch.cli.init:init",
-    "detect": "stitch.cli.detect:detect",
+    "init": "stitch.plugins.intake.init:init",
+    "detect": "stitch.plugins.intake.detect:detect",
     "run": "stitch.cli.run:run",
     "check": "stitch.cli.check:check",
     "compare": "stitch.cli.compare:compare_run",
@@ -30,17 +30,17 @@ _OWN_COMMANDS = {
     "drop": "stitch.cli.change:drop",
     "note": "stitch.cli.note:note",
     "next": "stitch.cli.diagnose:next_measurement",
-    "plan": "stitch.cli.plan:plan_views",
-    "measure": "stitch.cli.measure:measure",
-    "verify": "stitch.cli.verify:verify",
-    "explain": "stitch.cli.explain:explain_run",
+    "plan": "stitch.plugins.metrology.planning.command:plan_views",
+    "measure": "stitch.plugins.metrology.measure:measure",
+    "verify": "stitch.plugins.metrology.verify:verify",
+    "explain": "stitch.plugins.explain.command:explain_run",
     "effects": "stitch.cli.effects:effects",
     "report": "stitch.cli.report:report",
-    "watch": "stitch.cli.watch_command:watch",
-    "batch": "stitch.cli.batch:batch",
-    "import": "stitch.cli.import_file:import_command",
-    "export": "stitch.cli.export_run:export_run",
-    "calibrate": "stitch.cli.calibrate:calibrate",
+    "watch": "stitch.plugins.watch.watch_command:watch",
+    "batch": "stitch.plugins.watch.batch.command:batch",
+    "import": "stitch.plugins.intake.import_file:import_command",
+    "export": "stitch.plugins.export.export_run:export_run",
+    "calibrate": "stitch.plugins.metrology.calibrate.command:calibrate",
 }
 
 

@@ -15,10 +15,10 @@ from stitch.cli.terminal import emit, say, show_block, show_files, show_next, sh
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
-    from stitch.comparison.displaced_views import FollowedCovariate
-    from stitch.comparison.open3d_witness import Witness
-    from stitch.comparison.residual_tables import ResidualTable, ResidualTables
-    from stitch.runs.run import Run
+    from stitch.output.comparison.displaced_views import FollowedCovariate
+    from stitch.output.comparison.open3d_witness import Witness
+    from stitch.output.comparison.residual_tables import ResidualTable, ResidualTables
+    from stitch.run_data import Run
 
 _SCOPE = "This look shows what the error follows, one covariate at a time. The cause is for stitch diagnose to name."
 _WORST_ROWS = 5
@@ -51,10 +51,10 @@ def compare_run(
     if program is not None:
         _compare_with(program, run, effects_file, trust=trust, as_json=as_json)
         return
-    from stitch.comparison.residual_tables import comparison_document
-    from stitch.stored.stored_run import load_run
-    from stitch.writing.json_file import to_json
-    from stitch.writing.run_folder import lock_run_folder
+    from stitch.output.comparison.residual_tables import comparison_document
+    from stitch.output.json_file import to_json
+    from stitch.output.run_folder import lock_run_folder
+    from stitch.output.stored_run import load_run
 
     with lock_run_folder(run), show_activity("comparing: reading the scans"):
         state = load_run(run, effects_file, trust=trust)
@@ -67,11 +67,11 @@ def compare_run(
 
 def _compare_with(program: str, run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
     """Let another program register the scans of a run, write witness.json with a picture, and print what differs."""
-    from stitch.comparison.open3d_witness import open3d_witness
-    from stitch.stored.stored_run import load_run
+    from stitch.output.comparison.open3d_witness import open3d_witness
+    from stitch.output.json_file import to_json, write_json
+    from stitch.output.run_folder import call_entry_points, lock_run_folder
+    from stitch.output.stored_run import load_run
     from stitch.system.open3d_library import import_open3d
-    from stitch.writing.json_file import to_json, write_json
-    from stitch.writing.run_folder import call_entry_points, lock_run_folder
 
     if program not in _WITNESSES:
         raise InputError(f"--with {program}: to fix: {' or '.join(_WITNESSES)}")
@@ -89,7 +89,7 @@ def _compare_with(program: str, run: Path, effects_file: Path | None, *, trust: 
 
 
 def _show_witness(witness: Witness, length_unit: str, run: Path) -> None:
-    from stitch.units import angle_text, length_text
+    from stitch.numerics.units import angle_text, length_text
 
     for sentence in witness.sentences(length_unit):
         say(sentence)
@@ -106,9 +106,9 @@ def _show_witness(witness: Witness, length_unit: str, run: Path) -> None:
 
 def write_comparison(state: Run, run: Path) -> ResidualTables:
     """Return the comparison of a run, after compare.json and what other packages make of it are written."""
-    from stitch.comparison.residual_tables import compare_surfaces, compare_targets, comparison_document
-    from stitch.writing.json_file import write_json
-    from stitch.writing.run_folder import call_entry_points
+    from stitch.output.comparison.residual_tables import compare_surfaces, compare_targets, comparison_document
+    from stitch.output.json_file import write_json
+    from stitch.output.run_folder import call_entry_points
 
     with show_activity("comparing: residuals by view, joint, time and place"):
         found = compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
@@ -120,7 +120,7 @@ def write_comparison(state: Run, run: Path) -> ResidualTables:
 
 def show_comparison(comparison: ResidualTables, state: Run, run: Path) -> None:
     """Print what follows something, the worst views and places, and the clearest tables."""
-    from stitch.units import MICROMETRES, length_text
+    from stitch.numerics.units import MICROMETRES, length_text
 
     unit = state.session.length_unit
     to_um = MICROMETRES[unit]
@@ -140,7 +140,7 @@ def show_comparison(comparison: ResidualTables, state: Run, run: Path) -> None:
 
 def _show_followed(followed: Sequence[FollowedCovariate], to_um: float) -> None:
     """Print what whole views follow, and their course along the clearest covariate."""
-    from stitch.comparison.displaced_views import also_clear, equally_clear
+    from stitch.output.comparison.displaced_views import also_clear, equally_clear
 
     if not followed:
         return
@@ -174,7 +174,7 @@ def _followed_text(own: FollowedCovariate) -> str:
 
 def _significance_sentence(comparison: ResidualTables) -> str:
     """Return what the means of all bins say together; views are the samples."""
-    from stitch.comparison.residual_tables import CLEAR
+    from stitch.output.comparison.residual_tables import CLEAR
 
     if not comparison.groups:
         return "Nothing that is known of the views changes from one to another."
@@ -211,7 +211,7 @@ def _worst_rows(table: ResidualTable, state: Run, to_um: float) -> str:
     """Return the worst rows of a table with their rms; of places, in which unit and frame they are written."""
     import numpy as np
 
-    from stitch.comparison.residual_tables import PLACE
+    from stitch.output.comparison.residual_tables import PLACE
 
     told = ", ".join(
         f"{table.label[i]} {table.rms[i] * to_um:.1f}"

@@ -15,7 +15,7 @@ from stitch.system.process import end_at_once
 if TYPE_CHECKING:
     from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
     from stitch.diagnosis.residual_structure import BudgetLine
-    from stitch.runs.run import Run
+    from stitch.run_data import Run
 
 _LISTED_CANDIDATES = 3
 _LISTED_DEPENDENCES = 3
@@ -38,8 +38,8 @@ def diagnose_run(
       stitch diagnose runs/blade-17
       stitch diagnose runs/blade-17 --effects-file mine.py --json
     """
-    from stitch.writing.diagnosis_document import suggested_command
-    from stitch.writing.json_file import to_json
+    from stitch.output.diagnosis_document import suggested_command
+    from stitch.output.json_file import to_json
 
     found, document, unit = _diagnose_folder(run, effects_file, trust)
     if as_json:
@@ -62,7 +62,7 @@ def next_measurement(
     Examples:
       stitch next runs/blade-17
     """
-    from stitch.writing.json_file import to_json
+    from stitch.output.json_file import to_json
 
     found, document, _ = _diagnose_folder(run, effects_file, trust)
     if as_json:
@@ -88,9 +88,9 @@ def _no_correlation(name: str) -> str:
 
 
 def _diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, object], str]:
-    from stitch.pipeline import diagnose
-    from stitch.stored.stored_run import load_run
-    from stitch.writing.run_folder import lock_run_folder, preload_entry_points
+    from stitch.api.pipeline import diagnose
+    from stitch.output.run_folder import lock_run_folder, preload_entry_points
+    from stitch.output.stored_run import load_run
 
     with lock_run_folder(run):
         with show_activity("diagnosing: reading the scans"):
@@ -103,10 +103,10 @@ def _diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple
 
 def write_diagnosis(diagnosis: Diagnosis, state: Run, run: Path) -> dict[str, object]:
     """Return the diagnosis as a document, after diagnosis.json and what other packages make of it are written."""
-    from stitch.stored.stored_run import diagnosed_state
-    from stitch.writing.diagnosis_document import diagnosis_document
-    from stitch.writing.json_file import write_json
-    from stitch.writing.run_folder import call_entry_points
+    from stitch.output.diagnosis_document import diagnosis_document
+    from stitch.output.json_file import write_json
+    from stitch.output.run_folder import call_entry_points
+    from stitch.output.stored_run import diagnosed_state
 
     document = diagnosis_document(diagnosis) | {"of": diagnosed_state(state, run)}
     with show_activity("diagnosing: drawing pictures and page"):
@@ -117,8 +117,8 @@ def write_diagnosis(diagnosis: Diagnosis, state: Run, run: Path) -> dict[str, ob
 
 def show_diagnosis(diagnosis: Diagnosis, length_unit: str) -> None:
     """Print the finding for everybody, the evidence, the likeliest effects, and where the error comes from."""
-    from stitch.runs.run import doubt_remedy
-    from stitch.writing.diagnosis_document import open_doubts, plain_finding
+    from stitch.output.diagnosis_document import open_doubts, plain_finding
+    from stitch.run_data import doubt_remedy
 
     say(plain_finding(diagnosis, length_unit), bold=True)
     if in_full():
@@ -166,8 +166,8 @@ def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], l
 
 def show_budget(budget: Sequence[BudgetLine], length_unit: str) -> None:
     """Print source, share of the variance and size (rms) of all that the poses leave; nothing without a budget."""
-    from stitch.units import length_text
-    from stitch.writing.diagnosis_document import largest_error_sources, share_text
+    from stitch.numerics.units import length_text
+    from stitch.output.diagnosis_document import largest_error_sources, share_text
 
     told = [
         f"{line.source} {share_text(line)} ({length_text(line.sigma, length_unit, 2)})"
@@ -178,7 +178,7 @@ def show_budget(budget: Sequence[BudgetLine], length_unit: str) -> None:
 
 
 def _candidate_row(diagnosis: Diagnosis, s: CandidateEffect, length_unit: str) -> list[str]:
-    from stitch.units import length_text
+    from stitch.numerics.units import length_text
 
     if not s.ranked.score.observable:
         return [s.name, "not seen", "–", "–", "–"]
@@ -202,7 +202,7 @@ def _show_untested(diagnosis: Diagnosis) -> None:
 
 def _show_missed(diagnosis: Diagnosis, length_unit: str) -> None:
     """Print what effects too small to be seen could still do to the hand-eye."""
-    from stitch.units import length_text
+    from stitch.numerics.units import length_text
 
     known = sorted(((s.hand_eye, s.name) for s in diagnosis.candidates if s.hand_eye is not None), reverse=True)
     if told := ", ".join(f"{name} {length_text(size, length_unit, 2)}" for size, name in known[:3]):

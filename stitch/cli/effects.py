@@ -29,7 +29,7 @@ def effects(
     """
     from stitch.effects.contract import EFFECTS, find_effect
     from stitch.effects.user_file import load
-    from stitch.writing.json_file import to_json
+    from stitch.output.json_file import to_json
 
     if effects_file:
         load(effects_file)

@@ -15,7 +15,7 @@ from stitch.cli.commands import CommandGroup
 from stitch.cli.progress import TimeLeft, live_line
 from stitch.cli.terminal import say, speak_any_terminal
 from stitch.errors import StitchError
-from stitch.reading.text_files import shortened
+from stitch.session.reading.text_files import shortened
 from stitch.system import process
 from stitch.system.process import watched
 

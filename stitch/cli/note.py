@@ -25,9 +25,9 @@ def note(
     Examples:
       stitch note runs/blade-17 "fixture shimmed after this step" --step 0
     """
-    from stitch.stored.stored_run import read_ledger
-    from stitch.writing.json_file import to_json, write_json
-    from stitch.writing.run_folder import lock_run_folder
+    from stitch.output.json_file import to_json, write_json
+    from stitch.output.run_folder import lock_run_folder
+    from stitch.output.stored_run import read_ledger
 
     text, by = text.strip(), by.strip()
     if not text:

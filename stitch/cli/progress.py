@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 from stitch.system.process import AGAIN, QUIET
 
 if TYPE_CHECKING:
-    from stitch.frames import Array
-    from stitch.measurement.session import Session
-    from stitch.runs.recorder import Recorder
-    from stitch.runs.run import Run, StageResult
+    from stitch.numerics.frames import Array
+    from stitch.recorder import Recorder
+    from stitch.run_data import Run, StageResult
+    from stitch.session.session import Session
 
 _SOON = 1.0  # a loop that ends sooner (s) needs no time left
 PROGRESS_VARIABLE = "STITCH_PROGRESS"  # json: lines for programs; off: none on what is no terminal
@@ -40,8 +40,8 @@ def show_activity(text: str) -> Iterator[None]:
 
 def recorder_for(folder: Path, recording: bool) -> Recorder:
     """Return progress on a terminal or as lines, and the recording."""
-    from stitch.runs.recorder import RecorderGroup
-    from stitch.writing.run_folder import recordings
+    from stitch.output.run_folder import recordings
+    from stitch.recorder import RecorderGroup
 
     lines: list[Recorder] = [ProgressLines()] if progress_lines_requested() else []
     return RecorderGroup([Progress(), *lines, *(recordings(folder) if recording else [])])
@@ -196,7 +196,7 @@ class Progress:
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
         """Show where the iteration stands."""
-        from stitch.units import length_text
+        from stitch.numerics.units import length_text
 
         # Labelled points have their partners by name.
         within = f", partners within {length_text(gate, self.unit)}" if isfinite(gate) else ""
@@ -223,7 +223,7 @@ class ProgressLines:
 
     def start(self, session: Session) -> None:
         """What is worked on."""
-        from stitch.units import MICROMETRES
+        from stitch.numerics.units import MICROMETRES
 
         self.to_um = MICROMETRES[session.length_unit]
         _print_line(progress="start", session=session.name, views=len(session.views))

@@ -117,12 +117,12 @@ def _write_run_page(
     run: Path, with_diagnosis: bool, tolerance: float | None, effects_file: Path | None, trust: bool
 ) -> Path:
     """Return the page of a run, written anew."""
+    from stitch.api.pipeline import diagnose
     from stitch.cli.compare import write_comparison
     from stitch.cli.diagnose import write_diagnosis
     from stitch.cli.run import show_light
-    from stitch.pipeline import diagnose
-    from stitch.stored.stored_run import load_run, standing_diagnosis
-    from stitch.writing import run_folder
+    from stitch.output import run_folder
+    from stitch.output.stored_run import load_run, standing_diagnosis
 
     page = run / "report.html"
     with run_folder.lock_run_folder(run):
@@ -146,9 +146,9 @@ def _write_two_run_page(
     run: Path, other: Path, output: Path | None, tolerance: float | None, effects_file: Path | None, trust: bool
 ) -> Path:
     """Return the page of what changed from one run to the other."""
-    from stitch.comparison.two_runs import compare_runs, comparison_sentence
-    from stitch.stored.stored_run import load_run
-    from stitch.writing.run_folder import call_entry_points, lock_run_folder
+    from stitch.output.comparison.two_runs import compare_runs, comparison_sentence
+    from stitch.output.run_folder import call_entry_points, lock_run_folder
+    from stitch.output.stored_run import load_run
 
     if run.resolve() == other.resolve():
         raise InputError(f"{run} and {other} are one run; to fix: name two, or one alone for its own page")

@@ -30,10 +30,10 @@ from stitch.system.process import end_at_once, load_on_use
 
 if TYPE_CHECKING:
     from stitch.api.live import LiveSession
-    from stitch.measurement.capture import Capture
-    from stitch.measurement.session import Session
     from stitch.model.model_toml import ModelFile
-    from stitch.runs.run import Run
+    from stitch.run_data import Run
+    from stitch.session.capture import Capture
+    from stitch.session.session import Session
 
 # Seconds between two looks, and how long a file may be half-written before that is said.
 _EVERY, _PATIENCE = 0.3, 5.0
@@ -113,11 +113,11 @@ def run(
     loaded = _load_sessions(paths, memory)
     # A second of libraries is still to be loaded, which takes one core.
     captures = _begin_to_prepare(loaded)
-    from stitch.pipeline import run_rig
-    from stitch.stages.register import DEFAULT
-    from stitch.writing.json_file import to_json
-    from stitch.writing.result_document import result_document
-    from stitch.writing.run_folder import new_folder, preload_entry_points
+    from stitch.api.pipeline import run_rig
+    from stitch.fusion.register import DEFAULT
+    from stitch.output.json_file import to_json
+    from stitch.output.result_document import result_document
+    from stitch.output.run_folder import new_folder, preload_entry_points
 
     name = "+".join(session.name for session in loaded)
     target = output or Path("runs" if sessions else "../runs") / name
@@ -156,14 +156,14 @@ def _require_known(
         for name in effects:
             find_effect(name)
     if register is not None:
-        from stitch.stages.register import method_named
+        from stitch.fusion.register import method_named
 
         method_named(register)
 
 
 def _begin_to_prepare(sessions: list[Session]) -> list[Future[Capture]]:
     """Return what `prepare_capture` will find of each session, in a thread that has begun with it."""
-    from stitch.measurement.capture import prepare_capture
+    from stitch.session.capture import prepare_capture
     from stitch.system.threads import begin
 
     return [begin(partial(prepare_capture, session)) for session in sessions]
@@ -173,8 +173,8 @@ def _require_mesh_kind(kind: str | None) -> None:
     """Refuse a kind of mesh that is not known, and before the work begins one for which Open3D is missing."""
     if kind is None:
         return
+    from stitch.output.mesh import KINDS, OPEN
     from stitch.system.open3d_library import import_open3d
-    from stitch.writing.mesh import KINDS, OPEN
 
     if kind not in KINDS:
         raise InputError(f"--mesh {kind}: to fix: --mesh alone, or one of {', '.join(KINDS)}")
@@ -201,7 +201,7 @@ def _follow_session(folder: Path, views: int | None) -> None:
         InputError: session.toml is missing or wrong, or the poses are of another convention than it states.
     """
     from stitch.api.live import follow
-    from stitch.reading.session_folder import load_session, read_session_document
+    from stitch.session.reading.session_folder import load_session, read_session_document
 
     table = folder / "views.csv"
     read_session_document(folder / "session.toml")
@@ -265,8 +265,8 @@ def _current_session() -> Path:
 
 def _load_sessions(paths: list[Path], memory: str | None) -> list[Session]:
     """Return the sessions; refuse names that cannot be those of their folders in the folder of a rig."""
-    from stitch.reading.session_folder import load_session
-    from stitch.writing.json_file import FILES
+    from stitch.output.json_file import FILES
+    from stitch.session.reading.session_folder import load_session
 
     size = bytes_of(memory)
     loaded = [load_session(path, memory=None if size is None else size / len(paths)) for path in paths]
@@ -294,7 +294,7 @@ def _given_models(
     if hand_eye is None and arm is None:
         return None, None, own
     from stitch.model.model_toml import keep_arm_effects
-    from stitch.stored.stored_run import trusted_model
+    from stitch.output.stored_run import trusted_model
 
     if hand_eye:
         return trusted_model(hand_eye, effects_file, trust)[0], None, own
@@ -316,16 +316,16 @@ def _write_runs(
 ) -> list[str]:
     """Write what was found, and return how each mesh lies to its cloud, in words."""
     from stitch.model.model_toml import write_model
-    from stitch.writing.result_document import model_of
-    from stitch.writing.run_folder import write_with_page
+    from stitch.output.result_document import model_of
+    from stitch.output.run_folder import write_with_page
 
     fits = []
     for result, folder in zip(runs, folders, strict=True):
         folder.mkdir(exist_ok=True)
         write_with_page(result, folder, tolerance)
         if mesh:
-            from stitch.writing.mesh import write_mesh
-            from stitch.writing.open3d_mesh import make_mesh
+            from stitch.output.mesh import write_mesh
+            from stitch.output.open3d_mesh import make_mesh
 
             surface, fit = make_mesh(result.fused, mesh)
             write_mesh(surface, folder / "mesh.ply")
@@ -354,10 +354,10 @@ def _show_written(folders: list[Path], fits: list[str]) -> None:
 
 def show_report(result: Run, tolerance: float | None = None, with_hand_eye: bool = True) -> None:
     """Print what a run found: a headline, what to do about it, numbers in a block, the hand-eye, and notes."""
-    from stitch.comparison.disagreement_field import model_history
-    from stitch.comparison.run_verdict import run_headline
-    from stitch.runs.run import doubt_remedy
-    from stitch.writing.fit_report import report_rows, run_hand_eye_lines
+    from stitch.output.comparison.disagreement_field import model_history
+    from stitch.output.comparison.run_verdict import run_headline
+    from stitch.output.fit_report import report_rows, run_hand_eye_lines
+    from stitch.run_data import doubt_remedy
 
     session = result.session
     say(f"{session.name}: {run_headline(result, model_history(result))}", bold=True)
@@ -386,8 +386,8 @@ def show_report(result: Run, tolerance: float | None = None, with_hand_eye: bool
 
 def show_light(result: Run, tolerance: float | None) -> None:
     """Print whether the part is within a tolerance, as the page's light says it; nothing where none is stated."""
-    from stitch.comparison.disagreement_field import model_history
-    from stitch.comparison.run_verdict import run_light
+    from stitch.output.comparison.disagreement_field import model_history
+    from stitch.output.comparison.run_verdict import run_light
 
     light = None if tolerance is None else run_light(result, model_history(result), tolerance)
     if light is not None:

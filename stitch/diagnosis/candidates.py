@@ -18,10 +18,10 @@ from stitch.effects.contract import (
     without_offset,
 )
 from stitch.effects.empirical import empirical_effects
-from stitch.frames import Array, Mask
 from stitch.model.model import Term
+from stitch.numerics.common_covariance import SelectedColumns
+from stitch.numerics.frames import Array, Mask
 from stitch.observations.linear_model import LinearModel, PointSums, Response
-from stitch.statistics.common_covariance import SelectedColumns
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,10 @@ from stitch.diagnosis.unnamed_joint_laws import joint_curves
 from stitch.diagnosis.unnamed_time_laws import RepeatingError, find_repeating_errors, reportable
 from stitch.diagnosis.validation import cross_validate
 from stitch.diagnosis.verdict import Evidence
-from stitch.frames import Array
+from stitch.fit.results import linearise
+from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.runs.run import Run
-from stitch.stages.results import linearise
+from stitch.run_data import Run
 from stitch.system.process import announce
 from stitch.system.threads import library_threads_off, parallel, return_large_arrays
 

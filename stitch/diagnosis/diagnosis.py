@@ -12,7 +12,7 @@ from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unnamed_joint_laws import JointCurve
 from stitch.diagnosis.unnamed_time_laws import RepeatingError, TimeCurve, reportable
 from stitch.diagnosis.validation import CrossValidation
-from stitch.frames import Array
+from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.scanner_errors import FieldError
 

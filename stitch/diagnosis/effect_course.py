@@ -11,19 +11,19 @@ from itertools import pairwise
 
 import numpy as np
 
-from stitch import frames
 from stitch.diagnosis.candidates import Form, candidate_as_fitted
 from stitch.diagnosis.residual_structure import Dependence, predicted_distances
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.unnamed_joint_laws import JointCurve
 from stitch.effects.contract import EFFECTS, Effect, parameters_in, twist
-from stitch.frames import Array, Indices
-from stitch.measurement.measurement import ScanView, Views
 from stitch.model.forward import moves_points, point_correction, scan_points
 from stitch.model.model import Term
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+from stitch.numerics.units import covariate_text
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import surfaces_of
-from stitch.units import covariate_text
+from stitch.session.measurement import ScanView, Views
 
 # Dots along one course: more cannot be told apart.
 _MOST = 300

@@ -27,13 +27,13 @@ from stitch.diagnosis.unnamed_time_laws import (
 )
 from stitch.diagnosis.validation import CrossValidation, Halves, cross_validate, validate_in_halves
 from stitch.diagnosis.verdict import Evidence, scanner_explains_it
-from stitch.measurement.measurement import Views
 from stitch.model.forward import moves_points
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.scanner_errors import FieldError, field_error
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.observations.surfaces.view_poses import noise_floor
+from stitch.session.measurement import Views
 
 # What remains between the views however each of them is moved: no error of poses, joints or mount leaves that.
 #

@@ -15,16 +15,16 @@ from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, Form
 from stitch.diagnosis.ranking import Ranked, conditioned_on_effects
 from stitch.diagnosis.validation import group_share
-from stitch.frames import Array, Indices
-from stitch.observations.linear_model import LinearModel
-from stitch.statistics.parameter_selection import (
+from stitch.numerics.frames import Array, Indices
+from stitch.numerics.parameter_selection import (
     PLAUSIBLE,
     eliminate_backward,
     log_evidence_at_scales,
     log_mixture,
     select_forward,
 )
-from stitch.statistics.reml import at_variances, fit_variances
+from stitch.numerics.reml import at_variances, fit_variances
+from stitch.observations.linear_model import LinearModel
 
 # Effects that are taken out at once.
 _TAKEN_OUT = 2

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.score import Score, score
-from stitch.frames import Array
+from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import parallel
 

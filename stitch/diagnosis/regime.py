@@ -9,10 +9,10 @@ count as scattering independently. Many views tell several effects apart at once
 from dataclasses import dataclass
 
 from stitch.diagnosis import thresholds as limits
+from stitch.numerics.parameter_selection import ANY_SIZE, PLAUSIBLE
+from stitch.numerics.reml import MANY_NUMBERS
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import MANY_VIEWS
-from stitch.statistics.parameter_selection import ANY_SIZE, PLAUSIBLE
-from stitch.statistics.reml import MANY_NUMBERS
 
 
 @dataclass(frozen=True)

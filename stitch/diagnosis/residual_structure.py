@@ -6,24 +6,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch import frames
 from stitch.diagnosis.ranking import Ranked, rank_all
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, DEPENDENCE_BINS, ODDS
 from stitch.diagnosis.unnamed_joint_laws import FittedProcess
 from stitch.diagnosis.unnamed_time_laws import RepeatingError
 from stitch.effects.empirical import FIELD
-from stitch.frames import Array
-from stitch.measurement.measurement import Views
 from stitch.model.forward import moves_points, scan_correction
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.least_squares import column_space, project_out
+from stitch.numerics.reml import fit_variances
+from stitch.numerics.variance_posterior import mean_variances
 from stitch.observations.linear_model import WHITE_COMPONENTS, LinearModel
 from stitch.observations.pose_errors import DRIFT_MEMORY, JOINT_SCATTER, PoseErrors
 from stitch.observations.surfaces.matching import Match, signed_distances
 from stitch.observations.surfaces.scanner_errors import field_scatter
 from stitch.observations.surfaces.surface_model import surfaces_of
-from stitch.statistics.least_squares import column_space, project_out
-from stitch.statistics.reml import fit_variances
-from stitch.statistics.variance_posterior import mean_variances
+from stitch.session.measurement import Views
 
 # A scanner that errs by where in its field a point is seen, by no law of the library.
 #

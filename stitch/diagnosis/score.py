@@ -17,19 +17,19 @@ from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, Form, candidate_of
 from stitch.diagnosis.regime import regime_of
 from stitch.effects.contract import Effect, find_effect
-from stitch.frames import Array, Mask
-from stitch.measurement.measurement import Measurement
-from stitch.measurement.session import Session
+from stitch.fit.results import linearise
 from stitch.model.model import Model, Term, term_of
 from stitch.model.model_toml import ModelFile, bind_to_session
+from stitch.numerics.distributions import chi2_limit, f_tail
+from stitch.numerics.frames import Array, Mask
+from stitch.numerics.parameter_selection import log_evidence_at_scales, log_mixture
+from stitch.numerics.reml import FurtherColumns, at_variances, fit_variances
+from stitch.numerics.units import METRES
+from stitch.numerics.variance_posterior import satterthwaite
 from stitch.observations.linear_model import LinearModel
-from stitch.stages.results import linearise
-from stitch.statistics.distributions import chi2_limit, f_tail
-from stitch.statistics.parameter_selection import log_evidence_at_scales, log_mixture
-from stitch.statistics.reml import FurtherColumns, at_variances, fit_variances
-from stitch.statistics.variance_posterior import satterthwaite
+from stitch.session.measurement import Measurement
+from stitch.session.session import Session
 from stitch.system.threads import parallel
-from stitch.units import METRES
 
 # One form of a candidate beside a model: what it gains, and its free amplitudes.
 #

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from stitch import frames
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import Score, form_weights
-from stitch.frames import Array
+from stitch.numerics import frames
+from stitch.numerics.distributions import f_limit, noncentral_f_tail
+from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.statistics.distributions import f_limit, noncentral_f_tail
 
 # Which candidates are aliases in these views: correlation of what they do, hand-eye and model projected out.
 

@@ -10,8 +10,8 @@ from stitch.diagnosis.residual_structure import NOT_REPEATING
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
 from stitch.diagnosis.unnamed_joint_laws import JointCurve
 from stitch.diagnosis.unnamed_time_laws import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
+from stitch.numerics.units import angle_text, duration_text, format_amount, length_text, rounded
 from stitch.observations.surfaces.scanner_errors import FieldError
-from stitch.units import angle_text, duration_text, format_amount, length_text, rounded
 
 _SCALE = "range_scale"
 # Curves of joints that are told in words; the page draws one more.

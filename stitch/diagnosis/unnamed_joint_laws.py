@@ -23,10 +23,25 @@ from scipy.special import logsumexp
 
 from stitch.diagnosis import thresholds as limits
 from stitch.effects.contract import EFFECTS
-from stitch.frames import Array, Indices
-from stitch.measurement.measurement import STILL
 from stitch.model.forward import pose_derivatives
 from stitch.model.model import term_of
+from stitch.numerics import parameter_selection
+from stitch.numerics.common_covariance import SelectedColumns
+from stitch.numerics.frames import Array, Indices
+from stitch.numerics.kernels import (
+    REACH,
+    SHORT_REACH,
+    SmoothErrors,
+    direction_reach,
+    exponential_kernel,
+    joint_kernel_factors,
+    ornstein_uhlenbeck,
+    periodic_kernel,
+    rbf_joints,
+    short_range_kernel,
+)
+from stitch.numerics.parameter_selection import log_mean_exp
+from stitch.numerics.reml import MixedModel, VarianceFit, at_variances, fit_variances
 from stitch.observations.linear_model import LinearModel, with_pose_errors
 from stitch.observations.pose_errors import (
     ALL_ANGLES,
@@ -43,22 +58,7 @@ from stitch.observations.pose_errors import (
     time_in_steps,
     usual_time_step,
 )
-from stitch.statistics import parameter_selection
-from stitch.statistics.common_covariance import SelectedColumns
-from stitch.statistics.kernels import (
-    REACH,
-    SHORT_REACH,
-    SmoothErrors,
-    direction_reach,
-    exponential_kernel,
-    joint_kernel_factors,
-    ornstein_uhlenbeck,
-    periodic_kernel,
-    rbf_joints,
-    short_range_kernel,
-)
-from stitch.statistics.parameter_selection import log_mean_exp
-from stitch.statistics.reml import MixedModel, VarianceFit, at_variances, fit_variances
+from stitch.session.measurement import STILL
 
 # Smooth processes by which a joint or the flange may err, as columns of the channel with unit coefficients: the
 # leading eigenvectors of their covariance between views.

@@ -25,7 +25,10 @@ from stitch.diagnosis.unnamed_joint_laws import (
     size_process,
     wandering_flange,
 )
-from stitch.frames import Array
+from stitch.numerics.frames import Array
+from stitch.numerics.parameter_selection import log_mean_exp
+from stitch.numerics.reml import NOISE, at_variances, fit_variances
+from stitch.numerics.units import duration_text
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import (
     DRIFT_MEMORY,
@@ -35,10 +38,7 @@ from stitch.observations.pose_errors import (
     usual_time_step,
     usual_twist,
 )
-from stitch.statistics.parameter_selection import log_mean_exp
-from stitch.statistics.reml import NOISE, at_variances, fit_variances
 from stitch.system.threads import parallel
-from stitch.units import duration_text
 
 # Of a Gaussian its full width at half maximum.
 _FULL_WIDTH = 2.355

@@ -8,12 +8,12 @@ import numpy as np
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Form
 from stitch.diagnosis.score import Score, score
-from stitch.frames import Array
+from stitch.numerics.distributions import chi2_tail, normal_tail
+from stitch.numerics.folds import JointEnd, halves_of
+from stitch.numerics.frames import Array
+from stitch.numerics.least_squares import mean_square_share
+from stitch.numerics.parameter_selection import log_evidence
 from stitch.observations.linear_model import CoefficientPrior, LinearModel, LinearTrial
-from stitch.statistics.distributions import chi2_tail, normal_tail
-from stitch.statistics.folds import JointEnd, halves_of
-from stitch.statistics.least_squares import mean_square_share
-from stitch.statistics.parameter_selection import log_evidence
 
 # Whether a candidate helps where nothing was measured: at ends of joints' ranges that were left out.
 #

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from stitch.errors import InputError
-from stitch.measurement.measurement import Measurement
-from stitch.units import Amount, format_amount
+from stitch.numerics.units import Amount, format_amount
+from stitch.session.measurement import Measurement
 
 # How the arguments of an effect's function become parameters: kinds, units, plausible sizes.
 

@@ -12,8 +12,8 @@ from math import prod
 import numpy as np
 
 from stitch.effects.contract import Effect, Spec, event, number, twist
-from stitch.frames import Array
-from stitch.measurement.measurement import ScanView, Views
+from stitch.numerics.frames import Array
+from stitch.session.measurement import ScanView, Views
 
 # A distortion of the scanner's field by no law.
 FIELD = "distortion_over_field"

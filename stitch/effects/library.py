@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from stitch.effects.contract import effect, event, number, offset, per_joint, per_torque, twist, vector
-from stitch.frames import Array
-from stitch.measurement.measurement import ScanView, Views
-from stitch.measurement.robot import Links
+from stitch.numerics.frames import Array
+from stitch.session.measurement import ScanView, Views
+from stitch.session.robot import Links
 
 # Effects of the arm: the true joint angles q* and the true links.
 

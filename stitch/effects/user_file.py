@@ -15,8 +15,8 @@ import numpy as np
 
 from stitch.effects.contract import EFFECTS, Effect, Spec
 from stitch.errors import InputError
-from stitch.frames import Array
-from stitch.measurement.robot import Links
+from stitch.numerics.frames import Array
+from stitch.session.robot import Links
 from stitch.system.process import time_limit
 
 # Is what a user's file says of an effect, and what its function returns, what the chain can use?

@@ -7,12 +7,12 @@ from functools import cached_property
 import numpy as np
 from pykdtree.kdtree import KDTree
 
-from stitch import frames
-from stitch.frames import Array, Indices
-from stitch.measurement.capture import Capture
-from stitch.measurement.measurement import Measurement, ScanView
-from stitch.measurement.robot import FlangeSlopes, Links, exact_links, flange_slopes, forward, forward_with_errors
 from stitch.model.model import Model, Term
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+from stitch.session.capture import Capture
+from stitch.session.measurement import Measurement, ScanView
+from stitch.session.robot import FlangeSlopes, Links, exact_links, flange_slopes, forward, forward_with_errors
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch import frames
 from stitch.effects.contract import Effect, Parameter, parameters_in
-from stitch.frames import Array, Mask
-from stitch.measurement.measurement import Measurement
-from stitch.units import METRES, value_uncertainty_text
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Mask
+from stitch.numerics.units import METRES, value_uncertainty_text
+from stitch.session.measurement import Measurement
 
 # An effect in use with its named parameters.
 

@@ -9,11 +9,11 @@ import tomli_w
 
 from stitch.effects.contract import Effect, Parameter, find_effect, parameters_in, require_available
 from stitch.errors import InputError
-from stitch.frames import Array, is_rigid
-from stitch.measurement.measurement import Measurement
 from stitch.model.model import EffectsCovariance, Model, Target, Term
-from stitch.reading.text_files import optional_text, read_toml, table_choice
-from stitch.units import METRES
+from stitch.numerics.frames import Array, is_rigid
+from stitch.numerics.units import METRES
+from stitch.session.measurement import Measurement
+from stitch.session.reading.text_files import optional_text, read_toml, table_choice
 
 FORMAT = "stitch-model/1"
 _HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps scanner

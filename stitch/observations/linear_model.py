@@ -16,14 +16,12 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model, Term
-from stitch.observations.pose_errors import JOINT_SCATTER, USUAL_JOINT_SCATTER, PoseErrors
-from stitch.statistics.common_covariance import SelectedColumns
-from stitch.statistics.folds import JointEnd, grouped_folds
-from stitch.statistics.least_squares import column_space
-from stitch.statistics.reml import (
+from stitch.numerics.common_covariance import SelectedColumns
+from stitch.numerics.folds import JointEnd, grouped_folds
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.least_squares import column_space
+from stitch.numerics.reml import (
     ALWAYS_PRESENT,
     NOISE,
     FurtherColumns,
@@ -36,7 +34,9 @@ from stitch.statistics.reml import (
     model_information,
     whitener,
 )
-from stitch.statistics.variance_posterior import Satterthwaite, satterthwaite
+from stitch.numerics.variance_posterior import Satterthwaite, satterthwaite
+from stitch.observations.pose_errors import JOINT_SCATTER, USUAL_JOINT_SCATTER, PoseErrors
+from stitch.session.measurement import Measurement
 
 # Numbers that were seen, and how they may err: components of a covariance, their sizes, models with fewer.
 

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch import frames
-from stitch.frames import Array
-from stitch.measurement import robot as kinematics
-from stitch.measurement.capture import Capture
-from stitch.measurement.robot import Robot
-from stitch.measurement.scan import centroid, spread
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.session import robot as kinematics
+from stitch.session.capture import Capture
+from stitch.session.robot import Robot
+from stitch.session.scan import centroid, spread
 
 # Names of the hand-eye's numbers: position, then rotation vector.
 NUMBERS = ("x", "y", "z", "rx", "ry", "rz")

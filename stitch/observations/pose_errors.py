@@ -19,13 +19,12 @@ from itertools import permutations
 
 import numpy as np
 
-from stitch import frames
 from stitch.effects.contract import EFFECTS, Effect, missing_need
-from stitch.frames import Array, Mask
-from stitch.measurement.measurement import STILL, Measurement, Torques
 from stitch.model.forward import pose_derivatives
 from stitch.model.model import Model, Term, term_of
-from stitch.statistics.kernels import (
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Mask
+from stitch.numerics.kernels import (
     SmoothErrors,
     direction_kernel,
     load_kernel,
@@ -37,7 +36,8 @@ from stitch.statistics.kernels import (
     short_range_kernel,
     two_joint_kernel,
 )
-from stitch.statistics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
+from stitch.numerics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
+from stitch.session.measurement import STILL, Measurement, Torques
 
 # What joints and links of any arm do a little wrong: effects of the library, and the twists of the views by them.
 

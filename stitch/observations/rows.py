@@ -12,19 +12,19 @@ from functools import cached_property
 
 import numpy as np
 
-from stitch import frames
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.capture import Capture
-from stitch.measurement.measurement import Measurement
 from stitch.model.forward import PointSlopes, moves_points, pose_derivatives
 from stitch.model.model import Model, Term, sizes_of, stack_parameters, values_of
+from stitch.numerics import frames
+from stitch.numerics.common_covariance import CommonCovariance, common_covariance
+from stitch.numerics.folds import JointEnd, joint_ends
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.least_squares import BlockLeastSquares, equilibrated, independent
+from stitch.numerics.parameter_selection import UNSEEN
+from stitch.numerics.reml import MixedModel, fit_variances, whitener
 from stitch.observations.linear_model import CoefficientPrior, LinearModel, Observation, PointSums, Response
 from stitch.observations.pose_errors import joint_offset_twists, mean_square_per_axis
-from stitch.statistics.common_covariance import CommonCovariance, common_covariance
-from stitch.statistics.folds import JointEnd, joint_ends
-from stitch.statistics.least_squares import BlockLeastSquares, equilibrated, independent
-from stitch.statistics.parameter_selection import UNSEEN
-from stitch.statistics.reml import MixedModel, fit_variances, whitener
+from stitch.session.capture import Capture
+from stitch.session.measurement import Measurement
 
 
 @dataclass(frozen=True, kw_only=True)

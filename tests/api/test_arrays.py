@@ -5,10 +5,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from stitch.api.arrays import cloud_of, poses_of, sighting_of
 from stitch.errors import InputError
-from stitch.measurement.session import Cloud
-from stitch.reading.clouds import read_cloud
+from stitch.plugins.intake.arrays import cloud_of, poses_of, sighting_of
+from stitch.session.reading.clouds import read_cloud
+from stitch.session.session import Cloud
 from tests.needs import needs_open3d
 
 RNG = np.random.default_rng(0)
@@ -182,8 +182,8 @@ def test_labelled_points_of_a_view():
 
 
 def test_a_thinned_cloud_gives_all_of_its_points():
-    from stitch.measurement.capture import thin_cloud
-    from stitch.measurement.session import Scanner
+    from stitch.session.capture import thin_cloud
+    from stitch.session.session import Scanner
 
     dense = RNG.normal(size=(500, 3)) + np.array([0, 0, 500.0])
     thin = thin_cloud("v", Cloud(dense), 100, Scanner(None, None, None, np.array([0, 0, 1.0])))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import stitch
-from stitch.measurement.session import Cloud
+from stitch.session.session import Cloud
 from tests.needs import needs_open3d
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE

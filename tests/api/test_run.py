@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform
 
 import stitch
-from stitch import frames
 from stitch.api import run as api_run
-from stitch.comparison.residual_tables import comparison_document
 from stitch.errors import InputError
-from stitch.reading.clouds import read_cloud
-from stitch.writing.diagnosis_document import diagnosis_document
-from stitch.writing.json_file import to_json
+from stitch.numerics import frames
+from stitch.output.comparison.residual_tables import comparison_document
+from stitch.output.diagnosis_document import diagnosis_document
+from stitch.output.json_file import to_json
+from stitch.session.reading.clouds import read_cloud
 from tests.api.same import same_folder, taken
 from tests.needs import needs_open3d
 

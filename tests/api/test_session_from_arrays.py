@@ -10,8 +10,8 @@ import stitch
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.write import robot_table
 from stitch.errors import InputError
-from stitch.integrity.deep_check import refuse_whole
-from stitch.measurement.session import View
+from stitch.screening.deep_check import refuse_whole
+from stitch.session.session import View
 from tests.api.same import taken
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from stitch.cli.compare import show_comparison
-from tests.comparison.compared_views import compared
+from tests.output.comparison.compared_views import compared
 
 STATE = SimpleNamespace(
     session=SimpleNamespace(length_unit="mm", mount="eye_in_hand"),

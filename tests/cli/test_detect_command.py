@@ -15,10 +15,10 @@ from data_synth.fixtures.board_scans import (
     write_board_session,
     write_pcd,
 )
-from stitch import frames
 from stitch.cli.main import main
-from stitch.reading.session_folder import load_session
-from stitch.units import METRES
+from stitch.numerics import frames
+from stitch.numerics.units import METRES
+from stitch.session.reading.session_folder import load_session
 
 cv2 = pytest.importorskip("cv2")
 BOARD = "charuco:8x6:12:9:DICT_4X4_50"

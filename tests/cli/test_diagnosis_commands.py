@@ -12,7 +12,7 @@ from data_synth.scene import load_scene
 from data_synth.write import write_session, write_truth
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.stored.stored_run import load_run
+from stitch.output.stored_run import load_run
 
 
 @pytest.fixture(scope="module")

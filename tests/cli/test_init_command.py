@@ -8,7 +8,7 @@ import pytest
 
 from data_synth.fixtures.raw_folders import Convention, raw_folder
 from stitch.cli.main import main
-from stitch.reading.session_folder import load_session
+from stitch.session.reading.session_folder import load_session
 
 
 @pytest.fixture

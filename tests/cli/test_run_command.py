@@ -37,7 +37,7 @@ def test_an_existing_folder_that_is_no_run_is_not_touched(session, tmp_path):
 
 
 def test_a_run_cannot_take_the_place_of_the_folder_one_stands_in(session, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("stitch.pipeline.run_rig", lambda *_: pytest.fail("computed first"))
+    monkeypatch.setattr("stitch.api.pipeline.run_rig", lambda *_: pytest.fail("computed first"))
     (tmp_path / "here" / "inner").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here" / "inner")
     for target in (".", "..", tmp_path / "here" / "inner"):
@@ -90,7 +90,7 @@ def test_a_mesh_may_be_of_a_kind_and_takes_no_session_for_one(words, sessions, k
 
 
 def test_a_mesh_for_which_open3d_is_missing_is_refused_before_the_work(session, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("stitch.pipeline.run_rig", lambda *_: pytest.fail("computed first"))
+    monkeypatch.setattr("stitch.api.pipeline.run_rig", lambda *_: pytest.fail("computed first"))
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(SystemExit) as ended:
         main(["run", str(session), "-o", str(tmp_path / "run"), "--mesh", "watertight"])

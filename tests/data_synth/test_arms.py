@@ -8,7 +8,7 @@ import pytest
 from data_synth import kinematics
 from data_synth.arms import ARMS, Arm, with_payload
 from data_synth.fixtures.arm_sources import plain_product, second_source
-from stitch.measurement import robot
+from stitch.session import robot
 
 RNG = np.random.default_rng(5)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.blade_cells import disturbed
-from stitch import frames
+from stitch.numerics import frames
 
 
 def test_disturbed_is_as_far_off_as_it_says():

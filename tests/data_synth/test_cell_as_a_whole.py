@@ -8,11 +8,12 @@ import pytest
 from data_synth import kinematics
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.write import write_session
-from stitch import frames, pipeline
-from stitch.measurement.capture import prepare_capture
+from stitch.api import pipeline
+from stitch.numerics import frames
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, collect_overlaps
-from stitch.reading.session_folder import load_session
+from stitch.session.capture import prepare_capture
+from stitch.session.reading.session_folder import load_session
 from stitch.system.threads import library_threads_off
 
 VIEWS = 8

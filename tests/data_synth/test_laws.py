@@ -13,7 +13,7 @@ from data_synth.laws import points as point_laws
 from data_synth.laws.brackets import GEOMETRY
 from data_synth.moment import Plan
 from data_synth.scanner import Cloud
-from stitch import frames
+from stitch.numerics import frames
 
 
 @cache

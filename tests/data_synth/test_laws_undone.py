@@ -12,8 +12,8 @@ from data_synth.fixtures.part_distance import EXACT, off_part
 from data_synth.fixtures.quiet_scenes import clean, mesh_of, simulated
 from data_synth.kinematics import GRAVITY
 from data_synth.simulate import Measured
-from stitch import frames
-from stitch.measurement import robot
+from stitch.numerics import frames
+from stitch.session import robot
 
 VIEWS = 3
 

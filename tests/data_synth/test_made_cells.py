@@ -9,9 +9,9 @@ from data_synth.cells.base_stand import TwoBases
 from data_synth.made_cell import CELLS
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
-from stitch import frames
-from stitch.cells.base_to_base import read_stand, solve_stand
 from stitch.cli.main import main
+from stitch.numerics import frames
+from stitch.plugins.cells.base_to_base import read_stand, solve_stand
 
 
 def run(*arguments):

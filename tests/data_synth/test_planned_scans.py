@@ -13,7 +13,7 @@ from data_synth.fixtures.ideal_scanner import ranges
 from data_synth.fixtures.quiet_scenes import clean, mesh_for, mesh_of, simulated, with_part
 from data_synth.scanner import rays
 from data_synth.scanning import cast
-from stitch import frames
+from stitch.numerics import frames
 
 
 @pytest.mark.parametrize("name", ["blade", pytest.param("car-door", marks=pytest.mark.slow), "spheres"])

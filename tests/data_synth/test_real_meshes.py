@@ -12,12 +12,12 @@ import trimesh
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
 from data_synth.write import write_session
-from stitch import frames
-from stitch.cells.cad import read_cad
-from stitch.cells.placed_scans import join_scans
-from stitch.cells.scan_to_cad import fit_cad
-from stitch.pipeline import run
-from stitch.reading.session_folder import load_session
+from stitch.api.pipeline import run
+from stitch.numerics import frames
+from stitch.plugins.cells.cad import read_cad
+from stitch.plugins.cells.placed_scans import join_scans
+from stitch.plugins.cells.scan_to_cad import fit_cad
+from stitch.session.reading.session_folder import load_session
 
 # Longest side of the scanned object, mm.
 SIZE = 200.0

@@ -14,7 +14,7 @@ from data_synth.made_session import make, truth_path
 from data_synth.simulate import simulate
 from data_synth.write import write_session, write_truth
 from stitch.errors import InputError, NoResultError
-from stitch.reading.session_folder import load_session
+from stitch.session.reading.session_folder import load_session
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -7,11 +7,11 @@ import pytest
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
-from stitch import frames
+from stitch.api.pipeline import change, diagnose, run
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.pipeline import change, diagnose, run
-from stitch.writing.diagnosis_document import diagnosis_document
-from stitch.writing.json_file import to_json
+from stitch.numerics import frames
+from stitch.output.diagnosis_document import diagnosis_document
+from stitch.output.json_file import to_json
 
 
 def blade_run(seed, hidden, mount="eye_to_hand", views=12, plan_seed=None, pixels=90):

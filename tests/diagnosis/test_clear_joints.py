@@ -11,7 +11,6 @@ from numpy.polynomial import Polynomial
 
 from data_synth import kinematics
 from data_synth.ordinary_arm import draw_arm, with_memory
-from stitch import frames
 from stitch.diagnosis.residual_structure import variance_budget
 from stitch.diagnosis.sentences import curve_sentences, joint_curve_sentence
 from stitch.diagnosis.thresholds import ODDS
@@ -23,6 +22,7 @@ from stitch.diagnosis.unnamed_joint_laws import (
     log_posterior_of_any,
     significant_laws,
 )
+from stitch.numerics import frames
 from stitch.observations.pose_errors import JOINT_LOAD, TIME_ONLY, TRAVEL, TWO_ANGLES, WAVES, WITH_TIME, usual_time_step
 from tests.diagnosis.freed_blade import freed_blade
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from data_synth.fixtures.in_memory import session_of
 from stitch.diagnosis.residual_structure import covariate_values
-from stitch.measurement.measurement import measurement_of
+from stitch.session.measurement import measurement_of
 
 
 def test_what_a_covariate_is_called_does_not_make_it_a_joint(blade_capture):

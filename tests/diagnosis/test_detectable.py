@@ -7,8 +7,8 @@ from scipy.stats import norm
 
 from stitch.diagnosis.sensitivity import least_noncentrality
 from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR
-from stitch.statistics.reml import MixedModel, VarianceFit, fit_variances
-from stitch.statistics.variance_posterior import satterthwaite
+from stitch.numerics.reml import MixedModel, VarianceFit, fit_variances
+from stitch.numerics.variance_posterior import satterthwaite
 
 
 def test_known_scatter_and_one_parameter_need_what_two_quantiles_say():

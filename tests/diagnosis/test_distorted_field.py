@@ -7,10 +7,10 @@ import pytest
 
 from data_synth.fixtures.blade_cells import captured, measured_blade
 from data_synth.fixtures.in_memory import session_of
+from stitch.api.pipeline import run
 from stitch.diagnosis.diagnose import diagnose_state
 from stitch.effects.empirical import FIELD, empirical_effects
-from stitch.measurement.measurement import measurement_of
-from stitch.pipeline import run
+from stitch.session.measurement import measurement_of
 
 
 def said_of(measured, seen=lambda points: points):

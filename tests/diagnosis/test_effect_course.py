@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from data_synth import kinematics
-from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.effect_course import EffectCourse, course_of_candidate
 from stitch.diagnosis.score import score
 from stitch.effects.contract import EFFECTS
+from stitch.numerics import frames
 from stitch.observations.linear_model import LinearModel
 from tests.diagnosis.freed_blade import FreedBlade, freed_blade
 

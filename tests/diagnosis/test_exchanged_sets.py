@@ -8,10 +8,10 @@ from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.exchanged_sets import exchanged_set, is_better_set
 from stitch.diagnosis.ranking import rank_one
 from stitch.effects.contract import EFFECTS
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.observations.targets.target_model import target_model
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
 
 TRUE = ("joint_offset", "joint_compliance")
 

@@ -3,14 +3,14 @@
 import numpy as np
 
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
+from stitch.api.pipeline import run
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.ranking import is_certain, rank_one
 from stitch.diagnosis.stepwise_selection import find_exchange
 from stitch.diagnosis.validation import Extrapolation, extrapolate, untested_ends_reason
 from stitch.effects.contract import EFFECTS
-from stitch.pipeline import run
-from stitch.statistics.folds import JointEnd
+from stitch.numerics.folds import JointEnd
 
 
 def stands(session, name):

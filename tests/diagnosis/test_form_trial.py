@@ -6,12 +6,12 @@ from scipy.linalg import null_space
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.score import score, try_form
 from stitch.effects.contract import EFFECTS
-from stitch.statistics.parameter_selection import ANY_SIZE
-from stitch.statistics.reml import log_prior
+from stitch.numerics import frames
+from stitch.numerics.parameter_selection import ANY_SIZE
+from stitch.numerics.reml import log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
 VIEWS = 16

@@ -7,7 +7,7 @@ import pytest
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import simulated
 from data_synth.scene import load_scene
-from stitch.pipeline import run
+from stitch.api.pipeline import run
 
 
 @pytest.mark.slow

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_cell
+from stitch.api.pipeline import change, diagnose, run, suggest
 from stitch.diagnosis.stepwise_selection import find_effect_to_drop
-from stitch.pipeline import change, diagnose, run, suggest
 
 
 def test_a_hidden_joint_offset_is_named_and_found():

@@ -10,7 +10,6 @@ from scipy.stats import multivariate_normal
 from data_synth import kinematics
 from data_synth.laws.unnamed import UNNAMED
 from data_synth.ordinary_arm import with_memory
-from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import ScatterLimit
@@ -18,8 +17,9 @@ from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.diagnosis.unnamed_joint_laws import joint_curves, joint_laws, laws_of_kinds, significant_laws
 from stitch.diagnosis.unnamed_time_laws import find_repeating_errors
 from stitch.effects.contract import EFFECTS
+from stitch.numerics import frames
+from stitch.numerics.reml import MAY_BE_ABSENT, NOISE, log_prior
 from stitch.observations.pose_errors import ALL_ANGLES, JOINT_LOAD, OWN_ANGLE, WITH_TIME
-from stitch.statistics.reml import MAY_BE_ABSENT, NOISE, log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
 # Effects that move views as wholes; those of points take longer to ask for.

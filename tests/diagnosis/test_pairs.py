@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from data_synth import kinematics
-from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import find_missing_pair, pair_is_validated
 from stitch.diagnosis.ranking import is_certain, rank_all
 from stitch.effects.contract import EFFECTS
+from stitch.numerics import frames
 from tests.diagnosis.freed_blade import freed_blade
 
 ASKED = ("joint_offset", "link_geometry", "gear_eccentricity", "backlash", "settling", "mount_drift", "fixture_drift")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.score import scatter_limit
-from stitch.measurement.session import StatedRepeatability
-from stitch.pipeline import diagnose, run
+from stitch.session.session import StatedRepeatability
 
 
 def test_repeatability_of_iso_9283_from_drawn_poses():

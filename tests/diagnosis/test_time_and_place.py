@@ -10,10 +10,10 @@ from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit
 from stitch.effects.contract import EFFECTS
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.observations.targets.target_model import target_model
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
 
 VIEWS, TURNS = 48, 30
 JUMP = np.array([3e-4, -2e-4, 4e-4, 0.15, 0.1, -0.2])  # rad, mm

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from stitch import frames
 from stitch.diagnosis.sentences import time_curve_sentence
 from stitch.diagnosis.unnamed_time_laws import TimeCurve, significant_time_law, time_curve
+from stitch.numerics import frames
 from tests.diagnosis.freed_blade import freed_blade
 
 VIEWS = 18

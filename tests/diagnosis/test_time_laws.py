@@ -9,7 +9,6 @@ from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
 from data_synth.ordinary_arm import with_memory
-from stitch import frames
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import ScatterLimit
@@ -21,8 +20,9 @@ from stitch.diagnosis.unnamed_time_laws import (
     time_processes,
 )
 from stitch.effects.contract import EFFECTS
+from stitch.numerics import frames
+from stitch.numerics.reml import log_prior
 from stitch.observations.pose_errors import DRIFT_MEMORY
-from stitch.statistics.reml import log_prior
 from tests.diagnosis.freed_blade import freed_blade
 
 VIEWS = 18

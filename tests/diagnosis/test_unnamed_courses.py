@@ -8,8 +8,8 @@ from data_synth.fixtures.labelled_arm import TARGETS, flange, joints_of, labelle
 from data_synth.laws.unnamed import UNNAMED
 from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
+from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.unnamed_time_laws import least_log_bayes_factor, unnamed_courses
-from stitch.pipeline import diagnose, run
 
 VIEWS, SEED = 120, 31
 

@@ -5,13 +5,13 @@ import pytest
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
-from stitch import frames
 from stitch.effects import EFFECTS
 from stitch.effects.contract import parameters_in
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
 from stitch.model.forward import corrected_capture, perturbed_frames
 from stitch.model.model import Model, term_of
+from stitch.numerics import frames
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
 
 # Amplitude 1 is a tenth of a millimetre; a hundredth of that must remain: second-order terms are smaller still.
 _LEFT = 0.03

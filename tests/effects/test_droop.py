@@ -9,7 +9,7 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import flange, joints_of, labelled_cell
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from data_synth.laws.brackets import GEOMETRY, end_twist
-from stitch import frames
+from stitch.api.pipeline import run
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.ranking import is_certain, rank_all
@@ -17,11 +17,11 @@ from stitch.diagnosis.thresholds import ODDS
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need
 from stitch.effects.user_file import load
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.model.forward import perturbed_frames
 from stitch.model.model import term_of
-from stitch.pipeline import run
+from stitch.numerics import frames
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of, with_part_origin
 
 
 def chain_for(measured):

@@ -8,8 +8,8 @@ from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
 from stitch.effects.contract import find_effect, parameters_in, require_available
 from stitch.errors import InputError
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
 
 
 def chain_for(measured):

@@ -5,8 +5,8 @@ import pytest
 
 from data_synth.fixtures.in_memory import session_of
 from stitch.effects import EFFECTS
-from stitch.measurement.measurement import measurement_of
 from stitch.model.model import term_of
+from stitch.session.measurement import measurement_of
 
 
 @pytest.mark.parametrize(

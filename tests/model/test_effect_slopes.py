@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.in_memory import session_of
-from stitch import frames
 from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need, parameters_in
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of, with_part_origin
 from stitch.model.forward import PointSlopes, perturbed_frames, pose_derivatives
 from stitch.model.model import Model, Term, term_of
+from stitch.numerics import frames
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of, with_part_origin
 
 
 def chain_for(measured):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stitch import frames
 from stitch.model.model import expanded_uncertainty, printed_covariance
+from stitch.numerics import frames
 
 
 @pytest.mark.parametrize("angle", [1e-5, 0.8, 3.1])

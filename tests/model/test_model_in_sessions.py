@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.in_memory import session_of
+from stitch.api.pipeline import run_rig
 from stitch.effects import EFFECTS
 from stitch.effects.contract import parameters_in
 from stitch.errors import InputError
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
-from stitch.measurement.robot import unit_torques
+from stitch.fit.rig import require_effects
 from stitch.model.model import term_of
 from stitch.model.model_toml import ModelFile, bind_to_session
-from stitch.pipeline import run_rig
-from stitch.stages.rig import require_effects
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
+from stitch.session.robot import unit_torques
 
 
 def without(session, *columns):

@@ -10,7 +10,7 @@ from scipy.optimize import check_grad
 
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import Measured, clean, simulated
-from stitch import pipeline
+from stitch.api import pipeline
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.effects.contract import EFFECTS

@@ -9,7 +9,7 @@ import pytest
 
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import clean, simulated
-from stitch import pipeline
+from stitch.api import pipeline
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap, field_error, robust_pass_share
 

@@ -12,15 +12,15 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import with_part
 from data_synth.ordinary_arm import draw_arm, with_memory
 from data_synth.simulate import simulate
-from stitch import frames
 from stitch.diagnosis.residual_structure import variance_budget
 from stitch.effects import EFFECTS
-from stitch.measurement.measurement import measurement_of
 from stitch.model.model import Model
+from stitch.numerics import frames
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.surfaces.view_poses import unconstrained_poses
+from stitch.session.measurement import measurement_of
 
 VIEWS, SIZE = 12, 0.5
 

@@ -9,8 +9,9 @@ from scipy.stats import chi2
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import Measured, simulated
 from data_synth.scene import load_scene
-from stitch import frames, pipeline
+from stitch.api import pipeline
 from stitch.diagnosis.diagnose import linear_model_of
+from stitch.numerics import frames
 from stitch.observations.surfaces.scanner_errors import field_error, field_scatter
 
 SEEDS = 2

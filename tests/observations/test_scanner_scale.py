@@ -7,11 +7,11 @@ import pytest
 
 from data_synth.fixtures.blade_cells import captured, measured_blade
 from data_synth.fixtures.in_memory import session_of
-from stitch import frames
-from stitch.measurement.measurement import measurement_of
+from stitch.numerics import frames
 from stitch.observations.surfaces.hand_eye_fit import SCANNER_SCALE, fit_hand_eye
 from stitch.observations.surfaces.scanner_errors import SCALE_SIGMA, scale_scatter
 from stitch.observations.surfaces.view_poses import unconstrained_poses
+from stitch.session.measurement import measurement_of
 
 VIEWS, STRETCH = 6, 3e-4
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from data_synth.fixtures.blade_cells import captured_blade
-from stitch import frames
+from stitch.numerics import frames
 from stitch.observations.surfaces.hand_eye_fit import capture_repeatability, hand_eye_jacobian
 from stitch.observations.surfaces.matching import match_pairs, overlapping_pairs, sample_points, signed_distances
 from stitch.observations.surfaces.normal_equations import assemble, carry_overlaps, collect_overlaps, gram, pair_squares

@@ -8,15 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.drilled_plate import VIEWS, measured_plate
 from data_synth.fixtures.in_memory import labelled_session_of
-from stitch import frames
 from stitch.effects.contract import EFFECTS
-from stitch.measurement.capture import Sightings, prepare_capture
-from stitch.measurement.measurement import measurement_of
 from stitch.model.forward import target_correction
 from stitch.model.model import Model, term_of
+from stitch.numerics import frames
 from stitch.observations.surfaces.effect_columns import view_responses
 from stitch.observations.surfaces.normal_equations import Gram, append_targets, assemble, target_pairs
 from stitch.observations.surfaces.view_poses import solve_views, unconstrained_poses
+from stitch.session.capture import Sightings, prepare_capture
+from stitch.session.measurement import measurement_of
 
 
 def scattered(seed, views=7, targets=4):

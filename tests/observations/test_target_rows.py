@@ -8,12 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.effects.contract import EFFECTS, missing_need
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
 from stitch.model.forward import PointSlopes, corrected_capture, target_correction
 from stitch.model.model import Model, term_of
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
 from stitch.observations.targets.rows import initial_landmarks, target_rows
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
 
 
 def off(T, true):

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import stitch
+from stitch.output.run_folder import write_with_page
 from stitch.system import threads
-from stitch.writing.run_folder import write_with_page
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -34,8 +34,8 @@ from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.evidence import select
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
 from stitch.effects import EFFECTS
-from stitch.measurement.capture import prepare_capture
-from stitch.measurement.measurement import measurement_of
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
 from stitch.model.model import Model
 from stitch.observations.plate import plate_model
 

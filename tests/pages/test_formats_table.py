@@ -3,8 +3,8 @@
 import re
 from pathlib import Path
 
-from stitch.intake.raw_poses import PROGRAMS, STRUCTURED, TABLES
-from stitch.reading.clouds import CLOUD_SUFFIXES
+from stitch.plugins.intake.raw_poses import PROGRAMS, STRUCTURED, TABLES
+from stitch.session.reading.clouds import CLOUD_SUFFIXES
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
 BAGS = (".bag", ".db3", ".mcap")

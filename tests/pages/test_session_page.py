@@ -7,10 +7,10 @@ import numpy as np
 
 from bench.docs.page_blocks import ROOT, blocks
 from data_synth.fixtures.labelled_arm import DH_ROWS, labelled_cell
-from stitch.pipeline import diagnose, run
-from stitch.reading.session_folder import load_session
-from stitch.writing.diagnosis_document import diagnosis_document
-from stitch.writing.result_document import ledger, result_document
+from stitch.api.pipeline import diagnose, run
+from stitch.output.diagnosis_document import diagnosis_document
+from stitch.output.result_document import ledger, result_document
+from stitch.session.reading.session_folder import load_session
 
 PAGE = ROOT / "docs" / "session.md"
 

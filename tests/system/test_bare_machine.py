@@ -35,10 +35,10 @@ def test_scan_motions_mesh_and_cad_in_a_stripped_environment():
     said = run_python("""
         import numpy as np
         from data_synth.fixtures.blade_cells import captured_blade
-        from stitch.cells import cad, scan_to_cad
-        from stitch.stages.fuse import fuse
-        from stitch.stages.coarse import motion_candidates
-        from stitch.writing.mesh import mesh_of
+        from stitch.plugins.cells import cad, scan_to_cad
+        from stitch.fusion.fuse import fuse
+        from stitch.fit.coarse import motion_candidates
+        from stitch.output.mesh import mesh_of
         measured, capture = captured_blade(0, views=4, pixels=60)
         assert motion_candidates([capture])
         fused = fuse(capture, measured.T_reference_scanner)

@@ -11,7 +11,7 @@ import pytest
 from stitch.api.run import Stitched
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.runs.run import FusedCloud
+from stitch.run_data import FusedCloud
 from stitch.system import open3d_library
 from tests.needs import needs_open3d
 

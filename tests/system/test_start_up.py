@@ -30,8 +30,8 @@ def test_dear_libraries_are_loaded_when_they_are_needed(module, also_without):
 def test_a_run_loads_nothing_of_the_diagnosis():
     """Nor of plans, pictures and meshes: all that it needs from the first file to the page."""
     on_use = "from stitch.system.process import load_on_use; load_on_use('numpy.f2py', 'numpy.testing')\n"
-    modules = loaded(f"{on_use}import stitch.cli.run, stitch.pipeline, stitch.writing.run_folder, viz.run_page")
-    assert {"stitch.stages.register", "scipy.optimize", "numpy.f2py"} <= modules
+    modules = loaded(f"{on_use}import stitch.cli.run, stitch.api.pipeline, stitch.output.run_folder, viz.run_page")
+    assert {"stitch.fusion.register", "scipy.optimize", "numpy.f2py"} <= modules
     without = {"scipy.cluster", "scipy.interpolate", "scipy.ndimage", "yaml", "numpy.f2py.rules", "unittest"}
     assert not modules & (DEAR | without | {"stitch.diagnosis", "stitch.planning", "stitch.explanation"})
     asked = "import scipy.optimize, numpy; numpy.testing.assert_allclose(1, 1); numpy.f2py.run_main"
@@ -39,7 +39,7 @@ def test_a_run_loads_nothing_of_the_diagnosis():
 
 
 def test_scans_are_read_and_prepared_while_scipy_is_loaded():
-    assert "scipy" not in loaded("import stitch.reading.session_folder, stitch.measurement.capture")
+    assert "scipy" not in loaded("import stitch.session.reading.session_folder, stitch.session.capture")
 
 
 @pytest.mark.parametrize("line", ["--version", "--help"])
@@ -76,7 +76,7 @@ def test_an_arm_without_meshes_needs_no_library_of_meshes():
 
 
 def test_a_batch_on_one_process_needs_no_cluster():
-    assert not loaded("import stitch.cli.batch") & {"distributed", "dask", "tornado", "asyncio"}
+    assert not loaded("import stitch.plugins.watch.batch.command") & {"distributed", "dask", "tornado", "asyncio"}
 
 
 def test_page_recording_and_diagnosis_are_drawn_without_a_plotting_library():

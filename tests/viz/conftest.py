@@ -5,8 +5,8 @@ import rerun as rr
 
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.write import write_session
-from stitch.pipeline import run
-from stitch.reading.session_folder import load_session
+from stitch.api.pipeline import run
+from stitch.session.reading.session_folder import load_session
 from viz.recording import RerunRecorder
 
 

@@ -7,7 +7,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.pipeline import run
+from stitch.api.pipeline import run
 from viz.iteration_timeline import Moment, log_moments
 from viz.recording import RerunRecorder
 from viz.rrd_file import RecordingFile

@@ -14,12 +14,12 @@ from rerun.chunk import RrdReader
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.write import write_session
-from stitch.comparison.disagreement_field import model_history
+from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.unnamed_joint_laws import JointCurve
-from stitch.pipeline import diagnose, run
-from stitch.runs.run import Note
-from stitch.units import length_text
-from stitch.writing.result_document import result_document
+from stitch.numerics.units import length_text
+from stitch.output.comparison.disagreement_field import model_history
+from stitch.output.result_document import result_document
+from stitch.run_data import Note
 from tests.viz.test_steps_told import told_at
 from viz.colours import UNSEEN, signed_colours
 from viz.course_recording import apart, log_course

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from markupsafe import escape
 
-from stitch.comparison.disagreement_field import model_history
-from stitch.comparison.run_verdict import check_tolerance, plain_verdict, run_headline
-from stitch.writing.result_document import result_document
+from stitch.output.comparison.disagreement_field import model_history
+from stitch.output.comparison.run_verdict import check_tolerance, plain_verdict, run_headline
+from stitch.output.result_document import result_document
 from tests.in_browser import require_for_everybody
 from viz.page_parts import render, unbroken
 from viz.run_page import write_report

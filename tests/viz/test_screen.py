@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stitch.comparison.disagreement_field import model_history
+from stitch.output.comparison.disagreement_field import model_history
 from viz.run_page import write_report
 
 # A model with one more effect: a screen of diagnosis.json whose prediction halves the field.

@@ -6,8 +6,8 @@ import re
 import pytest
 from rerun.chunk import RrdReader
 
-from stitch.units import length_text
-from stitch.writing.result_document import result_document
+from stitch.numerics.units import length_text
+from stitch.output.result_document import result_document
 from viz.model_timeline import FRAMES
 from viz.page_parts import unbroken
 

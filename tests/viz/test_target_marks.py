@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import PROBE_TURN, TABLE, TARGETS, flange, labelled_cell
-from stitch.pipeline import run
+from stitch.api.pipeline import run
 from viz.target_scene import ANY, NOTHING, bodies, mark_values, marks_of
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch import frames
+from stitch.numerics import frames
 from viz.blueprint import eye_for
 
 HALF_FIELD = np.tan(np.radians(55.0) / 2)  # of the viewer's field, upwards

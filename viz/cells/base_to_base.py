@@ -8,12 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from stitch import frames
-from stitch.cells.base_to_base import CONTRADICTION_SIGMAS, BaseResult, comparison_text
-from stitch.cells.stand import DistanceComparison, Stand, compare_distances, rod_points
-from stitch.comparison.run_verdict import ToleranceVerdict
-from stitch.frames import Array
-from stitch.units import MICROMETRES
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import MICROMETRES
+from stitch.output.comparison.run_verdict import ToleranceVerdict
+from stitch.plugins.cells.base_to_base import CONTRADICTION_SIGMAS, BaseResult, comparison_text
+from stitch.plugins.cells.stand import DistanceComparison, Stand, compare_distances, rod_points
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, GREEN, ORANGE

@@ -6,8 +6,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch.cells.drilling import DrillJob, DrillResult, Drive, Hole, correction_sentence, significant_effect_sentences
-from stitch.frames import Array, transform
+from stitch.numerics.frames import Array, transform
+from stitch.plugins.cells.drilling import (
+    DrillJob,
+    DrillResult,
+    Drive,
+    Hole,
+    correction_sentence,
+    significant_effect_sentences,
+)
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, GREEN, ORANGE

@@ -9,8 +9,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from stitch.comparison.run_verdict import ToleranceVerdict
-from stitch.reading.session_folder import UNKNOWN, content_hash
+from stitch.output.comparison.run_verdict import ToleranceVerdict
+from stitch.session.reading.session_folder import UNKNOWN, content_hash
 from viz.figures import png, svg
 from viz.page_parts import Head, Row, Subject, page_written, versions, write_page
 

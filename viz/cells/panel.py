@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch import frames
-from stitch.cells.panel import PanelJob, PanelResult, leg_sentence, shape_sentence
-from stitch.cells.panel_model import MotionErrors
-from stitch.comparison.run_verdict import ToleranceVerdict
-from stitch.frames import Array, Indices
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+from stitch.output.comparison.run_verdict import ToleranceVerdict
+from stitch.plugins.cells.panel import PanelJob, PanelResult, leg_sentence, shape_sentence
+from stitch.plugins.cells.panel_model import MotionErrors
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, DARK, GREEN, ORANGE, SIGNED, YELLOW, signed_colours

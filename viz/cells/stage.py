@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.frames import Array
+from stitch.numerics.frames import Array
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
 import rerun as rr

@@ -6,11 +6,11 @@ import numpy as np
 import rerun as rr
 from matplotlib.figure import Figure
 
-from stitch import frames
-from stitch.cells.scan_to_cad import Deviations, allowance_sentence
-from stitch.cells.window import FitJob, FittedPart, agreement_sentence, with_unit
-from stitch.comparison.run_verdict import ToleranceVerdict
-from stitch.frames import Array
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.output.comparison.run_verdict import ToleranceVerdict
+from stitch.plugins.cells.scan_to_cad import Deviations, allowance_sentence
+from stitch.plugins.cells.window import FitJob, FittedPart, agreement_sentence, with_unit
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, ORANGE, SIGNED, signed_colours

@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stitch import frames
-from stitch.cells.seam import VERDICTS, Limits, Seam, Station
-from stitch.cells.window import SeamJob, limits_text, stations_sentence
-from stitch.comparison.run_verdict import ToleranceVerdict
-from stitch.frames import Array
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.output.comparison.run_verdict import ToleranceVerdict
+from stitch.plugins.cells.seam import VERDICTS, Limits, Seam, Station
+from stitch.plugins.cells.window import SeamJob, limits_text, stations_sentence
 from viz.cells import stage
 from viz.cells.page import Page, Picture, Table, write
 from viz.colours import BLUE, DARK, GREEN, ORANGE, YELLOW

@@ -9,7 +9,7 @@ import numpy as np
 from pykdtree.kdtree import KDTree
 
 from stitch.errors import InputError
-from stitch.frames import Array, Indices, Mask
+from stitch.numerics.frames import Array, Indices, Mask
 from viz.part_data import packed_values
 from viz.review.residual_rows import ResidualRows
 from viz.target_scene import ANY, NOTHING, mark_values

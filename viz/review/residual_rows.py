@@ -10,9 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from stitch.errors import InputError
-from stitch.frames import Array, Indices
+from stitch.numerics.distributions import MAD_TO_SIGMA
+from stitch.numerics.frames import Array, Indices
 from stitch.observations.surfaces.normal_equations import RMS_GATE
-from stitch.statistics.distributions import MAD_TO_SIGMA
 
 # Correspondences that are kept; of more, every n-th.
 _AT_MOST = 150_000

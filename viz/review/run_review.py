@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from stitch.errors import InputError
-from stitch.frames import Indices
 from stitch.model.model_toml import read_model
+from stitch.numerics.frames import Indices
+from stitch.numerics.units import MICROMETRES
+from stitch.output.run_folder import restore_fit
 from stitch.system.files import whole_file
-from stitch.units import MICROMETRES
-from stitch.writing.run_folder import restore_fit
 from viz.review.chosen_field import Choice, PatchWeights, chosen_field, chosen_points, numbered_marks, patch_weights
 from viz.review.residual_rows import ResidualRows, read_rows, read_sightings
 from viz.review.run_snapshot import Snapshot, read_snapshot, version_of

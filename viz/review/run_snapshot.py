@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from stitch.comparison.disagreement_field import effect_changes
-from stitch.comparison.run_verdict import shorten_doubts
 from stitch.errors import InputError
-from stitch.reading.text_files import shortened
-from stitch.runs.run import LedgerStep
-from stitch.stored.stored_run import read_documents
-from stitch.units import MICROMETRES, format_amount
-from stitch.writing.diagnosis_document import effect_description, effect_in_words
+from stitch.numerics.units import MICROMETRES, format_amount
+from stitch.output.comparison.disagreement_field import effect_changes
+from stitch.output.comparison.run_verdict import shorten_doubts
+from stitch.output.diagnosis_document import effect_description, effect_in_words
+from stitch.output.stored_run import read_documents
+from stitch.run_data import LedgerStep
+from stitch.session.reading.text_files import shortened
 
 # Undo and redo, read from the ledger alone: it only grows, and a return to an earlier model is one of its steps.
 

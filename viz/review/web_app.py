@@ -25,7 +25,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from stitch.errors import InputError, StitchError
-from stitch.stored.stored_run import read_documents
+from stitch.output.stored_run import read_documents
 from viz.page_parts import render
 from viz.review.chosen_field import Choice
 from viz.review.jobs import Busy, Job, Jobs, News

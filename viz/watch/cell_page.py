@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from stitch.system.files import whole_file
-from stitch.units import covariate_text, covariate_unit, rounded
-from stitch.watch.report import (
+from stitch.numerics.units import covariate_text, covariate_unit, rounded
+from stitch.plugins.watch.report import (
     CellReport,
     CellTrend,
     FollowedChannel,
@@ -22,6 +21,7 @@ from stitch.watch.report import (
     table_unit,
     uncertainty_note,
 )
+from stitch.system.files import whole_file
 from viz import captions
 from viz.page_parts import render
 from viz.watch.small_multiples import channel_drawing, drawings

@@ -10,7 +10,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch.watch.report import CellTrend, day_text, table_unit
+from stitch.plugins.watch.report import CellTrend, day_text, table_unit
 
 # Round numbers for axes: of values, and of times.
 

@@ -5,16 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch import frames
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.measurement import Measurement
 from stitch.model.forward import PointSlopes, moves_points, pose_derivatives
 from stitch.model.model import Model, Term
+from stitch.numerics import frames
+from stitch.numerics.distributions import tukey
+from stitch.numerics.frames import Array, Indices, Mask
 from stitch.observations.linear_model import Response
 from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import sum_by_pair
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, solve_views
-from stitch.statistics.distributions import tukey
+from stitch.session.measurement import Measurement
 
 # Correspondences whose slopes are held at a time: some megabytes, whatever the session's size. One block after the
 # other: threads that take turns at so many small calls need longer than one.

@@ -13,25 +13,25 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag, null_space
 
-from stitch import frames
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.capture import Capture
-from stitch.observations.linear_model import WHITE_COMPONENTS
-from stitch.observations.observability import seen_part, visible_twists
-from stitch.observations.pose_errors import PoseErrors, white_scatter_only
-from stitch.observations.surfaces.normal_equations import Gram, pair_squares
-from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.statistics.folds import grouped_folds
-from stitch.statistics.least_squares import (
+from stitch.numerics import frames
+from stitch.numerics.folds import grouped_folds
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.least_squares import (
     GeneralisedFit,
     column_space,
     generalised_fit,
     project_out,
     summed_squares,
 )
-from stitch.statistics.parameter_selection import WhitenedData
-from stitch.statistics.reml import MixedModel, fit_variances
-from stitch.statistics.variance_posterior import mean_variances
+from stitch.numerics.parameter_selection import WhitenedData
+from stitch.numerics.reml import MixedModel, fit_variances
+from stitch.numerics.variance_posterior import mean_variances
+from stitch.observations.linear_model import WHITE_COMPONENTS
+from stitch.observations.observability import seen_part, visible_twists
+from stitch.observations.pose_errors import PoseErrors, white_scatter_only
+from stitch.observations.surfaces.normal_equations import Gram, pair_squares
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
+from stitch.session.capture import Capture
 
 # How far the robot's poses scatter: restricted maximum likelihood on per-view pose estimates.
 #

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stitch import frames
-from stitch.frames import Array, Indices
-from stitch.measurement.scan import Scan, box_corners, even_indices
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+from stitch.session.scan import Scan, box_corners, even_indices
 from stitch.system.threads import parallel
 
 # Sampled points of all views, placed in the reference frame once, and their search for nearest points of a view.

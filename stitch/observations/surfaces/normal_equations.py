@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from stitch import frames
 from stitch.errors import NoResultError
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.capture import Capture, Sightings
-from stitch.measurement.scan import Scan, centroid
+from stitch.numerics import frames
+from stitch.numerics.distributions import mad_sigma, tukey
+from stitch.numerics.frames import Array, Indices, Mask
 from stitch.observations.surfaces.matching import Match, Searched, match_pairs, overlapping_pairs, sample_points
-from stitch.statistics.distributions import mad_sigma, tukey
+from stitch.session.capture import Capture, Sightings
+from stitch.session.scan import Scan, centroid
 
 # Residuals beyond 4 robust sigmas are not surface distances; for normal errors that cuts 0.006 %.
 RMS_GATE = 4.0

@@ -8,16 +8,16 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.optimize import minimize
 
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.measurement import Measurement
 from stitch.model.forward import PointSlopes
 from stitch.model.model import Model, Term
+from stitch.numerics.distributions import chi2_tail, tukey
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.least_squares import project_out
 from stitch.observations.surfaces.effect_columns import PointGram, apparent_twists, stream_point_sums
 from stitch.observations.surfaces.hand_eye_fit import SCANNER_FIELD, SCANNER_SCALE
 from stitch.observations.surfaces.normal_equations import Gram, Overlaps
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, solve_view_sums, visible_step
-from stitch.statistics.distributions import chi2_tail, tukey
-from stitch.statistics.least_squares import project_out
+from stitch.session.measurement import Measurement
 
 # Along the ray; finer ones only where views may have errors for themselves, which are not to explain what all share.
 _DEGREE, _FINE_DEGREE = 3, 6

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.capture import Capture
-from stitch.measurement.measurement import Measurement
 from stitch.model.model import Model, Term, sizes_of, values_of
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.least_squares import column_space, fit_columns, independent
+from stitch.numerics.reml import MixedModel, VarianceFit, at_variances, fit_variances
 from stitch.observations.linear_model import (
     CoefficientPrior,
     LinearModel,
@@ -28,8 +28,8 @@ from stitch.observations.surfaces.hand_eye_fit import (
 from stitch.observations.surfaces.normal_equations import pair_squares
 from stitch.observations.surfaces.scanner_errors import field_scatter
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.statistics.least_squares import column_space, fit_columns, independent
-from stitch.statistics.reml import MixedModel, VarianceFit, at_variances, fit_variances
+from stitch.session.capture import Capture
+from stitch.session.measurement import Measurement
 
 # A model of the views' twists tried on sums over pairs: no new matches.
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch import frames
-from stitch.frames import Array, Mask
-from stitch.measurement.capture import Capture
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Mask
+from stitch.numerics.least_squares import anderson_step
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import Gram, Overlaps, carry_overlaps, collect_overlaps, next_gate
-from stitch.statistics.least_squares import anderson_step
+from stitch.session.capture import Capture
 
 # Views moved by one step of an iteration after another.
 

@@ -7,11 +7,11 @@ rotation, t and P solved again. A measured probe adds the turns: A·X = Z·B (Sh
 
 import numpy as np
 
-from stitch import frames
-from stitch.closed_form.hand_eye import shah
 from stitch.errors import NoResultError
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.capture import Capture
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.hand_eye import shah
+from stitch.session.capture import Capture
 
 _REWEIGHTED = 12
 # Singular values of the equilibrated system below this share of the largest: the motions do not show it all.

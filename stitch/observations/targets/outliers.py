@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.capture import Sightings
+from stitch.numerics.distributions import MAD_TO_SIGMA, nan_median
+from stitch.numerics.frames import Array, Indices, Mask
 from stitch.observations.targets.rows import (
     COMPARED_TARGETS,
     TargetRows,
@@ -20,7 +20,7 @@ from stitch.observations.targets.rows import (
     target_distances,
     target_positions,
 )
-from stitch.statistics.distributions import MAD_TO_SIGMA, nan_median
+from stitch.session.capture import Sightings
 
 # Six times the usual deviation: one in a thousand million of honest Gaussian errors. Pose errors of an arm whose
 # model lacks something have longer tails: six times the median happens.

@@ -11,14 +11,14 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch import frames
-from stitch.closed_form.feature_matching import align_points
-from stitch.frames import Array, Indices, Mask
-from stitch.measurement.capture import Capture, Sightings
-from stitch.measurement.session import NominalTargets
+from stitch.numerics import frames
+from stitch.numerics.feature_matching import align_points
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.least_squares import BlockLeastSquares
+from stitch.numerics.reml import fit_variances
 from stitch.observations.rows import Rows
-from stitch.statistics.least_squares import BlockLeastSquares
-from stitch.statistics.reml import fit_variances
+from stitch.session.capture import Capture, Sightings
+from stitch.session.session import NominalTargets
 
 # Distances between the targets of one view: what they are wherever the arm stood, whatever the hand-eye is.
 

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stitch.frames import Array
-from stitch.measurement.measurement import Measurement
 from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
+from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.rows import RowObservation, row_model
 from stitch.observations.targets.rows import Drawing, Landmarks, TargetRows, initial_landmarks, target_rows
+from stitch.session.measurement import Measurement
 
 # What the labelled points of one session say under a fitted model.
 

@@ -12,9 +12,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from stitch.comparison.residual_tables import compare_surfaces, comparison_document
-from stitch.stored.stored_run import load_run
-from stitch.writing.json_file import write_json
+from stitch.output.comparison.residual_tables import compare_surfaces, comparison_document
+from stitch.output.json_file import write_json
+from stitch.output.stored_run import load_run
 
 
 class Server:

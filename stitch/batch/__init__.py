@@ -1,1 +1,0 @@
-"""Many sessions on one machine or many: each is run once, whatever dies on the way; see docs/batch.md."""

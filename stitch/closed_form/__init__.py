@@ -1,1 +1,0 @@
-"""Hand-eyes in closed form: A·X = X·B and A·X = Z·B."""

@@ -1,0 +1,200 @@
+"""Views that nobody has taken yet: joint angles within reach, as rows of a session and as a measurement."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from stitch.model.model import Model, Term
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+from stitch.observations.targets.rows import Landmarks, TargetRows, target_rows
+from stitch.plugins.metrology.planning.expected_model import FEWEST, CellModel, expected_scans
+from stitch.session.capture import Sightings, build_capture
+from stitch.session.measurement import PAYLOAD, Measurement, Torques, Views, torques_of
+from stitch.session.robot import Robot, forward
+from stitch.session.session import Session, View
+
+_SAMPLES = 6000
+_SPREAD = np.radians(40.0)  # about joint angles that were driven before
+_CLOSER = np.radians(20.0)  # about views that were chosen among those
+_LIMIT = np.radians(170.0)  # of joints whose limits nobody stated, unless they were beyond already
+# A view may see the part by this share of its distance farther off than any before, and turned by so much.
+_MARGIN, _TURNED = 0.15, np.cos(np.radians(50.0))
+
+
+def nearby(seen: Array, chosen: Array | None = None) -> Array:
+    """(K, n) joint angles near those that were driven (V, n), or closer to chosen ones (C, n), within the limits that
+    were kept."""
+    rng = np.random.default_rng(0)
+    about, spread = (seen, _SPREAD) if chosen is None else (chosen, _CLOSER)
+    joints = about[rng.integers(0, len(about), _SAMPLES)] + rng.uniform(-spread, spread, (_SAMPLES, seen.shape[1]))
+    limit = np.maximum(_LIMIT, np.abs(seen).max(axis=0))
+    return np.asarray(joints[(np.abs(joints) < limit).all(axis=1)])
+
+
+def reachable(
+    seen: Array,
+    poses_of: Callable[[Array], Array],
+    seen_from: Array,
+    centre: Array,
+    chosen: Array | None = None,
+) -> Array:
+    """(K, n) joint angles in which the scanner sees the part about as it has before.
+
+    Args:
+        seen: (V, n) joint angles that were driven.
+        poses_of: T_reference_scanner (K, 4, 4) at joint angles (K, n).
+        seen_from: the same (V, 4, 4) of the views that there are.
+        centre: (3,) of what they see, reference frame.
+        chosen: (C, n) joint angles to stay close to.
+    """
+    joints = nearby(seen, chosen)
+    poses = poses_of(joints)
+    there = frames.transform(frames.inverse(poses), centre[None])[:, 0]
+    before = frames.transform(frames.inverse(seen_from), centre[None])[:, 0]
+    margin = _MARGIN * np.linalg.norm(before, axis=1).mean()
+    inside = ((there > before.min(axis=0) - margin) & (there < before.max(axis=0) + margin)).all(axis=1)
+    # A view direction far from all others would share no surface with them.
+    inside &= (poses[:, :3, 2] @ seen_from[:, :3, 2].T).max(axis=1) > _TURNED
+    return np.asarray(joints[inside])
+
+
+def candidate_measurement(measurement: Measurement, joints: Array) -> Measurement:
+    """The measurement with views that nobody has taken yet, right after the last one, each approached from there."""
+    assert measurement.robot is not None
+    views, count = measurement.views, len(joints)
+    last = np.repeat(views.joints[-1:], count, axis=0)
+    torques = _torques_at(measurement.robot, views, joints)
+    pause = float(np.median(np.diff(views.time))) if views.has("time") and views.count > 1 else 0.0
+    # They would be taken at rest.
+    velocity = None if views.velocity is None else np.zeros_like(joints)
+    T_base_flange = forward(measurement.robot, joints)
+    candidate = replace(
+        views,
+        count=count,
+        joints=joints,
+        previous=last,
+        approach=np.sign(joints - last),
+        time=np.full(count, views.time[-1] + pause),
+        velocity=velocity,
+        torques=torques,
+        covariates={name: np.full(count, values[-1]) for name, values in views.covariates.items()},
+        number=np.full(count, views.number[-1] + 1),
+        T_base_flange=T_base_flange,
+    )
+    return replace(measurement, views=candidate, T_base_flange=T_base_flange, scan_views=())
+
+
+def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:
+    """At joint angles (K, n), with the last view's payload; measured ones as at the nearest pose of all views."""
+    if views.torques.measured:
+        near = np.linalg.norm(joints[:, None] - views.joints[None], axis=2).argmin(axis=1)
+        return replace(views.torques, values=views.torques.values[near])
+    carried = views.covariates.get(PAYLOAD)
+    return torques_of(robot, joints, None if carried is None else np.full(len(joints), carried[-1]))
+
+
+# Further views of a session that is planned.
+
+# A view must show this share of what the others show.
+_SHARE = 0.4
+# So many times as many poses are tried as are asked for.
+_TRIES = 4
+
+
+def with_views(session: Session, joints: Sequence[Array], in_turn: bool = True) -> Session:
+    """The session with further views at joint angles (n,) rad, after the last one, called p01, p02 …
+
+    Args:
+        in_turn: each driven to from the one before; else each from the last view that there is, one of them being next.
+    """
+    assert session.robot is not None
+    last, views = session.views[-1], list(session.views)
+    times = [view.time_s for view in views if view.time_s is not None]
+    pause = float(np.median(np.diff(times))) if len(times) > 1 else 60.0
+    for k, q in enumerate(joints):
+        before = views[-1] if in_turn else last
+        assert before.joints is not None
+        # As alternatives they come at times that a few views would take.
+        later = pause * (k + 1 if in_turn else k % 6 + 1)
+        views.append(
+            View(
+                name=f"p{k + 1:02d}",
+                cloud=None,
+                T_base_flange=forward(session.robot, q),
+                joints=q,
+                approach=np.sign(q - before.joints),
+                time_s=None if last.time_s is None else last.time_s + later,
+                covariates=dict(last.covariates),
+            )
+        )
+    return replace(session, views=tuple(views))
+
+
+def candidate_joints(session: Session, cell: CellModel, count: int, chosen: Array | None = None) -> Array:
+    """(K, n) joint angles near those that are planned, or closer to chosen ones (C, n), in which the scanner would see
+    the part, K ≤ count."""
+    T_mount = cell.model.T_mount
+    driven, T_base_flange = session.joints, np.array([view.T_base_flange for view in session.views])
+    assert driven is not None
+
+    def poses_of(joints: Array) -> Array:
+        assert session.robot is not None
+        return build_capture(session.name, (), forward(session.robot, joints), session.mount).poses(T_mount)
+
+    seen_from = build_capture(session.name, (), T_base_flange, session.mount).poses(T_mount)
+    joints = reachable(driven, poses_of, seen_from, cell.part.centre, chosen)
+    least = max(FEWEST, _SHARE * np.median([len(index) for index in expected_scans(cell, seen_from)]))
+    seen = (len(index) >= least for index in expected_scans(cell, poses_of(joints[: _TRIES * count])))
+    return np.asarray(joints[: _TRIES * count][list(seen)][:count])
+
+
+# Labelled points of views that nobody has taken yet.
+
+
+def candidate_rows(
+    measurement: Measurement, seen: TargetRows, landmarks: Landmarks, variances: Array, terms: Sequence[Term]
+) -> tuple[TargetRows, list[Array], Array]:
+    """Rows of K views in which every target would be seen, how they answer to `terms`, and their covariance.
+
+    Args:
+        measurement: of the candidate views.
+        seen: rows of the views that were taken.
+        variances: (3,) of rotation scatter, translation scatter, factor on the sensor's noise.
+
+    Returns:
+        Rows, one (K, m, P) per term, and (K, m, m).
+    """
+    known = np.flatnonzero(np.isfinite(landmarks.positions).all(axis=1))
+    measurement = _all_seen(measurement, seen, landmarks, known)
+    undrawn = replace(landmarks, drawing=None, T_reference_part=None)
+    rows = target_rows(measurement.capture, seen.T_mount, undrawn)
+    unknown = np.zeros((*rows.residual.shape, landmarks.size - rows.landmarks.shape[2]))
+    rows = replace(rows, landmarks=np.concatenate([rows.landmarks, unknown], axis=2))
+    covariance = rows.mixed_model(rows.hand_eye).covariance(variances)
+    return rows, rows.effect_columns(measurement, Model(seen.T_mount), terms), covariance
+
+
+def _all_seen(measurement: Measurement, seen: TargetRows, landmarks: Landmarks, known: Indices) -> Measurement:
+    """The measurement with sightings of all known targets, as good as those that were seen."""
+    before, K = seen.sightings, len(measurement.T_base_flange)
+    bare = build_capture("candidates", (), measurement.T_base_flange, measurement.mount)
+    back = frames.inverse(bare.poses(seen.T_mount))
+    points = frames.transform(back, landmarks.positions[known])
+    sightings = Sightings(
+        targets=before.targets,
+        target=np.tile(known, (K, 1)),
+        points=points,
+        sigma=np.full(points.shape[:2], np.median(before.sigma[before.used])),
+        used=np.ones(points.shape[:2], bool),
+    )
+    if before.sigma_rotation is not None and landmarks.orientation is not None:
+        sigma_rotation = np.full(K, np.median(before.sigma_rotation))
+        rotation = back[:, :3, :3] @ landmarks.orientation
+        sightings = replace(sightings, rotation=rotation, sigma_rotation=sigma_rotation)
+    first = measurement.target_views[0]
+    usual = None if first.intensity is None else np.zeros(len(known))
+    like = replace(first, views=measurement.views, cosine=np.ones(len(known)), intensity=usual)
+    views = tuple(replace(like, index=v) for v in range(K))
+    return replace(measurement, capture=replace(bare, sightings=sightings), target_views=views)

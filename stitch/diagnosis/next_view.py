@@ -1,0 +1,199 @@
+"""What to measure next: the pose that separates two candidate effects best, or the artefact that does.
+
+Two effects a and b are told apart by what of a's pattern b cannot imitate: λ = |y_a − best of b|² in units
+of the scatter. A further view adds six rows to both patterns; among poses that the arm can take and in which
+the scanner would see the part as it has before, the one that adds most to the two that stay most alike is proposed.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from stitch.diagnosis.candidate_views import candidate_measurement, candidate_rows, nearby, reachable
+from stitch.diagnosis.diagnosis import Diagnosis, Proposal
+from stitch.diagnosis.information import separations
+from stitch.diagnosis.score import Score
+from stitch.diagnosis.sensitivity import alias_matrix
+from stitch.diagnosis.thresholds import ALIAS_CORRELATION, SEPARATION_LAMBDA, WORTHWHILE_GAIN
+from stitch.model.forward import moves_points, perturbed_frames, pose_derivatives
+from stitch.model.model import Model
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.reml import NOISE
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.observations.targets.target_model import TargetObservation
+from stitch.session.capture import build_capture
+from stitch.session.measurement import Measurement
+from stitch.session.robot import forward
+from stitch.system.threads import library_threads_off
+
+# Poses that are tried; and the likeliest candidates among which an alias of the best is sought.
+_TRIED, _LIKELIEST = 250, 6
+
+ARTEFACTS = {
+    "range_scale": "scan a sphere or ball bar of known size, or the part's CAD: overlaps alone hardly show a scale",
+    "range_nonlinearity": "scan one patch at three distances, near, at the standoff and far",
+    "incidence_bias": "scan one patch straight and at 60° from the same distance",
+    "intensity_bias": "scan a flat plate with a black and a white half",
+    "field_curvature": "scan a flat plate that fills the field, then the same turned by 180° about the view axis",
+    "lens_distortion": "repeat a view with the scanner or the part turned by 180° about the view axis",
+    "scanner_thermal_scale": "repeat the first view once the scanner is warm, and again after it has cooled",
+    "latency": "repeat a sweep at half the speed and in the other direction",
+    "mount_drift": "repeat the first views at the end without a pause",
+    "mount_warmup": "repeat one view every two minutes after switching on",
+    "joint_compliance": "repeat three views with another payload",
+    "backlash": "repeat three views approached from the other side of every joint",
+    "settling": "repeat three views after waiting five seconds before the scan",
+    "robot_thermal_growth": "repeat the first views once the arm is warm",
+    "mount_droop": "repeat a view with the flange turned by 180° about its axis",
+    "fixture_droop": "repeat a view with the part hanging the other way",
+    "fixture_drift": "clamp the part anew and repeat the first views at the end",
+    "part_growth": "repeat a view of the part at another temperature, with the cell unchanged",
+    "part_sag": "repeat two views with the part hanging the other way",
+    "part_slip": "repeat the first view now",
+}
+
+
+def propose_measurements(found: Diagnosis) -> tuple[Proposal, ...]:
+    """Return what would tell the named group apart; without a group, the clearest candidate from what resembles it."""
+    with library_threads_off():
+        linear, group = found.linear, _effects_to_separate(found)
+        names = tuple(score.name for score in group)
+        artefacts = tuple(Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS)
+        can_move = linear.measurement.robot is not None and linear.measurement.views.joints.shape[1] > 0
+        best = _best_pose(linear, group) if can_move else None
+        if best is None:
+            return artefacts
+        joints, count, separated = best
+        told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(joints))
+        times = "a view" if count == 1 else f"{count} views"
+        pose = Proposal(f"take {times} near {told}", separated, [round(float(x), 2) for x in joints], count)
+        return (pose, *artefacts)
+
+
+def _effects_to_separate(found: Diagnosis) -> list[Score]:
+    """The group that was named, or the best candidate and its nearest alias; else nothing."""
+    if len(found.named) > 1:
+        return [r.score for r in found.named]
+    seen = [c.ranked for c in found.candidates if c.ranked.score.observable and c.ranked.score.fitted][:_LIKELIEST]
+    if found.verdict == "adequate" or len(seen) < 2:
+        return []
+    first = found.named[0] if found.named else seen[0]
+    others = [r.score for r in seen if r.name != first.name]
+    row = alias_matrix(found.linear, [first.score, *others])[0, 1:]
+    return [first.score, others[int(row.argmax())]] if row.max() > ALIAS_CORRELATION else []
+
+
+def _best_pose(linear: LinearModel, group: Sequence[Score]) -> tuple[Array, int, tuple[str, ...]] | None:
+    """Joint angles (n,) in degrees where the two that stay most alike gain most, the number of such views, and what
+    they separate; None if poses cannot separate anything.
+    """
+    pairs = [(gains, (a.name, b.name)) for a, b in combinations(group, 2) if (gains := _gains(linear, a, b))]
+    pairs = [(gains, names) for gains, names in pairs if gains.of_views.max() > WORTHWHILE_GAIN * SEPARATION_LAMBDA]
+    if not pairs:
+        return None
+    k = int(np.min([gains.of_views for gains, _ in pairs], axis=0).argmax())
+    counts = [np.ceil(max(SEPARATION_LAMBDA - g.known, 0.0) / max(g.of_views[k], 1e-12)) for g, _ in pairs]
+    separated = dict.fromkeys(score.name for score in group if any(score.name in names for _, names in pairs))
+    return np.degrees(pairs[0][0].joints[k]), int(np.clip(max(counts), 1, 99)), tuple(separated)
+
+
+@dataclass(frozen=True)
+class _Gains:
+    """How much apart two candidate effects are, and how much each of K views would add to it."""
+
+    known: float
+    joints: Array  # (K, n) rad, the same for every two candidate effects
+    of_views: Array  # (K,)
+
+
+def _gains(linear: LinearModel, a: Score, b: Score) -> _Gains | None:
+    """None if poses cannot show the effects."""
+    views = candidate_views(linear, a, b)
+    if views is None or not len(views.joints):
+        return None
+    # Columns of hand-eye and model, of b at plausible sizes, and the pattern of a.
+    pattern = linear.whiten(a.form.columns) @ a.values
+    known = np.column_stack([linear.white_design, linear.whiten(b.form.columns) * b.form.sizes, pattern])
+    further = np.concatenate([views.design, views.b * b.form.sizes, (views.a @ a.values)[..., None]], axis=2)
+    white = np.linalg.solve(views.half, further)
+    present, q = known.T @ known, known.shape[1]
+    rival, own = slice(linear.white_design.shape[1], q - 1), slice(q - 1, q)
+    apart = float(separations(present, own, rival)[0])
+    each = separations(present + white.transpose(0, 2, 1) @ white, own, rival)[:, 0]
+    return _Gains(apart, views.joints, each - apart)
+
+
+# How candidate views would answer to a model and to two effects.
+
+
+@dataclass(frozen=True)
+class CandidateViews:
+    """K views with m numbers each, before whitening."""
+
+    joints: Array  # (K, n) rad
+    design: Array  # (K, m, a) per column of the model
+    a: Array  # (K, m, p) per free parameter of one effect
+    b: Array  # (K, m, q) of the other
+    half: Array  # (K, m, m) Cholesky factors of the scatter of one view
+
+
+def _of_surfaces(linear: LinearModel, seen: SurfaceObservation, a: Score, b: Score) -> CandidateViews | None:
+    """Poses in which the scanner would see the part about as it has before; None if poses cannot show the effects."""
+    zero = [s.form.at(np.zeros(len(s.values))) for s in (a, b)]
+    T_mount, centre = linear.model.T_mount, seen.unconstrained.overlaps.gram.centre
+
+    def poses_of(joints: Array) -> Array:
+        assert linear.measurement.robot is not None
+        T = forward(linear.measurement.robot, joints)
+        return build_capture("candidates", (), T, linear.measurement.mount).poses(T_mount)
+
+    joints = reachable(linear.measurement.views.joints, poses_of, seen.capture.poses(T_mount), centre)[:_TRIED]
+    if moves_points(zero) or not len(joints):
+        return None
+    measurement, bare = candidate_measurement(linear.measurement, joints), Model(T_mount)
+    to_centre = frames.make(np.eye(3), -centre)
+    own = frames.adjoint(to_centre @ (perturbed_frames(measurement, ())[0] @ bare.T_mount))
+    extra = np.zeros((len(joints), 6, linear.white_design.shape[1] - 6))
+    found = pose_derivatives(measurement, bare, zero, centre)
+    of_a, of_b = (c[s.form.keep].transpose(1, 2, 0) for c, s in zip(found, (a, b), strict=True))
+    half = _view_scatter(linear, measurement, to_centre)
+    return CandidateViews(joints, np.concatenate([own, extra], axis=2), of_a, of_b, half)
+
+
+def _of_targets(linear: LinearModel, seen: TargetObservation, a: Score, b: Score) -> CandidateViews:
+    """Poses near those driven, in which all targets are seen."""
+    joints = nearby(linear.measurement.views.joints)[:_TRIED]
+    measurement = candidate_measurement(linear.measurement, joints)
+    zero = [s.form.at(np.zeros(len(s.values))) for s in (a, b)]
+    flange_and_noise = np.append(linear.flange_scatter(linear.null), linear.null.variances[NOISE])
+    rows, columns, covariance = candidate_rows(measurement, seen.rows, seen.landmarks, flange_and_noise, zero)
+    extra = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - rows.landmarks.shape[2]))
+    design = np.concatenate([rows.hand_eye, rows.landmarks, extra], axis=2)
+    of_a, of_b = (c[..., s.form.keep] for c, s in zip(columns, (a, b), strict=True))
+    return CandidateViews(joints, design, of_a, of_b, np.asarray(np.linalg.cholesky(covariance), float))
+
+
+# What was observed, and how it would look in a further view; nothing is proposed for what is not in here.
+_VIEWS_BY_OBSERVATION: dict[type, Callable[[LinearModel, Any, Score, Score], CandidateViews | None]] = {
+    SurfaceObservation: _of_surfaces,
+    TargetObservation: _of_targets,
+}
+
+
+def candidate_views(linear: LinearModel, a: Score, b: Score) -> CandidateViews | None:
+    """Further views of a session for two effects; None if no pose can show them."""
+    of = _VIEWS_BY_OBSERVATION.get(type(linear.observation))
+    return None if of is None else of(linear, linear.observation, a, b)
+
+
+def _view_scatter(linear: LinearModel, measurement: Measurement, to_centre: Array) -> Array:
+    """(K, 6, 6) Cholesky factors of the pose scatter of one view about the centre."""
+    T = measurement.T_base_flange
+    carried = frames.adjoint(to_centre @ (np.broadcast_to(np.eye(4), T.shape) if measurement.eye_to_hand else T))
+    variances = np.repeat(np.maximum(linear.flange_scatter(linear.null), 1e-300), 3)
+    return np.asarray(np.linalg.cholesky(carried * variances @ carried.transpose(0, 2, 1)))

@@ -1,0 +1,394 @@
+"""Find a coarse hand-eye from nothing, or take the given one.
+
+Candidates come from two independent ideas: (1) the centroids of the clouds as crude labelled points
+of one fixed target, minimised from many starting rotations (`centroid_hand_eyes`); (2) relative scan motions
+against the robot's (AX = XB, five solvers; `motion_candidates`). Every candidate is then closed in on the scans
+at low resolution, and the consistency of the whole set decides: the truncated mean square distance
+between all views that ought to meet. Objects without features (sphere, cone, plane) pass the same way.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+
+import numpy as np
+from scipy.linalg import null_space
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from stitch.errors import NoResultError
+from stitch.fit.correct import COARSE_SAMPLES, icp_hand_eye, next_gates
+from stitch.numerics import feature_matching, frames
+from stitch.numerics.feature_matching import FeaturedSurface
+from stitch.numerics.frames import Array
+from stitch.numerics.hand_eye import AXXB_SOLVERS
+from stitch.numerics.odometry import (
+    angle_differences,
+    is_stream,
+    motions_between,
+    motions_of_stream,
+    scan_odometry,
+)
+from stitch.observations.observability import hidden_translations
+from stitch.observations.surfaces.matching import NeighbourQueries, neighbour_queries, sample_points
+from stitch.observations.surfaces.normal_equations import Overlaps, collect_overlaps, common_samples
+from stitch.session.capture import Capture, part_size
+from stitch.session.scan import Scan, even_indices, subsample
+from stitch.system.process import steps
+from stitch.system.threads import parallel
+
+# Hand-eyes from the clouds' centroids, as crude labelled points of one fixed target.
+
+_STARTS = 24
+
+
+def scanner_centre(captures: Sequence[Capture]) -> Array:
+    """Mean centroid of the scans in the scanner frame (3,)."""
+    return np.asarray(np.mean([scan.points.mean(axis=0) for c in captures for scan in c.scans], axis=0))
+
+
+def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
+    """Hand-eyes (4, 4) that bring the clouds' centroids of each capture to one point, best first.
+
+    The centroid of a view leans to the side it sees, so this is coarse: 2–17° and 20–60 mm.
+    """
+    centroids = [np.array([s.points.mean(axis=0) for s in c.scans]) for c in captures]
+    # A shift that moves all views alike has a column of zeros but for rounding: along it the start stays at zero.
+    hidden = hidden_translations(captures, np.eye(4))
+    shifts = null_space(hidden.T) if hidden.size else np.eye(3)
+
+    def hand_eye(x: Array) -> Array:
+        return frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), shifts @ x[3:])
+
+    def residual(x: Array) -> Array:
+        T = hand_eye(x)
+        rows = []
+        for c, centroid in zip(captures, centroids, strict=True):
+            placed = frames.transform(c.poses(T), centroid[:, None])[:, 0]
+            rows.append((placed - placed.mean(axis=0)).ravel())
+        return np.concatenate(rows)
+
+    fits = []
+    for start in Rotation.random(_STARTS, rng=np.random.default_rng(0)):
+        first = np.r_[start.as_rotvec(), np.zeros(shifts.shape[1])]
+        fit = least_squares(residual, first, method="trf", max_nfev=100, x_scale="jac")
+        fits.append((float(fit.cost), fit.x))
+    fits.sort(key=lambda pair: pair[0])
+    found: list[Array] = []
+    for _, x in fits:
+        T = hand_eye(x)
+        if all(np.degrees(frames.angle_between(T, other)) > 3 for other in found):
+            found.append(T)
+    return found
+
+
+# Hand-eyes that were tried, and which of them are the same answer.
+
+# Points of a view that are asked for their nearest neighbours while a hand-eye is searched.
+SEARCH_SAMPLES = 120
+# Two candidates are the same answer if they place the part within this share of its size.
+_SAME_SHARE = 0.03
+
+
+@dataclass(frozen=True)
+class HandEyeCandidate:
+    """One hand-eye that was tried: its origin and how well all views fall together."""
+
+    source: str
+    T_mount: Array  # (4, 4) after closing in
+    score: float  # length_unit, lower is better
+    reached: int = 1  # starts that ended here
+
+
+def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> float:
+    """Root mean square distance of points to every other view, truncated at `limit`.
+
+    Views that fail to meet count with the limit, so falling apart cannot pay.
+    """
+    squares: list[float] = []
+    for c in captures:
+        poses = c.poses(T_mount)
+        picked = [sample_points(scan, SEARCH_SAMPLES) for scan in c.scans]
+        every = neighbour_queries(c.scans, poses, picked)
+
+        def mean_squares(w: int, every: NeighbourQueries = every) -> list[float]:
+            parts = [(v, slice(None)) for v in range(len(every.scans)) if v != w and len(every.index[v])]
+            if not parts:
+                return []
+            _, points, normals = every.gather(parts)
+            distance, facing = every.search(w, points, normals, limit)
+            by_view = np.split(np.where(facing, distance, limit) ** 2, np.cumsum(every.counts(parts))[:-1])
+            return [float(np.mean(own)) for own in by_view]
+
+        squares += chain.from_iterable(parallel(mean_squares, range(len(c.scans))))
+    return float(np.sqrt(np.mean(squares)))
+
+
+def distinct_hand_eyes(
+    captures: Sequence[Capture], tried: Sequence[HandEyeCandidate], size: float
+) -> list[HandEyeCandidate]:
+    """Distinct answers, best first; each keeps its best hand-eye and the name of its first start."""
+    groups: list[list[HandEyeCandidate]] = []
+    for candidate in tried:
+        for group in groups:
+            if same_hand_eye(captures, size, candidate.T_mount, group[0].T_mount):
+                group.append(candidate)
+                break
+        else:
+            groups.append([candidate])
+    best = [
+        replace(min(group, key=lambda c: c.score), source=group[0].source, reached=sum(c.reached for c in group))
+        for group in groups
+    ]
+    return sorted(best, key=lambda c: c.score)
+
+
+def same_hand_eye(captures: Sequence[Capture], size: float, T_a: Array, T_b: Array) -> bool:
+    """True if two hand-eyes place a part of this size (length_unit) alike: by its largest displacement."""
+    centre = scanner_centre(captures)
+    corners = centre + size / 2 * np.vstack([np.eye(3), -np.eye(3)])
+    off = np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1)
+    return bool(off.max() < _SAME_SHARE * size)
+
+
+# Relative scanner motions from the scans alone, and hand-eyes from them (AX = XB).
+#
+# Neighbouring views are registered by features (FPFH, RANSAC; Rusu et al. 2009); a stream of scans in small steps
+# by KISS-ICP's odometry (Vizzo et al. 2023). The motions are matched with the robot's by five solvers.
+# Single motions may be wrong: a motion counts only if its rotation angle agrees with the robot's,
+# which holds for any hand-eye.
+
+# The angle of a conjugate motion is an invariant: |angle(A) − angle(B)| small (Chen 1991).
+_ANGLE_TOLERANCE = np.radians(3.0)
+_MINIMUM_MOTIONS = 3
+_FEATURE_SPACINGS = 6.0
+_POINTS = 1500
+# One partner in twelve right leaves five good triples among so many.
+_DRAWS = 10_000
+
+
+def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
+    """(source, T_mount (4, 4)) of every solver on every kind of motion that has enough of them."""
+    out: list[tuple[str, Array]] = []
+    for kind, motions in (("features", feature_motions), ("KISS-ICP", sequence_motions)):
+        robot, scanner = [], []
+        for capture in captures:
+            A, B = consistent_motions(*motions(capture))
+            robot.append(A)
+            scanner.append(B)
+        A, B = np.concatenate(robot), np.concatenate(scanner)
+        if len(A) < _MINIMUM_MOTIONS:
+            continue
+        for name, solver in AXXB_SOLVERS.items():
+            try:
+                T_mount = solver(A, B)
+            except (NoResultError, np.linalg.LinAlgError):
+                continue
+            if np.isfinite(T_mount).all():
+                out.append((f"{kind}, {name}", T_mount))
+    return out
+
+
+def robot_motions(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
+    """A (M, 4, 4) with A·X = X·B, B the motion that maps view w's scanner frame into view v's."""
+    return motions_between(capture.T_reference_mount, pairs)
+
+
+def consistent_motions(A: Array, B: Array) -> tuple[Array, Array]:
+    """The motions whose rotation angles agree."""
+    keep = angle_differences(A, B) < _ANGLE_TOLERANCE
+    return A[keep], B[keep]
+
+
+def feature_motions(capture: Capture) -> tuple[Array, Array]:
+    """(A, B), each (M, 4, 4): motions between neighbours of the sequence (and its ends) by feature matching."""
+    size = _FEATURE_SPACINGS * capture.spacing
+
+    def described(scan: Scan) -> FeaturedSurface:
+        points, normals = feature_matching.voxel_downsample(
+            scan.points, scan.normals, max(size / 2, even_grid_size(scan.points))
+        )
+        return feature_matching.compute_fpfh(points, normals, 2.5 * size)
+
+    surfaces = list(parallel(described, capture.scans))
+
+    def motion(pair: tuple[int, int]) -> Array:
+        target, source = (surfaces[v] for v in pair)
+        T = feature_matching.register_ransac(source, target, reach=1.5 * size, draws=_DRAWS)
+        return feature_matching.align_icp(source, target, T, reach=size)
+
+    pairs = neighbouring_views(len(capture.scans))
+    return robot_motions(capture, pairs), np.array(list(parallel(motion, pairs, "pairs of scans"))).reshape(-1, 4, 4)
+
+
+def neighbouring_views(views: int) -> list[tuple[int, int]]:
+    """Pairs of views one and two apart, of two views the pair."""
+    steps = [(v, v + step) for step in (1, 2) for v in range(views - step)]
+    return steps if views > 2 else [(0, 1)]
+
+
+def even_grid_size(points: Array) -> float:
+    """Grid size that leaves about `_POINTS` points of a surface."""
+    extent = np.ptp(points, axis=0)
+    return float(np.sqrt(np.prod(np.sort(extent)[1:]) / _POINTS))
+
+
+def sequence_motions(capture: Capture) -> tuple[Array, Array]:
+    """(A, B), each (M, 4, 4): motions of a stream of scans by its odometry; none of separate views."""
+    scans = [scan.points[even_indices(len(scan.points), _POINTS)] for scan in capture.scans]
+    if not is_stream(capture.T_reference_mount, scans):
+        return np.zeros((0, 4, 4)), np.zeros((0, 4, 4))
+    return motions_of_stream(capture.T_reference_mount, scan_odometry(scans))
+
+
+_SEARCH_POINTS = 2000
+# The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
+_STEPS_TO_MEET, _STEPS_AFTER = 4, 3
+# First gate of the search and truncation of the score, as shares of the part's size.
+COARSE_GATE, SCORE_SHARE = 0.35, 0.05
+# Where a hand-eye came from that was not searched.
+STATED, REUSED = "given in session.toml", "of another run, used as it is"
+# Two answers of the search whose scores differ by less than this ratio are equally good.
+_CLOSE = 1.1
+# Restarts about the best centroid solution: its error on real parts was 2–17°.
+_RESTART_DEG = 15.0
+
+
+@dataclass(frozen=True)
+class CoarseHandEye:
+    """The coarse hand-eye; `candidates` best first, one per distinct answer."""
+
+    T_mount: Array  # (4, 4)
+    gate: float  # length_unit: first distance between partners for the correction
+    source: str
+    candidates: tuple[HandEyeCandidate, ...]
+    _met: dict[int, tuple[Capture, Overlaps]] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def overlaps(self, capture: Capture) -> Overlaps:
+        """What a few points of each view meet under it. The stage is told of it, and the correction begins with it.
+
+        Raises:
+            NoResultError: no two views overlap.
+        """
+        # The second who asks takes it along: nobody asks a third time.
+        own, found = self._met.pop(id(capture), (None, None))
+        if found is None or own is not capture:
+            samples = common_samples(capture.scans, COARSE_SAMPLES)
+            found = collect_overlaps(capture, capture.poses(self.T_mount), self.gate, samples)
+            self._met[id(capture)] = capture, found
+        return found
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """True if another distinct answer of the search is as good."""
+        return self.runner_up_ratio < _CLOSE
+
+    @property
+    def runner_up_ratio(self) -> float:
+        """Score of the second distinct answer over the best; inf if there is none."""
+        return self.candidates[1].score / self.candidates[0].score if len(self.candidates) > 1 else np.inf
+
+
+def use_given_hand_eye(captures: Sequence[Capture], T_mount: Array, source: str) -> CoarseHandEye:
+    """Take a hand-eye that is known from elsewhere: the gate is wide enough for 5° and 30 mm.
+
+    Args:
+        source: where from, in words.
+    """
+    return CoarseHandEye(T_mount, COARSE_GATE * part_size(captures), source, ())
+
+
+def find_coarse_hand_eye(captures: Sequence[Capture]) -> CoarseHandEye:
+    """Search the hand-eye.
+
+    Raises:
+        NoResultError: fewer than three views, or no candidate makes the views overlap.
+    """
+    if sum(len(c.scans) for c in captures) < 3:
+        raise NoResultError("a hand-eye cannot be found from fewer than 3 views: give scanner.pose in session.toml")
+    size = part_size(captures)
+    starts = _starting_hand_eyes(captures, size)
+    tried = icp_from_starts(captures, starts, size)
+    if not tried:
+        raise NoResultError(
+            "no hand-eye makes the scans overlap: check mount (eye_to_hand or eye_in_hand), the pose "
+            "convention and that scans and poses are paired rightly, or give scanner.pose"
+        )
+    # Starts were turned about the part, which carries the scanner along: a shift that nothing shows ends at zero.
+    tried = [replace(c, T_mount=_without_hidden_shift(captures, c.T_mount)) for c in tried]
+    answers = distinct_hand_eyes(captures, tried, size)
+    return CoarseHandEye(answers[0].T_mount, 0.2 * size, answers[0].source, tuple(answers))
+
+
+def _without_hidden_shift(captures: Sequence[Capture], T_mount: Array) -> Array:
+    """Return the hand-eye (4, 4) with no shift along what the motions leave open."""
+    hidden = T_mount[:3, :3] @ hidden_translations(captures, T_mount)
+    T = T_mount.copy()
+    T[:3, 3] -= hidden @ (hidden.T @ T[:3, 3])
+    return T
+
+
+def _starting_hand_eyes(captures: Sequence[Capture], size: float) -> list[tuple[str, Array]]:
+    """Distinct starting hand-eyes with the name of the idea behind each.
+
+    Turns of a quarter and a half about the line of sight are there to be refuted: they say how far
+    the runner-up is.
+    """
+    centroids = centroid_hand_eyes(captures)
+    starts = [("centroids", T) for T in centroids[:3]]
+    centre = scanner_centre(captures)
+    for axis in np.vstack([np.eye(3), -np.eye(3)]):
+        starts.append(("centroids, turned", centroids[0] @ turn_about(axis * np.radians(_RESTART_DEG), centre)))
+    for quarter in (1, 2, 3):
+        turn = centre / np.linalg.norm(centre) * np.pi / 2 * quarter
+        starts.append((f"turned by {90 * quarter}° about the line of sight", centroids[0] @ turn_about(turn, centre)))
+    motions = [(f"scan motions, {name}", T) for name, T in motion_candidates(captures)]
+    kept: list[tuple[str, Array]] = []
+    for name, T in motions:
+        if not any(same_hand_eye(captures, size, T, other) for _, other in kept):
+            kept.append((name, T))
+    return starts + kept
+
+
+def turn_about(rotation: Array, centre: Array) -> Array:
+    """Return the (4, 4) turn by a rotation vector (3,) about a point (3,)."""
+    T = frames.make(Rotation.from_rotvec(rotation).as_matrix(), np.zeros(3))
+    T[:3, 3] = centre - T[:3, :3] @ centre
+    return T
+
+
+def icp_from_starts(
+    captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], size: float
+) -> list[HandEyeCandidate]:
+    """Close in from every start on few points; starts under which no views overlap are dropped.
+
+    Half way, starts that have met go on as one: most end in the same place.
+    """
+    light = [replace(c, scans=tuple(subsample(scan, _SEARCH_POINTS) for scan in c.scans)) for c in captures]
+    met: list[tuple[list[str], Array, list[float]]] = []
+    for source, start in steps("trying hand-eyes", starts):
+        half = _icp_steps(light, start, [COARSE_GATE * size] * len(captures), _STEPS_TO_MEET)
+        if half is None:
+            continue
+        same = [sources for sources, T, _ in met if same_hand_eye(captures, size, half[0], T)]
+        if same:
+            same[0].append(source)
+        else:
+            met.append(([source], *half))
+    ends = [(sources, _icp_steps(light, T, gates, _STEPS_AFTER)) for sources, T, gates in met]
+    return [
+        HandEyeCandidate(sources[0], end[0], view_consistency(captures, end[0], SCORE_SHARE * size), len(sources))
+        for sources, end in ends
+        if end is not None
+    ]
+
+
+def _icp_steps(
+    captures: Sequence[Capture], T_mount: Array, gates: Sequence[float], steps: int
+) -> tuple[Array, list[float]] | None:
+    """Close in by some steps: hand-eye and the gates to go on with; None if no views overlap."""
+    try:
+        T_mount, overlaps, _ = icp_hand_eye(captures, T_mount, gates, samples=SEARCH_SAMPLES, maximum=steps)
+    except NoResultError:
+        return None
+    return T_mount, next_gates(captures, overlaps)

@@ -1,0 +1,183 @@
+"""The fit of a session that grows by one view at a time: each new view is matched with the others, once.
+
+The first views are fitted as `correct` fits them. A further view is moved to where the surfaces of the others put it;
+all pairs are then solved together from their correspondences, which are not searched again. That costs what the new
+view costs, and V² numbers. `stitch.run` over all views is the fit that counts; this one says where it is going.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.errors import NoResultError
+from stitch.fit.correct import REUSE_GATE, Correction
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+from stitch.observations.pose_errors import PoseErrors
+from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
+from stitch.observations.surfaces.matching import (
+    MINIMUM_OVERLAP,
+    Match,
+    match_pairs,
+    near_pairs,
+    sample_points,
+    signed_distances,
+)
+from stitch.observations.surfaces.normal_equations import NEAR_NULL, Gram, Overlaps, next_gate, sum_matches
+from stitch.observations.surfaces.view_poses import (
+    SAMPLES,
+    UnconstrainedPoses,
+    unconstrained_poses,
+    visible_step,
+)
+from stitch.session.capture import Capture, part_size
+from stitch.session.scan import Scan
+
+# A view that moves by less than this share of the robust sigma rests.
+_CONVERGED = 5e-3
+_MAXIMUM_ITERATIONS = 12
+# Where all views together have moved by this share of the gate, their partners are searched anew.
+_SEARCH_ANEW = 0.3
+
+
+@dataclass(frozen=True)
+class LiveFit:
+    """Hand-eye and views as far as they are known."""
+
+    capture: Capture
+    T_mount: Array  # (4, 4) T_mount_scanner
+    covariance: Array  # (6, 6) of T_mount·exp(ξ), scanner frame, rotation first
+    unconstrained: UnconstrainedPoses  # relative to the poses under T_mount
+    drifted: float = 0.0  # largest distance by which views moved since all partners were searched, length_unit
+
+    @property
+    def gate(self) -> float:
+        """Distance within which partners are searched, length_unit."""
+        return self.unconstrained.overlaps.gate
+
+
+@dataclass(frozen=True)
+class NewView:
+    """A view where the surfaces of the others put it."""
+
+    fit: LiveFit  # with this view as its last
+    seen_before: float  # share of its sampled points that lie on the surface of another view
+
+
+# From a capture, its freed views and a hand-eye to how the poses may err, and to the scanner's errors by source.
+ErrorPrior = Callable[[Capture, UnconstrainedPoses, Array], tuple[PoseErrors, dict[str, list[Array]]]]
+
+
+def start_live_fit(correction: Correction) -> LiveFit:
+    """Return the fit of the first views, as `correct` found it, ready for further ones."""
+    own, T_mount = correction.captures[0], correction.model.T_mount
+    freed = correction.unconstrained[0].relative_to(own.poses(T_mount))
+    return LiveFit(own, T_mount, correction.hand_eye.covariance, freed)
+
+
+def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_flange: Array) -> NewView:
+    """Move a new view to where the surfaces of the others put it, and add its correspondences.
+
+    Args:
+        T_reference_mount, T_reference_flange: (4, 4) of the view, as in `Capture`.
+
+    Raises:
+        NoResultError: it overlaps with no other view.
+    """
+    own = replace(
+        fit.capture,
+        scans=(*fit.capture.scans, scan),
+        T_reference_mount=np.concatenate([fit.capture.T_reference_mount, T_reference_mount[None]]),
+        T_reference_flange=np.concatenate([fit.capture.T_reference_flange, T_reference_flange[None]]),
+    )
+    model_poses = own.poses(fit.T_mount)
+    poses = np.concatenate([fit.unconstrained.poses, model_poses[-1:]])
+    gate, last = REUSE_GATE * part_size([own]), len(poses) - 1
+    # The others stand still meanwhile: only their place counts, and the new view's samples.
+    samples = [sample_points(s, SAMPLES) for s in own.scans]
+    matches = _match_last(own, poses, gate, samples)
+    for _ in range(_MAXIMUM_ITERATIONS):
+        g = sum_matches(matches, len(poses))
+        step = _last_step(g)
+        poses[last] = frames.moved_about(g.centre, step, poses[last])
+        gate = min(gate, max(next_gate(Overlaps([], matches, g, gate), own), 0.6 * gate))
+        matches = _match_last(own, poses, gate, samples)
+        if np.linalg.norm(step * g.displacement_factors) < _CONVERGED * g.scale and gate <= 1.01 * fit.gate:
+            break
+    together = _solve_together(own, poses, [*fit.unconstrained.overlaps.matches, *matches], min(gate, fit.gate))
+    moved = np.linalg.norm(frames.log(frames.inverse(poses) @ together.poses)[:, 3:], axis=1)
+    seen = np.unique(np.concatenate([m.index_w for m in matches]))
+    fitted = replace(
+        fit,
+        capture=own,
+        unconstrained=together.relative_to(model_poses),
+        drifted=fit.drifted + float(moved[:-1].max(initial=0.0)),
+    )
+    return NewView(fitted, float(np.isin(samples[last], seen).mean()))
+
+
+def fit_live_hand_eye(fit: LiveFit, prior: ErrorPrior) -> LiveFit:
+    """Fit the hand-eye to the views as they stand; partners are searched anew where the views have moved far."""
+    freed = fit.unconstrained
+    if fit.drifted > _SEARCH_ANEW * fit.gate:
+        freed = unconstrained_poses(fit.capture, fit.capture.poses(fit.T_mount), fit.gate)
+    errors, of_scanner = prior(fit.capture, freed, fit.T_mount)
+    found = fit_hand_eye([fit.capture], [freed], fit.T_mount, scanner_errors=of_scanner, errors=errors)
+    return LiveFit(
+        fit.capture,
+        found.T_mount,
+        found.covariance,
+        freed.relative_to(fit.capture.poses(found.T_mount)),
+        fit.drifted if freed is fit.unconstrained else 0.0,
+    )
+
+
+def without_view(fit: LiveFit, view: int) -> LiveFit:
+    """Return the fit without one view and its correspondences; the hand-eye stays as it is.
+
+    Raises:
+        NoResultError: no two of the others overlap.
+    """
+    old = fit.unconstrained.overlaps
+    matches = [replace(m, v=m.v - (m.v > view), w=m.w - (m.w > view)) for m in old.matches if view not in (m.v, m.w)]
+    own = fit.capture.without(np.array([view]))
+    if not matches:
+        raise NoResultError(f"{own.name}: no two views overlap")
+    poses = np.delete(fit.unconstrained.poses, view, axis=0)
+    together = _solve_together(own, poses, matches, old.gate)
+    return replace(fit, capture=own, unconstrained=together.relative_to(own.poses(fit.T_mount)))
+
+
+def _match_last(capture: Capture, poses: Array, gate: float, samples: Sequence[Indices]) -> list[Match]:
+    """Return the correspondences of the last view with every other one that it overlaps."""
+    last = len(poses) - 1
+    pairs = [pair for pair in near_pairs(capture.scans, poses, gate) if pair[1] == last]
+    least = MINIMUM_OVERLAP * len(samples[last])
+    found = [m for m in match_pairs(capture.scans, poses, pairs, gate, samples)[0] if len(m.residual) > least]
+    if not found:
+        raise NoResultError(f"{capture.scans[last].name}: it shares no surface with the other views")
+    return found
+
+
+def _last_step(g: Gram) -> Array:
+    """(6,) twist of the last view that brings it onto the others, in the directions that they show."""
+    unit = g.displacement_factors
+    values, vectors = np.linalg.eigh(g.matrix.sum(axis=0) / np.outer(unit, unit))
+    keep = values > NEAR_NULL * values[-1]
+    pull = vectors[:, keep].T @ (g.vector.sum(axis=0) / unit)
+    return np.asarray(vectors[:, keep] @ (pull / values[keep]) / unit)
+
+
+def _solve_together(capture: Capture, poses: Array, matches: list[Match], gate: float) -> UnconstrainedPoses:
+    """Move all views by the correspondences that are known; they are not searched again."""
+    points = [scan.points for scan in capture.scans]
+    for _ in range(2):
+        ends = np.cumsum([len(m.residual) for m in matches])[:-1]
+        apart = np.split(signed_distances(matches, poses, points), ends)
+        matches = [replace(m, residual=e) for m, e in zip(matches, apart, strict=True)]
+        g = sum_matches(matches, len(poses))
+        step = visible_step(g)
+        poses = frames.moved_about(g.centre, step, poses)
+    overlaps = Overlaps([(m.v, m.w) for m in matches], matches, g, gate)
+    return UnconstrainedPoses(poses, np.zeros((len(poses), 6)), overlaps)

@@ -1,0 +1,103 @@
+"""What the sessions of one rig, and a model that is used for them, must have in common."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stitch.effects.contract import find_effect, parameters_in, require_available
+from stitch.errors import InputError
+from stitch.model.model_toml import ModelFile
+from stitch.session.measurement import Measurement
+from stitch.session.session import Session
+
+# No two measured scans begin with so many points alike.
+_COMPARED_POINTS = 100
+
+
+def require_same_rig(sessions: Sequence[Session], model: ModelFile | None) -> None:
+    """Refuse sessions that cannot share a hand-eye, or that show nothing.
+
+    Raises:
+        InputError: names the session and what is wrong.
+    """
+    first = sessions[0]
+    for other in sessions[1:]:
+        if (other.mount, other.length_unit) != (first.mount, first.length_unit):
+            raise InputError(
+                f"{other.path}: mount {other.mount} in {other.length_unit}, but {first.path} has {first.mount} "
+                f"in {first.length_unit}; only sessions of one rig share a hand-eye"
+            )
+    if model and model.mount != first.mount:
+        raise InputError(
+            f"the model's mount is {model.mount}, that of {first.path} is {first.mount}; use a run of the same rig"
+        )
+    for session in sessions:
+        if not session.has_clouds and not session.has_sightings:
+            raise InputError(f"{session.path}: some views name no cloud and there is no points.csv or frames.csv")
+        if session.has_clouds != first.has_clouds:
+            clouds, points = (first, session) if first.has_clouds else (session, first)
+            raise InputError(
+                f"{clouds.path} has clouds and {points.path} labelled points alone; to fix: run them apart, one with "
+                "the model of the other (--hand-eye, --arm)"
+            )
+        if not session.has_clouds:
+            _require_same_arm(first, session)
+        if len(session.views) < 2:
+            raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")
+
+
+def _require_same_arm(first: Session, other: Session) -> None:
+    """Sessions of labelled points share an arm; its loads may differ."""
+    a, b = first.robot, other.robot
+    if a is None or b is None:
+        return
+    rows = ((x.before, x.after, x.theta) for x in (a, b))
+    if a.n_joints != b.n_joints or not all(np.allclose(x, y) for x, y in zip(*rows, strict=True)):
+        raise InputError(
+            f"{other.path}: its [robot] is another arm than that of {first.path}; only sessions of one arm share its "
+            "effects; to fix: state the same rows, or run them apart"
+        )
+
+
+def require_measured_once(sessions: Sequence[Session]) -> None:
+    """Refuse a scan that stands in two sessions: it would count as two, and the hand-eye seem surer than it is.
+
+    Raises:
+        InputError: names both sessions and views.
+    """
+    known: dict[bytes, tuple[Session, str]] = {}
+    for session in sessions:
+        clouds = {
+            view.name: view.cloud.points[:_COMPARED_POINTS].tobytes()
+            for view in session.views
+            if view.cloud is not None
+        }
+        for name, points in clouds.items():
+            if points in known:
+                other, view = known[points]
+                raise InputError(
+                    f"{session.path}: the scan of view {name} is that of view {view} in {other.path}, measured once "
+                    "and given twice; to fix: name each session once"
+                )
+        known |= {points: (session, name) for name, points in clouds.items()}
+
+
+def require_effects(measurements: Sequence[Measurement], effects: Sequence[str]) -> None:
+    """Refuse effects that a session cannot have, or that have other parameters in another session of the rig.
+
+    Raises:
+        InputError: names the effect, the session and what is missing or different.
+    """
+    for effect in map(find_effect, effects):
+        for measurement in measurements:
+            require_available(measurement, effect)
+        first, *others = (
+            {f"{p.name} ({p.unit})" for p in parameters_in(measurement, effect)} for measurement in measurements
+        )
+        for measurement, own in zip(measurements[1:], others, strict=True):
+            if own != first:
+                raise InputError(
+                    f"effect {effect.name}: sessions {measurements[0].capture.name} and {measurement.capture.name} "
+                    f"do not share {', '.join(sorted(first ^ own))}; give both the same arm, link masses and "
+                    "temperatures, or run them apart"
+                )

@@ -1,0 +1,371 @@
+"""Fuse registered views into one cloud: overlap averaged by weight on a grid of the scans' spacing.
+
+What a view shows in a cell is a voxel of it. A point counts where it is supported (`support.py`).
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import pairwise
+from threading import Lock
+
+import numpy as np
+from pykdtree.kdtree import KDTree
+
+from stitch.fusion.support import (
+    PlacedPoints,
+    cell_numbers,
+    edge_credit,
+    find_support,
+    number_groups,
+    pack_cells,
+    weighted_sums,
+)
+from stitch.model.forward import moves_points, point_correction
+from stitch.model.model import Model
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.run_data import FusedCloud, Unsupported
+from stitch.session.capture import Capture
+from stitch.session.measurement import MIN_COSINE, Measurement, intensity_scale
+from stitch.session.scan import Scan, box_corners
+from stitch.session.session import Cloud, Session, WholeCloud
+from stitch.system.threads import map_parts, parallel
+
+# Points seen at a grazing angle weigh little and edges less, but a place only they saw stays.
+_EDGE_WEIGHT = 0.05
+
+
+def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedCloud:
+    """Average all points of all views in cells of `cell` (default: the scans' spacing), in the reference frame.
+
+    Returns:
+        Points, normals, `residual` = rms distance of the views' surfaces from the fused one along
+        its normal (NaN where one view only), and the number of views per point.
+    """
+    return fuse_points(place_scans(capture.scans, poses), cell or capture.spacing)
+
+
+def point_weights(confidence: Array, usable: Array) -> Array:
+    """(N,) what points count by their cosine of incidence, and by whether they lie on a smooth surface."""
+    return np.asarray(confidence**2 * np.where(usable, 1.0, _EDGE_WEIGHT))
+
+
+def place_scans(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
+    """All points of all scans in the reference frame, one view after the other."""
+    placed = [_place_scan(scan, T, v) for v, (scan, T) in enumerate(zip(scans, poses, strict=True))]
+    return PlacedPoints(*(np.concatenate([getattr(p, f.name) for p in placed]) for f in fields(PlacedPoints)))
+
+
+def _place_scan(scan: Scan, T: Array, v: int) -> PlacedPoints:
+    points, normals = frames.transform(T, scan.points), frames.rotate(T, scan.normals)
+    weight = point_weights(scan.confidence, scan.usable)
+    return PlacedPoints(points, normals, weight, np.full(len(points), v), np.asarray(scan.usable, bool))
+
+
+def fuse_points(placed: PlacedPoints, size: float) -> FusedCloud:
+    """The same of placed points, in cells of `size`; the grid is the reference frame's own."""
+    return _fuse_voxels(_voxels(placed, cell_numbers(placed.points, size)))
+
+
+@dataclass(frozen=True)
+class _Voxels:
+    """What views show in cells of the grid, one row for a view in a cell; a view's rows stand in the order of cells."""
+
+    cell: Indices  # (G,)
+    weight: Array  # (G,)
+    points: Array  # (G, 3) weighted mean
+    normals: Array  # (G, 3) weighted mean, shorter than 1
+
+
+def _voxels(placed: PlacedPoints, cells: Indices) -> _Voxels:
+    """The voxels of points of any views, given the cell of each (N,)."""
+    different, at = number_groups(cells)
+    views = int(placed.view.max(initial=0)) + 1
+    keys, at = number_groups(at * views + placed.view)
+    weight: Array = np.asarray(np.bincount(at, placed.weight), float)
+    mean, normal = (
+        weighted_sums(at, placed.weight, values) / weight[:, None] for values in (placed.points, placed.normals)
+    )
+    return _Voxels(different[keys // views], weight, mean, normal)
+
+
+def _fuse_voxels(voxels: _Voxels) -> FusedCloud:
+    """The mean surface in every cell, in the order of cells, and how far those of the views lie from it."""
+    _, at = number_groups(voxels.cell)
+    weight = np.bincount(at, voxels.weight)
+    points = weighted_sums(at, voxels.weight, voxels.points) / weight[:, None]
+    normals = weighted_sums(at, voxels.weight, voxels.normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    offset = np.zeros(len(at))
+    # One axis after the other, as rows of three take several times the memory of what they come to.
+    for p, m, n in zip(voxels.points.T, points.T, normals.T, strict=True):
+        offset += (p - m[at]) * n[at]
+    count = np.bincount(at)
+    square = np.bincount(at, voxels.weight * offset**2)
+    residual = np.where(count > 1, np.sqrt(square / weight), np.nan)
+    return FusedCloud(points, normals, residual, count.astype(np.int32))
+
+
+# Fuse scans of which memory holds only some points: every point read once more, slab by slab of the part.
+#
+# The slabs end where cells of the grid end, so that what comes out does not depend on how many there are. A voxel takes
+# normal, edge and support from the nearest point in memory, whose surface was that of all points.
+
+# Points of a slab; as many slabs are at work as there are cores, at some 200 bytes a point.
+_SLAB = 1_250_000
+# A scan is read for so many slabs at once; points of slabs that are to come wait in memory, at 24 bytes a point.
+_AHEAD = 16
+# Effects of scanner and part move a point by less than this share of the view's size.
+_MAX_MOVE = 0.02
+# A voxel on the surface of the nearest point in memory lies within so many times the edge of the square that this one
+# has for itself: those in memory may stand in rows, as far apart as half of this.
+_WITHIN = 4.0
+# It lies off its plane by less than so many sigmas and this share of the distance, more where little is junk.
+_SIGMAS, _OFF_PLANE = 4.0, 0.15
+
+
+@dataclass(frozen=True)
+class RegisteredSession:
+    """A session under its model, with single views registered."""
+
+    session: Session
+    measurement: Measurement  # with the effects in use
+    model: Model
+    own: Capture  # without them
+    poses: Array  # (V, 4, 4) T_reference_scanner
+
+    @cached_property
+    def intensity_scale(self) -> tuple[float, float] | None:
+        """Mean and standard deviation by which the model's effects count intensities."""
+        return intensity_scale(self.session)
+
+
+def has_whole_clouds(session: Session) -> bool:
+    """True if memory holds only some of the points that were scanned."""
+    return any(view.cloud is not None and view.cloud.whole is not None for view in session.views)
+
+
+def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[FusedCloud, Unsupported]:
+    """Fuse all supported points that were scanned, those in memory and those in files; return what was dropped as well.
+
+    Args:
+        slab: points that are fused at a time; with more of them the result is held in files without a name.
+
+    Raises:
+        InputError: a scan is not what it was when it was read, or there is no room for the fused cloud.
+    """
+    own, poses = registered.own, registered.poses
+    cell = float(np.median([scan.scanned_spacing for scan in own.scans]))
+    whole = has_whole_clouds(registered.session)
+    # Points in memory may stand in rows: not their spacing says what place one has, but its surface.
+    place = float(np.sqrt(np.median([np.median(scan.area) for scan in own.scans]))) if whole else own.spacing
+    placed = place_scans(own.scans, poses)
+    support = find_support(own.scans, poses, placed, place)
+    if not whole:
+        dropped = Unsupported(len(support.kept), int(support.alone.sum()), int(support.looked_through.sum()))
+        return fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell), dropped
+    del placed  # of every view: memory is for the slabs
+    # One point in memory is looked up for a block of voxels, which is no larger than the place of such a point.
+    block = max(1, int(place / cell))
+    slabs = _cut_into_slabs(registered, cell, block, slab)
+    split = np.cumsum([len(scan.points) for scan in own.scans])[:-1]
+    parts = zip(np.split(support.alone, split), np.split(support.looked_through, split), support.junk, strict=True)
+    views = [_ViewInSlabs(registered, v, slabs, *part) for v, part in enumerate(parts)]
+    dropped = Unsupported()
+
+    def of_slab(number: int) -> tuple[FusedCloud | None, Unsupported]:
+        found, dropped = list[_Voxels](), Unsupported()
+        for view in views:
+            own, of_view = view.voxels(number)
+            found.append(own)
+            dropped += of_view
+        voxels = _Voxels(*(np.concatenate([getattr(f, field.name) for f in found]) for field in fields(_Voxels)))
+        found.clear()
+        return _fuse_voxels(voxels) if len(voxels.cell) else None, dropped
+
+    def clouds() -> Iterator[FusedCloud]:
+        nonlocal dropped
+        for cloud, of_one in parallel(of_slab, range(slabs.count), "fusing slabs"):
+            dropped += of_one
+            if cloud is not None:
+                yield cloud
+
+    cloud = next(clouds()) if slabs.count == 1 else FusedCloud(**map_parts(vars(cloud) for cloud in clouds()))
+    return cloud, dropped
+
+
+@dataclass(frozen=True)
+class _Slabs:
+    """Slabs of the grid of cells in the reference frame."""
+
+    cell: float  # edge of a cell
+    block: int  # cells along an edge of a block
+    axis: int  # across the slabs
+    ends: Array  # (S + 1,) number of the first cell of each, and of the one after the last
+
+    @property
+    def count(self) -> int:
+        """S."""
+        return len(self.ends) - 1
+
+    def of(self, coordinate: Array) -> Indices:
+        """(N,) numbers of the slabs in which coordinates along the axis lie."""
+        return np.searchsorted(self.ends, np.floor(coordinate / self.cell), side="right") - 1
+
+    def cells(self, columns: Iterable[Array]) -> list[Indices]:
+        """Numbers of the cells, a column for each of x, y, z."""
+        return [np.floor(column / self.cell).astype(np.int64) for column in columns]
+
+
+def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int, slab: int) -> _Slabs:
+    """Slabs of so many points across the part's longest axis, which end where blocks end."""
+    step = block * cell
+    own, poses = registered.own, registered.poses
+    shown = [frames.transform(T, scan.points) for scan, T in zip(own.scans, poses, strict=True)]
+    low, high = (f([f(p, axis=0) for p in shown], axis=0) for f in (np.min, np.max))
+    axis = int(np.argmax(high - low))
+    first = np.floor(low[axis] / step)
+    share = [1.0 if v.cloud is None else v.cloud.count / len(v.cloud.points) for v in registered.session.views]
+    length = int(np.floor(high[axis] / step) - first) + 1
+    along = np.zeros(length)
+    for points, per_point in zip(shown, share, strict=True):
+        along += per_point * np.bincount((np.floor(points[:, axis] / step) - first).astype(np.int64), minlength=length)
+    number = np.floor((np.cumsum(along) - along / 2) / slab)
+    ends = first + np.flatnonzero(np.diff(number) > 0) + 1
+    return _Slabs(cell, block, axis, np.array([-np.inf, *(block * ends), np.inf]))
+
+
+class _ViewInSlabs:
+    """One view, and what it shows in each slab; every slab is asked for once."""
+
+    def __init__(
+        self, registered: RegisteredSession, v: int, slabs: _Slabs, alone: Mask, through: Mask, junk: float
+    ) -> None:
+        """Take what slabs ask again and again.
+
+        Args:
+            slabs: the same for all views.
+            alone: points in memory on no surface.
+            through: those past which other views look.
+            junk: share of the points that stand alone.
+        """
+        self.registered, self.v, self.slabs = registered, v, slabs
+        self.scan, self.T = registered.own.scans[v], registered.poses[v]
+        cloud = registered.session.views[v].cloud
+        self.whole = None if cloud is None else cloud.whole
+        self.moves = moves_points(registered.model.terms)
+        self.kept, self.through = ~(alone | through), through
+        self.surface = np.flatnonzero(~alone) if not alone.all() else np.arange(len(alone))
+        some = len(self.surface) < len(alone)
+        self.tree = KDTree(self.scan.points[self.surface], leafsize=16) if some else self.scan.tree
+        self.off_plane = _OFF_PLANE * (1 + edge_credit(junk))
+        self.first, self.last, self.margin = 0, slabs.count - 1, slabs.cell
+        if self.whole is not None:
+            self.margin += _MAX_MOVE * float(np.ptp(self.whole.box, axis=0).max()) if self.moves else 0.0
+            height = frames.transform(self.T, box_corners(self.whole.box))[:, slabs.axis]
+            self.first, self.last = slabs.of(np.array([height.min() - self.margin, height.max() + self.margin]))
+        self.waiting: dict[int, list[Array]] = {}  # points of slabs to come
+        self.in_memory: PlacedPoints | None = None  # while there are some
+        self.lock = Lock()
+
+    def voxels(self, slab: int) -> tuple[_Voxels, Unsupported]:
+        """Voxels of a slab, and how many of its points support nothing."""
+        axis = self.slabs.axis
+        if self.whole is None:
+            every = _place_scan(self.scan, self.T, self.v)
+            inside = self.slabs.of(every.points[:, axis]) == slab
+            keep = inside & self.kept
+            dropped = Unsupported(
+                *(int(np.sum(m & inside)) for m in (inside, ~self.kept & ~self.through, self.through))
+            )
+            kept = every.take(keep)
+            return _voxels(kept, pack_cells(self.slabs.cells(kept.points.T), axis)), dropped
+        in_memory, placed = self._points_in(slab, self.whole)
+        cells = self.slabs.cells(placed)
+        if in_memory is None:
+            return _Voxels(cells[0], np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))), Unsupported()
+        different, at = number_groups(pack_cells(cells, axis))
+        count = np.bincount(at, minlength=len(different))
+        mean = np.stack([np.bincount(at, p, len(different)) for p in placed], axis=1) / count[:, None]
+        nearest = self._nearest(mean, count)
+        normal = in_memory.normals[nearest]
+        away = mean - in_memory.points[nearest]
+        far, off = np.einsum("ij,ij->i", away, away), np.abs(np.einsum("ij,ij->i", away, normal))
+        del away
+        alone = far > _WITHIN**2 * self.scan.area[nearest]
+        alone |= self.scan.usable[nearest] & (off > _SIGMAS * self.scan.noise + self.off_plane * np.sqrt(far))
+        through = self.through[nearest] & ~alone
+        keep = ~(alone | through)
+        weight = (count * in_memory.weight[nearest])[keep]
+        found = _Voxels(different[keep], weight, mean[keep], normal[keep])
+        return found, Unsupported(len(at), int(count[alone].sum()), int(count[through].sum()))
+
+    def _points_in(self, slab: int, whole: WholeCloud) -> tuple[PlacedPoints | None, list[Array]]:
+        """The view's points in memory, None beside an empty slab, and columns x, y, z of all points of the slab.
+
+        Both in the reference frame, and without the effects.
+        """
+        if not self.first <= slab <= self.last:
+            return None, [np.zeros(0)] * 3
+        with self.lock:
+            if slab not in self.waiting:
+                start = slab - (slab - self.first) % _AHEAD
+                self.waiting |= self._cut(whole, start, min(start + _AHEAD, self.last + 1))
+                self.in_memory = _place_scan(self.scan, self.T, self.v)
+            columns, in_memory = self.waiting.pop(slab), self.in_memory
+            if not self.waiting:
+                self.in_memory = None  # of hundreds of views they are half a gigabyte
+        return in_memory if len(columns[0]) else None, columns
+
+    def _cut(self, whole: WholeCloud, start: int, stop: int) -> dict[int, list[Array]]:
+        """The same of slabs from `start` up to `stop`, by their numbers."""
+        every = whole.read()
+        height = _along(self.T, every.points, self.slabs.axis)
+        low, high = self.slabs.cell * self.slabs.ends[[start, stop]]
+        near = np.flatnonzero((height >= low - self.margin) & (height < high + self.margin))
+        points = self._corrected(every, near) if self.moves else every.points[near]
+        columns = [_along(self.T, points, i) for i in range(3)]
+        # Numbers of 16 bits are sorted in a fifth of the time.
+        slab = self.slabs.of(columns[self.slabs.axis]).astype(np.int16)
+        order = np.argsort(slab, kind="stable")
+        ends = np.searchsorted(slab[order], np.arange(start, stop + 1))
+        return {k: [c[order[a:b]] for c in columns] for k, (a, b) in enumerate(pairwise(ends), start)}
+
+    def _corrected(self, every: Cloud, index: Indices) -> Array:
+        """Some of the points, scanner frame, without the effects in use."""
+        blocks = np.array_split(index, len(index) // _SLAB + 1)
+        return np.concatenate(
+            [_corrected_points(self.registered, self.v, every.points[b], every.scalars, b) for b in blocks]
+        )
+
+    def _nearest(self, mean: Array, count: Indices) -> Indices:
+        """(G,) the point in memory that is nearest to the block in which a voxel lies."""
+        cells = [c // self.slabs.block for c in self.slabs.cells(mean.T)]
+        different, at = number_groups(pack_cells(cells, self.slabs.axis))
+        middle = weighted_sums(at, count.astype(float), mean) / np.bincount(at, count, len(different))[:, None]
+        _, index = self.tree.query(frames.transform(frames.inverse(self.T), middle), k=1)
+        return np.asarray(self.surface[index][at])
+
+
+def _along(T: Array, points: Array, axis: int) -> Array:
+    """(N,) one coordinate of points (N, 3) under T."""
+    # A product of matrices this narrow takes ten times as long.
+    (x, y, z), (a, b, c, t) = points.T, T[axis]
+    return np.asarray(x * a + y * b + z * c + t)
+
+
+def _corrected_points(
+    registered: RegisteredSession, v: int, points: Array, scalars: dict[str, Array], index: Indices
+) -> Array:
+    """Points (N, 3) of view v, scanner frame, without the effects in use."""
+    scan, terms = registered.measurement.capture.scans[v], registered.model.terms
+    _, nearest = scan.tree.query(points, k=1)
+    cosine = np.abs(np.einsum("ij,ij->i", scan.normals[nearest], scan.rays(points)))
+    scale = registered.intensity_scale
+    view = replace(
+        registered.measurement.scan_views[v],
+        cosine=np.maximum(cosine, MIN_COSINE),
+        intensity=None if scale is None else (scalars["intensity"][index] - scale[0]) / scale[1],
+    )
+    return points + point_correction(terms, points, view, registered.own.poses(registered.model.T_mount)[v])

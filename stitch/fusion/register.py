@@ -1,0 +1,241 @@
+"""Register what the hand-eye cannot explain: all views at once, each held by the robot's pose.
+
+Two methods weigh the correspondences (`METHODS`): `dpwvm`, the weighted variance of the distances (`dpwvm_weights`),
+and `gicp`, plane to plane inside Tukey's biweight (`plane_weights`). The cost is the weighted mean of Var(d) +
+λ·mean(d)² with λ = 1: an offset common to all points of a pair is the very step that stitching has to close. Under
+`dpwvm` λ is 0 for a view that shows an offset of its own, as stock on a casting.
+
+Solving all views together leaves no drift around a loop. The prior is each view's pose from the robot, with the
+scatter that the overlaps themselves show (REML).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.fusion.correspondence_weights import OffsetSums, dpwvm_weights, plane_weights, with_offsets
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.observations.surfaces.hand_eye_fit import Repeatability
+from stitch.observations.surfaces.matching import Match, sample_points
+from stitch.observations.surfaces.normal_equations import (
+    FINE_SAMPLES,
+    NEAR_NULL,
+    Gram,
+    Overlaps,
+    append_targets,
+    assemble,
+    collect_overlaps,
+    gram,
+    next_gate,
+)
+from stitch.observations.surfaces.view_poses import LastStep, has_converged, take_step
+from stitch.observations.targets.rows import TargetRows
+from stitch.recorder import Recorder, SilentRecorder
+from stitch.session.capture import Capture
+
+# Each view moved by its own most likely error, where its labelled points show one.
+
+
+def register_targets(rows: TargetRows, variances: Array, poses: Array) -> tuple[Array, Array]:
+    """Poses (V, 4, 4) moved by each view's most likely error, and what is left of its targets, (V, S).
+
+    The most likely twist of a view is C·leverᵀ·V⁻¹·(−left) (best linear unbiased prediction, Robinson 1991).
+    """
+    V = len(rows.lever)
+    to_centre = frames.make(np.eye(3), -rows.centre)
+    carried = frames.adjoint(to_centre @ rows.capture.T_reference_flange)
+    scatter = carried * np.repeat(variances[:2], 3) @ carried.transpose(0, 2, 1)
+    covariance = rows.mixed_model(rows.hand_eye).covariance(variances)[:V]
+    pushed = np.linalg.solve(covariance, -rows.residual[:V, :, None])
+    twist = (scatter @ rows.lever.transpose(0, 2, 1) @ pushed)[..., 0]
+    moved = frames.moved_about(rows.centre, twist, poses)
+    left = rows.residual.copy()
+    left[:V] += np.einsum("vmi,vi->vm", rows.lever, twist)
+    return moved, rows.distances(left)
+
+
+_MAXIMUM_ITERATIONS = 25
+_CONVERGED = 5e-3
+# Iterations in a row in which neither the rms nor the step may fall by this share, at a gate that stands still.
+_PATIENCE, _FALLS = 3, 1e-3
+# Weights (M,) per match, from the matches, their capture and T_reference_scanner (V, 4, 4).
+CorrespondenceWeights = Callable[[Sequence[Match], Capture, Array], Sequence[Array]]
+
+
+@dataclass(frozen=True)
+class Method:
+    """What correspondences count, and whether an offset that a view's whole surface shows costs nothing."""
+
+    name: str
+    weigh: CorrespondenceWeights
+    offsets: bool = False
+
+
+DPWVM = Method("dpwvm", dpwvm_weights, offsets=True)
+GICP = Method("gicp", plane_weights)
+METHODS = {method.name: method for method in (DPWVM, GICP)}
+DEFAULT = DPWVM.name
+
+
+def method_named(name: str) -> Method:
+    """Return the method of `--register`.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    if name not in METHODS:
+        raise InputError(f"--register {name}: no method has this name; to fix: {' or '.join(METHODS)}")
+    return METHODS[name]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Poses after the fit; how far they are from the model's is the robot's own error."""
+
+    poses: Array  # (V, 4, 4) T_reference_scanner
+    overlaps: Overlaps
+    history: tuple[float, ...]
+    note: str = ""  # why it ended before the views stood still
+    offsets: dict[int, float] = field(default_factory=dict)  # by which whole surfaces of views stand off, outwards
+
+
+def unseen_moves(found: Registration, model_poses: Array) -> Array:
+    """Return (V,) how far register moved each view along its surfaces, where no overlap shows it; length_unit.
+
+    A ball turns and a cylinder slides on itself: such moves come from the noise and from the prior.
+    """
+    g = found.overlaps.gram
+    blocks, factors = np.zeros((g.views, 6, 6)), g.displacement_factors
+    for side in g.pairs.T:
+        np.add.at(blocks, side, g.matrix / np.outer(factors, factors))
+    values, vectors = np.linalg.eigh(blocks)
+    to_centre = frames.make(np.eye(3), -g.centre)
+    moved = frames.log(to_centre @ found.poses @ frames.inverse(model_poses) @ frames.inverse(to_centre)) * factors
+    along = np.einsum("vik,vi->vk", vectors, moved - moved.mean(axis=0))
+    return np.asarray(np.linalg.norm(along * (values < NEAR_NULL * values[:, -1:]), axis=1))
+
+
+def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> Array:
+    """(V, 6, 6) inverse covariance of the views' twists about `centre`."""
+    carried = frames.adjoint(frames.make(np.eye(3), -centre) @ capture.T_reference_flange)
+    sigma = np.diag([scatter.rotation**2] * 3 + [scatter.translation**2] * 3)
+    return np.asarray(np.linalg.inv(carried @ sigma @ carried.transpose(0, 2, 1)))
+
+
+def register(
+    capture: Capture,
+    model_poses: Array,
+    scatter: Repeatability,
+    gate: float,
+    recorder: Recorder | None = None,
+    start: Array | None = None,
+    method: Method = METHODS[DEFAULT],
+    before: Overlaps | None = None,
+) -> Registration:
+    """Move every view by its own twist until the overlaps agree, or until neither rms nor step falls any more.
+
+    Args:
+        model_poses: T_reference_scanner (V, 4, 4) of robot and hand-eye.
+        scatter: prior of the flange poses and the factor on the overlap noise.
+        gate: first distance between partners, length_unit.
+        start: (V, 4, 4) poses to begin with, if a better guess than the model's is at hand.
+        method: what every correspondence counts.
+        before: of the same points at poses near by: what cannot have changed is not searched again.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    recorder = recorder or SilentRecorder()
+    picked = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
+    poses, history = np.array(model_poses if start is None else _without_mean_motion(start, model_poses)), list[float]()
+    overlaps = collect_overlaps(capture, poses, gate, picked, before)
+    last: LastStep = None
+    progress = _Progress()
+    for index in range(_MAXIMUM_ITERATIONS):
+        g = overlaps.gram
+        history.append(g.rms)
+        recorder.iteration("register", index, poses, g.rms, gate)
+        equations = normal_equations(overlaps, capture, poses, model_poses, scatter=scatter, method=method)
+        step = equations.step
+        tighter = min(gate, next_gate(overlaps, capture))
+        if has_converged(g, step, _CONVERGED) and tighter > 0.9 * gate:
+            return Registration(poses, overlaps, tuple(history), offsets=equations.offsets)
+        if progress.made(g, step, gate):
+            best = Registration(poses, overlaps, (), offsets=equations.offsets)
+        elif progress.stalled >= _PATIENCE:
+            break
+        poses, last = take_step(poses, g, step, last)
+        gate = tighter
+        overlaps = collect_overlaps(capture, poses, gate, picked, overlaps)
+    return replace(best, history=tuple(history), note=progress.note(len(history)))
+
+
+class _Progress:
+    """Whether the rms or the step still falls, and for how many iterations neither has."""
+
+    def __init__(self) -> None:
+        self.rms = self.step = self.gate = np.inf
+        self.stalled = 0
+
+    def made(self, g: Gram, step: Array, gate: float) -> bool:
+        """Return True if one of both fell below all before; under a tighter gate they begin anew."""
+        size = float(np.sqrt(np.mean(step[:, 3:] ** 2)))
+        if gate < 0.9 * self.gate:
+            self.rms, self.step, self.gate = np.inf, np.inf, gate
+        falls = g.rms < (1 - _FALLS) * self.rms or size < (1 - _FALLS) * self.step
+        self.rms, self.step = min(self.rms, g.rms), min(self.step, size)
+        self.stalled = 0 if falls else self.stalled + 1
+        return falls
+
+    def note(self, iterations: int) -> str:
+        """Return one sentence on why register ended and where."""
+        kept = iterations - self.stalled
+        if self.stalled >= _PATIENCE:
+            return (
+                f"stopped after {iterations} iterations, since neither rms nor step fell any further; "
+                f"the poses of iteration {kept} are kept"
+            )
+        return f"did not come to rest in {iterations} iterations; the poses of iteration {kept} are kept"
+
+
+def _without_mean_motion(start: Array, model_poses: Array) -> Array:
+    """`start` without its mean motion against the robot, which no overlap can show."""
+    common = frames.log(start @ frames.inverse(model_poses)).mean(axis=0)
+    return np.asarray(frames.exp(-common) @ start)
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Of data and prior, for twists of all views about the centre; the inverse of H is their covariance."""
+
+    H: Array  # (6V, 6V)
+    b: Array  # (6V,)
+    offsets: dict[int, float] = field(default_factory=dict)  # that views show, eliminated
+
+    @property
+    def step(self) -> Array:
+        """(V, 6) of Gauss and Newton."""
+        return np.asarray(np.linalg.solve(self.H, -self.b).reshape(-1, 6))
+
+
+def normal_equations(
+    overlaps: Overlaps, capture: Capture, poses: Array, model_poses: Array, *, scatter: Repeatability, method: Method
+) -> NormalEquations:
+    """Return what the overlaps say under a method's weights, and the robot's prior."""
+    old, weights = overlaps.gram, method.weigh(overlaps.matches, capture, poses)
+    surfaces = gram(overlaps.matches, old.views, old.centre, old.scale, weights)
+    sums = OffsetSums(surfaces, overlaps.matches, weights) if method.offsets else None
+    if sums is not None:
+        surfaces = replace(surfaces, square=sums.square)
+    g = append_targets(surfaces, overlaps.targets, capture.noise_factor)
+    variance, prior = g.variance * scatter.noise_factor, prior_precision(capture, scatter, g.centre)
+    to_centre = frames.make(np.eye(3), -g.centre)
+    off = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))
+    H, b = assemble(g)
+    H, b = H / variance, b / variance + np.einsum("vij,vj->vi", prior, off).reshape(-1)
+    for v, precision in enumerate(prior):
+        H[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += precision
+    return NormalEquations(H, b) if sums is None else NormalEquations(*with_offsets(H, b, sums, variance, old.scale))

@@ -1,0 +1,310 @@
+"""Which points of the scans are surface: others hold them, in their view or in all, and no view looks past.
+
+A point is *settled* where another view shows the same surface in the same cell. The rest is asked one by one: do its
+neighbours in its own view lie on a surface through it; if not, do those of all views. What is left may be a body that
+stands in the way of some views: others look past it, and it hangs together with nothing that two views show.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from pykdtree.kdtree import KDTree
+
+from stitch.fusion.look_through import range_images
+from stitch.numerics.distributions import MAD_TO_SIGMA
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.session.scan import Scan
+from stitch.system.threads import parallel
+
+# Height of a point over no surface, in any unit.
+_NONE = 1e100
+# Bits for a coordinate of a cell: three of them are one integer.
+_BITS = 21
+# Neighbours that are asked, and how many have to lie on one surface; a neighbour on an edge counts half.
+_NEIGHBOURS, _LEAST, _EDGE_VOTE = 8, 3.0, 0.5
+# Normals of one surface, as cosines to their mean.
+_ALIKE = 0.6
+# Sigmas across the surface within which a point lies on it.
+_SIGMAS = 4.0
+# A point that has so many times the solid angle of others for itself stands alone. On an edge it is twice, in a corner
+# four times.
+_ALONE = 6.0
+_EDGE_ALONE = 3.0
+# Noise and spacing of a view are believed up to so many times the median over the views.
+_OF_OTHERS = 2.0
+# Neighbours scatter about one surface by less than this share of their distance.
+_FLAT = 0.2
+# The centroid of neighbours all around lies within this share of the distance; beyond, the surface ends. There a point
+# may lie off the plane of the others, by up to the second share.
+_AROUND, _ROUNDED = 0.2, 0.3
+# Share of points alone in a view at which an edge gets no more than the least credit: one point beside an edge is then
+# as likely to be junk as surface. A tenth of it, and it gets that much more.
+_JUNK, _LEAST_CREDIT = 0.1, 0.1
+# Neighbours in all views lie within so many cells.
+_NEAR = 1.5
+# A view looks past a point if what it saw lies so many cells behind.
+_MARGIN = 3.0
+# Views that have to look past a point on a smooth surface; on an edge, one.
+_PAST = 2
+# Parts hang together over gaps of so many cells; at most so many such steps make the largest side.
+_GAP, _STEPS = 4.0, 128
+# A body is no part of what was scanned if so few of its points are seen twice, and so many, more than five, are looked
+# past: of surfaces that one view alone saw, views look past next to none, where scans hold a third of junk too.
+_SEEN_TWICE, _CONTRADICTED, _WITNESSES = 0.05, 0.05, 5
+
+
+@dataclass(frozen=True)
+class PlacedPoints:
+    """Points of registered views in the reference frame."""
+
+    points: Array  # (N, 3)
+    normals: Array  # (N, 3)
+    weight: Array  # (N,)
+    view: Indices  # (N,)
+    usable: Mask  # (N,): on a smooth surface
+
+    def take(self, keep: Mask) -> "PlacedPoints":
+        """Some of them."""
+        return PlacedPoints(*(getattr(self, f.name).compress(keep, axis=0) for f in fields(PlacedPoints)))
+
+
+@dataclass(frozen=True)
+class Support:
+    """Per point of all views, one after the other."""
+
+    alone: Mask  # no surface goes through it
+    looked_through: Mask  # it is on one, and other views look past it
+    junk: Array  # (V,) share of points that stand alone
+
+    @property
+    def kept(self) -> Mask:
+        """What is surface."""
+        return np.asarray(~(self.alone | self.looked_through))
+
+
+def find_support(scans: Sequence[Scan], poses: Array, placed: PlacedPoints, cell: float) -> Support:
+    """Return which points of the views are supported.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner.
+        placed: the points of the scans by these poses, one view after the other.
+        cell: edge of the cells in which views meet, length_unit.
+    """
+    settled, scatter = _points_on_surface(placed, cell)
+    parts = np.split(settled, np.cumsum([len(scan.points) for scan in scans])[:-1])
+    # What a view full of junk says of itself is not believed beyond what the others say of the same scanner.
+    noise = _limited([scan.noise for scan in scans])
+    angles = _limited([scan.solid_angle for scan in scans])
+    tests = list(parallel(lambda item: _held_by_own_view(*item), zip(scans, parts, noise, angles, strict=True)))
+    held = np.concatenate([test[0] for test in tests])
+    junk = np.array([test[1] for test in tests])
+    held |= _held_by_all_views(placed, held, scatter, cell)
+    through = np.zeros(len(held), bool)
+    asked = np.flatnonzero(held & ~settled)
+    if len(asked) and len(scans) > 1:
+        through[asked] = _looked_through(scans, poses, placed, held, settled, asked, cell)
+    return Support(~held, through, junk)
+
+
+def cell_numbers(points: Array, size: float) -> Indices:
+    """(N,) a number for the cell of each point (N, 3) in the grid about the frame's origin."""
+    return pack_cells([np.floor(column / size).astype(np.int64) for column in points.T], 0)
+
+
+def pack_cells(cells: Sequence[Indices], axis: int) -> Indices:
+    """(N,) one number for three of a cell, a million to either side of the origin, in the order along `axis`."""
+    first, second, third = (cells[i] + (1 << _BITS - 1) for i in (axis, *(i for i in range(3) if i != axis)))
+    return np.asarray((first << 2 * _BITS) | (second << _BITS) | third)
+
+
+def number_groups(key: Indices) -> tuple[Indices, Indices]:
+    """The different keys in their order (G,), and the number of its own for each (N,)."""
+    # np.unique does the same in six times the time: keys of a scan come in runs, which a stable sort merges.
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    new = np.ones(len(key), bool)
+    new[1:] = ordered[1:] != ordered[:-1]
+    different = ordered[new]
+    del ordered
+    number = np.cumsum(new)
+    number -= 1
+    at = np.empty(len(key), np.int64)
+    at[order] = number
+    return different, at
+
+
+def weighted_sums(group: Indices, weight: Array, values: Array) -> Array:
+    """(G, k) weighted sums of values (N, k) over the groups (N,) of their rows."""
+    return np.stack([np.bincount(group, weight * column) for column in values.T], axis=1)
+
+
+def edge_credit(junk: float) -> float:
+    """How far an edge is believed where such a share of a view stands alone: the decimal logarithm of the odds."""
+    return float(max(np.log10(_JUNK / max(junk, 1e-9)), _LEAST_CREDIT))
+
+
+def _points_on_surface(placed: PlacedPoints, cell: float) -> tuple[Mask, float]:
+    """Points in whose cell another view shows the same surface (N,), and the scatter of views across it."""
+    views = int(placed.view.max()) + 1
+    _, at = number_groups(cell_numbers(placed.points, cell))
+    weight = np.bincount(at, placed.weight)
+    mean, normal = (weighted_sums(at, placed.weight, values) for values in (placed.points, placed.normals))
+    mean /= weight[:, None]
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    off, cosine = np.zeros(len(at)), np.zeros(len(at))
+    # One axis after the other: of hundreds of views, rows of three are hundreds of megabytes.
+    for p, n, m, across in zip(placed.points.T, placed.normals.T, mean.T, normal.T, strict=True):
+        own = across[at]
+        off += (p - m[at]) * own
+        cosine += n * own
+    off, alike = np.abs(off), cosine > _ALIKE
+    del cosine, mean, normal
+    groups, group = number_groups(at * views + placed.view)
+    seen = np.bincount(groups // views, minlength=len(weight))
+    several = placed.usable & (seen > 1)[at]
+    scatter = MAD_TO_SIGMA * float(np.median(off[several])) if several.any() else 0.0
+    near = off < _SIGMAS * scatter
+    shows = np.bincount(group, placed.usable & near & alike, len(groups)) > 0
+    others = np.bincount(groups // views, shows, len(weight))[at] - shows[group]
+    return near & (others >= np.where(placed.usable, 1, 2)), scatter
+
+
+def _limited(values: Sequence[float]) -> Array:
+    """(V,) values of one scanner's views, none beyond twice their median."""
+    return np.minimum(values, _OF_OTHERS * float(np.median(values)))
+
+
+def _held_by_own_view(scan: Scan, settled: Mask, noise: float, angle_each: float) -> tuple[Mask, float]:
+    """Points (N,) of a scan that are settled or lie on a surface of their neighbours, and the share that is alone.
+
+    Args:
+        noise: of the scan across a surface, length_unit.
+        angle_each: solid angle that a point on a smooth surface has for itself.
+    """
+    held, asked = np.ones(len(scan.points), bool), np.flatnonzero(~settled)
+    if not len(asked) or len(scan.points) <= _NEIGHBOURS:
+        return held, 0.0
+    distance, index = scan.tree.query(scan.points[asked], k=_NEIGHBOURS + 1)
+    index, radius = index[:, 1:], distance[:, -1]
+    angle = radius**2 * np.pi / (_NEIGHBOURS + 1) * np.maximum(scan.confidence[asked], 0.1)
+    angle /= np.einsum("ij,ij->i", scan.points[asked] - scan.eye, scan.points[asked] - scan.eye)
+    share = angle / angle_each
+    alone = share > _ALONE
+    junk = float(alone.sum()) / len(scan.points)
+    credit = edge_credit(junk)
+    vote = np.where(scan.usable[index], 1.0, _EDGE_VOTE)
+    around = scan.points.take(index, axis=0) - scan.points.take(asked, axis=0)[:, None]
+    centroid, normals = around.mean(axis=1), scan.normals.take(index, axis=0)
+    # What the first round throws out supports nothing in the second.
+    for _ in range(2):
+        local = _LocalSurface(around, normals, vote * held[index])
+        aside = np.linalg.norm(centroid - np.einsum("ij,ij->i", centroid, local.normal)[:, None] * local.normal, axis=1)
+        rounded = np.minimum(credit * np.maximum(aside - _AROUND * radius, 0), _ROUNDED * radius)
+        within = _SIGMAS * noise + local.bend * radius / 2 + np.where(share < _EDGE_ALONE, rounded, 0.0)
+        flat = local.scatter < _FLAT * (1 + credit / 2) * radius
+        held[asked] &= ~alone & (local.votes >= _LEAST) & flat & (np.abs(local.height) < within)
+    return held, junk
+
+
+class _LocalSurface:
+    """The surface that k neighbours of N points span: votes, mean normal, height over the points, scatter, bend."""
+
+    def __init__(self, around: Array, normals: Array, vote: Array) -> None:
+        self.normal = np.einsum("nk,nki->ni", vote, normals)
+        self.normal /= np.maximum(np.linalg.norm(self.normal, axis=1, keepdims=True), 1e-12)
+        cosine = np.einsum("nki,ni->nk", normals, self.normal)
+        counts = (vote > 0) & (cosine > _ALIKE)
+        self.votes = (vote * counts).sum(axis=1)
+        # On a ball the mean of both normals is exact, as in symmetric ICP (Rusinkiewicz 2019).
+        heights = np.einsum("nki,nki->nk", normals + self.normal[:, None], around) / 2
+        self.height = _masked_median(heights, counts)
+        self.scatter = MAD_TO_SIGMA * _masked_median(np.abs(heights - self.height[:, None]), counts)
+        self.bend = np.sqrt(np.maximum(2 * (1 - _masked_median(cosine, counts)), 0))
+
+
+def _masked_median(values: Array, counts: Mask) -> Array:
+    """(N,) lower median of those values (N, k) that count; a large number where none does."""
+    ordered = np.sort(np.where(counts, values, _NONE), axis=1)
+    middle = np.maximum(counts.sum(axis=1) - 1, 0) // 2
+    return np.asarray(np.take_along_axis(ordered, middle[:, None], axis=1)[:, 0])
+
+
+def _held_by_all_views(placed: PlacedPoints, held: Mask, scatter: float, cell: float) -> Mask:
+    """Points (N,) that lie on a surface of the held points of all views, though not on one of their own view."""
+    found, asked = np.zeros_like(held), np.flatnonzero(~held)
+    base = np.flatnonzero(held)
+    if not len(asked) or len(base) < _NEIGHBOURS:
+        return found
+    tree = KDTree(np.ascontiguousarray(placed.points[base]), leafsize=16)
+    distance, index = tree.query(placed.points[asked], k=_NEIGHBOURS, distance_upper_bound=_NEAR * cell)
+    near = np.isfinite(distance[:, -1])
+    asked, index, radius = asked[near], base[index[near]], distance[near, -1]
+    around = placed.points.take(index, axis=0) - placed.points[asked][:, None]
+    local = _LocalSurface(around, placed.normals.take(index, axis=0), np.ones(index.shape))
+    within = _SIGMAS * scatter + local.bend * radius / 2
+    found[asked] = (local.votes > _NEIGHBOURS / 2 - 1) & (np.abs(local.height) < within)
+    return found
+
+
+def _looked_through(
+    scans: Sequence[Scan],
+    poses: Array,
+    placed: PlacedPoints,
+    held: Mask,
+    settled: Mask,
+    asked: Indices,
+    cell: float,
+) -> Mask:
+    """(A,) of the points `asked` those past which views look, alone or as a body that hangs together with nothing."""
+    kept = np.split(held, np.cumsum([len(scan.points) for scan in scans])[:-1])
+    if not all(keep.any() for keep in kept):
+        return np.zeros(len(asked), bool)
+    images = range_images(scans, kept, cell)
+    points, normals, own = placed.points[asked], placed.normals[asked], placed.view[asked]
+    centres, radii = _balls_around(points, own, len(scans))
+    columns = np.ascontiguousarray(points.T)
+
+    def by_view(v: int) -> tuple[Indices, Indices]:
+        concerned = images.may_concern(scans[v], poses[v], centres, radii)
+        concerned[v] = False
+        near = np.flatnonzero(concerned[own])
+        return near, images.views_through(scans[v], poses[v], v, columns[:, near], normals[near], _MARGIN * cell)
+
+    past, missed = np.zeros(len(asked), np.int64), np.zeros(len(asked), np.int64)
+    for near, found in parallel(by_view, range(len(scans))):
+        past[near] += found == 1
+        missed[near] += found == 2
+    through = past >= np.where(placed.usable[asked], _PAST, 1)
+    contradicted = np.zeros(len(held), bool)
+    contradicted[asked] = past + missed > 0
+    loose = np.zeros(len(held), bool)
+    ends = np.cumsum([0, *(len(scan.points) for scan in scans)])
+    for v in np.flatnonzero(np.bincount(own[contradicted[asked]]) > _WITNESSES):
+        # What stands in the way of one view may stand near what others show.
+        every = ends[v] + np.flatnonzero(kept[v])
+        loose[every] = _in_loose_body(placed.points[every], settled[every], contradicted[every], cell)
+    return np.asarray(through | loose[asked])
+
+
+def _balls_around(points: Array, view: Indices, views: int) -> tuple[Array, Array]:
+    """Centres (V, 3) and radii (V,) of balls around each view's points."""
+    count = np.maximum(np.bincount(view, minlength=views), 1)
+    centres = np.stack([np.bincount(view, column, views) for column in points.T], axis=1) / count[:, None]
+    radii = np.zeros(views)
+    np.maximum.at(radii, view, np.linalg.norm(points - centres[view], axis=1))
+    return centres, radii
+
+
+def _in_loose_body(points: Array, settled: Mask, contradicted: Mask, cell: float) -> Mask:
+    """(N,) points of a view in bodies that hang together with nothing that is seen twice, and past which views look."""
+    from scipy.ndimage import label
+
+    step = max(_GAP * cell, *(float(np.ptp(column)) / _STEPS for column in points.T))
+    at = tuple(((column - column.min()) / step).astype(np.int32) for column in points.T)
+    grid = np.zeros([int(i.max()) + 1 for i in at], bool)
+    grid[at] = True
+    body = label(grid, np.ones((3, 3, 3)))[0][at]
+    size = np.bincount(body)
+    twice, against = (np.bincount(body, mask, len(size)) for mask in (settled, contradicted))
+    return np.asarray(((twice < _SEEN_TWICE * size) & (against > np.maximum(_CONTRADICTED * size, _WITNESSES)))[body])

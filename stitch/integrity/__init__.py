@@ -1,1 +1,0 @@
-"""Whether a session can be trusted: linkage of views, data snooping, pairing of rows, conventions of poses."""

@@ -1,0 +1,68 @@
+"""Tails of distributions, and where they begin: `scipy.stats` has them too, and takes a second to load.
+
+All are upper tails: P(X > x), and the x beyond which the share p lies.
+"""
+
+import numpy as np
+from scipy import special
+
+from stitch.numerics.frames import Array
+
+# Robust scale and weights of residuals.
+
+MAD_TO_SIGMA = 1.4826
+# Tukey's biweight at 4.685 σ keeps 95 % efficiency for normal errors (Holland & Welsch 1977).
+_TUKEY = 4.685
+
+
+def mad_sigma(e: Array) -> float:
+    """Robust sigma 1.4826 × median |e| of residuals (N,) that are symmetric about zero."""
+    return MAD_TO_SIGMA * float(np.median(np.abs(e)))
+
+
+def nan_median(values: Array) -> Array:
+    """(n,) medians over the first axis of values (m, n) without their NaN; NaN where there is nothing else."""
+    known, ordered, column = np.isfinite(values).sum(axis=0), np.sort(values, axis=0), np.arange(values.shape[1])
+    low, high = np.maximum(known - 1, 0) // 2, np.minimum(known // 2, len(values) - 1)
+    return np.asarray((ordered[low, column] + ordered[high, column]) / 2)
+
+
+def tukey(e: Array, scale: float) -> Array:
+    """Biweight of residuals at a robust sigma."""
+    return np.asarray(np.clip(1 - (e / (_TUKEY * scale)) ** 2, 0, None) ** 2)
+
+
+def chi2_tail(x: float, degrees: float) -> float:
+    """P(χ²_degrees > x)."""
+    return float(special.chdtrc(degrees, x))
+
+
+def chi2_limit(p: float, degrees: float) -> float:
+    """The χ² that a share p exceeds."""
+    return float(special.chdtri(degrees, p))
+
+
+def normal_tail(x: float) -> float:
+    """P(N(0, 1) > x)."""
+    return float(special.ndtr(-x))
+
+
+def binomial_tail(x: int, count: int, share: float) -> float:
+    """P(X > x) of so many trials with a chance each."""
+    return float(special.bdtrc(x, count, share))
+
+
+def f_tail(x: float, numerator: float, denominator: float) -> float:
+    """P(F > x) with degrees of freedom of numerator and denominator."""
+    return float(special.fdtrc(numerator, denominator, x))
+
+
+def f_limit(p: float, numerator: float, denominator: float) -> float:
+    """The F that a share p exceeds, exact for tiny p too: by the beta distribution of d₂/(d₂ + d₁ F)."""
+    share = special.betaincinv(denominator / 2, numerator / 2, p)
+    return float(denominator * (1 - share) / (numerator * share))
+
+
+def noncentral_f_tail(x: float, numerator: float, denominator: float, shift: float) -> float:
+    """P(F > x) of the noncentral F distribution with noncentrality `shift`."""
+    return float(1 - special.ncfdtr(numerator, denominator, shift, x))

@@ -1,0 +1,176 @@
+"""The rigid motion between two sets of points: of partners in closed form; of surfaces from their shape alone.
+
+Surfaces need no first guess: fast point feature histograms (FPFH; Rusu, Blodow & Beetz 2009) say how the surface bends
+around each point, whatever the frame. Points whose histograms are each other's nearest are tentative partners; triples
+of partners propose motions, the one that the partners agree with best wins (RANSAC), and ICP refines it. Draws are
+seeded and each sum has one order, so the same surfaces give the same motion, bit for bit.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pykdtree.kdtree import KDTree
+
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+
+_BINS = 11
+_NEIGHBOURS = 100
+_MIN_SAMPLE = 3
+# Edges of a triple that differ by more than a tenth between the surfaces are no rigid copy.
+_EDGE_RATIO = 0.9
+_ICP_STEPS = 30
+# Motions judged at once: bounds the memory.
+_BLOCK = 200
+
+
+def align_points(points: Array, targets: Array, weights: Array | None = None) -> Array:
+    """(..., 4, 4) the rigid motions that bring points (..., N, 3) closest to their targets (..., N, 3).
+
+    Least squares, by singular values (Arun, Huang & Blostein 1987).
+
+    Args:
+        weights: (N,) on the squares of each; all count alike unless stated.
+    """
+    share = np.full(points.shape[-2], 1.0) if weights is None else weights
+    share = (share / share.sum())[:, None]
+    middle, there = ((share * x).sum(axis=-2) for x in (points, targets))
+    across = np.swapaxes(share * (targets - there[..., None, :]), -1, -2) @ (points - middle[..., None, :])
+    R = frames.nearest_rotation(across)
+    return frames.make(R, there - (R @ middle[..., None])[..., 0])
+
+
+@dataclass(frozen=True)
+class FeaturedSurface:
+    """A surface of N points with the histograms that tell its points apart."""
+
+    points: Array  # (N, 3)
+    normals: Array  # (N, 3) unit
+    histograms: Array  # (N, 33)
+    tree: Any  # pykdtree KDTree over `points`
+
+
+def voxel_downsample(points: Array, normals: Array, size: float) -> tuple[Array, Array]:
+    """Mean point (M, 3) and unit mean normal (M, 3) of every voxel of edge `size` that holds points."""
+    _, voxel = np.unique(np.floor((points - points.min(axis=0)) / size).astype(int), axis=0, return_inverse=True)
+    voxel = voxel.ravel()
+    count = np.bincount(voxel)
+
+    def mean(values: Array) -> Array:
+        return np.stack([_sums(voxel, column, len(count)) for column in values.T], axis=1) / count[:, None]
+
+    return mean(points), _unit(mean(normals))
+
+
+def compute_fpfh(points: Array, normals: Array, radius: float) -> FeaturedSurface:
+    """Feature histograms of points (N, 3) with unit normals (N, 3) from up to 99 neighbours within `radius`."""
+    points = np.ascontiguousarray(points, float)
+    tree = KDTree(points)
+    count = min(_NEIGHBOURS, len(points))
+    distance, index = (a.reshape(len(points), count) for a in tree.query(points, k=count, distance_upper_bound=radius))
+    own, column = np.nonzero(np.isfinite(distance) & (distance > 0))
+    other = index[own, column].astype(int)
+    simple = _angle_histograms(points, normals, own, other)
+    weight = 1 / distance[own, column] ** 2
+    around = np.stack([_sums(own, weight * share[other], len(points)) for share in simple.T], axis=1)
+    return FeaturedSurface(points, normals, _normalised(simple) + _normalised(around), tree)
+
+
+def register_ransac(source: FeaturedSurface, target: FeaturedSurface, reach: float, draws: int, seed: int = 0) -> Array:
+    """Motion (4, 4) that maps `source` onto `target` by RANSAC over feature partners (Fischler & Bolles 1981).
+
+    Args:
+        reach: partners lie at most so far apart under the right motion.
+        draws: triples of partners that are tried.
+
+    Returns:
+        The motion of the triple with the least truncated cost; identity where no triple is a rigid copy.
+    """
+    own, other = _partners(source.histograms, target.histograms)
+    a, b = source.points[own], target.points[other]
+    triples = np.random.default_rng(seed).integers(len(a), size=(draws, _MIN_SAMPLE))
+    triples = triples[_same_shape(a[triples], b[triples])]
+    T = align_points(a[triples], b[triples])
+    moved = a[triples] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+    T = T[np.linalg.norm(moved - b[triples], axis=2).max(axis=1, initial=0.0) < reach]
+    return np.asarray(T[np.argmin(_msac_costs(T, a, b, reach))]) if len(T) else np.eye(4)
+
+
+def align_icp(source: FeaturedSurface, target: FeaturedSurface, T: Array, reach: float) -> Array:
+    """Motion (4, 4) after point-to-plane ICP from `T` (Chen & Medioni 1992); partners lie within `reach`."""
+    for _ in range(_ICP_STEPS):
+        moved = frames.transform(T, source.points)
+        distance, index = target.tree.query(moved, k=1, distance_upper_bound=reach)
+        near = np.isfinite(distance)
+        if near.sum() < 6:
+            break
+        place, n = target.points[index[near].astype(int)], target.normals[index[near].astype(int)]
+        residual = np.einsum("ij,ij->i", moved[near] - place, n)
+        # Turning about the points' own centre keeps turn and shift apart.
+        centre = frames.make(np.eye(3), moved[near].mean(axis=0))
+        design = frames.plane_rows(moved[near] - centre[:3, 3], n)
+        step = np.linalg.lstsq(design, -residual, rcond=1e-6)[0]
+        T = centre @ frames.exp(step) @ frames.inverse(centre) @ T
+        if np.linalg.norm(step[3:]) < 1e-6 * reach and np.linalg.norm(step[:3]) < 1e-7:
+            break
+    return T
+
+
+def _angle_histograms(points: Array, normals: Array, own: Indices, other: Indices) -> Array:
+    """(N, 33): of three angles between each point and its neighbours, the shares in 11 bins each."""
+    line = _unit(points[other] - points[own])
+    first, second = normals[own], normals[other]
+    # The frame sits on that of the two points whose normal lies closer to the line between them.
+    swap = np.abs(np.einsum("ij,ij->i", first, line)) < np.abs(np.einsum("ij,ij->i", second, line))
+    first, second = np.where(swap[:, None], second, first), np.where(swap[:, None], first, second)
+    line = np.where(swap[:, None], -line, line)
+    v = _unit(np.cross(line, first))
+    w = np.cross(first, v)
+    theta = np.arctan2(np.einsum("ij,ij->i", w, second), np.einsum("ij,ij->i", first, second))
+    cosines = np.einsum("ij,ij->i", v, second), np.einsum("ij,ij->i", first, line)
+    histograms = []
+    for share in (theta / (2 * np.pi) + 0.5, *((cosine + 1) / 2 for cosine in cosines)):
+        bins = np.clip((share * _BINS).astype(int), 0, _BINS - 1)
+        histograms.append(np.bincount(own * _BINS + bins, minlength=len(points) * _BINS).reshape(-1, _BINS))
+    return _normalised(np.hstack(histograms).astype(float))
+
+
+def _normalised(histograms: Array) -> Array:
+    """Each of the three histograms of a point sums to 100; one without neighbours stays 0."""
+    parts = histograms.reshape(len(histograms), 3, _BINS)
+    total = parts.sum(axis=2, keepdims=True)
+    return np.asarray((100 * parts / np.where(total > 0, total, 1)).reshape(len(histograms), -1))
+
+
+def _unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
+
+
+def _sums(group: Indices, values: Array, groups: int) -> Array:
+    return np.asarray(np.bincount(group, values, groups), float)
+
+
+def _partners(a: Array, b: Array) -> tuple[Indices, Indices]:
+    """Indices of histograms that are each other's nearest; where those are too few, of every one and its nearest."""
+    forth, back = (KDTree(y).query(x, k=1)[1].astype(int) for x, y in ((a, b), (b, a)))
+    own = np.arange(len(a))
+    mutual = back[forth] == own
+    return (own[mutual], forth[mutual]) if mutual.sum() >= 3 * _MIN_SAMPLE else (own, forth)
+
+
+def _same_shape(a: Array, b: Array) -> NDArray[np.bool_]:
+    """Whether the edges of triples a and b (K, 3, 3) have the same length."""
+    edges = [np.linalg.norm(triples - np.roll(triples, 1, axis=1), axis=2) for triples in (a, b)]
+    return np.asarray((np.minimum(*edges) > _EDGE_RATIO * np.maximum(*edges)).all(axis=1))
+
+
+def _msac_costs(T: Array, a: Array, b: Array, reach: float) -> Array:
+    """Sum of squared distances, truncated at `reach`, under each motion (K,): MSAC, Torr & Zisserman 2000."""
+    costs = []
+    for block in np.array_split(T, len(T) // _BLOCK + 1):
+        # One product for all motions: its rows are the three coordinates of each.
+        off = (block[:, :3, :3].reshape(-1, 3) @ a.T).reshape(len(block), 3, len(a)) + block[:, :3, 3:] - b.T
+        costs.append(np.minimum(np.einsum("kij,kij->kj", off, off), reach**2).sum(axis=1))
+    return np.concatenate(costs)

@@ -1,0 +1,110 @@
+"""Groups of views to leave out: neighbours in time, neighbours in pose, ends of a joint's range.
+
+Leaving out random views would leave their neighbours in, which share their error.
+"""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+
+_GROUPS = 5
+# Below this many views every view is a group of its own.
+_FEW = 10
+# Enough places for a spread among them, enough views in each to lose it without loss of rank.
+_PLACES, _VIEWS_PER_PLACE = 25, 6
+# A fifth of the views at either end, if these are enough to tell their mean error from another.
+_END, _VIEWS_PER_END = 0.2, 20
+
+
+@dataclass(frozen=True)
+class JointEnd:
+    """Views at one end of what a joint has driven: without them, a model has to extrapolate to them."""
+
+    joint: int  # counted from 0
+    upper: bool
+    views: Indices
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        return f"the {'highest' if self.upper else 'lowest'} fifth of joint {self.joint + 1}"
+
+
+def grouped_folds(T_base_flange: Array, lever: float) -> list[Indices]:
+    """Index arrays of the views to leave out together; every view is left out twice where there are enough.
+
+    Args:
+        T_base_flange: (V, 4, 4) in the order of time.
+        lever: length that makes a radian of orientation comparable with a distance.
+    """
+    count = len(T_base_flange)
+    if count < _FEW:
+        return [np.array([v]) for v in range(count)]
+    by_time = np.array_split(np.arange(count), _GROUPS)
+    # A region that holds most views would leave too little to fit.
+    return [f for f in [*by_time, *_regions(T_base_flange, lever, _GROUPS)] if 0 < len(f) <= count // 2]
+
+
+def halves_of(T_base_flange: Array, lever: float) -> list[tuple[Indices, Indices]]:
+    """Three ways to halve V views: in the order of time, by the region of their poses, alternately.
+
+    Args:
+        T_base_flange: (V, 4, 4) in the order of time.
+        lever: length that makes a radian of orientation comparable with a distance.
+    """
+    views = np.arange(len(T_base_flange))
+    twists = _pose_offsets(T_base_flange, lever)
+    # Along the direction in which the poses differ most.
+    along = np.linalg.svd(twists - twists.mean(axis=0), full_matrices=False)[0][:, 0]
+    orders = views, np.argsort(along, kind="stable"), np.argsort(views % 2, kind="stable")
+    halves = [np.array_split(order, 2) for order in orders]
+    return [(np.sort(first), np.sort(second)) for first, second in halves]
+
+
+def view_clusters(T_base_flange: Array, lever: float) -> list[Indices]:
+    """Index arrays of views near each other, every view in one: what a model does not know errs alike in one place."""
+    count = len(T_base_flange)
+    if count < _PLACES * _VIEWS_PER_PLACE:
+        return [np.array([v]) for v in range(count)]
+    return [f for f in _regions(T_base_flange, lever, _PLACES) if len(f)]
+
+
+def joint_ends(joints: Array, observed: Indices) -> list[JointEnd]:
+    """Both ends of every joint's range; none of a joint that stands still, or where views are few.
+
+    Args:
+        joints: (V, n) rad.
+        observed: indices of the views that show something.
+    """
+    out, every = [], joints[observed]
+    for joint, (q, low, high) in enumerate(zip(every.T, *np.quantile(every, [_END, 1 - _END], axis=0), strict=True)):
+        for upper, views in ((False, observed[q <= low]), (True, observed[q >= high])):
+            # Where many views share one angle, an end may be most of them.
+            if _VIEWS_PER_END <= len(views) <= len(observed) // 2:
+                out.append(JointEnd(joint, upper, views))
+    return out
+
+
+def _pose_offsets(T_base_flange: Array, lever: float) -> Array:
+    """(V, 6) twists of the flange from its first pose, as lengths: the same wherever the base's frame lies."""
+    return np.asarray(frames.log(frames.inverse(T_base_flange[:1]) @ T_base_flange) * np.repeat([lever, 1.0], 3))
+
+
+def _regions(T_base_flange: Array, lever: float, groups: int) -> list[Indices]:
+    twists = _pose_offsets(T_base_flange, lever)
+    # Poses that repeat count once, in the order of their first visit: of fewer places than groups k-means would find
+    # none to begin the last group with.
+    _, first, pose = np.unique(twists, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    with warnings.catch_warnings():
+        # An empty group is no harm: it is left out by the callers.
+        warnings.simplefilter("ignore", UserWarning)
+        from scipy.cluster.vq import kmeans2
+
+        _, label = kmeans2(twists[first[order]], min(groups, len(first)), minit="++", seed=0)
+    of_view = label[np.argsort(order)][pose]
+    return [np.flatnonzero(of_view == k) for k in range(groups)]

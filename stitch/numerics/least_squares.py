@@ -1,0 +1,337 @@
+"""Least squares in unknowns of mixed units: columns are equilibrated first, what says nothing drops out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, qr
+from scipy.linalg.lapack import dlauum, dpotrf, dpotrs, dtrtri
+from scipy.special import ndtri
+
+from stitch.numerics.frames import Array, Indices, Mask
+
+# Anderson acceleration with a memory of one step (Anderson 1965; for ICP: Pavlov et al. 2018).
+#
+# Partners follow a view that moves, so that every step of point-to-plane matching leaves the same share of the way
+# undone. Two steps tell that share, and the next one makes up for it.
+
+# Against steps that hardly shrink: at most twice as far, or half as far where they turn back.
+_FARTHEST, _NEAREST = 1.0, -0.5
+
+
+def anderson_step(step: Array, last_step: Array, last_taken: Array) -> Array:
+    """(N,) the step to take, from what two iterations in turn ask for.
+
+    Args:
+        step: (N,) what the present iteration asks for, all components in one unit.
+        last_step: (N,) what the iteration before asked for.
+        last_taken: (N,) the step that was taken then.
+    """
+    change = step - last_step
+    square = float(change @ change)
+    share = 0.0 if square == 0 else float(np.clip(-(change @ step) / square, _NEAREST, _FARTHEST))
+    return np.asarray(step + share * (last_taken + change))
+
+
+# Where every column of a unit diagonal has more than this share of its root beside those before it, a Cholesky factor
+# is as good as eigenvectors, and takes a tenth of the time.
+CLEARLY_KNOWN = 1e-3
+# Above this one it solves as well as they do.
+_SOLVABLE = 1e-6
+
+
+def equilibrated(matrix: Array) -> tuple[Array, Array]:
+    """Symmetric matrices (..., k, k) of unit diagonal, and the units (..., k) that make them: rows and columns times
+    these; unknowns count in rad, mm and per hour."""
+    unit = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
+    return matrix * unit[..., :, None] * unit[..., None, :], unit
+
+
+# How much more leaving out samples moves estimates than their covariance says (Efron & Stein 1981).
+
+# Fewer estimates say nothing about their spread.
+_FEWEST = 4
+
+
+def grouped_inflation(left_out: Array, covariance: Array) -> float:
+    """Factor on the covariance, at least 1: the jackknife's over the model's, mean over all directions.
+
+    Args:
+        left_out: (G, K) estimates with one group of samples left out.
+        covariance: (K, K) of the estimates.
+    """
+    count = len(left_out)
+    if count < _FEWEST:
+        return 1.0
+    scaled, unit = equilibrated(covariance)
+    centred = (left_out - left_out.mean(axis=0)) * unit
+    values, vectors = np.linalg.eigh(scaled)
+    keep = values > 1e-9
+    squares = (count - 1) / count * ((centred @ vectors[:, keep]) ** 2).sum(axis=0) / values[keep]
+    return float(max(1.0, squares.mean()))
+
+
+# A covariance in blocks: its inverse, its factor and its determinant.
+
+
+@dataclass(frozen=True)
+class InverseCovariance:
+    """Of a covariance V in B blocks of m."""
+
+    matrix: Array  # (B, m, m) V⁻¹
+    half: Array  # (B, m, m) L⁻¹, lower, with V = L Lᵀ
+    logdet: float  # of V; infinite where it has no inverse
+
+
+def invert_covariance(V: Array) -> InverseCovariance:
+    """The inverse of (B, m, m); of a matrix that has none `logdet` is infinite."""
+    # A search or a leap that ran away ends among infinite variances.
+    if not np.isfinite(V).all():
+        return InverseCovariance(V, V, np.inf)
+    return _invert_blocks(V) if len(V) > 1 else _invert_single(V[0])
+
+
+def _invert_single(V: Array) -> InverseCovariance:
+    """Of one large block."""
+    L, failed = dpotrf(V, lower=1, clean=1)
+    if failed:
+        return InverseCovariance(V[None], V[None], np.inf)
+    half, _ = dtrtri(L, lower=1)
+    lower, _ = dlauum(half, lower=1)
+    # Above the diagonal all are zero.
+    inverse = lower + lower.T
+    np.fill_diagonal(inverse, np.diag(lower))
+    return InverseCovariance(inverse[None], half[None], 2 * float(np.log(np.diag(L)).sum()))
+
+
+def _invert_blocks(V: Array) -> InverseCovariance:
+    """Of many small blocks, by Cholesky factors of all at once: a library's loop over them takes five times as long."""
+    m = V.shape[1]
+    A = np.ascontiguousarray(V.transpose(1, 2, 0))
+    L, half = np.zeros_like(A), np.zeros_like(A)  # blocks last
+    for j in range(m):
+        below = A[j:, j] - np.einsum("ikb,kb->ib", L[j:, :j], L[j, :j])
+        if not (below[0] > 0).all():
+            return InverseCovariance(V, V, np.inf)
+        L[j:, j] = below / np.sqrt(below[0])
+        half[j, :j] = -np.einsum("kb,kib->ib", L[j, :j], half[:j, :j]) / L[j, j]
+        half[j, j] = 1 / L[j, j]
+    half = np.ascontiguousarray(half.transpose(2, 0, 1))
+    return InverseCovariance(half.transpose(0, 2, 1) @ half, half, 2 * float(np.log(np.einsum("iib->ib", L)).sum()))
+
+
+# Least squares over blocks: estimates, their covariance, and the same without some views.
+
+
+@dataclass(frozen=True)
+class BlockLeastSquares:
+    """z = X·x + noise in B blocks of m, with a weak prior; the noise's covariance is known.
+
+    Rows weigh by their own variances (working independence, Liang & Zeger 1986): as long as effects are missing
+    the scatter of the views is not the noise it is taken for, and full weights would trade millimetres at the
+    targets for combinations that only look exact. The covariance of the estimates counts all correlations.
+    """
+
+    z: Array  # (B, m)
+    X: Array  # (B, m, k)
+    covariance: Array  # (B, m, m)
+    precision: Array  # (k,) of the prior
+    prior_vector: Array  # (k,) precision times the prior's middle
+
+    @cached_property
+    def _weights(self) -> Array:
+        """(B, m) W."""
+        return np.asarray(1 / np.einsum("bii->bi", self.covariance))
+
+    @cached_property
+    def _rows(self) -> Array:
+        """(B, m, k + 1) columns and numbers in units of the numbers' own sigmas."""
+        return np.concatenate([self.X, self.z[..., None]], axis=2) * np.sqrt(self._weights)[..., None]
+
+    @cached_property
+    def _sums(self) -> Array:
+        """(k + 1, k + 1) of all blocks."""
+        return _summed(self._rows)
+
+    @property
+    def information(self) -> Array:
+        """(k, k) XᵀWX."""
+        return self._sums[:-1, :-1]
+
+    def residual_vectors(self, estimates: Array) -> Array:
+        """(B, k) XᵀW(z − X·x) of every block."""
+        return np.asarray(np.einsum("bmk,bm->bk", self.X, self._weights * (self.z - self.X @ estimates)))
+
+    def solve(self, left_out: Array | Indices | None = None) -> Array:
+        """(k,) estimates, without some blocks."""
+        return self.solve_each([(self.precision, self.prior_vector)], left_out)[0]
+
+    def solve_each(self, priors: Sequence[tuple[Array, Array]], left_out: Array | Indices | None = None) -> list[Array]:
+        """The same under each of some priors; one of fewer than k columns is of the first ones, the others left out."""
+        sums = self._sums if left_out is None else self._sums - _summed(self._rows[np.asarray(left_out, np.int64)])
+        return [self._solve(sums, *prior) for prior in priors]
+
+    def _solve(self, sums: Array, precision: Array, prior_vector: Array) -> Array:
+        k = len(precision)
+        prior, vector = np.diag(precision), sums[:k, -1] + prior_vector
+        unit = equilibrated(self._sums[:k, :k] + prior)[1]
+        scaled = (sums[:k, :k] + prior) * np.outer(unit, unit)
+        root, failed = dpotrf(scaled, lower=1, clean=0)
+        if not failed and np.diag(root).min() > _SOLVABLE:
+            return np.asarray(dpotrs(root, vector * unit, lower=1)[0] * unit)
+        return np.asarray(_pseudo_inverse(scaled, unit) @ vector)
+
+    def estimates_covariance(self) -> Array:
+        """(k, k) of the estimates under the blocks' full covariance."""
+        weighted = self.X * self._weights[..., None]
+        spread = np.einsum("bmk,bmn,bnl->kl", weighted, self.covariance, weighted, optimize=True)
+        inverse = self._inverse
+        return np.asarray(inverse @ (spread + np.diag(self.precision)) @ inverse)
+
+    def shift_by_errors(self, errors: Array) -> Array:
+        """(k, q) how far errors (B, m, q) of the blocks, which nobody models, move the estimates."""
+        pulls = np.einsum("bmk,bm,bmq->kq", self.X, self._weights, errors, optimize=True)
+        return np.asarray(self._inverse @ pulls)
+
+    @cached_property
+    def _inverse(self) -> Array:
+        """(k, k) with all blocks."""
+        return _pseudo_inverse(*equilibrated(self.information + np.diag(self.precision)))
+
+    def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
+        """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""
+        return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)
+
+
+def _summed(X: Array) -> Array:
+    """(k, k) Σ_b XᵀX of (B, m, k)."""
+    flat = X.reshape(-1, X.shape[2])
+    return np.asarray(flat.T @ flat)
+
+
+def _pseudo_inverse(scaled: Array, unit: Array) -> Array:
+    """(k, k) inverse of what is scaled (k, k) in some units (k,); what nothing shows is zero in it."""
+    values, vectors = np.linalg.eigh(scaled)
+    shown = np.abs(values) > 1e-14 * np.abs(values).max(initial=0.0)
+    vectors = vectors[:, shown] * unit[:, None]
+    return np.asarray((vectors / values[shown]) @ vectors.T)
+
+
+@dataclass(frozen=True)
+class GeneralisedFit:
+    """Generalised least squares with a prior: what was seen (n,) to a unknowns."""
+
+    gain: Array  # (a, n)
+    covariance: Array  # (a, a)
+
+    def solve(self, z: Array, prior_vector: Array) -> Array:
+        """(a,) from what was seen (n,), and the prior's precision times its middle (a,)."""
+        return np.asarray(self.gain @ z + self.covariance @ prior_vector)
+
+
+def generalised_fit(noise: Array, columns: Array, precision: Array) -> GeneralisedFit:
+    """Columns (n, a) under noise of covariance (n, n), with a prior of a precision (a, a); units may be mixed."""
+    weighted = cho_solve(cho_factor(noise, lower=True), columns)
+    scaled, unit = equilibrated(columns.T @ weighted + precision)
+    covariance = np.linalg.inv(scaled) * np.outer(unit, unit)
+    return GeneralisedFit(np.asarray(covariance @ weighted.T), np.asarray(covariance))
+
+
+# Of so many rows singular values take ten times as long as eigenvalues of the columns' products. These, their squares,
+# tell as well which combinations say something, unless one lies between.
+_MANY_ROWS, _SAYS_SOMETHING, _SAYS_NOTHING = 1_000, 1e-8, 1e-12
+
+
+def column_space(columns: Array, relative: float = 1e-9) -> Array:
+    """(n, r) orthonormal basis of the columns (n, K), whatever their units; combinations that say nothing drop out."""
+    scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    if len(scaled) > _MANY_ROWS:
+        values, vectors = np.linalg.eigh(scaled.T @ scaled)
+        says = values > _SAYS_SOMETHING
+        if relative**2 <= _SAYS_NOTHING and (says | (values < _SAYS_NOTHING)).all():
+            return np.asarray(scaled @ (vectors[:, says] / np.sqrt(values[says])))
+    U, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    return np.asarray(U[:, s > relative * s[0]])
+
+
+def fit_columns(columns: Array, values: Array) -> Array:
+    """(K,) least squares of columns (n, K), whatever their units, to values (n,)."""
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    return np.asarray(np.linalg.lstsq(columns / scale, values, rcond=1e-10)[0] / scale)
+
+
+def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Array:
+    """Minimum-norm solution of the symmetric system matrix·x = −vector, in scaled unknowns."""
+    scaled, unit = equilibrated(matrix)
+    values, vectors = np.linalg.eigh(scaled)
+    keep = values > relative * values[-1]
+    projected = vectors[:, keep].T @ (-vector * unit) / values[keep]
+    return np.asarray(unit * (vectors[:, keep] @ projected))
+
+
+def summed_squares(blocks: Array) -> Array:
+    """(n, n) Σ_v B_v B_vᵀ of blocks (V, n, k): covariance of n numbers that V independent unit errors move.
+
+    One matrix product: with hundreds of views a sum over three indices takes a hundred times as long.
+    """
+    wide = blocks.transpose(1, 0, 2).reshape(blocks.shape[1], -1)
+    return np.asarray(wide @ wide.T)
+
+
+# Which parameters the views can know: absolute first, then beside the hand-eye and each other.
+
+
+def independent(base: Array, further: Array, sizes: Array, threshold: float) -> Mask:
+    """(P,) bool: columns that stand out by at least `threshold` sigmas at their size, beside those chosen before.
+
+    The clearest is chosen first (QR with pivoting), so that of two that say the same the better known stays.
+
+    Args:
+        base: (N, a) whitened columns that come first, whatever they say.
+        further: (N, P) whitened columns per unit of their parameters.
+        sizes: (P,) plausible sizes of the parameters.
+    """
+    # Pivoting among the rows of a first factor chooses the same; on all N rows scipy reserves N² numbers for it.
+    rest = np.linalg.qr(project_out(base, further * sizes), mode="r")
+    R, order = qr(rest, mode="r", pivoting=True)
+    clear = np.abs(np.diag(R)) >= threshold
+    chosen = np.zeros(further.shape[1], bool)
+    chosen[order[: len(clear)][clear]] = True
+    return chosen
+
+
+def project_out(base: Array, columns: Array) -> Array:
+    """What is left of `columns` beside the column space of `base`."""
+    if not base.shape[1]:
+        return columns
+    U = column_space(base)
+    return np.asarray(columns - U @ (U.T @ columns))
+
+
+# What one of two models leaves of the mean square error that the other leaves.
+
+
+def mean_square_share(with_it: Array, without: Array) -> tuple[float, float]:
+    """What one model leaves over what another leaves, mean squares, and the standard error of that.
+
+    Args:
+        with_it: (G,) sum of squares of each sample, a group of views or one view, under the one.
+        without: (G,) under the other.
+    """
+    share = float(with_it.sum() / max(without.sum(), 1e-300))
+    spread = np.sum((with_it - share * without) ** 2) * len(without) / max(len(without) - 1, 1)
+    return share, float(np.sqrt(spread) / max(without.sum(), 1e-300))
+
+
+def significantly_smaller(squares: Array, others: Array, chance: float) -> bool:
+    """True if the first are less by more than chance would make them; views where either is not finite do not count.
+
+    Args:
+        squares: (V,) mean square of each view under one model.
+        others: (V,) under another.
+        chance: one-sided, of the normal distribution.
+    """
+    seen = np.isfinite(squares) & np.isfinite(others)
+    share, sigma = mean_square_share(squares[seen], others[seen])
+    return bool(share < 1 - ndtri(1 - chance) * sigma)

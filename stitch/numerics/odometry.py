@@ -1,0 +1,172 @@
+"""Motions of a scanner that never stops, from its scans in their order alone: KISS-ICP (Vizzo et al. 2023).
+
+KISS-ICP is made for small steps: it predicts each pose from the last motion and closes in on a map of what was seen
+before. Separate views are no such sequence (`is_stream`).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from stitch.errors import NoResultError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+from stitch.numerics.hand_eye import park_martin
+
+# From one scan to the next a stream turns and shifts no more than this: rad, share of the part's size.
+_LARGEST_TURN, _LARGEST_SHIFT = np.radians(10.0), 0.25
+# Share of the steps that must keep within it: a stream may pause, or lose a scan.
+_MOST = 0.95
+# Fewer scans are no stream.
+_FEWEST = 10
+# Of the part's size: the grid of the map, and sigma of its robust kernel. An arm moves smoothly, so that the prediction
+# from the last motion is never farther off than a few of them.
+_VOXEL, _KERNEL = 0.02, 0.02
+# KISS-ICP's other lengths are those of streets, in metres: a part is scaled to this size.
+_STREET = 100.0
+# Started from the last motion it is there within some ten steps, or nowhere.
+_STEPS = 60
+# Passes of the odometry: the second one knows from the first where the robot carries the scanner.
+_PASSES = 2
+# Of the motions that agree best, the middle one turns as the robot does within so much, rad.
+_TURNS_ALIKE = np.radians(0.5)
+# Motions that show a hand-eye turn by so much, rad; steps of the stream between their ends, as shares of its length.
+_TURNED, _STRIDES = np.radians(10.0), (0.05, 0.1, 0.2, 0.35)
+
+
+def size_of_scan(points: Array) -> float:
+    """Return the size of points (N, 3): twice their rms distance from their middle."""
+    return 2 * float(np.sqrt(points.var(axis=0).sum()))
+
+
+def is_stream(T_reference_mount: Array, scans: Sequence[Array]) -> bool:
+    """Return whether poses (V, 4, 4) and scans, (N, 3) each, move on in small steps."""
+    if len(scans) < _FEWEST:
+        return False
+    middle = np.array([points.mean(axis=0) for points in scans])
+    turned = frames.angle_between(T_reference_mount[:-1], T_reference_mount[1:])
+    shifted = np.linalg.norm(np.diff(middle, axis=0), axis=1) / np.median([size_of_scan(points) for points in scans])
+    return bool(np.mean((turned < _LARGEST_TURN) & (shifted < _LARGEST_SHIFT)) >= _MOST)
+
+
+def scan_odometry(
+    scans: Sequence[Array],
+    times: Sequence[Array] | None = None,
+    interval: float = 1.0,
+    predicted: Array | None = None,
+) -> Array:
+    """Return T_first_scanner (V, 4, 4) of every scan of a stream.
+
+    Args:
+        scans: points (N, 3) each, scanner frame.
+        times: s from the time of its scan to each point (N,), of a scanner that moved meanwhile; None: it stood still.
+        interval: s from one scan to the next.
+        predicted: (V - 1, 4, 4) motions of the scanner from scan to scan; None: it moves on as it did last.
+    """
+    from kiss_icp.config import KISSConfig
+    from kiss_icp.kiss_icp import KissICP
+
+    scale = _STREET / float(np.median([size_of_scan(points) for points in scans]))
+    config = KISSConfig()
+    # Its sums over several threads have no fixed order, so their last digits would change from run to run.
+    config.registration.max_num_threads = 1
+    config.registration.max_num_iterations = _STEPS
+    config.mapping.voxel_size = _VOXEL * _STREET
+    config.adaptive_threshold.fixed_threshold = _KERNEL * _STREET
+    config.data.max_range = 1e6
+    config.data.deskew = times is not None
+    odometry = KissICP(config)
+    odometry.preprocessor = _ToTheTimeOfTheScan(odometry.preprocessor, interval)
+    poses = []
+    for v, points in enumerate(scans):
+        if predicted is not None and v:
+            odometry.last_delta = frames.make(predicted[v - 1, :3, :3], scale * predicted[v - 1, :3, 3])
+        odometry.register_frame(np.ascontiguousarray(scale * points), np.zeros(0) if times is None else times[v])
+        poses.append(odometry.last_pose.copy())
+    found = np.array(poses)
+    found[:, :3, 3] /= scale
+    return found
+
+
+def hand_eye_of_stream(
+    T_reference_mount: Array,
+    scans: Sequence[Array],
+    times: Sequence[Array] | None,
+    interval: float,
+    T_mount: Array | None,
+) -> tuple[Array | None, Array]:
+    """Return T_mount (4, 4) of A·X = X·B over the odometry of a stream, and the odometry, T_first_scanner (V, 4, 4).
+
+    Where the scans show little, as along an edge, the robot says where the next one is to be sought. That needs a
+    hand-eye: the stated one, or that of a first pass, which goes on as it moved last. None: the odometry does not turn
+    as the robot does.
+
+    Args:
+        T_reference_mount: (V, 4, 4) from the robot.
+        times, interval: as for `scan_odometry`.
+        T_mount: (4, 4) hand-eye to begin with, off by some per cent of the distance to the part; None: not known.
+    """
+    steps = motions_between(T_reference_mount, [(v, v + 1) for v in range(len(scans) - 1)])
+    for _ in range(_PASSES):
+        predicted = None if T_mount is None else frames.inverse(T_mount) @ steps @ T_mount
+        odometry = scan_odometry(scans, times, interval, predicted)
+        A, B = motions_of_stream(T_reference_mount, odometry)
+        if not len(A) or np.median(angle_differences(A, B)) > _TURNS_ALIKE:
+            return None, odometry
+        try:
+            T_mount = park_martin(A, B)
+        except NoResultError:
+            return None, odometry
+    return T_mount, odometry
+
+
+class _ToTheTimeOfTheScan:
+    """KISS-ICP's de-skew for scans that take a part of the interval, brought to the time of the scan.
+
+    Its own takes a scan to last until the next one, and brings it to its last point.
+    """
+
+    def __init__(self, own: Any, interval: float) -> None:
+        self._own, self._interval = own, interval
+
+    def preprocess(self, points: Array, times: Array, T_last_now: Array) -> Array:
+        """Return points (N, 3) as seen from where the scanner was at time 0."""
+        if not len(times):
+            return np.asarray(self._own.preprocess(points, times, T_last_now))
+        velocity = frames.log(T_last_now) / self._interval
+        at_end = self._own.preprocess(points, times, frames.exp(np.ptp(times) * velocity))
+        return np.asarray(frames.transform(frames.exp(times.max() * velocity), at_end))
+
+
+def turned_pairs(T_reference_mount: Array) -> list[tuple[int, int]]:
+    """Return pairs of views between which the robot turned enough to show a hand-eye."""
+    V = len(T_reference_mount)
+    strides = sorted({max(1, round(share * V)) for share in _STRIDES})
+    v: Indices = np.concatenate([np.arange(V - stride) for stride in strides])
+    w: Indices = np.concatenate([np.arange(stride, V) for stride in strides])
+    turned = frames.angle_between(T_reference_mount[v], T_reference_mount[w]) > _TURNED
+    return list(zip(v[turned].tolist(), w[turned].tolist(), strict=True))
+
+
+def motions_of_stream(T_reference_mount: Array, odometry: Array) -> tuple[Array, Array]:
+    """Return (A, B), each (M, 4, 4): motions of the mount and of the scanner between views where the robot turned.
+
+    Both turn by the same angle, whatever the hand-eye is (Chen 1991). A step that went wrong spoils every motion across
+    it: the half whose angles agree best is kept.
+    """
+    pairs = turned_pairs(T_reference_mount)
+    A, B = motions_between(T_reference_mount, pairs), motions_between(odometry, pairs)
+    apart = angle_differences(A, B)
+    kept = np.sort(np.argsort(apart, kind="stable")[: -(-len(pairs) // 2)])
+    return A[kept], B[kept]
+
+
+def angle_differences(A: Array, B: Array) -> Array:
+    """Return by how much the rotation angles of motions (M, 4, 4) differ, (M,) rad."""
+    return np.asarray(np.abs(frames.angle_between(np.eye(4), A) - frames.angle_between(np.eye(4), B)))
+
+
+def motions_between(poses: Array, pairs: Sequence[tuple[int, int]]) -> Array:
+    """Return (M, 4, 4) motions that map the frame of view w into that of view v, of poses (V, 4, 4)."""
+    return np.array([frames.inverse(poses[v]) @ poses[w] for v, w in pairs]).reshape(-1, 4, 4)

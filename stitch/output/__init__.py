@@ -1,0 +1,1 @@
+"""What is written and what reads it: result, run folder, page data, comparison."""

@@ -1,0 +1,211 @@
+"""The same session by somebody else's program: Open3D's multiway registration, an independent witness."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import distributions
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from pykdtree.kdtree import KDTree
+
+from stitch.errors import NoResultError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import angle_text, length_text
+from stitch.run_data import Run
+from stitch.system.open3d_library import import_open3d
+
+_FORMAT = "stitch-witness/1"
+# Points of a view that are registered: a surface is averaged over enough of them, and a pair takes a tenth of a second.
+_POINTS = 30_000
+# Distances between partners, coarse to fine, and the scale beyond which the last, robust fit doubts; in spacings of the
+# points. It begins near the end: wider ones pair across edges and slide a thin part along itself, by 2 mm on a blade.
+_DISTANCES, _ROBUST = (1.0, 0.5), 0.25
+# Points that say how far the clouds lie apart.
+_ASKED = 20_000
+_NEIGHBOURS = 20
+# Views are paired that look from within 60° of each other, and of which so much meets at the start: on a thin part the
+# other side lies within reach.
+_SAME_SIDE, _OVERLAP = 0.5, 0.3
+
+
+@dataclass(frozen=True)
+class Witness:
+    """Open3D's poses of the views beside those of a run, after the common rigid motion that no scan can tell."""
+
+    version: str
+    views: tuple[str, ...]
+    poses: Array  # (V, 4, 4) T_reference_scanner, length_unit
+    shift: Array  # (V,) how far the middle of a view lies from where the run puts it, length_unit
+    turn: Array  # (V,) rad
+    pairs: int  # of views that it registered
+    to_run: Array  # (N,) from points of its cloud to the surface of the run's, signed along the normal, length_unit
+    from_run: Array  # (M,) from points of the run's cloud to the surface of its own
+    places: Array  # (M, 3) of the latter, reference frame
+
+    def document(self) -> dict[str, Any]:
+        """Return what witness.json holds."""
+        rows = zip(self.views, self.poses, self.shift, self.turn, strict=True)
+        return {
+            "format": _FORMAT,
+            "program": f"Open3D {self.version}, multiway registration",
+            "pairs": self.pairs,
+            "views": [
+                {"view": name, "pose": T.tolist(), "shift": float(d), "turn_rad": float(a)} for name, T, d, a in rows
+            ],
+            "to_run": _summary(self.to_run),
+            "from_run": _summary(self.from_run),
+        }
+
+    def sentences(self, length_unit: str) -> list[str]:
+        """Return what an auditor reads, one fact a sentence."""
+        here, there = (_summary(d) for d in (self.to_run, self.from_run))
+        worst = int(np.argmax(self.shift))
+        return [
+            f"Open3D {self.version} registered the same scans by {self.pairs} pairs and a graph of poses.",
+            "It began at the robot's poses under this run's hand-eye, and knows of no robot after that.",
+            f"From its cloud to this one: half within {length_text(here['median'], length_unit)}, "
+            f"95 % within {length_text(here['p95'], length_unit)}.",
+            f"From this cloud to its own: half within {length_text(there['median'], length_unit)}, "
+            f"95 % within {length_text(there['p95'], length_unit)}.",
+            f"The views differ by {length_text(float(np.median(self.shift)), length_unit)} and "
+            f"{angle_text(float(np.median(self.turn)))} in the median.",
+            f"{self.views[worst]} differs most, by {length_text(float(self.shift[worst]), length_unit)}.",
+        ]
+
+
+def _summary(distance: Array) -> dict[str, float]:
+    median, p95 = np.quantile(np.abs(distance), [0.5, 0.95])
+    return {"median": float(median), "p95": float(p95), "mean": float(distance.mean())}
+
+
+def open3d_witness(run: Run) -> Witness:
+    """Compute the poses of a run's views by Open3D: pairs by robust point-to-plane ICP, then a graph of poses.
+
+    Bits repeat: it works on one thread.
+
+    Raises:
+        InputError: Open3D is not installed, or lacks a library of the system.
+        NoResultError: the run has no scans, or a view meets no other.
+    """
+    o3d = import_open3d("--with open3d")
+    clouds = [view.cloud.points for view in run.session.views if view.cloud is not None]
+    if len(clouds) < len(run.session.views):
+        raise NoResultError("--with open3d: labelled points are no clouds; there is nothing for Open3D to register")
+    clouds = [points[:: max(1, len(points) // _POINTS)] for points in clouds]
+    with _one_thread(o3d):
+        poses, pairs = _registered(o3d, clouds, run.poses_model, _spacing(clouds))
+        normals = [np.asarray(cloud.normals) for cloud in _with_normals(o3d, clouds)]
+    poses = _common_motion(clouds, poses, run.poses) @ poses
+    difference = frames.inverse(run.poses) @ poses
+    middles = np.array([points.mean(axis=0) for points in clouds])
+    moved = np.array([frames.transform(T, m[None])[0] - m for T, m in zip(difference, middles, strict=True)])
+    own = np.concatenate([frames.transform(T, points) for T, points in zip(poses, clouds, strict=True)])
+    own_normals = np.concatenate([frames.rotate(T, n) for T, n in zip(poses, normals, strict=True)])
+    fused, fused_normals = run.fused.points, run.fused.normals
+    asked = fused[:: max(1, len(fused) // _ASKED)]
+    return Witness(
+        version=_version(),
+        views=tuple(run.session.names),
+        poses=poses,
+        shift=np.linalg.norm(moved, axis=1),
+        turn=np.linalg.norm(frames.log(difference)[:, :3], axis=1),
+        pairs=pairs,
+        to_run=_from_surface(own[:: max(1, len(own) // _ASKED)], fused, fused_normals),
+        from_run=_from_surface(asked, own, own_normals),
+        places=asked,
+    )
+
+
+def _version() -> str:
+    return next(d.version for d in distributions() if (d.metadata["Name"] or "").lower() in ("open3d", "open3d-cpu"))
+
+
+@contextmanager
+def _one_thread(o3d: Any) -> Iterator[None]:
+    """Keep Open3D to one thread, where it can be kept so, and to errors."""
+    limit = getattr(o3d.utility, "set_max_threads", lambda _: None)
+    limit(1)
+    try:
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            yield
+    finally:
+        limit(0)
+
+
+def _spacing(clouds: list[Array]) -> float:
+    """Return the edge of the square that one point has for itself: the disc to the 8th neighbour holds 8 of them."""
+    rows = [np.ascontiguousarray(points, float) for points in clouds]
+    far = [np.median(KDTree(points).query(points[::20], k=9)[0][:, -1]) for points in rows]
+    return float(np.median(far) * np.sqrt(np.pi / 8))
+
+
+def _with_normals(o3d: Any, clouds: list[Array]) -> list[Any]:
+    """Return Open3D's clouds with normals towards the scanner."""
+    shown = []
+    for points in clouds:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, float)))
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBOURS))
+        cloud.orient_normals_towards_camera_location(np.zeros(3))
+        shown.append(cloud)
+    return shown
+
+
+def _registered(o3d: Any, clouds: list[Array], start: Array, spacing: float) -> tuple[Array, int]:
+    """Return T_reference_scanner (V, 4, 4) and the number of pairs that were registered."""
+    registration = o3d.pipelines.registration
+    shown = _with_normals(o3d, clouds)
+    graph = registration.PoseGraph()
+    graph.nodes.extend([registration.PoseGraphNode(T) for T in start])
+    for i, j in _one_sided(clouds, start):
+        T = frames.inverse(start[i]) @ start[j]
+        if registration.evaluate_registration(shown[j], shown[i], _DISTANCES[0] * spacing, T).fitness < _OVERLAP:
+            continue
+        for distance in _DISTANCES:
+            last = distance == _DISTANCES[-1]
+            loss = registration.TukeyLoss(k=_ROBUST * spacing) if last else registration.L2Loss()
+            method = registration.TransformationEstimationPointToPlane(loss)
+            T = registration.registration_icp(shown[j], shown[i], distance * spacing, T, method).transformation
+        information = registration.get_information_matrix_from_point_clouds(
+            shown[j], shown[i], _DISTANCES[-1] * spacing, T
+        )
+        # An edge of Open3D leads from its source to its target.
+        graph.edges.append(registration.PoseGraphEdge(j, i, T, information, uncertain=False))
+    linked = {v for edge in graph.edges for v in (edge.source_node_id, edge.target_node_id)}
+    if len(linked) < len(clouds):
+        raise NoResultError("--with open3d: Open3D finds no pair for some view; there is nothing to compare")
+    registration.global_optimization(
+        graph,
+        registration.GlobalOptimizationLevenbergMarquardt(),
+        registration.GlobalOptimizationConvergenceCriteria(),
+        registration.GlobalOptimizationOption(
+            max_correspondence_distance=_DISTANCES[-1] * spacing, edge_prune_threshold=0.25, reference_node=0
+        ),
+    )
+    return np.array([node.pose for node in graph.nodes]), len(graph.edges)
+
+
+def _one_sided(clouds: list[Array], poses: Array) -> list[tuple[int, int]]:
+    """Return the pairs of views that look at the part from the same side."""
+    looks = [frames.rotate(T, c.mean(axis=0)[None])[0] for c, T in zip(clouds, poses, strict=True)]
+    unit = [look / np.linalg.norm(look) for look in looks]
+    return [(i, j) for i, j in combinations(range(len(clouds)), 2) if unit[i] @ unit[j] > _SAME_SIDE]
+
+
+def _common_motion(clouds: list[Array], poses: Array, wanted: Array) -> Array:
+    """Return the rigid motion (4, 4) that brings all views nearest to where others put them."""
+    a, b = (
+        np.concatenate([frames.transform(T, points) for T, points in zip(own, clouds, strict=True)])
+        for own in (poses, wanted)
+    )
+    R = frames.nearest_rotation((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
+    return frames.make(R, b.mean(axis=0) - R @ a.mean(axis=0))
+
+
+def _from_surface(points: Array, surface: Array, normals: Array) -> Array:
+    """Return the distance (N,) of points from the tangent plane of the nearest surface point."""
+    _, at = KDTree(np.ascontiguousarray(surface, float)).query(np.ascontiguousarray(points, float))
+    distance: Array = np.einsum("ni,ni->n", points - surface[at], normals[at])
+    return distance

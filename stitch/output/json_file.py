@@ -1,0 +1,166 @@
+"""JSON without NaN, written whole or not at all."""
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.session.reading.text_files import read_json_object
+from stitch.system.files import Ours, whole_file
+
+# What in a run folder is the run's, and may be replaced; everything else there is a person's own.
+
+# Of result.json.
+FORMAT = "stitch-run/1"
+# Every file that a command writes into a run folder. What is not listed here is never removed.
+FILES = {
+    "model.toml",
+    "result.json",
+    "ledger.json",
+    "stitched.ply",
+    "mesh.ply",
+    "residuals.parquet",
+    "recording.rrd",
+    "report.html",
+    "report.pdf",
+    "features.json",
+    "features.csv",
+    "features.html",
+    "two-runs.html",
+    "two-runs.pdf",
+    "compare.json",
+    "witness.json",
+    "witness.png",
+    "diagnosis.json",
+    "diagnosis.rrd",
+    "robot.toml",
+    "robot.urdf",
+}
+# Earlier fits of the run, by what they were made of.
+FITS = ".fits"
+# "suspects" is what "candidates" was called once.
+_PICTURES = {
+    "budget",
+    "candidates",
+    "suspects",
+    "added_variable",
+    "shape",
+    "aliases",
+    "views",
+    "joint_courses",
+    "time_course",
+    "field_map",
+    "compare",
+}
+
+
+def is_run_file(path: Path) -> Ours:
+    """Whether a path inside the run folder `path` was written by stitch."""
+    inner = set(_runs_of_rig(path))
+
+    def is_ours(inside: Path) -> bool:
+        if inside.parts[0] in inner:
+            inside = inside.relative_to(inside.parts[0])
+        match inside.parts:
+            case (name,):
+                return name in FILES or (name.startswith(".") and name.endswith(".new") and name[1:-4] in FILES)
+            case (folder, *_) if folder == FITS:
+                return True
+            case ("pictures", _):
+                return inside.stem in _PICTURES and inside.suffix in (".png", ".svg")
+        return False
+
+    return is_ours
+
+
+def sessions_in(path: Path) -> list[str] | None:
+    """Paths of the sessions of a run folder as it states them; None for a folder that is no run."""
+    if not path.is_dir() or (path / "session.toml").exists() or not (path / "model.toml").is_file():
+        return None
+    told = [
+        _session_path(file)
+        for file in (path / "result.json", *(path / name / "result.json" for name in _runs_of_rig(path)))
+    ]
+    found = [session for session in told if session is not None]
+    return found or None
+
+
+def require_free(path: Path, sessions: Sequence[Path], force: bool) -> None:
+    """Refuse a place for a run of `sessions` where something would be lost.
+
+    Raises:
+        InputError: `path` lies in a session, holds one, holds the present folder, is no run, or is one of other
+            sessions and not to be replaced by `force`.
+    """
+    target, here = path.resolve(), Path.cwd()
+    if target in (here, *here.parents):
+        raise InputError(f"{path}: one stands in this folder, and a run replaces it; name another with -o")
+    own = [session.resolve() for session in sessions]
+    for folder in (target, *target.parents):
+        if folder in own or (folder / "session.toml").is_file():
+            raise InputError(f"{path}: lies in the session {folder}, which is only read; name another folder with -o")
+    for session in own:
+        if target in session.parents:
+            raise InputError(f"{path}: the session {session} lies in it; name another folder with -o")
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return
+    if (before := sessions_in(target)) is None:
+        raise InputError(f"{path}: exists and is not a run folder; name another with -o")
+    if not force and {str(Path(s).resolve()) for s in before} != {str(s) for s in own}:
+        raise InputError(
+            f"{path}: holds the run of {', '.join(before)}; name another with -o, or replace it with --force"
+        )
+
+
+def others_of_rig(run: Path) -> list[str]:
+    """Names of the runs that one rig's folder holds beside a run."""
+    own = run.resolve()
+    return [name for name in _runs_of_rig(own.parent) if name != own.name]
+
+
+def _runs_of_rig(path: Path) -> list[str]:
+    """Names of the runs in the folder of a rig, which has no result of its own."""
+    if not path.is_dir() or (path / "result.json").exists() or not (path / "model.toml").is_file():
+        return []
+    return sorted(file.parent.name for file in path.glob("*/result.json") if _session_path(file) is not None)
+
+
+def _session_path(file: Path) -> str | None:
+    document = read_json_object(file)
+    session = document.get("session") if document.get("format") == FORMAT else None
+    return session if isinstance(session, str) and "\0" not in session else None
+
+
+def write_json(document: Any, path: Path) -> None:
+    """Write JSON whole or not at all; what is not known is null."""
+    with whole_file(path) as file:
+        file.write_text(to_json(document) + "\n", encoding="utf-8")
+
+
+def to_json(document: Any) -> str:
+    """JSON text; JSON has no NaN and no infinity: what is not known is null."""
+    return json.dumps(_without_nan(document), indent=1, allow_nan=False)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def rows_of_fields(items: Iterable[Any], fields: str) -> list[dict[str, Any]]:
+    """One row an item with some of its fields, arrays and tuples as lists."""
+    return [{name: _plain(getattr(item, name)) for name in fields.split()} for item in items]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return list(value) if isinstance(value, tuple) else value

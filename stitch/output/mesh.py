@@ -1,0 +1,128 @@
+"""A triangle mesh of the fused cloud, on request."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import igl
+import numpy as np
+from plyfile import PlyData, PlyElement
+from pykdtree.kdtree import KDTree
+
+from stitch.errors import NoResultError
+from stitch.numerics.frames import Array, Indices
+from stitch.system.threads import parallel
+
+# A cell's edge is one spacing of the points: finer, and cells on the surface have no point beside them; coarser, and
+# sheets are lost that are thinner than a cell. At least this share of the largest side bounds memory and time.
+_CELL_SHARE = 1 / 512
+# Points that say how far the surface lies: enough to average the noise, few enough to follow a fillet.
+_NEIGHBOURS = 16
+# A cell with a corner farther than so many cells from all points holds no surface: the mesh ends where the points do.
+_REACH = 2.5
+# The mesh reaches at most so many cells beyond the last points: holes between points are narrower.
+_OVERHANG = 1.0
+# Points that tell the spacing; places that are worked on at a time, as many as stay in a core's cache.
+_SAMPLES, _IN_CACHE = 20_000, 4096
+# Ends where the points do; closed; with a tenth of the triangles. Open3D makes the latter two.
+OPEN, WATERTIGHT, LIGHT = KINDS = ("open", "watertight", "light")
+NO_SURFACE = "no mesh: the fused points span no surface; run without --mesh"
+# In the order in which libigl counts the corners of a cell.
+_CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """V vertices and T triangles, counter-clockwise seen from outside."""
+
+    vertices: Array  # (V, 3)
+    triangles: Indices  # (T, 3)
+
+
+def write_mesh(mesh: TriangleMesh, path: Path) -> None:
+    """Write a mesh as binary PLY."""
+    vertices = np.empty(len(mesh.vertices), [(axis, "<f8") for axis in "xyz"])
+    for axis, column in zip("xyz", mesh.vertices.T, strict=True):
+        vertices[axis] = column
+    faces = np.empty(len(mesh.triangles), [("vertex_indices", "<i4", (3,))])
+    faces["vertex_indices"] = mesh.triangles
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    PlyData(elements, byte_order="<").write(str(path))
+
+
+def mesh_of(points: Array, normals: Array, outside: float = 0.0) -> TriangleMesh:
+    """The surface through points (N, 3) with unit normals (N, 3), open where there are no points.
+
+    Marching cubes (Lorensen & Cline 1987) over the signed distance from the points' weighted tangent planes: implicit
+    moving least squares (Kolluri 2008), in the cells about the points alone. Nothing is closed that nobody saw.
+
+    Args:
+        outside: cells by which the surface is sought outside, before its vertices are moved back: a sheet that is
+            thinner than a cell has corners of cells within it only so.
+
+    Raises:
+        NoResultError: the points span no surface.
+    """
+    if len(points) < _NEIGHBOURS:
+        raise NoResultError(NO_SURFACE)
+    tree = KDTree(np.ascontiguousarray(points, float))
+    size = max(spacing(points, tree), _CELL_SHARE * float(np.ptp(points, axis=0).max()))
+    places, cells = _cells_about(points, size)
+    heights, nearest = _heights(places, points, normals, tree, size)
+    cells = cells[(nearest < _REACH * size)[cells].all(axis=1)]
+    vertices, triangles, _ = igl.marching_cubes(heights, places, cells, outside * size)
+    # Beyond the last points the tangent planes run on; what lies farther than a hole between points ends there.
+    gap, nearest = tree.query(vertices, k=1)
+    triangles = triangles[(gap < np.hypot(_OVERHANG, outside) * size)[triangles].all(axis=1)]
+    if not len(triangles):
+        raise NoResultError(NO_SURFACE)
+    kept, triangles = np.unique(triangles, return_inverse=True)
+    vertices, nearest = vertices[kept], nearest[kept].astype(np.int64)
+    if outside:
+        vertices = vertices - _heights(vertices, points, normals, tree, size)[0][:, None] * normals[nearest]
+    return TriangleMesh(vertices, triangles.reshape(-1, 3))
+
+
+def spacing(points: Array, tree: Any) -> float:
+    """Return the edge of the square that one point has for itself: the disc to the 8th neighbour holds 8 of them."""
+    distance, _ = tree.query(points[:: max(1, len(points) // _SAMPLES)], k=9)
+    return float(np.median(distance[:, -1]) * np.sqrt(np.pi / 8))
+
+
+def _cells_about(points: Array, size: float) -> tuple[Array, Indices]:
+    """Corners (P, 3) of the cells in which or beside which points lie, and per cell its eight corners (C, 8)."""
+    origin = points.min(axis=0) - 2 * size
+    cell = np.floor((points - origin) / size).astype(np.int64)
+    shape = cell.max(axis=0) + 3
+    steps = np.array([shape[1] * shape[2], shape[2], 1])
+    around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    keys = np.unique(np.unique(cell @ steps)[:, None] + around @ steps)
+    corners, cells = np.unique(keys[:, None] + _CORNERS @ steps, return_inverse=True)
+    places = origin + size * np.stack(np.unravel_index(corners, shape), axis=1)
+    return places, cells.reshape(-1, 8).astype(np.int64)
+
+
+def _heights(places: Array, points: Array, normals: Array, tree: Any, size: float) -> tuple[Array, Array]:
+    """Signed distance (P,) of places (P, 3) from the surface, and distance (P,) from the nearest point."""
+
+    # Coordinates first, then neighbours, each in one piece: sums over rows of three or sixteen take longer.
+    columns, facing = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T)
+
+    def of(block: Array) -> tuple[Array, Array]:
+        distance, index = (np.ascontiguousarray(x.T) for x in tree.query(block, k=_NEIGHBOURS))
+        n = np.array([column.take(index) for column in facing])
+        away = np.array([at - column.take(index) for column, at in zip(columns, block.T, strict=True)])
+        # Of a thin sheet only the nearer side counts.
+        agree = np.maximum(np.einsum("ikp,ip->kp", n, n[:, 0]), 0)
+        weight = agree * np.exp((distance[0] ** 2 - distance**2) / size**2)
+        weight /= weight.sum(axis=0)
+        here = np.einsum("kp,ikp->ip", weight, n)
+        here /= np.sqrt(np.einsum("ip,ip->p", here, here))
+        # Tangent planes at the points lie above a convex surface, one at the place itself below it: on a ball the
+        # mean of both normals is exact, as in symmetric ICP (Rusinkiewicz 2019).
+        n += here[:, None]
+        return np.einsum("kp,kp->p", weight, np.einsum("ikp,ikp->kp", n, away)) / 2, distance[0]
+
+    blocks = parallel(of, np.array_split(places, len(places) // _IN_CACHE + 1), "blocks of the mesh")
+    heights, nearest = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    return heights, nearest

@@ -1,0 +1,176 @@
+"""Meshes that Open3D makes of the fused cloud: closed, or with a tenth of the triangles."""
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from pykdtree.kdtree import KDTree
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from stitch.errors import NoResultError
+from stitch.numerics.frames import Array, Indices
+from stitch.numerics.units import length_text
+from stitch.output.mesh import LIGHT, NO_SURFACE, WATERTIGHT, TriangleMesh, mesh_of, spacing
+from stitch.run_data import FusedCloud
+from stitch.system.open3d_library import import_open3d
+
+# Poisson counts the density of points in levels of its octree. Where it is so many levels below the median, one point
+# stands for eight: nobody looked there, and the surface is the solver's own.
+_SPARSE_LEVELS = 1.5
+_FEWEST_POINTS = 100
+# Poisson solves in a cube so many times as large as the points' box.
+_BOX_SCALE = 1.1
+# Parts with a smaller share of the largest one's triangles are scraps of the trimming.
+_PART_SHARE = 0.01
+_LIGHT_SHARE = 0.1
+# Points that say how far the mesh is off the cloud.
+_ASKED = 20_000
+_SEEN_SPACINGS = 2.5
+
+
+@dataclass(frozen=True)
+class MeshFit:
+    """How a mesh lies to the points that it was made of; lengths in length_unit."""
+
+    triangles: int
+    closed: bool  # every edge belongs to two triangles
+    median: float  # of the distances of the points from the mesh
+    p95: float
+    unseen: float  # share of the area that is farther than 2.5 spacings from all points
+
+    def sentence(self, length_unit: str) -> str:
+        """Return the numbers in plain words."""
+        unseen = f" Nobody looked at {self.unseen:.0%} of its area." if self.closed else ""
+        return (
+            f"mesh.ply: {'closed' if self.closed else 'open'}, {self.triangles:,} triangles. Half of the fused points "
+            f"lie within {length_text(self.median, length_unit)} of it, 95 % within "
+            f"{length_text(self.p95, length_unit)}.{unseen}"
+        )
+
+
+def make_mesh(cloud: FusedCloud, kind: str) -> tuple[TriangleMesh, MeshFit]:
+    """Return a mesh of the fused points and how far off them it lies; reference frame, length_unit.
+
+    Args:
+        kind: "open" ends where the points do, "watertight" is closed, "light" is open with a tenth of the triangles.
+
+    Raises:
+        InputError: Open3D is not installed, or lacks a library of the system.
+        NoResultError: the points span no surface.
+    """
+    if kind == WATERTIGHT:
+        mesh = watertight(cloud.points, cloud.normals)
+    else:
+        mesh = mesh_of(cloud.points, cloud.normals)
+        mesh = light(mesh, max(1, round(_LIGHT_SHARE * len(mesh.triangles)))) if kind == LIGHT else mesh
+    return mesh, mesh_fit(mesh, cloud.points)
+
+
+def watertight(points: Array, normals: Array) -> TriangleMesh:
+    """Compute the closed surface through points (N, 3) with unit normals (N, 3).
+
+    Screened Poisson reconstruction (Kazhdan & Hoppe 2013), trimmed where its points are sparse; each opening that is
+    left is closed by a fan about its middle. Bits repeat: the solver runs on one thread.
+
+    Raises:
+        InputError: Open3D is not installed, or lacks a library of the system.
+        NoResultError: the points span no surface.
+    """
+    o3d = import_open3d("--mesh watertight")
+    if len(points) < _FEWEST_POINTS:
+        raise NoResultError(NO_SURFACE)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, float)))
+    cloud.normals = o3d.utility.Vector3dVector(np.asarray(normals, float))
+    solve = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        found, density = solve(cloud, depth=_octree_depth(points), scale=_BOX_SCALE, n_threads=1)
+    levels = np.asarray(density)
+    triangles = np.asarray(found.triangles, np.int64)
+    triangles = triangles[(levels > np.median(levels) - _SPARSE_LEVELS)[triangles].all(axis=1)]
+    return _capped(np.asarray(found.vertices), _large_parts(_without_pinches(triangles)))
+
+
+def light(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
+    """Return a mesh with about so many triangles, by quadric error metrics (Garland & Heckbert 1997).
+
+    Raises:
+        InputError: Open3D is not installed, or lacks a library of the system.
+    """
+    o3d = import_open3d("--mesh light")
+    whole = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.triangles.astype(np.int32))
+    )
+    found = whole.simplify_quadric_decimation(triangles)
+    return TriangleMesh(np.asarray(found.vertices), np.asarray(found.triangles, np.int64))
+
+
+def mesh_fit(mesh: TriangleMesh, points: Array) -> MeshFit:
+    """Compute how a mesh lies to points (N, 3) of the same frame and unit; of many points every so manieth is asked."""
+    tree = KDTree(np.ascontiguousarray(points, float))
+    asked = np.ascontiguousarray(points[:: max(1, len(points) // _ASKED)], float)
+    distance = np.sqrt(igl.point_mesh_squared_distance(asked, mesh.vertices, mesh.triangles)[0])
+    corners = mesh.vertices[mesh.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    far = tree.query(corners.mean(axis=1))[0] > _SEEN_SPACINGS * spacing(points, tree)
+    median, p95 = np.quantile(distance, [0.5, 0.95])
+    return MeshFit(
+        triangles=len(mesh.triangles),
+        closed=not len(_rim(mesh.triangles)),
+        median=float(median),
+        p95=float(p95),
+        unseen=float(area[far].sum() / area.sum()),
+    )
+
+
+def _octree_depth(points: Array) -> int:
+    """Return the depth at which a cell of the octree is no larger than the points' spacing."""
+    size = float(np.ptp(points, axis=0).max())
+    return int(np.ceil(np.log2(_BOX_SCALE * size / spacing(points, KDTree(np.ascontiguousarray(points, float))))))
+
+
+def _rim(triangles: Indices) -> Indices:
+    """Return the directed edges (E, 2) of triangles (T, 3) that no neighbour runs through the other way."""
+    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    count = int(triangles.max(initial=0)) + 1
+    there, back = edges @ [count, 1], edges[:, ::-1] @ [count, 1]
+    rim: Indices = edges[~np.isin(there, back)]
+    return rim
+
+
+def _without_pinches(triangles: Indices) -> Indices:
+    """Return the triangles without those at which two openings meet in one vertex: no fan closes both."""
+    while len(triangles):
+        pinched = np.bincount(_rim(triangles)[:, 0], minlength=triangles.max() + 1) > 1
+        if not pinched.any():
+            break
+        triangles = triangles[~pinched[triangles].any(axis=1)]
+    return triangles
+
+
+def _large_parts(triangles: Indices) -> Indices:
+    """Return the triangles of connected parts that are no scraps."""
+    if not len(triangles):
+        raise NoResultError(NO_SURFACE)
+    part = _connected(triangles[:, [0, 1, 1, 2]].reshape(-1, 2), int(triangles.max()) + 1)[triangles[:, 0]]
+    sizes = np.bincount(part)
+    return np.asarray(triangles[(sizes >= _PART_SHARE * sizes.max())[part]])
+
+
+def _capped(vertices: Array, triangles: Indices) -> TriangleMesh:
+    """Return the mesh with a fan over each opening, and without the vertices that no triangle has."""
+    rim = _rim(triangles)
+    opening = _connected(rim, len(vertices))[rim[:, 0]]
+    _, opening = np.unique(opening, return_inverse=True)
+    count = np.bincount(opening)[:, None]
+    middles = np.column_stack([np.bincount(opening, column) for column in vertices[rim[:, 0]].T]) / np.maximum(count, 1)
+    fans = np.column_stack([rim[:, ::-1], len(vertices) + opening])
+    kept, triangles = np.unique(np.vstack([triangles, fans]), return_inverse=True)
+    return TriangleMesh(np.vstack([vertices, middles])[kept], triangles.reshape(-1, 3))
+
+
+def _connected(edges: Indices, count: int) -> Indices:
+    """Return a label (count,) per vertex, the same where edges (E, 2) join two."""
+    graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    label: Indices = connected_components(graph, directed=False)[1]
+    return label

@@ -1,0 +1,297 @@
+"""The run folder on disk: written whole or not at all."""
+
+import csv
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from importlib.metadata import entry_points, version
+from itertools import chain
+from pathlib import Path
+from threading import Thread
+from typing import Any, TypeVar
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from stitch.effects import EFFECTS
+from stitch.errors import InputError
+from stitch.model.model_toml import read_model, write_model
+from stitch.numerics.frames import Array
+from stitch.observations.surfaces.matching import Match
+from stitch.output.json_file import FILES, FITS, is_run_file, require_free, write_json
+from stitch.output.result_document import ledger, model_of, residual_columns, result_document
+from stitch.recorder import Recorder
+from stitch.run_data import FusedCloud, Run
+from stitch.session.reading.session_folder import measured_files
+from stitch.session.session import Session, View
+from stitch.system.files import claim_folder, rewrite_folder
+from stitch.system.threads import release_mapped
+
+# Recordings of a run, made by the packages that offer one.
+
+
+def recordings(folder: Path) -> list[Recorder]:
+    """What other packages record of a run into its folder, by the entry-point group `stitch.recorders`."""
+    return [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]
+
+
+# stitched.ply and residuals.parquet.
+
+_Value = TypeVar("_Value")
+
+# Rows that are in memory at a time.
+_ROWS = 1_000_000
+_PLACE = ("x", "y", "z", "nx", "ny", "nz")
+_RESERVED_COLUMNS = {"view", "partner", *_PLACE, "residual", "heldout", "time_s"}
+
+
+def write_cloud(cloud: FusedCloud, path: Path) -> None:
+    """Binary PLY with normals, `residual` and `views`, how many support a point.
+
+    Of a cloud in a file never more than a part is in memory.
+    """
+    names = ("x", "y", "z", "nx", "ny", "nz", "residual")
+    layout = np.dtype([(name, "<f4") for name in names] + [("views", "<u2")])
+    header = PlyData([PlyElement.describe(np.empty(0, layout), "vertex")], byte_order="<").header
+    with path.open("wb") as out:
+        out.write(header.replace("vertex 0", f"vertex {len(cloud.points)}").encode() + b"\n")
+        for start in range(0, len(cloud.points), _ROWS):
+            part = slice(start, start + _ROWS)
+            columns = np.column_stack([cloud.points[part], cloud.normals[part], cloud.residual[part]])
+            vertex = np.empty(len(columns), layout)
+            for name, column in zip(names, columns.T, strict=True):
+                vertex[name] = column
+            vertex["views"] = cloud.count[part]
+            vertex.tofile(out)
+            for values in vars(cloud).values():
+                release_mapped(values)
+
+
+def write_residuals(run: Run, path: Path) -> None:
+    """Write the table of residuals as Parquet."""
+    import pyarrow.parquet as pq
+
+    table = residual_table(run)
+    # Of numbers that never repeat a dictionary takes four times as long as they do, and more room.
+    repeated = [name for name in table.column_names if name not in (*_PLACE, "residual", "heldout")]
+    pq.write_table(table, path, compression="zstd", use_dictionary=repeated)
+
+
+def residual_table(run: Run) -> Any:
+    """Return one row per residual of the model, before the register stage moves single views, as a pyarrow.Table.
+
+    `time_s` is NaN where nobody states it; a covariate that is called like another column becomes `covariate_NAME`.
+    What the clouds state of every point stands there as well, of the partner's point as `partner_NAME`.
+    """
+    import pyarrow as pa
+
+    session = _without_reserved_covariates(run.session)
+    of_views = {key for view in session.views for key in view.covariates}
+    of_points = {key for view in session.views if view.cloud is not None for key in view.cloud.scalars}
+    parts = [] if run.overlaps is None else [_columns(session, m, of_views, of_points) for m in run.overlaps.matches]
+    if run.targets is not None:
+        parts.append(residual_columns(run.targets, session))
+    # Beside clouds, labelled points have the columns of these.
+    common = [key for key in (parts or [{}])[0] if all(key in part for part in parts)]
+    columns = {key: [part[key] for part in parts] for key in common}
+    return pa.table({key: _joined(pa, own) for key, own in columns.items()})
+
+
+def _joined(pa: Any, parts: Sequence[Array]) -> Any:
+    """One column of parts; of names that are the same all over a part each is encoded once."""
+    if not parts or parts[0].dtype.kind != "U":
+        return pa.array(np.concatenate(parts))
+    encoded = [
+        pa.array(own).dictionary_encode()
+        if own.strides[0]
+        else pa.DictionaryArray.from_arrays(np.zeros(len(own), np.int32), own[:1])
+        for own in parts
+    ]
+    return pa.chunked_array(encoded).unify_dictionaries().combine_chunks()
+
+
+def _without_reserved_covariates(session: Session) -> Session:
+    """The session without covariates that would take the place of a column."""
+
+    def free(values: dict[str, _Value]) -> dict[str, _Value]:
+        return {f"covariate_{key}" if key in _RESERVED_COLUMNS else key: value for key, value in values.items()}
+
+    def renamed(view: View) -> View:
+        cloud = None if view.cloud is None else replace(view.cloud, scalars=free(view.cloud.scalars))
+        return replace(view, covariates=free(view.covariates), cloud=cloud)
+
+    return replace(session, views=tuple(renamed(view) for view in session.views))
+
+
+def _columns(session: Session, m: Match, of_views: Iterable[str], of_points: Iterable[str]) -> dict[str, Array]:
+    """Columns of one pair of views, a row per correspondence."""
+    size = len(m.residual)
+    own, time = session.views[m.v].covariates, session.views[m.v].time_s
+    out = {
+        name: np.broadcast_to(np.array(session.views[v].name), size) for name, v in (("view", m.v), ("partner", m.w))
+    }
+    out |= dict(zip(_PLACE, (*m.middle.T, *m.normal.T), strict=True))
+    out |= {"residual": m.residual, "time_s": np.full(size, np.nan if time is None else time)}
+    out |= {key: np.full(size, own.get(key, np.nan)) for key in sorted(of_views)}
+    for key in sorted(of_points):
+        for name, v, index in ((key, m.v, m.index_v), (f"partner_{key}", m.w, m.index_w)):
+            cloud = session.views[v].cloud
+            if cloud is not None and key in cloud.scalars:
+                out[name] = cloud.scalars[key][index]
+            else:
+                out.setdefault(name, np.full(size, np.nan))
+    return out
+
+
+@contextmanager
+def new_folder(path: Path, sessions: Sequence[Path], force: bool = False) -> Iterator[Path]:
+    """A scratch folder that takes the place of `path` if the block succeeds, and goes if it fails.
+
+    Of what stands there, only what a run wrote goes; a person's own files stay.
+
+    Args:
+        sessions: folders of the sessions that are run.
+        force: replace the run of other sessions too.
+
+    Raises:
+        InputError: `path` is no place for this run, or another process writes there.
+    """
+    require_free(path, sessions, force)
+    with rewrite_folder(path, is_run_file(path)) as scratch:
+        yield scratch
+
+
+@contextmanager
+def replace_run_files(path: Path) -> Iterator[Path]:
+    """A scratch folder whose files take the place of all that was made of the old model if the block succeeds; the old
+    fit is kept for `restore_fit`."""
+    with rewrite_folder(path, is_run_file(path)) as scratch:
+        yield scratch
+        # A file system without links keeps none.
+        with suppress(OSError, InputError):
+            _keep_fit(path, scratch)
+
+
+# Fits that a run has had, kept by links: the way back to one takes no fit.
+
+# All that are kept; beyond it the oldest go.
+_KEPT_BYTES = 1e9
+
+
+def restore_fit(path: Path, effects: Collection[str], recording: bool) -> bool:
+    """Give a run the fit with these effects that it has had before, as a further step of its ledger.
+
+    False where none is kept, or only one without the recording that is asked for.
+
+    Raises:
+        InputError: another process writes there.
+    """
+    kept = _place_of_fit(path, effects)
+    if kept is None or not all((kept / name).is_file() for name in ("ledger.json", "recording.rrd")[: 1 + recording]):
+        return False
+    with lock_run_folder(path), replace_run_files(path) as scratch:
+        # No links: who edits model.toml where it stands would edit the kept one.
+        shutil.copytree(kept, scratch, dirs_exist_ok=True)
+        steps, earlier = (json.loads((at / "ledger.json").read_text(encoding="utf-8")) for at in (path, kept))
+        again = {key: told for key, told in earlier[-1].items() if key != "notes"} | {"step": len(steps)}
+        write_json([*steps, again], scratch / "ledger.json")
+    return True
+
+
+def _place_of_fit(path: Path, effects: Collection[str]) -> Path | None:
+    """Return where the fit of a run's session with these effects is kept; None where the session or the model is not
+    what was fitted, and for effects of a user's own file, which may change."""
+    try:
+        session = Path(json.loads((path / "result.json").read_text(encoding="utf-8"))["session"])
+        fitted, own = (path / "result.json").stat().st_mtime_ns, (path / "model.toml").stat().st_mtime_ns
+        marks = [
+            (file.name, told.st_size, told.st_mtime_ns) for file in measured_files(session) for told in [file.stat()]
+        ]
+        known = {effect.name for effect in EFFECTS.values() if effect.tier != "user"}
+    except (OSError, ValueError, LookupError, csv.Error):
+        return None
+    if max(own, *(time for _, _, time in marks)) > fitted or not known.issuperset(effects):
+        return None
+    made_of = json.dumps([version("stitch"), sorted(effects), marks])
+    return path / FITS / hashlib.sha256(made_of.encode()).hexdigest()[:16]
+
+
+def _keep_fit(path: Path, scratch: Path) -> None:
+    """Link the fits that a run keeps, and the one that it has, into the folder that takes its place."""
+    if (path / FITS).is_dir():
+        shutil.copytree(path / FITS, scratch / FITS, copy_function=os.link)
+    if (place := _place_of_fit(path, read_model(path).effects)) is not None:
+        place = scratch / FITS / place.name
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+        for name in FILES:
+            if (path / name).is_file():
+                os.link(path / name, place / name)
+    size = 0
+    for fit in sorted((scratch / FITS).iterdir(), key=lambda fit: -fit.stat().st_mtime_ns):
+        size += sum(file.stat().st_size for file in fit.iterdir())
+        if size > _KEPT_BYTES:
+            shutil.rmtree(fit)
+
+
+@contextmanager
+def lock_run_folder(path: Path) -> Iterator[None]:
+    """Hold a run folder as its only writer, from reading it to writing into it.
+
+    Raises:
+        InputError: another process writes there, or its folder of pictures is a link to elsewhere.
+    """
+    if not path.parent.is_dir():
+        yield
+        return
+    with claim_folder(path):
+        if (path / "pictures").is_symlink():
+            raise InputError(f"{path}/pictures: is a link out of the run folder; to fix: remove it")
+        yield
+
+
+def call_entry_points(group: str, *arguments: Any) -> None:
+    """Call what other packages offer under an entry-point group."""
+    for entry in entry_points(group=group):
+        entry.load()(*arguments)
+
+
+def preload_entry_points(*groups: str) -> None:
+    """Load beside the fit what `extend` calls after it: it leaves a core idle, and drawing takes a second to load."""
+
+    def load() -> None:
+        # What fails here fails again where it is called, and is said there.
+        with suppress(Exception):
+            for entry in chain.from_iterable(entry_points(group=group) for group in groups):
+                entry.load()
+
+    Thread(target=load, daemon=True).start()
+
+
+def write_with_page(run: Run, folder: Path, tolerance: float | None = None) -> None:
+    """Write model.toml, result.json, ledger.json, stitched.ply, residuals.parquet and report.html into `folder`.
+
+    Args:
+        tolerance: within which the views have to agree on the part, length_unit.
+    """
+    # The page, which takes longest, is made while all else is written.
+    with ThreadPoolExecutor(2) as beside:
+        begun = [
+            beside.submit(call_entry_points, "stitch.reports", run, folder / "report.html", tolerance),
+            beside.submit(_write_points, run, folder),
+        ]
+        write_model(model_of(run), folder / "model.toml")
+        write_json(result_document(run), folder / "result.json")
+        write_json(ledger(run), folder / "ledger.json")
+        for written in begun:
+            written.result()
+
+
+def _write_points(run: Run, folder: Path) -> None:
+    write_cloud(run.fused, folder / "stitched.ply")
+    write_residuals(run, folder / "residuals.parquet")

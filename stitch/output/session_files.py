@@ -1,0 +1,143 @@
+"""A session folder on disk: session.toml, views.csv and what the sensor saw; whole or not at all.
+
+The one writer of the format: the cells hand out their readings with it, and simulated cells what they measured.
+"""
+
+import csv
+import io
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+from plyfile import PlyData, PlyElement
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.session.reading.session_folder import SESSION_FORMAT
+from stitch.session.session import Cloud
+
+TableColumns = Mapping[str, Sequence[object] | Array]  # a table by its header; text as it stands, floats with 12 digits
+
+
+@dataclass(frozen=True)
+class SessionFiles:
+    """What one session folder holds. Lengths in length_unit, frames as the sensor's mount has them."""
+
+    name: str
+    length_unit: str
+    mount: str
+    views: TableColumns  # columns of views.csv, the first called `view`
+    tables: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # of session.toml, e.g. {"scanner": {…}}
+    clouds: Mapping[str, Cloud] = field(default_factory=dict)  # by file, relative to the folder; scanner frame
+    points: TableColumns | None = None  # view, target, x, y, z and sigma where it is known
+    frames: TableColumns | None = None  # view, x, y, z, qx, qy, qz, qw of a probe in the sensor's frame
+    targets: Mapping[str, Array] = field(default_factory=dict)  # nominal places (3,), part frame
+    copies: Sequence[Path] = ()  # files that lie beside session.toml, such as the part's CAD
+    texts: Mapping[str, str] = field(default_factory=dict)  # by file: others that lie there, such as a URDF
+    scalar: str = "<f4"  # in which type clouds hold their scalars; "<f8" keeps every digit
+
+
+def pose_columns(T: Array) -> dict[str, Array]:
+    """Columns x, y, z, qx, qy, qz, qw of poses (V, 4, 4)."""
+    columns = np.hstack([T[:, :3, 3], frames.to_quaternion(T)])
+    return dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), columns.T, strict=True))
+
+
+def write_session(folder: Path, session: SessionFiles) -> None:
+    """Write one session into the new folder, with everything or not at all.
+
+    Raises:
+        InputError: the folder exists and is not empty.
+    """
+    with whole_folder(folder) as scratch:
+        _write(scratch, session)
+
+
+def write_sessions(folder: Path, sessions: Sequence[SessionFiles]) -> None:
+    """Write one session into `folder`, several into folders of their names below it; all of them or nothing.
+
+    Raises:
+        InputError: the folder exists and is not empty, or a name cannot be a folder's.
+    """
+    with whole_folder(folder) as scratch:
+        for session in sessions:
+            if session.name != Path(session.name).name:
+                raise InputError(f"{folder}: {session.name!r} is no name for a folder; rename the session")
+            _write(scratch if len(sessions) == 1 else scratch / session.name, session)
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A scratch folder that takes the place of `folder` if the block succeeds, and goes if it fails.
+
+    Raises:
+        InputError: the folder exists and is not empty.
+    """
+    if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
+        raise InputError(f"{folder}: exists already; name another folder for the session")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    scratch = folder.with_name(f".{folder.name}.writing")
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    try:
+        yield scratch
+        if folder.exists():
+            folder.rmdir()
+        scratch.rename(folder)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _write(folder: Path, session: SessionFiles) -> None:
+    folder.mkdir(exist_ok=True)
+    head = {"format": SESSION_FORMAT, "name": session.name}
+    head |= {"length_unit": session.length_unit, "mount": session.mount}
+    (folder / "session.toml").write_text(tomli_w.dumps({**head, **session.tables}), encoding="utf-8")
+    for name, text in session.texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    for file in session.copies:
+        shutil.copyfile(file, folder / file.name)
+    for name, cloud in session.clouds.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_ply(folder / name, cloud, session.scalar)
+    write_table(folder / "views.csv", session.views)
+    for name, table in (("points.csv", session.points), ("frames.csv", session.frames)):
+        if table is not None:
+            write_table(folder / name, table)
+    if session.targets:
+        xyz = np.array(list(session.targets.values()))
+        write_table(folder / "targets.csv", {"target": list(session.targets), **dict(zip("xyz", xyz.T, strict=True))})
+
+
+def write_ply(path: Path, cloud: Cloud, scalar: str = "<f4") -> None:
+    """Write one scan as binary PLY: places and normals in double precision, its scalars as `scalar` says."""
+    # Single precision holds 30 nm at half a metre; positions keep double, they are what everything rests on.
+    columns = dict(zip("xyz", cloud.points.T, strict=True))
+    if cloud.normals is not None:
+        columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.T, strict=True))
+    layout = [(axis, "<f8") for axis in columns] + [(name, scalar) for name in cloud.scalars]
+    vertex = np.empty(len(cloud.points), layout)
+    for name, values in (columns | cloud.scalars).items():
+        vertex[name] = values
+    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
+
+
+def write_table(file: Path, columns: TableColumns) -> None:
+    """Write one table of a session."""
+    file.write_text(table_text(columns), encoding="utf-8", newline="")
+
+
+def table_text(columns: TableColumns) -> str:
+    """A table as CSV."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    for row in zip(*columns.values(), strict=True):
+        writer.writerow([f"{value:.12g}" if isinstance(value, float) else value for value in row])
+    return out.getvalue()

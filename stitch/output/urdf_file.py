@@ -1,0 +1,72 @@
+"""A robot as URDF (http://wiki.ros.org/urdf/XML), in metres and radians."""
+
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.session.robot import Robot, elementary
+
+
+def to_urdf(robot: Robot) -> str:
+    """The chain base_link, link_1 … link_n, flange as URDF text: the same flange pose for every joint angle.
+
+    Masses are written as point masses; the payload is a link of its own fixed to the flange, so a reader
+    of the file must not add it again.
+    """
+    root = ElementTree.Element("robot", name=robot.name or "robot")
+    ElementTree.SubElement(root, "link", name="base_link")
+    parent, carried = "base_link", np.eye(4)
+    for i in range(robot.n_joints):
+        origin = carried @ robot.before[i] @ elementary("z", robot.theta[i])
+        # A link's frame sits right behind its joint here, before `after`, which the next origin takes up.
+        centre = frames.transform(robot.after[i], robot.com[i][None])[0] * robot.metres_per_unit
+        link = f"link_{i + 1}"
+        _add_link(root, link, float(robot.mass[i]), centre)
+        _add_joint(root, f"joint_{i + 1}", "continuous", parent, link, origin, robot.metres_per_unit)
+        parent, carried = link, robot.after[i]
+    _add_link(root, "flange", 0.0, np.zeros(3))
+    _add_joint(root, "flange_joint", "fixed", parent, "flange", carried, robot.metres_per_unit)
+    if robot.payload_mass:
+        _add_link(root, "payload", robot.payload_mass, robot.payload_com * robot.metres_per_unit)
+        _add_joint(root, "payload_joint", "fixed", "flange", "payload", np.eye(4), robot.metres_per_unit)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
+
+
+def _add_link(root: ElementTree.Element, name: str, mass: float, com: Array) -> None:
+    link = ElementTree.SubElement(root, "link", name=name)
+    if mass:
+        inertial = ElementTree.SubElement(link, "inertial")
+        ElementTree.SubElement(inertial, "origin", xyz=_text(com))
+        ElementTree.SubElement(inertial, "mass", value=_text(np.array([mass])))
+        # Other readers insist on the element; a point mass has none.
+        ElementTree.SubElement(inertial, "inertia", dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0"))
+
+
+def _add_joint(
+    root: ElementTree.Element, name: str, kind: str, parent: str, child: str, T: Array, metres: float
+) -> None:
+    joint = ElementTree.SubElement(root, "joint", name=name, type=kind)
+    ElementTree.SubElement(joint, "origin", xyz=_text(T[:3, 3] * metres), rpy=_text(roll_pitch_yaw(T[:3, :3])))
+    ElementTree.SubElement(joint, "parent", link=parent)
+    ElementTree.SubElement(joint, "child", link=child)
+    if kind != "fixed":
+        ElementTree.SubElement(joint, "axis", xyz="0 0 1")
+
+
+def roll_pitch_yaw(R: Array) -> Array:
+    """(3,) with R = Rz(yaw)·Ry(pitch)·Rx(roll), exact at and near a pitch of 90° too.
+
+    There yaw alone is ill-determined; roll is read from what remains after the yaw that was chosen,
+    so that an error of one undoes that of the other.
+    """
+    yaw = np.arctan2(R[1, 0], R[0, 0])
+    rest = elementary("z", -yaw)[:3, :3] @ R
+    return np.array([np.arctan2(-rest[1, 2], rest[1, 1]), np.arctan2(-rest[2, 0], rest[0, 0]), yaw])
+
+
+def _text(values: Array) -> str:
+    """Shortest decimals that read back as the same float64."""
+    return " ".join(repr(float(x)) for x in values)

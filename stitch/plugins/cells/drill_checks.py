@@ -1,0 +1,162 @@
+"""What a drilling cell shows of itself: the plate's place by its locating holes, and trial drives to the holes."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.numerics.feature_matching import align_points
+from stitch.numerics.frames import Array
+from stitch.plugins.cells.drilling_sensors import RangerFit
+from stitch.plugins.cells.job_files import JobTable, on_a_line, read_columns
+
+# The calibration plate against the flange: its holes' mean height is h, their spread says how parallel it is.
+
+MIN_LOCATING = 3
+
+
+@dataclass(frozen=True)
+class PlatePlace:
+    """Of the nine holes along the flange's z, length unit."""
+
+    height: float  # mean, h of the source
+    stated: float
+    parallelism: float  # largest distance of a hole from that mean
+    locating_rms: float | None  # of the locating holes, fitted; None where the plate is given in the flange frame
+
+
+def holes_in_flange(file: Path, plate_xyz: Array, T_measuring_flange: Array) -> tuple[Array, float]:
+    """Return the plate's holes (N, 3) in the flange frame and the locating holes' rms.
+
+    Args:
+        file: locating holes, x y z in the plate's frame and seen_x seen_y seen_z in the measuring system.
+        plate_xyz: (N, 3) in the plate's frame.
+        T_measuring_flange: (4, 4) at the home pose.
+
+    Raises:
+        InputError: a column is missing, or fewer than three holes off one line.
+    """
+    table = read_columns(file, "", "x y z seen_x seen_y seen_z")
+    nominal, seen = table.stack("x y z"), table.stack("seen_x seen_y seen_z")
+    if len(nominal) < MIN_LOCATING or on_a_line(nominal) or on_a_line(seen):
+        raise InputError(f"{file}: the holes fix no plate; to fix: measure {MIN_LOCATING} or more off one line")
+    T_measuring_plate = align_points(nominal, seen)
+    off = seen - frames.transform(T_measuring_plate, nominal)
+    inside = frames.transform(frames.inverse(T_measuring_flange) @ T_measuring_plate, plate_xyz)
+    return inside, float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+def plate_place(plate_xyz: Array, stated: float, locating_rms: float | None) -> PlatePlace:
+    """Height and parallelism of holes (N, 3) in the flange frame."""
+    z = plate_xyz[:, 2]
+    return PlatePlace(float(z.mean()), stated, float(np.abs(z - z.mean()).max()), locating_rms)
+
+
+# Trial drives: what camera and rangers see at a hole, before and after the correction, and what a pin that is driven
+# into it bounds (tables 4, 6 and 7 of the source).
+
+STAGES = ("drawing", "corrected", "levelled")  # driven by the drawing, by the correction, and then along the normal
+
+
+@dataclass(frozen=True)
+class Pin:
+    """A round bar in the tool's place, length unit."""
+
+    diameter: float
+    feed: float  # along the hole, from the levelled pose
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What was seen at one hole."""
+
+    hole: str
+    stage: str  # of STAGES
+    uv: Array  # (2,)
+    readings: dict[str, float]  # by ranger
+    diameter: float | None  # of the hole
+
+
+@dataclass(frozen=True)
+class TrialError:
+    """Error of one drive; lengths in length unit, angles in rad."""
+
+    hole: str
+    stage: str
+    height: float  # h' − h
+    tilt: float  # of the surface's normal against the flange's z
+    in_plane: float  # e2D, by the camera
+    distance: float  # of all three
+    pin_position: float | None  # largest error that lets the pin in
+    pin_tilt: float | None
+
+
+def read_trials(file: Path, rangers: tuple[str, ...], pin: Pin | None) -> tuple[Trial, ...]:
+    """Read trial drives: hole, stage, u, v, a column for each ranger and, with a pin, the hole's diameter.
+
+    Raises:
+        InputError: a column is missing, an unknown stage, or fewer than three rangers.
+    """
+    if len(rangers) < 3:
+        raise InputError(f"{file}: trials need three rangers for a normal; to fix: name the rangers' table")
+    table = read_columns(file, "hole stage", f"u v {' '.join(rangers)}{' diameter' if pin else ''}")
+    for stage in table.texts["stage"]:
+        if stage not in STAGES:
+            raise InputError(f"{file}: stage is {stage!r}; to fix: write one of {', '.join(STAGES)}")
+    return tuple(
+        Trial(
+            name,
+            stage,
+            np.array([table.numbers["u"][i], table.numbers["v"][i]]),
+            {ranger: float(table.numbers[ranger][i]) for ranger in rangers},
+            float(table.numbers["diameter"][i]) if pin else None,
+        )
+        for i, (name, stage) in enumerate(zip(table.texts["hole"], table.texts["stage"], strict=True))
+    )
+
+
+def read_pin(document: JobTable) -> Pin | None:
+    """Return the pin of a job's table [pin]; None without one."""
+    if "pin" not in document:
+        return None
+    table = document.table("pin", ("diameter", "feed"))
+    return Pin(table.number("diameter", positive=True), table.number("feed", positive=True))
+
+
+def trial_error(
+    trial: Trial,
+    beams: Mapping[str, RangerFit],
+    in_plane_of: Callable[[Array, float], Array],
+    stated: float,
+    pin: Pin | None,
+) -> TrialError:
+    """Return the error of one drive.
+
+    Args:
+        in_plane_of: x, y (2,) in the flange frame of an image point (2,) at a height.
+        stated: height of the work plane.
+    """
+    spots = np.array([beams[name].origin + d * beams[name].direction for name, d in trial.readings.items()])
+    normal = np.linalg.svd(spots - spots.mean(axis=0))[2][2]
+    seen_at = float(spots[:, 2].mean())
+    height = seen_at - stated
+    tilt = float(np.arccos(min(abs(normal[2]), 1.0)))
+    in_plane = float(np.linalg.norm(in_plane_of(trial.uv, seen_at)))
+    position = turn = None
+    if pin is not None and trial.diameter is not None and trial.stage == STAGES[-1]:
+        # The pin went in: it leaves the hole no more room than this, nor can it stray further than its tilt says.
+        position = min((trial.diameter - pin.diameter) / 2, in_plane + pin.feed * np.tan(tilt))
+        turn = float(np.arctan(position / pin.feed))
+    return TrialError(
+        trial.hole,
+        trial.stage,
+        height=height,
+        tilt=tilt,
+        in_plane=in_plane,
+        distance=float(np.hypot(height, in_plane)),
+        pin_position=position,
+        pin_tilt=turn,
+    )

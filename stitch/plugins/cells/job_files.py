@@ -1,0 +1,327 @@
+"""A cell's job file: its format, and checks of tables, words, numbers and file names."""
+
+import csv
+import math
+import reprlib
+import shlex
+import subprocess
+import sys
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch.errors import InputError, NoResultError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.output.session_files import TableColumns
+from stitch.session.reading.csv_files import finite_number, read_csv_lines
+from stitch.session.reading.text_files import read_toml
+from stitch.system.files import whole_file
+
+# No length, angle or sigma of a cell lies outside; beyond, squares overflow or vanish.
+LOWEST_VALUE, HIGHEST_VALUE = 1e-12, 1e9
+
+
+@dataclass(frozen=True)
+class JobTable:
+    """A table of a job file, read key by key. All methods raise `InputError` that names file, place and remedy."""
+
+    file: Path
+    entries: dict[str, Any]
+    place: str = ""  # of the table in the file
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.entries
+
+    def refusal(self, key: str, remedy: str) -> InputError:
+        """Return the error that refuses the value of a key."""
+        return InputError(f"{self.file}: {self._at(key)} is {reprlib.repr(self.entries.get(key))}; to fix: {remedy}")
+
+    def table(self, key: str, known: Collection[str], required: bool = False) -> "JobTable":
+        """Return a table within this one, empty where it may be missing; unknown keys are refused."""
+        if required and not isinstance(self.entries.get(key), dict):
+            raise InputError(f"{self.file}: [{self._at(key)}] is missing; to fix: add this table")
+        return checked_table(self.file, self._at(key), self.entries.get(key, {}), known)
+
+    def choice(self, key: str, known: Collection[str], default: str | None = None) -> str:
+        """Return one of some words."""
+        value = self.entries.get(key, default)
+        if not isinstance(value, str) or value not in known:
+            raise self.refusal(key, f"write one of {', '.join(known)}")
+        return value
+
+    def number(self, key: str, default: float | None = None, positive: bool = False) -> float:
+        """Return a finite number, above zero if `positive`."""
+        return self._finite(key, self.entries.get(key, default), positive)
+
+    def vectors(self, key: str, shape: tuple[int, ...], form: str) -> Array:
+        """Return finite numbers of a shape, such as (3,) for [x, y, z]; `form` says how to write them."""
+
+        def flat(value: Any, shape: tuple[int, ...]) -> list[Any]:
+            if not shape:
+                return [value]
+            if not isinstance(value, list) or len(value) != shape[0]:
+                raise InputError(f"{self.file}: {self._at(key)} is {reprlib.repr(value)}; to fix: write {form}")
+            return [entry for part in value for entry in flat(part, shape[1:])]
+
+        return np.array([self._finite(key, number, False) for number in flat(self.entries.get(key), shape)]).reshape(
+            shape
+        )
+
+    def pose(self, key: str) -> Array:
+        """Return the pose (4, 4) of a table with the keys x, y, z, a_deg, b_deg, c_deg."""
+        names = POSE_COLUMNS.split()
+        numbers = self.table(key, names, required=True)
+        return poses_from_rows(np.array([numbers.number(name) for name in names]))
+
+    def path(self, key: str) -> Path:
+        """Return a file that is named relative to the job file."""
+        value = self.entries.get(key)
+        if not isinstance(value, str):
+            raise self.refusal(key, "name a file in quotes")
+        return self.file.parent / value
+
+    def _at(self, key: str) -> str:
+        return f"{self.place}.{key}" if self.place else key
+
+    def _finite(self, key: str, value: Any, positive: bool) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            wanted = "a finite number"
+        elif abs(value) > HIGHEST_VALUE:
+            wanted = "a number that a cell can have"
+        elif positive and value < LOWEST_VALUE:
+            wanted = "a number above zero"
+        else:
+            return float(value)
+        raise InputError(f"{self.file}: {self._at(key)} is {value!r}; to fix: write {wanted}")
+
+
+def read_job_file(file: Path, expected_format: str, known: Collection[str], example: str) -> JobTable:
+    """Read a job file; unknown keys of its top level are refused.
+
+    Args:
+        expected_format: the format it must state, such as "stitch-drill/1".
+        example: where a job of that format lies.
+
+    Raises:
+        InputError: it is missing, not TOML, of another format, or holds an unknown key.
+    """
+    document = read_toml(file, f"see {example} for how it looks")
+    if document.get("format") != expected_format:
+        raise InputError(f'{file}: format is {document.get("format")!r}; to fix: write "{expected_format}"')
+    return checked_table(file, "", document, known)
+
+
+def checked_table(file: Path, place: str, entries: Any, known: Collection[str]) -> JobTable:
+    """Return entries as a table; refuse a key that nobody reads, since most are misspelt.
+
+    Raises:
+        InputError: `entries` is not a table or holds an unknown key.
+    """
+    if not isinstance(entries, dict):
+        raise InputError(f"{file}: {place} is no table; to fix: write [{place}]")
+    for key in entries:
+        if key not in known:
+            close = get_close_matches(key, known, 1)
+            hint = f"write {close[0]!r}" if close else f"write one of {', '.join(sorted(known))}"
+            raise InputError(f"{file}: unknown key {f'{place}.{key}' if place else key!r}; to fix: {hint}")
+    return JobTable(file, entries, place)
+
+
+# CSV tables with named columns, as a person edits them.
+
+
+@dataclass(frozen=True)
+class CsvColumns:
+    """The wanted columns of a CSV file, row by row."""
+
+    texts: dict[str, list[str]]
+    numbers: dict[str, Array]  # (N,) each
+    rows: int
+
+    def stack(self, names: str) -> Array:
+        """Number columns (N, k) by their names, separated by blanks."""
+        return np.column_stack([self.numbers[name] for name in names.split()])
+
+
+def read_columns(file: Path, texts: str, numbers: str) -> CsvColumns:
+    """Read a CSV with a header line; other columns are left alone.
+
+    Args:
+        texts: names of text columns, separated by blanks.
+        numbers: names of number columns, separated by blanks.
+
+    Raises:
+        InputError: the file, a column or a value is missing or no finite number; names the line.
+    """
+    header, lines = read_csv_lines(file)
+    for name in (*texts.split(), *numbers.split()):
+        if name not in header:
+            raise InputError(
+                f"{file}: column {name!r} is missing; to fix: name {texts} {numbers} in the header".rstrip()
+            )
+    if not lines:
+        raise InputError(f"{file}: no rows below the header; to fix: add one per line")
+    rows = [(line, dict(zip(header, cells + [""] * len(header), strict=False))) for line, cells in lines]
+    for line, row in rows:
+        for name in texts.split():
+            if not row[name].strip():
+                raise InputError(f"{file} line {line}: {name} is empty; to fix: write a name")
+    return CsvColumns(
+        {name: [row[name].strip() for _, row in rows] for name in texts.split()},
+        {name: np.array([_number(file, line, name, row[name]) for line, row in rows]) for name in numbers.split()},
+        len(rows),
+    )
+
+
+def require_unique(file: Path, what: str, names: list[str]) -> None:
+    """Raise `InputError` where the name of a thing (`what`, such as "hole") stands in two rows."""
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{file}: {what} {name} stands twice; to fix: leave one of them out, or rename it")
+
+
+def _number(file: Path, line: int, name: str, cell: str) -> float:
+    value = finite_number(file, line, name, cell)
+    if abs(value) > HIGHEST_VALUE:
+        raise InputError(f"{file} line {line}: {name} is {cell.strip()!r}; to fix: write a number that a cell can have")
+    return value
+
+
+# What every cell's command hands out beside its result: a Rerun recording, a page, a session folder.
+#
+# Recording, page and pictures come from whoever offers them under the entry points `stitch.cell_recordings`,
+# `stitch.cell_reports` and `stitch.cell_pictures`, by the command's name.
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a person asks a cell's command for."""
+
+    output: Path | None = None  # table or folder
+    recording: Path | None = None
+    report: Path | None = None
+    session: Path | None = None
+    as_json: bool = False
+
+
+def write_pictures(command: str, folder: Path, *results: Any) -> list[str]:
+    """Write the pictures of a command's job and result (`results`) into its folder; returns the files' names."""
+    offered = entry_points(group="stitch.cell_pictures", name=command)
+    return [name for writer in offered for name in writer.load()(*results, folder)]
+
+
+def write_recording_and_page(command: str, recording: Path | None, report: Path | None, *results: Any) -> None:
+    """Write recording and page of a command's job and result (`results`), each whole or not at all.
+
+    Raises:
+        InputError: nobody offers one for this command, or its folder does not exist.
+    """
+    for group, path in (("stitch.cell_recordings", recording), ("stitch.cell_reports", report)):
+        if path is None:
+            continue
+        offered = entry_points(group=group, name=command)
+        if not offered:
+            raise InputError(f"{path}: no writer for `stitch {command}` is installed; to fix: install stitch anew")
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: its folder does not exist; to fix: make it first")
+        with whole_file(path) as scratch:
+            for writer in offered:
+                writer.load()(*results, scratch)
+
+
+def fixed_digits(values: Array, digits: int) -> str:
+    """Numbers in a row of a table, without a negative zero."""
+    return " ".join(f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0)
+
+
+# Points that lie within this share of their extent of one line leave the turn about it open.
+_FLAT = 1e-3
+
+
+def on_a_line(points: Array) -> bool:
+    """Whether points (N, 3) lie on one line, or all in one place."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(len(points) < 2 or spread[1] <= _FLAT * max(spread[0], 1e-12))
+
+
+# Poses as CSV rows: x, y, z and the angles a, b, c in degrees, turned about z, y', x'' in this order.
+
+POSE_COLUMNS = "x y z a_deg b_deg c_deg"
+
+
+def poses_from_rows(numbers: Array) -> Array:
+    """Poses (..., 4, 4) from rows (..., 6)."""
+    numbers = np.asarray(numbers, float)
+    R = Rotation.from_euler("ZYX", numbers[..., 3:].reshape(-1, 3), degrees=True).as_matrix()
+    return frames.make(R.reshape(*numbers.shape[:-1], 3, 3), numbers[..., :3])
+
+
+def rows_from_poses(poses: Array) -> Array:
+    """Rows (N, 6) from poses (N, 4, 4)."""
+    poses = np.asarray(poses, float)
+    return np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX", degrees=True)])
+
+
+def poses_from_columns(table: CsvColumns) -> Array:
+    """Poses (N, 4, 4) of a table that holds the six columns."""
+    return poses_from_rows(table.stack(POSE_COLUMNS))
+
+
+def write_poses(file: Path, key: str, names: Sequence[str], poses: Array) -> None:
+    """A CSV of named poses (N, 4, 4)."""
+    rows = np.round(rows_from_poses(poses), 6) + 0.0
+    columns = {name: rows[:, i] for i, name in enumerate(POSE_COLUMNS.split())}
+    write_columns(file, {key: list(names), **columns})
+
+
+def write_columns(file: Path, columns: Mapping[str, Sequence[object] | Array]) -> None:
+    """A CSV with a header; numbers keep nine digits."""
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(columns)
+        for row in zip(*columns.values(), strict=True):
+            writer.writerow([f"{value:.9g}" if isinstance(value, float) else value for value in row])
+
+
+# Columns of points.csv from labelled points, as a session of `stitch run` and `diagnose` wants them.
+
+
+def points_table(views: Sequence[str], targets: Sequence[str], places: Array, sigma: Array | None) -> TableColumns:
+    """Columns view, target, x, y, z and, where it is known, sigma.
+
+    Args:
+        views: N names, one for each point.
+        targets: N names of what was seen there.
+        places: (N, 3) in the sensor's frame.
+        sigma: (N,) of each coordinate; None where nobody knows it.
+    """
+    columns: dict[str, Any] = {"view": list(views), "target": list(targets)}
+    columns |= dict(zip("xyz", places.T, strict=True))
+    return columns if sigma is None else columns | {"sigma": np.asarray(sigma, float)}
+
+
+def call_machines(drive: str) -> None:
+    """Run the program of --drive, which moves the robots and measures anew.
+
+    Raises:
+        InputError: it cannot be started.
+        NoResultError: it fails.
+    """
+    try:
+        done = subprocess.run(shlex.split(drive), check=False, capture_output=True, text=True)
+    except (OSError, ValueError) as error:
+        raise InputError(f"--drive {drive}: {error}; to fix: write a program and its arguments") from None
+    print(done.stdout, end="", file=sys.stderr)
+    if done.returncode:
+        told = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise NoResultError(
+            f"--drive {drive}: exit code {done.returncode}, {told}. The robots stand where it left them; to fix: see "
+            "its message, then call again"
+        )

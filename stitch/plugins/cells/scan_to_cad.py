@@ -1,0 +1,635 @@
+"""Scan onto CAD: point to plane, robustly weighted, on points that look all ways."""
+
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+from pathlib import Path
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from stitch.errors import InputError, NoResultError
+from stitch.numerics import feature_matching, frames
+from stitch.numerics.frames import Array, Indices
+from stitch.plugins.cells.cad import (
+    MAD,
+    TUKEY,
+    CadSurface,
+    NearestPartners,
+    Regions,
+    biweight,
+    biweight_slope,
+    cell_weights,
+    nearest_partners,
+    sample_normal_space,
+    sample_partners,
+)
+from stitch.plugins.cells.job_files import write_columns
+from stitch.plugins.cells.placed_scans import SOURCES, JoinedScans, PlacingErrors
+from stitch.session.reading.csv_files import is_number
+from stitch.session.scan import even_indices
+
+# Stock on a casting: how far the scan stands off the CAD, even or slowly varying. Positive is outside: stock on it.
+
+FREE, VARYING = "free", "varying"
+# Below this share told from a motion, an error of form enters more than threefold; that is said.
+FAINT = 0.1
+# Products of Legendre polynomials over the part's box up to this degree: what varies slowly.
+_DEGREE = 3
+_ORDERS = tuple(order for order in product(range(_DEGREE + 1), repeat=3) if 0 < sum(order) <= _DEGREE)
+
+
+@dataclass(frozen=True)
+class AllowancePrior:
+    """What is believed of the allowance before the fit; length_unit of the CAD."""
+
+    known: float = 0.0
+    free: bool = False
+    varying: bool = False  # implies free
+
+    @property
+    def columns(self) -> int:
+        """How many numbers are to be found."""
+        return self.free + self.varying * len(_ORDERS)
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """Stock between CAD and scan, positive outside."""
+
+    value: float  # mean over the fit's points
+    sigma: float  # of that mean; 0 where it was stated
+    lowest: float  # over the fit's points; of an even allowance the value
+    highest: float
+    sigma_field: float  # largest 1-sigma at any of those points
+    prior: AllowancePrior
+    separable_share: float  # share of it that no motion of the part imitates, 0 to 1; 1 where it was stated
+    coefficients: Array  # (K,) of the columns
+    cad: CadSurface
+
+    def at(self, points: Array) -> Array:
+        """(N,) allowance at points (N, 3), part frame."""
+        return self.prior.known + allowance_columns(points, self.cad, self.prior) @ self.coefficients
+
+
+def read_allowance(text: str | None) -> AllowancePrior:
+    """What `--allowance` asks for: `free`, `varying` or a number.
+
+    Raises:
+        InputError: neither.
+    """
+    if text is None:
+        return AllowancePrior()
+    if text in (FREE, VARYING):
+        return AllowancePrior(free=True, varying=text == VARYING)
+    if not is_number(text) or not np.isfinite(float(text)):
+        raise InputError(
+            f"--allowance is {text!r}; to fix: write free (to find an even one), varying (one that changes slowly "
+            "over the part), or the stock in the CAD's unit, as 0.3"
+        )
+    return AllowancePrior(known=float(text))
+
+
+def allowance_columns(points: Array, cad: CadSurface, prior: AllowancePrior) -> Array:
+    """(N, K) allowance at points (N, 3), part frame, per unit of each number that is to be found."""
+    if not prior.free:
+        return np.zeros((len(points), 0))
+    ones = np.ones((len(points), 1))
+    if not prior.varying:
+        return ones
+    half = np.maximum(np.ptp(np.asarray(cad.mesh.bounds), axis=0) / 2, 1e-9 * cad.size)
+    scaled = np.clip((points - cad.centre) / half, -1.1, 1.1)
+    # Of unit mean square over the box each.
+    x, y, z = (legendre.legvander(axis, _DEGREE) * np.sqrt(2 * np.arange(_DEGREE + 1) + 1) for axis in scaled.T)
+    return np.column_stack([ones, *(x[:, i] * y[:, j] * z[:, k] for i, j, k in _ORDERS)])
+
+
+def allowance_sentence(allowance: Allowance, length_unit: str | None) -> str:
+    """Its size with sigma, and what the sign means; None: nobody says in which unit."""
+    unit = f" {length_unit}" if length_unit else ""
+    if not allowance.prior.free:
+        return f"Allowance {allowance.value:+.4g}{unit} as stated (plus: stock outside the CAD)."
+    size = f"Allowance {allowance.value:+.4f} ± {allowance.sigma:.4f}{unit} (1 σ; plus: stock outside the CAD)"
+    if allowance.prior.varying:
+        size += (
+            f", from {allowance.lowest:+.4f} to {allowance.highest:+.4f}{unit} over the scan, each ± "
+            f"{allowance.sigma_field:.4f}{unit} at most"
+        )
+    if allowance.separable_share < FAINT:
+        size += (
+            f"; only {allowance.separable_share:.1%} of it is told from a motion of the part, so that errors of form "
+            "weigh in it"
+        )
+    return size + "."
+
+
+# The allowance beside the pose: scale, shrinkage, what can be told, and the result.
+#
+# From mean(d²) = Var(d) + mean(d)² a cost Var(d) + λ·mean(d)² can be chosen; the ordinary fit has λ = 1. With an
+# unknown allowance λ = 0: only the variance of the distances is made small (variance-minimisation matching), and their
+# mean is the allowance. A column of ones beside the six of the pose does the same and gives its sigma. Distances above
+# and below the allowance are two classes, plus and minus, each with its own scale, and the cleaner one counts for
+# both: gates, risers and flash all stand on one side.
+
+# Share of an even allowance that no motion of the part imitates. Below, an error of the part's form would enter the
+# allowance more than thirtyfold.
+_MIN_SEPARABLE_SHARE = 1e-3
+# A class of fewer than this share of the points has no scale of its own.
+_CLASS = 0.1
+# A field this far below the scatter of the points is none.
+_MIN_FIELD_SHARE = 1e-3
+
+
+def robust_spread(rest: Array, prior: AllowancePrior) -> float:
+    """Robust sigma of distances (N,) less their allowance: of the cleaner class where one is to be found."""
+    if prior.free:
+        sides = [np.abs(rest[rest >= 0]), np.abs(rest[rest < 0])]
+        if min(map(len, sides)) >= _CLASS * len(rest):
+            return MAD * min(float(np.median(side)) for side in sides)
+    return MAD * float(np.median(np.abs(rest)))
+
+
+def separable_share(N: Array) -> float:
+    """Share of an even allowance that no motion of the part imitates, from the normal matrix (6 + K, 6 + K).
+
+    Raises:
+        NoResultError: next to nothing; says which motion does.
+    """
+    motion = np.linalg.solve(N[:6, :6], N[:6, 6])
+    share = float(1 - motion @ N[:6, 6] / N[6, 6])
+    if share < _MIN_SEPARABLE_SHARE:
+        shift = -motion[3:] / max(float(np.linalg.norm(motion[3:])), 1e-300)
+        along = " ".join(f"{x:.2f}" for x in shift)
+        raise NoResultError(
+            f"the allowance cannot be told from a shift of the part along ({along}): all that was scanned looks to "
+            "one side; to fix: scan opposite sides too, or state the stock, as --allowance 0.3"
+        )
+    return share
+
+
+def varying_ridge(N: Array, coefficients: Array, scale: float, before: float) -> tuple[Array, float]:
+    """(6 + K,) what shrinks the varying part, in units of N, and its size τ by MacKay's evidence (1992).
+
+    Pose and mean are free. Of a flat field the evidence lets τ fall to nothing.
+
+    Args:
+        N: normal matrix of weights that are 1 where nothing is wrong.
+        before: τ of the round before.
+    """
+    weights = np.zeros(len(N))
+    varying = coefficients[1:]
+    if not len(varying):
+        return weights, before
+    weights[7:] = (scale / before) ** 2
+    left = np.diag(np.linalg.inv(N + np.diag(weights)))[7:] * weights[7:]
+    size = np.sqrt(float(varying @ varying) / max(float((1 - left).sum()), 1e-3))
+    size = max(float(size), _MIN_FIELD_SHARE * scale)
+    weights[7:] = (scale / size) ** 2
+    return weights, size
+
+
+def summarise_allowance(
+    points: Array, cad: CadSurface, prior: AllowancePrior, coefficients: Array, covariance: Array, N: Array
+) -> Allowance | None:
+    """The allowance as people want it, over the fit's points (N, 3), part frame; None where none was spoken of.
+
+    Args:
+        covariance: of pose and coefficients, (6 + K, 6 + K).
+        N: their normal matrix.
+    """
+    if prior == AllowancePrior():
+        return None
+    B = allowance_columns(points, cad, prior)
+    local, C, mean = prior.known + B @ coefficients, covariance[6:, 6:], B.mean(axis=0)
+    return Allowance(
+        value=prior.known + float(mean @ coefficients),
+        sigma=float(np.sqrt(mean @ C @ mean)),
+        lowest=float(local.min()),
+        highest=float(local.max()),
+        sigma_field=float(np.sqrt(np.einsum("ni,ij,nj->n", B, C, B).max())),
+        prior=prior,
+        separable_share=separable_share(N) if prior.free else 1.0,
+        coefficients=coefficients,
+        cad=cad,
+    )
+
+
+_MIN_FIT_POINTS = 50
+_ROUNDS = 80
+# A step below this share of the part is none; and cells along the part for the second kind of weight.
+_STILL, _CELLS = 1e-7, 40
+# A surface that leaves a direction open by this share of the best one fixes no pose.
+_OPEN = 1e-6
+NO_ALLOWANCE = AllowancePrior()
+
+
+@dataclass(frozen=True)
+class CadFit:
+    """T_base_part and what the fit rests on."""
+
+    T_base_part: Array  # (4, 4)
+    covariance: Array  # (6, 6) of ξ about the CAD's centre, T·exp(ξ), rotation (rad) first
+    parts: dict[str, Array]  # (6, 6) shares of it by source: the scan's noise, and SOURCES where they are known
+    scale: float  # robust 1-sigma of the distances less the allowance
+    rms: float  # of the same of all points that have a partner, deformed places too
+    inliers: float  # share of the fit's points with weight above a half
+    points: int
+    allowance: Allowance | None = None  # None: none was spoken of
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) sigmas of rotation (rad) and translation, about the CAD's centre and axes."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def fit_cad(
+    scan: JoinedScans,
+    cad: CadSurface,
+    T_base_part: Array,
+    regions: Regions | None = None,
+    prior: AllowancePrior = NO_ALLOWANCE,
+    errors: PlacingErrors | None = None,
+) -> CadFit:
+    """Refine a coarse T_base_part (4, 4) until it stands still, and with it the allowance if it is wanted.
+
+    The scale follows from the distances' median each round, never below the scan's own noise; what a deformation moved
+    beyond 4.7 scales has no say. The rim of a dent leaves less, yet all to one side: so once the fit stands, whole
+    cells of the surface are weighted by their means too (`cell_weights`). The points are drawn evenly over the
+    directions they look to (`sample_normal_space`).
+
+    Args:
+        errors: how the scans' places may err; the covariance takes it up.
+
+    Raises:
+        NoResultError: too few points meet the CAD, or the surface leaves a direction or the allowance open.
+    """
+    scan = scan.take(sample_normal_space(scan, T_base_part))
+    noise = scan.noise if np.isfinite(scan.noise) else 0.0
+    scale, by_cell = cad.size / 100, False
+    numbers, size = np.zeros(prior.columns), cad.size / 100
+    for _ in range(_ROUNDS):
+        seen = _find_correspondences(scan, cad, T_base_part, regions, prior)
+        rest = seen.partners.distance - prior.known - seen.stock @ numbers
+        # The gate closes by half a round at most, so that a bad start can still be pulled in.
+        spread = robust_spread(rest[seen.used], prior)
+        scale = max(spread, 0.5 * scale, noise)
+        weight = np.asarray(seen.used * biweight(rest / (TUKEY * scale)))
+        if by_cell:
+            left = replace(seen.partners, distance=rest)
+            weight = weight * cell_weights(seen.local, left, seen.used, cad.size / _CELLS, scale)
+        N = _normal_matrix(seen.design, weight, cad)
+        shrink, size = varying_ridge(N, numbers, scale, size)
+        pull = np.concatenate([np.zeros(6), numbers]) * shrink
+        step = np.asarray(np.linalg.solve(N + np.diag(shrink), -seen.design.T @ (weight * rest) - pull), np.float64)
+        T_base_part, numbers = moved_about(T_base_part, step[:6], cad.centre), numbers + step[6:]
+        if np.abs(step[3:]).max() < _STILL * cad.size and scale <= 1.05 * max(spread, noise):
+            if by_cell:
+                break
+            by_cell = True
+    parts = _covariances(scan, seen, rest, weight, scale=scale, shrink=shrink, T_base_part=T_base_part, errors=errors)
+    covariance = sum(parts.values(), np.zeros_like(N))
+    used = rest[seen.used]
+    return CadFit(
+        T_base_part,
+        covariance=covariance[:6, :6],
+        parts={name: part[:6, :6] for name, part in parts.items()},
+        scale=scale,
+        rms=float(np.sqrt((used**2).mean())),
+        inliers=float(np.mean(np.abs(used) < 0.54 * TUKEY * scale)),
+        points=len(used),
+        allowance=summarise_allowance(seen.local[seen.used], cad, prior, numbers, covariance, N),
+    )
+
+
+def moved_about(T_base_part: Array, step: Array, centre: Array) -> Array:
+    """The pose (4, 4) after a Gauss-Newton step, a twist (6,) about a centre (3,) of the part."""
+    return np.asarray(T_base_part @ frames.inverse(frames.moved_about(centre, step, np.eye(4))))
+
+
+def _covariances(
+    scan: JoinedScans,
+    seen: "_Correspondences",
+    rest: Array,
+    weight: Array,
+    *,
+    scale: float,
+    shrink: Array,
+    T_base_part: Array,
+    errors: PlacingErrors | None,
+) -> dict[str, Array]:
+    """Covariances (6 + K, 6 + K) by source.
+
+    Of the noise a sandwich: the weights are not the inverse variances (Huber & Ronchetti 2009, ch. 7). What is shrunk
+    is as large as believed, which is an error of its own. Of misplaced scans the sum of the fit's squared answers.
+    """
+    design, u = seen.design, rest / (TUKEY * scale)
+    slope = np.where(weight > 0, weight / np.maximum(biweight(u), 1e-12) * biweight_slope(u), 0.0)
+    inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, slope, design) + np.diag(shrink))
+    meat = np.einsum("ni,n,nj->ij", design, (weight * rest) ** 2, design) + np.diag(shrink) * scale**2
+    out = {"scan": np.asarray(inverse @ meat @ inverse)}
+    if errors is not None:
+        normals = frames.rotate(T_base_part, seen.partners.normal)
+        for source in SOURCES:
+            answers = [
+                inverse @ (design[own].T @ (slope[own] * np.einsum("ni,ni->n", normals[own], moved)))
+                for own, moved in errors.modes(scan, source)
+            ]
+            out[source] = sum((np.outer(a, a) for a in answers), np.zeros_like(inverse))
+    return out
+
+
+@dataclass(frozen=True)
+class _Correspondences:
+    """N points at one pose: part frame, partners, which may count, and how distances answer."""
+
+    local: Array  # (N, 3)
+    partners: NearestPartners
+    used: NDArray[np.bool_]  # (N,)
+    stock: Array  # (N, K) columns of the allowance
+    design: Array  # (N, 6 + K) of the twist about the CAD's centre and the allowance
+
+
+def _find_correspondences(
+    scan: JoinedScans, cad: CadSurface, T_base_part: Array, regions: Regions | None, prior: AllowancePrior
+) -> _Correspondences:
+    T = frames.inverse(T_base_part)
+    local = frames.transform(T, scan.points)
+    found = nearest_partners(cad, local, frames.rotate(T, scan.normals))
+    used = found.accept if regions is None else found.accept & regions.used(local)
+    if used.sum() < _MIN_FIT_POINTS:
+        raise NoResultError(
+            f"{used.sum()} points meet the CAD; to fix: check the start, the regions and the CAD's unit"
+        )
+    stock = allowance_columns(local, cad, prior)
+    design = np.hstack([frames.plane_rows(local - cad.centre, found.normal), -stock])
+    return _Correspondences(local, found, used, stock, design)
+
+
+def _normal_matrix(design: Array, weight: Array, cad: CadSurface) -> Array:
+    """(6 + K, 6 + K) of a Gauss-Newton step: a twist about the CAD's centre, and the numbers of the allowance."""
+    N = np.einsum("ni,n,nj->ij", design, weight, design)
+    units = np.repeat([cad.size / 2, 1.0], 3)
+    values = np.linalg.eigvalsh(N[:6, :6] / np.outer(units, units))
+    if values[0] < _OPEN * values[-1]:
+        shift = ", and of a plate the allowance is a shift along its normal" if len(N) > 6 else ""
+        raise NoResultError(
+            f"the scanned surface leaves a direction open (plane, cylinder or sphere){shift}; to fix: scan an edge too"
+        )
+    if len(N) > 6:
+        separable_share(N)
+    return np.asarray(N)
+
+
+# Where the part lies, without a guess: principal axes and features give candidates, the surface decides.
+
+_MIN_START_POINTS = 50
+_START_POINTS = 1500  # of the scan that judge a candidate
+_KEEP = 6  # candidates that are refined
+_REFINE = 20  # steps of a candidate's refinement
+_FEATURE_RUNS, _FEATURE_DRAWS, _FEATURE_SAMPLES = 3, 50_000, 6000
+# A start of which less than a third of the scan meets the CAD is none.
+_LEAST_SHARE = 1 / 3
+# A pose that so much of the scan agrees with needs no second opinion.
+_CERTAIN = 0.95
+
+
+@dataclass(frozen=True)
+class CadStart:
+    """A coarse pose and how well it stands against the next best different one."""
+
+    T_base_part: Array  # (4, 4)
+    share: float  # of the scan's points that meet the CAD
+    runner_up: float  # the same of the best pose elsewhere; close to `share` means a symmetric part
+
+
+def find_cad_start(scan: JoinedScans, cad: CadSurface) -> CadStart:
+    """Try the 24 ways to lay principal axes on principal axes, and feature matches where none of them meets; refine.
+
+    Features are FPFH with RANSAC (Rusu et al. 2009): they serve where the scan shows only a piece of
+    the part, principal axes where it is too smooth for features.
+
+    Raises:
+        NoResultError: no candidate brings a third of the scan onto the CAD.
+    """
+    if scan.usable.sum() < _MIN_START_POINTS:
+        raise NoResultError(
+            f"{scan.usable.sum()} usable points in the scan; to fix: scan surfaces head-on, edges do not count"
+        )
+    index = _spread_sample(scan)
+    points, normals = scan.points[index], scan.normals[index]
+    gate, fine = cad.size / 25, cad.size / 250
+    ranked = sorted(_axis_candidates(points, cad), key=lambda T: -_inlier_share(T, points, normals, cad, gate))
+    refined = [_refine(T, points, normals, cad, gate) for T in ranked[:_KEEP]]
+    shares = [_inlier_share(T, points, normals, cad, fine) for T in refined]
+    if max(shares) < _CERTAIN:
+        refined += [_refine(T, points, normals, cad, gate) for T in _feature_candidates(points, normals, cad)]
+        shares = [_inlier_share(T, points, normals, cad, fine) for T in refined]
+    best = int(np.argmax(shares))
+    corners = cad.samples[:: max(1, len(cad.samples) // 200)]
+    placed = [frames.transform(T, corners) for T in refined]
+    apart = [np.linalg.norm(p - placed[best], axis=1).max() for p in placed]
+    elsewhere = [s for s, d in zip(shares, apart, strict=True) if d > cad.size / 50]
+    if shares[best] < _LEAST_SHARE:
+        raise NoResultError(
+            f"scan and CAD do not meet: {shares[best]:.0%} of the points at best; to fix: check the CAD's unit, "
+            "or cut away what is not the part"
+        )
+    return CadStart(refined[best], shares[best], max(elsewhere, default=0.0))
+
+
+def _spread_sample(scan: JoinedScans) -> Indices:
+    """Indices of points evenly over the surface: one per voxel, then evenly thinned."""
+    usable = np.flatnonzero(scan.usable)
+    size = np.ptp(scan.points[usable], axis=0).max() / 70
+    _, first = np.unique(np.floor(scan.points[usable] / size).astype(int), axis=0, return_index=True)
+    kept = usable[np.sort(first)]
+    if len(kept) < _MIN_START_POINTS:
+        raise NoResultError(
+            f"the scans reach over {70 * size:.3g}, mostly empty; to fix: correct a scanner's pose, or cut them"
+        )
+    picked: Indices = kept[even_indices(len(kept), _START_POINTS)]
+    return picked
+
+
+def _axis_candidates(points: Array, cad: CadSurface) -> list[Array]:
+    """The 24 turns that lay the scan's principal axes onto the CAD's."""
+    clouds = (points, cad.samples[::20])
+    scan_axes, cad_axes = (np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2] for p in clouds)
+    turns = [np.eye(3)[list(p)] * signs for p in permutations(range(3)) for signs in product((1, -1), repeat=3)]
+    found = []
+    for turn in turns:
+        R = scan_axes.T @ turn @ cad_axes
+        if np.linalg.det(R) > 0:
+            found.append(frames.make(R, points.mean(axis=0) - R @ cad.samples.mean(axis=0)))
+    return found
+
+
+def _feature_candidates(points: Array, normals: Array, cad: CadSurface) -> list[Array]:
+    """Poses (4, 4) from feature matching, one per seed."""
+    size = cad.size / 60
+    step = max(1, len(cad.samples) // _FEATURE_SAMPLES)
+    scan = feature_matching.compute_fpfh(points, normals, 5 * size)
+    part = feature_matching.compute_fpfh(cad.samples[::step], cad.normals[::step], 5 * size)
+    found = []
+    for seed in range(_FEATURE_RUNS):
+        T_part_base = feature_matching.register_ransac(scan, part, reach=1.5 * size, draws=_FEATURE_DRAWS, seed=seed)
+        found.append(frames.inverse(T_part_base))
+    return found
+
+
+def _partners(T_base_part: Array, points: Array, normals: Array, cad: CadSurface) -> tuple[Array, Array, Array]:
+    """Points in the part frame, their samples and the samples' normals."""
+    T = frames.inverse(T_base_part)
+    local = frames.transform(T, points)
+    index = sample_partners(cad, local, frames.rotate(T, normals))
+    return local, cad.samples[index], cad.normals[index]
+
+
+def _inlier_share(T_base_part: Array, points: Array, normals: Array, cad: CadSurface, gate: float) -> float:
+    local, samples, directions = _partners(T_base_part, points, normals, cad)
+    seen = frames.rotate(frames.inverse(T_base_part), normals)
+    same = np.einsum("ij,ij->i", seen, directions) > 0.8
+    return float(np.mean(same & (np.linalg.norm(local - samples, axis=1) < gate)))
+
+
+def _refine(T_base_part: Array, points: Array, normals: Array, cad: CadSurface, gate: float) -> Array:
+    """Point-to-plane steps with a gate that closes to a tenth."""
+    for width in gate * np.geomspace(4.0, 0.1, _REFINE):
+        local, samples, directions = _partners(T_base_part, points, normals, cad)
+        off = local - samples
+        near = np.linalg.norm(off, axis=1) < max(width, 3 * cad.spacing)
+        if near.sum() < 12:
+            break
+        residual = np.einsum("ij,ij->i", off[near], directions[near])
+        arm = local[near] - cad.centre
+        design = np.hstack([np.cross(arm, directions[near]) / cad.size, directions[near]])
+        # Directions that the surface leaves open must not run away: a weak pull to stay.
+        step = np.linalg.solve(design.T @ design + 1e-4 * near.sum() * np.eye(6), -design.T @ residual)
+        step[:3] /= cad.size
+        T_base_part = moved_about(T_base_part, step, cad.centre)
+    return T_base_part
+
+
+# The deviation map: signed distances of scanned points from the CAD with its stock, and cells out of tolerance.
+
+# A cell with fewer points has no mean worth a verdict.
+_MIN_MAP_POINTS = 5
+
+
+@dataclass(frozen=True)
+class DeviationCells:
+    """C cells of the map: points of one cube that look the same way, averaged."""
+
+    middle: Array  # (C, 3) part frame
+    mean: Array  # (C,) deviation, positive outside
+    spread: Array  # (C,) 1-sigma of the points
+    count: NDArray[np.int64]  # (C,)
+
+
+@dataclass(frozen=True)
+class Deviations:
+    """N points that have a place on the CAD, part frame."""
+
+    points: Array  # (N, 3)
+    distance: Array  # (N,) positive outside
+    tolerance: float
+    cells: DeviationCells
+
+    @property
+    def outside(self) -> NDArray[np.bool_]:
+        """(C,) cells whose mean is beyond the tolerance."""
+        return np.asarray(np.abs(self.cells.mean) > self.tolerance)
+
+
+def measure_deviations(
+    scan: JoinedScans,
+    cad: CadSurface,
+    T_base_part: Array,
+    tolerance: float,
+    cell: float,
+    allowance: Allowance | None = None,
+) -> Deviations:
+    """Distances of all usable points from the CAD, or from the CAD with its allowance; cells average the noise away.
+
+    Args:
+        T_base_part: (4, 4) where the part lies.
+        tolerance, cell: of a cell's mean, and its edge length; the CAD's unit.
+    """
+    T = frames.inverse(T_base_part)
+    local = frames.transform(T, scan.points[scan.usable])
+    found = nearest_partners(cad, local, frames.rotate(T, scan.normals[scan.usable]))
+    points, distance, normal = local[found.accept], found.distance[found.accept], found.normal[found.accept]
+    if allowance is not None:
+        distance = distance - allowance.at(points)
+    key = np.hstack([np.floor(points / cell), np.round(normal)]).astype(np.int64)
+    _, where, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    where = where.ravel()
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.bincount(where, values, len(count)) / count)
+
+    average = mean(distance)
+    middle = np.column_stack([mean(points[:, k]) for k in range(3)])
+    spread = np.sqrt(np.maximum(mean((distance - average[where]) ** 2), 0.0))
+    full = count >= _MIN_MAP_POINTS
+    cells = DeviationCells(middle[full], average[full], spread[full], count[full].astype(np.int64))
+    return Deviations(points, distance, tolerance, cells)
+
+
+def write_deviation_ply(file: Path, deviations: Deviations) -> None:
+    """Points with the scalar `deviation` and a colour: blue inside, red outside, full at the tolerance."""
+    share = np.clip(deviations.distance / deviations.tolerance, -1, 1)
+    vertex = np.empty(
+        len(share), [(n, "f4") for n in ("x", "y", "z", "deviation")] + [(n, "u1") for n in ("red", "green", "blue")]
+    )
+    vertex["x"], vertex["y"], vertex["z"] = deviations.points.T
+    vertex["deviation"] = deviations.distance
+    pale = 235 * (1 - np.abs(share))
+    vertex["red"], vertex["green"] = np.where(share > 0, 235, pale), pale
+    vertex["blue"] = np.where(share < 0, 235, pale)
+    PlyData([PlyElement.describe(vertex, "vertex")]).write(str(file))
+
+
+def write_deviation_csv(file: Path, deviations: Deviations) -> None:
+    """One row per cell, the worst first."""
+    c, order = deviations.cells, np.argsort(-np.abs(deviations.cells.mean))
+    columns = {axis: c.middle[order, k] for k, axis in enumerate("xyz")}
+    columns |= {"deviation": c.mean[order], "spread": c.spread[order]}
+    verdicts = ["bad" if bad else "good" for bad in deviations.outside[order]]
+    write_columns(file, {**columns, "points": c.count[order].tolist(), "verdict": verdicts})
+
+
+# Several parts of the same kind in one scan.
+
+# Parts stand apart by more than this many point spacings, or this share of the part where the spacing is finer.
+_GAP_SPACINGS, _GAP_SHARE = 6.0, 1 / 40
+# A heap of points smaller than this share of the part's surface is no part.
+_MIN_INSTANCE_SHARE = 0.1
+
+
+def split_instances(scan: JoinedScans, cad: CadSurface, count: int) -> list[JoinedScans]:
+    """The scan's heaps of points, linked where nearer than the gap between parts, largest first.
+
+    Raises:
+        NoResultError: fewer heaps of a part's size than wanted.
+    """
+    if count == 1:
+        return [scan]
+    gap = max(_GAP_SPACINGS * scan.spacing, _GAP_SHARE * cad.size)
+    cells, where = np.unique(np.floor(scan.points / (gap / 3)).astype(int), axis=0, return_inverse=True)
+    # Cells three to a gap: those whose centres lie within it belong together.
+    pairs = cKDTree(cells).query_pairs(3.0, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
+    labels = connected_components(graph, directed=False)[1][where.ravel()]
+    heaps = [labels == label for label in range(labels.max() + 1)]
+    # Of a part at most one side is seen, so half its surface is the most a heap can hold.
+    big = [heap for heap in heaps if scan.area[heap].sum() > _MIN_INSTANCE_SHARE * cad.mesh.area / 2]
+    if len(big) < count:
+        raise NoResultError(
+            f"{len(big)} separate parts in the scan, {count} wanted; to fix: scan the others, or correct `instances`"
+        )
+    return [scan.take(heap) for heap in sorted(big, key=lambda heap: -scan.area[heap].sum())[:count]]

@@ -1,0 +1,506 @@
+"""The stand and what was read on it.
+
+Stand frame S: origin at slide zero, x along the rail away from P1, z the pivot axis of the rod, y = z × x.
+At angle 0 the rod lies on the rail and points back to P1, towards −x.
+"""
+
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from stitch.errors import NoResultError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.session.robot import elementary
+
+
+@dataclass(frozen=True)
+class TouchedPoints:
+    """Points that one robot touched, in its own base frame, with their covariance."""
+
+    names: tuple[str, ...]
+    points: Array  # (N, 3), length unit
+    covariance: Array  # (N, 3, 3)
+    rpy: Array | None = None  # (N, 3) α, β, γ of the flange, R = Rz(γ) Ry(β) Rx(α), where joint angles gave the points
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Everything that was read. Lengths in length_unit, angles in rad.
+
+    `rail` holds the points of the main robot, listed along the rail from P1 on; `rail_slide` the slide reading of the
+    cup touched there, NaN where none was read. `rod` holds the points of the second robot, one per rod setting.
+    """
+
+    length_unit: str
+    rail: TouchedPoints
+    rail_slide: Array  # (N,)
+    rod: TouchedPoints
+    slide: Array  # (M,) position of the pivot along the rail
+    angle: Array  # (M,) from the rail
+    length: Array  # (M,) pivot to cup
+    turn: float  # +1: the angle grows clockwise seen from above, −1: anticlockwise
+    sigma_slide: float
+    sigma_angle: float
+    sigma_length: float
+    sigma_level_stand: float  # how well the rod's swing is horizontal across the rail
+    sigma_level_base: float | None  # how well the two bases are parallel in tilt; None: not known
+    file: Path | None = None  # that was read
+
+    @property
+    def cups(self) -> Array:
+        """(M, 3) rod cup in the stand frame, as it was read."""
+        return rod_points(self.slide, self.angle, self.length, self.turn)
+
+
+def cylinder_points(joint1: Array | float, radius: Array | float, height: Array | float) -> Array:
+    """Points (..., 3) of a robot that reaches `radius` and `height` at the joint-1 angle, right-handed about z."""
+    return np.stack([radius * np.cos(joint1), radius * np.sin(joint1), height], axis=-1)
+
+
+def cylinder_covariance(joint1: float, radius: float, sigma: tuple[float, float, float]) -> Array:
+    """Covariance (3, 3) of one of `cylinder_points` from the sigmas of joint 1 (rad), radius and height."""
+    c, s = np.cos(joint1), np.sin(joint1)
+    jacobian = np.array([[-radius * s, c, 0.0], [radius * c, s, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(jacobian @ np.diag(np.square(sigma)) @ jacobian.T)
+
+
+@dataclass(frozen=True)
+class DhArm:
+    """A chain of turning and sliding joints by DH rows; lengths in length unit, angles in rad."""
+
+    a: Array  # (n,)
+    alpha: Array
+    d: Array
+    theta: Array
+    slides: NDArray[np.bool_]  # joints that slide along z instead of turning about it
+    modified: bool = False  # Craig's rows; else those of Denavit and Hartenberg
+    tip: Array = field(default_factory=lambda: np.zeros(3))  # in the flange frame
+
+    def flange(self, joints: Array) -> Array:
+        """T_base_flange (..., 4, 4) at joints (..., n)."""
+        T = np.eye(4)
+        for i, q in enumerate(np.moveaxis(np.asarray(joints, float), -1, 0)):
+            turn = self.theta[i] + (0.0 if self.slides[i] else q)
+            shift = self.d[i] + (q if self.slides[i] else 0.0)
+            joint, link = elementary("z", turn, shift), elementary("x", self.alpha[i], self.a[i])
+            T = T @ (link @ joint if self.modified else joint @ link)
+        return T
+
+    def touched(self, joints: Array, sigma: Array) -> tuple[Array, Array, Array]:
+        """Tips (N, 3), their covariance (N, 3, 3) from the joints' sigmas (n,), and α, β, γ (N, 3) of the flange."""
+        T, steps = self.flange(joints), 1e-5 * np.eye(len(sigma))
+        ahead, back = (self._tips(joints[:, None] + sign * steps) for sign in (1, -1))
+        slopes = (ahead - back) / 2e-5 * sigma[:, None]
+        angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX")[:, ::-1]
+        return self._tips(joints), np.einsum("nki,nkj->nij", slopes, slopes), angles
+
+    def _tips(self, joints: Array) -> Array:
+        T = self.flange(joints)
+        return np.asarray(T[..., :3, 3] + T[..., :3, :3] @ self.tip)
+
+
+def rod_points(slide: Array, angle: Array, length: Array, turn: float) -> Array:
+    """Rod cup (M, 3) in the stand frame (formulas 5 and 6 of the source, with the slide added)."""
+    across = turn * length * np.sin(angle)
+    return np.stack([slide - length * np.cos(angle), across, np.zeros_like(slide)], axis=-1)
+
+
+def level_stand(rail: Array, rail_slide: Array) -> Array:
+    """T_base1_stand (4, 4) from points (N, 3) on the rail, with the rod's swing horizontal across the rail.
+
+    The source's choice: the line R–S of its figure 6 is perpendicular to the vertical plane through the rail.
+    """
+    x = rail_direction(rail)
+    y = np.cross([0.0, 0.0, 1.0], x)
+    y /= np.linalg.norm(y)
+    known = np.isfinite(rail_slide)
+    origin = np.mean(rail[known] - rail_slide[known, None] * x, axis=0)
+    return frames.make(np.stack([x, y, np.cross(x, y)], axis=-1), origin)
+
+
+def rail_direction(rail: Array) -> Array:
+    """(3,) unit direction of growing slide, in which the points (N, 3) are listed."""
+    line = np.linalg.svd(rail - rail.mean(axis=0), full_matrices=False)[2][0]
+    return np.asarray(line * np.sign(line @ (rail[-1] - rail[0])))
+
+
+# Distances that two instruments give independently: where they differ, one of them is wrong.
+#
+# The distance between two settings of the rod follows from slide, angle and length alone, whatever the bases are; the
+# second robot measures the same distance by its joints. So the comparison needs no fit and names its pair of points.
+
+
+@dataclass(frozen=True)
+class DistanceComparison:
+    """One distance, by the stand and by a robot's joints."""
+
+    pair: tuple[str, str]
+    by_stand: float
+    by_robot: float
+    sigma: float  # of the difference
+
+    @property
+    def difference(self) -> float:
+        """By robot minus by stand."""
+        return self.by_robot - self.by_stand
+
+    @property
+    def sigmas(self) -> float:
+        """|difference| over its sigma."""
+        return abs(self.difference) / self.sigma
+
+
+def compare_distances(stand: Stand) -> tuple[DistanceComparison, ...]:
+    """Every pair of rod settings, and every pair of rail points whose slide was read; largest contradiction first."""
+    found = [_compare_rod_pair(stand, i, j) for i, j in combinations(range(len(stand.slide)), 2)]
+    known = np.flatnonzero(np.isfinite(stand.rail_slide)).tolist()
+    for i, j in combinations(known, 2):
+        distance = abs(float(stand.rail_slide[j] - stand.rail_slide[i]))
+        found.append(_distance_comparison(stand.rail, i, j, distance, 2 * stand.sigma_slide**2))
+    return tuple(sorted(found, key=lambda c: -c.sigmas))
+
+
+def _compare_rod_pair(stand: Stand, i: int, j: int) -> DistanceComparison:
+    """Both slides count as one reading where they are equal: the pivot was not moved."""
+    apart = stand.cups[j] - stand.cups[i]
+    distance = float(np.linalg.norm(apart))
+    unit = apart / max(distance, np.finfo(float).tiny)
+    variance = 0.0 if stand.slide[i] == stand.slide[j] else 2 * (unit[0] * stand.sigma_slide) ** 2
+    for k in (i, j):
+        along = np.array([-np.cos(stand.angle[k]), stand.turn * np.sin(stand.angle[k]), 0.0])
+        across = np.array([-along[1], along[0], 0.0])
+        variance += (unit @ along * stand.sigma_length) ** 2
+        variance += (unit @ across * stand.length[k] * stand.sigma_angle) ** 2
+    return _distance_comparison(stand.rod, i, j, distance, variance)
+
+
+def _distance_comparison(
+    touched: TouchedPoints, i: int, j: int, by_stand: float, variance: float
+) -> DistanceComparison:
+    apart: Array = touched.points[j] - touched.points[i]
+    by_robot = float(np.linalg.norm(apart))
+    unit = apart / max(by_robot, np.finfo(float).tiny)
+    variance += float(unit @ (touched.covariance[i] + touched.covariance[j]) @ unit)
+    return DistanceComparison((touched.names[i], touched.names[j]), by_stand, by_robot, float(np.sqrt(variance)))
+
+
+# All readings of the stand as one least-squares problem, every reading with its own sigma.
+
+_TOLERANCES = {"xtol": 1e-10, "ftol": 1e-10, "gtol": 1e-10}
+
+
+@dataclass(frozen=True)
+class BaseFit:
+    """T_base1_base2 with its uncertainty about the axes of base 1."""
+
+    T_base1_base2: Array  # (4, 4)
+    T_base1_stand: Array  # (4, 4)
+    covariance: Array  # (6, 6): rotation (rad) and translation, T = Trans(t + δ) · Rot(φ) · R
+    rail_residuals: Array  # (N, 3) touched minus fitted, base 1
+    rod_residuals: Array  # (M, 3) touched minus fitted, base 2
+    chi_square: float
+    redundancy: int  # readings beyond what the unknowns need
+
+    @property
+    def p_value(self) -> float:
+        """Chance of so large a misfit if the stated sigmas hold; 1 without redundancy."""
+        return float(chi2.sf(self.chi_square, self.redundancy)) if self.redundancy else 1.0
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) sigmas of rotation (rad) and translation."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def fit_stand(stand: Stand) -> BaseFit:
+    """Maximum likelihood over both base poses and over the true values of all rod readings.
+
+    Raises:
+        NoResultError: the readings leave a direction of the second base open.
+    """
+    start, scales = _initial_poses(stand), _unknown_scales(stand)
+    steps = np.diag(1e-2 * scales)
+
+    def jacobian_at(x: Array) -> Array:
+        """Central differences, all columns in one evaluation; a step is a hundredth of a typical error."""
+        ahead, back = _residuals(stand, start, x + np.stack([steps, -steps]))
+        return np.asarray((ahead - back).T / (2e-2 * scales))
+
+    solution = least_squares(
+        lambda x: _residuals(stand, start, x),
+        np.zeros(len(scales)),
+        jac=jacobian_at,
+        x_scale=scales,
+        method="trf",
+        **_TOLERANCES,
+    )
+    jacobian = solution.jac * scales
+    U, values, Vt = np.linalg.svd(jacobian, full_matrices=False)
+    if len(U) < len(Vt) or values[-1] < 1e-7 * values[0]:
+        raise NoResultError(
+            "turning the second base about the line through its points changes no reading; to fix: touch a third point "
+            "off that line, or state level.second_base"
+        )
+    covariance = (Vt.T / values**2) @ Vt * np.outer(scales, scales)
+    T_stand, T_base, *_ = _unpack(stand, start, solution.x)
+    rail, rod = _point_misfits(stand, start, solution.x)
+    return BaseFit(
+        T_base,
+        T_stand,
+        covariance[6:12, 6:12],
+        rail_residuals=rail,
+        rod_residuals=rod,
+        chi_square=float(2 * solution.cost),
+        redundancy=len(U) - len(Vt),
+    )
+
+
+def _initial_poses(stand: Stand) -> tuple[Array, Array]:
+    """Level stand, and the second base from its points; bases upright where the points leave that open."""
+    T_stand = level_stand(stand.rail.points, stand.rail_slide)
+    here = frames.transform(T_stand, stand.cups)
+    there = stand.rod.points
+    # The upright pair only decides what two points leave open: a thousandth of the points' spread.
+    up = 1e-3 * np.linalg.norm(there - there.mean(axis=0)) * np.array([[0.0, 0.0, 1.0]])
+    turn = Rotation.align_vectors(
+        np.vstack([here - here.mean(axis=0), up]), np.vstack([there - there.mean(axis=0), up])
+    )[0]
+    R = turn.as_matrix()
+    return T_stand, frames.make(R, here.mean(axis=0) - R @ there.mean(axis=0))
+
+
+def _unknown_scales(stand: Stand) -> Array:
+    """Typical size of each unknown's error, for conditioning: rad for rotations, length elsewhere."""
+    length = max(stand.sigma_length, stand.sigma_slide)
+    pose = np.repeat([stand.sigma_angle, length], 3)
+    along = np.full(len(stand.rail.points), length)
+    rod = np.repeat([stand.sigma_slide, stand.sigma_angle, stand.sigma_length], len(stand.slide))
+    return np.concatenate([pose, pose, along, rod])
+
+
+def _unpack(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, ...]:
+    """Poses, positions along the rail, and corrections of slide, angle and length; x is (..., n)."""
+    N, M = len(stand.rail.points), len(stand.slide)
+    poses = []
+    for T0, step in zip(start, (x[..., :6], x[..., 6:12]), strict=True):
+        turn = frames.exp(np.concatenate([step[..., :3], np.zeros_like(step[..., :3])], axis=-1))[..., :3, :3]
+        poses.append(frames.make(turn @ T0[:3, :3], T0[:3, 3] + step[..., 3:]))
+    along = frames.transform(frames.inverse(start[0]), stand.rail.points)[:, 0] + x[..., 12 : 12 + N]
+    return poses[0], poses[1], along, *np.moveaxis(x[..., 12 + N :].reshape(*x.shape[:-1], 3, M), -2, 0)
+
+
+def _point_misfits(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, Array]:
+    """Touched minus fitted points, each in the base of the robot that touched them."""
+    T_stand, T_base, along, slide, angle, length = _unpack(stand, start, x)
+    rail = frames.transform(T_stand, along[..., None] * np.array([1.0, 0.0, 0.0]))
+    cup = rod_points(stand.slide + slide, stand.angle + angle, stand.length + length, stand.turn)
+    rod = frames.transform(frames.inverse(T_base) @ T_stand, cup)
+    return stand.rail.points - rail, stand.rod.points - rod
+
+
+def _residuals(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
+    """Everything over its sigma: touched points, rod readings, level of the stand and of the second base."""
+    T_stand, T_base, along, slide, angle, length = _unpack(stand, start, x)
+    rail, rod = _point_misfits(stand, start, x)
+    known = np.isfinite(stand.rail_slide)
+    rows = [
+        _whiten(rail, stand.rail.covariance),
+        _whiten(rod, stand.rod.covariance),
+        (along[..., known] - stand.rail_slide[known]) / stand.sigma_slide,
+        slide / stand.sigma_slide,
+        angle / stand.sigma_angle,
+        length / stand.sigma_length,
+        T_stand[..., 2, 1:2] / stand.sigma_level_stand,
+    ]
+    if stand.sigma_level_base is not None:
+        rows.append(T_base[..., :2, 2] / stand.sigma_level_base)
+    return np.concatenate(rows, axis=-1)
+
+
+def _whiten(residuals: Array, covariance: Array) -> Array:
+    white = np.linalg.solve(np.linalg.cholesky(covariance), residuals[..., None])
+    return np.asarray(white.reshape(*residuals.shape[:-2], -1))
+
+
+# The source's solution: project the polyhedron of points and origins onto X-Y, X-Z and Y-Z (formulas 5 to 11).
+#
+# The X-Y plane is solved by the cosine rule, letter for letter but for two misprints: |O2R2| is printed with the
+# coordinates of R1, and |O1e| with |O1P1| where its triangle has the side |O1P2|. Both pairs are equal in the
+# source's experiments. The source's γ counts clockwise; `project` returns right-handed angles, so its γ is −γz.
+#
+# For X-Z and Y-Z the source says "likewise". `Projection.likewise` has the same rules there, 0/0 in its experiments,
+# where P1 and P2 fall on one point of the X-Z plane. So T takes these planes from the vectors R1R2 that rod and second
+# robot give, which is the same triangle; an angle whose R1R2 falls on a point of its plane is taken as level.
+
+# The formulas hold for the source's arrangement only, and elsewhere give any number without a sign of it. So the
+# solution must carry R1 and R2 onto the rod's cup within this share of the rod's length: far above all noise.
+_GAP = 0.05
+# The same in a plane that T does not take, where other arrangements come near: a millimetre of the rod.
+_CLOSED = 2e-4
+# R1R2 or P1P2 shorter in a plane than this share of its length gives no angle there.
+_SHORT = 0.05
+_ARRANGEMENT = "check the rod and joint readings, and that the stand is placed as the source places it"
+
+
+@dataclass(frozen=True)
+class Projection:
+    """What the three planes give; angles in rad, right-handed; NaN where a plane shows no angle."""
+
+    T_base1_base2: Array  # (4, 4), formula 11
+    gamma_beta_alpha: Array  # (3,)
+    offsets: Array  # (3, 2): px1, py1; px2, pz1; py2, pz2
+    # By plane, "X-Z" and "Y-Z": β, px2, pz1 and α, py2, pz2 by the rules of the X-Y plane, or why there are none.
+    likewise: dict[str, Array | str]
+    flange_beta_alpha: Array | None  # (2,) from pins that stand upright in their cups; None without flange angles
+
+
+def project(stand: Stand) -> Projection:
+    """T_base1_base2 from exactly two points per robot by the source's three projections.
+
+    Raises:
+        NoResultError: other than two points per robot, a slide that moved between R1 and R2, or triangles that do
+            not close as in the source's arrangement.
+    """
+    if len(stand.rail.points) != 2 or len(stand.rod.points) != 2 or np.ptp(stand.slide) > 0:
+        raise NoResultError("the projection takes two points per robot and one slide; to fix: use the least squares")
+    T_stand = level_stand(stand.rail.points, stand.rail_slide)
+    pivot, *cups = frames.transform(T_stand, np.vstack([[stand.slide[0], 0.0, 0.0], stand.cups]))
+    R_base1 = np.array(cups)
+    gamma, p_xy = _cosine_rules(stand, pivot, R_base1, stand.rod.points, (0, 1), stand.turn)
+    turned = stand.rod.points @ _rotation(2, gamma).T
+    likewise = {
+        "X-Z": _likewise(stand, pivot, R_base1, turned, (2, 0)),
+        "Y-Z": _likewise(stand, pivot, R_base1, turned, (1, 2)),
+    }
+    beta, p_xz = _plane(R_base1, turned, (2, 0), 1)
+    turned = stand.rod.points @ (_rotation(2, gamma) @ _rotation(1, beta)).T
+    alpha, p_zy = _plane(R_base1, turned, (1, 2), 0)
+    rotation = _rotation(2, gamma) @ _rotation(1, beta) @ _rotation(0, alpha)
+    offsets = np.array([p_xy, p_xz[::-1], p_zy])
+    mean = [(p_xy[0] + p_xz[1]) / 2, (p_xy[1] + p_zy[0]) / 2, (p_xz[0] + p_zy[1]) / 2]
+    T = frames.make(rotation, np.array(mean))
+    gap = float(np.linalg.norm(frames.transform(T, stand.rod.points) - R_base1, axis=1).max())
+    if not gap < _GAP * stand.length.max():
+        raise NoResultError(f"the projection misses the rod's cup by {gap:.3g}; to fix: {_ARRANGEMENT}")
+    return Projection(T, np.array([gamma, beta, alpha]), offsets, likewise, _flange_tilt(stand, gamma))
+
+
+def _likewise(stand: Stand, pivot: Array, R_base1: Array, turned: Array, axes: tuple[int, int]) -> Array | str:
+    """Angle and both offsets (3,) in X-Z or Y-Z, x or y first, or why there are none; `turned` is R after γ (2, 3)."""
+    for name, points in (("P1 and P2", stand.rail.points), ("R1 and R2", R_base1)):
+        apart = points[1] - points[0]
+        if np.linalg.norm(apart[list(axes)]) < _SHORT * np.linalg.norm(apart):
+            return f"{name} fall on one point of this plane, where the cosine rules are 0/0"
+    found = []
+    for side in (1.0, -1.0):
+        try:
+            angle, offset = _cosine_rules(stand, pivot, R_base1, turned, axes, side)
+        except NoResultError:
+            continue
+        back = turned[:, axes] @ _rotation(2, angle)[:2, :2].T + offset
+        gap = float(np.abs(back - R_base1[:, axes]).max())
+        found.append((gap, np.array([angle, *(offset[::-1] if axes == (2, 0) else offset)])))
+    gap, best = min(found, key=lambda pair: pair[0], default=(np.inf, None))
+    if best is not None and gap < _CLOSED * stand.length.max():
+        return best
+    return "the triangles do not close in this plane"
+
+
+def _flange_tilt(stand: Stand, gamma: float) -> Array | None:
+    """(2,) β and α that make the flanges' z axes of both robots parallel; None where their angles are not known."""
+    if stand.rail.rpy is None or stand.rod.rpy is None:
+        return None
+    main, second = (
+        Rotation.from_euler("ZYX", touched.rpy[:, ::-1]).as_matrix()[:, :, 2].mean(axis=0)
+        for touched in (stand.rail, stand.rod)
+        if touched.rpy is not None
+    )
+    # Both upwards; the turn about x alone changes y, then that about y the angle from z to x.
+    here, there = (axis * np.sign(axis[2]) for axis in (_rotation(2, -gamma) @ main, second))
+    reach = np.hypot(there[1], there[2])
+    alpha = np.arctan2(there[1], there[2]) - np.arcsin(np.clip(here[1] / reach, -1, 1))
+    turned = _rotation(0, float(alpha)) @ there
+    return np.array([np.arctan2(here[0], here[2]) - np.arctan2(turned[0], turned[2]), alpha])
+
+
+def _cosine_rules(
+    stand: Stand, pivot: Array, R_base1: Array, rod: Array, axes: tuple[int, int], side: float
+) -> tuple[float, Array]:
+    """Angle and offsets (2,) in the plane of `axes` by formulas 5 to 10 and the cosine rules after them.
+
+    Written for the source's side: seen against the plane's normal, the rod turns clockwise. With `side` −1 all is
+    mirrored.
+
+    Args:
+        pivot: (3,) of the rod, base 1.
+        R_base1: (2, 3) where the rod's cup stood, base 1.
+        rod: (2, 3) the same as the second robot touched it.
+    """
+    mirror = np.array([1.0, side])
+    P, R, e, cups = (points[..., list(axes)] * mirror for points in (stand.rail.points, rod, pivot, R_base1))
+    # Formulas 5 to 10 in this plane: the rod's length, and its angle against the rail.
+    length, theta = np.linalg.norm(cups - e, axis=1), _angles_between(P[0] - P[1], cups - e)
+    P2e = float(np.linalg.norm(e - P[1]))
+    Pr, Rr = np.arctan2(P[:, 1], P[:, 0]), -np.arctan2(R[:, 1], R[:, 0])
+    O1P, O2R = np.hypot(P[:, 0], P[:, 1]), np.hypot(R[:, 0], R[:, 1])
+    P1P2, R1R2 = _third_side(O1P[0], O1P[1], abs(Pr[0] - Pr[1])), _third_side(O2R[0], O2R[1], abs(Rr[0] - Rr[1]))
+    C1, C3 = _angle(O1P[0], P1P2, O1P[1]), _angle(O2R[0], R1R2, O2R[1])
+    C2, C4, C7 = np.pi - (C1 + Pr[0]), np.pi - (C3 + Rr[0]), np.pi - (C3 + abs(Rr[0] - Rr[1]))
+    C5, C6 = _angle(length[0], R1R2, length[1]), _angle(R1R2, length[1], length[0])
+    gamma_z = C2 + C4 + theta[0] - C5
+    O2e = _third_side(O2R[1], length[1], C7 + C6)
+    C8 = _angle(O2e, length[1], O2R[1])
+    C13 = C1 + abs(Pr[0] - Pr[1])
+    O1e = _third_side(P2e, O1P[1], C13)
+    C10 = _angle(P2e, O1e, O1P[1])
+    sign = np.sign(Pr[1])
+    er = sign * (np.pi - (C13 + C10)) + Pr[1]
+    C9 = C10 + theta[1] - C8
+    O1O2 = _third_side(O2e, O1e, C9)
+    C11 = _angle(O1O2, O1e, O2e)
+    bearing = sign * (abs(er) - C11)
+    gamma = float(np.arctan2(np.sin(-gamma_z), np.cos(-gamma_z))) * side
+    return gamma, O1O2 * np.array([np.cos(bearing), np.sin(bearing)]) * mirror
+
+
+def _angles_between(a: Array, b: Array) -> Array:
+    """(N,) angles of vectors b (N, 2) against a (2,), without sign."""
+    return np.asarray(np.abs(np.arctan2(a[0] * b[:, 1] - a[1] * b[:, 0], b @ a)))
+
+
+def _third_side(a: float, b: float, between: float) -> float:
+    return float(np.sqrt(a * a + b * b - 2 * a * b * np.cos(between)))
+
+
+def _angle(a: float, b: float, opposite: float) -> float:
+    """Angle between the sides a and b of a triangle."""
+    cosine = (a * a + b * b - opposite * opposite) / (2 * a * b) if a * b > 0 else np.nan
+    # A triangle that lies flat may miss ±1 by rounding; one that misses more does not close.
+    if not abs(cosine) < 1 + 1e-12:
+        raise NoResultError(
+            f"projection: sides {a:.4f}, {b:.4f} and {opposite:.4f} make no triangle; to fix: {_ARRANGEMENT}"
+        )
+    return float(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def _plane(R_base1: Array, R_turned: Array, axes: tuple[int, int], normal: int) -> tuple[float, Array]:
+    """Angle about the axis `normal` and the two offsets, from the direction of R1R2 in the plane `axes`."""
+    here, there = R_base1[:, axes], R_turned[:, axes]
+    d1, d2 = here[1] - here[0], there[1] - there[0]
+    seen = np.linalg.norm(d2) > _SHORT * np.linalg.norm(R_turned[1] - R_turned[0])
+    angle = float(np.arctan2(d2[0] * d1[1] - d2[1] * d1[0], d2 @ d1)) if seen else float("nan")
+    turned = R_turned @ _rotation(normal, angle).T
+    return angle, np.asarray((R_base1 - turned).mean(axis=0)[list(axes)])
+
+
+def _rotation(axis: int, angle: float) -> Array:
+    """(3, 3); of an angle that a plane does not show, no turn."""
+    angle = 0.0 if np.isnan(angle) else angle
+    return np.asarray(frames.exp(np.concatenate([angle * np.eye(3)[axis], np.zeros(3)]))[:3, :3])

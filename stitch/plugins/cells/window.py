@@ -1,0 +1,521 @@
+"""Both window jobs from their readings to their results and files."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from stitch.errors import InputError, NoResultError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import uncertainty_text
+from stitch.output.session_files import SessionFiles, pose_columns, write_session
+from stitch.plugins.cells.cad import Box, CadSurface, Regions, coverage, read_cad
+from stitch.plugins.cells.job_files import (
+    POSE_COLUMNS,
+    JobTable,
+    Wanted,
+    checked_table,
+    poses_from_columns,
+    read_columns,
+    read_job_file,
+    require_unique,
+    rows_from_poses,
+    write_columns,
+    write_poses,
+    write_recording_and_page,
+)
+from stitch.plugins.cells.placed_scans import (
+    JoinedScans,
+    PlacedScans,
+    assemble_scans,
+    read_placed_session,
+    read_scan_table,
+    stated_errors,
+)
+from stitch.plugins.cells.scan_to_cad import (
+    AllowancePrior,
+    CadFit,
+    CadStart,
+    Deviations,
+    allowance_sentence,
+    find_cad_start,
+    fit_cad,
+    measure_deviations,
+    read_allowance,
+    split_instances,
+    write_deviation_csv,
+    write_deviation_ply,
+)
+from stitch.plugins.cells.seam import VERDICTS, Limits, Seam, Station, measure_seam
+from stitch.session.session import Cloud
+from stitch.system.process import console
+
+# A robot path moved along with the part.
+
+
+def correct_path(T_base_tool: Array, T_base_part_nominal: Array, T_base_part: Array) -> Array:
+    """Poses (N, 4, 4) that stand to the found part as the programmed ones stand to the nominal part.
+
+    T_base_tool' = T_base_part · T_base_part_nominal⁻¹ · T_base_tool.
+    """
+    return T_base_part @ frames.inverse(T_base_part_nominal) @ T_base_tool
+
+
+# Job files of `stitch fit` and `stitch seam` (TOML); every check of the input is made here.
+
+FIT_FORMAT, SEAM_FORMAT = "stitch-fit/1", "stitch-seam/1"
+_SCANS = {"scans", "session", "hand_eye", "errors"}
+_FIT_KEYS = {"format", *_SCANS, "cad", "length_unit"}
+_FIT_KEYS |= {"instances", "tolerance", "cell", "region", "nominal", "path", "coverage"}
+_SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma"}
+
+
+@dataclass(frozen=True)
+class FitJob:
+    """Scans onto one CAD model; lengths in the CAD's unit, `length_unit` where somebody says which that is."""
+
+    placed: PlacedScans
+    scan: JoinedScans  # the same as one cloud
+    cad: CadSurface
+    cad_file: Path
+    instances: int
+    tolerance: float
+    cell: float
+    regions: Regions
+    coverage: float  # share of every expected region that must be seen
+    T_base_part_nominal: Array | None  # (4, 4)
+    path: tuple[list[str], Array] | None  # names and T_base_tool (N, 4, 4)
+    file: Path | None = None  # that was read
+    allowance_prior: AllowancePrior = field(default_factory=AllowancePrior)  # of the stock on the part
+    length_unit: str | None = None
+
+
+@dataclass(frozen=True)
+class SeamJob:
+    """Scans of a seam, where the part lies and where to measure; mm."""
+
+    placed: PlacedScans
+    scan: JoinedScans  # the same as one cloud
+    T_base_part: Array  # (4, 4)
+    stations: tuple[Station, ...]
+    limits: Limits
+    pose_sigma: float
+    file: Path | None = None  # that was read
+
+
+def read_fit_job(file: Path | str) -> FitJob:
+    """Read and check a job of `stitch fit`.
+
+    Raises:
+        InputError: a file is missing or malformed; an entry is missing, unknown or impossible.
+    """
+    file = Path(file)
+    document = read_job_file(file, FIT_FORMAT, _FIT_KEYS, "examples/window/fit.toml")
+    nominal = document.pose("nominal") if "nominal" in document else None
+    path = None
+    if "path" in document:
+        if nominal is None:
+            raise InputError(
+                f"{file}: path has no [nominal]; to fix: give the part's pose for which the path was programmed"
+            )
+        rows = read_columns(document.path("path"), "name", POSE_COLUMNS)
+        path = (rows.texts["name"], poses_from_columns(rows))
+    instances = document.entries.get("instances", 1)
+    if not isinstance(instances, int) or isinstance(instances, bool) or instances < 1:
+        raise document.refusal("instances", "write how many parts are in the scan, 1 or more")
+    cad_file = document.path("cad")
+    cad, placed = read_cad(cad_file), _read_scans(document)
+    unit = placed.length_unit if "session" in document else None  # else neither scans nor CAD name it
+    if "length_unit" in document:
+        unit = document.choice("length_unit", (unit,) if unit else ("mm", "m"))
+    return FitJob(
+        placed=placed,
+        scan=assemble_scans(placed),
+        cad=cad,
+        cad_file=cad_file,
+        instances=instances,
+        tolerance=document.number("tolerance", 0.5, positive=True),
+        cell=document.number("cell", cad.size / 60, positive=True),
+        regions=_read_regions(document),
+        coverage=document.number("coverage", 0.5),
+        T_base_part_nominal=nominal,
+        path=path,
+        file=file,
+        length_unit=unit,
+    )
+
+
+def read_seam_job(file: Path | str) -> SeamJob:
+    """Read and check a job of `stitch seam`.
+
+    Raises:
+        InputError: a file is missing or malformed; an entry is missing, unknown or impossible.
+    """
+    file = Path(file)
+    document = read_job_file(file, SEAM_FORMAT, _SEAM_KEYS, "examples/window/seam.toml")
+    if ("part" in document) == ("fit" in document):
+        raise InputError(f"{file}: no place of the part; to fix: give [part] with its pose, or fit = its fit.json")
+    T_base_part = document.pose("part") if "part" in document else _fitted_pose(document.path("fit"))
+    limits = document.table("limits", Limits.__dataclass_fields__)
+    placed = _read_scans(document)
+    return SeamJob(
+        placed=placed,
+        scan=assemble_scans(placed),
+        T_base_part=T_base_part,
+        stations=_read_stations(document.path("stations")),
+        limits=Limits(**{key: limits.number(key, positive="tolerance" in key) for key in limits.entries}),
+        pose_sigma=abs(document.number("pose_sigma", 0.0)),
+        file=file,
+    )
+
+
+def _read_scans(document: JobTable) -> PlacedScans:
+    """From a table of scanner poses, or from a session and a hand-eye."""
+    file = document.file
+    if ("scans" in document) == ("session" in document):
+        raise InputError(f"{file}: no scans; to fix: give scans = a table of them, or session = a session folder")
+    if "scans" in document and "hand_eye" in document:
+        raise InputError(
+            f"{file}: hand_eye goes with session; to fix: leave it out, for a table of scans has the scanner's poses"
+        )
+    if "scans" in document:
+        placed = read_scan_table(document.path("scans"))
+    elif "hand_eye" in document:
+        placed = read_placed_session(document.path("session"), document.path("hand_eye"))
+    else:
+        raise InputError(
+            f"{file}: session has no hand_eye; to fix: name the file that `stitch calibrate sphere -o` wrote"
+        )
+    return replace(placed, errors=stated_errors(document, placed))
+
+
+def _read_regions(document: JobTable) -> Regions:
+    boxes: dict[str, list[Box]] = {"expected": [], "forbidden": []}
+    entries = document.entries.get("region", [])
+    if not isinstance(entries, list):
+        raise InputError(f"{document.file}: region is no list; to fix: write [[region]], one for each box")
+    for i, entry in enumerate(entries):
+        region = checked_table(document.file, f"region[{i + 1}]", entry, {"name", "kind", "low", "high"})
+        kind = region.choice("kind", boxes)
+        low, high = (region.vectors(key, (3,), "[x, y, z] in the part's frame") for key in ("low", "high"))
+        if (low >= high).any():
+            raise InputError(
+                f"{document.file}: the box {region.place} is empty; to fix: write low below high in x, y and z"
+            )
+        boxes[kind].append(Box(str(entry.get("name", region.place)), low, high))
+    return Regions(tuple(boxes["expected"]), tuple(boxes["forbidden"]))
+
+
+def _fitted_pose(file: Path) -> Array:
+    """T_base_part (4, 4) of the first part of a fit.json."""
+    try:
+        T = np.array(json.loads(file.read_text(encoding="utf-8"))["parts"][0]["T_base_part"], float)
+    except FileNotFoundError:
+        raise InputError(f"{file}: not found; to fix: run stitch fit with -o first, or give [part]") from None
+    except (ValueError, KeyError, IndexError, TypeError):
+        raise InputError(
+            f"{file}: holds no parts[0].T_base_part; to fix: name the fit.json that stitch fit wrote"
+        ) from None
+    if not frames.is_rigid(T):
+        raise InputError(f"{file}: parts[0].T_base_part is no rigid motion; to fix: run stitch fit again")
+    return T
+
+
+def _read_stations(file: Path) -> tuple[Station, ...]:
+    columns = read_columns(file, "station", "x y z across_x across_y across_z out_x out_y out_z")
+    names = columns.texts["station"]
+    middle = columns.stack("x y z")
+    across, out = columns.stack("across_x across_y across_z"), columns.stack("out_x out_y out_z")
+    require_unique(file, "station", names)
+    for i, name in enumerate(names):
+        if np.linalg.norm(np.cross(across[i], out[i])) < 0.5 or abs(np.linalg.norm(out[i]) - 1) > 0.05:
+            raise InputError(
+                f"{file}: station {name}: across and out are not unit vectors at right angles; to fix: correct them"
+            )
+    return tuple(Station(n, m, a, o) for n, m, a, o in zip(names, middle, across, out, strict=True))
+
+
+@dataclass(frozen=True)
+class FittedPart:
+    """One part found in the scan."""
+
+    start: CadStart
+    fit: CadFit
+    deviations: Deviations
+    coverage: dict[str, float]  # of expected regions
+    forbidden: dict[str, int]  # usable points in forbidden regions
+    path: Array | None  # (N, 4, 4) corrected T_base_tool
+
+
+def fit_parts(job: FitJob) -> list[FittedPart]:
+    """Start, fit and map every part; largest first.
+
+    Raises:
+        NoResultError: a part is not found, or an expected region is not covered.
+    """
+    return [_fit_part(job, scan) for scan in split_instances(job.scan, job.cad, job.instances)]
+
+
+def _fit_part(job: FitJob, scan: JoinedScans) -> FittedPart:
+    start = find_cad_start(scan, job.cad)
+    found = fit_cad(scan, job.cad, start.T_base_part, job.regions, job.allowance_prior, job.placed.errors)
+    T = frames.inverse(found.T_base_part)
+    local, normals = frames.transform(T, scan.points[scan.usable]), frames.rotate(T, scan.normals[scan.usable])
+    covered = {box.name: coverage(box, job.cad, local, normals) for box in job.regions.expected}
+    for name, share in covered.items():
+        if share < job.coverage:
+            raise NoResultError(
+                f"expected region {name}: only {share:.0%} of it was scanned, {job.coverage:.0%} wanted; to fix: "
+                "scan it, or lower `coverage`"
+            )
+    forbidden = {box.name: int(box.holds(local).sum()) for box in job.regions.forbidden}
+    path = None
+    if job.path is not None and job.T_base_part_nominal is not None:
+        path = correct_path(job.path[1], job.T_base_part_nominal, found.T_base_part)
+    mapped = measure_deviations(
+        scan, job.cad, found.T_base_part, tolerance=job.tolerance, cell=job.cell, allowance=found.allowance
+    )
+    return FittedPart(start, found, mapped, coverage=covered, forbidden=forbidden, path=path)
+
+
+def fit_document(job: FitJob, parts: list[FittedPart]) -> dict[str, Any]:
+    """Plain data for JSON; length_unit of the CAD, degrees."""
+    nominal = job.T_base_part_nominal
+    return {
+        "format": "stitch-fit-result/1",
+        "length_unit": job.length_unit,
+        "noise": job.scan.noise,
+        "T_base_part_nominal": None if nominal is None else nominal.tolist(),
+        "parts": [_part_document(p) for p in parts],
+    }
+
+
+def _part_document(part: FittedPart) -> dict[str, Any]:
+    cells = part.deviations.cells
+    worst = int(np.argmax(np.abs(cells.mean))) if len(cells.mean) else None
+    pose = rows_from_poses(part.fit.T_base_part[None])[0].tolist()
+    document = {
+        "T_base_part": part.fit.T_base_part.tolist(),
+        "pose": dict(zip(POSE_COLUMNS.split(), pose, strict=True)),
+        "sigma": part.fit.sigma[3:].tolist(),
+        "sigma_deg": np.degrees(part.fit.sigma[:3]).tolist(),
+        "sigma_parts": {name: np.sqrt(np.diag(C)[3:]).tolist() for name, C in part.fit.parts.items()},
+        "scale": part.fit.scale,
+        "rms": part.fit.rms,
+        "inliers": part.fit.inliers,
+        "points": part.fit.points,
+        "start_share": part.start.share,
+        "start_runner_up": part.start.runner_up,
+        "cells": len(cells.mean),
+        "cells_outside": int(part.deviations.outside.sum()),
+        "worst": None if worst is None else {"at": cells.middle[worst].tolist(), "deviation": float(cells.mean[worst])},
+        "coverage": part.coverage,
+        "points_in_forbidden": part.forbidden,
+    }
+    if (allowance := part.fit.allowance) is not None:
+        document["allowance"] = {
+            "value": allowance.value,
+            "sigma": allowance.sigma,
+            "kind": "varying" if allowance.prior.varying else "free" if allowance.prior.free else "stated",
+            "lowest": allowance.lowest,
+            "highest": allowance.highest,
+            "sigma_field": allowance.sigma_field,
+            "told_apart": allowance.separable_share,
+        }
+    return document
+
+
+def write_fit(job: FitJob, parts: list[FittedPart], folder: Path) -> list[str]:
+    """fit.json, and for each part its map and path; returns the files' names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "fit.json").write_text(json.dumps(fit_document(job, parts), indent=1) + "\n", encoding="utf-8")
+    written = ["fit.json"]
+    for i, part in enumerate(parts):
+        tail = f"-{i + 1}" if len(parts) > 1 else ""
+        names = [f"deviation{tail}.ply", f"deviation{tail}.csv"]
+        write_deviation_ply(folder / names[0], part.deviations)
+        write_deviation_csv(folder / names[1], part.deviations)
+        if part.path is not None and job.path is not None:
+            names.append(f"path{tail}.csv")
+            write_poses(folder / names[-1], "name", job.path[0], part.path)
+        written += names
+    return written
+
+
+def solve_seam(job: SeamJob) -> list[Seam]:
+    """Flush and gap at every station.
+
+    Raises:
+        NoResultError: no station could be measured.
+    """
+    seams = measure_seam(job.scan, job.T_base_part, job.stations, job.limits, job.pose_sigma, job.placed.errors)
+    if all(seam.verdict == "not measured" for seam in seams):
+        raise NoResultError(f"no station could be measured; the first: {seams[0].reason}")
+    return seams
+
+
+def write_seam(seams: list[Seam], file: Path) -> None:
+    """One row per station."""
+    names = ("station", "flush", "gap", "sigma_flush", "sigma_gap", "verdict", "reason")
+    write_columns(file, {name: [getattr(seam, name) for seam in seams] for name in names})
+
+
+# What a fit found, in sentences: the same on the terminal, on the page and in the recording.
+
+NO_UNIT = "Lengths in the unit of the CAD, whose file names none; length_unit in the job states it."
+
+
+def with_unit(job: FitJob, size: str) -> str:
+    """A length with its unit, where that is known."""
+    return f"{size} {job.length_unit}" if job.length_unit else size
+
+
+def agreement_sentence(job: FitJob, part: FittedPart, name: str) -> str:
+    """How well the part lies on its CAD, and how many cells of the map are out."""
+    bad, cells = part.deviations.outside, part.deviations.cells
+    where = f"its points scatter about the CAD by {with_unit(job, f'{part.fit.scale:.3f}')} (1 σ)"
+    if not bad.any():
+        limit = with_unit(job, f"{part.deviations.tolerance:g}")
+        return f"{name} is found; {where}, and all {len(bad)} cells of the map are within {limit}."
+    worst = with_unit(job, f"{cells.mean[int(np.argmax(np.abs(cells.mean)))]:+.2f}")
+    return f"{name} is found; {where}, but {bad.sum()} of {len(bad)} cells of the map are out, by {worst} at most."
+
+
+def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
+    """Pose with its sigma, stock, doubt, the worst cell and what did not count."""
+    x, y, z, a, b, c = rows_from_poses(part.fit.T_base_part[None])[0]
+    shift, turn = part.fit.sigma[3:].max(), np.degrees(part.fit.sigma[:3]).max()
+    place = with_unit(job, f"x {x:.3f}, y {y:.3f}, z {z:.3f}")
+    yield (
+        f"T_base_part: {place}, ± {uncertainty_text(shift)} at most; a {a:.4f}, b {b:.4f}, c {c:.4f}° about z, y', "
+        f"x'', ± {uncertainty_text(turn)}° at most (1 σ)."
+    )
+    yield _sigma_sentence(job, part)
+    if part.fit.allowance is not None:
+        yield allowance_sentence(part.fit.allowance, job.length_unit)
+    if part.start.runner_up > 0.9 * part.start.share:
+        yield (
+            f"Another pose meets {part.start.runner_up:.0%} of the scan, this one {part.start.share:.0%}: the part is "
+            "nearly symmetric, or too little of it was scanned."
+        )
+    if part.deviations.outside.any():
+        cells = part.deviations.cells
+        worst = int(np.argmax(np.abs(cells.mean)))
+        at = ", ".join(f"{axis} {value:.0f}" for axis, value in zip("xyz", cells.middle[worst], strict=True))
+        yield (
+            f"Worst cell: {with_unit(job, f'{cells.mean[worst]:+.2f}')} at {with_unit(job, at)} of the part's frame "
+            "(plus: outside the CAD)."
+        )
+    for name, count in part.forbidden.items():
+        if count:
+            yield f"{count} points in forbidden region {name} did not count."
+
+
+_SOURCE_WORDS = {"scan": "the scan's noise", "hand_eye": "the hand-eye", "robot": "the robot", "scanner": "the scanner"}
+
+
+def _sigma_sentence(job: FitJob, part: FittedPart) -> str:
+    """What the ± of the place counts, largest first."""
+    sizes = {name: float(np.sqrt(np.diag(C)[3:].max())) for name, C in part.fit.parts.items()}
+    if len(sizes) == 1:
+        return "± counts the scan's noise alone; [errors] in the job states those of robot and scanner."
+    ranked = sorted((name for name, size in sizes.items() if size), key=lambda name: -sizes[name])
+    told = ", ".join(with_unit(job, f"{_SOURCE_WORDS[name]} {uncertainty_text(sizes[name])}") for name in ranked)
+    return f"± of the place by source: {told}."
+
+
+# The scans of a part or a seam as a cloud session, with the hand-eye that placed them and their CAD.
+
+
+def scan_session(name: str, placed: PlacedScans, cad: Path | None = None) -> SessionFiles:
+    """One view for each scan; where the job knew only the scanner's poses, the scanner itself counts as the flange."""
+    files = [f"clouds/{view}.ply" for view in placed.names]
+    tables = {"scanner": {"pose": placed.T_flange_scanner.tolist()}}
+    if cad is not None:
+        tables["part"] = {"cad": cad.name, "cad_unit": placed.length_unit}
+    return SessionFiles(
+        name=name,
+        length_unit=placed.length_unit,
+        mount="eye_in_hand",
+        tables=tables,
+        views={"view": placed.names, "cloud": files, **pose_columns(placed.T_base_flange)},
+        clouds={file: Cloud(points) for file, points in zip(files, placed.clouds, strict=True)},
+        copies=() if cad is None else (cad,),
+    )
+
+
+# What `stitch fit` does: parts fitted, shown, drawn, as map and path and as a session.
+
+
+def run_fit(file: Path, allowance: str | None, wanted: Wanted) -> None:
+    """Fit the parts of a job and hand out what was asked for; `InputError` and `NoResultError` end it."""
+    prior = read_allowance(allowance)
+    job = replace(read_fit_job(file), allowance_prior=prior)
+    parts = fit_parts(job)
+    written = write_fit(job, parts, wanted.output) if wanted.output is not None else []
+    if wanted.session is not None:
+        write_session(wanted.session, scan_session(file.stem, job.placed, job.cad_file))
+    write_recording_and_page("fit", wanted.recording, wanted.report, job, parts)
+    if wanted.as_json:
+        print(json.dumps(fit_document(job, parts), indent=1))
+        return
+    terminal = console()
+    for i, part in enumerate(parts):
+        terminal.print(agreement_sentence(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))
+        for line in detail_sentences(job, part):
+            terminal.print(f"  {line}")
+    if job.length_unit is None:
+        terminal.print(NO_UNIT)
+    for name in written:
+        print(f"{wanted.output}/{name}")
+
+
+# What a seam's stations say, in sentences: the same on the terminal, on the page and in the recording.
+
+
+def limits_text(limits: Limits) -> str:
+    """What is allowed."""
+    flush, gap = f"{limits.flush:g} ± {limits.flush_tolerance:g}", f"{limits.gap:g} ± {limits.gap_tolerance:g}"
+    return f"flush {flush} mm, gap {gap} mm"
+
+
+def stations_sentence(limits: Limits, seams: list[Seam]) -> str:
+    """How many stations are good."""
+    counts = {verdict: sum(s.verdict == verdict for s in seams) for verdict in VERDICTS}
+    found = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
+    return f"{len(seams)} stations: {found}. Allowed: {limits_text(limits)}."
+
+
+# What `stitch seam` does: stations measured, shown, drawn, as a table and as a session.
+
+
+def run_seam(file: Path, wanted: Wanted) -> None:
+    """Measure the stations of a seam and hand out what was asked for; `InputError` and `NoResultError` end it."""
+    job = read_seam_job(file)
+    seams = solve_seam(job)
+    if wanted.output is not None:
+        write_seam(seams, wanted.output)
+    if wanted.session is not None:
+        write_session(wanted.session, scan_session(file.stem, job.placed))
+    write_recording_and_page("seam", wanted.recording, wanted.report, job, seams)
+    if wanted.as_json:
+        rows = [{k: None if isinstance(v, float) and np.isnan(v) else v for k, v in asdict(s).items()} for s in seams]
+        print(json.dumps(rows, indent=1))
+        return
+    table = Table("station", "flush / mm", "gap / mm", "verdict", title="Stations, ± 1 σ", title_justify="left")
+    for s in seams:
+        if s.reason:
+            table.add_row(s.station, "", "", f"{s.verdict}: {s.reason}")
+        else:
+            flush, gap = f"{s.flush:+.3f} ± {s.sigma_flush:.3f}", f"{s.gap:.3f} ± {s.sigma_gap:.3f}"
+            table.add_row(s.station, flush, gap, s.verdict)
+    terminal = console()
+    terminal.print(stations_sentence(job.limits, seams))
+    terminal.print(table)
+    if wanted.output is not None:
+        print(wanted.output)

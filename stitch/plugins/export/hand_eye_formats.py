@@ -1,0 +1,328 @@
+"""A hand-eye as the text of each format, with what it means and its U (k = 2) in comments."""
+
+import json
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.model.model import COVERAGE_FACTOR, numbers_covariance, uncertainty_scope
+from stitch.model.model_toml import ModelFile, read_model
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import METRES, length_text
+from stitch.output.stored_run import read_diagnosis, read_result
+from stitch.output.urdf_file import roll_pitch_yaw
+from stitch.plugins.intake.controllers.taught_points import NUMBERS, fixed_xyz_numbers, quaternion_w_first_numbers
+
+_PARENTS = {"eye_to_hand": "base_link", "eye_in_hand": "flange"}
+_PARENT_WORDS = {"eye_to_hand": "base", "eye_in_hand": "flange"}
+# Characters that a frame's name may have in every format: those of a link in URDF and of a name in YAML.
+_PLAIN_LETTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_")
+
+
+@dataclass(frozen=True)
+class ExportedHandEye:
+    """A hand-eye with the names that other programs need."""
+
+    session: str
+    T_mount: Array  # (4, 4) T_parent_child, m
+    covariance: Array  # (6, 6) of T·exp(ξ), scanner frame, rotation first; rad and m
+    length_unit: str  # of the session
+    mount: str  # eye_to_hand | eye_in_hand
+    parent: str  # frame that carries the scanner, as other programs call it
+    child: str  # the scanner's own frame
+    notes: tuple[str, ...]  # plain sentences: what was not observable, what the numbers do not hold
+
+    @property
+    def name(self) -> str:
+        """T_base_scanner or T_flange_scanner."""
+        return f"T_{_PARENT_WORDS[self.mount]}_scanner"
+
+    def head(self, numbers: Callable[[Array], Array], labels: Sequence[str], units: Sequence[str]) -> list[str]:
+        """Return lines for comments: what it is, U (k = 2) of each number that the format states, and the notes.
+
+        Args:
+            numbers: what the format writes of T_parent_child in m, (n,).
+            labels: their names, (n,).
+            units: their units, (n,).
+        """
+        sigma = np.sqrt(np.diag(numbers_covariance(numbers, self.T_mount, self.covariance)))
+        sizes = zip(labels, COVERAGE_FACTOR * sigma, units, strict=True)
+        U = [f"{label} {size:.2g} {unit}".rstrip() for label, size, unit in sizes]
+        return [
+            f"{self.name} of session {self.session}: maps coordinates of {self.child} into {self.parent}; "
+            f"stitch {version('stitch')}",
+            f"U (k = 2), in the frame {self.parent}: {', '.join(U)}",
+            *self.notes,
+        ]
+
+    def lengths(self, unit: str) -> Array:
+        """Return (4, 4) T_parent_child with lengths in "mm" or "m"."""
+        T = self.T_mount.copy()
+        T[:3, 3] /= METRES[unit]
+        return T
+
+
+def hand_eye_of_run(folder: Path, parent: str | None = None, child: str = "scanner") -> ExportedHandEye:
+    """Return the corrected hand-eye of a run folder.
+
+    Args:
+        parent: name of the frame that carries the scanner; default base_link (eye_to_hand) or flange (eye_in_hand).
+
+    Raises:
+        InputError: no run, a damaged one, or a name that a frame cannot have.
+    """
+    result, model, told = read_result(folder), read_model(folder), read_diagnosis(folder)
+    if model.mount not in _PARENTS:
+        raise InputError(f"{folder}/model.toml: mount is {model.mount!r}; to fix: eye_to_hand or eye_in_hand")
+    return hand_eye_from(result, model, told, parent, child)
+
+
+def hand_eye_from(
+    result: dict[str, Any], model: ModelFile, told: dict[str, Any], parent: str | None = None, child: str = "scanner"
+) -> ExportedHandEye:
+    """Return the corrected hand-eye of a result and its model.
+
+    Args:
+        result: as result.json.
+        told: as diagnosis.json; {} where there is none.
+        parent, child: names of frames, as `hand_eye_of` takes them.
+
+    Raises:
+        InputError: a name that a frame cannot have, or numbers that the views do not show and nobody states.
+    """
+    unknown = result.get("hand_eye_unknown", [])
+    session = str(result.get("name") or Path(result["session"]).name)
+    if unknown and not result.get("hand_eye_stated"):
+        raise InputError(
+            f"{session}: these views do not show {', '.join(unknown)} of the hand-eye; to fix: add views turned about "
+            "other axes, or state [scanner] pose in session.toml"
+        )
+    metres = METRES[model.length_unit]
+    T, scale = model.T_mount.copy(), np.repeat([1.0, metres], 3)
+    T[:3, 3] *= metres
+    notes = [uncertainty_scope(told.get("verdict")).rstrip("."), *_undetectable_notes(told, model.length_unit)]
+    notes += [f"Not observable from these motions, left at the coarse value: {axis}" for axis in result["unobservable"]]
+    notes += [f"As stated in session.toml, not measured: {', '.join(unknown)}"] if unknown else []
+    if model.effects:
+        notes.append(f"Not in these numbers, as they are one rigid motion: {', '.join(model.effects)}")
+    return ExportedHandEye(
+        session=session,
+        T_mount=T,
+        covariance=model.covariance * np.outer(scale, scale),
+        length_unit=model.length_unit,
+        mount=model.mount,
+        parent=_require_plain_name("--parent", parent or _PARENTS[model.mount]),
+        child=_require_plain_name("--child", child),
+        notes=tuple(notes),
+    )
+
+
+def _require_plain_name(flag: str, name: str) -> str:
+    if not name or not set(name) <= _PLAIN_LETTERS or name[0].isdigit():
+        raise InputError(f"{flag} {name!r}: to fix: a name of letters, digits and _, as links in URDF have it")
+    return name
+
+
+def _undetectable_notes(diagnosis: dict[str, Any], length_unit: str) -> list[str]:
+    """Return how far an effect that the views do not show could push the hand-eye: U is that of the model."""
+    candidates = diagnosis.get("candidates", [])
+    known = [(c["hand_eye_if_missed"], c["effect"]) for c in candidates if c.get("hand_eye_if_missed") is not None]
+    if not known:
+        return []
+    size, name = max(known)
+    pushed = length_text(size, length_unit, 2)
+    return [f"Not in U: an effect too small to be seen could displace it, at the part, by as much as {pushed} ({name})"]
+
+
+@dataclass(frozen=True)
+class ControllerFrame:
+    """How one controller writes a frame."""
+
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    comment: str  # begins a line of comment
+    template: str  # {name} and the numbers by position
+    place: dict[str, str]  # mount → where it is entered
+
+
+_DEGREES = ("mm", "mm", "mm", "°", "°", "°")
+_CONTROLLERS = {
+    "kuka": ControllerFrame(
+        tuple("XYZABC"),
+        _DEGREES,
+        "; ",
+        "DECL FRAME {name}={{X {0},Y {1},Z {2},A {3},B {4},C {5}}}",
+        {"eye_in_hand": "TOOL_DATA", "eye_to_hand": "BASE_DATA"},
+    ),
+    "fanuc": ControllerFrame(
+        tuple("XYZWPR"),
+        _DEGREES,
+        "! ",
+        "{name}:\nX = {0} mm, Y = {1} mm, Z = {2} mm,\nW = {3} deg, P = {4} deg, R = {5} deg",
+        {"eye_in_hand": "UTOOL", "eye_to_hand": "UFRAME"},
+    ),
+    "abb": ControllerFrame(
+        ("x", "y", "z", "q1", "q2", "q3", "q4"),
+        ("mm", "mm", "mm", "", "", "", ""),
+        "! ",
+        "PERS pose {name}:=[[{0},{1},{2}],[{3},{4},{5},{6}]];",
+        {"eye_in_hand": "tframe of a tooldata", "eye_to_hand": "uframe of a wobjdata"},
+    ),
+    "ur": ControllerFrame(
+        ("x", "y", "z", "rx", "ry", "rz"),
+        ("m", "m", "m", "rad", "rad", "rad"),
+        "# ",
+        "{name} = p[{0}, {1}, {2}, {3}, {4}, {5}]",
+        {"eye_in_hand": "TCP", "eye_to_hand": "plane feature"},
+    ),
+}
+
+
+def controller_frame(eye: ExportedHandEye, controller: str) -> str:
+    """Return the frame as a controller writes it, by "kuka", "fanuc", "abb" or "ur"."""
+    form, near = _CONTROLLERS[controller], _frame_numbers(eye.T_mount, controller)
+    head = eye.head(lambda T: _frame_numbers(T, controller, near), form.labels, form.units)
+    lines = [*head, f"Entered as {form.place[eye.mount]}, in the controller's own base and flange"]
+    text = form.template.format(*(f"{x + 0.0:.9f}" for x in near), name=eye.name)
+    return f"{commented(form.comment, lines)}{text}\n"
+
+
+def _frame_numbers(T: Array, controller: str, near: Array | None = None) -> Array:
+    """Of a pose (4, 4) in m; the controllers' functions take mm."""
+    T = T.copy()
+    T[:3, 3] *= 1000
+    return np.asarray(NUMBERS[controller](T, near))
+
+
+_QUATERNION = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+def ros_yaml(eye: ExportedHandEye) -> str:
+    """Return a launch file of ROS 2 in YAML that publishes the transform: what MoveIt's own calibration saves."""
+    numbers = zip(_QUATERNION, _pose_quaternion(eye.T_mount).tolist(), strict=True)
+    flags = " ".join(f"--{key} {row([x])}" for key, x in numbers)
+    return (
+        f"{commented('# ', _quaternion_head(eye))}launch:\n  - node:\n      pkg: tf2_ros\n"
+        f"      exec: static_transform_publisher\n      name: {eye.parent}_to_{eye.child}\n      output: log\n"
+        f'      args: "--frame-id {eye.parent} --child-frame-id {eye.child} {flags}"\n'
+    )
+
+
+def ros_launch(eye: ExportedHandEye) -> str:
+    """Return the same as a launch file of ROS 1."""
+    args = f"{row(_pose_quaternion(eye.T_mount))} {eye.parent} {eye.child}"
+    return (
+        f"{xml_comment(_quaternion_head(eye))}<launch>\n"
+        f'  <node pkg="tf2_ros" type="static_transform_publisher" name="{eye.parent}_to_{eye.child}"\n'
+        f"        args={quoteattr(args)} />\n</launch>\n"
+    )
+
+
+def urdf(eye: ExportedHandEye) -> str:
+    """Return a link and a fixed joint, to be included in the robot's URDF; m and rad."""
+    near = _roll_pitch_yaw(eye.T_mount)
+    labels, units = ("x", "y", "z", "roll", "pitch", "yaw"), ("m",) * 3 + ("rad",) * 3
+    head = xml_comment(eye.head(lambda T: _roll_pitch_yaw(T, near), labels, units))
+    root = ElementTree.Element("robot", name=eye.child)
+    ElementTree.SubElement(root, "link", name=eye.child)
+    joint = ElementTree.SubElement(root, "joint", name=f"{eye.parent}_to_{eye.child}", type="fixed")
+    ElementTree.SubElement(joint, "parent", link=eye.parent)
+    ElementTree.SubElement(joint, "child", link=eye.child)
+    rpy = roll_pitch_yaw(eye.T_mount[:3, :3])
+    ElementTree.SubElement(joint, "origin", xyz=row(eye.T_mount[:3, 3]), rpy=row(rpy))
+    ElementTree.indent(root)
+    return f"{head}{ElementTree.tostring(root, encoding='unicode')}\n"
+
+
+def opencv(eye: ExportedHandEye) -> str:
+    """Return YAML of cv::FileStorage: the matrix and its covariance in the session's length_unit."""
+    unit = eye.length_unit
+    scale = np.repeat([1.0, 1 / METRES[unit]], 3)
+    facts = {"session": eye.session, "parent": eye.parent, "child": eye.child, "length_unit": unit}
+    return (
+        f"%YAML:1.0\n---\n{commented('# ', _matrix_head(eye, unit))}"
+        + "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}\n" for key, value in facts.items())
+        + _cv_matrix(eye.name, eye.lengths(unit))
+        + "# Of a right perturbation T·exp(ξ) in the scanner's frame: rotation in rad, then translation\n"
+        + _cv_matrix("covariance", eye.covariance * np.outer(scale, scale))
+    )
+
+
+def zivid(eye: ExportedHandEye) -> str:
+    """Return YAML as Zivid's SDK saves a Matrix4x4; mm."""
+    rows = ",\n".join(f"      [{row(line, ', ')}]" for line in eye.lengths("mm"))
+    head = commented("# ", _matrix_head(eye, "mm"))
+    return f"{head}__version__:\n  serializer: 1\n  data: 1\nFloatMatrix:\n  Data:\n    [\n{rows}\n    ]\n"
+
+
+HAND_EYE_FORMATS: dict[str, Callable[[ExportedHandEye], str]] = {
+    "ros": ros_yaml,
+    "urdf": urdf,
+    "opencv": opencv,
+    "zivid": zivid,
+    "kuka": lambda eye: controller_frame(eye, "kuka"),
+    "fanuc": lambda eye: controller_frame(eye, "fanuc"),
+    "abb": lambda eye: controller_frame(eye, "abb"),
+    "ur": lambda eye: controller_frame(eye, "ur"),
+}
+
+
+def _pose_quaternion(T: Array) -> Array:
+    """(7,) x, y, z, qx, qy, qz, qw."""
+    return np.append(T[:3, 3], frames.to_quaternion(T))
+
+
+def _quaternion_head(eye: ExportedHandEye) -> list[str]:
+    near = quaternion_w_first_numbers(eye.T_mount)
+    order = [0, 1, 2, 4, 5, 6, 3]
+    return eye.head(lambda T: quaternion_w_first_numbers(T, near)[order], _QUATERNION, ("m",) * 3 + ("",) * 4)
+
+
+def _roll_pitch_yaw(T: Array, near: Array | None = None) -> Array:
+    """FANUC's angles are those of URDF, in degrees."""
+    turned = np.repeat([1.0, 180 / np.pi], 3)
+    return np.asarray(fixed_xyz_numbers(T, None if near is None else near * turned) / turned)
+
+
+def _matrix_head(eye: ExportedHandEye, unit: str) -> list[str]:
+    """For matrices U of position, and of a small turn about the axes of the parent."""
+
+    def numbers(T: Array) -> Array:
+        move = frames.log(frames.inverse(eye.T_mount) @ T)
+        return np.append(T[:3, 3] / METRES[unit], 1e3 * eye.T_mount[:3, :3] @ move[:3])
+
+    labels = ("x", "y", "z", "turn about x", "turn about y", "turn about z")
+    return eye.head(numbers, labels, (unit,) * 3 + ("mrad",) * 3)
+
+
+def _cv_matrix(name: str, matrix: Array) -> str:
+    rows = ",\n       ".join(row(line, ", ") for line in matrix)
+    return f"{name}: !!opencv-matrix\n   rows: {len(matrix)}\n   cols: {len(matrix.T)}\n   dt: d\n   data: [ {rows} ]\n"
+
+
+def digits(x: float) -> str:
+    """Return the shortest decimals that read back as the same float64, without an exponent: some readers take none."""
+    return np.format_float_positional(x + 0.0, trim="0")
+
+
+def row(numbers: Iterable[float], separator: str = " ") -> str:
+    """Return several of them."""
+    return separator.join(digits(x) for x in numbers)
+
+
+def commented(mark: str, lines: Sequence[str], end: str = "") -> str:
+    """Return lines of comment between a mark and an end."""
+    return "".join(f"{mark}{' '.join(line.split())}{end}\n" for line in lines)
+
+
+def xml_comment(lines: Sequence[str]) -> str:
+    """Return the same in XML, where two hyphens would end a comment."""
+    return commented("<!-- ", [line.replace("--", "–") for line in lines], " -->")

@@ -1,0 +1,311 @@
+"""Clouds and poses as people hold them in a process, turned into what a file of the same scan would give.
+
+Open3D and trimesh are known by the names of their modules: whoever passes such an object has imported them.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.plugins.intake.layouts import possible_layouts
+from stitch.plugins.intake.raw_poses import RawPoses
+from stitch.plugins.intake.readings import readings
+from stitch.session.reading.clouds import cloud_of_columns, measured_pixels
+from stitch.session.reading.depth_image import Intrinsics, lifted
+from stitch.session.session import Cloud, Sighting
+
+Columns = dict[str, Array]
+_KNOWN = (
+    "(N, 3) or (H, W, 3) numbers, a structured array with x, y, z, a mapping with points, a PointCloud of trimesh or "
+    "Open3D, or (depth image, intrinsics)"
+)
+_NORMALS = ("nx", "ny", "nz")
+_COLOURS = ("red", "green", "blue")
+# A rotation that is one within this is taken as it is, to the last digit; another is made one.
+_ORTHONORMAL = 1e-9
+
+
+def cloud_of(item: Any, where: str, scale: float = 1.0) -> Cloud:
+    """Return a scan in the session's unit with normals, colours and every scalar that it has.
+
+    Colours become the scalars red, green and blue, 0 … 255, as a PLY file holds them. Points at 0 0 0, and pixels
+    of which x, y and z are NaN, are left out.
+
+    Args:
+        where: the scan's name, for messages.
+        scale: turns the unit of the item into the session's.
+
+    Raises:
+        InputError: a kind that is not known, another shape, no points, or points that are not finite.
+    """
+    if scale == 1.0 and _is_plain(item):
+        return Cloud(item)
+    return cloud_of_columns(where, _columns(item, where), scale)
+
+
+def _is_plain(item: Any) -> bool:
+    """Return True of points of which nothing is changed or left out: they need no copy."""
+    fits = isinstance(item, np.ndarray) and item.ndim == 2 and item.shape[1:] == (3,) and item.dtype == np.float64
+    return fits and len(item) > 0 and bool(np.isfinite(item).all()) and bool(item.any(axis=1).all())
+
+
+def _columns(item: Any, where: str) -> Columns:
+    """Return columns (N,) by name."""
+    if isinstance(item, Cloud):
+        return _of_cloud(item if item.whole is None else item.whole.read())
+    if isinstance(item, Mapping):
+        return _of_mapping(item, where)
+    if isinstance(item, tuple) and len(item) == 2 and not isinstance(item[0], (int, float)):
+        return _of_depth(*item, where)
+    library = type(item).__module__.split(".")[0]
+    if library == "open3d":
+        return _of_open3d(item, where)
+    if library == "trimesh" and hasattr(item, "vertices"):
+        colours = getattr(item, "colors", None)
+        return _points(np.asarray(item.vertices), where) | (_colours(colours, where) if _any(colours) else {})
+    array = np.asarray(item)
+    if array.dtype.names is not None:
+        columns = {name: array[name].ravel() for name in array.dtype.names if array[name].ndim == array.ndim}
+        return measured_pixels(columns)
+    return _points(array, where)
+
+
+def _of_cloud(cloud: Cloud) -> Columns:
+    normals = {} if cloud.normals is None else dict(zip(_NORMALS, cloud.normals.T, strict=True))
+    return dict(zip("xyz", cloud.points.T, strict=True)) | normals | cloud.scalars
+
+
+def _points(points: Array, where: str) -> Columns:
+    """Return columns x, y, z of (N, 3), or of (H, W, 3) whose pixels without a measurement are NaN."""
+    if points.ndim not in (2, 3) or points.shape[-1] != 3 or points.dtype.kind not in "fiu":
+        raise InputError(f"{where}: {_array_kind(points)} is no cloud that is known; to fix: pass {_KNOWN}")
+    columns = dict(zip("xyz", points.reshape(-1, 3).T, strict=True))
+    return measured_pixels(columns) if points.ndim == 3 else columns
+
+
+def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
+    """Return columns of a mapping: points, normals and colors are three each, every other entry is one."""
+    rest = {str(name): np.asarray(values) for name, values in item.items()}
+    points = rest.pop("points", None)
+    columns = {} if points is None else _points_all(points, where)
+    count = len(next(iter(columns.values()), ()))
+    for name, known in (("normals", _normals), ("colors", _colours)):
+        if name in rest:
+            columns |= known(rest.pop(name), where)
+    columns |= {name: values.ravel() for name, values in rest.items()}
+    odd = next((name for name, column in columns.items() if len(column) != (count or len(columns[name]))), None)
+    if odd is not None:
+        raise InputError(f"{where}: {odd} has {len(columns[odd])} values for {count} points; to fix: pass one a point")
+    return measured_pixels(columns)
+
+
+def _points_all(points: Array, where: str) -> Columns:
+    """Return every pixel, measured or not, so that other columns stay beside it."""
+    if points.ndim == 3 and points.shape[-1] == 3:
+        points = points.reshape(-1, 3)
+    return _points(points, where)
+
+
+def _normals(normals: Any, where: str) -> Columns:
+    return _three(_NORMALS, np.asarray(normals), "normals", where)
+
+
+def _colours(colours: Any, where: str) -> Columns:
+    """0 … 255, of bytes as they are and of floats from 0 to 1; an opacity is left out."""
+    values = np.asarray(colours)
+    if values.dtype.kind == "f":
+        values = np.round(values * 255)
+    return _three(_COLOURS, values[..., :3], "colors", where)
+
+
+def _three(names: Sequence[str], values: Array, what: str, where: str) -> Columns:
+    if values.ndim < 2 or values.shape[-1] != 3:
+        raise InputError(f"{where}: {what} of shape {values.shape}; to fix: pass three numbers a point")
+    return dict(zip(names, values.reshape(-1, 3).T, strict=True))
+
+
+def _any(values: Any) -> bool:
+    return values is not None and len(values) > 0
+
+
+def _of_open3d(item: Any, where: str) -> Columns:
+    """Return the columns of a PointCloud, legacy or of tensors."""
+    if hasattr(item, "depth"):
+        raise InputError(f"{where}: an image has no points without its lens; to fix: pass (image, intrinsics)")
+    if hasattr(item, "has_normals"):
+        columns = _points(np.asarray(item.points), where)
+        columns |= _normals(item.normals, where) if item.has_normals() else {}
+        return columns | (_colours(item.colors, where) if item.has_colors() else {})
+    if "positions" not in getattr(item, "point", ()):
+        raise InputError(f"{where}: {type(item).__name__} is no cloud that is known; to fix: pass {_KNOWN}")
+    values = {name: item.point[name].cpu().numpy() for name in item.point}
+    columns = _points(values.pop("positions"), where)
+    for name, known in (("normals", _normals), ("colors", _colours)):
+        if name in values:
+            columns |= known(values.pop(name), where)
+    one = {name: x.reshape(len(x)) for name, x in values.items() if x.size == len(x)}
+    return columns | {"intensity" if name == "intensities" else name: x for name, x in one.items()}
+
+
+def _of_depth(image: Any, intrinsics: Any, where: str) -> Columns:
+    """Return the columns of a depth image lifted through its lens, and its colours; 0 where nothing was measured."""
+    depth = _pixels(getattr(image, "depth", image))
+    colour = getattr(image, "color", None)
+    if depth.ndim != 2:
+        raise InputError(
+            f"{where}: {_array_kind(depth)} is no depth image; to fix: pass (H, W) numbers with intrinsics"
+        )
+    points = lifted(where, depth.astype(float), _intrinsics(intrinsics, where)).reshape(-1, 3)
+    seen = np.isfinite(points[:, 2])
+    columns = dict(zip("xyz", points[seen].T, strict=True))
+    pixels = np.zeros(0) if colour is None else _pixels(colour)
+    if pixels.shape[:2] != depth.shape:
+        return columns
+    if pixels.ndim == 2:
+        return columns | {"intensity": pixels.ravel()[seen]}
+    return columns | {name: values[seen] for name, values in _colours(pixels, where).items()}
+
+
+def _pixels(image: Any) -> Array:
+    """Return (H, W) or (H, W, C) of an array or an image of Open3D."""
+    for way in ("as_tensor", "cpu"):
+        image = getattr(image, way)() if hasattr(image, way) else image
+    values = image.numpy() if hasattr(image, "numpy") else np.asarray(image)
+    return values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
+
+
+def _intrinsics(item: Any, where: str) -> Intrinsics:
+    """Read a PinholeCameraIntrinsic, a matrix (3, 3), or a mapping with fx, fy, cx, cy; pixels."""
+    size = None
+    if hasattr(item, "intrinsic_matrix"):
+        size = (int(item.width), int(item.height)) if item.width > 0 else None
+        K = np.asarray(item.intrinsic_matrix, float)
+    elif isinstance(item, Mapping):
+        f, c = [float(item[k]) for k in ("fx", "fy")], [float(item[k]) for k in ("cx", "cy")]
+        K = np.array([[f[0], 0, c[0]], [0, f[1], c[1]], [0, 0, 1]])
+    else:
+        K = np.asarray(item.cpu().numpy() if hasattr(item, "cpu") else item, float)
+    if K.shape != (3, 3) or not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        raise InputError(
+            f"{where}: the intrinsics are no matrix (3, 3) with focal lengths; to fix: pass fx, fy, cx, cy in pixels"
+        )
+    fx, fy, cx, cy = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    return Intrinsics(Path(where), fx, fy, cx, cy, distortion=np.zeros(0), size=size, units_per_metre=None)
+
+
+def poses_of(poses: Any, where: str) -> Array:
+    """Return poses (V, 4, 4) of matrices, scipy's RigidTransform, (Rotation, translation), or a list of any of these.
+
+    Matrices that are stored by columns are told by their row 0 0 0 1, as `stitch init` tells them.
+
+    Args:
+        where: for messages.
+
+    Raises:
+        InputError: another kind or shape, numbers that are not finite, or a pose that is no rigid motion.
+    """
+    T = _matrices(poses, where)
+    if T.ndim != 3 or T.shape[1:] != (4, 4) or not len(T):
+        raise InputError(
+            f"{where}: poses of shape {T.shape}; to fix: pass (V, 4, 4), RigidTransform, (Rotation, translation), or "
+            "a list of one a view"
+        )
+    if not np.isfinite(T).all():
+        bad = int((~np.isfinite(T).all(axis=(1, 2))).argmax())
+        raise InputError(f"{where}: pose {bad} is not finite; to fix: leave that view out")
+    try:
+        (layout, *_) = possible_layouts(RawPoses(where, None, T.reshape(-1, 16), ((),) * len(T), "an array"))
+    except InputError:
+        raise InputError(f"{where}: {_no_motion(T)}; write a rotation, and 0 0 0 1 in the last row") from None
+    (reading, *_) = readings(layout)
+    R = T[:, :3, :3]
+    plain = np.array_equal(layout.position, T[:, :3, 3])
+    exact = plain and bool(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < _ORTHONORMAL)
+    return T if exact else reading.T
+
+
+def _matrices(poses: Any, where: str) -> Array:
+    """Return (V, 4, 4) of many poses, (4, 4) of one."""
+    if hasattr(poses, "as_matrix") and not isinstance(poses, Rotation):
+        return np.asarray(poses.as_matrix(), float)
+    if isinstance(poses, tuple) and len(poses) == 2 and isinstance(poses[0], Rotation):
+        return _joined(*poses, where)
+    try:
+        if isinstance(poses, Sequence) and not isinstance(poses, str):
+            poses = [_matrices(pose, where) if _is_object(pose) else np.asarray(pose, float) for pose in poses]
+        return np.array(poses, float)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{where}: poses are not all matrices (4, 4); to fix: pass (V, 4, 4), RigidTransform, "
+            "(Rotation, translation), or a list of one a view"
+        ) from None
+
+
+def _is_object(pose: Any) -> bool:
+    """Return True of a RigidTransform, or of a rotation beside a translation."""
+    return hasattr(pose, "as_matrix") or (isinstance(pose, tuple) and isinstance(pose[0], Rotation))
+
+
+def _joined(R: Rotation, t: Any, where: str) -> Array:
+    shift = np.asarray(t, float)
+    matrices = R.as_matrix()
+    if shift.shape != matrices.shape[:-1]:
+        raise InputError(
+            f"{where}: {matrices.shape[:-2] or 'one'} rotations and translations of shape {shift.shape}; to fix: pass "
+            "three numbers a rotation"
+        )
+    return frames.make(matrices, shift)
+
+
+def _no_motion(T: Array) -> str:
+    """Say why the worst of the matrices is no rigid motion."""
+    R = T[:, :3, :3]
+    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) + np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1)
+    det = np.linalg.det(R)
+    worst = int(np.argmax(off + (det < 0)))
+    size = np.abs(R[worst] @ R[worst].T - np.eye(3)).max()
+    return f"pose {worst} is not a rigid motion (R·Rᵀ differs from 1 by {size:.2g}, det {det[worst]:+.3f})"
+
+
+def sighting_of(item: Any, where: str) -> Sighting | None:
+    """Return the labelled points of one view: of a mapping from target to (3,), sensor frame; None where it has none.
+
+    Args:
+        item: such a mapping, a `Sighting` with sigmas of its own, or None.
+
+    Raises:
+        InputError: a place that is not three finite numbers.
+    """
+    if item is None or isinstance(item, Sighting):
+        return item
+    if not item:
+        return None
+    points = np.array([np.asarray(place, float) for place in item.values()])
+    if points.shape != (len(item), 3) or not np.isfinite(points).all():
+        raise InputError(f"{where}: labelled points are not three finite numbers each; to fix: pass {{target: (3,)}}")
+    return Sighting(tuple(str(name) for name in item), points, np.full(len(item), np.nan))
+
+
+def per_view(values: Any, count: int, where: str, ndim: int = 1) -> Array:
+    """Return numbers of which there is one row a view, as an array of `ndim` axes.
+
+    Raises:
+        InputError: another number of rows, or another shape.
+    """
+    try:
+        found = np.asarray(values, float)
+    except (TypeError, ValueError):
+        found = np.zeros((0,))
+    if found.ndim != ndim or len(found) != count:
+        raise InputError(f"{where}: shape {found.shape} for {count} views; to fix: pass one row of numbers a view")
+    return found
+
+
+def _array_kind(array: Array) -> str:
+    return f"an array of shape {array.shape} and type {array.dtype}"

@@ -1,0 +1,166 @@
+"""Which row of a table belongs to which cloud: by name, by time, by number, by order."""
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+from stitch.errors import InputError
+from stitch.numerics.frames import Array
+from stitch.plugins.intake.clock_times import rows_by_time
+
+# Clouds or poses that a list may lack where nothing but the order pairs them: more, and they do not belong together.
+LACKING = 2
+_SHIFTS = (1, -1, 2, -2)
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Per cloud the row of its pose; None where it has none."""
+
+    rows: tuple[int | None, ...]
+    words: str
+    by_name: bool  # names tell it; else the order is a guess
+
+    @property
+    def used(self) -> tuple[int, ...]:
+        """Clouds that have a pose."""
+        return tuple(i for i, row in enumerate(self.rows) if row is not None)
+
+    def of(self, clouds: Sequence[int], without_pose: Collection[int]) -> "Pairing":
+        """Return the pairing of some of the clouds; those whose row holds no pose have none."""
+        rows = tuple(self.rows[i] for i in clouds)
+        return replace(self, rows=tuple(None if row in without_pose else row for row in rows))
+
+
+def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None = None) -> list[Pairing]:
+    """Ways to pair, the likely one first; one where the names tell it.
+
+    Args:
+        clouds: files in their order.
+        labels: per row the texts that stand beside it.
+        numbers: (V, C) of the table: a column of it may number the clouds.
+
+    Raises:
+        InputError: so many more of one than of the other that they do not belong together.
+    """
+    named = named_pairing(clouds, labels, numbers)
+    if named is not None:
+        return [named]
+    N, M = len(clouds), len(labels)
+    numbered = _by_row(clouds, M)
+    if numbered:
+        return numbered
+    if abs(N - M) > LACKING or min(N, M) < 3:
+        raise InputError(
+            f"{clouds[0].parent}: {N} clouds and {M} poses, and their names do not tell which belong together; to fix: "
+            "write the cloud's file name beside each pose, or leave out what does not belong"
+        )
+    if N == M:
+        same: tuple[int | None, ...] = tuple(range(N))
+        out = [Pairing(same, "in the order of the names of the clouds", False)]
+        out.append(Pairing(same[::-1], "the poses in reverse order", False))
+        return out + [_shifted_pairing(N, by) for by in _SHIFTS if N - abs(by) >= 4]
+    return _incomplete_pairings(N, M)
+
+
+def named_pairing(
+    clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None = None
+) -> Pairing | None:
+    """Return the pairing that names, times or numbers tell; None where they do not."""
+    named = _by_text(clouds, labels) or _by_time(clouds, labels, numbers)
+    return named or _by_number(clouds, labels) or _by_column(clouds, numbers)
+
+
+def _by_row(clouds: Sequence[Path], rows: int) -> list[Pairing]:
+    """Return cloud N with row N, counted from 0, from 1, or both, of numbered clouds that are fewer than the rows."""
+    own = [n for cloud in clouds if (n := _last_number(cloud.stem)) is not None]
+    if not len(clouds) == len(set(own)) < rows or len(own) < 3 or 2 * len(own) < rows:
+        return []
+    out = []
+    for first in (0, 1):
+        if min(own) >= first and max(own) < rows + first:
+            words = f"cloud N with pose N, counted from {first}; {rows - len(own)} poses without a cloud"
+            out.append(Pairing(tuple(n - first for n in own), words, False))
+    return out
+
+
+def _shifted_pairing(count: int, by: int) -> Pairing:
+    rows = tuple(i + by if 0 <= i + by < count else None for i in range(count))
+    side = "below" if by > 0 else "above"
+    return Pairing(rows, f"each cloud with the pose {abs(by)} row{'s' * (abs(by) > 1)} {side}", False)
+
+
+def _incomplete_pairings(N: int, M: int) -> list[Pairing]:
+    """One list lacks one or two: every way, the end first."""
+    out = []
+    if N < M:
+        for gone in list(combinations(range(M), M - N))[::-1]:
+            rows = tuple(row for row in range(M) if row not in gone)
+            words = f"in order, pose {' and '.join(str(g + 1) for g in gone)} without a cloud"
+            out.append(Pairing(rows, words, False))
+        return out
+    for gone in list(combinations(range(N), N - M))[::-1]:
+        left = iter(range(M))
+        told = tuple(None if i in gone else next(left) for i in range(N))
+        out.append(Pairing(told, f"in order, cloud {' and '.join(str(g + 1) for g in gone)} without a pose", False))
+    return out
+
+
+def _by_text(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairing | None:
+    """A text beside the pose is the cloud's path, file name, or name without its ending."""
+    where: dict[str, set[int]] = {}
+    for row, texts in enumerate(labels):
+        for text in texts:
+            path = Path(text.strip().replace("\\", "/").lower())
+            for name in {path.name, path.stem}:
+                where.setdefault(name, set()).add(row)
+    rows = []
+    for cloud in clouds:
+        found = where.get(cloud.name.lower()) or where.get(cloud.stem.lower())
+        rows.append(next(iter(found)) if found is not None and len(found) == 1 else None)
+    known = [row for row in rows if row is not None]
+    if len(known) < 2 or len(set(known)) < len(known):
+        return None
+    return Pairing(tuple(rows), "by the names beside the poses", True)
+
+
+def _by_time(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None) -> Pairing | None:
+    """The times in the clouds' names are those beside the poses, to a fraction of the time from scan to scan."""
+    found = rows_by_time(clouds, labels, numbers)
+    if found is None:
+        return None
+    rows, farthest = found
+    words = f"by the times in the names of the clouds, {farthest:.2g} s at most from those of their poses"
+    left = len(labels) - len(rows)
+    words += f"; {left} poses belong to no cloud" if left else ""
+    return Pairing(tuple(rows), words, True)
+
+
+def _by_number(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairing | None:
+    """The last number in the cloud's name is that in the name of the pose: view_07 and robot_pose_7."""
+    own = [_last_number(cloud.stem) for cloud in clouds]
+    if None in own or len(set(own)) < len(own):
+        return None
+    for column in range(min(map(len, labels), default=0)):
+        theirs = [_last_number(Path(texts[column]).stem) for texts in labels]
+        if None not in theirs and len(set(theirs)) == len(theirs) and set(own) <= set(theirs):
+            return Pairing(tuple(theirs.index(number) for number in own), "by the numbers in the names", True)
+    return None
+
+
+def _by_column(clouds: Sequence[Path], numbers: Array | None) -> Pairing | None:
+    """The one column of whole numbers, no two alike, in which the last numbers of the clouds' names stand."""
+    own = [_last_number(cloud.stem) for cloud in clouds]
+    if numbers is None or None in own or len(set(own)) < len(own):
+        return None
+    counted = [list(c) for c in numbers.T if len(set(c)) == len(c) and {*own} <= {*c}]
+    if len(counted) != 1 or any(x != int(x) for x in counted[0]):
+        return None
+    return Pairing(tuple(counted[0].index(number) for number in own), "by the numbers in a column", True)
+
+
+def _last_number(name: str) -> int | None:
+    found = re.findall(r"\d+", name)
+    return int(found[-1]) if found else None

@@ -1,0 +1,467 @@
+"""From a folder of scans and poses to the first session: read, paired, judged by the scans, with reasons.
+
+What a person states is taken; what the files tell is read; the rest is decided by the scans (`choose_convention`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics.frames import Array
+from stitch.plugins.intake.cloud_pairs import Pairing, pairings
+from stitch.plugins.intake.convention_choice import (
+    ConventionChoice,
+    ConventionScore,
+    Interpretation,
+    Mounting,
+    all_interpretations,
+    choose_by_surfaces,
+    choose_convention,
+    choose_mounting,
+    fitted_scale,
+    require_no_background,
+    require_own_frames,
+    weigh_doubts,
+)
+from stitch.plugins.intake.folder_files import FolderFiles, Guess, angles_in_names, find_folder_files
+from stitch.plugins.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, cloud_units, covariate_columns, size_words
+from stitch.plugins.intake.raw_poses import RawPoses, header_poses, is_program, program_poses, read_raw_poses
+from stitch.plugins.intake.readings import (
+    Reading,
+    StatedTable,
+    all_readings,
+    candidate_units,
+    doubted_readings,
+    mixed_readings,
+    require_known_word,
+    with_joints_of,
+)
+from stitch.plugins.intake.scan_targets import TargetSearch, find_folder_targets, target_motions
+from stitch.plugins.intake.stops import rows_with_scans
+from stitch.screening.conventions import RelativeScans, register_scan_pairs
+from stitch.session.capture import Capture, distinct_points, thin_session
+from stitch.session.reading.clouds import read_cloud
+from stitch.session.reading.depth_image import DEPTH_SUFFIXES, find_intrinsics
+from stitch.session.reading.range_image import poses_in_scans
+from stitch.session.session import Cloud, Mount, Scanner, Session, Sighting, View
+from stitch.system.process import steps
+
+# What a person states with flags, of a table of poses and of the folder it lies in; None where nothing is stated.
+
+_MOUNTS = ("eye_in_hand", "eye_to_hand")
+
+
+@dataclass(frozen=True)
+class StatedFolder(StatedTable):
+    """And what its folder holds beside it, checked."""
+
+    poses: Path | None = None
+    cloud_unit: str | None = None
+    mount: str | None = None
+    orientation: tuple[float, ...] = ()  # of all poses, where the table has x, y, z alone
+    within: tuple[float, ...] = ()  # corners of the box that counts, low first, scanner frame, unit of the clouds
+    targets: TargetSearch = field(default_factory=TargetSearch)  # boards and balls in the scans
+
+    def __post_init__(self) -> None:
+        """As of the table."""
+        super().__post_init__()
+        require_known_word("--cloud-unit", self.cloud_unit, CLOUD_UNITS)
+        require_known_word("--mount", self.mount, _MOUNTS)
+        if self.within and (len(self.within) != 6 or not (self.box[0] < self.box[1]).all()):
+            raise InputError("--within: to fix: state the lowest and the highest corner, x,y,z,x,y,z, of a box")
+
+    @property
+    def box(self) -> Array:
+        """The corners (2, 3) of the box that counts; (0, 3) where everything does."""
+        return np.array(self.within, float).reshape(-1, 3)
+
+    @property
+    def carries(self) -> bool | None:
+        """Whether the poses as written carry the mount's frame, where mount and direction are both stated."""
+        if self.mount is None or self.inverse is None:
+            return None
+        return (self.mount == "eye_in_hand") != self.inverse
+
+
+# The guesses of a first session, each with its reason in words.
+
+
+def session_guesses(
+    files: FolderFiles,
+    raw: RawPoses,
+    decided: ConventionChoice,
+    clouds: Sequence[Array],
+    own_units: Sequence[str],
+    stated: StatedFolder,
+) -> tuple[Guess, ...]:
+    """What was found and how it is read; of the mount speaks `choose_mounting`."""
+    return (
+        _files_guess(files, raw),
+        _pairing_guess(decided),
+        _columns_guess(raw, decided, stated),
+        _rotation_guess(decided, stated),
+        _length_unit_guess(decided, stated),
+        _cloud_unit_guess(files, clouds, own_units, stated),
+    )
+
+
+def score_words(score: ConventionScore) -> str:
+    """What the scans say of a way."""
+    if not np.isfinite(score.misfit):
+        return "profiles do not tell it"
+    if not score.meets:
+        return "no two views meet"
+    motions = "" if score.closed is None else f", {100 * score.closed:.0f} % of the scanner's motions close"
+    return f"a rough fit leaves {score.misfit:.2f} mm{motions}"
+
+
+def _files_guess(files: FolderFiles, raw: RawPoses) -> Guess:
+    clouds = f"{len(files.clouds)} clouds {files.clouds[0].name} … {files.clouds[-1].name}"
+    aside = f"; left aside: {', '.join(f.name for f in files.unused[:5])}" if files.unused else ""
+    ends = dict.fromkeys((*files.poses[:1], *files.poses[-1:]))  # one, where there is one file
+    found = f"{clouds}, {len(raw.numbers)} poses in {' … '.join(file.name for file in ends) or 'their headers'}"
+    return Guess("files", found, f"{raw.words}{aside}", True, "--poses")
+
+
+def _pairing_guess(decided: ConventionChoice) -> Guess:
+    pairing = decided.best.interpretation.pairing
+    if pairing.by_name:
+        return Guess("pairing", pairing.words, "cloud and pose bear the same name, time or number", True, "--poses")
+    reason = f"names do not tell it; under it {score_words(decided.best)}"
+    return Guess("pairing", pairing.words, reason, decided.determined, "a column with the cloud's file name")
+
+
+def _columns_guess(raw: RawPoses, decided: ConventionChoice, stated: StatedFolder) -> Guess:
+    layout = decided.best.interpretation.reading.layout
+    beside = list(covariate_columns(layout, range(len(raw.numbers)), raw.time_s))
+    words = f"; beside the poses {', '.join(beside)}" if beside else ""
+    words += f"; {raw.clock.words}" if raw.clock is not None and raw.clock.words else ""
+    if stated.columns:
+        return Guess("columns", ", ".join(stated.columns), f"stated with --columns{words}", True, "--columns")
+    reason = ("the file names them" if layout.named else "told by their values") + words
+    return Guess("columns", layout.words, reason, layout.named or decided.determined, "--columns")
+
+
+def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
+    best = decided.best.interpretation.reading
+    if stated.rotation:
+        return Guess("rotation", best.words, "stated with --rotation", True, "--rotation")
+    if decided.overruled:
+        named = ", as the columns are named" * best.layout.named
+        reason = f"the scans contradict {decided.overruled}{named}; {score_words(decided.best)}"
+        return Guess("rotation", best.words, reason, decided.determined, "--rotation")
+    if best.layout.convention is not None:
+        sure = best.layout.sure or (decided.determined and not decided.only_believed)
+        reason = f"only the names say so; {decided.only_believed or 'others'} would fit too"
+        reason = "told by the file" if sure else reason
+        return Guess("rotation", best.words, reason, sure, "--rotation")
+    reason = score_words(decided.best)
+    alike = [w.reading.words for w in decided.equivalent if w.reading.words != best.words]
+    if alike:
+        reason += f"; {', '.join(dict.fromkeys(alike[:3]))} would stitch alike, with another hand-eye"
+    other = decided.runner_up
+    words = None
+    if other is not None:
+        direction = "poses as they are" if other.interpretation.carries else "poses inverted"
+        words = f"{other.interpretation.reading.words}, {direction}, {score_words(other)}"
+    return Guess("rotation", best.words, reason, decided.determined, "--rotation", words)
+
+
+def _length_unit_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
+    way = decided.best.interpretation
+    reach = float(np.linalg.norm(way.reading.T[:, :3, 3], axis=1).max())
+    if stated.length_unit:
+        return Guess("length_unit", way.length_unit, "stated with --unit", True, "--unit")
+    if way.reading.layout.length_unit:
+        return Guess("length_unit", way.length_unit, "told by the file", True, "--unit")
+    metres = reach * POSE_UNITS[way.length_unit]
+    reason = f"positions reach {reach:.4g}, that is {metres:.2f} m, as robots do; {score_words(decided.best)}"
+    return Guess("length_unit", way.length_unit, reason, decided.determined, "--unit")
+
+
+def _cloud_unit_guess(
+    files: FolderFiles, clouds: Sequence[Array], own_units: Sequence[str], stated: StatedFolder
+) -> Guess:
+    if stated.cloud_unit:
+        return Guess("cloud_unit", stated.cloud_unit, "stated with --cloud-unit", True, "--cloud-unit")
+    other = own_units[1] if len(own_units) > 1 else None
+    counted = files.clouds[0].suffix.lower() in (".png", ".tif", ".tiff")
+    words = "; whole numbers of depth are mm unless the intrinsics state depth_scale" * counted
+    return Guess("cloud_unit", own_units[0], f"{size_words(clouds)}{words}", other is None, "--cloud-unit", other)
+
+
+# Enough points a view to tell conventions.
+_POINTS = 8000
+_FEWEST = 3
+
+
+@dataclass(frozen=True)
+class FirstSession:
+    """What was found in a folder and how it is to be taken."""
+
+    files: FolderFiles
+    raw: RawPoses
+    cloud_unit: str
+    choice: ConventionChoice
+    mounting: Mounting
+    guesses: tuple[Guess, ...]
+    optical_axis: str
+    sightings: tuple[Sighting, ...] = ()  # mm, of every cloud, where targets are looked for
+    sphere_mm: float | None = None  # radius, where the clouds are profiles of a sphere
+    box: Array = field(default_factory=lambda: np.empty((0, 3)))  # corners, of the box that counts, unit of the clouds
+
+    @property
+    def pairing(self) -> Pairing:
+        """Which row belongs to which cloud."""
+        return self.choice.best.interpretation.pairing
+
+
+def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
+    """Find clouds and poses in a folder, read them, and let the scans tell how they belong together.
+
+    Raises:
+        InputError: no clouds or poses, or one that cannot be read; names the file and what to do.
+    """
+    found = find_folder_files(folder, stated.poses)
+    raw = _read_table(found, stated)
+    clouds, kept, lost = _read_clouds(found.clouds, stated.box)
+    pairs = [pairing.of(kept, raw.without_pose) for pairing in pairings(found.clouds, raw.labels, raw.numbers)]
+    found = replace(found, clouds=tuple(found.clouds[i] for i in kept))
+    points = [c.points for c in clouds]
+    own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
+    ways_to_read = all_readings(raw, found.urdf, stated)
+    units = candidate_units(ways_to_read, stated)
+    if all(_is_profile(cloud) for cloud in points):
+        way = all_interpretations(ways_to_read, pairs, units, (True,))[0]
+        return _profiles_of_a_sphere(found, raw, clouds, way, stated)
+    seen, of_targets = find_folder_targets(found, points, CLOUD_UNITS[own_units[0]], stated.targets)
+    shown = target_motions(seen) if seen else None
+    capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
+    decided = _decide(
+        found, raw, ways_to_read, (capture, CLOUD_UNITS[own_units[0]] / MM), (pairs, units), stated, shown
+    )
+    axis, axis_guess = guess_optical_axis(clouds)
+    settled = choose_mounting(decided, stated.mount, stated.inverse)
+    told = session_guesses(found, raw, decided, points, own_units, stated)
+    beside = (*of_targets, *_codes_guess(clouds), *_left_out_guess(found, decided, lost))
+    guesses = (*told, settled.guess, axis_guess, *beside)
+    return FirstSession(found, raw, own_units[0], decided, settled, guesses, axis, sightings=seen, box=stated.box)
+
+
+def _decide(
+    found: FolderFiles,
+    raw: RawPoses,
+    ways_to_read: Sequence[Reading],
+    scans: tuple[Capture, float],
+    open_: tuple[Sequence[Pairing], Sequence[str]],
+    stated: StatedFolder,
+    shown: RelativeScans | None,
+) -> ConventionChoice:
+    """Let the scans choose among the readings, and among those that the names of columns deny.
+
+    Args:
+        scans: made light, mm, and the unit of their files in mm.
+        open_: pairings and units of length that are possible.
+        shown: motions that targets show.
+
+    Raises:
+        InputError: scans that stand still, lie in one frame or have another scale.
+    """
+    (capture, mm), (pairs, units) = scans, open_
+
+    @cache
+    def motions() -> RelativeScans:
+        # They are dear: what stands still before the scanner is told before.
+        require_no_background(found.folder, capture, mm)
+        return register_scan_pairs(capture)
+
+    def choose(among: Sequence[Reading]) -> ConventionChoice:
+        return choose_convention(capture, motions, among, pairs, units, stated.carries, shown)
+
+    decided = choose(ways_to_read)
+    require_own_frames(found.folder, motions, decided)
+    if not decided.determined:
+        require_scale(found, fitted_scale(motions(), decided), stated)
+    layout = decided.best.interpretation.reading.layout
+    doubted = [] if layout.turntable else doubted_readings(raw, found.urdf, stated)
+    if not decided.determined:
+        doubted += mixed_readings(raw, stated)
+    if doubted and not decided.determined:
+        decided = weigh_doubts(decided, choose(doubted))
+    elif doubted and not (layout.sure or stated.rotation):
+        decided = weigh_doubts(decided, choose_by_surfaces(capture, doubted, decided.best.interpretation))
+    if not decided.determined and found.clouds[0].suffix.lower() in DEPTH_SUFFIXES:
+        # Where counts are far too large or small the motions close less well.
+        require_scale(found, fitted_scale(motions(), decided, (10.0, 0.1)), stated)
+    return decided
+
+
+# Of the width of a profile: how far its points lie from a plane through the scanner.
+_FLAT = 1e-3
+
+
+def _is_profile(points: Array) -> bool:
+    """Return True of one line of a laser: all points lie in a plane through the scanner's origin."""
+    extents = np.linalg.svd(points[:: -(-len(points) // _POINTS)], compute_uv=False)
+    return bool(extents[2] < _FLAT * extents[1])
+
+
+def _profiles_of_a_sphere(
+    files: FolderFiles, raw: RawPoses, clouds: Sequence[Cloud], way: Interpretation, stated: StatedFolder
+) -> FirstSession:
+    """Return the session for `stitch calibrate sphere`; profiles tell nothing of how the poses are to be read.
+
+    Raises:
+        InputError: no radius of the sphere is stated.
+    """
+    radii = stated.targets.balls or ()
+    if len(radii) != 1:
+        raise InputError(
+            f"{files.folder}: every cloud is one profile of a laser line and shows no surface; to fix: for profiles of "
+            f"one sphere state its radius in mm, stitch init {files.folder} --ball RADIUS --yes"
+        )
+    decided = ConventionChoice(ConventionScore(way, np.eye(4), np.inf, False, None), None, False, (), 0.0, 0.0)
+    points = [cloud.points for cloud in clouds]
+    own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
+    mounting = choose_mounting(decided, stated.mount, stated.inverse)
+    axis, axis_guess = guess_optical_axis(clouds)
+    sphere = Guess("sphere", f"radius {radii[0]:g} mm", "stated with --ball", True, "--ball")
+    guesses = (*session_guesses(files, raw, decided, points, own_units, stated), mounting.guess, axis_guess, sphere)
+    return FirstSession(files, raw, own_units[0], decided, mounting, guesses, axis, sphere_mm=radii[0])
+
+
+def _read_table(found: FolderFiles, stated: StatedFolder) -> RawPoses:
+    """Return the rows of the poses, named and completed as stated; of a recording those that belong to scans."""
+    raw = _read_folder_poses(found)
+    raw = raw.renamed(stated.columns) if stated.columns else raw
+    raw = raw.oriented(stated.orientation) if stated.orientation else raw
+    if found.urdf is not None and raw.header is not None and not stated.columns:
+        raw = with_joints_of(raw, found.urdf)
+    return rows_with_scans(raw, found.clouds, found.urdf, stated)
+
+
+def _read_clouds(files: Sequence[Path], box: Array) -> tuple[list[Cloud], list[int], list[str]]:
+    """Return the clouds that show something, their numbers among the files, and why the others do not.
+
+    Raises:
+        InputError: fewer than three do.
+    """
+    clouds, kept, lost = list[Cloud](), list[int](), list[InputError]()
+    for i, file in enumerate(steps("clouds", files)):
+        try:
+            cloud = distinct_points(read_cloud(file))
+            cloud = cloud.within(box) if len(box) else cloud
+            if len(cloud.points) < _FEWEST:
+                raise InputError(f"{file}: {len(cloud.points)} points show no surface; to fix: take the scan out")
+        except InputError as error:
+            lost.append(error)
+            continue
+        clouds.append(cloud)
+        kept.append(i)
+    if lost and (len(clouds) < _FEWEST or len(lost) > len(clouds)):
+        raise lost[0]
+    return clouds, kept, [str(error).split("; ")[0] for error in lost]
+
+
+def _codes_guess(clouds: Sequence[Cloud]) -> tuple[Guess, ...]:
+    """Return what share of the points was read as a code for nothing measured."""
+    coded = sum(cloud.coded for cloud in clouds)
+    if not coded:
+        return ()
+    share = coded / (coded + sum(cloud.count for cloud in clouds))
+    codes = ", ".join(f"{code:g}" for code in sorted({code for cloud in clouds for code in cloud.codes}))
+    return (Guess("codes", codes, f"{share:.1%} of the points hold it: nothing was measured there", True, "clouds"),)
+
+
+def _left_out_guess(files: FolderFiles, decided: ConventionChoice, lost: Sequence[str]) -> tuple[Guess, ...]:
+    """Return what became of clouds and rows that hold nothing."""
+    pairing = decided.best.interpretation.pairing
+    unposed = [files.clouds[i].name for i, row in enumerate(pairing.rows) if row is None]
+    words = [*lost, *([f"no pose for {', '.join(unposed)}"] if unposed else [])]
+    if not words:
+        return ()
+    count = len(lost) + len(unposed)
+    return (Guess("left_out", f"{count} view{'s' * (count > 1)}", "; ".join(words), True, "views.csv"),)
+
+
+# Factors between clouds and robot that a fitted scale is taken for, within this share.
+_ROUND, _ROUND_NEAR = (1.0, 2.0, 2.5, 4.0, 5.0, 8.0), 0.02
+_INCHES = (25.4, 1 / 25.4, 2.54, 1 / 2.54, 0.0254, 1 / 0.0254)
+# Scanners and robots agree within this share; beyond, a unit is wrong.
+_SCALE = 0.05
+
+
+def require_scale(files: FolderFiles, scale: float | None, stated: StatedFolder) -> None:
+    """Refuse scans that move as the robot does, but so many times as far.
+
+    Raises:
+        InputError: names the file or the flag that states the unit, and what to write there.
+    """
+    if scale is None or abs(np.log(scale)) < _SCALE:
+        return
+    powers = [digit * 10.0**power for digit in _ROUND for power in range(-6, 7)] + [*_INCHES]
+    near = min(powers, key=lambda x: abs(np.log(scale / x)))
+    factor = near if abs(scale / near - 1) < _ROUND_NEAR else float(f"{scale:.4g}")
+    first = files.clouds[0]
+    told = f"the clouds are {scale:.4g} times as large as the robot's motions"
+    if first.suffix.lower() in DEPTH_SUFFIXES:
+        camera = find_intrinsics(first)
+        per_metre = (camera.units_per_metre or 1000.0) * factor
+        raise InputError(
+            f"{camera.source}: {told}, so a count of depth is {1000 / per_metre:.4g} mm; to fix: write depth_scale = "
+            f'{per_metre:.6g} (counts per metre) there, as "depth_scale": {per_metre:.6g}'
+        )
+    if factor in (1000.0, 0.001) and stated.length_unit:
+        raise InputError(f"--unit {stated.length_unit}: {told}; to fix: leave --unit out")
+    if factor in (1000.0, 0.001):
+        unit = "mm" if factor == 0.001 else "m"
+        raise InputError(f"{files.folder}: {told}; to fix: state --cloud-unit {unit}")
+    raise InputError(
+        f"{files.folder}: {told}; to fix: multiply x, y, z of the clouds by {1 / factor:.6g}, or those of the poses by "
+        f"{factor:.6g}"
+    )
+
+
+def _read_folder_poses(files: FolderFiles) -> RawPoses:
+    if not files.poses:
+        angles = angles_in_names(files.clouds)
+        if angles is not None and poses_in_scans(list(files.clouds)) is None:
+            labels = tuple((cloud.name,) for cloud in files.clouds)
+            source = f"{files.clouds[0].name} … {files.clouds[-1].name}"
+            return RawPoses(
+                source, ("turntable_deg",), np.array(angles)[:, None], labels, "angles in the names of the clouds"
+            )
+        return header_poses(files.clouds)
+    first = files.poses[0]
+    if is_program(first):
+        return program_poses(first)
+    return read_raw_poses(files.poses)
+
+
+def capture_of(clouds: Sequence[Cloud], scale: float) -> Capture:
+    """Scans made light, in mm, at no poses."""
+    scaled = [Cloud(cloud.points * scale, cloud.normals) for cloud in clouds]
+    views = [View(f"v{i}", cloud, np.eye(4), None, None, time_s=None, covariates={}) for i, cloud in enumerate(scaled)]
+    return thin_session(bare_session(views, "eye_in_hand"), _POINTS)[1]
+
+
+def bare_session(views: Sequence[View], mount: Mount) -> Session:
+    """A session in mm of which nothing but the views is known."""
+    scanner = Scanner(None, None, None, np.array([0.0, 0.0, 1.0]))
+    return Session(
+        Path(), "", "mm", mount, scanner, robot=None, sphere_radius=None, cad=None, cad_unit=None, views=tuple(views)
+    )
+
+
+def guess_optical_axis(clouds: Sequence[Cloud]) -> tuple[str, Guess]:
+    """The side of z on which the points lie."""
+    middle: Array = np.mean([np.median(c.points, axis=0) for c in clouds], axis=0)
+    axis = "-z" if middle[2] < 0 and abs(middle[2]) > np.linalg.norm(middle[:2]) else "+z"
+    told = abs(middle[2]) > np.linalg.norm(middle[:2])
+    where = ", ".join(f"{x:.3g}" for x in middle)
+    reason = f"the middle of the scans lies at ({where}) in the scanner's frame"
+    return axis, Guess("optical_axis", axis, reason, bool(told), "optical_axis in session.toml")

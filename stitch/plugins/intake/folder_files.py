@@ -1,0 +1,325 @@
+"""What a folder holds: clouds, files of poses, a robot's description."""
+
+import re
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from natsort import natsorted, ns
+
+from stitch.errors import InputError
+from stitch.plugins.intake.layouts import possible_layouts
+from stitch.plugins.intake.raw_poses import (
+    PROGRAMS,
+    STRUCTURED,
+    TABLES,
+    is_program,
+    read_by_its_program,
+    read_raw_poses,
+)
+from stitch.session.reading.clouds import CLOUD_SUFFIXES, ptx_scans
+from stitch.session.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
+from stitch.session.reading.range_image import poses_in_scans
+from stitch.session.reading.text_files import WORKBOOKS, import_extra, readable
+
+# Which files of a folder are scans, and which of them are the scans of its campaign.
+
+# Text files are clouds or tables of poses: a scan has more lines than a campaign has views.
+_EITHER = (".txt", ".csv", ".asc")
+_CLOUD_LINES = 400
+# A recording of a robot is as long as a scan; the names of its columns tell them apart.
+_RECORDINGS = 2
+_RECORDED, _HEADER = re.compile(rb"tcp|pose|joint|flange|q[wxyz]\b|actual_|quat", re.IGNORECASE), 4096
+
+
+def clouds_among(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Files of the kind that most clouds have, and clouds of other kinds."""
+    fitting = [f for f in files if f.suffix.lower() in CLOUD_SUFFIXES and _is_cloud(f)]
+    if not fitting:
+        return [], []
+    kinds = Counter(f.suffix.lower() for f in fitting)
+    order = list(CLOUD_SUFFIXES)
+    best = max(kinds, key=lambda kind: (kinds[kind], -order.index(kind)))
+    return [f for f in fitting if f.suffix.lower() == best], [f for f in fitting if f.suffix.lower() != best]
+
+
+def _is_cloud(file: Path) -> bool:
+    if file.suffix.lower() == ".npy":
+        return _is_cloud_array(file) or is_depth_image(file)
+    if file.suffix.lower() in DEPTH_SUFFIXES:
+        return is_depth_image(file)
+    if file.suffix.lower() not in _EITHER:
+        return True
+    with file.open("rb") as stream:
+        if _RECORDED.search(stream.readline(_HEADER)):
+            return False
+        stream.seek(0)
+        return sum(1 for _, _ in zip(stream, range(_CLOUD_LINES), strict=False)) == _CLOUD_LINES
+
+
+def _is_cloud_array(file: Path) -> bool:
+    """An image of points, or more rows than a campaign has views; matrices (V, 4, 4) are poses."""
+    try:
+        shape = np.load(file, mmap_mode="r", allow_pickle=False).shape or (0,)
+    except (ValueError, OSError):
+        return False
+    image = len(shape) == 3 and shape[1:] not in ((4, 4), (3, 4))
+    return shape[-1] >= 3 and (image or (len(shape) == 2 and shape[0] >= _CLOUD_LINES))
+
+
+# What was guessed about a folder: each guess with its reason, how sure it is, and the flag that overrules it.
+
+
+@dataclass(frozen=True)
+class Guess:
+    """One thing that the files do not say, or say only in a name."""
+
+    what: str  # "rotation", "mount" …
+    value: str
+    reason: str
+    determined: bool  # the files or the scans tell it; False: it cannot be told from these views
+    flag: str  # that overrules it
+    runner_up: str | None = None
+
+    @property
+    def line(self) -> str:
+        """For a comment or a terminal."""
+        untold = "" if self.determined else f" cannot be told from these views, {self.flag} overrules it;"
+        other = f"; next best: {self.runner_up}" if self.runner_up else ""
+        return f"{self.what}: {self.value};{untold} {self.reason}{other}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """As `stitch init --json` prints it."""
+        return {
+            "what": self.what,
+            "value": self.value,
+            "reason": self.reason,
+            "told": self.determined,
+            "flag": self.flag,
+            "runner_up": self.runner_up,
+        }
+
+
+_DEEPEST = 3
+_LARGEST_TABLE_MB = 5.0
+_PACKED = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst")
+# What this program writes itself.
+_OWN = {"views.csv", "session.toml", "points.csv", "frames.csv", "targets.csv"}
+
+
+@dataclass(frozen=True)
+class FolderFiles:
+    """Files of one folder; clouds in the order of their names, numbers by size."""
+
+    folder: Path
+    clouds: tuple[Path, ...]
+    poses: tuple[Path, ...]  # one table, or a file for each pose; none: they stand in the headers of the scans
+    urdf: Path | None
+    unused: tuple[Path, ...]  # clouds of another kind and other files of poses, not used
+
+
+@readable()
+def find_folder_files(folder: Path, poses: Path | None = None) -> FolderFiles:
+    """Find clouds and poses in a folder and below it.
+
+    Args:
+        poses: file or folder of the poses, where a person names it.
+
+    Raises:
+        InputError: no clouds, no poses, or several tables of poses.
+    """
+    _require_folder(folder)
+    if poses is not None and not poses.exists():
+        raise InputError(f"{poses}: no such file; to fix: name the file of the poses")
+    files = list_files(folder)
+    named = {poses, *(poses.iterdir() if poses is not None and poses.is_dir() else ())}
+    clouds, other_clouds = clouds_among([f for f in files if f not in named])
+    if not clouds:
+        raise InputError(_no_clouds_message(folder, files))
+    # A recording of the robot is as long as a scan, and the only text beside scans of another kind.
+    texts = [f for f in other_clouds if f.suffix.lower() in _EITHER]
+    taken = {*clouds, *(other_clouds if len(texts) > _RECORDINGS else set(other_clouds) - {*texts})}
+    candidates = [f for f in files if f not in taken and _may_hold_poses(f) and not read_by_its_program(f)]
+    chosen: list[Path] = []
+    rest: list[Path] = []
+    if poses is not None:
+        chosen, rest = _stated_pose_files(poses, taken)
+    elif candidates or (poses_in_scans(clouds) is None and angles_in_names(clouds) is None):
+        chosen, rest = _choose_pose_files(folder, candidates, len(clouds))
+    urdfs = [f for f in files if f.suffix.lower() == ".urdf"]
+    return FolderFiles(
+        folder=folder,
+        clouds=tuple(clouds),
+        poses=tuple(chosen),
+        urdf=urdfs[0] if len(urdfs) == 1 else None,
+        unused=tuple(dict.fromkeys((*(f for f in other_clouds if f not in chosen), *rest))),
+    )
+
+
+# Angles of a turntable in names: scan_020deg, angle_45.5, 120°.
+_ANGLE = re.compile(
+    r"(?:angle|winkel|rot|turn|table|theta|deg)[a-z]*[_-]?([+-]?\d+(?:[.,]\d+)?)"
+    r"|(\d+(?:[.,p]\d+)?)[_ ]?(?:deg|grad|°)",
+    re.IGNORECASE,
+)
+
+
+def angles_in_names(clouds: Sequence[Path]) -> list[float] | None:
+    """Return the angle in each cloud's name, degrees; None where one has none, or two are alike."""
+    found = [_ANGLE.search(cloud.stem) for cloud in clouds]
+    if len(clouds) < 3 or None in found:
+        return None
+    angles = [float(re.sub("[,p]", ".", m[1] or m[2])) for m in found if m is not None]
+    return angles if len(set(angles)) == len(angles) else None
+
+
+def _require_folder(folder: Path) -> None:
+    if folder.is_dir():
+        return
+    if not folder.is_file():
+        raise InputError(f"{folder}: no such folder; to fix: name the folder of the scans")
+    if folder.suffix.lower() in _PACKED:
+        raise InputError(f"{folder}: is packed; to fix: unpack it and name the folder")
+    raise InputError(f"{folder}: is a file; to fix: name the folder that it lies in, {folder.parent}")
+
+
+def _no_clouds_message(folder: Path, files: Sequence[Path]) -> str:
+    """Why, and what to do: an archive that nobody has unpacked, or files of other kinds."""
+    packed = next((f for f in files if f.suffix.lower() in _PACKED), None)
+    if packed is not None:
+        return f"{folder}: no clouds there, only packed in {packed.relative_to(folder)}; to fix: unpack it there"
+    kinds = Counter(f.suffix.lower() or f.name for f in files).most_common(3)
+    there = f", only {', '.join(f'{count} {kind}' for kind, count in kinds)}" if kinds else ""
+    return (
+        f"{folder}: no clouds there{there}; to fix: put the scans there as {', '.join(CLOUD_SUFFIXES)}, or "
+        "the points that a tracker measured beside the poses"
+    )
+
+
+def list_files(folder: Path, depth: int = 0) -> list[Path]:
+    """Return files in a folder and below, hidden ones and folders of runs left out."""
+    out = []
+    for entry in natsorted(folder.iterdir(), alg=ns.IGNORECASE):
+        if entry.name.startswith(".") or entry.name in _OWN:
+            continue
+        if entry.is_file():
+            out.append(entry)
+        elif entry.is_dir() and depth < _DEEPEST and not (entry / "result.json").exists():
+            out += list_files(entry, depth + 1)
+    return out
+
+
+def _may_hold_poses(file: Path) -> bool:
+    kinds = (*STRUCTURED, *TABLES, *PROGRAMS, *WORKBOOKS)
+    return file.suffix.lower() in kinds and file.stat().st_size < _LARGEST_TABLE_MB * 1e6
+
+
+def _stated_pose_files(poses: Path, clouds: set[Path]) -> tuple[list[Path], list[Path]]:
+    if poses.is_dir():
+        inside = [f for f in poses.iterdir() if f.is_file() and f not in clouds and _may_hold_poses(f)]
+        if not inside:
+            raise InputError(f"{poses}: no files of poses there; to fix: name the file or the folder of the poses")
+        return natsorted(inside, alg=ns.IGNORECASE), []
+    return [poses], []
+
+
+_NAMES_POSE = re.compile(r"pose|robot|flange|tcp|joint|trajector", re.IGNORECASE)
+
+
+def _choose_pose_files(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[Path], list[Path]]:
+    """The one table, or the files that are named alike and are about as many as the clouds."""
+    alike: dict[tuple[Path, str, str], list[Path]] = {}
+    for file in candidates:
+        alike.setdefault((file.parent, re.sub(r"\d+", "#", file.stem), file.suffix.lower()), []).append(file)
+    sets = [files for files in alike.values() if len(files) > 2 and abs(len(files) - clouds) <= 2]
+    single = [files for files in alike.values() if len(files) == 1]
+    groups = sets or [g for g in single if _NAMES_POSE.search(g[0].stem)]
+    groups = groups or (len(single) > 1 and [g for g in single if _holds_poses(g[0])]) or single
+    if not groups and alike:
+        most = max(alike.values(), key=len)
+        raise InputError(
+            f"{folder}: {clouds} clouds but {len(most)} files that may hold a pose each, {most[0].name} … "
+            f"{most[-1].name}; to fix: leave out what does not belong, or name the file of the poses with --poses FILE"
+        )
+    if not groups:
+        raise InputError(f"{folder}: no file of poses there; to fix: name it with --poses FILE")
+    if len(groups) > 1:
+        shown = ", ".join(str(g[0].relative_to(folder)) for g in groups[:4])
+        raise InputError(f"{folder}: several files may hold the poses ({shown}); to fix: name it with --poses FILE")
+    return groups[0], [f for f in candidates if f not in groups[0]]
+
+
+def _holds_poses(file: Path) -> bool:
+    """Several, whatever the file is called; what a camera's file or a remark holds is none."""
+    if is_program(file):
+        return True
+    try:
+        raw = read_raw_poses([file])
+        return len(raw.numbers) > 1 and bool(possible_layouts(raw))
+    except InputError:
+        return False
+
+
+# Files that hold the scans of a whole campaign, E57 and Leica's PTX, as one file a scan.
+
+# Tables and descriptions that lie beside such a file are far smaller.
+_SMALL_MB = 5.0
+
+
+@contextmanager
+def one_scan_a_file(folder: Path) -> Iterator[Path]:
+    """Give the folder as it is, or, where a file holds several scans, a passing one with a file for each of them.
+
+    Raises:
+        InputError: the package that reads such files is not installed.
+    """
+    files = list_files(folder) if folder.is_dir() else []
+    packed = {file: count for file in files if (count := _scan_count(file)) > 1}
+    if not packed:
+        yield folder
+        return
+    with TemporaryDirectory() as scratch:
+        unpacked = Path(scratch) / folder.resolve().name
+        unpacked.mkdir()
+        for file in files:
+            if file in packed:
+                _unpack(file, packed[file], unpacked)
+            elif file.stat().st_size < _SMALL_MB * 1e6:
+                shutil.copyfile(file, unpacked / file.name)
+        yield unpacked
+
+
+def _scan_count(file: Path) -> int:
+    if file.suffix.lower() == ".e57":
+        return int(import_extra("pye57", file, "formats").E57(str(file)).scan_count)
+    return len(ptx_scans(file)) if file.suffix.lower() == ".ptx" else 1
+
+
+def _unpack(file: Path, count: int, folder: Path) -> None:
+    """Write each scan, with its pose, to a file of its own, numbered in their order."""
+    names = [folder / f"{file.stem}_{i:0{len(str(count - 1))}d}{file.suffix.lower()}" for i in range(count)]
+    if file.suffix.lower() == ".ptx":
+        for name, lines in zip(names, ptx_scans(file), strict=True):
+            name.write_text("\n".join(lines) + "\n", encoding="ascii", errors="replace")
+        return
+    pye57 = import_extra("pye57", file, "formats")
+    source = pye57.E57(str(file))
+    for i, name in enumerate(names):
+        header = source.get_header(i)
+        fields = set(header.point_fields)
+        columns = source.read_scan(
+            i, ignore_missing_fields=True, transform=False, intensity="intensity" in fields, colors="colorRed" in fields
+        )
+        posed = header.has_pose()
+        with pye57.E57(str(name), mode="w") as written:
+            written.write_scan_raw(
+                {field: np.asarray(column) for field, column in columns.items()},
+                rotation=np.asarray(header.rotation) if posed else None,
+                translation=np.asarray(header.translation) if posed else None,
+            )

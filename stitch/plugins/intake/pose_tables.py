@@ -1,0 +1,479 @@
+"""Plain tables of numbers as people write them: any separator, decimal commas, with a header or none."""
+
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics.frames import Array
+from stitch.plugins.intake.clock_times import is_time_of_day
+from stitch.session.reading.text_files import read_any_text, shortened
+
+# Cells of a table as people write them, and the numbers in them.
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+# A pose as Universal Robots writes it: p[0.1, 0.2, …].
+_POSE_OF_UR = re.compile(r"(?<!\w)p\s*\[(?=\s*[+-]?\.?\d)")
+# What programs write where they have no number.
+_MARKED_NUMBER = re.compile(r"^#\d+\b(?=\s*[(\[])")
+_GROUPS = re.compile(r"[)\]]\s*[(\[]")
+_NO_NUMBER = re.compile(r"[+-]?(nan|inf(inity)?)|null|none|#?n/?a|-?1\.#(qnan|ind|inf)", re.IGNORECASE)
+# A number behind a name, "pose 0: 0.83" or "P0 0.83", and before a name or a unit, "0.83 a.ply" or "0.83 mm".
+_DECIMAL = r"[+-]?\d*[.,]\d+(?:[eE][+-]?\d+)?"
+_NUMBER_BEHIND = re.compile(rf"(.*\S\s*[:=])\s+([+-]?\d[\d.,]*(?:[eE][+-]?\d+)?)|(.*[A-Za-z_].*?[:=\s])\s*({_DECIMAL})")
+_NUMBER_BEFORE = re.compile(rf"({_DECIMAL})\s*([A-Za-z°].*)")
+_BRACKETS = str.maketrans("[](){}", " " * 6)
+# Rows of a matrix as MATLAB has them: "T1 = [0.36, 0.93, 0.1; 0.2, …];".
+_ROWS = re.compile(r"\[[^\[\]]*\d\.\d[^\[\]]*;[^\[\]]*\]")
+
+
+def split_cells(line: str, separator: str) -> list[str]:
+    """Cells of a line, trimmed."""
+    if ";" in line and _ROWS.search(line):
+        line = _ROWS.sub(lambda rows: re.sub("[,;] *", separator, rows[0]), line.rstrip("; "))
+    # "#1 (x, y, z) (q…)": a row's number, and groups of numbers.
+    line = _GROUPS.sub(separator, _MARKED_NUMBER.sub(lambda mark: mark[0] + separator, line))
+    line = _POSE_OF_UR.sub("[", line).translate(_BRACKETS).strip()
+    if separator == " ":
+        return line.split()
+    row = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return [cell.strip().strip('"') for cell in row]
+
+
+@lru_cache(maxsize=1 << 17)
+def parse_number(cell: str) -> float | None:
+    """Return the number in a cell, with a point or a comma, NaN for what programs write for none; None of words."""
+    cell = cell.rstrip("°").strip()
+    if _NO_NUMBER.fullmatch(cell):
+        return float("nan")
+    if _NUMBER.fullmatch(cell):
+        return float(cell)
+    if DECIMAL_COMMA.fullmatch(cell):
+        return float(cell.replace(",", "."))
+    return None
+
+
+def without_trailing_blanks(cells: list[str]) -> list[str]:
+    """Cells without the empty ones at the end."""
+    last = max((i for i, cell in enumerate(cells) if cell), default=-1)
+    return cells[: last + 1]
+
+
+# Rows of a spreadsheet brought to one length: empty cells at the end, titles above, units below the names.
+
+# Line of the file, and its cells.
+NumberedRows = list[tuple[int, list[str]]]
+_SEVERAL = 3
+
+
+def trimmed_rows(rows: NumberedRows) -> NumberedRows:
+    """Without empty cells at the end, but for those below a name that only some rows have a remark under."""
+    numbered = [cells for _, cells in rows if _number_count(cells) >= _SEVERAL]
+    if not numbered:
+        return [(line, short) for line, cells in rows if (short := without_trailing_blanks(cells))]
+    written = Counter(len(cells) for cells in numbered).most_common(1)[0][0]
+    width = max(len(without_trailing_blanks(cells)) for cells in numbered)
+    first, *_, last = [line for line, cells in rows if _number_count(cells) >= _SEVERAL] * 2
+    out = []
+    for line, cells in rows:
+        some = sum(bool(cell) for cell in cells)
+        # Between rows of numbers, a name alone is a view without a pose; elsewhere it is a title or a remark.
+        named = _number_count(cells) >= _SEVERAL or 2 * some > width or first < line < last
+        of_table = len(cells) == written and named
+        short = cells[:width] if of_table else without_trailing_blanks(cells)
+        out += [(line, short)] if some else []
+    return out
+
+
+def rows_below_titles(rows: NumberedRows) -> NumberedRows:
+    """Without what people write above a table: rows of another length with hardly a number among their words."""
+    width = Counter(len(row) for _, row in rows).most_common(1)[0][0] if rows else 0
+    first = 0
+    while first < len(rows) - 1 and len(rows[first][1]) != width:
+        known = [parse_number(cell) is not None for cell in rows[first][1]]
+        if all(known) or sum(known) > 1:
+            break
+        first += 1
+    return rows[first:]
+
+
+def names_with_units(names: list[str], cells: list[str]) -> list[str] | None:
+    """Names with the units that stand in a row of their own below them; None where that row is none of units."""
+    if len(cells) > len(names) or _number_count(cells):
+        return None
+    below = [*cells, *[""] * (len(names) - len(cells))]
+    return [f"{name} [{cell.strip('[]() ')}]" if cell else name for name, cell in zip(names, below, strict=True)]
+
+
+def _number_count(cells: list[str]) -> int:
+    return sum(parse_number(cell) is not None for cell in cells)
+
+
+# What the names of columns say: position, rotation, joint angles, units.
+
+# Words that say nothing about which number a column holds.
+_FILLERS = {"pose", "tcp", "robot", "flange", "tool", "tool0", "actual", "target", "base", "in", "of", "the", "coord"}
+_FILLERS |= {"lage", "koordinate", "verschiebung", "roboter", "flansch", "achse", "um", "ist", "soll", "wert"}
+_FILLERS |= {"position", "pos", "translation", "trans", "t", "p", "transform", "vector", "point", "cartesian", "end"}
+_ROTATION = {"rotation", "orientation", "quaternion", "quat", "rot", "euler", "angles", "angle", "rpy", "rotvec", "o"}
+_ROTATION |= {"drehung", "winkel", "orientierung"}
+_LENGTHS = {"mm": "mm", "millimeter": "mm", "millimetre": "mm", "m": "m", "meter": "m", "metre": "m", "cm": "cm"}
+_LENGTHS |= {"inch": "inch", "in": "inch", "inches": "inch"}
+_ANGLES = {"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radian": "rad", "radians": "rad"}
+# In German degrees, elsewhere a four-hundredth of a turn: the unit of an angle, whichever.
+_ANGULAR = {*_ANGLES, "grad"}
+_UNIT = re.compile(r"[\[(]\s*([^\])]*)\s*[\])]|[_\s](mm|cm|deg|rad|inch|°|grad|(?<=\s)m)$")
+_COUNTED = re.compile(r".*tcp_?pose[_\[. ]*([0-6])\]?")
+_JOINT = re.compile(r"(?:j|joint|axis|theta|jt)_?([1-9])")
+
+# Triples of angles and quadruples of quaternions by name; a rotation stated by its names alone, or None.
+_NAMED = {
+    ("qx", "qy", "qz", "qw"): "quaternion-xyzw",
+    ("q0", "q1", "q2", "q3"): "quaternion-wxyz",
+    ("q1", "q2", "q3", "q4"): "quaternion-wxyz",
+    ("rotx", "roty", "rotz", "rotw"): "quaternion-xyzw",
+    ("rvx", "rvy", "rvz"): "rotation-vector",
+    ("azyx", "bzyx", "czyx"): "zyx-intrinsic",
+    ("ozyz", "azyz", "tzyz"): "zyz-intrinsic",
+    ("w", "p", "r"): "xyz-extrinsic",
+    ("roll", "pitch", "yaw"): "xyz-extrinsic",
+    ("yaw", "pitch", "roll"): "zyx-intrinsic",
+    ("rx", "ry", "rz"): None,
+    ("rz", "ry", "rx"): None,
+    ("a", "b", "c"): None,
+    ("u", "v", "w"): None,
+    ("alpha", "beta", "gamma"): None,
+    ("rotx", "roty", "rotz"): None,
+    ("rotz", "roty", "rotx"): None,
+    ("rot0", "rot1", "rot2"): None,
+    ("rot0", "rot1", "rot2", "rot3"): None,
+}
+# Names under which nobody writes anything else; q0 … q3 have been x, y, z, w, and roll, pitch, yaw KUKA's A, B, C.
+_SURE = [{"qx", "qy", "qz", "qw"}, {"rvx", "rvy", "rvz"}, {"azyx", "bzyx", "czyx"}, {"ozyz", "azyz", "tzyz"}]
+
+
+@dataclass(frozen=True)
+class NamedColumns:
+    """Columns whose meaning their names tell; indices into the columns."""
+
+    position: tuple[int, ...] = ()
+    rotation: tuple[int, ...] = ()
+    joints: tuple[int, ...] = ()
+    convention: str | None = None  # of the rotation, where the names alone tell it
+    sure: bool = True  # nobody writes another convention under these names
+    length_unit: str | None = None  # of the position
+    angle_unit: str | None = None  # of rotation or joints
+    rest: dict[str, int] = field(default_factory=dict)  # other named columns: times, temperatures
+
+
+def read_names(header: Sequence[str]) -> NamedColumns:
+    """What a header says."""
+    plain, units = zip(*(bare_name(name) for name in header), strict=True)
+    where: dict[str, int] = {}
+    for i, name in enumerate(plain):
+        where.setdefault(name, i)
+    joints = _joint_columns(header)
+    counted = _counted_pose(header)
+    if counted:
+        called = dict(zip(counted, ("x", "y", "z", "rvx", "rvy", "rvz"), strict=True))
+        plain = tuple(called.get(i, name) for i, name in enumerate(plain))
+        units = tuple("m" if i in counted[:3] else unit for i, unit in enumerate(units))
+        where = {name: plain.index(name) for name in plain}
+    position = tuple(where[a] for a in "xyz") if all(a in where for a in "xyz") else ()
+    rotation, convention = _rotation_columns(where, set(position) | set(joints))
+    matrix = _matrix_columns(header) if not rotation else ()
+    if matrix:
+        rotation, position, convention = matrix, (), None
+    used = {*position, *rotation, *joints}
+    return NamedColumns(
+        position=position,
+        rotation=rotation,
+        joints=joints,
+        convention=convention,
+        sure=convention is None or {plain[i] for i in rotation} in _SURE,
+        length_unit=next((_LENGTHS[units[i]] for i in position if units[i] in _LENGTHS), None),
+        angle_unit=next((_ANGLES[units[i]] for i in (*rotation, *joints) if units[i] in _ANGLES), None),
+        rest={header[i]: i for i in range(len(header)) if i not in used and header[i] not in ("", "-")},
+    )
+
+
+def bare_name(name: str) -> tuple[str, str]:
+    """A name without its unit and fillers, and its unit."""
+    found = _UNIT.search(name.strip())
+    unit = (found[1] or found[2] or "").strip().lower() if found else ""
+    if found:
+        name = name.strip()[: found.start()]
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)  # camelCase
+    words = [w for w in re.split(r"[._\s/\-]+", name.lower()) if w]
+    unit = unit or next((w for w in words if w in ("mm", "deg", "rad", "cm", "inch")), "")
+    if not unit and "m" in words and len(words) > 1:
+        unit = "m"
+    turned = any(w in _ROTATION for w in words)
+    words = [w for w in words if w != unit]
+    kept = [w for w in words if w not in _FILLERS and w not in _ROTATION and w not in ("xyzw", "wxyz", "xyz")]
+    if not kept:
+        return (words[-1] if len(words) == 1 else ""), unit
+    last = re.sub(r"^(?:[pt]|pos)_?([xyz])$", r"\1", kept[-1])
+    order = next((w for w in words if w in ("xyzw", "wxyz")), None)
+    if order and last in ("0", "1", "2", "3"):
+        return f"q{order[int(last)]}", unit
+    if last in ("0", "1", "2") and not turned and any(w in words for w in ("position", "pos", "translation", "t")):
+        return "xyz"[int(last)], unit
+    # An axis with the unit of an angle is a turn, in whatever language it is named: "Drehung um Z [°]".
+    turned = turned if last in ("w", "0", "1", "2", "3") else last in ("x", "y", "z") and (turned or unit in _ANGULAR)
+    return (f"rot{last}" if turned else last), unit
+
+
+def _counted_pose(header: Sequence[str]) -> tuple[int, ...]:
+    """Return the columns actual_TCP_pose_0 … 5 in their order, as RTDE of Universal Robots records them; else none."""
+    for kind in ("actual", "target", ""):
+        found = [
+            (int(m[1]), i) for i, n in enumerate(header) if (m := _COUNTED.fullmatch(n.lower())) and kind in n.lower()
+        ]
+        if len(found) == 6 and len({number for number, _ in found}) == 6:
+            return tuple(i for _, i in sorted(found))
+    return ()
+
+
+def _rotation_columns(where: dict[str, int], taken: set[int]) -> tuple[tuple[int, ...], str | None]:
+    for names, convention in sorted(_NAMED.items(), key=lambda item: -len(item[0])):
+        index = [where.get(name, -1) for name in names]
+        # Angles by place: the triple counts in the order in which its columns stand.
+        ordered = len(names) == 4 or index == sorted(index)
+        if min(index) >= 0 and not taken & {*index} and ordered:
+            return tuple(index), convention
+    return (), None
+
+
+def _joint_columns(header: Sequence[str]) -> tuple[int, ...]:
+    alike: dict[str, dict[int, int]] = {}
+    for i, name in enumerate(header):
+        lower = name.strip().lower()
+        match = _JOINT.match(lower) or re.match(r"(?:.*joints?|.*_q|q|a)[._\s\[]*(\d)\b", lower)
+        if match:
+            alike.setdefault(lower[: match.start(1)], {}).setdefault(int(match[1]), i)
+    for found in alike.values():
+        first, count = min(found), len(found)
+        complete = count >= 4 and sorted(found) == list(range(first, first + count))
+        if complete and (count >= 5 or "j" in header[found[first]].lower()):
+            return tuple(found[k] for k in sorted(found))
+    return ()
+
+
+def _matrix_columns(header: Sequence[str]) -> tuple[int, ...]:
+    """Columns m00 … m33, r11 … t3 or 0 … 15 in the order of the file, if they are 12 or 16."""
+    named = [
+        i for i, name in enumerate(header) if re.search(r"(?:^|[._])(?:[mtr]?_?\d{1,2}|t[xyz1-3])\]?$", name.lower())
+    ]
+    return tuple(named) if len(named) in (12, 16) else ()
+
+
+_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas", " ": "spaces"}
+# Lines that are drawn, as below the header of a table in Markdown.
+_RULE = re.compile(r"[-|:+=\s]*(?:-{3}|={3})[-|:+=\s]*")
+_COMMENTS = ("#", "%", "//")
+_MAX_TABLE_MB = 50
+
+
+@dataclass(frozen=True)
+class NumberTable:
+    """Numbers in rows, as one file has them."""
+
+    file: Path
+    header: tuple[str, ...] | None  # names of the columns of numbers
+    numbers: Array  # (n, C); NaN where a program wrote that it had none
+    labels: tuple[tuple[str, ...], ...]  # texts of every row, from columns that hold no numbers
+    lines: tuple[int, ...]  # line number of every row
+    words: str  # how it was read
+
+
+def read_number_table(file: Path) -> NumberTable:
+    """Read a table of numbers.
+
+    Raises:
+        InputError: no numbers in rows, rows of different length, or a cell without a number; names the line.
+    """
+    return parse_number_table(file, read_any_text(file, "name a table of poses", _MAX_TABLE_MB))
+
+
+def parse_number_table(file: Path, content: str) -> NumberTable:
+    """The same of a text that was read from a file."""
+    lines = [(i, line.strip()) for i, line in enumerate(content.splitlines(), 1)]
+    kept = [(i, line) for i, line in lines if line and not _RULE.fullmatch(line)]
+    body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
+    # Where every line is marked, #1 is a row's number.
+    body = body or [(i, line) for i, line in kept if _MARKED_NUMBER.match(line)]
+    if not body:
+        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+    separator = _separator_of([line for _, line in body])
+    read = trimmed_rows([(i, split_cells(line, separator)) for i, line in body])
+    rows = rows_below_titles(read)
+    above = len(read) - len(rows)
+    comments = [(i, line) for i, line in kept if line.startswith(_COMMENTS) and i < body[0][0]]
+    header, rows = _split_header(file, rows, comments[-1][1] if comments else "", separator)
+    header, rows = _split_labels(header, rows)
+    text, numeric = _text_and_number_columns(rows)
+    if len(numeric) < (1 if header else _SEVERAL):
+        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+    numbers = np.array(
+        [[_cell_number(file, i, row[c] if any(row[k] for k in numeric) else "nan") for c in numeric] for i, row in rows]
+    )
+    _require_one_decimal_mark(file, rows, numeric)
+    decimal = any(DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
+    words = f"separated by {_SEPARATORS[separator]}{', decimal commas' * decimal}"
+    words += ", with a header" if header else ", without a header"
+    if above:
+        words += f", {above} line{'s' * (above > 1)} of words above it passed over"
+    return NumberTable(
+        file=file,
+        header=tuple(header[c] for c in numeric) if header else None,
+        numbers=numbers,
+        labels=tuple(tuple(row[c] for c in text) for _, row in rows),
+        lines=tuple(i for i, _ in rows),
+        words=words,
+    )
+
+
+def _cell_number(file: Path, line: int, cell: str) -> float:
+    found = parse_number(cell)
+    if found is None or abs(found) >= 1e30:
+        raise InputError(f"{file} line {line}: {shortened(cell)} is no number; to fix: write one there")
+    return found
+
+
+def _require_one_decimal_mark(file: Path, rows: Sequence[tuple[int, list[str]]], numeric: Sequence[int]) -> None:
+    """Refuse a column with commas before the decimals in which a point stands too: 1.269 may mean a thousand."""
+    for c in numeric:
+        pointed = [(i, row[c]) for i, row in rows if "." in row[c]]
+        if pointed and any("," in row[c] for _, row in rows):
+            line, cell = pointed[0]
+            raise InputError(
+                f"{file} line {line}: {shortened(cell)} has a point, other numbers of its column have a comma before "
+                "their decimals; to fix: write all alike, without marks for thousands"
+            )
+
+
+def _split_header(
+    file: Path, rows: list[tuple[int, list[str]]], comment: str, separator: str
+) -> tuple[list[str] | None, list[tuple[int, list[str]]]]:
+    """The header's names, from the first row or the comment above it, and the rows of numbers, all of one length."""
+    header: list[str] | None = None
+    if not rows:
+        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+    top, first = rows[0]
+    below = rows[1:] or rows
+    width = Counter(len(row) for _, row in [*below, rows[0]]).most_common(1)[0][0]
+    typical = next(
+        (row for _, row in below if len(row) == width and any(parse_number(c) is not None for c in row)), first
+    )
+    texts = [parse_number(cell) is None for cell in first]
+    if len(rows) > 1 and any(t and parse_number(c) is not None for t, c in zip(texts, typical, strict=False)):
+        header, rows = first, rows[1:]
+        units = names_with_units(header, rows[0][1]) if len(rows) > 1 else None
+        if units is not None:
+            header, rows = units, rows[1:]
+    elif comment:
+        names = split_cells(comment.lstrip("#%/ "), separator)
+        header = names if len(names) == width and all(parse_number(name) is None for name in names) else None
+    odd = next(((i, row) for i, row in rows if len(row) != width), None)
+    if odd is not None:
+        raise InputError(
+            f"{file} line {odd[0]}: {len(odd[1])} cells, other rows have {width}; to fix: write one number a column"
+        )
+    if header is not None and len(header) != width:
+        raise InputError(f"{file} line {top}: {len(header)} names for {width} columns; to fix: name every column once")
+    return header, rows
+
+
+def _split_labels(header: list[str] | None, rows: NumberedRows) -> tuple[list[str] | None, NumberedRows]:
+    """Part numbers from the words in their cells, so that none is lost; a unit behind them goes into the name."""
+    for c in range(len(rows[0][1]) - 1, -1, -1):
+        parts = [_label_and_number(row[c]) for _, row in rows]
+        known = [part for part in parts if part is not None]
+        if 2 * len(known) <= len(rows):
+            continue
+        behind = {words for words, _ in known}
+        rows = [
+            (i, [*row[:c], *(part or (row[c], "nan")), *row[c + 1 :]])
+            for (i, row), part in zip(rows, parts, strict=True)
+        ]
+        if header is not None:
+            unit = f"{header[c]} [{behind.pop()}]" if len(behind) == 1 else header[c]
+            header = [*header[:c], "", unit, *header[c + 1 :]]
+    return header, rows
+
+
+def _label_and_number(cell: str) -> tuple[str, str] | None:
+    if parse_number(cell) is not None or is_time_of_day(cell):
+        return None
+    if found := _NUMBER_BEHIND.fullmatch(cell):
+        return (found[1] or found[3]).rstrip(" :="), found[2] or found[4]
+    found = _NUMBER_BEFORE.fullmatch(cell)
+    return None if found is None else (found[2], found[1])
+
+
+def _text_and_number_columns(rows: Sequence[tuple[int, list[str]]]) -> tuple[list[int], list[int]]:
+    """Columns of text, and of numbers: a column with numbers in more than half of its cells is one of numbers."""
+    width = len(rows[0][1])
+    share = [sum(parse_number(row[c]) is not None for _, row in rows) / len(rows) for c in range(width)]
+    return [c for c in range(width) if share[c] <= 0.5], [c for c in range(width) if share[c] > 0.5]
+
+
+# Tables of motion capture: rows of names above each other, and empty cells where nothing was seen.
+
+_HEAD_ROWS, _SPARSE = 30, 0.6
+
+
+def with_one_header(text: str) -> str:
+    """Return a table whose rows of names stand in one row, and whose empty cells of numbers are nan."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
+    body = [line for line in lines if not line.lstrip().startswith(_COMMENTS)]
+    separator = _separator_of(body[: 10 * _HEAD_ROWS])
+    if separator == " ":
+        return text
+    rows = [split_cells(line, separator) for line in body]
+    above = [i for i, row in enumerate(rows[:_HEAD_ROWS]) if 2 * _number_count(row) <= sum(map(bool, row))]
+    first = above[-1] + 1 if above else 0
+    if first >= len(rows):
+        return text
+    width = len(rows[first])
+    heads = [
+        row for row in rows[:first] if abs(len(row) - width) <= 1 and not _number_count(row) and sum(map(bool, row)) > 1
+    ]
+    heads = [[*row, ""][:width] for row in heads]
+    counted = [sum(parse_number(row[c]) is not None for row in rows[first:] if c < len(row)) for c in range(width)]
+    out = [[cell or "nan" * bool(n) for cell, n in zip(row, counted, strict=False)] for row in rows[first:]]
+    names = [[_merged_name(heads, c) for c in range(width)]] if heads else []
+    told = io.StringIO()
+    csv.writer(told, delimiter=separator, lineterminator="\n").writerows([*names, *out])
+    return "\n".join([*([] if heads else comments), told.getvalue()])
+
+
+def _merged_name(heads: list[list[str]], column: int) -> str:
+    """What stands above a column, one below the other; a name that stands over several columns counts for each."""
+    words = []
+    for k, row in enumerate(heads):
+        own = row[column]
+        spread = sum(map(bool, row)) < _SPARSE * len(row) and column > 1
+        last = k == len(heads) - 1
+        if not own and spread and not last:
+            own = next((cell for cell in row[column:1:-1] if cell), "")
+        if own and (column > 1 or last or not any(other[column] for other in heads[k + 1 :])):
+            words.append(own)
+    return " ".join(dict.fromkeys(words))
+
+
+def _separator_of(lines: Sequence[str]) -> str:
+    counts = {s: [_number_count(split_cells(line, s)) for line in lines] for s in _SEPARATORS}
+    # A number in the words above a table is none of its cells.
+    least = _SEVERAL if max(map(max, counts.values())) >= _SEVERAL else 1
+    return max(counts, key=lambda s: sum(n for n in counts[s] if n >= least))

@@ -1,0 +1,429 @@
+"""Poses as files have them: rows of numbers with what names them, before anybody says what the numbers mean."""
+
+import csv
+import json
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics.frames import Array
+from stitch.plugins.intake.clock_times import ClockTimes, find_clock_column
+from stitch.plugins.intake.controllers.program import POSE_COLUMNS, csv_text, import_file
+from stitch.plugins.intake.pose_formats import PoseRow, joint_state_rows, open3d_rows, read_pose_text
+from stitch.plugins.intake.pose_tables import NumberTable, parse_number_table, with_one_header
+from stitch.session.reading.range_image import poses_in_scans, times_in_scans
+from stitch.session.reading.text_files import (
+    WORKBOOKS,
+    read_any_text,
+    read_text,
+    reason_of,
+    require_file,
+    workbook_sheets,
+)
+from stitch.session.reading.yaml_file import parse_yaml
+
+# Poses in JSON and YAML: lists, matrices and mappings, however deep, as rows of named numbers.
+
+# Sizes of a bare list of numbers that can be a pose or joint angles.
+_SIZES = (5, 6, 7, 8, 9, 12, 16)
+_MATRICES = ((3, 3), (3, 4), (4, 4), (1, 3), (3, 1), (1, 4), (4, 1))
+
+
+def nested_rows(document: Any) -> list[PoseRow]:
+    """Rows of a document; numbers without names are called 0, 1, 2 … Empty if it holds no poses.
+
+    A pose may be a list of numbers, a matrix, or a mapping; poses may stand in a list, or in a mapping by name.
+    """
+    if isinstance(document, dict):
+        named = [((str(key), *_texts(value)), _pose_numbers(value)) for key, value in document.items()]
+        direct = [(texts, row) for texts, row in named if row is not None]
+        if len(direct) > 1 and len({tuple(row) for _, row in direct}) == 1:
+            return direct
+    own = _pose_numbers(document)
+    if own is not None:
+        return [(_texts(document), own)]
+    if isinstance(document, list):
+        rows: list[PoseRow] = []
+        for item in document:
+            row = _pose_numbers(item)
+            rows += [(_texts(item), row)] if row is not None else nested_rows(item)
+        return rows
+    deeper = [nested_rows(value) for value in document.values()] if isinstance(document, dict) else []
+    return max(deeper, key=len, default=[])
+
+
+def _pose_numbers(value: Any) -> dict[str, float] | None:
+    """The numbers of one pose by name, or None if a value is none."""
+    flat = _flat_numbers(value)
+    if flat is not None:
+        return {str(i): x for i, x in enumerate(flat)} if len(flat) in _SIZES else None
+    if not isinstance(value, dict):
+        return None
+    data = _matrix_numbers(value)
+    if data is not None:
+        return {str(i): x for i, x in enumerate(data)}
+    inner = next((row for v in value.values() if isinstance(v, dict) and (row := _pose_numbers(v)) is not None), None)
+    if inner is not None:
+        # The pose stands one level deeper, beside a time, a temperature or a name.
+        unnamed = all(name.isdigit() for name in inner)
+        beside = _ros_stamp(value) | {k: float(x) for k, x in value.items() if _is_number(x)}
+        return inner if unnamed else beside | inner
+    out = _named_numbers(value)
+    return out if len(out) >= _SIZES[0] else None
+
+
+def _ros_stamp(value: dict[str, Any]) -> dict[str, float]:
+    """The time of a message of ROS, 1 or 2, from its header; nothing where none is written."""
+    header = value.get("header")
+    stamp = header.get("stamp") if isinstance(header, dict) else None
+    if not isinstance(stamp, dict):
+        return {}
+    whole, part = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs", 0))
+    if not (isinstance(whole, (int, float)) and isinstance(part, (int, float)) and whole > 0):
+        return {}
+    return {"time_s": whole + 1e-9 * part}
+
+
+def _matrix_numbers(value: dict[str, Any]) -> list[float] | None:
+    """16 numbers that stand alone in a mapping: OpenCV's and Zivid's layouts."""
+    inner = [v for v in value.values() if isinstance(v, (list, dict))]
+    if len(inner) != 1 and not {"rows", "cols", "data"} <= {*value}:
+        lists = [flat for v in inner if (flat := _flat_numbers(v)) is not None and len(flat) == 16]
+        return lists[0] if len(lists) == 1 else None
+    if len(inner) != 1:
+        return None
+    flat = _flat_numbers(inner[0])
+    if flat is not None:
+        return flat if len(flat) in (12, 16) else None
+    return _matrix_numbers(inner[0]) if isinstance(inner[0], dict) else None
+
+
+def _flat_numbers(value: Any) -> list[float] | None:
+    """The numbers of a list, or of a matrix row by row; None if it is neither."""
+    if not isinstance(value, list) or not value:
+        return None
+    if all(_is_number(item) for item in value):
+        return [float(item) for item in value]
+    rows = [_flat_numbers(item) for item in value if isinstance(item, list) and all(_is_number(x) for x in item)]
+    shape = (len(value), *{len(row) for row in rows if row is not None})
+    if len(rows) < len(value) or shape not in _MATRICES:
+        return None
+    return [x for row in rows if row is not None for x in row]
+
+
+def _named_numbers(value: dict[str, Any], prefix: str = "") -> dict[str, float]:
+    """Numbers of a mapping by their path: position.x, rotation.0 …"""
+    out: dict[str, float] = {}
+    for key, item in value.items():
+        name = f"{prefix}{key}"
+        flat = _flat_numbers(item)
+        if _is_number(item):
+            out[name] = float(item)
+        elif flat is not None:
+            out |= {f"{name}.{i}": x for i, x in enumerate(flat)}
+        elif isinstance(item, dict) and name.count(".") < 5:
+            out |= _named_numbers(item, f"{name}.")
+    return out
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    """Texts that stand beside the numbers of a pose."""
+    return tuple(item for item in value.values() if isinstance(item, str)) if isinstance(value, dict) else ()
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+STRUCTURED = (".json", ".yaml", ".yml", ".npy", ".npz")
+TABLES = (".txt", ".csv", ".dat", ".tsv", ".tab", ".asc", ".pose", ".poses", ".log", ".va", ".pos")
+_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
+_MAX_POSES_MB = 50
+# Of files, or of rows, that have to hold a pose: where fewer do, the export is at fault and not a view.
+_FEWEST_WHOLE = 0.6
+
+
+@dataclass(frozen=True)
+class RawPoses:
+    """V rows of C numbers; each row holds one pose, or the joint angles of one."""
+
+    source: str  # file or files, for messages
+    header: tuple[str, ...] | None  # names of the columns
+    numbers: Array  # (V, C)
+    labels: tuple[tuple[str, ...], ...]  # per row the texts beside it, such as a view's name or its cloud's
+    words: str  # how it was read
+    without_pose: frozenset[int] = frozenset()  # rows without a number where one belongs; they repeat another row
+
+    @property
+    def clock(self) -> ClockTimes | None:
+        """Times of day, where one of the texts beside the poses is one."""
+        return find_clock_column(self.labels)
+
+    @property
+    def time_s(self) -> Array | None:
+        """Seconds (V,) since the first pose, where one of the texts beside the poses is a time of day."""
+        return None if self.clock is None else self.clock.seconds
+
+    def renamed(self, names: Sequence[str]) -> "RawPoses":
+        """The same with columns named by a person.
+
+        Raises:
+            InputError: more or fewer names than columns, or a name twice.
+        """
+        if twice := {name for name in names if name != "-" and names.count(name) > 1}:
+            raise InputError(f"--columns {','.join(names)}: {twice.pop()} stands twice; to fix: name each column once")
+        if len(names) != self.numbers.shape[1]:
+            raise InputError(
+                f"--columns {','.join(names)}: {len(names)} names, {self.source} has {self.numbers.shape[1]} columns "
+                "of numbers; to fix: name each, and - for one to leave out"
+            )
+        return replace(self, header=tuple(names), words=f"{self.words}; columns as named")
+
+    def oriented(self, orientation: Sequence[float]) -> "RawPoses":
+        """Return the same with the one rotation that all poses have behind x, y and z.
+
+        Raises:
+            InputError: other than three or four numbers, or a table that has more than x, y, z.
+        """
+        where = [i for i, name in enumerate(self.header or "xyz") if name.lower().split(" ")[0].rstrip("_m[(") in "xyz"]
+        if len(orientation) not in (3, 4) or len(where) != 3:
+            raise InputError(
+                f"--orientation: {len(orientation)} numbers for {self.source}; to fix: state three angles, or a "
+                "quaternion x,y,z,w, for a table of x, y, z alone"
+            )
+        names = ("rot0", "rot1", "rot2") if len(orientation) == 3 else ("qx", "qy", "qz", "qw")
+        header = (*(self.header or "xyz"), *names)
+        constant = np.tile(np.array(orientation, float), (len(self.numbers), 1))
+        return replace(self, header=header, numbers=np.hstack([self.numbers, constant]))
+
+
+def read_raw_poses(files: Sequence[Path]) -> RawPoses:
+    """Read the rows of one file, or of several that hold one pose each.
+
+    Raises:
+        InputError: no poses in a file, or files of different kinds; names file and line.
+    """
+    if len(files) == 1:
+        return _read_file(files[0])
+    rows, broken = _read_each(files)
+    width = rows[0].numbers.shape[1]
+    other = next((r for r in rows if r.numbers.shape[1] != width or r.header != rows[0].header), None)
+    if other is not None:
+        raise InputError(f"{other.source}: is written otherwise than {rows[0].source}; to fix: export all alike")
+    return RawPoses(
+        source=f"{files[0].name} … {files[-1].name}",
+        header=rows[0].header,
+        numbers=np.vstack([r.numbers for r in rows]),
+        labels=tuple((file.stem, *row.labels[0]) for file, row in zip(files, rows, strict=True)),
+        words=f"{len(files)} files, a pose each",
+        without_pose=broken,
+    )
+
+
+def _read_each(files: Sequence[Path]) -> tuple[list[RawPoses], frozenset[int]]:
+    """Return the pose of each file, and the numbers of files that hold none: a few of many, which repeat another."""
+    rows: dict[int, RawPoses] = {}
+    refused: InputError | None = None
+    for i, file in enumerate(files):
+        try:
+            rows[i] = _read_file(file)
+        except InputError as error:
+            refused = refused or error
+            continue
+        if len(rows[i].numbers) != 1:
+            raise InputError(
+                f"{file}: holds {len(rows[i].numbers)} poses, one a file is expected; to fix: name the one file of "
+                "all poses with --poses FILE"
+            )
+    if refused is not None and len(rows) < _FEWEST_WHOLE * len(files):
+        raise refused
+    broken = {i for i in range(len(files)) if i not in rows or rows[i].without_pose}
+    first = next(row for i, row in rows.items() if i not in broken) if len(broken) < len(files) else rows[0]
+    return [first if i in broken else rows[i] for i in range(len(files))], frozenset(broken)
+
+
+def _read_file(file: Path) -> RawPoses:
+    require_file(file, "name a file of poses")
+    suffix = file.suffix.lower()
+    if suffix in (".npy", ".npz"):
+        return _from_numpy(file)
+    if suffix in (".json", ".yaml", ".yml"):
+        told = read_text(file, "name a file of poses", _MAX_POSES_MB)
+        documents = [_from_json(file, told)] if suffix == ".json" else parse_yaml(file, told)
+        document = documents[0] if len(documents) == 1 else documents
+        rows = open3d_rows(document) or joint_state_rows(document) or nested_rows(document)
+        return _from_rows(file, rows, suffix[1:].upper())
+    if suffix in WORKBOOKS:
+        return _from_workbook(file)
+    text = read_any_text(file, "name a table of poses", _MAX_POSES_MB)
+    found = read_pose_text(text)
+    if found is not None:
+        return _from_rows(file, *found)
+    table = parse_number_table(file, text)
+    return _matrix_blocks(table) or _raw_poses(str(file), table.header, table.numbers, table.labels, table.words)
+
+
+def _from_workbook(file: Path) -> RawPoses:
+    """Return the one sheet that holds rows of numbers."""
+    found = []
+    for name, text in workbook_sheets(file).items():
+        with suppress(InputError):
+            found.append((name, parse_number_table(file, with_one_header(text))))
+    if len(found) != 1:
+        raise InputError(
+            f"{file}: {len(found)} sheets hold rows of numbers; to fix: leave the sheet of the poses alone"
+        )
+    name, table = found[0]
+    return _raw_poses(f"{file}, sheet {name}", table.header, table.numbers, table.labels, f"sheet {name}")
+
+
+def _raw_poses(
+    source: str, header: tuple[str, ...] | None, numbers: Array, labels: Sequence[tuple[str, ...]], words: str
+) -> RawPoses:
+    """Return rows of numbers; those with one that is not finite repeat the first of the others.
+
+    Raises:
+        InputError: hardly a row is whole.
+    """
+    broken = np.asarray(~np.isfinite(numbers).all(axis=1), bool)
+    if len(numbers) > 1 and (~broken).sum() < _FEWEST_WHOLE * len(numbers):
+        raise InputError(
+            f"{source}: {broken.sum()} of {len(numbers)} rows hold a number that is not finite; to fix: export "
+            "the poses again"
+        )
+    whole = np.where(broken[:, None], numbers[np.argmin(broken)], numbers) if broken.any() else numbers
+    return RawPoses(source, header, whole, tuple(labels), words, frozenset(np.flatnonzero(broken).tolist()))
+
+
+def _matrix_blocks(table: NumberTable) -> RawPoses | None:
+    """4×4 matrices, or 3×4 ones, over several lines each; None if the table is none of that."""
+    x = table.numbers
+    if x.shape[1] != 4:
+        return None
+    for height in (4, 3):
+        if len(x) % height:
+            continue
+        blocks = x.reshape(-1, height, 4)
+        whole = blocks[np.isfinite(blocks).all(axis=(1, 2))]
+        if not len(whole):
+            continue
+        R = whole[:, :3, :3]
+        if height == 3 and np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-3):
+            words = "3×4 matrices"
+        elif height == 4 and np.allclose(whole[:, 3], _LAST_ROW):
+            words = "4×4 matrices"
+        elif height == 4 and np.allclose(whole[:, :3, 3], 0) and np.allclose(whole[:, 3, 3], 1):
+            words = "4×4 matrices by columns"
+        else:
+            continue
+        return _raw_poses(str(table.file), None, blocks.reshape(len(blocks), -1), ((),) * len(blocks), words)
+    return None
+
+
+def _from_json(file: Path, text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{file}: not valid JSON ({reason_of(error)}); to fix: correct it there") from None
+
+
+def _from_numpy(file: Path) -> RawPoses:
+    try:
+        loaded = np.load(file, allow_pickle=False)
+        arrays = {file.stem: loaded} if isinstance(loaded, np.ndarray) else {k: loaded[k] for k in loaded.files}
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"{file}: cannot be read ({reason_of(error)}); to fix: save plain numbers") from None
+    fitting = [a for a in arrays.values() if a.dtype.kind in "fiu" and a.ndim in (2, 3) and a.size]
+    if not fitting:
+        raise InputError(f"{file}: holds no array (V, C) or (V, 4, 4); to fix: save the poses as one of these")
+    x = np.asarray(max(fitting, key=lambda a: a.ndim), float)
+    flat = x.reshape(1, 16) if x.shape == (4, 4) else x.reshape(len(x), -1)
+    return _raw_poses(str(file), None, flat, ((),) * len(flat), f"an array {'×'.join(map(str, x.shape))}")
+
+
+def _from_rows(file: Path, rows: Sequence[PoseRow], kind: str) -> RawPoses:
+    if not rows:
+        raise InputError(f"{file}: holds no poses that are known; to fix: write a table or 4×4 matrices")
+    names = tuple(rows[0][1])
+    for i, (_, row) in enumerate(rows, 1):
+        if tuple(row) != names:
+            raise InputError(f"{file}: pose {i} is written otherwise than the first; to fix: write all alike")
+    numbers = np.array([list(row.values()) for _, row in rows], float)
+    header = None if all(re.fullmatch(r"\d+", name) for name in names) else names
+    return _raw_poses(str(file), header, numbers, [labels for labels, _ in rows], kind)
+
+
+# Poses of a folder without a table: those in the headers of its scans.
+
+
+def header_poses(clouds: Sequence[Path]) -> RawPoses:
+    """The pose in the header of each scan, named as its file is, with the time where the header has one.
+
+    Raises:
+        InputError: a header without a pose.
+    """
+    poses = poses_in_scans(list(clouds))
+    if poses is None:
+        raise InputError(
+            f"{clouds[0].parent}: no poses in the headers of the scans; to fix: name them with --poses FILE"
+        )
+    told = times_in_scans(list(clouds))
+    times: Sequence[tuple[str, ...]] = [()] * len(clouds) if told is None else [(time,) for time in told]
+    words = "they may be the scanner's own, of scans that were registered already: then the hand-eye is about unity"
+    return RawPoses(
+        source=f"{clouds[0].name} … {clouds[-1].name}",
+        header=None,
+        numbers=poses.reshape(-1, 16),
+        labels=tuple((cloud.name, *time) for cloud, time in zip(clouds, times, strict=True)),
+        words=words,
+    )
+
+
+# Poses of a robot program: its points that have one.
+
+PROGRAMS = (".ls", ".src", ".mod", ".script")
+_KUKA_DATA = ".dat"
+_LOOKED_AT = 65536
+
+
+def is_program(file: Path) -> bool:
+    """Whether a file is a program of a robot; .dat is the ending of a KUKA's points, and of many a table."""
+    kind = file.suffix.lower()
+    if kind != _KUKA_DATA:
+        return kind in PROGRAMS
+    with file.open("rb") as stream:
+        return b"DEFDAT" in stream.read(_LOOKED_AT).upper()
+
+
+def read_by_its_program(file: Path) -> bool:
+    """Whether a file holds the points of a KUKA's program that lies beside it, which is read instead."""
+    return file.suffix.lower() == _KUKA_DATA and any(file.with_suffix(s).exists() for s in (".src", ".SRC"))
+
+
+def program_poses(file: Path) -> RawPoses:
+    """Points with a pose, mm; of a program with joint targets alone, these.
+
+    Raises:
+        InputError, NoResultError: as the program's reader does.
+    """
+    told = import_file(file, "mm")
+    header, *body = list(csv.reader(told.text.splitlines()))
+    posed = POSE_COLUMNS[-1] in header
+    kept = [row for row in body if row[-1]] if posed else body
+    columns = [i for i in range(len(header)) if all(row[i] for row in kept)]
+    table = parse_number_table(file, csv_text([[row[i] for i in columns] for row in [header, *kept]]))
+    words = "the points of a robot program"
+    left = len(body) - len(kept)
+    words += f", {left} without a pose left out" if left else ""
+    if told.warnings:
+        words += (
+            "; where a tool or a base was in force, the hand-eye is that of the tool, unless `stitch import --frame … "
+            "--tool …` has made flange poses of them"
+        )
+    return RawPoses(str(file), table.header, table.numbers, table.labels, words)

@@ -1,0 +1,1 @@
+"""Numbers of a part with their uncertainty: features, budgets, calibration, and planning for them."""

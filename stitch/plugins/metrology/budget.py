@@ -1,0 +1,301 @@
+"""The numbers of features with U, their correlations, and which source brings how much of it (JCGM 100).
+
+All numbers of a run answer to the same sources, so their covariance is one matrix: a distance is better known than its
+ends where what moves both is the same.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.spatial import cKDTree
+
+from stitch.numerics.frames import Array
+from stitch.plugins.metrology.feature_file import Contribution, FeatureList
+from stitch.plugins.metrology.features import NUMBERS, Feature, FittedFeature, fit_feature, position_of, reach_of
+from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors, Responses, RunPoints
+
+# The variances are posterior means, which hold already that they are not well known: twice their root covers 95 %
+# whatever the degrees of freedom. These are told for who compares with a factor of Student's t.
+COVERAGE_FACTOR = 2.0
+OWN_NOISE = "noise of the feature's own points"
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number of a feature; lengths in length_unit, slopes in rad."""
+
+    feature: Feature
+    quantity: str
+    unit: str
+    value: float
+    nominal: float
+    u: float  # standard uncertainty
+    degrees: float  # effective degrees of freedom (Welch 1947; Satterthwaite 1946)
+    shares: dict[str, float]  # of every source in the variance; they add up to 1
+    points: int  # that count
+    form: float  # width of the band of 95 % of the residuals; NaN of a distance
+
+    @property
+    def name(self) -> str:
+        """Feature and quantity."""
+        return f"{self.feature.name}.{self.quantity}"
+
+    @property
+    def U(self) -> float:
+        """Expanded uncertainty, coverage about 95 %."""
+        return COVERAGE_FACTOR * self.u
+
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """Of the value, where its feature has a tolerance and this is the number that it is of."""
+        tolerance = self.feature.tolerance
+        if tolerance is None or self.quantity != NUMBERS[self.feature.kind][0]:
+            return None
+        return self.nominal + tolerance[0], self.nominal + tolerance[1]
+
+    @property
+    def conforms(self) -> bool | None:
+        """Whether it lies within its limits by more than U, beyond them by more than U (ISO 14253-1), or neither."""
+        if self.limits is None:
+            return None
+        low, high = self.limits
+        if low + self.U <= self.value <= high - self.U:
+            return True
+        return False if self.value < low - self.U or self.value > high + self.U else None
+
+
+@dataclass(frozen=True)
+class MeasuredFeatures:
+    """Q numbers of the features of one run, with what is known of all of them together."""
+
+    numbers: tuple[Number, ...]
+    covariance: Array  # (Q, Q)
+    fits: tuple[FittedFeature, ...]  # of all features but distances
+    length_unit: str
+
+    @property
+    def correlation(self) -> Array:
+        """(Q, Q)."""
+        sigma = np.maximum(np.sqrt(np.diag(self.covariance)), 1e-300)
+        return np.asarray(self.covariance / np.outer(sigma, sigma))
+
+
+def measure_features(places: PlaceErrors, wanted: FeatureList) -> MeasuredFeatures:
+    """Fit features to the points of a run.
+
+    Raises:
+        NoResultError: too few points lie on a feature.
+    """
+    return evaluate(places, wanted, fit_features(places.points, wanted.features))
+
+
+def fit_features(points: RunPoints, features: Sequence[Feature]) -> tuple[FittedFeature, ...]:
+    """Return the fits of all features but distances.
+
+    Raises:
+        NoResultError: too few points lie on one.
+    """
+    tree = cKDTree(points.points, balanced_tree=False, compact_nodes=False)
+    placed = [feature for feature in features if feature.kind != "distance"]
+    near = (np.sort(np.array(tree.query_ball_point(f.at, reach_of(f)), np.int64)) for f in placed)
+    return tuple(fit_feature(feature, points, index) for feature, index in zip(placed, near, strict=True))
+
+
+def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeature]) -> MeasuredFeatures:
+    """Return the numbers of fits and of distances between them, under all that may be wrong about the places."""
+    table = number_table(wanted.features, fits)
+    responses = stack_responses([places.responses(fit.at, fit.gradient) for fit in fits]).combined(table.slopes)
+    rows = [(s.name, responses.loadings(s), s.degrees) for s in places.sources]
+    rows.append((OWN_NOISE, _root_of(responses.noise), np.inf))
+    rows += [(c.source, _stated_loadings(c, table), c.degrees) for c in wanted.contributions]
+    covariance = np.sum([own @ own.T for _, own, _ in rows], axis=0)
+    by_fit = {fit.feature.name: fit for fit in fits}
+    numbers = []
+    for q, (feature, quantity) in enumerate(table.names):
+        squares = np.array([own[q] @ own[q] for _, own, _ in rows])
+        total = max(squares.sum(), 1e-300)
+        shares = dict.fromkeys((name for name, _, _ in rows), 0.0)
+        for (name, _, _), square in zip(rows, squares, strict=True):
+            shares[name] += float(square / total)
+        spread = np.sum(squares**2 / np.array([degrees for _, _, degrees in rows]))
+        fit = by_fit.get(feature.name)
+        numbers.append(
+            Number(
+                feature=feature,
+                quantity=quantity,
+                unit=_unit_of(quantity, places.measurement.length_unit),
+                value=float(table.values[q]),
+                nominal=float(table.nominal[q]),
+                u=float(np.sqrt(squares.sum())),
+                degrees=float(total**2 / spread) if spread > 0 else np.inf,
+                shares=dict(sorted(shares.items(), key=lambda item: -item[1])),
+                points=0 if fit is None else len(fit.residual),
+                form=float("nan") if fit is None else fit.form,
+            )
+        )
+    return MeasuredFeatures(tuple(numbers), covariance, tuple(fits), places.measurement.length_unit)
+
+
+def _unit_of(quantity: str, length_unit: str) -> str:
+    return "rad" if quantity.startswith("slope") else length_unit
+
+
+def _root_of(covariance: Array) -> Array:
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def stack_responses(parts: Sequence[Responses]) -> Responses:
+    """Return the responses of several fits as one; each has noise of its own."""
+    return Responses(
+        np.vstack([part.views for part in parts]),
+        np.vstack([part.parameters for part in parts]),
+        np.vstack([part.field for part in parts]),
+        block_diag(*(part.noise for part in parts)),
+    )
+
+
+@dataclass(frozen=True)
+class FeatureNumbers:
+    """Q numbers of features and distances, and how they follow from the numbers of the fits."""
+
+    names: tuple[tuple[Feature, str], ...]
+    values: Array  # (Q,)
+    nominal: Array  # (Q,)
+    slopes: Array  # (Q, B) in the B numbers of all fits
+
+
+def number_table(features: Sequence[Feature], fits: Sequence[FittedFeature]) -> FeatureNumbers:
+    """Return all numbers in the order of the features."""
+    start = dict(zip([f.feature.name for f in fits], np.cumsum([0, *(len(f.values) for f in fits)]), strict=False))
+    by_name, width = {fit.feature.name: fit for fit in fits}, sum(len(fit.values) for fit in fits)
+    names, values, nominal, slopes = list[tuple[Feature, str]](), list[float](), list[float](), list[Array]()
+    for feature in features:
+        row = np.zeros((len(NUMBERS[feature.kind]), width))
+        names += [(feature, quantity) for quantity in NUMBERS[feature.kind]]
+        if feature.kind == "distance":
+            a, b = (by_name[name] for name in feature.between)
+            distance, of_a, of_b = _distance_slopes(a, b)
+            row[0, start[a.feature.name] :][: len(of_a)] = of_a
+            row[0, start[b.feature.name] :][: len(of_b)] = of_b
+            as_placed = distance_between(a.feature, _nominal_values(a.feature), b.feature, _nominal_values(b.feature))
+            values.append(distance)
+            nominal.append(float(as_placed) if feature.nominal is None else feature.nominal)
+        else:
+            fit = by_name[feature.name]
+            row[:, start[feature.name] :][:, : len(fit.values)] = np.eye(len(fit.values))
+            values += fit.values.tolist()
+            nominal += _nominal_values(feature).tolist()
+        slopes.append(row)
+    return FeatureNumbers(tuple(names), np.array(values), np.array(nominal), np.vstack(slopes))
+
+
+def _nominal_values(feature: Feature) -> Array:
+    """(q,) of a feature as it should be."""
+    if "x" in NUMBERS[feature.kind]:
+        return np.append(feature.size, feature.at)
+    return np.zeros(len(NUMBERS[feature.kind]))
+
+
+def distance_between(a: Feature, of_a: Array, b: Feature, of_b: Array) -> Array:
+    """Return the distance (...,) of two features with numbers (..., q): of centres, or of a place from a plane."""
+    if a.kind == "plane" and b.kind != "plane":
+        return distance_between(b, of_b, a, of_a)
+    if b.kind != "plane":
+        return np.asarray(np.linalg.norm(position_of(a, of_a) - position_of(b, of_b), axis=-1))
+    x, y, z = np.moveaxis((position_of(a, of_a) - b.at) @ b.R, -1, 0)
+    h, su, sv = np.moveaxis(of_b, -1, 0)
+    return np.asarray(np.abs(z - h - su * x - sv * y) / np.sqrt(1 + su**2 + sv**2))
+
+
+def _distance_slopes(a: FittedFeature, b: FittedFeature) -> tuple[float, Array, Array]:
+    """The distance of two fits, and its slopes in the numbers of either."""
+    if a.feature.kind == "plane" and b.feature.kind != "plane":
+        distance, of_b, of_a = _distance_slopes(b, a)
+        return distance, of_a, of_b
+    distance = float(distance_between(a.feature, a.values, b.feature, b.values))
+    if b.feature.kind != "plane":
+        e = position_of(a.feature, a.values) - position_of(b.feature, b.values)
+        e /= max(distance, 1e-300)
+        return distance, e @ a.position_slopes, -e @ b.position_slopes
+    x, y, z = (position_of(a.feature, a.values) - b.feature.at) @ b.feature.R
+    h, su, sv = b.values
+    sign = np.sign(z - h - su * x - sv * y) / np.sqrt(1 + su**2 + sv**2)
+    return distance, sign * (b.feature.R @ [-su, -sv, 1.0]) @ a.position_slopes, -sign * np.array([1.0, x, y])
+
+
+def _stated_loadings(stated: Contribution, table: FeatureNumbers) -> Array:
+    """(Q, ·) what a stated contribution does to the numbers: a relative one to all lengths together."""
+    lengths = np.array([quantity in ("distance", "diameter") for _, quantity in table.names])
+    own = np.array([stated.length * (not quantity.startswith("slope")) for _, quantity in table.names])
+    return np.column_stack([stated.relative * table.values * lengths, np.diag(own)])
+
+
+# Monte Carlo (JCGM 101): every source drawn, the points moved by it, every feature fitted again.
+
+# Points of a feature that a trial fits; what views share does not average out among them.
+_TRIAL_POINTS = 300
+_TRIAL_BLOCK = 200
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """Trials beside the linear propagation of the same fits, to at most so many points of each feature."""
+
+    trials: int
+    u: Array  # (Q,) standard deviation of the trials
+    propagated: Array  # (Q,) standard uncertainty by the slopes
+    interval: Array  # (Q, 2) that holds 95 % of the trials, less the value
+
+    @property
+    def ratio(self) -> Array:
+        """(Q,) of the trials over the propagation; its own standard deviation is 1/√(2 · trials)."""
+        return np.asarray(self.u / np.maximum(self.propagated, 1e-300))
+
+
+def monte_carlo(
+    places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeature], trials: int, seed: int = 0
+) -> MonteCarlo:
+    """Return what trials say of the numbers of some fits; nothing of the slopes of the fits is used."""
+    rng = np.random.default_rng(seed)
+    thin = [fit.thinned(_TRIAL_POINTS) for fit in fits]
+    linear = evaluate(places, wanted, thin)
+    modes = [(s, rng.standard_normal((s.views.shape[1], trials))) for s in places.sources]
+    by_feature = {fit.feature.name: (fit.feature, _refits(places, fit, modes, trials, rng)) for fit in thin}
+    table, columns = number_table(wanted.features, thin), list[Array]()
+    for feature in wanted.features:
+        if feature.kind == "distance":
+            (a, of_a), (b, of_b) = (by_feature[name] for name in feature.between)
+            columns.append(distance_between(a, of_a, b, of_b)[:, None])
+        else:
+            columns.append(by_feature[feature.name][1])
+    drawn = np.hstack(columns)
+    for stated in wanted.contributions:
+        loadings = _stated_loadings(stated, table)
+        drawn = drawn + rng.standard_normal((trials, loadings.shape[1])) @ loadings.T
+    interval = np.quantile(drawn, [0.025, 0.975], axis=0).T - table.values[:, None]
+    return MonteCarlo(trials, drawn.std(axis=0, ddof=1), np.array([n.u for n in linear.numbers]), interval)
+
+
+def _refits(
+    places: PlaceErrors,
+    fit: FittedFeature,
+    modes: Sequence[tuple[ErrorSource, Array]],
+    trials: int,
+    rng: np.random.Generator,
+) -> Array:
+    """(M, q) numbers of a feature from its points as M trials move them."""
+    totals = [
+        np.sum([getattr(s, name) @ drawn for s, drawn in modes], axis=0).T for name in ("views", "parameters", "field")
+    ]
+    twists, own = totals[0], np.hstack(totals[1:])
+    shapes, noise = places.point_modes(fit.at)
+    out = np.empty((trials, len(fit.values)))
+    for start in range(0, trials, _TRIAL_BLOCK):
+        block = slice(start, min(start + _TRIAL_BLOCK, trials))
+        moved = fit.at.points + np.tensordot(own[block], shapes, axes=1)
+        moved += noise * rng.standard_normal((*moved.shape[:2], 1))
+        out[block] = [fit.refit(points) for points in places.moved(fit.at, twists[block], moved)]
+    return out

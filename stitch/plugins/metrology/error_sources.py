@@ -1,0 +1,243 @@
+"""All that may be wrong about the places of a run, carried through the fit and through register.
+
+Register moves every view by δ̂ = K (d + n): d is how far robot and model misplace the view, n what noise and the
+scanner's smooth errors make of its overlaps, and K = (H + Λ)⁻¹ H with the information H of the overlaps and the
+precision Λ of the robot's pose. Hand-eye and effects are x̂ = X u, a linear answer to what the same overlaps show. So
+the registered views err by a known linear map of whatever errs,
+
+    η = −(I − K) r + B x̂ + K (n + a·f),     x̂ = X (r + n + a·f),     B = (I − K) J_views − K J_points,
+
+with errors r of the poses, smooth errors f of the scanner and what the overlaps make of them, a. f, and parameters of
+effects that change points, move the points themselves as well. The sizes are posterior means of the variances.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from stitch.errors import InputError
+from stitch.fit.coarse import REUSED
+from stitch.fit.fit import WEAK
+from stitch.fusion.register import METHODS, normal_equations, prior_precision
+from stitch.model.forward import PointSlopes, corrected_capture, moves_points
+from stitch.model.model import kept_root, sizes_of, stack_parameters, values_of
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Mask
+from stitch.numerics.reml import NOISE, fit_variances
+from stitch.numerics.variance_posterior import mean_variances, satterthwaite
+from stitch.observations.pose_errors import DRIFT_MEMORY, STOP_COMPONENTS, prior_pose_errors
+from stitch.observations.surfaces.effect_columns import apparent_twists, view_columns
+from stitch.observations.surfaces.hand_eye_fit import (
+    FittedEffects,
+    HandEyeSolution,
+    hand_eye_jacobian,
+    solve_hand_eye,
+)
+from stitch.observations.surfaces.scanner_errors import half_field, shared_error_likelihood, sum_smooth_errors
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
+from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors
+from stitch.run_data import Run
+from stitch.session.capture import Capture
+from stitch.system.threads import library_threads_off
+
+# Sources as people call them.
+SCATTER, ARM, WANDERING = "robot: scatter of the poses", "robot: joints and links", "robot: wandering in time"
+STOP, OVERLAPS, SCANNER = "robot: shared by the scans of a stop", "noise of the overlaps", "scanner: smooth errors"
+OTHER_RUN, OTHER_ARM, UNSEEN = "model of another run", "arm of another run", "hand-eye: not shown by the motions"
+# What a session does not show of itself.
+NOT_INCLUDED = (
+    "scale of the scanner, where range_scale is not in the model: an artefact of known length shows it",
+    "temperature of the part, against 20 °C and over the session",
+    "clamping of the part, and how it bends",
+    "effects that the model lacks (stitch diagnose)",
+    "shape and roughness of the surface within the points of a feature",
+)
+_MANY = 1e6
+# Directions with a smaller share of a component's largest variance are rounding.
+_ROUNDING = 1e-12
+
+
+def place_errors(run: Run) -> PlaceErrors:
+    """Return the places of a run's points with all that its own views say may be wrong about them.
+
+    Raises:
+        InputError: a run without clouds.
+        NoResultError: no two views overlap.
+    """
+    if not run.measurement.capture.scans or run.registered is None:
+        raise InputError(f"{run.session.name}: has no clouds, so no surface; to fix: name a run of scans")
+    with library_threads_off():
+        chain = error_chain(run)
+        terms = [term for term in run.terms if moves_points([term])]
+        return PlaceErrors(
+            measurement=run.measurement,
+            capture=chain.capture,
+            poses=run.poses,
+            centre=chain.freed.overlaps.gram.centre,
+            sources=tuple(_sources(run, chain)),
+            slopes=PointSlopes.about_model(run.measurement, run.model, terms) if terms else None,
+            half=half_field(run.measurement),
+        )
+
+
+@dataclass(frozen=True)
+class ErrorChain:
+    """The linear maps of the module's head; twists (6V,) about the centre of `freed`, F fitted parameters."""
+
+    capture: Capture
+    freed: UnconstrainedPoses
+    solution: HandEyeSolution
+    fitted: Mask  # (P,) of all parameters of effects
+    of_points: Mask  # (P,) of effects that change points
+    columns: Array  # (6V, P)
+    follow: Array  # (6V, 6V) K
+    answer: Array  # (6 + F, 6V) X; zero for the model of another run
+    to_views: Array  # (6V, 6 + F) B
+
+    def of_poses(self, root: Array) -> tuple[Array, Array]:
+        """What errors of poses (6V, m) make of the views (6V, m) and of the parameters (6 + F, m)."""
+        x = self.answer @ root
+        return np.asarray(self.follow @ root - root + self.to_views @ x), x
+
+    def of_overlaps(self, twists: Array) -> tuple[Array, Array]:
+        """The same of errors of what the overlaps show, twists (6V, m)."""
+        x = self.answer @ twists
+        return np.asarray(self.follow @ twists + self.to_views @ x), x
+
+    def of_model(self, x: Array) -> tuple[Array, Array]:
+        """The same of errors of the parameters (6 + F, m) themselves."""
+        return np.asarray(self.to_views @ x), x
+
+
+def error_chain(run: Run) -> ErrorChain:
+    """Return the linear maps by which errors reach the registered views of a run."""
+    measurement, model = run.measurement, run.model
+    own = corrected_capture(measurement, model)
+    freed = unconstrained_poses(own, own.poses(model.T_mount), run.gate)
+    columns, parameters = view_columns(measurement, model, freed), stack_parameters(model.terms)
+    given = REUSED in run.stages[0].note
+    fitted = np.array([p.fitted and (given or not p.kept) for p in parameters], bool)
+    of_points = np.array([moves_points([term]) for term in model.terms for _ in term.parameters], bool)
+    effects = FittedEffects((columns[:, fitted],), values_of(model.terms)[fitted], WEAK * sizes_of(model.terms)[fitted])
+    found = solve_hand_eye([own], [freed], model.T_mount, effects)
+    answer = np.asarray(found.gls.gain @ found.parts[0].reduced_poses.reduction)
+    follow = _follow_overlaps(run, own, found, freed.overlaps.gram.centre)
+    g = freed.overlaps.gram
+    of_views = np.column_stack(
+        [hand_eye_jacobian(found.parts[0].hand_eye_frames, g.centre), columns[:, fitted] * ~of_points[fitted]]
+    )
+    by_points = np.column_stack([np.zeros((len(columns), 6)), columns[:, fitted] * of_points[fitted]])
+    return ErrorChain(
+        capture=own,
+        freed=freed,
+        solution=found,
+        fitted=fitted,
+        of_points=of_points,
+        columns=columns,
+        follow=follow,
+        answer=np.zeros_like(answer) if given else answer,
+        to_views=of_views - follow @ (of_views + by_points),
+    )
+
+
+def _follow_overlaps(run: Run, own: Capture, found: HandEyeSolution, centre: Array) -> Array:
+    """(6V, 6V) K: by how much of what the overlaps show register moves the views, twists about `centre` (3,)."""
+    assert run.registered is not None
+    scatter, method = found.scatter[0], METHODS[run.register_method]
+    H = normal_equations(run.registered, own, run.poses, run.poses_model, scatter=scatter, method=method).H
+    about = run.registered.gram.centre
+    held = np.zeros_like(H)
+    for v, precision in enumerate(prior_precision(own, scatter, about)):
+        held[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] = precision
+    shift = np.kron(np.eye(len(run.poses)), frames.adjoint(frames.make(np.eye(3), centre - about)))
+    K = np.eye(len(H)) - np.linalg.solve(H, held)
+    return np.asarray(np.linalg.solve(shift, K @ shift))
+
+
+# Sources with their modes; those of one name are one line of a budget.
+
+# A source of one name: its modes as errors of views and of fitted parameters, how well its size is known, and of the
+# scanner's smooth errors which one it is.
+_Modes = tuple[str, tuple[Array, Array], float, int | None]
+
+
+def _sources(run: Run, chain: ErrorChain) -> Iterator[ErrorSource]:
+    twists, sizes, degrees = _smooth_errors(run, chain)
+    smooth = [
+        (SCANNER, chain.of_overlaps(twists[:, [k]] * size), known, k)
+        for k, (size, known) in enumerate(zip(sizes, degrees, strict=True))
+    ]
+    for name, (views, x), known, k in [*_pose_modes(run, chain, twists * sizes), *_model_modes(run, chain), *smooth]:
+        parameters, field = np.zeros((len(chain.fitted), x.shape[1])), np.zeros((len(sizes), x.shape[1]))
+        parameters[chain.fitted] = x[6:]
+        if k is not None:
+            field[k] = sizes[k]
+        yield ErrorSource(name, views, parameters[chain.of_points], field, known)
+
+
+def _smooth_errors(run: Run, chain: ErrorChain) -> tuple[Array, Array, Array]:
+    """Twists (6V, K) that the overlaps show for unit smooth errors, their sizes (K,), and degrees of freedom (K,).
+
+    Sizes are those that the covariance of the hand-eye counts. One whose logarithm is known to s has ½/s² degrees of
+    freedom (JCGM 100, G.4.2).
+    """
+    sums, noise = sum_smooth_errors(run.measurement, chain.freed)
+    twists = apparent_twists(sums, chain.freed)
+    if not np.isfinite(noise):
+        return twists, np.zeros(twists.shape[1]), np.full(twists.shape[1], _MANY)
+    likelihood = shared_error_likelihood(sums, twists, chain.freed, noise)
+    shares = likelihood.map_shares
+    spread = likelihood.share_spread(shares)
+    of_mode = np.append(np.zeros(twists.shape[1] - 1, int), 1)  # all over the field have one size, incidence its own
+    return twists, (noise * shares)[of_mode], (0.5 / spread**2)[of_mode]
+
+
+def _pose_modes(run: Run, chain: ErrorChain, smooth: Array) -> Iterator[_Modes]:
+    """Errors of the poses and the noise of the overlaps, as large as the views show them.
+
+    What the overlaps vary by more than they would if smooth errors (6V, K) were known is not noise but the scanner's.
+    """
+    found, g = chain.solution, chain.freed.overlaps.gram
+    errors = prior_pose_errors([run.measurement], run.model, [g.centre]).repeating_only()
+    mixed = found.rig.mixed(errors)
+    sizes = fit_variances(mixed, both_starts=True)
+    sigma = np.sqrt(mean_variances(mixed, sizes))
+    known = 2 / np.clip(np.diag(satterthwaite(mixed, sizes).spread), 2 / _MANY, 2.0)
+    carried = frames.adjoint(frames.make(np.eye(3), -g.centre) @ chain.capture.T_reference_flange)
+    for k, axes in enumerate((slice(0, 3), slice(3, 6))):
+        root = block_diag(*carried[:, :, axes])
+        yield SCATTER, chain.of_poses(sigma[k] * root), float(known[k]), None
+    seen = g.visible
+    noise = sigma[NOISE] * seen.scale[:, None] * seen.vectors * np.sqrt(g.variance / seen.values)
+    seen_smooth = found.rig.reduce([smooth])
+    beside = replace(mixed, fixed=(seen_smooth @ seen_smooth.T)[None])
+    left = mean_variances(beside, fit_variances(beside, both_starts=True))[NOISE] / sigma[NOISE] ** 2
+    for name, share in ((OVERLAPS, min(left, 1.0)), (SCANNER, 1.0 - min(left, 1.0))):
+        yield name, chain.of_overlaps(np.sqrt(share) * noise), float(known[NOISE]), None
+    names = dict.fromkeys(DRIFT_MEMORY, WANDERING) | dict.fromkeys(STOP_COMPONENTS, STOP)
+    for k, (name, component) in enumerate(zip(errors.names, errors.components, strict=True), NOISE + 1):
+        yield names.get(name, ARM), chain.of_poses(sigma[k] * _root(component)), float(known[k]), None
+
+
+def _model_modes(run: Run, chain: ErrorChain) -> Iterator[_Modes]:
+    """Errors of a model that other views fitted, or of what these did not show."""
+    kept = chain.columns @ kept_root(run.terms, run.model.effects_covariance)
+    if kept.any():
+        yield OTHER_ARM, chain.of_poses(kept), _MANY, None
+    found, hand_eye = chain.solution, np.eye(6 + int(chain.fitted.sum()))[:, :6]
+    if not chain.answer.any():
+        effects = run.model.effects_covariance.root(run.terms)[chain.fitted]
+        yield OTHER_RUN, chain.of_model(block_diag(_root(run.mount_covariance), effects)), _MANY, None
+        return
+    yield UNSEEN, chain.of_model(found.gls.covariance @ _root(found.prior)), _MANY, None
+    if found.hidden.size:
+        yield UNSEEN, chain.of_model(hand_eye @ found.hidden), _MANY, None
+
+
+def _root(covariance: Array) -> Array:
+    """(n, m) L with L·Lᵀ the covariance (n, n)."""
+    values, vectors = np.linalg.eigh(covariance)
+    keep = values > _ROUNDING * max(values[-1], 1e-300)
+    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))

@@ -1,0 +1,228 @@
+"""FEATURES.toml: what is to be measured, in the frame of the part, with nominal values, tolerances and calibrations."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import METRES
+from stitch.plugins.metrology.features import NUMBERS, Feature, nearest_on_mesh
+from stitch.session.reading.robot_description import require_known_keys
+from stitch.session.reading.text_files import read_toml, reason_of, shortened
+
+# Points count within so many spacings of the nominal surface, and a patch is so wide, where nobody says so.
+_WITHIN, _PATCH = 10.0, 15.0
+_COMMON = ("name", "kind", "tolerance", "calibrated", "U")
+_KEYS = {
+    "point": ("at", "normal", "radius", "within"),
+    "deviation": ("at", "radius", "within"),
+    "plane": ("at", "normal", "radius", "within"),
+    "sphere": ("at", "diameter", "within"),
+    "cylinder": ("at", "axis", "diameter", "length", "within"),
+    "circle": ("at", "axis", "diameter", "within"),
+    "distance": ("between", "nominal"),
+}
+_PLACED = {kind for kind in NUMBERS if kind != "distance"}
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """Something that may be wrong which the run does not show, as a person states it: one sigma."""
+
+    source: str
+    relative: float = 0.0  # of distances and diameters, together
+    length: float = 0.0  # of every number by itself, length_unit
+    degrees: float = np.inf  # of freedom
+
+
+@dataclass(frozen=True)
+class FeatureList:
+    """Features in the reference frame and unit of a run."""
+
+    features: tuple[Feature, ...]
+    contributions: tuple[Contribution, ...] = ()
+    limits: dict[str, float] | None = None  # largest permissible errors of a verification: form, size, distance
+
+
+def read_features(file: Path, length_unit: str, spacing: float) -> FeatureList:
+    """Read what is to be measured.
+
+    Args:
+        length_unit: of the run; the file may state another.
+        spacing: of the run's points, length_unit.
+
+    Raises:
+        InputError: the file is missing or malformed, a key is unknown, or a feature lacks what it needs.
+    """
+    document = read_toml(file, "write one with a [[feature]] for each thing to measure: see docs/measure.md")
+    require_known_keys(str(file), document, ("length_unit", "frame", "cad", "feature", "contribution", "limits"))
+    unit = document.get("length_unit", length_unit)
+    if unit not in METRES:
+        raise InputError(f"{file}: length_unit is {shortened(unit)}; to fix: write {' or '.join(METRES)}")
+    reader = _Reader(file, METRES[unit] / METRES[length_unit], spacing, document)
+    rows = document.get("feature", [])
+    if not isinstance(rows, list) or not rows:
+        raise InputError(f"{file}: asks for nothing; to fix: write a table [[feature]] for each thing to measure")
+    features = tuple(reader.feature(i, row) for i, row in enumerate(rows))
+    names = [feature.name for feature in features]
+    if len(set(names)) < len(names):
+        raise InputError(f"{file}: two features are named {max(names, key=names.count)!r}; to fix: name each once")
+    known = {f.name for f in features if f.kind in _PLACED - {"deviation"}}
+    for feature in features:
+        if feature.kind == "distance" and not set(feature.between) <= known:
+            raise InputError(
+                f"{file}: {feature.name}: between is {list(feature.between)}; to fix: name two points, planes, "
+                "spheres, cylinders or circles of this file"
+            )
+    contributions = tuple(reader.contribution(i, row) for i, row in enumerate(document.get("contribution", [])))
+    return FeatureList(features, contributions, reader.limits())
+
+
+@dataclass(frozen=True)
+class _Reader:
+    file: Path
+    scale: float  # of the file's lengths into the run's unit
+    spacing: float
+    document: dict[str, Any]
+
+    def feature(self, i: int, row: Any) -> Feature:
+        """Return one feature in the reference frame."""
+        where = f"{self.file}: feature {i + 1}"
+        kind = row.get("kind") if isinstance(row, dict) else None
+        if kind not in NUMBERS:
+            raise InputError(f"{where}: kind is {shortened(kind)}; to fix: write one of {', '.join(NUMBERS)}")
+        where = f"{self.file}: {row.get('name') or f'feature {i + 1}'}"
+        require_known_keys(where, row, (*_COMMON, *_KEYS[kind]))
+        name = row.get("name", f"{kind} {i + 1}")
+        if not isinstance(name, str) or not name.isprintable():
+            raise InputError(f"{where}: name is {shortened(name)}; to fix: write a word in quotes")
+        found = replace(self._stated(where, row), name=name, kind=kind, tolerance=self._tolerance(where, row))
+        if kind == "distance":
+            between = row.get("between")
+            if not isinstance(between, list) or len(between) != 2 or between[0] == between[1]:
+                raise InputError(f"{where}: between is {shortened(between)}; to fix: name two features")
+            return replace(found, between=(str(between[0]), str(between[1])))
+        return self._placed(where, row, found)
+
+    def _stated(self, where: str, row: dict[str, Any]) -> Feature:
+        """Return what any feature may state."""
+        numbers = {
+            key: None if key not in row else self.scale * float(self._numbers(where, row, key, ()))
+            for key in ("nominal", "calibrated")
+        }
+        U = self.scale * float(self._numbers(where, row, "U", ())) if "U" in row else 0.0
+        return Feature("", "", nominal=numbers["nominal"], calibrated=numbers["calibrated"], calibrated_U=U)
+
+    def _placed(self, where: str, row: dict[str, Any], found: Feature) -> Feature:
+        """Return a feature with its place and size."""
+        kind, T = found.kind, self.T_reference_part
+        at = frames.transform(T, self.scale * self._numbers(where, row, "at", (3,))[None])[0]
+        sizes = {
+            key: self.scale * float(self._numbers(where, row, key, ())) if key in row else default
+            for key, default in (
+                ("radius", _PATCH * self.spacing),
+                ("within", _WITHIN * self.spacing),
+                ("diameter", 0.0),
+                ("length", 0.0),
+            )
+        }
+        for key in ("diameter", "length"):
+            if key in _KEYS[kind] and not sizes[key] > 0:
+                raise InputError(f"{where}: {key} is {shortened(row.get(key))}; to fix: write a length above zero")
+        cad, axis = None, np.array([0.0, 0.0, 1.0])
+        for direction in {"normal", "axis"} & set(_KEYS[kind]):
+            axis = frames.rotate(T, self._numbers(where, row, direction, (3,))[None])[0]
+            if not np.linalg.norm(axis) > 0:
+                raise InputError(f"{where}: {direction} has no direction; to fix: write [x, y, z]")
+        if kind == "deviation":
+            cad = self.cad(where)
+            places, normals = nearest_on_mesh(cad, at[None])
+            at, axis = places[0], normals[0]
+        radius = sizes["length"] / 2 if kind == "cylinder" else sizes["radius"]
+        return replace(
+            found,
+            at=at,
+            axis=axis / np.linalg.norm(axis),
+            size=sizes["diameter"],
+            radius=radius if kind in ("point", "plane", "deviation", "cylinder") else 0.0,
+            within=sizes["within"],
+            cad=cad,
+        )
+
+    @property
+    def T_reference_part(self) -> Array:
+        """(4, 4) in which the file's places are given; the reference frame itself where it says nothing."""
+        frame = self.document.get("frame", {})
+        require_known_keys(f"{self.file}: frame", frame, ("pose",))
+        if "pose" not in frame:
+            return np.eye(4)
+        T = self._numbers(f"{self.file}: frame", frame, "pose", (4, 4))
+        T[:3, 3] *= self.scale
+        if not frames.is_rigid(T):
+            raise InputError(f"{self.file}: frame.pose is no rigid motion; to fix: write T_reference_part, four rows")
+        return T
+
+    def cad(self, where: str) -> Any:
+        """Return the mesh that deviations count from, reference frame."""
+        name = self.document.get("cad")
+        if not isinstance(name, str) or not (self.file.parent / name).is_file():
+            raise InputError(
+                f'{where}: cad is {shortened(name)}; to fix: write cad = "part.stl" at the top of the file'
+            )
+        try:
+            mesh = trimesh.load_mesh(self.file.parent / name)
+        except Exception as error:  # every reader of trimesh fails in its own way
+            raise InputError(
+                f"{self.file}: {name}: cannot be read ({reason_of(error)}); to fix: export it again"
+            ) from None
+        mesh.apply_scale(self.scale)
+        return mesh.apply_transform(self.T_reference_part)
+
+    def contribution(self, i: int, row: Any) -> Contribution:
+        """Return something that a person says may be wrong."""
+        where = f"{self.file}: contribution {i + 1}"
+        require_known_keys(where, row, ("source", "relative", "length", "degrees"))
+        numbers = {
+            key: float(self._numbers(where, row, key, ())) for key in ("relative", "length", "degrees") if key in row
+        }
+        if not isinstance(row.get("source"), str) or min(numbers.values(), default=-1.0) < 0:
+            raise InputError(f'{where}: to fix: write source = "…" and one sigma, relative = 1e-5 or length = 0.002')
+        degrees = max(numbers.get("degrees", np.inf), 1.0)
+        return Contribution(
+            row["source"], numbers.get("relative", 0.0), self.scale * numbers.get("length", 0.0), degrees
+        )
+
+    def limits(self) -> dict[str, float] | None:
+        """Return the largest permissible errors of a verification."""
+        table = self.document.get("limits")
+        if table is None:
+            return None
+        where = f"{self.file}: limits"
+        require_known_keys(where, table, ("form", "size", "distance"))
+        return {key: self.scale * float(self._numbers(where, table, key, ())) for key in table}
+
+    def _tolerance(self, where: str, row: dict[str, Any]) -> tuple[float, float] | None:
+        value = row.get("tolerance")
+        if value is None:
+            return None
+        shape = (2,) if isinstance(value, list) else ()
+        numbers = self.scale * self._numbers(where, row, "tolerance", shape)
+        low, high = (-abs(float(numbers)), abs(float(numbers))) if not shape else (float(numbers[0]), float(numbers[1]))
+        if not low < high:
+            raise InputError(f"{where}: tolerance is {shortened(value)}; to fix: write one number, or [lower, upper]")
+        return low, high
+
+    def _numbers(self, where: str, row: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
+        try:
+            found = np.array(row[key], float)
+        except (KeyError, TypeError, ValueError, OverflowError):
+            found = np.full(shape or (1,), np.nan)
+        if found.shape != shape or not np.isfinite(found).all():
+            form = {(): "a number", (3,): "[x, y, z]", (2,): "[lower, upper]", (4, 4): "four rows of four"}[shape]
+            raise InputError(f"{where}: {key} is {shortened(row.get(key))}; to fix: write {form}")
+        return found

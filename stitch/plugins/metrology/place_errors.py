@@ -1,0 +1,216 @@
+"""Where the points of a run are, and how far they may lie from where they truly are: sources, each a sum of modes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.lib import recfunctions
+from plyfile import PlyData, PlyElement
+
+from stitch.model.forward import PointSlopes
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.observations.surfaces.scanner_errors import smooth_corrections
+from stitch.run_data import FusedCloud
+from stitch.session.capture import Capture
+from stitch.session.measurement import Measurement
+from stitch.system.files import whole_file
+
+# What is seen at more than 60° errs most with incidence, and other views see it better.
+_LEAST_COSINE = 0.5
+
+
+@dataclass(frozen=True)
+class ErrorSource:
+    """m independent modes of unit variance; lengths in length_unit, angles in rad."""
+
+    name: str
+    views: Array  # (6V, m) left twists about `PlaceErrors.centre` by which the registered views err
+    parameters: Array  # (P, m) errors of parameters of effects that change points
+    field: Array  # (K, m) smooth errors of the scanner
+    degrees: float  # of freedom with which its size is known
+
+
+@dataclass(frozen=True)
+class RunPoints:
+    """N usable points of all registered views, without the effects in use; reference frame."""
+
+    points: Array  # (N, 3)
+    normals: Array  # (N, 3) unit, towards the scanner
+    view: Indices  # (N,)
+    index: Indices  # (N,) in its scan
+
+    def take(self, keep: Indices) -> "RunPoints":
+        """The points of some indices."""
+        return RunPoints(self.points[keep], self.normals[keep], self.view[keep], self.index[keep])
+
+
+@dataclass(frozen=True)
+class Responses:
+    """What q numbers answer to errors of the places, per unit of each."""
+
+    views: Array  # (q, 6V) to left twists of the views
+    parameters: Array  # (q, P)
+    field: Array  # (q, K)
+    noise: Array  # (q, q) covariance by the noise of their own points
+
+    def loadings(self, source: ErrorSource) -> Array:
+        """(q, m) what each mode of a source does to the numbers."""
+        return np.asarray(self.views @ source.views + self.parameters @ source.parameters + self.field @ source.field)
+
+    def combined(self, slopes: Array) -> "Responses":
+        """The same of numbers with slopes (p, q) in these."""
+        return Responses(
+            slopes @ self.views, slopes @ self.parameters, slopes @ self.field, slopes @ self.noise @ slopes.T
+        )
+
+
+@dataclass(frozen=True)
+class PlaceErrors:
+    """Where the points of a run are, and all that may be wrong about it."""
+
+    measurement: Measurement
+    capture: Capture  # without the effects in use
+    poses: Array  # (V, 4, 4) T_reference_scanner, registered
+    centre: Array  # (3,) reference frame
+    sources: tuple[ErrorSource, ...]
+    slopes: PointSlopes | None  # of the P parameters that change points
+    half: Array  # (2,) of the scanner's field
+
+    @property
+    def points(self) -> RunPoints:
+        """All usable points that the scanner does not see at a slant."""
+        scans = self.capture.scans
+        kept = [np.flatnonzero(scan.usable.astype(bool) & (scan.confidence > _LEAST_COSINE)) for scan in scans]
+        return RunPoints(
+            np.vstack([frames.transform(T, s.points[k]) for s, T, k in zip(scans, self.poses, kept, strict=True)]),
+            np.vstack([frames.rotate(T, s.normals[k]) for s, T, k in zip(scans, self.poses, kept, strict=True)]),
+            np.repeat(np.arange(len(scans)), [len(k) for k in kept]),
+            np.concatenate(kept).astype(np.int64),
+        )
+
+    def responses(self, at: RunPoints, gradient: Array) -> "Responses":
+        """What numbers with these slopes (q, N, 3) in the points, reference frame, answer to errors of the places."""
+        views = np.zeros((len(gradient), len(self.poses), 6))
+        field, parameters = np.zeros((len(gradient), self.modes_of_field)), np.zeros((len(gradient), self.parameters))
+        noise = np.zeros((len(gradient), len(gradient)))
+        for v in np.unique(at.view):
+            own = np.flatnonzero(at.view == v)
+            g = gradient[:, own]
+            views[:, v, :3] = np.cross(at.points[own] - self.centre, g).sum(axis=1)
+            views[:, v, 3:] = g.sum(axis=1)
+            index, seen = at.index[own], frames.rotate(frames.inverse(self.poses[v]), g)
+            field += np.einsum("qni,kni->qk", seen, self.field_modes(v, index))
+            if self.slopes is not None:
+                parameters += np.einsum("qni,kni->qk", seen, self.slopes.at(v, self.poses[v], index))
+            scan = self.capture.scans[v]
+            along = scan.noise * np.einsum("qni,ni->qn", seen, scan.normals[index])
+            noise += along @ along.T
+        return Responses(views.reshape(len(gradient), -1), parameters, field, noise)
+
+    def point_modes(self, at: RunPoints) -> tuple[Array, Array]:
+        """Return by how much points move per unit of the parameters and smooth errors (P + K, N, 3), and the noise of
+        each along its normal (N, 3), reference frame."""
+        shapes = np.zeros((self.parameters + self.modes_of_field, len(at.points), 3))
+        noise = np.zeros_like(at.points)
+        for v in np.unique(at.view):
+            own = np.flatnonzero(at.view == v)
+            index = at.index[own]
+            seen = self.field_modes(v, index)
+            if self.slopes is not None:
+                seen = np.concatenate([self.slopes.at(v, self.poses[v], index), seen])
+            shapes[:, own] = frames.rotate(self.poses[v], seen)
+            noise[own] = self.capture.scans[v].noise * at.normals[own]
+        return shapes, noise
+
+    def moved(self, at: RunPoints, twists: Array, points: Array) -> Array:
+        """Return points (M, N, 3) of some views, moved with their views by left twists (M, 6V) about the centre."""
+        views, index = np.unique(at.view, return_inverse=True)
+        T = frames.moved_about(self.centre, twists.reshape(len(twists), -1, 6)[:, views], np.eye(4))
+        out = np.empty_like(points)
+        for v in range(len(views)):
+            own = index == v
+            out[:, own] = points[:, own] @ T[:, v, :3, :3].transpose(0, 2, 1) + T[:, None, v, :3, 3]
+        return out
+
+    @property
+    def modes_of_field(self) -> int:
+        """K."""
+        return len(self.sources[0].field)
+
+    @property
+    def parameters(self) -> int:
+        """P."""
+        return len(self.sources[0].parameters)
+
+    def field_modes(self, v: int, index: Indices) -> Array:
+        """(K, N, 3) by which points of view v lie off per unit of each smooth error, scanner frame."""
+        scan = self.capture.scans[v]
+        cosine = self.measurement.scan_views[v].cosine[index]
+        return -smooth_corrections(scan.points[index] - scan.eye, cosine, self.half)
+
+
+# The standard uncertainty of every point of the stitched cloud along its normal.
+
+# A view has a part in a fused point where it has one of its own within so many cells.
+_WITHIN = 1.5
+_BLOCK = 200_000
+
+
+def point_sigmas(places: PlaceErrors, cloud: FusedCloud) -> Array:
+    """Return (N,) by which each fused point may lie off along its normal, one sigma, length_unit."""
+    scans = places.capture.scans
+    cell = _WITHIN * float(np.median([scan.scanned_spacing for scan in scans]))
+    out = np.empty(len(cloud.points))
+    for start in range(0, len(out), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        out[block] = _sigmas(places, cloud.points[block], cloud.normals[block], cell)
+    return out
+
+
+def _sigmas(places: PlaceErrors, points: Array, normals: Array, cell: float) -> Array:
+    seen, nearest = _views_of(places, points, cell)
+    lever = frames.plane_rows(points - places.centre, normals)
+    sets, member = np.unique(seen, axis=0, return_inverse=True)
+    square = np.zeros(len(points))
+    twists = [source.views.reshape(len(places.poses), 6, -1) for source in places.sources]
+    for k, views in enumerate(sets):
+        own = np.flatnonzero(member.ravel() == k)
+        shares = views / max(views.sum(), 1)
+        mean = np.concatenate([np.tensordot(shares, t, axes=1) for t in twists], axis=1)
+        moved = lever[own] @ mean + _of_points(places, views, shares, nearest[own], normals[own])
+        square[own] = np.einsum("nm,nm->n", moved, moved)
+        square[own] += sum(share**2 * scan.noise**2 for share, scan in zip(shares, places.capture.scans, strict=True))
+    return np.sqrt(square)
+
+
+def _views_of(places: PlaceErrors, points: Array, cell: float) -> tuple[Mask, Indices]:
+    """(N, V) which views see each point, at least the nearest one, and the nearest point of every view."""
+    distance, index = np.empty((len(points), len(places.poses))), np.empty((len(points), len(places.poses)), np.int64)
+    for v, (scan, T) in enumerate(zip(places.capture.scans, places.poses, strict=True)):
+        d, i = scan.tree.query(np.ascontiguousarray(frames.transform(frames.inverse(T), points)), k=1)
+        distance[:, v], index[:, v] = d.ravel(), i.ravel()
+    return (distance < cell) | (distance == distance.min(axis=1, keepdims=True)), index
+
+
+def _of_points(places: PlaceErrors, views: Mask, shares: Array, nearest: Indices, normals: Array) -> Array:
+    """(n, modes) by which errors of the points themselves move fused points along their normals."""
+    out = np.zeros((len(normals), sum(source.views.shape[1] for source in places.sources)))
+    field = np.concatenate([source.field for source in places.sources], axis=1)
+    parameters = np.concatenate([source.parameters for source in places.sources], axis=1)
+    for v in np.flatnonzero(views):
+        seen = frames.rotate(frames.inverse(places.poses[v]), normals)
+        out += shares[v] * np.einsum("ni,kni->nk", seen, places.field_modes(int(v), nearest[:, v])) @ field
+        if places.slopes is not None:
+            slopes = places.slopes.at(int(v), places.poses[v], nearest[:, v])
+            out += shares[v] * np.einsum("ni,kni->nk", seen, slopes) @ parameters
+    return out
+
+
+def write_sigmas(path: Path, sigma: Array) -> None:
+    """Write the points' sigma as a column of stitched.ply, whole or not at all."""
+    vertex = PlyData.read(str(path))["vertex"].data
+    kept = [name for name in vertex.dtype.names if name != "sigma"]
+    rows = recfunctions.append_fields(vertex[kept], "sigma", sigma.astype("<f4"), usemask=False)
+    with whole_file(path) as file:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(file))

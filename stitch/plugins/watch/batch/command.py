@@ -1,0 +1,156 @@
+"""`stitch batch SESSION…`: many sessions, each a run of its own, on one process or many."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+from uuid import uuid4
+
+import typer
+
+from stitch.cli.options import Json
+from stitch.cli.terminal import emit, say, show_files, show_table
+from stitch.errors import InputError, NoResultError
+
+if TYPE_CHECKING:
+    from stitch.plugins.watch.batch.run_batch import BatchJob, SessionRow
+
+# Of more sessions than these the terminal shows only those that need somebody; the page has all.
+_MOST = 100
+
+
+def batch(
+    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where the runs go.")] = Path("runs"),
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes on this machine.")] = 1,
+    scheduler: Annotated[
+        str, typer.Option("--scheduler", metavar="tcp://…", help="Workers of a Dask scheduler that runs already.")
+    ] = "",
+    force: Annotated[
+        bool, typer.Option("--force", help="Run finished sessions too, and replace runs of other sessions.")
+    ] = False,
+    recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
+    as_json: Json = False,
+) -> None:
+    """Run many sessions; one that fails does not stop the others. Started again, it runs what is not finished.
+
+    \b
+    Examples:
+      stitch batch blade-17 blade-18 blade-19 -o runs --workers 2
+      stitch batch blade-* --scheduler tcp://10.0.0.5:8786
+    """
+    from stitch.plugins.watch.batch.run_batch import run_jobs
+    from stitch.system.process import steps
+
+    if scheduler and workers > 1:
+        raise InputError("--workers and --scheduler: the scheduler has workers of its own; to fix: name one of the two")
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: is a file; to fix: name a folder for the runs with -o")
+    jobs, stood = _batch_jobs(sessions, output, force, recording), output.exists()
+    rows: dict[str, SessionRow] = {}
+    try:
+        # Whatever ends the loop ends the workers.
+        with closing(run_jobs(jobs, workers, scheduler, say)) as coming:
+            for row in steps("sessions", coming, len(jobs)):
+                rows[row.name] = row
+                say(f"{len(rows)} of {len(jobs)}  {row.name}: {_row_text(row)}")
+    except KeyboardInterrupt:
+        raise NoResultError(
+            f"stopped after {len(rows)} of {len(jobs)} sessions; to fix: start the same command again, it goes on from "
+            "there"
+        ) from None
+    if not stood and output.is_dir() and not any(output.iterdir()):
+        # Workers claim their places before they read: where nothing came of it, nothing is left.
+        output.rmdir()
+    _finish_batch([rows[job.run.name] for job in jobs], output, as_json)
+
+
+def _batch_jobs(sessions: list[Path], output: Path, force: bool, recording: bool) -> list[BatchJob]:
+    """Return a job for each session.
+
+    Raises:
+        InputError: two sessions, or a session and a file of the batch, would have the same place.
+    """
+    from stitch.plugins.watch.batch.run_batch import DOCUMENT, PAGE, BatchJob
+
+    names = [_session_name(path) for path in sessions]
+    if len(set(names)) < len(names):
+        twice = max(names, key=names.count)
+        raise InputError(f"two of the sessions are named {twice!r}; to fix: run them with -o of their own")
+    if taken := {DOCUMENT, PAGE} & set(names):
+        raise InputError(
+            f"a session is named {taken.pop()!r}, as a file of the batch is; to fix: name it otherwise in session.toml"
+        )
+    here, token = output.resolve(), uuid4().hex
+    return [
+        BatchJob(path.resolve(), here / name, token, force, recording)
+        for path, name in zip(sessions, names, strict=True)
+    ]
+
+
+def _session_name(session: Path) -> str:
+    """Return what a session is called; one that cannot be read is refused when it is its turn."""
+    from stitch.session.reading.session_folder import read_session_document, session_name
+
+    try:
+        file = session / "session.toml"
+        return session_name(file, read_session_document(file))
+    except InputError:
+        return session.resolve().name
+
+
+def _finish_batch(rows: list[SessionRow], output: Path, as_json: bool) -> None:
+    """Write the files, print tables and how it ended.
+
+    Raises:
+        InputError, NoResultError: sessions have no result.
+    """
+    from stitch.output.json_file import to_json
+    from stitch.plugins.watch.batch.run_batch import DOCUMENT, PAGE, batch_document, batch_sentence, write_summary
+
+    failed = [row for row in rows if row.error is not None]
+    if len(failed) < len(rows):
+        write_summary(rows, output)
+    if as_json:
+        emit(to_json(batch_document(rows)))
+    else:
+        _show_rows(rows, batch_sentence(rows))
+        show_files(output, (PAGE, DOCUMENT))
+    if failed:
+        kind = InputError if all(row.bad_input for row in failed) else NoResultError
+        raise kind(f"no result of {len(failed)} of {len(rows)} sessions; to fix: see the line of each above")
+
+
+def _show_rows(rows: Sequence[SessionRow], sentence: str) -> None:
+    """Print how it ended, the table, and the reasons of those without a result."""
+    from stitch.plugins.watch.batch.run_batch import SessionRow
+
+    say(sentence, bold=True)
+    shown = sorted(rows, key=SessionRow.urgency)[:_MOST] if len(rows) > _MOST else rows
+    cells = []
+    for row in shown:
+        lengths = [_um(x) for x in (row.coarse_um, row.residual_um, row.registered_um, row.noise_floor_um)]
+        worst = "–" if row.worst_view is None else f"{row.worst_view} {_um(row.worst_view_um)}"
+        cells.append((row.name, *lengths, worst, "–" if row.seconds is None else f"{row.seconds:.1f}"))
+    headings = ("session", "before", "one hand-eye", "registered", "noise", "worst view", "s")
+    show_table("Distance between the views (rms)", headings, cells, words=("session", "worst view"))
+    if len(shown) < len(rows):
+        say(f"The {_MOST} of {len(rows)} that need somebody first; the page has all.")
+    for row in rows:
+        if row.error is not None:
+            say(f"{row.session}: {row.error}")
+
+
+def _row_text(row: SessionRow) -> str:
+    if row.error is not None:
+        return f"no result: {row.error}"
+    before = "finished before, " if row.skipped else ""
+    return f"{before}{_um(row.residual_um)} with one hand-eye, {_um(row.registered_um)} registered"
+
+
+def _um(value: float | None) -> str:
+    from stitch.numerics.units import length_text
+
+    return "–" if value is None else length_text(value / 1e3, "mm", zeros=True)

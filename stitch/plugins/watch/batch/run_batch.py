@@ -1,0 +1,317 @@
+"""Many sessions, each run once into a folder of its own; rows come in the order in which they are finished."""
+
+import csv
+import hashlib
+import json
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import asdict, dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from stitch.api.pipeline import run
+from stitch.errors import BusyError, InputError, NoResultError, StitchError
+from stitch.numerics.units import MICROMETRES
+from stitch.output import run_folder
+from stitch.output.json_file import require_free, sessions_in, write_json
+from stitch.output.run_folder import call_entry_points, recordings
+from stitch.output.stored_run import read_ledger, read_result
+from stitch.plugins.watch.batch.cluster import joined_client, local_client, sessions_at_once
+from stitch.recorder import RecorderGroup
+from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, measured_files
+from stitch.session.reading.text_files import read_toml
+from stitch.system.files import claim_folder, whole_file
+from stitch.system.threads import share_cores
+
+
+@dataclass(frozen=True)
+class BatchJob:
+    """What a worker needs to know; all paths absolute, for it may stand elsewhere."""
+
+    session: Path
+    run: Path
+    batch: str  # name of this batch, unlike that of any other
+    force: bool = False  # run it although it is finished, and replace the run of another session
+    recording: bool = True
+    at_once: int = 1  # sessions that share the cores of the machine
+
+
+MARK = "batch-mark.json"
+_FORMAT = "stitch-batch-mark/1"
+
+
+def session_content_hash(session: Path) -> str | None:
+    """Return a hash of all that a run reads of a session: tables, clouds, and the files that session.toml names.
+
+    None where they cannot be read: such a session is never finished.
+    """
+    session = session.resolve()
+    try:
+        named = [session / text for text in _document_texts(read_toml(session / "session.toml", ""))]
+        files = [*measured_files(session), *(file for file in named if file.is_file())]
+    except (OSError, ValueError, csv.Error, InputError):
+        return None
+    found = content_hash(Path(session.anchor), files)
+    return None if found == UNKNOWN else found
+
+
+def write_mark(job: BatchJob, content: str | None, folder: Path) -> None:
+    """Write into a folder that becomes the run's of which content it is; both are there at once."""
+    told = {"format": _FORMAT, "batch": job.batch, "content": content, "began_with": _first_step_hash(folder)}
+    with whole_file(folder / MARK) as file:
+        file.write_text(json.dumps(told) + "\n", encoding="utf-8")
+
+
+def finished_batch(job: BatchJob, content: str | None) -> str | None:
+    """Return the batch that has run a session, if the folder holds a run of its very content; effects may have joined.
+
+    Of a batch that runs all again, only what it has run itself is finished.
+    """
+    if content is None or sessions_in(job.run) != [str(job.session.resolve())]:
+        return None
+    try:
+        told = json.loads((job.run / MARK).read_text(encoding="utf-8"))
+        # A later `stitch run` leaves the mark, and begins the history of the model anew.
+        own = told["began_with"] == _first_step_hash(job.run) and told["format"] == _FORMAT
+        whole = own and told["content"] == content and (not job.force or told["batch"] == job.batch)
+        return str(told["batch"]) if whole else None
+    except (OSError, ValueError, LookupError, TypeError, InputError):
+        return None
+
+
+def _first_step_hash(folder: Path) -> str:
+    """Return a hash of the numbers with which the history of the model begins; remarks may join it later."""
+    first = read_ledger(folder)[0]
+    numbers = [first[key] for key in ("hand_eye", "residual_rms", "heldout_rms", "noise_floor")]
+    return hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:16]
+
+
+def _document_texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str) and value and "\0" not in value:
+        yield value
+    elif isinstance(value, dict):
+        for inner in value.values():
+            yield from _document_texts(inner)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from _document_texts(inner)
+
+
+@dataclass(frozen=True)
+class SessionRow:
+    """What became of one session; lengths in µm, None where nothing was measured."""
+
+    session: str
+    name: str  # of the run's folder
+    run: str | None = None  # folder; None without a result
+    skipped: bool = False  # its run stood there
+    error: str | None = None
+    bad_input: bool = False
+    verdict: str | None = None
+    views: int | None = None  # that are fused
+    left_out: int | None = None  # views
+    coarse_um: float | None = None  # rms before the hand-eye is corrected
+    residual_um: float | None = None  # rms with one hand-eye
+    registered_um: float | None = None  # rms after every view has a pose of its own
+    noise_floor_um: float | None = None
+    worst_view: str | None = None  # of the largest rms after register
+    worst_view_um: float | None = None
+    seconds: float | None = None  # of its stages
+
+    def urgency(self) -> tuple[bool, float]:
+        """Return what sorts those first that have no result, then those with most above the noise."""
+        if self.residual_um is None or not self.noise_floor_um:
+            return self.error is None, 0.0
+        return True, -self.residual_um / self.noise_floor_um
+
+
+def finished_row(session: Path, run: Path, skipped: bool = False) -> SessionRow:
+    """Return the row of a session with a run.
+
+    Raises:
+        InputError: no run folder of one session, or a damaged one.
+    """
+    document = read_result(run)
+    to_um = MICROMETRES[document["length_unit"]]
+    rms = {stage["name"]: stage["rms"] for stage in document["stages"]}
+    views = [view for view in document["views"] if view["rms"] is not None]
+    worst = max(views, key=lambda view: float(view["rms"]), default=None)
+    left_out = len(document.get("left_out", ()))
+
+    def um(value: Any) -> float | None:
+        return None if value is None else float(value) * to_um
+
+    return SessionRow(
+        session=str(session),
+        name=run.name,
+        run=str(run),
+        skipped=skipped,
+        verdict=document["verdict"],
+        views=len(document["views"]) - left_out,
+        left_out=left_out,
+        coarse_um=um(rms.get("coarse")),
+        residual_um=um(document["residual_rms"]),
+        registered_um=um(rms.get("register")),
+        noise_floor_um=um(document["noise_floor"]),
+        worst_view=None if worst is None else worst["view"],
+        worst_view_um=None if worst is None else um(worst["rms"]),
+        seconds=sum(float(stage["seconds"]) for stage in document["stages"]),
+    )
+
+
+def failed_row(session: Path, run: Path, error: BaseException) -> SessionRow:
+    """Return the row of a session without a result: why, in one line."""
+    kind = "" if isinstance(error, StitchError) else f"{type(error).__name__}: "
+    told = f"{kind}{' '.join(str(error).split())}"
+    return SessionRow(str(session), run.name, error=told, bad_input=isinstance(error, InputError))
+
+
+# A worker that was given up may still be at work on a session: its successor waits for it, this long (s).
+LOCK_WAIT_SECONDS = 3600.0
+_RETRY_SECONDS = 0.5
+
+
+def run_session(job: BatchJob) -> SessionRow:
+    """Run a session into its folder unless its run stands there; what goes wrong becomes part of the answer."""
+    share_cores(job.at_once)
+    try:
+        require_free(job.run, [job.session], job.force)
+        with _locked_folder(job.run):
+            content = session_content_hash(job.session)
+            batch = finished_batch(job, content)
+            if batch is None:
+                session = load_session(job.session)
+                with run_folder.new_folder(job.run, [job.session], job.force) as scratch:
+                    result = run(session, recorder=RecorderGroup(recordings(scratch) if job.recording else []))
+                    run_folder.write_with_page(result, scratch)
+                    write_mark(job, content, scratch)
+            # A worker may die between a run and its answer; the next finds a run of this batch.
+            return finished_row(job.session, job.run, skipped=batch not in (None, job.batch))
+    except Exception as error:  # whatever befalls one session, the others go on
+        return failed_row(job.session, job.run, error)
+
+
+@contextmanager
+def _locked_folder(folder: Path) -> Iterator[None]:
+    """Hold the folder as its only writer, after whoever holds it now."""
+    until = time.monotonic() + LOCK_WAIT_SECONDS
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(claim_folder(folder))
+                break
+            except BusyError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(_RETRY_SECONDS)
+        yield
+
+
+DOCUMENT, PAGE = "batch.json", "batch.html"  # beside the runs: for programs, and for people
+BATCH_FORMAT = "stitch-batch/1"
+
+
+def batch_document(rows: Sequence[SessionRow]) -> dict[str, Any]:
+    """Return batch.json as a dictionary: how many, and a row a session; lengths in µm."""
+    failed = sum(row.error is not None for row in rows)
+    skipped = sum(row.skipped for row in rows)
+    return {
+        "format": BATCH_FORMAT,
+        "done": len(rows) - failed - skipped,
+        "skipped": skipped,
+        "failed": failed,
+        "sessions": [asdict(row) for row in rows],
+    }
+
+
+def write_summary(rows: Sequence[SessionRow], folder: Path) -> None:
+    """Write both into the folder of the runs, each whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(batch_document(rows), folder / DOCUMENT)
+    call_entry_points("stitch.batch_pages", rows, folder / PAGE)
+
+
+def batch_sentence(rows: Sequence[SessionRow]) -> str:
+    """Return how many are run, were finished before, have failed."""
+    counts = batch_document(rows)
+    words = {"done": "run", "skipped": "finished before", "failed": "without a result"}
+    told = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
+    return f"{len(rows)} {'session' if len(rows) == 1 else 'sessions'}: {', '.join(told) or 'nothing to do'}."
+
+
+_WORKERS_DIED = NoResultError(
+    "workers died over it, also when it ran alone; to fix: give it more memory, or thin its scans, and start the batch "
+    "again"
+)
+_SCHEDULER_GONE = NoResultError("the scheduler has gone; to fix: start the same batch again")
+
+
+def run_jobs(
+    jobs: Sequence[BatchJob], workers: int = 1, scheduler: str = "", say: Callable[[str], object] = str
+) -> Generator[SessionRow]:
+    """Run the jobs on this process, on so many, or on those of a scheduler; rows as they come.
+
+    Args:
+        say: is told what somebody has to know meanwhile; by default nobody is.
+
+    Raises:
+        InputError: the packages for more than one process are missing, or the scheduler does not answer.
+    """
+    if workers == 1 and not scheduler:
+        yield from map(run_session, jobs)
+        return
+    opened: AbstractContextManager[Any] = (
+        joined_client(scheduler) if scheduler else local_client(min(workers, len(jobs)))
+    )
+    with opened as client:
+        if not client.scheduler_info()["workers"]:
+            say(f"{scheduler} has no workers yet; waiting for one (dask worker {scheduler})")
+        at_once = sessions_at_once(client)
+        yield from rows_from(client, [replace(job, at_once=at_once) for job in jobs])
+
+
+def rows_from(
+    client: Any, jobs: Sequence[BatchJob], work: Callable[[BatchJob], SessionRow] = run_session
+) -> Iterator[SessionRow]:
+    """Yield rows from the workers of a client: all jobs at once; then, one after the other, those whose workers died.
+
+    Who has killed a worker is not certain where several sessions were with it, and what is too large beside another
+    may have room alone.
+    """
+    # One group of tasks: the scheduler keeps them, and hands a worker no second one while it has one.
+    keys = [(f"stitch-{job.batch}", job.run.name) for job in jobs]
+    futures = client.map(work, jobs, key=keys, pure=False)
+    job_of = dict(zip(futures, jobs, strict=True))
+    suspected = []
+    for done in import_module("distributed").as_completed(futures).batches():
+        # Fetched together: one by one a scheduler would be busy with that alone.
+        whole = [future for future in done if future.status == "finished"]
+        told = dict(zip(whole, client.gather(whole), strict=True))
+        for future in done:
+            job = job_of.pop(future)
+            row = told.get(future) or _row_of_future(future, job)
+            # The scheduler need not keep what has been told.
+            future.release()
+            if row is None:
+                suspected.append(job)
+            else:
+                yield row
+    for job in suspected:
+        alone = client.submit(work, job, key=(f"stitch-{job.batch}-alone", job.run.name), pure=False)
+        yield _row_of_future(alone, job) or failed_row(job.session, job.run, _WORKERS_DIED)
+
+
+def _row_of_future(future: Any, job: BatchJob) -> SessionRow | None:
+    """Return what a future holds; None where workers died."""
+    try:
+        row: SessionRow = future.result()
+        return row
+    except Exception as error:  # of the cluster: the session's own are in its row
+        match type(error).__name__:
+            case "KilledWorker":
+                return None
+            case "CancelledError" | "FutureCancelledError":
+                return failed_row(job.session, job.run, _SCHEDULER_GONE)
+        return failed_row(job.session, job.run, error)

@@ -1,0 +1,329 @@
+"""What a run computed, as plain frozen data; `writing` puts it on disk."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from stitch.model.model import Model, Term
+from stitch.numerics.frames import Array
+from stitch.observations.surfaces.hand_eye_fit import Repeatability
+from stitch.observations.surfaces.normal_equations import Overlaps
+from stitch.observations.targets.outliers import Outlier
+from stitch.observations.targets.target_model import TargetModelFit
+from stitch.session.measurement import Measurement
+from stitch.session.session import Session
+
+# A doubt of a session as a whole in one clause: what it means and what to do stands elsewhere.
+
+_CLAUSE_END = re.compile(r"[:.] |; to fix: ")
+
+
+def doubt_headline(doubt: str) -> str:
+    """A doubt up to what to do, or to its first colon or full stop outside brackets."""
+    ends = (found.start() for found in _CLAUSE_END.finditer(doubt) if _brackets_closed(doubt[: found.start()]))
+    return f"{doubt[: next(ends, len(doubt.rstrip('.')))]}."
+
+
+def effect_cure(effect: str) -> str:
+    """Return what a doubt says of an effect that would hold what is doubted."""
+    return f"add the effect {effect}"
+
+
+def doubt_remedy(doubt: str) -> str:
+    """Return what a doubt says after its headline; empty where that is all."""
+    more = doubt[len(doubt_headline(doubt)) - 1 :].lstrip(";:. ")
+    return more[:1].upper() + more[1:]
+
+
+def _brackets_closed(text: str) -> bool:
+    return text.count("(") == text.count(")")
+
+
+# By which methods register moves single views, for people.
+METHOD_TITLES = {"dpwvm": "DPWVM-style weighted fit", "gicp": "plane to plane (GICP) inside Tukey's biweight"}
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """One row of the stage table.
+
+    Example:
+        >>> [stage.name for stage in run.stages]
+        ['coarse', 'correct', 'register', 'fuse']
+    """
+
+    name: str  # coarse | correct | register | fuse
+    rms: float  # length_unit
+    correspondences: int
+    iterations: int
+    seconds: float
+    note: str = ""  # one plain sentence for people
+    method: str = ""  # of register, between surfaces: dpwvm | gicp
+
+    @property
+    def remark(self) -> str:
+        """The method in words, and the note."""
+        return "; ".join(text for text in (METHOD_TITLES.get(self.method, self.method), self.note) if text)
+
+
+@dataclass(frozen=True)
+class FusedCloud:
+    """The stitched cloud in the reference frame; lengths in length_unit.
+
+    Example:
+        >>> run.fused.points.shape == run.fused.normals.shape, int(run.fused.count.max())
+        (True, 5)
+    """
+
+    points: Array  # (N, 3)
+    normals: Array  # (N, 3)
+    residual: Array  # (N,) rms distance of the views' surfaces from this one, NaN if one view only
+    count: Array  # (N,) number of views that see the place
+
+
+@dataclass(frozen=True)
+class Unsupported:
+    """How many scanned points are not in the stitched cloud, of how many."""
+
+    points: int = 0
+    alone: int = 0  # on no surface of their own view or of others
+    looked_through: int = 0  # other views look past them
+
+    def __add__(self, other: "Unsupported") -> "Unsupported":
+        alone, through = self.alone + other.alone, self.looked_through + other.looked_through
+        return Unsupported(self.points + other.points, alone, through)
+
+    @property
+    def share(self) -> float:
+        """Of all points."""
+        return (self.alone + self.looked_through) / max(self.points, 1)
+
+
+@dataclass(frozen=True)
+class ExcludedView:
+    """A view that is not fused, and why."""
+
+    view: str
+    why: str
+    pose: Array  # (4, 4) T_reference_scanner of the model, where the robot says it stood
+    points: int = 0  # of its scan
+
+
+@dataclass(frozen=True)
+class ViewLinks:
+    """How the views hold each other, by their names."""
+
+    components: tuple[tuple[str, ...], ...] = ()  # largest first
+    weak: tuple[tuple[str, str], ...] = ()  # (view, its only partner)
+
+
+@dataclass(frozen=True)
+class Note:
+    """What a reviewer remarked on a step."""
+
+    at: str  # ISO 8601
+    by: str  # empty where nobody signed
+    text: str
+
+
+@dataclass(frozen=True)
+class LedgerStep:
+    """One change of the model: a line of ledger.json."""
+
+    effects: tuple[str, ...]
+    residual_rms: float
+    heldout_rms: float
+    noise_floor: float
+    T_mount: Array  # (4, 4)
+    values: dict[str, dict[str, float]] = field(default_factory=dict)  # effect -> parameter -> value
+    notes: tuple[Note, ...] = ()
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What the stages found of one session under its model; lengths in length_unit, angles in rad.
+
+    Example:
+        >>> run.fit.poses.shape, run.fit.corrections.shape
+        ((5, 4, 4), (5, 6))
+    """
+
+    stages: tuple[StageResult, ...]
+    poses_model: Array  # (V, 4, 4) T_reference_scanner of the model (robot, hand-eye, effects)
+    poses: Array  # (V, 4, 4) T_reference_scanner after register
+    view_rms: Array  # (V,) NaN for a view without partners, or without a target that counts
+    fused: FusedCloud
+    repeatability: Repeatability  # of the flange poses, as the overlaps show it
+    verdict: str  # one plain sentence
+    convergence: dict[str, list[float]]  # stage -> rms per iteration
+    corrections: Array  # (V, 6) twists: poses = exp(corrections) @ poses_model, reference frame
+    overlaps: Overlaps | None = None  # correspondences of the model, before register moves single views
+    registered: Overlaps | None = None  # correspondences found anew after register: what scatters there is noise
+    targets: TargetModelFit | None = None  # what the labelled points say, where there are any
+    outliers: tuple[Outlier, ...] = ()  # labelled points that do not count
+    unobservable: tuple[str, ...] = ()  # plain words, one per unobservable direction
+    unknown: tuple[str, ...] = ()  # of x, y, z, rx, ry, rz of the hand-eye: what those directions leave open
+    notes: tuple[str, ...] = ()
+    unsupported: Unsupported = field(default_factory=Unsupported)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One session, its model and its results, as `result.json` and the report show them.
+
+    Of a run that was read from a folder, `fit` is read and matched again when it is first asked for.
+    """
+
+    session: Session  # without the views that were left out
+    measurement: Measurement  # as it counts: without outliers
+    model: Model
+    T_mount_coarse: Array  # (4, 4)
+    gate: float  # largest distance between partners, length_unit; NaN without clouds
+    residual_rms: float
+    heldout_rms: float
+    noise_floor: float
+    source: Fit | Callable[[Any], Fit]  # what the stages found, or what reads it for this run
+    register_method: str = ""  # by which single views were registered; empty without clouds
+    ledger: tuple[LedgerStep, ...] = ()
+    effects_file: str | None = None
+    doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences: they stand before the verdict
+    left_out: tuple[ExcludedView, ...] = ()  # views of the session that are not fused
+    links: ViewLinks = field(default_factory=ViewLinks)
+    tried: dict[str, str] = field(default_factory=dict)  # effects that were fitted and dropped again, and why
+
+    @cached_property
+    def fit(self) -> Fit:
+        """What the stages found.
+
+        Raises:
+            InputError: a file of the run's folder is damaged, or belongs to another model or session.
+        """
+        return self.source if isinstance(self.source, Fit) else self.source(self)
+
+    def with_fit(self, **changes: Any) -> Self:
+        """Return the run with other values of some fields of `fit`.
+
+        Example:
+            >>> run.with_fit(notes=("Scanned twice.",)).notes
+            ('Scanned twice.',)
+        """
+        return replace(self, source=replace(self.fit, **changes))
+
+    @property
+    def heldout_or_fit_rms(self) -> float:
+        """On views left out, length_unit; that of the fit where the history does not know it."""
+        known = self.ledger[-1].heldout_rms if self.ledger else np.nan
+        return known if np.isfinite(known) else self.residual_rms
+
+    @property
+    def T_mount(self) -> Array:
+        """(4, 4) corrected hand-eye."""
+        return self.model.T_mount
+
+    @property
+    def mount_covariance(self) -> Array:
+        """(6, 6) of the right perturbation T·exp(ξ), scanner frame, rotation first."""
+        return self.model.covariance
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """Effects in use."""
+        return self.model.terms
+
+    @property
+    def effects(self) -> list[str]:
+        """Names of the effects in use."""
+        return self.model.effects
+
+    # Fields of `fit`.
+
+    @property
+    def stages(self) -> tuple[StageResult, ...]:
+        """Rows of the stage table: coarse, correct, register, fuse."""
+        return self.fit.stages
+
+    @property
+    def poses_model(self) -> Array:
+        """(V, 4, 4) T_reference_scanner of robot, hand-eye and effects alone, length_unit."""
+        return self.fit.poses_model
+
+    @property
+    def poses(self) -> Array:
+        """(V, 4, 4) T_reference_scanner after register, length_unit."""
+        return self.fit.poses
+
+    @property
+    def corrections(self) -> Array:
+        """(V, 6) twists in the reference frame, poses = exp(corrections)·poses_model; rad and length_unit."""
+        return self.fit.corrections
+
+    @property
+    def view_rms(self) -> Array:
+        """(V,) rms of each view's distances from the others, length_unit; NaN for one without partners."""
+        return self.fit.view_rms
+
+    @property
+    def fused(self) -> FusedCloud:
+        """The stitched cloud as arrays, reference frame, length_unit."""
+        return self.fit.fused
+
+    @property
+    def repeatability(self) -> Repeatability:
+        """Of the flange's poses, as the overlaps show it; rad and length_unit."""
+        return self.fit.repeatability
+
+    @property
+    def overlaps(self) -> Overlaps | None:
+        """Correspondences under the model, before register moves single views; None of labelled points alone."""
+        return self.fit.overlaps
+
+    @property
+    def registered(self) -> Overlaps | None:
+        """Correspondences found anew after register; None of labelled points alone."""
+        return self.fit.registered
+
+    @property
+    def targets(self) -> TargetModelFit | None:
+        """What the labelled points say; None where there are none."""
+        return self.fit.targets
+
+    @property
+    def outliers(self) -> tuple[Outlier, ...]:
+        """Labelled points that do not count."""
+        return self.fit.outliers
+
+    @property
+    def unobservable(self) -> tuple[str, ...]:
+        """Directions of the hand-eye that the views do not show, in plain words."""
+        return self.fit.unobservable
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Of x, y, z, rx, ry, rz of the hand-eye, what those directions leave open."""
+        return self.fit.unknown
+
+    @property
+    def verdict(self) -> str:
+        """One plain sentence."""
+        return self.fit.verdict
+
+    @property
+    def convergence(self) -> dict[str, list[float]]:
+        """Stage to rms of each of its iterations, length_unit."""
+        return self.fit.convergence
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for people."""
+        return self.fit.notes
+
+    def __repr__(self) -> str:
+        unit = self.session.length_unit
+        return (
+            f"Run({self.session.name!r}, {len(self.session.views)} views, residual {self.residual_rms:.4g} {unit}, "
+            f"held-out {self.heldout_rms:.4g} {unit}, {self.model!r})"
+        )

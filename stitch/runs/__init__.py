@@ -1,1 +1,0 @@
-"""What a run found, and who watches it work."""

@@ -1,0 +1,1 @@
+"""Which views count: linkage, data snooping, pairing of rows, conventions of poses."""

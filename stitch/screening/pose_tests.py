@@ -1,0 +1,426 @@
+"""Tests of the poses of views: steps that all views from one on share, single blunders, a factor on lengths."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.least_squares import least_squares
+from stitch.numerics.reml import VarianceFit
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
+from stitch.run_data import effect_cure
+from stitch.screening.hypotheses import scale_text
+from stitch.screening.problems import DisplacementSize, SessionProblem, displacement_text
+from stitch.screening.view_model import (
+    Projector,
+    UsualEffects,
+    ViewModel,
+    displacement_lower_bound,
+    hstack_columns,
+    leave_one_out_test,
+    left_out_test,
+    projector,
+    rotation_shift_lower_bounds,
+    test_alternative,
+)
+
+MovedBody = Literal["part", "scanner"]
+MOVED_BODIES: tuple[MovedBody, MovedBody] = ("part", "scanner")
+# −2 log likelihood of part against scanner at odds of 20 to 1; closer ones these views do not tell apart.
+_DISTINGUISHABLE_DEVIANCE = 2 * np.log(20)
+
+
+@dataclass(frozen=True)
+class PoseStep:
+    """From view `start` on all views share one displacement."""
+
+    start: int
+    moved: MovedBody
+    distinguishable: bool  # the other one of the two is clearly less likely
+    size: DisplacementSize  # of the displacement, of the middle of the part as it is seen
+    at_least: DisplacementSize  # the smallest that is likely: along itself a part slides unseen
+    p_value: float  # all change points counted
+
+    def describe(self, names: Sequence[str], length_unit: str) -> str:
+        """Return a warning with what to do."""
+        before, after = names[self.start - 1], names[self.start]
+        off = displacement_text(self.size, self.at_least, length_unit)
+        by = f"{off} off at the part" if off else "by an amount that these surfaces do not show"
+        other = "scanner" if self.moved == "part" else "part"
+        unsure = "" if self.distinguishable else f" (or the {other}: these views do not show which)"
+        further = f", or {effect_cure('part_slip')}" if self.moved == "part" and self.distinguishable else ""
+        return (
+            f"From view {after} on the {self.moved} sits elsewhere{unsure}, {by}; to fix: make two sessions, one up to "
+            f"{before} and one from {after} on{further}."
+        )
+
+    def columns(self, model: ViewModel) -> Array:
+        """(n, 6) of the displacement."""
+        return step_columns(model, self.start, self.moved)
+
+
+def step_columns(model: ViewModel, start: int, moved: str) -> Array:
+    """(n, 6) of a displacement that views from `start` on have in common."""
+    return np.asarray((model.views if moved == "part" else model.mounts)[start:].sum(axis=0))
+
+
+def likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody, int], tests: int) -> PoseStep:
+    """Return the likelier one of a step of the part and one of the scanner, with its size.
+
+    Args:
+        columns: (n, K) of what else there is.
+        best: the view from which on each of the two would have moved.
+        tests: how many steps were looked at.
+    """
+    own = {moved: hstack_columns(columns, step_columns(model, best[moved], moved)) for moved in MOVED_BODIES}
+    deviance = {moved: model.deviance(own[moved]) for moved in MOVED_BODIES}
+    likelier = min(MOVED_BODIES, key=lambda moved: deviance[moved])
+    told = bool(abs(deviance["part"] - deviance["scanner"]) > _DISTINGUISHABLE_DEVIANCE)
+    start = best[likelier]
+    displaced = step_columns(model, start, likelier)
+    p = test_alternative(projector(model, model.fit(columns), columns), displaced).p_value * tests
+    under = projector(model, model.fit(own[likelier]), columns)
+    tested = test_alternative(under, displaced)
+    carried = model.mount_twists[start:] if likelier == "scanner" else np.eye(6)[None]
+    moved = (carried @ tested.estimate).reshape(-1, 2, 3)
+    sizes = np.linalg.norm(moved, axis=2), [rotation_shift_lower_bounds(tested, under.degrees, own) for own in carried]
+    (turn, shift), (least_turn, least_shift) = (np.median(size, axis=0).tolist() for size in sizes)
+    size, at_least = (turn / model.lever, shift), (least_turn / model.lever, least_shift)
+    return PoseStep(start, likelier, told, size, at_least, p)
+
+
+# Single blunders: generalised extreme Studentised deviate (Rosner 1983, Technometrics 25:165). The most deviant view is
+# let go, the scatter estimated anew, and so on; the number of blunders is the largest count whose last one is
+# significant, so that several cannot hide in the scatter which they inflate. Beside a step, which all views from one on
+# have in common, single ones are sought anew.
+
+# Chance that a session without blunders loses a view.
+FAMILY_WISE = 0.01
+# At most a third of the views can be blunders: beyond, nothing says which are the good ones.
+_MAX_BLUNDER_SHARE = 1 / 3
+# Masking shows within a few steps; a search that has found nothing by then ends.
+_MASKING_DEPTH = 3
+# Fewer degrees of freedom tell no view from the scatter of the others.
+FEWEST_DEGREES = 12
+# The most deviant views, tested under the scatter of the others alone.
+_LEAVE_ONE_OUT_COUNT = 3
+
+
+@dataclass(frozen=True)
+class Blunder:
+    """One view whose pose contradicts the others."""
+
+    view: int
+    p_value: float  # family-wise
+
+
+@dataclass(frozen=True)
+class BlunderSearch:
+    """What the tests say, and the scatter of the poses without the blunders."""
+
+    blunders: tuple[Blunder, ...]
+    fit: VarianceFit
+    mean_columns: Array | None  # (n, K) columns of blunders and steps in the mean
+    null_projector: Projector  # null hypothesis with those columns in it
+
+
+def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequence[PoseStep] = ()) -> BlunderSearch:
+    """Find blunders among the views of a model.
+
+    Args:
+        excluded: views that are known to be off: they stay free and are not counted.
+        steps: what all views from one on have in common.
+    """
+    freed: list[Blunder] = []
+    columns, states = free_view_columns(model, excluded, steps), list[tuple[VarianceFit, Array | None, Projector]]()
+    most = max(int(_MAX_BLUNDER_SHARE * model.count) - len(excluded), 0)
+    significant = 0
+    while True:
+        fit = model.fit(columns)
+        under = projector(model, fit, columns)
+        states.append((fit, columns, under))
+        rest = [v for v in range(model.count) if v not in excluded and v not in [b.view for b in freed]]
+        if len(freed) >= most or len(freed) >= significant + _MASKING_DEPTH or under.degrees < FEWEST_DEGREES:
+            break
+        tests = {v: test_alternative(under, model.views[v]) for v in rest}
+        likely = sorted(rest, key=lambda v: tests[v].rank)[:_LEAVE_ONE_OUT_COUNT]
+        # Either test alone holds its level; together they were seen to stay below it (docs/integrity.md).
+        chance = {v: min(tests[v].p_value, leave_one_out_test(model, columns, v)[1]) for v in likely}
+        worst = min(likely, key=lambda v: chance[v])
+        p = min(1.0, chance[worst] * len(rest))
+        freed.append(Blunder(worst, p))
+        if p < FAMILY_WISE:
+            significant = len(freed)
+        columns = hstack_columns(columns, model.views[worst])
+    fit, columns, under = states[significant]
+    return BlunderSearch(tuple(freed[:significant]), fit, columns, under)
+
+
+def find_unlinked_blunders(
+    model: ViewModel, excluded: Sequence[int], unlinked: Sequence[int], steps: Sequence[PoseStep] = ()
+) -> list[Blunder]:
+    """Return the unlinked views that the scatter of all others does not explain."""
+    out = []
+    for v in unlinked:
+        others = [*excluded, *(w for w in unlinked if w != v)]
+        p = model.count * leave_one_out_test(model, free_view_columns(model, others, steps), v)[1]
+        if p < FAMILY_WISE:
+            out.append(Blunder(v, p))
+    return out
+
+
+def free_view_columns(model: ViewModel, excluded: Sequence[int], steps: Sequence[PoseStep]) -> Array | None:
+    """(n, K) of views that stay free, and of steps."""
+    own = [model.columns(excluded), *(step.columns(model) for step in steps)]
+    return hstack_columns(*own) if len(excluded) or steps else None
+
+
+# Steps: under one hand-eye for all views every change point in the order of time is tested, for the part and for the
+# scanner, as a displacement that all views from there on share: Baarda's test as for single views, an F since the
+# scatter comes from the same data, times the number of tests (Bonferroni). What drifts, warms up, remembers or follows
+# the pose is no step, so the scatter holds all by which poses of a good session may err, in sizes that they show.
+
+# That a session without a step shows one. What an arm does wrong where its poses change their kind is a step to a list
+# without joint angles: at nine equal poses three of four measured objects show the same one, at p of 0.006 to 0.06.
+STEP_CHANCE = 1e-4
+# Views from which on all by which poses may err takes minutes to hold against a step.
+MAX_VIEWS_WITH_EFFECTS = 100
+
+# Fewer views at an end than this are blunders of their own; more changes than this are no steps but a drift.
+_MIN_VIEWS_AT_END, _MAX_STEPS = 2, 3
+# Fewer views than this show no step beside their scatter.
+_MIN_VIEWS_FOR_STEP = 6
+# Less of its columns than this outside the mean is rounding.
+_NEW_COLUMN_SHARE = 1e-6
+
+
+def find_steps(
+    model: ViewModel, first: Array | None, singles: tuple[Array | None, int], chance: float
+) -> tuple[PoseStep, ...]:
+    """Change points in the order of time, beside single views that are off.
+
+    Args:
+        model: with all that may happen without a step.
+        first: (n, K) columns of views that are known to be off.
+        singles: columns (n, K) of these and all single blunders, and how many there are: they may explain as much.
+        chance: that a session without a step shows one.
+    """
+    found, columns = _search_steps(model, first, chance)
+    if singles[1]:
+        beside_them, every = _search_steps(model, singles[0], chance)
+        if not found or _akaike_criterion(model, every) < _akaike_criterion(model, columns):
+            found = beside_them
+    return tuple(sorted(found, key=lambda s: s.start))
+
+
+@dataclass(frozen=True)
+class _Pick:
+    """What explains most beside what was picked before: a step, or a single view that is off."""
+
+    columns: Array  # (n, 6)
+    p_value: float
+    tests: int  # of which it is the likeliest
+    starts: dict[MovedBody, int] | None = None  # where the step of each begins; None: a single view
+
+
+def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple[list[PoseStep], Array | None]:
+    """Find steps on top of columns that are in the mean already; return all columns with them and with single views.
+
+    As with single views (Rosner 1983) the search goes on beside what does not stand out yet: what is moved there and
+    back are two steps, and each hides in the scatter that the other makes, as a step does beside one view far off.
+    """
+
+    def with_columns_of(some: Sequence[_Pick]) -> Array | None:
+        return hstack_columns(first, *(pick.columns for pick in some)) if some else first
+
+    picked, significant = list[_Pick](), 0
+    while model.count >= _MIN_VIEWS_FOR_STEP and len(picked) < significant + _MAX_STEPS:
+        taken = [pick.starts for pick in picked if pick.starts is not None]
+        pick = _next_pick(model, with_columns_of(picked), taken) if len(taken) < _MAX_STEPS else None
+        if pick is None:
+            break
+        p = pick.p_value
+        if len(picked) > significant:
+            # Each of the last two may hide in the scatter that the other makes, and then neither stands out alone.
+            columns, last = with_columns_of(picked[:-1]), picked[-1]
+            under = projector(model, model.fit(columns), columns)
+            both = test_alternative(under, hstack_columns(last.columns, pick.columns))
+            p = min(p, both.p_value * last.tests * pick.tests)
+        picked.append(pick)
+        significant = len(picked) if p < chance else significant
+    picked = picked[:significant]
+    steps = [
+        likelier_step(model, with_columns_of([other for other in picked if other is not pick]), pick.starts, pick.tests)
+        for pick in picked
+        if pick.starts is not None
+    ]
+    # What was picked early may stand out no more beside the rest.
+    return [step for step in steps if step.p_value < chance], with_columns_of(picked)
+
+
+def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[MovedBody, int]]) -> _Pick | None:
+    """Return the likeliest step, or single view that is off, beside some columns; None where these leave no view."""
+    under, mean = projector(model, model.fit(columns), columns), model.mixed(columns).A[0]
+    # What the orthonormal columns of the mean hold of a view says nothing more.
+    free = [
+        v
+        for v, own in enumerate(model.views)
+        if np.linalg.norm(own - mean @ (mean.T @ own)) >= _NEW_COLUMN_SHARE * np.linalg.norm(own)
+    ]
+    if not free:
+        return None
+    every = range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
+    starts = [k for k in every if k not in [k for own in taken for k in own.values()]]
+    tests = {
+        (moved, k): test_alternative(under, step_columns(model, k, moved)) for moved in MOVED_BODIES for k in starts
+    }
+    alone = {v: test_alternative(under, model.views[v]) for v in free}
+    view, likelier = min(alone, key=lambda v: alone[v].rank), min(tests, key=lambda at: tests[at].rank, default=None)
+    # Of few views every start of a step may be taken.
+    if likelier is None or alone[view].rank < tests[likelier].rank:
+        return _Pick(model.views[view], alone[view].p_value * model.count, model.count)
+    best = {moved: max(starts, key=lambda k: tests[moved, k].statistic) for moved in MOVED_BODIES}
+    moved, start = likelier
+    count = len(MOVED_BODIES) * len(every) * _MAX_STEPS
+    return _Pick(step_columns(model, start, moved), tests[likelier].p_value * count, count, best)
+
+
+def _akaike_criterion(model: ViewModel, columns: Array | None) -> float:
+    """Return Akaike's for few numbers (Hurvich and Tsai 1989): half of the views, let go, would leave no scatter."""
+    count = len(model.z)
+    taken = model.hand_eye.shape[1] + (0 if columns is None else columns.shape[1])
+    return model.deviance(columns) + 2 * taken * count / (count - taken - 1) if count > taken + 1 else np.inf
+
+
+@dataclass(frozen=True)
+class PoseTests:
+    """What the poses of the views say by themselves."""
+
+    unplaced: list[int]
+    displaced: list[Blunder]  # stand off whatever the others scatter
+    blunder_search: BlunderSearch  # the rest of them, under the scatter of the others
+    steps: tuple[PoseStep, ...]
+    # Displaced views that effects of the arm do not explain in sizes that the others show.
+    sure: set[int] = field(default_factory=set)
+
+    @property
+    def excluded(self) -> list[int]:
+        """Views that take no part in the tests of the others."""
+        return [*self.unplaced, *(b.view for b in self.displaced)]
+
+    @property
+    def standing_off(self) -> list[int]:
+        """These, and single blunders under the scatter of the others."""
+        return [*self.excluded, *(b.view for b in self.blunder_search.blunders)]
+
+
+def pose_tests(
+    model: ViewModel,
+    unconstrained: UnconstrainedPoses,
+    unlinked: tuple[list[int], list[int]],
+    usual: UsualEffects | None,
+    chance: float = STEP_CHANCE,
+) -> PoseTests:
+    """Find single views that are off and steps; where there is a step, single views once more beside it.
+
+    Args:
+        unlinked: views that nothing holds, and those that were placed by their surfaces.
+        usual: what may happen to views beside white scatter; in many views it takes minutes to test a step against it.
+        chance: that a session without a step shows one.
+    """
+    unplaced, placed = unlinked
+    off = find_unlinked_blunders(model, unplaced, placed)
+    found = find_blunders(model, [*unplaced, *(b.view for b in off)])
+    few = usual is not None and model.count < MAX_VIEWS_WITH_EFFECTS
+    erring = model.with_errors(usual.errors(unconstrained)) if usual is not None and few else model
+    steps = find_steps(erring, model.columns(unplaced), (found.mean_columns, len(off) + len(found.blunders)), chance)
+    if steps:
+        # A view at the step may stand for one of its sides.
+        off = find_unlinked_blunders(model, unplaced, placed, steps)
+        found = find_blunders(model, [*unplaced, *(b.view for b in off)], steps)
+    sure = find_unlinked_blunders(erring, unplaced, [b.view for b in off], steps)
+    return PoseTests(unplaced, off, found, steps, {b.view for b in sure})
+
+
+def expected_poses(model: ViewModel, model_poses: Array, unconstrained: UnconstrainedPoses, tests: PoseTests) -> Array:
+    """Return where views are expected: hand-eye and steps estimated together, without the views that stand off.
+
+    Across a step the hand-eye alone is a compromise, and every view stands off from it by its share of the step.
+
+    Args:
+        model_poses: (V, 4, 4) T_reference_scanner from which the evidence is counted.
+        unconstrained: the views from there where surfaces put them.
+
+    Returns:
+        (V, 4, 4) T_reference_scanner.
+    """
+    alone = tests.standing_off
+    moved = [_step_displacement(model, tests, alone, k) for k in range(len(tests.steps))]
+    z = model.z - sum(step.columns(model) @ by for step, by in zip(tests.steps, moved, strict=True))
+    X = hstack_columns(model.hand_eye, model.columns(alone))
+    CX = np.linalg.solve(model.mixed().covariance(tests.blunder_search.fit.variances)[0], X)
+    twists = model.mount_twists @ least_squares(X.T @ CX, -CX.T @ z)[:6]
+    for step, by in zip(tests.steps, moved, strict=True):
+        own = model.mount_twists[step.start :] if step.moved == "scanner" else np.eye(6)[None]
+        twists[step.start :] += own @ by
+    twists[:, :3] /= model.lever
+    # Surfaces do not say where all views together stand.
+    twists += np.mean(np.delete(unconstrained.twists - twists, alone, axis=0), axis=0)
+    return frames.moved_about(model.centre, twists, model_poses)
+
+
+def _step_displacement(model: ViewModel, tests: PoseTests, excluded: list[int], k: int) -> Array:
+    """(6,) the least that step k may have moved, rotations in 1/lever: along itself a part slides unseen."""
+    others = free_view_columns(model, excluded, (*tests.steps[:k], *tests.steps[k + 1 :]))
+    under = projector(model, tests.blunder_search.fit, others)
+    return displacement_lower_bound(test_alternative(under, tests.steps[k].columns(model)), under.degrees)
+
+
+def least_displacement(
+    model: ViewModel, found: BlunderSearch, others: list[int], steps: tuple[PoseStep, ...], view: int, middle: Array
+) -> DisplacementSize:
+    """Return the smallest displacement of a view's middle that its evidence admits.
+
+    Args:
+        found: the scatter of the poses.
+        others: views that are off beside this one: they stay free.
+        middle: (3,) of the view's points, reference frame.
+    """
+    under = projector(model, found.fit, free_view_columns(model, others, steps))
+    carried = np.eye(6)
+    carried[3:, :3] = -frames.skew(middle - model.centre) / model.lever
+    tested = test_alternative(under, model.held_responses[view])
+    turn, shift = rotation_shift_lower_bounds(tested, under.degrees, carried)
+    return turn / model.lever, shift
+
+
+# No scanner in use is off by this share of its lengths, and no arm.
+_SCALE = 0.01
+# Chance of a factor by which a session is refused, and of one that is named where it is refused anyway.
+_LENGTH_CHANCE, _LIKELY_LENGTH = 1e-4, 0.01
+
+
+def length_problem(
+    model: ViewModel, T_reference_mount: Array, further: Array | None = None, likely: bool = False
+) -> SessionProblem | None:
+    """Test the robot's lengths as one factor on all its translations; None if they agree with the scans'.
+
+    Under a wrong one the part would come out whole but of the wrong size, and fit itself.
+
+    Args:
+        further: (n, K) columns of what was found beside: a factor must not explain what single views do.
+        T_reference_mount: (V, 4, 4), length_unit: a factor 1 + κ on them is a left twist (0, κ t) of every view.
+        likely: the poses contradict the scans, and what is asked for is why.
+    """
+    column = np.einsum("vni,vi->n", model.views[:, :, 3:], T_reference_mount[:, :3, 3])[:, None]
+    if further is not None and model.deviance(column) + 2 < model.deviance(further) + 2 * further.shape[1]:
+        # One number says as much as the six of every view (Akaike 1974): of few views one takes the factor upon itself.
+        further = None
+    found, p = left_out_test(model, further, column, column)
+    share = float(found.estimate[0])
+    if abs(share) < _SCALE or p > (_LIKELY_LENGTH if likely else _LENGTH_CHANCE):
+        return None
+    return SessionProblem("scale", (), scale_text(1 + share, float(found.normal[0, 0]) ** -0.5))

@@ -1,0 +1,320 @@
+"""Which views do not belong: detection, identification, adaptation (Teunissen 2018, J. Geodesy 92:59).
+
+Overlaps say which views are linked; a view that is not is tried wide, against the surface of the linked ones. Where it
+closes, its pose is wrong and it is known by how much; where it closes nowhere, it is no scan of this part. With every
+view in its place, each one's own displacement is tested under the scatter of the others.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
+from stitch.screening.placement import (
+    STILL_CONTRADICTS,
+    Linkage,
+    Placement,
+    evaluate_placement,
+    find_contradicting_views,
+    lies_in_a_line,
+    linkage,
+    needed_closure,
+    place_scan,
+    place_unlinked_views,
+    surface_of,
+)
+from stitch.screening.pose_tests import (
+    BlunderSearch,
+    PoseStep,
+    PoseTests,
+    expected_poses,
+    find_blunders,
+    least_displacement,
+    pose_tests,
+)
+from stitch.screening.view_model import UsualEffects, ViewModel, view_model
+from stitch.session.capture import Capture, part_size
+
+# Chance at which a step is tried: whether it stands out among the few views that are linked or not, that it links more
+# of them is the proof.
+_ANY_CHANCE = 1.0
+
+
+def place_across_steps(
+    capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, usual: UsualEffects | None
+) -> tuple[Array, UnconstrainedPoses]:
+    """Return where views are expected, and where overlaps put them: beside a step, if that links more of them.
+
+    A step pulls the hand-eye, and the side of it that has fewer views stands farther from the others than two scans can
+    share. Tried wide, such a view would close somewhere on a part that looks alike from several sides, and would be
+    called displaced; one step explains more than that, and views are tried from where it puts them first.
+
+    Args:
+        T_mount: (4, 4) hand-eye of the model poses from which `unconstrained` is seen.
+
+    Returns:
+        (V, 4, 4) T_reference_scanner, those of the model without a step; and the views freed, seen from these.
+    """
+    model_poses, apart = capture.poses(T_mount), list(linkage(unconstrained.overlaps).unlinked)
+    if not apart:
+        return model_poses, unconstrained
+    model = view_model(capture, T_mount, unconstrained)
+    tests = pose_tests(model, unconstrained, (apart, []), usual, _ANY_CHANCE)
+    if not tests.steps:
+        return model_poses, unconstrained
+    expected = expected_poses(model, model_poses, unconstrained, tests)
+    poses = np.array(unconstrained.poses)
+    poses[apart] = expected[apart]
+    tried = [unconstrained_poses(capture, start, unconstrained.overlaps.gate) for start in (expected, poses)]
+    best = min((unconstrained, *tried), key=lambda found: len(linkage(found.overlaps).unlinked))
+    return (model_poses, unconstrained) if best is unconstrained else (expected, best.relative_to(expected))
+
+
+def place_together(
+    capture: Capture,
+    model_poses: Array,
+    unconstrained: UnconstrainedPoses,
+    placed: Mapping[int, Placement],
+    *,
+    unlinked: Collection[int],
+    tolerance: float,
+) -> UnconstrainedPoses | None:
+    """Free unlinked views at one end of the list from where one of them was found, all displaced as it was.
+
+    After a knock of the scanner, or a part clamped anew, each of them alone may overlap too little with the others to
+    be placed, and would be taken for a scan of another part.
+
+    Args:
+        model_poses: (V, 4, 4) T_reference_scanner by the robot.
+        unconstrained: the views where overlaps alone put them.
+        placed: where some of the unlinked views belong.
+        tolerance: distance that is the same place, length_unit.
+
+    Returns:
+        The freed views, if that links them all and none contradicts; None if no common displacement does.
+    """
+    for views in end_runs(unlinked, len(model_poses)):
+        for v in sorted(set(views) & set(placed), key=lambda v: -placed[v].closure):
+            T, back = placed[v].T, frames.inverse(model_poses[v])
+            for moved in (model_poses @ back @ T, T @ back @ model_poses):
+                poses = np.array(unconstrained.poses)
+                poses[views] = moved[views]
+                tried = unconstrained_poses(capture, poses, unconstrained.overlaps.gate).relative_to(model_poses)
+                apart = linkage(tried.overlaps).unlinked
+                if not (apart or find_contradicting_views(capture.scans, tried.poses, tolerance, part_size([capture]))):
+                    return tried
+    return None
+
+
+def end_runs(views: Collection[int], count: int) -> list[range]:
+    """Return the unbroken runs of some views at the end and at the beginning of a list of so many."""
+    rest = [v for v in range(count) if v not in views]
+    return [range(rest[-1] + 1, count), range(rest[0])] if rest else []
+
+
+# On the surface of the others: four robust sigmas of the overlaps.
+_TOLERANCE_SIGMAS = 4.0
+
+
+@dataclass(frozen=True)
+class PlacedViews:
+    """Views where their surfaces put them."""
+
+    unconstrained: UnconstrainedPoses  # with the views where they belong
+    linkage: Linkage  # at the poses that overlaps alone give, from the model's
+    placed: dict[int, Placement]  # views that nothing linked, and where they belong
+    unplaced: list[int]  # views that belong nowhere
+    several: set[int]  # of these, views that close at several places alike
+    torn: tuple[int, ...]  # views that contradict the others, and still do where they belong
+    lines: list[int]  # views whose points lie in a line
+    tolerance: float  # distance from the surface of the others that still lies on it, length_unit
+    needed: float  # closure at which a scan counts as placed
+
+    @property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Views that surfaces link, with all in their places."""
+        silent = {*self.lines, *(v for v in self.torn if v in self.unplaced)}
+        return linkage(self.unconstrained.overlaps, silent).components
+
+
+def place_views(capture: Capture, model_poses: Array, unconstrained: UnconstrainedPoses) -> PlacedViews:
+    """Find where views belong by their surfaces: those that nothing links are tried wide.
+
+    Args:
+        model_poses: (V, 4, 4) T_reference_scanner by the robot.
+        unconstrained: the views freed from there.
+    """
+    lines = [v for v, scan in enumerate(capture.scans) if lies_in_a_line(scan)]
+    tolerance, size = _TOLERANCE_SIGMAS * unconstrained.overlaps.gram.scale, part_size([capture])
+    groups = linkage(unconstrained.overlaps, lines).components
+    torn = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, groups=groups)
+    linked = linkage(unconstrained.overlaps, {*lines, *torn})
+    needed = needed_closure(capture, unconstrained.poses, linked, tolerance)
+    placed, unplaced, several = place_unlinked_views(capture, model_poses, unconstrained, linked, (tolerance, needed))
+    apart = linked.unlinked
+    if placed and len(apart) > 1:
+        # One displacement of all explains more than one of each, which may have closed in a wrong place.
+        together = place_together(capture, model_poses, unconstrained, placed, unlinked=apart, tolerance=tolerance)
+        if together is not None:
+            unconstrained, linked, torn = together, linkage(together.overlaps, lines), ()
+            placed, unplaced, several = {}, [], set()
+    if placed:
+        poses = np.array(unconstrained.poses)
+        for v, placement in placed.items():
+            poses[v] = placement.T
+        unconstrained = unconstrained_poses(capture, poses, unconstrained.overlaps.gate).relative_to(model_poses)
+        if torn:
+            still = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, STILL_CONTRADICTS)
+            torn = tuple(v for v in still if v in torn)
+    return PlacedViews(
+        unconstrained, linked, placed, unplaced, several, torn, lines=lines, tolerance=tolerance, needed=needed
+    )
+
+
+@dataclass(frozen=True)
+class MisplacedView:
+    """A view that does not belong where its pose puts it."""
+
+    view: int
+    # displaced | foreign | several: it closes at several places alike | torn: in itself, so that it contradicts the
+    # others wherever it is put
+    kind: str
+    rotation: float  # rad; NaN for a foreign scan
+    distance: float  # length_unit, of the middle of its points; NaN for a foreign scan
+    p_value: float  # family-wise, 0 where it is not even linked
+    T: Array | None  # (4, 4) T_reference_scanner where the surface puts it
+    at_least: tuple[float, float] = (0.0, 0.0)  # rotation and distance of the smallest displacement that is likely
+
+
+@dataclass(frozen=True)
+class Snooping:
+    """What linkage and tests say about the views of one capture."""
+
+    linkage: Linkage  # at the poses that overlaps alone give, from the model's
+    misplaced: tuple[MisplacedView, ...]
+    suspected: tuple[MisplacedView, ...]  # stand out, but usual effects of the arm would do that too
+    steps: tuple[PoseStep, ...]  # from some view on the part or the scanner sits elsewhere
+    disconnected: tuple[tuple[int, ...], ...]  # groups of views that no surface links, if there is more than one
+    model: ViewModel
+    blunder_search: BlunderSearch
+    unconstrained: UnconstrainedPoses  # with the views where they belong
+    expected: Array  # (V, 4, 4) T_reference_scanner by the robot, steps with it
+    tolerance: float  # distance from the surface of the others that still lies on it, length_unit
+    needed: float  # closure at which a scan counts as placed
+
+    @property
+    def left_out(self) -> tuple[int, ...]:
+        """Views that are not to be fused: they do not belong, or not between the same steps as most are."""
+        return tuple(sorted(self.not_belonging | (set(range(self.linkage.views)) - set(self.largest_segment))))
+
+    @property
+    def largest_segment(self) -> range:
+        """The views between the same two steps, or ends, as most are."""
+        ends = [0, *(step.start for step in self.steps), self.linkage.views]
+        return max((range(a, b) for a, b in pairwise(ends)), key=len)
+
+    @property
+    def not_belonging(self) -> set[int]:
+        """Views that are misplaced or not linked."""
+        return {m.view for m in self.misplaced} | {v for group in self.disconnected[1:] for v in group}
+
+    @property
+    def rotation(self) -> float:
+        """Scatter of the flange poses without the blunders, rad."""
+        return float(np.sqrt(self.blunder_search.fit.variances[0]))
+
+    @property
+    def translation(self) -> float:
+        """The same of translations, length_unit."""
+        return float(np.sqrt(self.blunder_search.fit.variances[1]))
+
+
+def snoop_views(
+    capture: Capture,
+    T_mount: Array,
+    gate: float,
+    unconstrained: UnconstrainedPoses | None = None,
+    usual: UsualEffects | None = None,
+) -> Snooping:
+    """Examine the views of a capture under a hand-eye.
+
+    Args:
+        T_mount: (4, 4) corrected hand-eye.
+        gate: distance between partners at which the correction ended, length_unit.
+        unconstrained: the views freed from there, if that is at hand.
+        usual: what may happen to views beside white scatter; asked only where one stands out, or all from one on.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    model_poses = capture.poses(T_mount)
+    unconstrained = (
+        unconstrained_poses(capture, model_poses, gate)
+        if unconstrained is None
+        else unconstrained.relative_to(model_poses)
+    )
+    located = place_views(capture, *place_across_steps(capture, T_mount, unconstrained, usual))
+    located = replace(located, unconstrained=located.unconstrained.relative_to(model_poses))
+    model = view_model(capture, T_mount, located.unconstrained)
+    tests = pose_tests(model, located.unconstrained, (located.unplaced, list(located.placed)), usual)
+    expected = expected_poses(model, model_poses, located.unconstrained, tests) if tests.steps else model_poses
+    standing_out = _displaced_views(capture, model, expected, located, tests)
+    # A torn scan of which one half is in its place, or that common targets hold there, is not displaced as a whole.
+    torn = {v for v in located.torn if v not in located.unplaced}
+    sure = {m.view for m in standing_out}
+    if sure and usual is not None:
+        # Those that stand out beside what usually happens to all of them too.
+        again = find_blunders(model.with_usual(usual.twists(located.unconstrained)), tests.excluded, tests.steps)
+        sure &= {b.view for b in again.blunders} | tests.sure | torn
+    groups = located.groups
+    foreign = [
+        MisplacedView(v, "several" if v in located.several else "foreign", np.nan, np.nan, 0.0, None)
+        for v in located.unplaced
+        if (v,) in groups
+    ]
+    misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in sure]
+    return Snooping(
+        linkage=located.linkage,
+        misplaced=tuple(sorted([*misplaced, *foreign], key=lambda m: m.view)),
+        suspected=tuple(m for m in standing_out if m.view not in sure),
+        steps=tests.steps,
+        disconnected=tuple(g for g in groups if not set(g) <= {m.view for m in foreign}),
+        model=model,
+        blunder_search=tests.blunder_search,
+        unconstrained=located.unconstrained,
+        expected=expected,
+        tolerance=located.tolerance,
+        needed=located.needed,
+    )
+
+
+def _displaced_views(
+    capture: Capture, model: ViewModel, expected: Array, placed: PlacedViews, tests: PoseTests
+) -> list[MisplacedView]:
+    """Return views that stand off and torn ones, with where the surface of the others puts them."""
+    freed, search = placed.unconstrained, tests.blunder_search
+    off = sorted((*tests.displaced, *search.blunders), key=lambda b: b.view)
+    found = [(b.view, b.p_value, _refine_pose(capture, freed, b.view, placed.tolerance)) for b in off]
+    known = {b.view for b in off} | set(placed.unplaced)
+    out = []
+    for v, p, T in (*found, *((v, 0.0, freed.poses[v]) for v in placed.torn if v not in known)):
+        middle = capture.scans[v].points.mean(axis=0)[None]
+        there = frames.transform(freed.poses[v], middle)[0]
+        least = least_displacement(model, search, [w for w in tests.standing_off if w != v], tests.steps, v, there)
+        turn = float(frames.angle_between(expected[v], T))
+        shift = float(np.linalg.norm(frames.transform(T, middle) - frames.transform(expected[v], middle)))
+        out.append(MisplacedView(v, "displaced", turn, shift, p, T, least))
+    return out
+
+
+def _refine_pose(capture: Capture, unconstrained: UnconstrainedPoses, view: int, tolerance: float) -> Array:
+    """(4, 4) where the surface of the other views puts one: robust weights of all pairs hold it back."""
+    scan, T = capture.scans[view], unconstrained.poses[view]
+    others = [v for v in range(len(capture.scans)) if v != view]
+    surface = surface_of(capture.scans, unconstrained.poses, others, tolerance)
+    best = place_scan(scan, surface, T[None], part_size([capture]))[0]
+    return best.T if best.closure > evaluate_placement(scan, T, surface).closure else T

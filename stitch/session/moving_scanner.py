@@ -1,0 +1,105 @@
+"""Scans of a scanner that moves while it scans, as they would be from where each view stood (de-skew)."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.odometry import hand_eye_of_stream, is_stream
+from stitch.session.session import Session
+
+# Fewer views say nothing of how the robot moved between them.
+_FEWEST = 4
+
+
+def stand_still(session: Session) -> Session:
+    """Return the session with every point moved to where it would lie had the scanner stood at the pose of its view.
+
+    The robot's path runs smoothly through the poses of the views. The hand-eye that carries it over to the scanner
+    is that of the scans' own odometry where they are a stream, else the stated one.
+
+    Raises:
+        InputError: a view without time, or a cloud whose points have none; or no hand-eye at all.
+    """
+    where = session.path / "session.toml"
+    times = [view.time_s for view in session.views]
+    if None in times or len(times) < _FEWEST or np.any(np.diff(np.array(times, float)) <= 0):
+        raise InputError(
+            f"{where}: scanner.moving needs at least {_FEWEST} views with rising time_s; to fix: add the column to "
+            "views.csv, in the order of the scans"
+        )
+    for view in session.views:
+        if view.cloud is None or "time" not in view.cloud.scalars:
+            raise InputError(
+                f"{where}: scanner.moving, and the cloud of view {view.name} has no time of its points; to fix: write "
+                "the column time, s after time_s, or drop scanner.moving"
+            )
+    path = _RobotPath(np.array(times, float), mount_poses(session))
+    T_mount = stream_hand_eye(session)
+    if T_mount is None:
+        T_mount = session.scanner.T_mount
+    if T_mount is None:
+        raise InputError(
+            f"{where}: the scans show no hand-eye that says how the scanner moved; to fix: give scanner.pose"
+        )
+    views = []
+    for v, view in enumerate(session.views):
+        assert view.cloud is not None
+        points = _seen_from_view(view.cloud.points, view.cloud.scalars["time"], path, path.times[v], T_mount)
+        views.append(replace(view, cloud=replace(view.cloud, points=points, normals=None, whole=None)))
+    return replace(session, views=tuple(views))
+
+
+def mount_poses(session: Session) -> Array:
+    """Return T_reference_mount (V, 4, 4): the flange in the base frame, or for a scanner that stands the inverse."""
+    T = np.array([view.T_base_flange for view in session.views])
+    return T if session.mount == "eye_in_hand" else frames.inverse(T)
+
+
+def stream_hand_eye(session: Session) -> Array | None:
+    """Return T_mount (4, 4) of A·X = X·B over the odometry of a stream; None where the scans are none."""
+    clouds = [view.cloud for view in session.views if view.cloud is not None]
+    scans, T_reference_mount = [cloud.points for cloud in clouds], mount_poses(session)
+    if not is_stream(T_reference_mount, scans):
+        return None
+    times = [cloud.scalars["time"] for cloud in clouds] if session.scanner.moving else None
+    seconds = [view.time_s for view in session.views if view.time_s is not None]
+    interval = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    starts = [None] if session.scanner.T_mount is None else [session.scanner.T_mount, None]
+    for T_mount in starts:
+        found, _ = hand_eye_of_stream(T_reference_mount, scans, times, interval, T_mount)
+        if found is not None:
+            return found
+    return None
+
+
+class _RobotPath:
+    """T_reference_mount between the views: splines through their poses."""
+
+    def __init__(self, times: Array, T_reference_mount: Array) -> None:
+        self.times = times
+        # Few sessions have a scanner that moves: the others do not wait for it.
+        from scipy.interpolate import CubicSpline
+        from scipy.spatial.transform import Rotation, RotationSpline
+
+        self._place, self._by_vector = CubicSpline(times, T_reference_mount[:, :3, 3]), Rotation.from_rotvec
+        self._turn = RotationSpline(times, Rotation.from_matrix(T_reference_mount[:, :3, :3]))
+
+    def at(self, times: Array) -> Array:
+        """(K, 4, 4) at times (K,), which may lie a little before the first view or after the last."""
+        within = np.clip(times, self.times[0], self.times[-1])
+        T = np.tile(np.eye(4), (len(times), 1, 1))
+        rate, late = self._turn(within, 1), times - within
+        T[:, :3, :3] = (self._turn(within) * self._by_vector(rate * late[:, None])).as_matrix()
+        T[:, :3, 3] = self._place(within) + self._place(within, 1) * late[:, None]
+        return T
+
+
+def _seen_from_view(points: Array, times: Array, path: _RobotPath, of_view: float, T_mount: Array) -> Array:
+    """Return points (N, 3), each seen at its time, in the scanner's frame at the time of the view."""
+    moments, index = np.unique(times, return_inverse=True)
+    T_reference_scanner = path.at(of_view + moments) @ T_mount
+    T = (frames.inverse(path.at(np.array([of_view]))[0] @ T_mount) @ T_reference_scanner)[index]
+    return np.asarray(np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3])

@@ -1,0 +1,392 @@
+"""Robots from URDF. URDF counts in metres and radians (http://wiki.ros.org/urdf/XML)."""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import METRES
+from stitch.session.reading.text_files import require_file, shortened
+from stitch.session.robot import LinkMesh, Robot, elementary
+
+# DH rows, payload and gravity of the [robot] table, checked: a wrong number would move the arm without a word.
+
+# No length, angle or mass of an arm is larger in any unit; beyond, squares overflow.
+LARGEST = 1e12
+_DH_KEYS = ("a", "alpha_deg", "d", "theta_deg", "mass", "com")
+
+
+def robot_from_dh(
+    name: str,
+    convention: str,
+    joints: Sequence[dict[str, Any]],
+    payload: dict[str, Any] | None,
+    gravity: Array,
+    length_unit: str,
+) -> Robot:
+    """A robot from DH rows with keys a, alpha_deg, d, theta_deg, mass, com (missing ones are 0).
+
+    Raises:
+        InputError: unknown convention or key, no row, or a value that is not a finite number.
+    """
+    if not isinstance(joints, list) or not joints:
+        raise InputError("robot.joints is no list of rows; write one DH row a joint")
+    rows = [(f"robot.joints, joint {i + 1}", row) for i, row in enumerate(joints)]
+    for where, row in rows:
+        require_known_keys(where, row, _DH_KEYS)
+    a, alpha, d, theta = (
+        np.array([float(table_numbers(where, row, key, ())) for where, row in rows])
+        for key in ("a", "alpha_deg", "d", "theta_deg")
+    )
+    alpha, theta = np.radians(alpha), np.radians(theta)
+    before, after = _joint_transforms(convention, a, alpha, d)
+    masses = [point_mass(where, row) for where, row in rows]
+    payload_mass, payload_com = payload_of(payload)
+    return Robot(
+        name=name,
+        convention=convention,
+        before=before,
+        after=after,
+        theta=theta,
+        mass=np.array([m for m, _ in masses]),
+        com=np.array([c for _, c in masses]),
+        payload_mass=payload_mass,
+        payload_com=payload_com,
+        gravity=gravity_of(gravity),
+        metres_per_unit=METRES[length_unit],
+        a=a,
+        alpha=alpha,
+        d=d,
+    )
+
+
+def _joint_transforms(convention: str, a: Array, alpha: Array, d: Array) -> tuple[Array, Array]:
+    """(n, 4, 4) each: what stands before and behind the turn of every joint."""
+    if convention == "standard":
+        return np.broadcast_to(np.eye(4), (len(a), 4, 4)), elementary("z", 0, d) @ elementary("x", alpha, a)
+    if convention == "modified":
+        return elementary("x", alpha, a), elementary("z", 0, d)
+    raise InputError(f'robot.dh is {convention!r}; use "standard" or "modified"')
+
+
+def payload_of(payload: dict[str, Any] | None) -> tuple[float, Array]:
+    """Mass (kg) and centre of mass (3,) in the flange frame of [robot] payload; both 0 without one."""
+    if payload is None:
+        return 0.0, np.zeros(3)
+    require_known_keys("robot.payload", payload, ("mass", "com"))
+    return point_mass("robot.payload", payload)
+
+
+def gravity_of(gravity: Array) -> Array:
+    """Gravity (3,) in m/s² in the base frame, checked."""
+    return table_numbers("robot", {"gravity": gravity}, "gravity", (3,))
+
+
+def point_mass(where: str, table: dict[str, Any]) -> tuple[float, Array]:
+    """mass (kg, not negative) and com (3,) of a table; 0 where absent."""
+    mass = float(table_numbers(where, table, "mass", ()))
+    if mass < 0:
+        raise InputError(f"{where}: mass is {mass:g} kg; use a positive number")
+    return mass, table_numbers(where, table, "com", (3,))
+
+
+def require_known_keys(where: str, table: Any, known: tuple[str, ...]) -> None:
+    """Refuse other keys: a misspelt alpha_deg would silently count as 0, and the arm be another one."""
+    if not isinstance(table, dict):
+        raise InputError(
+            f"{where}: {shortened(table)} is not a table; write {{ {', '.join(k + ' = …' for k in known)} }}"
+        )
+    for key in table:
+        if key not in known:
+            close = get_close_matches(str(key), known, 1)
+            hint = f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
+            raise InputError(f"{where}: unknown key {shortened(key)}; {hint}")
+
+
+def table_numbers(where: str, table: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
+    """The finite number, shape (), or triple, shape (3,), at `key`; 0 where absent."""
+    try:
+        value = np.array(table.get(key, np.zeros(shape)), float)
+    except (TypeError, ValueError, OverflowError):
+        value = np.full(shape, np.nan)
+    if value.shape != shape or not (np.abs(value) < LARGEST).all():
+        kind = "three finite numbers" if shape else "a finite number"
+        raise InputError(f"{where}: {key} is {shortened(table[key])}; use {kind}")
+    return value
+
+
+# Elements of a URDF: numbers, origins, ends of joints, what is fixed to a link.
+
+Element = ElementTree.Element
+
+
+def link_name(joint: Element, kind: str) -> str:
+    """Name of the link at the `parent` or `child` end of a joint.
+
+    Raises:
+        InputError: it names none.
+    """
+    element = joint.find(kind)
+    if element is None or not element.get("link"):
+        raise InputError(f"joint {joint.get('name')} has no <{kind} link=…>; to fix: write it")
+    return str(element.get("link"))
+
+
+def fixed_links(root: Element, link: str, scale: float) -> Iterator[tuple[Element, Array]]:
+    """A link and every link fixed to it, and where each stands in the frame of the first (4, 4)."""
+    waiting = [(link, np.eye(4))]
+    while waiting:
+        name, T = waiting.pop()
+        element = next((e for e in root.findall("link") if e.get("name") == name), None)
+        if element is not None:
+            yield element, T
+        for joint in root.findall("joint"):
+            if joint.get("type") == "fixed" and link_name(joint, "parent") == name:
+                waiting.append((link_name(joint, "child"), T @ origin(joint, scale)))
+
+
+def origin(owner: Element, scale: float, where: str = "") -> Array:
+    """(4, 4) of the <origin> of an element, lengths times `scale`; unity where it has none.
+
+    Raises:
+        InputError: something that is no number.
+    """
+    where = where or f"joint {owner.get('name')}"
+    element = owner.find("origin")
+    from scipy.spatial.transform import Rotation
+
+    xyz, rpy = (attribute_numbers(element, key, "0 0 0", where) for key in ("xyz", "rpy"))
+    return frames.make(Rotation.from_euler("xyz", rpy).as_matrix(), xyz * scale)
+
+
+def attribute_numbers(element: Element | None, key: str, default: str, where: str) -> Array:
+    """(n,) the numbers of an attribute, as many as its default has.
+
+    Raises:
+        InputError: other than so many finite numbers.
+    """
+    text = default if element is None else element.get(key) or default
+    try:
+        found = np.array(text.split(), float)
+    except ValueError:
+        found = np.array([np.nan])
+    if len(found) != len(default.split()) or not (np.abs(found) < LARGEST).all():
+        raise InputError(f"{where}: {key} is {text!r}, not numbers; expand xacro files first")
+    return found
+
+
+# How the links of a URDF look: the mesh files that its <visual> elements name.
+
+
+def link_meshes(
+    root: Element, chain: list[Element], folder: Path, scale: float, T_flange_last: Array
+) -> tuple[LinkMesh, ...]:
+    """Meshes of the links of a chain and of what is fixed to them.
+
+    What has no file, or no numbers where it stands, is left out: a picture is no reason to refuse an arm.
+
+    Args:
+        chain: joints from base to flange, fixed ones among them.
+        folder: of the URDF; names begin there, those of a package wherever above it the rest of the name fits.
+        scale: length_unit in a metre.
+        T_flange_last: (4, 4) frame of the last turning joint's link in that of the flange.
+    """
+    turning = [joint for joint in chain if joint.get("type") != "fixed"]
+    links = [link_name(chain[0], "parent"), *(link_name(joint, "child") for joint in turning)]
+    found = []
+    for i, link in enumerate(links):
+        T_frame_link = T_flange_last if i == len(turning) else np.eye(4)
+        for element, T in fixed_links(root, link, scale):
+            for visual in element.findall("visual"):
+                mesh = _mesh(visual, folder, scale)
+                if mesh is not None:
+                    T_link_mesh, file, own = mesh
+                    found.append(LinkMesh(i, T_frame_link @ T @ T_link_mesh, file, own))
+    return tuple(found)
+
+
+def _mesh(visual: Element, folder: Path, scale: float) -> tuple[Array, Path, Array] | None:
+    """Where a visual stands on its link (4, 4), its file and scale (3,)."""
+    mesh = visual.find("geometry/mesh")
+    file = None if mesh is None else _file(mesh.get("filename") or "", folder)
+    if file is None:
+        return None
+    try:
+        return origin(visual, scale, "visual"), file, attribute_numbers(mesh, "scale", "1 1 1", "visual") * scale
+    except InputError:
+        return None
+
+
+def _file(name: str, folder: Path) -> Path | None:
+    """The file that a URDF names: beside it, or package://name/rest in a folder above it."""
+    kind, mark, rest = name.rpartition("://")
+    if not rest or (mark and kind not in ("file", "package")):
+        return None
+    places = [folder / rest]
+    if kind == "package":
+        inside = rest.partition("/")[2]
+        places = [above / path for above in (folder, *folder.resolve().parents) for path in (rest, inside) if path]
+    try:
+        return next((place for place in places if place.is_file()), None)
+    except (OSError, ValueError):
+        return None
+
+
+def robot_from_urdf(
+    path: Path | str,
+    base_link: str | None,
+    flange_link: str | None,
+    length_unit: str,
+    gravity: Array,
+    payload: dict[str, Any] | None = None,
+) -> Robot:
+    """The serial chain base_link → flange_link, in length_unit.
+
+    Fixed joints are merged. A link's mass includes all links fixed to it, a tool beyond the flange too:
+    `payload` comes on top. Links on moving side branches (fingers) are not counted.
+
+    Raises:
+        InputError: unreadable, no such link, no chain between them, or a joint that does not turn freely.
+    """
+    path = Path(path)
+    require_file(path, "correct robot.urdf in session.toml")
+    try:
+        robot = ElementTree.parse(path).getroot()
+    except (OSError, ValueError, LookupError, ElementTree.ParseError) as error:
+        raise InputError(f"{path}: not a readable URDF: {error}; to fix: export it as plain URDF") from None
+    try:
+        scale, chain = 1 / METRES[length_unit], _joint_chain(robot, base_link, flange_link)
+        before, after, mass, com, T_last_flange = _serial_chain(robot, chain, scale)
+        payload_mass, payload_com = payload_of(payload)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return Robot(
+        name=str(robot.get("name", path.stem)),
+        convention="urdf",
+        before=before,
+        after=after,
+        theta=np.zeros(len(before)),
+        mass=mass,
+        com=com,
+        payload_mass=payload_mass,
+        payload_com=payload_com,
+        gravity=gravity_of(gravity),
+        metres_per_unit=METRES[length_unit],
+        meshes=link_meshes(robot, chain, path.parent, scale, frames.inverse(T_last_flange)),
+    )
+
+
+_MOVING = ("revolute", "continuous", "prismatic")
+
+
+def moving_joints(urdf: str, base_link: str, flange_link: str) -> list[tuple[str, str]]:
+    """Name and kind of each joint that moves between two links of a URDF's text; none where no chain joins them."""
+    try:
+        chain = _joint_chain(ElementTree.fromstring(urdf), base_link, flange_link)
+    except (ValueError, LookupError, ElementTree.ParseError, InputError):
+        return []
+    return [(j.get("name") or "", str(j.get("type"))) for j in chain if j.get("type") in _MOVING]
+
+
+def poses_of_urdf(urdf: str, base_link: str, flange_link: str, joints: Array) -> Array:
+    """T_base_flange (V, 4, 4), mm, for joints (V, n), rad or m, that turn or slide along their axes."""
+    T, moved = np.tile(np.eye(4), (len(joints), 1, 1)), iter(joints.T)
+    for joint in _joint_chain(ElementTree.fromstring(urdf), base_link, flange_link):
+        T = T @ origin(joint, 1e3)
+        if joint.get("type") in _MOVING:
+            turn, q = _turn_to_z(joint), next(moved)
+            slides = joint.get("type") == "prismatic"
+            T = T @ turn @ (elementary("z", 0.0, 1e3 * q) if slides else elementary("z", q)) @ frames.inverse(turn)
+    return T
+
+
+def _serial_chain(root: Element, chain: list[Element], scale: float) -> tuple[Array, Array, Array, Array, Array]:
+    """What stands before and behind the turn of every joint (n, 4, 4), what it moves: mass (n,), com (n, 3).
+
+    And T_last_flange (4, 4): the flange's frame in that of the last link.
+    """
+    before: list[Array] = []
+    after: list[Array] = []
+    mass, com = [], []
+    pending = np.eye(4)
+    for joint in chain:
+        pending = pending @ origin(joint, scale)
+        if joint.get("type") == "fixed":
+            continue
+        _require_turning(joint)
+        turn = _turn_to_z(joint)
+        before.append(pending @ turn)
+        after.append(frames.inverse(turn))
+        body = list(_rigid_body(root, link_name(joint, "child"), scale))
+        mass.append(sum(m for m, _ in body))
+        com.append(sum((m * c for m, c in body), np.zeros(3)) / (mass[-1] or 1.0))
+        pending = np.eye(4)
+    if not before:
+        raise InputError("no revolute joint between base_link and flange_link; to fix: name the ends of the arm")
+    # The last link's own frame is the flange: what is fixed to it moves the frame and the centre of mass.
+    after[-1] = after[-1] @ pending
+    com[-1] = frames.transform(frames.inverse(pending), com[-1][None])[0]
+    return np.array(before), np.array(after), np.array(mass), np.array(com), pending
+
+
+def _joint_chain(root: Element, base_link: str | None, flange_link: str | None) -> list[Element]:
+    """Joints from base to flange; walked backwards, because a link has one parent."""
+    parent_of: dict[str, Element] = {}
+    for joint in root.findall("joint"):
+        child = link_name(joint, "child")
+        if child in parent_of:
+            raise InputError(f"link {child} hangs on two joints; a URDF is a tree")
+        parent_of[child] = joint
+    if not base_link or not flange_link:
+        parents = {link_name(joint, "parent") for joint in parent_of.values()}
+        roots, ends = (", ".join(sorted(names)) for names in (parents - set(parent_of), set(parent_of) - parents))
+        raise InputError(
+            "robot.urdf needs base_link and flange_link in session.toml; the tree starts at "
+            f"{roots or '?'} and ends at {ends}"
+        )
+    chain: list[Element] = []
+    link = flange_link
+    while link != base_link:
+        if link not in parent_of or parent_of[link] in chain:
+            raise InputError(f"no chain from {base_link} to {flange_link} (stops at {link}); check the link names")
+        chain.append(parent_of[link])
+        link = link_name(chain[-1], "parent")
+    return chain[::-1]
+
+
+def _require_turning(joint: Element) -> None:
+    name, kind = joint.get("name"), joint.get("type")
+    if kind not in ("revolute", "continuous"):
+        raise InputError(f"joint {name} is {kind}; only revolute and continuous joints are known")
+    if joint.find("mimic") is not None:
+        raise InputError(f"joint {name} copies another joint (mimic); only independent revolute joints are known")
+
+
+def _rigid_body(root: Element, link: str, scale: float) -> Iterator[tuple[float, Array]]:
+    """Mass and centre of mass (in the frame of `link`) of it and of every link fixed to it."""
+    for element, T in fixed_links(root, link, scale):
+        name, inertial = element.get("name"), element.find("inertial")
+        if inertial is not None and inertial.find("mass") is not None:
+            mass = attribute_numbers(inertial.find("mass"), "value", "0", f"link {name}")
+            if len(mass) != 1 or mass[0] < 0:
+                raise InputError(f"link {name}: mass is not a positive number")
+            yield float(mass[0]), (T @ origin(inertial, scale, f"link {name}"))[:3, 3]
+
+
+def _turn_to_z(joint: Element) -> Array:
+    """A rotation whose z axis is the joint's axis; URDF's default axis is x."""
+    direction = attribute_numbers(joint.find("axis"), "xyz", "1 0 0", f"axis of joint {joint.get('name')}")
+    length = np.linalg.norm(direction)
+    if length < 1e-9:
+        raise InputError(f"axis of joint {joint.get('name')} has no direction; to fix: write its axis")
+    direction /= length
+    helper = np.eye(3)[np.abs(direction).argmin()]
+    x = np.cross(helper, direction)
+    x /= np.linalg.norm(x)
+    return frames.make(np.column_stack([x, np.cross(direction, x), direction]), np.zeros(3))

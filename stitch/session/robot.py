@@ -1,0 +1,247 @@
+"""Serial robots: forward kinematics, joint axes, Jacobian and gravity torques, vectorised over poses.
+
+One joint is `before · Rz(q + theta) · after`: standard DH has before = 1 and after = Tz(d)Tx(a)Rx(α)
+(Denavit & Hartenberg 1955), modified DH before = Rx(α)Tx(a) and after = Tz(d) (Craig 1986), URDF
+before = origin with the joint axis turned to z and after = its inverse turn.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+
+
+@dataclass(frozen=True)
+class LinkMesh:
+    """How a link looks, for pictures alone."""
+
+    link: int  # 0 is the base, i what joint i moves: its frame is that of `link_frames`, the flange's for the last
+    T_link_mesh: Array  # (4, 4) length_unit
+    file: Path
+    scale: Array  # (3,) length_unit in a unit of the file
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A chain of n revolute joints. Lengths in length_unit, angles in rad, masses in kg."""
+
+    name: str
+    convention: str  # standard | modified | urdf
+    before: Array  # (n, 4, 4)
+    after: Array  # (n, 4, 4)
+    theta: Array  # (n,) offset added to the joint angle
+    mass: Array  # (n,) of link i, which joint i moves
+    com: Array  # (n, 3) in the link's own frame, after joint i
+    payload_mass: float
+    payload_com: Array  # (3,) in the flange frame
+    gravity: Array  # (3,) m/s² in the base frame
+    metres_per_unit: float
+    a: Array | None = None  # (n,) DH parameters, None for URDF
+    alpha: Array | None = None
+    d: Array | None = None
+    meshes: tuple[LinkMesh, ...] = ()
+
+    @property
+    def n_joints(self) -> int:
+        return len(self.theta)
+
+    @property
+    def has_masses(self) -> bool:
+        """True if masses of links are known; what the flange carries is not what the arm itself weighs."""
+        return bool(self.mass.any())
+
+    @property
+    def carries_at_flange(self) -> bool:
+        """True if no centre of mass of a payload is known: it counts at the flange's origin."""
+        return not self.payload_com.any()
+
+
+def elementary(axis: str, angle: Array | float = 0.0, shift: Array | float = 0.0) -> Array:
+    """Rotation about and shift along one coordinate axis; scalars or (n,) -> (..., 4, 4)."""
+    angle, shift = np.broadcast_arrays(np.asarray(angle, float), np.asarray(shift, float))
+    i = "xyz".index(axis)
+    j, k = (i + 1) % 3, (i + 2) % 3
+    T = np.zeros((*angle.shape, 4, 4))
+    T[..., i, i] = T[..., 3, 3] = 1.0
+    T[..., j, j] = T[..., k, k] = np.cos(angle)
+    T[..., k, j] = np.sin(angle)
+    T[..., j, k] = -T[..., k, j]
+    T[..., i, 3] = shift
+    return T
+
+
+def link_frames(robot: Robot, joints: Array) -> Array:
+    """T_base_link (..., n+1, 4, 4) for joint angles (..., n) in rad; index 0 is the base itself."""
+    joints = np.asarray(joints, float)
+    out = [np.broadcast_to(np.eye(4), (*joints.shape[:-1], 4, 4))]
+    for i in range(robot.n_joints):
+        turn = elementary("z", joints[..., i] + robot.theta[i])
+        out.append(out[-1] @ robot.before[i] @ turn @ robot.after[i])
+    return np.stack(out, axis=-3)
+
+
+def forward(robot: Robot, joints: Array) -> Array:
+    """T_base_flange (..., 4, 4) for joint angles (..., n) in rad."""
+    return np.asarray(link_frames(robot, joints)[..., -1, :, :])
+
+
+def joint_axes(robot: Robot, joints: Array) -> tuple[Array, Array]:
+    """A point on each joint axis and its direction, both (..., n, 3), in the base frame."""
+    axis_frame = link_frames(robot, joints)[..., :-1, :, :] @ robot.before
+    return axis_frame[..., :3, 3], axis_frame[..., :3, 2]
+
+
+def jacobian(robot: Robot, joints: Array) -> Array:
+    """(..., 6, n): body twist of the flange, T·exp(J dq), rotation first (rad, length_unit per rad).
+
+    The columns are the joint screws seen from the flange (Lynch & Park, *Modern Robotics*, 5.1.2).
+    """
+    point, axis = joint_axes(robot, joints)
+    T = forward(robot, joints)
+    lever = T[..., None, :3, 3] - point
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)[..., None, :, :]
+    turned = [(Rt @ v[..., None])[..., 0] for v in (axis, np.cross(axis, lever))]
+    return np.swapaxes(np.concatenate(turned, axis=-1), -1, -2)
+
+
+def unit_torques(robot: Robot, joints: Array) -> Array:
+    """(..., n, n) N·m about joint i of 1 kg at the origin of link k's frame; 0 where joint i does not carry it."""
+    link = link_frames(robot, joints)
+    point, axis = joint_axes(robot, joints)
+    lever = link[..., None, 1:, :3, 3] - point[..., :, None, :]
+    torque = np.einsum("...ij,...ikj->...ik", axis, np.cross(lever, robot.gravity))
+    n = robot.n_joints
+    return np.asarray(torque * robot.metres_per_unit * (np.arange(n)[None, :] >= np.arange(n)[:, None]))
+
+
+def payload_torques(robot: Robot, joints: Array) -> Array:
+    """(..., n) N·m about +z of every joint of 1 kg at the payload's centre of mass: z_i · (c − o_i) × g."""
+    flange = link_frames(robot, joints)[..., -1, :, :]
+    point, axis = joint_axes(robot, joints)
+    centre = (flange[..., :3, :3] @ robot.payload_com[:, None])[..., 0] + flange[..., :3, 3]
+    torque = np.einsum("...ij,...ij->...i", axis, np.cross(centre[..., None, :] - point, robot.gravity))
+    return np.asarray(torque * robot.metres_per_unit)
+
+
+def gravity_torques(robot: Robot, joints: Array) -> Array:
+    """Torque of gravity about +z of every joint, N·m, (..., n): z_i · Σ (c − o_i) × m g over the links beyond.
+
+    Minus the slope of potential energy V = −Σ m g·c; the drive holds the opposite. Zeros without masses.
+    """
+    link = link_frames(robot, joints)
+    point, axis = joint_axes(robot, joints)
+    centres = (link[..., 1:, :3, :3] @ robot.com[..., None])[..., 0] + link[..., 1:, :3, 3]
+    tool = (link[..., -1, :3, :3] @ robot.payload_com[:, None])[..., 0] + link[..., -1, :3, 3]
+    centres = np.concatenate([centres, tool[..., None, :]], axis=-2)
+    mass = np.append(robot.mass, robot.payload_mass)
+    # Link k is moved by joint i if k ≥ i; the payload by all.
+    beyond = np.arange(robot.n_joints + 1)[None, :] >= np.arange(robot.n_joints)[:, None]
+    moment = np.einsum("ik,k,...kj->...ij", beyond, mass, centres)
+    moment -= (beyond @ mass)[:, None] * point
+    torque = np.einsum("...ij,...ij->...i", axis, np.cross(moment, robot.gravity))
+    return np.asarray(torque * robot.metres_per_unit)
+
+
+# A serial robot whose links are a little wrong: where its flange truly is, and how that answers to every error.
+
+_X, _Z = 0, 2  # columns of a frame
+
+
+@dataclass(frozen=True)
+class Links:
+    """What is wrong with an arm's links: a factor on all lengths per view, and errors of the DH rows.
+
+    For URDF the errors act behind the joint in the frame that its axis makes: along x, along z, about x.
+    """
+
+    scale: Array  # (V,)
+    da: Array  # (n,) length_unit
+    dd: Array  # (n,) length_unit
+    dalpha: Array  # (n,) rad
+
+
+@dataclass(frozen=True)
+class FlangeSlopes:
+    """Body twists of the flange, T·exp(slope·error), rotation first, per unit of each error."""
+
+    joints: Array  # (V, 6, n)
+    scale: Array  # (V, 6)
+    da: Array  # (V, 6, n)
+    dd: Array  # (V, 6, n)
+    dalpha: Array  # (V, 6, n)
+
+    def twists(self, joints: Array, links: Links) -> Array:
+        """(V, 6) of the flange for small changes of the joint angles (V, n) and of the links."""
+        rows = np.einsum("vki,i->vk", self.da, links.da) + np.einsum("vki,i->vk", self.dd, links.dd)
+        rows += np.einsum("vki,i->vk", self.dalpha, links.dalpha)
+        return np.asarray(np.einsum("vki,vi->vk", self.joints, joints) + self.scale * links.scale[:, None] + rows)
+
+
+def exact_links(count: int, joints: int) -> Links:
+    """Those of an arm without any error, for `count` views."""
+    return Links(np.ones(count), *np.zeros((3, joints)))
+
+
+def forward_with_errors(robot: Robot, joints: Array, links: Links) -> Array:
+    """T_base_flange (V, 4, 4) of an arm with such links, for joint angles (V, n) in rad."""
+    return np.asarray(_chain(robot, joints, links)[-1][2])
+
+
+def flange_slopes(robot: Robot, joints: Array, links: Links) -> FlangeSlopes:
+    """How the flange answers to small changes of joint angles (V, n) and links, about these.
+
+    Each error is a screw in a frame of the chain, seen from the flange (Lynch & Park, *Modern Robotics*, 5.1.2).
+    """
+    chain = _chain(robot, joints, links)
+    T, modified = chain[-1][2], robot.convention == "modified"
+    still, slopes = np.zeros((len(joints), 3)), dict[str, list[Array]](joints=[], da=[], dd=[], dalpha=[])
+    scale, reach = np.zeros((len(joints), 6)), links.scale[:, None]
+    for before, turned, after, moved in chain:
+        row = before if modified else after  # the frame at whose x axis da and dalpha act
+        slopes["joints"].append(_screw(T, turned, turned[..., :3, _Z], still))
+        slopes["da"].append(_screw(T, row, still, reach * row[..., :3, _X]))
+        slopes["dalpha"].append(_screw(T, row, row[..., :3, _X], still))
+        # d lies along the joint's own axis: ahead of `after`, or, modified, at its end.
+        slopes["dd"].append(_screw(T, after, still, reach * (after if modified else turned)[..., :3, _Z]))
+        scale += _screw(T, after, still, moved / reach)
+    stacked = {name: np.stack(own, axis=-1) for name, own in slopes.items()}
+    return FlangeSlopes(scale=scale, **stacked)
+
+
+def _chain(robot: Robot, joints: Array, links: Links) -> list[tuple[Array, Array, Array, Array]]:
+    """Per joint the frames T_base_· (V, 4, 4) before its turn, after it and at the link's end, and (V, 3) by how much
+    the link's lengths move that end."""
+    modified = robot.convention == "modified"
+    x_error, z_error = elementary("x", links.dalpha, links.da), elementary("z", 0, links.dd)
+    T, out = np.broadcast_to(np.eye(4), (len(joints), 4, 4)), []
+    for i in range(robot.n_joints):
+        if modified:
+            own = robot.before[i] @ x_error[i], robot.after[i] @ z_error[i]
+        else:
+            own = robot.before[i], z_error[i] @ robot.after[i] @ x_error[i]
+        before, after = (_scaled(factor, links.scale) for factor in own)
+        first = T @ before
+        turned = first @ elementary("z", joints[:, i] + robot.theta[i])
+        last = turned @ after
+        moved = first[:, :3, 3] - T[:, :3, 3] + last[:, :3, 3] - turned[:, :3, 3]
+        out.append((first, turned, last, moved))
+        T = last
+    return out
+
+
+def _scaled(T: Array, scale: Array) -> Array:
+    """(V, 4, 4) of one transform, its lengths times `scale` (V,)."""
+    out = np.tile(T, (len(scale), 1, 1))
+    out[:, :3, 3] *= scale[:, None]
+    return out
+
+
+def _screw(T_base_flange: Array, at: Array, turn: Array, shift: Array) -> Array:
+    """(V, 6) body twist of the flange of a turn and a shift (V, 3) in the base's directions at the origin of `at`."""
+    lever = T_base_flange[:, :3, 3] - at[:, :3, 3]
+    back = frames.inverse(T_base_flange)
+    moved = (turn, np.cross(turn, lever) + shift)
+    return np.concatenate([frames.rotate(back, part[:, None])[:, 0] for part in moved], axis=1)

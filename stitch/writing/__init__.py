@@ -1,1 +1,0 @@
-"""Runs and results as files: whole or not at all."""

@@ -1,0 +1,120 @@
+"""The arm of one run kept in another, under another mount: what stays, how much it helps, and what its errors cost."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
+from stitch.api.pipeline import run
+from stitch.cli.main import main
+from stitch.model.model_toml import keep_arm_effects
+from stitch.output.result_document import model_of
+
+OFFSET = np.array([0, 1e-3, -1.5e-3, 4e-4, 2e-3, 0])
+
+
+def arm_of(seed, views=40):
+    """What a session with its own mount says about the arm."""
+    session, *_ = labelled_cell(seed, views=views, offset=OFFSET)
+    return keep_arm_effects(model_of(run(session, effects=["joint_offset"])))
+
+
+def error_of(found, T_mount):
+    """Twist (6,) of the true hand-eye in the frame of the one found, rotation first."""
+    relative = np.linalg.inv(found.T_mount) @ T_mount
+    return np.append(Rotation.from_matrix(relative[:3, :3]).as_rotvec(), relative[:3, 3])
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_few_views_under_another_mount_gain_from_a_known_arm(mount):
+    arm = arm_of(0)
+    session, T_mount, _ = labelled_cell(1, views=8, mount=mount, offset=OFFSET)
+    nominal, kept = run(session), run(session, arm=arm)
+    assert kept.heldout_rms < 0.3 * nominal.heldout_rms
+    assert np.linalg.norm(error_of(kept, T_mount)[3:]) < 0.3 * np.linalg.norm(error_of(nominal, T_mount)[3:])
+    stated = arm.effects["joint_offset"]
+    assert {p.name: (p.value, p.kept) for p in kept.terms[0].parameters} == {
+        name: (p.value, True) for name, p in stated.items()
+    }
+    np.testing.assert_equal([p.sigma for p in kept.terms[0].parameters], [p.sigma for p in stated.values()])
+
+
+@pytest.mark.slow
+def test_errors_of_the_kept_arm_are_in_the_covariance_of_the_hand_eye():
+    """Few views say what the arm is, many where the scanner sits: without the arm's own errors sigmas were far too small."""
+    together, alone, degrees = 0.0, 0.0, 0
+    for seed in range(12):
+        session, T_mount, _ = labelled_cell(100 + seed, views=60, offset=OFFSET)
+        arm = arm_of(200 + seed, views=9)
+        found = run(session, arm=arm)
+        xi = error_of(found, T_mount)
+        together += xi @ np.linalg.solve(found.mount_covariance, xi)
+        free = run(session, effects=["joint_offset"])
+        alone += xi @ np.linalg.solve(free.mount_covariance, xi)
+        degrees += 6
+    assert together < chi2.ppf(0.999, degrees)
+    assert alone > chi2.ppf(0.999, degrees)  # the test would see it
+
+
+def test_the_command_keeps_the_arm_through_what_follows(tmp_path, stitch_command, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first, second = (labelled_cell(seed, views=16, offset=OFFSET)[0] for seed in (0, 1))
+    a, b = write_labelled(tmp_path / "a", first), write_labelled(tmp_path / "b", second)
+    stitch_command("run", a, "-o", "ra", "--effects", "joint_offset", "--no-recording")
+    stitch_command("run", b, "-o", "rb", "--arm", "ra", "--no-recording")
+    stated = json.loads((tmp_path / "ra" / "result.json").read_text())["effects"]["joint_offset"]
+    for change in ((), ("add", "rb", "link_geometry"), ("drop", "rb", "link_geometry")):
+        if change:
+            stitch_command(*change, "--no-recording")
+        assert json.loads((tmp_path / "rb" / "result.json").read_text())["effects"]["joint_offset"] == stated
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--arm", "r", "--hand-eye", "r"], "--arm and --hand-eye"),
+        (["--arm", "r"], "no effect of joints or links"),
+        (["--arm", "nowhere"], "nowhere"),
+    ],
+)
+def test_what_cannot_be_kept_is_refused_in_one_line(tmp_path, stitch_command, monkeypatch, capsys, arguments, told):
+    monkeypatch.chdir(tmp_path)
+    folder = write_labelled(tmp_path / "s", labelled_cell(0, views=8)[0])
+    stitch_command("run", folder, "-o", "r", "--no-recording")
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        main(["run", str(folder), "-o", "q", *arguments])
+    assert stop.value.code == 2
+    line = capsys.readouterr().err
+    assert told in line and line.count("\n") == 1
+    assert not (tmp_path / "q").exists()
+
+
+def told_of(found):
+    """What a run says of the arm it was given: as a doubt, and as a note."""
+    return [[line for line in own if "arm of the other run" in line] for own in (found.doubts, found.notes)]
+
+
+def test_a_kept_arm_is_held_against_the_nominal_one():
+    session, *_ = labelled_cell(1, views=20, offset=OFFSET)
+    doubts, (note,) = told_of(run(session, arm=arm_of(0)))
+    assert not doubts and "where the nominal arm leaves" in note
+    other, *_ = labelled_cell(1, views=20, offset=-OFFSET)
+    (doubt,), notes = told_of(run(other, arm=arm_of(0)))
+    assert not notes and "does not hold here" in doubt and "run without --arm" in doubt
+
+
+def test_the_effect_of_a_kept_arm_that_errs_here_is_named():
+    session, *_ = labelled_cell(1, views=20, offset=OFFSET)
+    arm = arm_of(0)
+    parameter = next(iter(arm.effects["joint_offset"].values()))
+    wrong = {f"{letter}{joint}": replace(parameter, value=5e-4) for letter in "AB" for joint in (2, 3)}
+    zero = {f"{letter}{joint}": replace(parameter, value=0.0) for letter in "AB" for joint in (1, 4, 5, 6)}
+    imitated = replace(arm, effects={**arm.effects, "gear_harmonic": {**wrong, **zero}})
+    (doubt,), _ = told_of(run(session, arm=imitated))
+    assert "without its gear_harmonic" in doubt

@@ -1,0 +1,102 @@
+"""Cells whose motions leave the hand-eye partly open: what they show is found, and the rest is never a number."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stitch.errors import InputError
+from stitch.fit.coarse import centroid_hand_eyes
+from stitch.fit.correct import correct
+from stitch.model.model import hand_eye_lines
+from stitch.numerics import frames
+from stitch.observations.observability import hidden_translations, unknown_numbers
+from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_of_run
+from stitch.session.capture import build_capture
+from stitch.session.scan import prepare_scan
+from tests.plugins.export.test_hand_eye_formats import ANYWHERE, COVARIANCE, bare_run
+
+X = frames.make(Rotation.from_rotvec([0.08, -0.12, 0.75]).as_matrix(), np.array([62.0, -38.0, 95.0]))
+VIEWS, NOISE = 8, 0.01
+# Poses that are written with so many digits turn by this where they stand still, rad.
+ROUNDED = 2e-5
+
+
+def flange_poses(kind, rng):
+    """T_base_flange (V, 4, 4) of a machine that looks at a part near the base's origin."""
+    down = Rotation.from_rotvec([np.pi, 0, 0])
+    turn = np.linspace(-0.6, 0.6, VIEWS)
+    around_z = Rotation.from_rotvec(np.outer(turn, [0, 0, 1]))
+    R, move = {
+        "gantry": (Rotation.concatenate([down] * VIEWS), rng.uniform(-12, 12, (VIEWS, 3))),
+        "turntable": (around_z * down, np.zeros((VIEWS, 3))),
+        "scara": (around_z * down, rng.uniform(-12, 12, (VIEWS, 3))),
+        # Three joints turn the flange about the base's z axis, and about one axis that turns with it.
+        "still wrist": (
+            around_z * Rotation.from_rotvec(np.outer(rng.permutation(turn) / 2, [0, 1, 0])) * down,
+            rng.uniform(-12, 12, (VIEWS, 3)),
+        ),
+    }[kind]
+    R = Rotation.from_rotvec(ROUNDED * rng.standard_normal((VIEWS, 3))) * R
+    looks = R.apply((X @ [0, 0, 400, 1])[:3])
+    return frames.make(R.as_matrix(), move - looks)
+
+
+def cell(kind, seed=0):
+    """The capture of a wavy plate, 120 mm long, seen from a machine's poses."""
+    rng = np.random.default_rng(seed)
+    T_base_flange = flange_poses(kind, rng)
+    scans = []
+    for v, T in enumerate(T_base_flange @ X):
+        x, y = rng.uniform(-60, 60, (2, 1500))
+        z = 6 * np.sin(x / 11) * np.cos(y / 15) + 0.002 * x**2 + NOISE * rng.standard_normal(1500)
+        scans.append(prepare_scan(f"v{v}", frames.transform(frames.inverse(T), np.column_stack([x, y, z]))))
+    return build_capture(kind, scans, T_base_flange, "eye_in_hand")
+
+
+@pytest.mark.parametrize(
+    ("kind", "unknown", "shifts"),
+    [
+        ("gantry", ("x", "y", "z"), 3),
+        ("scara", ("z",), 1),
+        ("turntable", ("x", "y", "z", "rx", "ry", "rz"), 1),
+        ("still wrist", (), 0),
+    ],
+)
+def test_what_a_machine_leaves_open_is_named_and_stays_near_the_part(kind, unknown, shifts):
+    capture = cell(kind)
+    assert hidden_translations([capture], X).shape == (3, shifts)
+    found = unknown_numbers([capture], X)
+    assert set(unknown) <= set(found) and bool(found) == bool(unknown)
+    if kind in ("gantry", "scara"):
+        assert found == unknown
+    for T in centroid_hand_eyes([capture])[:3]:
+        assert np.linalg.norm(T[:3, 3]) < 2e3
+
+
+@pytest.mark.parametrize("kind", ["gantry", "scara"])
+def test_what_is_known_is_found_and_the_rest_stays_where_it_was(kind):
+    capture = cell(kind)
+    start = X @ frames.exp(np.array([0.01, -0.008, 0.012, 0, 0, 0]))
+    fit = correct([capture], start, 10.0).hand_eye
+    off = frames.log(frames.inverse(X) @ fit.T_mount)
+    assert np.linalg.norm(off[:3]) < 1e-3
+    hidden = X[:3, :3] @ hidden_translations([capture], X)
+    np.testing.assert_allclose(hidden.T @ (fit.T_mount[:3, 3] - start[:3, 3]), 0.0, atol=0.05)
+    # Neither the search nor the fit knows it better than the weak prior of one working distance.
+    along = hidden.T @ X[:3, :3]
+    assert (np.diag(along @ fit.covariance[3:, 3:] @ along.T) > 100.0**2).all()
+
+
+def test_open_numbers_are_not_printed():
+    lines = hand_eye_lines(X, np.eye(6) * 1e-6, "eye_in_hand", "mm", unknown=("x", "rz"))
+    assert "x not known, y -38" in lines[1] and lines[2].endswith("z not known mrad")
+    assert "x 62 as stated" in hand_eye_lines(X, np.eye(6), "eye_in_hand", "mm", unknown=("x",), stated=True)[1]
+
+
+def test_every_format_refuses_open_numbers_unless_they_are_stated(tmp_path):
+    run = bare_run(tmp_path / "r", ANYWHERE, COVARIANCE, hand_eye_unknown=["x", "y"], hand_eye_stated=False)
+    with pytest.raises(InputError, match="do not show x, y of the hand-eye; to fix: "):
+        hand_eye_of_run(run)
+    run = bare_run(tmp_path / "t", ANYWHERE, COVARIANCE, hand_eye_unknown=["x", "y"], hand_eye_stated=True)
+    for write in HAND_EYE_FORMATS.values():
+        assert "As stated in session.toml, not measured: x, y" in write(hand_eye_of_run(run))

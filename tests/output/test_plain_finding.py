@@ -1,0 +1,252 @@
+"""What a diagnosis says on the shop floor, and the command that it names."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import stitch.api.pipeline as stepwise
+import stitch.diagnosis.validation as validation
+import stitch.output.diagnosis_document as plain
+import stitch.output.finding_screen as finding_screen
+from bench.docs.page_blocks import refused
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.validation import CrossValidation
+from stitch.effects import EFFECTS
+from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.output.diagnosis_document import effect_in_words, plain_finding, remedy_at_machine, suggested_command
+from stitch.screening.pose_tests import PoseStep
+
+
+def test_every_effect_of_the_library_has_words():
+    library = [effect.name for effect in EFFECTS.values() if effect.tier == "physical"]
+    said = [effect_in_words(name) for name in library]
+    assert len(said) > 20 and len(set(said)) == len(said)
+    assert all(words.startswith(f"{name} (") for name, words in zip(library, said, strict=True))
+    assert effect_in_words("of_my_own") == "of_my_own"
+
+
+@pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
+@pytest.mark.parametrize(("curves", "time_curve"), [((), None), (("of joint 3",), None), ((), "of the flange")])
+@pytest.mark.parametrize("follows_field", [False, True])
+def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve, follows_field):
+    """No formula is looked for of what the scanner itself errs by."""
+    monkeypatch.setattr("stitch.output.diagnosis_document.group_share", lambda linear, group: (0.7, 0.1))
+    found = SimpleNamespace(
+        verdict=verdict,
+        curves=curves,
+        time_curve=time_curve,
+        doubts=(),
+        dropped_before=None,
+        linear=None,
+        candidates=(),
+        likelier_than_not=True,
+        follows_field=follows_field,
+    )
+    command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
+    assert command.startswith("stitch ") and refused(command) is None
+    explained = verdict == "unknown_effect" and bool(curves or time_curve) and not follows_field
+    assert ("explain" in command) == explained
+
+
+@pytest.mark.parametrize("share", [0.949, 0.951])
+def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
+    """Neither before it was asked for nor, again, right after: `stitch add --group` judges by the same number."""
+    for module in (plain, validation):
+        monkeypatch.setattr(module, "group_share", lambda linear, group: (share, 0.05))
+    cause = SimpleNamespace(name="play", ranked=SimpleNamespace(score=None))
+    found = SimpleNamespace(
+        verdict="cannot_tell",
+        effects=("play",),
+        candidates=(cause,),
+        doubts=(),
+        dropped_before=None,
+        certain=True,
+        likelier_than_not=True,
+        sentence="",
+        linear=SimpleNamespace(measurement=SimpleNamespace(length_unit="mm")),
+    )
+    monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
+    monkeypatch.setattr(stepwise, "change", lambda state, effects, recorder: pytest.fail("it is added"))
+    command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
+    assert refused(command) is None and ("--group" in command) == (share < 0.95)
+    if share > 0.95:
+        model = SimpleNamespace(effects=[])
+        assert stepwise.suggest_group(SimpleNamespace(model=model))[0] is None and command == "stitch next RUN"
+
+
+@pytest.mark.parametrize("verdict", ["missing_effect", "cannot_tell", "unknown_effect", "adequate"])
+def test_no_model_is_built_on_a_doubtful_session(verdict):
+    found = SimpleNamespace(
+        verdict=verdict,
+        effects=("backlash",),
+        curves=("of joint 3",),
+        time_curve=None,
+        doubts=("knocked",),
+        dropped_before=None,
+        likelier_than_not=True,
+    )
+    command = suggested_command(found, "RUN").rsplit(": ", 1)[1]
+    assert command == "stitch review RUN" and refused(command) is None
+
+
+@pytest.mark.parametrize("moved", ["part", "scanner"])
+@pytest.mark.parametrize("distinguishable", [True, False])
+@pytest.mark.parametrize("further", [(), ("knocked",)])
+def test_a_slip_that_is_named_is_no_doubt_beside_it(moved, distinguishable, further):
+    """The step and the effect are one sentence; a scanner that was knocked is no slip of the part."""
+    step = PoseStep(2, moved, distinguishable, (7e-4, 0.12), (7e-4, 0.12), 1e-30)
+    found = SimpleNamespace(
+        verdict="missing_effect",
+        effects=("part_slip",),
+        candidates=(SimpleNamespace(name="part_slip", cross_validation=None),),
+        doubts=(step.describe(["a", "b", "c", "d"], "mm"), *further),
+        dropped_before=None,
+        certain=True,
+        likelier_than_not=True,
+    )
+    same = moved == "part" and distinguishable
+    told, command = plain_finding(found, "mm"), suggested_command(found, "RUN").rsplit(": ", 1)[1]
+    assert ("part_slip (from view c on the part sits elsewhere, " in told) == same
+    assert told.count("sits elsewhere") == 1
+    assert ("may only be consequences" in told) == (not same or bool(further))
+    assert command == ("stitch add RUN --suggested" if same and not further else "stitch review RUN")
+
+
+def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
+    """Beside adequate it is no second thing that contradicts the first."""
+    same = FieldError(0.017, 0.0, 9.0, over_noise=False)
+    own = FieldError(0.0, 0.012, 9.0, over_noise=False, by_view=True)
+    for smooth, said in ((None, "arm's scatter explain"), (same, "own error (17 µm over"), (own, "own error (12 µm, ")):
+        found = SimpleNamespace(
+            verdict="adequate",
+            effects=(),
+            scanner_error=smooth,
+            doubts=(),
+            dropped_before=None,
+            certain=True,
+            likelier_than_not=True,
+        )
+        assert said in plain_finding(found, "mm")
+
+
+@pytest.mark.parametrize(
+    ("odds", "said"),
+    [
+        (25.0, "Missing in the model: settling"),
+        (4.0, "against chance are 4 to 1."),
+        (0.5, "against chance are 1 to 2."),
+    ],
+)
+def test_a_name_that_may_be_chance_is_no_statement(odds, said):
+    """20 to 1 over nothing, as over every other name."""
+    candidate = SimpleNamespace(name="settling", cross_validation=None)
+    found = SimpleNamespace(
+        verdict="missing_effect",
+        effects=("settling",),
+        candidates=(candidate,),
+        doubts=(),
+        dropped_before=None,
+        log_odds_over_nothing=np.log(odds),
+    )
+    found.certain = Diagnosis.certain.fget(found)
+    found.likelier_than_not = Diagnosis.likelier_than_not.fget(found)
+    told = plain_finding(found, "mm")
+    assert ("though chance is more likely" in told) == (odds < 1)
+    assert said in told and told.startswith("Perhaps missing") == (odds < 20)
+
+
+@pytest.mark.parametrize(
+    ("inside", "poses", "said"),
+    [
+        (0.25, 0.64, "reduce the error from 40 µm to 20 µm"),
+        (1.02, 0.64, "predicted about 20% better"),
+        (1.02, 1.1, "with it, rms)."),
+    ],
+)
+def test_an_error_that_should_rise_is_no_gain(inside, poses, said):
+    """Of 20 µm of scatter a small effect moves the residual by less than chance does, either way."""
+    left = CrossValidation(inside=inside, heldout=1.0, poses=poses, poses_sigma=0.1, steadiness=0.9)
+    found = SimpleNamespace(
+        verdict="missing_effect",
+        effects=("settling",),
+        candidates=(SimpleNamespace(name="settling", cross_validation=left),),
+        doubts=(),
+        dropped_before=None,
+        certain=True,
+        likelier_than_not=True,
+        residual_rms=0.04,
+    )
+    told = plain_finding(found, "mm")
+    assert said in told and ("reduce the error" in told) == (inside < 1)
+
+
+def _found(
+    verdict: str, p_value: float, *, certain: bool = True, heldout: float = 0.5, posterior: float = 0.97
+) -> SimpleNamespace:
+    """A diagnosis of one effect that helps, and another that holds 3 % where both hold all."""
+    ranked, other = (
+        SimpleNamespace(
+            name="play",
+            adjusted=p_value,
+            posterior=share,
+            tests=21,
+            score=SimpleNamespace(observable=seen, fitted=True),
+        )
+        for share, seen in ((posterior, True), (posterior * 3 / 97, False))
+    )
+    candidate = SimpleNamespace(name="play", ranked=ranked, cross_validation=SimpleNamespace(heldout=heldout))
+    return SimpleNamespace(
+        verdict=verdict,
+        effects=("play",) if verdict == "missing_effect" else (),
+        candidates=(candidate, SimpleNamespace(name="sag", ranked=other, cross_validation=None)),
+        certain=certain,
+        log_odds_over_nothing=np.log(3),
+        depends_on=(SimpleNamespace(p_value=p_value),),
+        repeating_errors=(),
+        implausible=False,
+    )
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (_found("missing_effect", 1e-46), "less than one of a million sessions (p = 1e-46). Of 21 known effects tried"),
+        (_found("missing_effect", 1e-3), "one of 1,000 sessions (p = 0.001). Of 21 known effects tried, it holds 97%"),
+        (
+            _found("missing_effect", 1e-3, posterior=0.22),
+            "it holds 97% of the evidence. Its cause is less sure: a curve without a name would explain as much.",
+        ),
+        (
+            _found("missing_effect", 1e-3, certain=False),
+            "Not very sure: the odds that it is more than chance are 3 to 1",
+        ),
+        (_found("unknown_effect", 2e-4), "one of 5,000 sessions (p = 0.0002)."),
+        (_found("unknown_effect", 0.5), "the cause has no name"),
+        (_found("adequate", 0.4), "play comes nearest. Chance alone would show as much in 40% of such sessions"),
+    ],
+)
+def test_the_screen_says_how_sure_it_is(found, said):
+    assert said in finding_screen.certainty(found)
+
+
+@pytest.mark.parametrize(
+    ("curves", "said"),
+    [
+        ((), "look for what changes with the angle of joint 2."),
+        ((SimpleNamespace(joint=5),), "have joint 5 checked: gear, bearing, and what hangs on it."),
+    ],
+)
+def test_where_no_effect_is_named_the_machine_is_still_told_of(curves, said):
+    follows = (SimpleNamespace(covariate="j2_deg", p_value=1e-9),)
+    found = SimpleNamespace(verdict="unknown_effect", curves=curves, depends_on=follows, follows_field=False)
+    assert remedy_at_machine(found) == f"At the machine: {said}"
+    for by_view, told in ((False, "At the machine: have the scanner calibrated."), (True, "")):
+        found.follows_field, found.scanner_error = True, SimpleNamespace(by_view=by_view)
+        assert remedy_at_machine(found) == told
+
+
+@pytest.mark.parametrize(("heldout", "shown"), [(0.5, 1), (1.1, 0)])
+def test_an_effect_that_makes_views_left_out_worse_is_offered_only_where_it_is_named(heldout, shown):
+    assert len(finding_screen.compared(_found("adequate", 0.4, heldout=heldout))) == shown
+    assert len(finding_screen.compared(_found("missing_effect", 0.4, heldout=heldout))) == 1

@@ -1,0 +1,195 @@
+"""What misplaced scans do to pose, flush and gap: the stated answer against fitting the misplaced scans anew."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from data_synth.cells import window_scans, window_views
+from data_synth.shapes import car_door
+from data_synth.shapes.car_door import CarDoor, Pane
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.output.session_files import SessionFiles, pose_columns, write_session
+from stitch.plugins.cells.cad import cad_surface
+from stitch.plugins.cells.job_files import JobTable
+from stitch.plugins.cells.placed_scans import (
+    SOURCES,
+    JoinedScans,
+    PlacedScans,
+    PlacingErrors,
+    assemble_scans,
+    join_scans,
+    read_hand_eye,
+    read_placed_session,
+    stated_errors,
+)
+from stitch.plugins.cells.scan_to_cad import fit_cad
+from stitch.plugins.cells.seam import Limits, Station, measure_seam
+from stitch.session.scan import prepare_scan
+from stitch.session.session import Cloud
+
+DOOR = {"length": 600.0, "height": 520.0, "belt": 300.0, "window_frame": 34.0}
+X = frames.make(np.eye(3), [0.0, 130.0, 90.0])  # T_flange_scanner
+# A hand-eye's error along one direction of its twist, and one of a view's flange.
+XI = np.array([1e-4, -2e-4, 5e-5, 0.03, 0.02, -0.04])
+
+
+def scans_of(pane):
+    far, poses = window_scans.scan_outside(pane, np.eye(4), 0.02, 1, (2, 1), rays=60, distance=600.0)
+    near, close = window_scans.scan_edges(pane, np.eye(4), Pane(**DOOR), "pane", 0.02, 2, count=6, rays=70)
+    return [prepare_scan("", c) for c in far + near], np.concatenate([poses, close]) @ frames.inverse(X)
+
+
+@pytest.fixture(scope="module")
+def pane():
+    return car_door.build_pane(Pane(**DOOR))
+
+
+def errors_of(T_base_flange, **kinds):
+    return PlacingErrors(T_base_flange, X, kinds.pop("hand_eye", np.zeros((6, 6))), **kinds)
+
+
+def test_modes_move_points_as_frames_do(pane):
+    scans, T_base_flange = scans_of(pane)
+    scan = join_scans(scans, T_base_flange @ X)
+    # Of a covariance of rank one all other modes vanish.
+    *rest, (own, moved) = errors_of(T_base_flange, hand_eye=np.outer(XI, XI)).modes(scan, "hand_eye")
+    assert all(np.abs(other).max() < 1e-6 for _, other in rest)
+    there = join_scans(scans, T_base_flange @ X @ frames.exp(XI))
+    truly = there.points - scan.points
+    sign = np.sign((truly * moved).sum())
+    assert len(own) == len(scan.points)
+    assert np.abs(sign * moved - truly).max() < 1e-3 * np.abs(truly).max()
+    modes = list(errors_of(T_base_flange, rotation=1e-4).modes(scan, "robot"))
+    own, moved = modes[4]  # the second view's turn about its flange's y
+    T_base_flange[1] = T_base_flange[1] @ frames.exp(np.array([0, 1e-4, 0, 0, 0, 0]))
+    truly = join_scans(scans, T_base_flange @ X).points - scan.points
+    assert len(modes) == 3 * len(scans) and not truly[scan.view != 1].any()
+    assert np.abs(moved - truly[own]).max() < 1e-3 * np.abs(moved).max()
+
+
+def sweeps(folder, columns=("sweep_x", "sweep_y", "sweep_z"), time=True):
+    """Two sweeps over a plane; returns the session, its hand-eye, and where each sweep's points lie in the base."""
+    rng = np.random.default_rng(3)
+    T_flange_scanner = X @ frames.exp(np.array([0.3, -0.2, 0.1, 0, 0, 0]))
+    poses = np.array([frames.exp(np.append(rng.normal(0, 0.5, 3), rng.normal(0, 300, 3))) for _ in range(2)])
+    velocity, clouds, places = rng.normal(0, 60, (2, 3)), {}, []
+    for k, T in enumerate(poses):
+        place, t = np.column_stack([rng.uniform(0, 100, (80, 2)), np.zeros(80)]), rng.uniform(-1, 1, 80)
+        scanner = np.array([frames.make(np.eye(3), v) @ T @ T_flange_scanner for v in t[:, None] * velocity[k]])
+        seen = np.array([frames.transform(frames.inverse(A), p) for A, p in zip(scanner, place, strict=True)])
+        clouds[f"v{k}.ply"] = Cloud(seen, scalars={"time": t} if time else {})
+        places.append(place)
+    views = {"view": ["v0", "v1"], "cloud": list(clouds), **pose_columns(poses)}
+    views |= dict(zip(columns, velocity.T, strict=True))
+    write_session(folder / "s", SessionFiles("s", "mm", "eye_in_hand", views, clouds=clouds, scalar="<f8"))
+    (folder / "x.json").write_text(json.dumps({"hand_eye": T_flange_scanner.tolist(), "length_unit": "mm"}))
+    return read_placed_session(folder / "s", folder / "x.json"), velocity, places
+
+
+def test_sweeps_are_put_together_by_the_flange_s_motion(tmp_path):
+    placed, _, places = sweeps(tmp_path)
+    for T, cloud, place in zip(placed.T_base_scanner, placed.clouds, places, strict=True):
+        assert np.abs(frames.transform(T, cloud) - place).max() < 1e-3  # clouds hold seven digits
+
+
+def test_errors_of_a_sweep_turn_about_the_flange_where_it_was(tmp_path):
+    placed, _, _ = sweeps(tmp_path)
+    scan = assemble_scans(placed)
+    errors = PlacingErrors(placed.T_base_flange, placed.T_flange_scanner, np.outer(XI, XI))
+    moved = list(errors.modes(scan, "hand_eye"))[-1][1]
+    T = placed.T_base_scanner[scan.view]
+    local = np.einsum("nji,nj->ni", T[:, :3, :3], scan.points - np.vstack(placed.carried) - T[:, :3, 3])
+    truly = frames.transform(T @ frames.exp(XI), local[:, None])[:, 0] + np.vstack(placed.carried) - scan.points
+    sign = np.sign((truly * moved).sum())
+    assert np.abs(sign * moved - truly).max() < 1e-3 * np.abs(truly).max()
+
+
+def test_a_sweep_without_times_is_refused(tmp_path):
+    with pytest.raises(InputError, match="view v0 is a sweep, and the points of its cloud have no time; to fix"):
+        sweeps(tmp_path, time=False)
+
+
+def test_scanner_error_has_its_rms_along_the_ray(pane):
+    """All modes together have the stated variance where the field is evenly seen."""
+    grid = np.stack(np.meshgrid(np.linspace(-0.3, 0.3, 41), np.linspace(-0.2, 0.2, 41)), -1).reshape(-1, 2)
+    flat = prepare_scan("", np.column_stack([400 * grid, np.full(len(grid), 400.0)]))
+    scan = join_scans([flat], np.eye(4)[None] @ X)
+    modes = [moved for _, moved in errors_of(np.eye(4)[None], scanner=0.01).modes(scan, "scanner")]
+    variance = sum((moved**2).sum(axis=1).mean() for moved in modes)
+    assert np.sqrt(variance) == pytest.approx(0.01, rel=0.1)
+    ray = scan.points - X[:3, 3]
+    assert all(np.abs(np.cross(moved, ray)).max() < 1e-9 for moved in modes)
+
+
+def test_pose_answers_as_a_fit_of_the_misplaced_scans():
+    """A block seen from all six sides; four views of three sides each."""
+    block, rng = trimesh.creation.box((200.0, 150.0, 100.0)), np.random.default_rng(0)
+    points = trimesh.sample.sample_surface(block, 12000, seed=1)[0]
+    normals = np.zeros_like(points)
+    side = np.abs(points / [100.0, 75.0, 50.0]).argmax(axis=1)
+    normals[np.arange(len(points)), side] = np.sign(points[np.arange(len(points)), side])
+    view = rng.integers(4, size=len(points))
+    noisy = points + rng.normal(0, 0.02, (len(points), 1)) * normals
+    T = np.array([frames.exp(np.append(rng.normal(0, 1, 3), rng.normal(0, 300, 3))) for _ in range(4)])
+    T_base_flange, ones = T @ frames.inverse(X), np.ones(len(points))
+    scan = JoinedScans(noisy, normals, ones > 0, ones, 2.0, 0.02, view)
+    xi = 0.2 * XI
+    errors = errors_of(T_base_flange, hand_eye=np.outer(xi, xi))
+    cad = cad_surface(block)
+    before = fit_cad(scan, cad, np.eye(4), errors=errors)
+    local = frames.transform(frames.inverse(T)[view], noisy[:, None])[:, 0]
+    misplaced = frames.transform((T @ frames.exp(xi))[view], local[:, None])[:, 0]
+    after = fit_cad(replace(scan, points=misplaced), cad, np.eye(4))
+    truly = frames.log(frames.inverse(before.T_base_part) @ after.T_base_part)
+    assert np.sqrt(np.diag(before.parts["hand_eye"])) == pytest.approx(
+        np.abs(truly), rel=0.1, abs=2e-7 + 0.03 * np.abs(truly[3:]).max()
+    )
+    assert before.covariance == pytest.approx(sum(before.parts[name] for name in ("scan", *SOURCES)))
+
+
+def test_gap_and_flush_answer_as_a_measurement_of_the_misplaced_scans(pane):
+    door = car_door.build(CarDoor(**DOOR))
+    places = [values[:1] for values in window_views.stations(Pane(**DOOR))]
+    clouds, poses = window_scans.scan_seam([door, pane], np.eye(4), tuple(places), 0.02, 1, rays=120)
+    scans, station = [prepare_scan("", c) for c in clouds], Station("1", *(values[0] for values in places))
+    T_base_flange = poses @ frames.inverse(X)
+    scan = join_scans(scans, poses)
+    (alone,) = measure_seam(scan, np.eye(4), [station], Limits())
+    xi = 0.1 * XI  # well below the noise: further apart, the two views no longer share a surface
+    errors = errors_of(T_base_flange, hand_eye=np.outer(xi, xi))
+    (known,) = measure_seam(scan, np.eye(4), [station], Limits(), errors=errors)
+    (moved,) = measure_seam(join_scans(scans, poses @ frames.exp(xi)), np.eye(4), [station], Limits())
+    for name in ("gap", "flush"):
+        wanted = abs(getattr(moved, name) - getattr(alone, name))
+        added = np.sqrt(getattr(known, f"sigma_{name}") ** 2 - getattr(alone, f"sigma_{name}") ** 2)
+        assert added == pytest.approx(wanted, rel=0.1, abs=2e-4)
+    # A stated pose_sigma takes the place of the robot's scatter.
+    robot = errors_of(T_base_flange, translation=5.0)
+    (stated,) = measure_seam(scan, np.eye(4), [station], Limits(), 0.1, robot)
+    assert stated.sigma_gap == pytest.approx(np.hypot(alone.sigma_gap, 0.1))
+
+
+def test_hand_eye_file_brings_its_errors(tmp_path):
+    covariance = np.diag([1e-8] * 3 + [4e-10] * 3)
+    run = {"hand_eye": np.eye(4).tolist(), "length_unit": "m", "hand_eye_covariance": covariance.tolist()}
+    run["repeatability"] = {"rotation": 3e-5, "translation": 2e-5}
+    (tmp_path / "result.json").write_text(json.dumps(run))
+    _, errors = read_hand_eye(tmp_path / "result.json", "mm", np.eye(4)[None])
+    assert np.sqrt(np.diag(errors.hand_eye)) == pytest.approx([1e-4] * 3 + [0.02] * 3)
+    assert (errors.rotation, errors.translation) == pytest.approx((3e-5, 0.02))
+    sphere = {"hand_eye": np.eye(4).tolist(), "length_unit": "mm", "scatter_of_views": {"shift": 0.04}}
+    (tmp_path / "sphere.json").write_text(json.dumps(sphere))
+    _, errors = read_hand_eye(tmp_path / "sphere.json", "mm", np.eye(4)[None])
+    assert errors.translation == 0.04 and not errors.hand_eye.any()
+
+
+def test_job_states_what_nobody_measured(tmp_path):
+    placed = PlacedScans((), (), np.zeros((0, 4, 4)), X)
+    assert stated_errors(JobTable(tmp_path, {}), placed) is None
+    assert stated_errors(JobTable(tmp_path, {"errors": {"scanner": 0.02}}), placed).scanner == 0.02
+    with pytest.raises(InputError, match=r"errors\.scaner.*to fix: write 'scanner'"):
+        stated_errors(JobTable(tmp_path, {"errors": {"scaner": 0.02}}), placed)

@@ -1,0 +1,236 @@
+"""Scan onto CAD and seam: scans of known meshes in known poses; truth from the meshes, not from the package."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from data_synth.cells import window_scans, window_views
+from data_synth.shapes import car_door
+from data_synth.shapes.car_door import CarDoor, Pane
+from stitch.cli.main import main
+from stitch.errors import InputError, NoResultError
+from stitch.numerics import frames
+from stitch.plugins.cells.cad import Box, Regions, cad_surface, nearest_partners
+from stitch.plugins.cells.placed_scans import join_scans
+from stitch.plugins.cells.scan_to_cad import find_cad_start, fit_cad, measure_deviations, split_instances
+from stitch.plugins.cells.seam import Limits, Station, find_edge, measure_seam
+from stitch.plugins.cells.window import correct_path
+from stitch.session.scan import prepare_scan
+
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "window"
+NOISE = 0.05
+# A door of half the size: the same shapes, a quarter of the triangles.
+DOOR = {"length": 600.0, "height": 520.0, "belt": 300.0, "window_frame": 34.0}
+
+
+def truth(seed):
+    return frames.make(Rotation.random(rng=np.random.default_rng(seed)).as_matrix(), [3567.7, -2954.3, 1932.9])
+
+
+def joined(clouds, poses):
+    return join_scans([prepare_scan("", c) for c in clouds], poses)
+
+
+def furthest(T, true, mesh):
+    """The largest distance by which the pose's error moves a point of the part."""
+    off = (T - true) @ np.vstack([mesh.vertices.T, np.ones(len(mesh.vertices))])
+    return np.linalg.norm(off[:3], axis=0).max()
+
+
+@pytest.fixture(scope="module")
+def door():
+    return car_door.build(CarDoor(**DOOR))
+
+
+@pytest.fixture(scope="module")
+def pane():
+    return car_door.build_pane(Pane(**DOOR))
+
+
+@pytest.fixture(scope="module")
+def pane_cad(pane):
+    return cad_surface(pane)
+
+
+def scan_pane(pane, T, seed):
+    far, poses = window_scans.scan_outside(pane, T, NOISE, seed, (2, 1), rays=80, distance=600.0)
+    near, close = window_scans.scan_edges(pane, T, Pane(**DOOR), "pane", NOISE, seed + 9, count=8, rays=90)
+    return joined(far + near, np.concatenate([poses, close]))
+
+
+def test_distances_are_those_of_trimesh(pane, pane_cad):
+    """Points up to 1.5 mm off either face of the 4 mm pane: the nearest triangle is the one below them."""
+    rng = np.random.default_rng(0)
+    points, faces = trimesh.sample.sample_surface(pane, 60, seed=1)
+    normals = pane.face_normals[faces]
+    off = points + rng.uniform(-1.5, 1.5, (60, 1)) * normals
+    found = nearest_partners(pane_cad, off, normals)
+    count = len(pane.faces)
+    place = trimesh.triangles.closest_point(np.tile(pane.triangles, (60, 1, 1)), np.repeat(off, count, axis=0))
+    wanted = np.linalg.norm(place.reshape(60, count, 3) - off[:, None], axis=2).min(axis=1)
+    assert found.accept.mean() > 0.8
+    assert np.abs(np.abs(found.distance) - wanted)[found.accept].max() < 2e-3
+
+
+def test_fit_without_a_guess(pane, pane_cad):
+    seed, T = 3, truth(3)
+    scan = scan_pane(pane, T, seed)
+    start = find_cad_start(scan, pane_cad)
+    found = fit_cad(scan, pane_cad, start.T_base_part)
+    assert furthest(found.T_base_part, T, pane) < 0.05
+    # The truth lies within the stated covariance: chi-square of 6, chance 1e-4, with the sandwich's own doubt.
+    shift = frames.make(np.eye(3), pane_cad.centre)
+    off = frames.log(np.linalg.inv(T @ shift) @ found.T_base_part @ shift)
+    assert off @ np.linalg.solve(found.covariance, off) < 2 * 27.9
+
+
+def test_weld_dent_shows_in_the_map_and_does_not_pull_the_fit(door):
+    """A dent of 3 mm (σ 60 mm) on a door of 600 mm; start 6 mm and 0.5° off."""
+    weld = window_scans.Weld(x=170.0, z=90.0, size=3.0, reach=60.0)
+    warped, cad, T = window_scans.warp(door, weld), cad_surface(door), truth(1)
+    far, poses = window_scans.scan_outside(warped, T, NOISE, 1, (2, 2), rays=110, distance=500.0)
+    near, close = window_scans.scan_edges(warped, T, CarDoor(**DOOR), "door", NOISE, 2, count=8, rays=80)
+    scan = joined(far + near, np.concatenate([poses, close]))
+    centre = frames.make(np.eye(3), cad.centre)
+    start = T @ centre @ frames.exp(np.array([6e-3, -5e-3, 6e-3, 4, -3, 3.5])) @ np.linalg.inv(centre)
+    found = fit_cad(scan, cad, start)
+    assert furthest(found.T_base_part, T, door) < 0.05
+    shown = measure_deviations(scan, cad, found.T_base_part, 0.5, 15.0)
+    # Compared where the outer skin is flat enough for a dent along y to be one along the normal within 5 %.
+    slope = np.gradient(car_door.outer_surface(CarDoor(**DOOR), np.full(3, 170.0), np.array([88.0, 90.0, 92.0])), 2.0)[
+        1
+    ]
+    middle = shown.cells.middle
+    at = (np.hypot(middle[:, 0] - weld.x, middle[:, 2] - weld.z) < 25) & (shown.cells.mean < -1)
+    assert at.sum() >= 4
+    expected = -window_scans.dent(weld, middle[at, 0], middle[at, 2]) / np.hypot(1, slope)
+    assert shown.cells.mean[at] == pytest.approx(expected, abs=0.2)
+    far_off = np.hypot(middle[:, 0] - weld.x, middle[:, 2] - weld.z) > 4 * weld.reach
+    assert np.median(np.abs(shown.cells.mean[far_off])) < 0.05
+    assert shown.outside[at].all()
+
+
+@pytest.mark.slow
+def test_two_parts_in_one_scan(pane, pane_cad):
+    Ts = [truth(5), truth(5) @ frames.make(np.eye(3), [30.0, -450.0, 40.0])]
+    scans = [scan_pane(pane, T, 5 + i) for i, T in enumerate(Ts)]
+    columns = (np.concatenate([getattr(s, n) for s in scans]) for n in ("points", "normals", "usable", "area"))
+    view = np.repeat([0, 1], [len(s.points) for s in scans])
+    both = type(scans[0])(*columns, scans[0].spacing, scans[0].noise, view)
+    heaps = split_instances(both, pane_cad, 2)
+    middles = [s.points.mean(axis=0) for s in scans]
+    whose = [int(np.argmin([np.linalg.norm(h.points.mean(axis=0) - m) for m in middles])) for h in heaps]
+    assert sorted(whose) == [0, 1]
+    for heap, k in zip(heaps, whose, strict=True):
+        assert furthest(fit_cad(heap, pane_cad, Ts[k]).T_base_part, Ts[k], pane) < 0.05
+    with pytest.raises(NoResultError, match="2 separate parts"):
+        split_instances(both, pane_cad, 3)
+
+
+def test_forbidden_region_keeps_a_gripper_out_of_the_fit(pane, pane_cad):
+    """A plate 1 mm above a third of the pane: with the region the fit stands, and only the box's points are out."""
+    T = truth(2)
+    scan = scan_pane(pane, T, 2)
+    local = frames.transform(np.linalg.inv(T), scan.points)
+    box = Box("gripper", np.array([250.0, -99, -99]), np.array([430.0, 99, 999]))
+    lifted = scan.points + np.where(box.holds(local), 1.0, 0.0)[:, None] * scan.normals
+    scan = replace(scan, points=lifted)
+    found = fit_cad(scan, pane_cad, T, Regions(forbidden=(box,)))
+    assert furthest(found.T_base_part, T, pane) < 0.05
+
+
+def test_a_plane_fixes_no_pose(pane_cad):
+    box = trimesh.creation.box([300, 200, 10])
+    cad = cad_surface(box)
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-140, 140, 4000), rng.uniform(-90, 90, 4000), np.full(4000, 5.0)])
+    scan = joined([points - [0, 0, 500.0]], np.array([frames.make(np.eye(3), [0, 0, 500.0])]))
+    with pytest.raises(NoResultError, match="leaves a direction open"):
+        fit_cad(scan, cad, np.eye(4))
+
+
+def test_edge_of_two_planes():
+    """Top at 2 + 0.1·across, flank at across = −8 + 0.2·height: they meet where both hold."""
+    rng = np.random.default_rng(1)
+    a, s = rng.uniform(-28, -8.5, 3000), rng.uniform(-10, 10, 6000)
+    h = rng.uniform(-3, 1.0, 3000)
+    top = np.column_stack([a, s[:3000], 2 + 0.1 * a + 0.02 * rng.standard_normal(3000)])
+    flank = np.column_stack([-8 + 0.2 * h + 0.02 * rng.standard_normal(3000), s[3000:], h])
+    normals = np.vstack([np.tile([-0.1, 0, 1.0], (3000, 1)), np.tile([1.0, 0, -0.2], (3000, 1))])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    edge = find_edge(np.vstack([top, flank]), normals, 1.0)
+    height = (2 + 0.1 * -8) / (1 - 0.1 * 0.2)
+    sigma = np.sqrt(np.diag(edge.covariance))
+    assert abs(edge.height - height) < 4 * sigma[1] < 0.02
+    assert abs(edge.across - (-8 + 0.2 * height)) < 4 * sigma[0] < 0.02
+
+
+def test_seam_at_eight_stations(door, pane):
+    """Within 0.05 mm of the meshes cut at the stations; the pane stands 0.6 mm out and 2.5 mm down."""
+    moved = pane.copy()
+    moved.apply_translation([0.7, 0.6, -2.5])
+    middle, across, out = window_views.stations(Pane(**DOOR))
+    T = truth(4)
+    scan = joined(*window_scans.scan_seam([door, moved], T, (middle, across, out), NOISE, 1, rays=110))
+    places = [Station(str(i), *v) for i, v in enumerate(zip(middle, across, out, strict=True))]
+    seams = measure_seam(scan, T, places, Limits())
+    true = np.array([window_scans.true_seam(moved, door, p.T_part_station) for p in places])
+    found = np.array([[s.flush, s.gap] for s in seams])
+    assert np.abs(found - true).max() < 0.05
+    wanted = ["bad" if abs(g - 16) > 2 or abs(f) > 1.5 else "good" for f, g in true]
+    assert [s.verdict for s in seams] == wanted
+    assert {"bad", "good"} <= set(wanted)
+
+
+def test_path_follows_the_part():
+    nominal, found, tool = truth(1), truth(2), truth(3)[None]
+    moved = correct_path(tool, nominal, found)[0]
+    assert np.allclose(np.linalg.inv(found) @ moved, np.linalg.inv(nominal) @ tool[0])
+
+
+@pytest.mark.parametrize(
+    "command, name, old, new, message",
+    [
+        ("fit", "fit.toml", '"pane.stl"', '"none.stl"', "none.stl: not found"),
+        ("fit", "fit.toml", "tolerance = 0.5", "tolerance = 0", "tolerance is 0; to fix: write a number above zero"),
+        ("fit", "fit.toml", "high = [700.0", "high = [10.0", "the box region[1] is empty"),
+        ("fit", "fit.toml", "[nominal]", "[nominl]", "unknown key 'nominl'; to fix: write 'nominal'"),
+        ("seam", "seam.toml", "[part]", "[other]", "unknown key 'other'"),
+        ("seam", "seam.toml", '"stations.csv"', '"seam.csv"', "column 'station' is missing"),
+    ],
+)
+def test_bad_job_is_refused_in_one_line(tmp_path, capsys, command, name, old, new, message):
+    for file in EXAMPLE.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    text = (EXAMPLE / name).read_text()
+    assert old in text
+    (tmp_path / name).write_text(text.replace(old, new))
+    with pytest.raises(SystemExit) as stop:
+        main([command, str(tmp_path / name)])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_expected_region_without_points_is_no_fit(pane_cad):
+    from stitch.plugins.cells.cad import coverage
+
+    box = Box("corner", np.array([-1e3, -1e3, -1e3]), np.array([1e3, 1e3, 1e3]))
+    assert coverage(box, pane_cad, np.array([[5e3, 0, 0.0]]), np.array([[0, 1.0, 0]])) == 0.0
+    with pytest.raises(InputError, match="not found"):
+        from stitch.plugins.cells.window import read_fit_job
+
+        read_fit_job("nowhere.toml")
+
+
+def test_scans_thrown_apart_by_a_wrong_pose_are_refused(pane, pane_cad):
+    scan = scan_pane(pane, truth(1), 1)
+    points = scan.points + np.where(np.arange(len(scan.points)) < 2000, 1e8, 0.0)[:, None]
+    thrown = replace(scan, points=points)
+    with pytest.raises(NoResultError, match="correct a scanner's pose"):
+        find_cad_start(thrown, pane_cad)

@@ -1,0 +1,78 @@
+"""Clouds and poses find each other by name, by time, by number, by order."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stitch.errors import InputError
+from stitch.plugins.intake.cloud_pairs import pairings
+
+CLOUDS = [Path(f"scans/view_{i:02d}.ply") for i in (1, 2, 3, 10)]
+
+
+@pytest.mark.parametrize(
+    ("labels", "rows"),
+    [
+        ([("view_10.ply",), ("view_03.ply",), ("view_02.ply",), ("view_01.ply",)], (3, 2, 1, 0)),
+        ([("a", r"C:\scans\VIEW_02.PLY"), ("b", "view_01"), ("c", "view_10"), ("d", "view_03")], (1, 0, 3, 2)),
+        ([("robot_pose_2",), ("robot_pose_1",), ("robot_pose_3",), ("robot_pose_10",)], (1, 0, 2, 3)),
+        ([("p1",), ("p2",), ("p3",), ("p4",), ("p10",)], (0, 1, 2, 4)),
+    ],
+)
+def test_names_tell(labels, rows):
+    (pairing,) = pairings(CLOUDS, labels)
+    assert pairing.rows == rows and pairing.by_name
+
+
+def test_without_names_the_order_comes_first_then_what_people_do_wrong():
+    found = pairings(CLOUDS, [()] * 4)
+    assert found[0].rows == (0, 1, 2, 3) and found[1].rows == (3, 2, 1, 0)
+    assert not any(p.by_name for p in found)
+
+
+def test_a_failed_scan_leaves_every_gap_open():
+    found = pairings(CLOUDS, [()] * 5)
+    assert {p.rows for p in found} == {(1, 2, 3, 4), (0, 2, 3, 4), (0, 1, 3, 4), (0, 1, 2, 4), (0, 1, 2, 3)}
+
+
+def test_lists_that_do_not_belong_together_are_refused():
+    with pytest.raises(InputError, match="4 clouds and 9 poses"):
+        pairings(CLOUDS, [()] * 9)
+
+
+SCANS = [Path(f"scan_2026-04-03_09-{minute}-07.ply") for minute in (12, 13, 15)]
+
+
+@pytest.mark.parametrize("day", ["2026-04-03T", "03.04.2026 ", ""])
+def test_times_tell_though_there_are_more_poses(day):
+    times = ["09:11:50", "09:12:06.5", "09:13:07", "09:14:00", "09:15:08", "09:16:00"]
+    (pairing,) = pairings(SCANS, [(f"{day}{time}",) for time in times])
+    assert pairing.rows == (1, 2, 4) and pairing.by_name and "1 s at most" in pairing.words
+    assert "3 poses belong to no cloud" in pairing.words
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        ["09:12:07", "09:13:07", "09:14:07", "09:14:30", "09:14:40", "09:14:50"],  # the last scan has no pose
+        ["10:12:07", "10:13:07", "10:15:07", "10:16:00", "10:17:00", "10:18:00"],  # another hour
+        ["09:12:07", "09:12:07", "09:12:07", "09:12:07", "09:12:07", "09:12:07"],
+    ],
+)
+def test_times_that_are_not_those_of_the_scans_tell_nothing(times):
+    with pytest.raises(InputError, match="3 clouds and 6 poses"):
+        pairings(SCANS, [(time,) for time in times])
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e3, 1e9])
+def test_a_trajectory_at_a_hundred_hertz_is_met_where_a_scan_was_taken(scale):
+    """Images and ground truth as the TUM RGB-D benchmark names them: seconds since 1970, many more poses than images."""
+    taken = [1305031453.374112, 1305031460.91, 1305031471.002]
+    clouds = [Path(f"depth/{t:.6f}.png") if scale == 1 else Path(f"depth_{round(t * scale)}.ply") for t in taken]
+    times = 1305031450 + 0.01 * np.arange(2500)
+    table = np.column_stack([times * scale, *np.random.default_rng(0).normal(size=(7, 2500))])
+    (pairing,) = pairings(clouds, [()] * len(table), table)
+    assert pairing.rows == tuple(round((t - times[0]) / 0.01) for t in taken) and pairing.by_name
+    with pytest.raises(InputError, match="3 clouds and 2500 poses"):
+        pairings(clouds, [()] * len(table), table + 3600 * scale)

@@ -1,0 +1,246 @@
+"""Layouts of pose files, typed after what vendors and libraries publish; none of them by a writer of this project."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stitch.errors import InputError
+from stitch.plugins.intake.folder_files import find_folder_files
+from stitch.plugins.intake.layouts import possible_layouts
+from stitch.plugins.intake.raw_poses import read_raw_poses
+from stitch.plugins.intake.readings import readings
+
+POSE_OF_ROS = """  position:
+    x: 0.5
+    y: -0.25
+    z: 0.75
+  orientation:
+    x: 0.0
+    y: 0.6
+    z: 0.0
+    w: 0.8
+"""
+# github.com/zivid/zivid-python-samples, robotTransform.yaml: OpenCV's FileStorage.
+OPENCV = """%YAML:1.0
+---
+PoseState: !!opencv-matrix
+   rows: 4
+   cols: 4
+   dt: d
+   data: [ 9.9670000000000003e-01, -4.0399999999999998e-02,
+       6.9900000000000004e-02, 5.6950000000000000e+02,
+       2.0799999999999999e-02, 9.6519999999999995e-01,
+       2.6060000000000000e-01, 3.1769999999999999e+02,
+       -7.8000000000000000e-02, -2.5829999999999997e-01,
+       9.6289999999999998e-01, 5.6929999999999995e+02, 0., 0., 0., 1. ]
+"""
+# Zivid's SDK saves a Matrix4x4 like this, as robot_pose_1.yaml … of its ROS driver.
+ZIVID = """__version__:
+  serializer: 1
+  data: 1
+FloatMatrix:
+  Data:
+    [
+      [0.9967, -0.0404, 0.0699, 569.5],
+      [0.0208, 0.9652, 0.2606, 317.7],
+      [-0.0780, -0.2583, 0.9629, 569.3],
+      [0, 0, 0, 1],
+    ]
+"""
+# ros2 topic echo /tf
+TF = """transforms:
+- header:
+    stamp:
+      sec: 1757021880
+    frame_id: base
+  child_frame_id: tool0
+  transform:
+    translation:
+      x: 0.5
+      y: -0.25
+      z: 0.75
+    rotation:
+      x: 0.0
+      y: 0.6
+      z: 0.0
+      w: 0.8
+---
+transforms:
+- header:
+    stamp:
+      sec: 1757021881
+    frame_id: base
+  child_frame_id: tool0
+  transform:
+    translation: {x: 0.5, y: -0.25, z: 0.5}
+    rotation: {x: 0.6, y: 0.0, z: 0.0, w: 0.8}
+"""
+# github.com/Shiyu-Xing/RegHEC, RobotPoses.dat: angles first, in rad, a comma at the end.
+REGHEC = """-2.620834,-0.519060,-2.473713,111.227938,-331.951396,317.520474,
+-2.708615,-0.418518,-2.414003,114.687198,-358.734326,360.941072,
+-2.979087,-0.752766,-2.269592,206.928588,-355.445190,317.091649,
+"""
+# Mech-Vision: x, y, z in m and a quaternion, w first (community.mech-mind.com/t/topic/1907).
+MECH_MIND = "[[0.5, -0.25, 0.75, 0.8, 0, 0.6, 0], [0.5, -0.25, 0.5, 0.8, 0.6, 0, 0]]"
+
+
+def read(tmp_path, name, text):
+    file = tmp_path / name
+    file.write_text(text, encoding="utf-8")
+    return read_raw_poses([file])
+
+
+def only(raw, **stated):
+    (layout,) = possible_layouts(raw)
+    (reading,) = readings(layout, **stated)
+    return reading
+
+
+@pytest.mark.parametrize(("name", "text"), [("opencv.yaml", OPENCV), ("robot_pose_1.yaml", ZIVID)])
+def test_matrices_of_zivid(tmp_path, name, text):
+    reading = only(read(tmp_path, name, text))
+    assert reading.rotation == "matrix"
+    assert np.allclose(reading.T[0][0], [0.9967, -0.0404, 0.0699, 569.5], atol=1e-3)
+
+
+def test_one_file_for_each_pose_in_the_order_of_their_numbers(tmp_path):
+    (tmp_path / "poses").mkdir()
+    (tmp_path / "scan.xyz").write_text("0 0 1\n", encoding="utf-8")
+    for i in (1, 2, 10):
+        (tmp_path / "poses" / f"robot_pose_{i}.yaml").write_text(ZIVID.replace("569.5", str(i)), encoding="utf-8")
+    raw = read_raw_poses(find_folder_files(tmp_path, tmp_path / "poses").poses)
+    assert only(raw).T[:, 0, 3].tolist() == [1, 2, 10]
+    assert [labels[0] for labels in raw.labels] == ["robot_pose_1", "robot_pose_2", "robot_pose_10"]
+
+
+def test_ros_transforms(tmp_path):
+    reading = only(read(tmp_path, "tf.yaml", TF))
+    assert reading.rotation == "quaternion-xyzw"
+    assert np.allclose(reading.T[:, :3, 3], [[0.5, -0.25, 0.75], [0.5, -0.25, 0.5]])
+    assert np.allclose(reading.T[0, :3, :3], [[0.28, 0, 0.96], [0, 1, 0], [-0.96, 0, 0.28]])
+
+
+def test_messages_of_ros_keep_their_time(tmp_path):
+    stamped = "header:\n  stamp:\n    sec: {}\n    nanosec: {}\n  frame_id: base\npose:\n" + POSE_OF_ROS
+    raw = read(tmp_path, "poses.yaml", "---\n".join(stamped.format(1718099007 + i, 250000000) for i in range(2)))
+    (layout,) = possible_layouts(raw)
+    assert layout.rest["time_s"].tolist() == [1718099007.25, 1718099008.25]
+    assert only(raw).T[0, :3, 3].tolist() == [0.5, -0.25, 0.75]
+
+
+def test_times_since_1970_stand_before_poses_without_a_header(tmp_path):
+    """A trajectory as the TUM RGB-D benchmark and evo write it."""
+    rows = "1305031453.3741 0.5 -0.25 0.75 0 0.6 0 0.8\n1305031453.3842 0.5 -0.25 0.5 0 0.6 0 0.8\n"
+    for head in ("", "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n"):
+        raw = read(tmp_path, "groundtruth.txt", head + rows)
+        (layout,) = possible_layouts(raw)
+        assert [next(iter(layout.rest.values()))[1]] == [1305031453.3842]
+        assert layout.position[0].tolist() == [0.5, -0.25, 0.75] and layout.rotation[0].tolist() == [0, 0.6, 0, 0.8]
+
+
+@pytest.mark.parametrize("brackets", ["p[{}]", "p [{}]", "[{}]", "({})"])
+def test_poses_as_universal_robots_writes_them(tmp_path, brackets):
+    raw = read(
+        tmp_path, "tcp_0.txt", brackets.format("0.7986999, -0.1417139, 0.7849780, -1.2629957, 0.69, -0.63") + "\n"
+    )
+    assert raw.numbers.tolist() == [[0.7986999, -0.1417139, 0.784978, -1.2629957, 0.69, -0.63]]
+
+
+def test_a_column_called_p_keeps_its_name(tmp_path):
+    raw = read(tmp_path, "poses.csv", "x,y,z,w[deg],p[deg],r[deg]\n" + "1,2,3,4,5,6\n" * 2)
+    assert raw.header is not None and raw.header[4].startswith("p")
+
+
+def test_reghec_says_by_its_sizes_that_angles_come_first_in_radians(tmp_path):
+    (layout,) = possible_layouts(read(tmp_path, "RobotPoses.dat", REGHEC))
+    assert layout.position[0].tolist() == [111.227938, -331.951396, 317.520474]
+    assert {r.angle_unit for r in readings(layout)} == {"rad", "deg"}
+
+
+def test_mech_mind_quaternion_may_be_of_either_order_until_somebody_says(tmp_path):
+    raw = read(tmp_path, "poses.json", MECH_MIND)
+    (layout,) = possible_layouts(raw)
+    assert [r.rotation for r in readings(layout)] == ["quaternion-xyzw", "quaternion-wxyz"]
+    assert np.allclose(only(raw, rotation="quaternion-wxyz").T[0, :3, 0], [0.28, 0, -0.96])
+
+
+@pytest.mark.parametrize("order", ["rows", "columns"])
+def test_matrices_in_text_json_yaml_and_numpy(tmp_path, order):
+    T = np.tile(np.eye(4), (3, 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(np.eye(3)).as_matrix()
+    T[:, :3, 3] = [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
+    written = T if order == "rows" else T.transpose(0, 2, 1)
+    blocks = "\n\n".join("\n".join(" ".join(f"{x:.9f}" for x in row) for row in M) for M in written)
+    (tmp_path / "blocks.txt").write_text(blocks, encoding="utf-8")
+    (tmp_path / "lists.json").write_text(json.dumps({"poses": written.tolist()}), encoding="utf-8")
+    (tmp_path / "named.json").write_text(
+        json.dumps({f"v{i}": M.tolist() for i, M in enumerate(written)}), encoding="utf-8"
+    )
+    dashes = "".join(f"- - {row[0].tolist()}\n" + "".join(f"  - {r.tolist()}\n" for r in row[1:]) for row in written)
+    (tmp_path / "dashes.yml").write_text(dashes, encoding="utf-8")
+    np.save(tmp_path / "all.npy", written)
+    np.savetxt(tmp_path / "flat.csv", written.reshape(3, 16), delimiter=";")
+    for name in ("blocks.txt", "lists.json", "named.json", "dashes.yml", "all.npy", "flat.csv"):
+        assert np.allclose(only(read_raw_poses([tmp_path / name])).T, T), name
+
+
+def test_three_by_four_and_rotations_apart(tmp_path):
+    R = Rotation.from_rotvec([[0.3, -0.2, 0.9], [0.1, 0.2, -0.4]]).as_matrix()
+    t = np.array([[1.0, 2, 3], [4, 5, 6]])
+    np.savetxt(tmp_path / "kitti.txt", np.concatenate([R, t[:, :, None]], axis=2).reshape(2, 12))
+    assert np.allclose(only(read_raw_poses([tmp_path / "kitti.txt"])).T[:, :3, 3], t)
+    np.savetxt(tmp_path / "apart.txt", np.hstack([R.reshape(2, 9), t]))
+    (layout,) = possible_layouts(read_raw_poses([tmp_path / "apart.txt"]))
+    by_rows, by_columns = readings(layout)
+    assert np.allclose(by_rows.T[:, :3, :3], R) and np.allclose(by_columns.T[:, :3, :3], R.transpose(0, 2, 1))
+
+
+HEADERS = {
+    "X [mm];Y [mm];Z [mm];A;B;C": (None, "mm", None),
+    "x_m,y_m,z_m,qw,qx,qy,qz": ("quaternion-xyzw", "m", None),
+    "q1,q2,q3,q4,x,y,z": ("quaternion-wxyz", None, None),
+    "X,Y,Z,W,P,R": ("xyz-extrinsic", None, None),
+    "tcp.position.x tcp.position.y tcp.position.z roll_deg pitch_deg yaw_deg": ("xyz-extrinsic", None, "deg"),
+    "rx(rad),ry(rad),rz(rad),px,py,pz": (None, None, "rad"),
+}
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_names_of_columns_tell_what_they_can(tmp_path, header):
+    count = len(header.replace(";", ",").replace(" [", "[").replace(",", " ").split())
+    row = [0.5] * 4 + [0.0] * (count - 4)
+    separator = next(s for s in ";, " if s in header)
+    if "qw" in header:
+        row = [0.1, 0.2, 0.3, 1, 0, 0, 0]
+    elif "q1" in header:
+        row = [1, 0, 0, 0, 0.1, 0.2, 0.3]
+    text = header + "\n" + "\n".join(separator.join(map(str, row)) for _ in range(3))
+    (layout,) = possible_layouts(read(tmp_path, "t.csv", text))
+    assert (layout.convention, layout.length_unit, layout.angle_unit) == HEADERS[header]
+    if header[0] == "q" or "qw" in header:
+        assert np.allclose(readings(layout)[0].T[:, :3, :3], np.eye(3))
+        assert np.allclose(layout.position, [0.1, 0.2, 0.3])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("a.json", "{", "not valid JSON"),
+        ("a.json", "[1, 2]", "holds no poses"),
+        ("a.yaml", "a: [1, 2", "bracket"),
+        ("a.yaml", "a:\n    - 1\n  b: 2\n", "no YAML that is known"),
+        ("a.yaml", "a: 1\nb: &x [1, 2]\nc: *x\n", "line 3: refers to what stands elsewhere"),
+        ("a.yaml", "a: 1\n? [1, 2]\n: 3\n", "line 2: a key is no word"),
+        ("a.yaml", "a:\n  b: \t1\n\tc: 2\n", "line 3: .* tab"),
+        ("a.yaml", "ä: 1\nb: \1", "line 2: .*control characters"),
+        ("a.yaml", "a: !!python/object/apply:os.getcwd []\n", "holds no poses"),
+        pytest.param("a.yaml", "[" * 100_000, "line 1: nested too deeply", id="a-hundred-thousand-lists"),
+        ("a.csv", "a,b,c,d,e\n1,2,3,4,5\n", "--columns"),
+        ("a.csv", "1,2,3,4,5,6,0.5\n2,3,4,5,6,7,0.5\n", "--columns"),
+    ],
+)
+def test_what_holds_no_poses_is_refused(tmp_path, name, text, told):
+    with pytest.raises(InputError, match=told):
+        possible_layouts(read(tmp_path, name, text))

@@ -1,0 +1,169 @@
+"""A table as a spreadsheet of another country saves it: its letters, its words, its clock, its own order of scans."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from data_synth.fixtures.raw_folders import Convention, raw_folder, session_poses
+from data_synth.write import write_session
+from stitch.errors import InputError
+from stitch.plugins.intake.clock_times import DAY_FIRST, MONTH_FIRST, clock_times
+from stitch.plugins.intake.cloud_pairs import pairings
+from stitch.plugins.intake.first_session import StatedFolder, first_session
+from stitch.plugins.intake.folder_files import find_folder_files
+from stitch.plugins.intake.layouts import covariate_columns, possible_layouts
+from stitch.plugins.intake.raw_poses import read_raw_poses
+from stitch.plugins.intake.session_draft import write_draft
+from stitch.session.reading.session_folder import load_session
+
+HEADER = (
+    "Nr.;Messung;Lage X [m];Lage Y [m];Lage Z [m];Drehung um Z [°];Drehung um Y [°];Drehung um X [°];Uhrzeit;Luft °C"
+)
+ROWS = ["1;Süd;0,5;-0,25;1;90;0;0;23:58:10;21,5", "2;Nord;0,5;-0,25;2;0;45;0;23:59:10,5;21,6"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
+def test_letters_and_words_of_another_country(tmp_path, encoding):
+    file = tmp_path / "Posen.csv"
+    file.write_bytes("\r\n".join([HEADER, *ROWS]).encode(encoding))
+    raw = read_raw_poses([file])
+    (layout,) = possible_layouts(raw)
+    assert layout.position.tolist() == [[0.5, -0.25, 1], [0.5, -0.25, 2]] and layout.length_unit == "m"
+    assert layout.rotation.tolist() == [[90, 0, 0], [0, 45, 0]] and layout.angle_unit == "deg"
+    assert [texts[0] for texts in raw.labels] == ["Süd", "Nord"]
+    assert covariate_columns(layout, [0, 1], raw.time_s)["time_s"] == ["0", "60.5"]
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path):
+    (tmp_path / "Posen.csv").write_bytes(b"1,2,3\0\x81\x8d4,5,6")
+    with pytest.raises(InputError, match="is no text"):
+        read_raw_poses([tmp_path / "Posen.csv"])
+
+
+def test_angles_are_no_position_though_their_columns_come_first(tmp_path):
+    header = "Giro X [grad],Giro Y [grad],Giro Z [grad],X [mm],Y [mm],Z [mm]"
+    (tmp_path / "t.csv").write_text(f"{header}\n1,2,3,400,500,600\n1,2,4,400,500,601\n", encoding="utf-8")
+    (layout,) = possible_layouts(read_raw_poses([tmp_path / "t.csv"]))
+    assert layout.position[0].tolist() == [400, 500, 600] and layout.rotation[0].tolist() == [1, 2, 3]
+    # Gradians or, in German, degrees: left to the scans.
+    assert layout.angle_unit is None
+
+
+@pytest.mark.parametrize(
+    ("cells", "seconds"),
+    [
+        (["09:14", "09:15"], [0, 60]),
+        (["2026-02-28T23:59:59.5Z", "2026-03-01 00:00:01"], [0, 1.5]),
+        (["31.12.2026 23:00:00", "01.01.2027 01:00:00"], [0, 7200]),
+        (["23:59:00", "00:01:00"], None),  # past midnight, or another order?
+        (["3/4/2026 09:00:00", "3/5/2026 09:00:00"], None),  # of March, or the third of April?
+        (["30.02.2026 09:00:00", "30.02.2026 09:01:00"], None),
+        (["9:14", "late"], None),
+        (["9:45", "9:75"], None),
+        (["23:00", "24:00"], None),
+        ([], None),
+    ],
+)
+def test_times_of_day(cells, seconds):
+    found = clock_times(cells)
+    assert (None if found is None or found.seconds is None else found.seconds.tolist()) == seconds
+
+
+@pytest.mark.parametrize(
+    ("dates", "days", "words"),
+    [
+        (("03/04/2026", "03/04/2026"), 0, ""),  # one day, whichever
+        (("12/04/2026", "13/04/2026"), 1, DAY_FIRST),
+        (("4/12/26", "4/13/26"), 1, MONTH_FIRST),
+        (("30-04-2026", "01-05-2026"), 1, DAY_FIRST),
+        (("03/04/2026", "02/05/2026"), 29, DAY_FIRST),  # the other way it runs backwards
+        (("03/04/2026", "04/04/2026"), None, "03/04/2026 8:00 AM may begin with the day or the month"),
+        (("2026-04-03", "2026-04-02"), None, "run backwards"),
+    ],
+)
+def test_dates_whose_order_nobody_states(dates, days, words):
+    found = clock_times([f"{dates[0]} 8:00 AM", f"{dates[1]} 1:00 PM"])
+    assert words in found.words and bool(words) == bool(found.words)
+    assert (None if found.seconds is None else found.seconds[1]) == (None if days is None else 86400 * days + 5 * 3600)
+
+
+def test_what_became_of_the_times_is_said(tmp_path):
+    header = "date,x,y,z,qx,qy,qz,qw"
+    rows = [f"{month}/4/2026 9:00 AM,{month},0,500,0,0,0,1" for month in (3, 4, 5)]
+    (tmp_path / "t.csv").write_text("\n".join([header, *rows]), encoding="utf-8")
+    raw = read_raw_poses([tmp_path / "t.csv"])
+    assert raw.time_s is None and "to fix: write dates as 2026-12-31" in raw.clock.words
+
+
+def test_a_column_that_numbers_the_clouds_pairs_them_and_is_no_covariate(tmp_path):
+    clouds = [tmp_path / name for name in ("links-3.ply", "mitte-1.ply", "nord-2.ply")]
+    (pairing,) = pairings(clouds, [("9:00",), ("9:01",), ("9:02",)], np.array([[1, 0.5], [2, 0.6], [3, 0.7]]))
+    assert pairing.rows == (2, 0, 1) and pairing.by_name
+    rows = "".join(f"{i};1;2;{i};0;0;{i};{20 + i}\n" for i in (2, 1, 3))
+    (tmp_path / "t.csv").write_text(f"Nr;x;y;z;rx;ry;rz;air\n{rows}", encoding="utf-8")
+    (layout,) = possible_layouts(read_raw_poses([tmp_path / "t.csv"]))
+    assert covariate_columns(layout, [0, 1, 2]) == {"air": ["22", "21", "23"]}
+
+
+def test_time_and_temperature_beside_a_pose_in_yaml_are_kept(tmp_path):
+    files = []
+    for i in (1, 2):
+        pose = f"tool:\n  position: [1.0, 2.0, {i}.0]\n  quaternion: [0.0, 0.0, 0.0, 1.0]\n"
+        files.append(tmp_path / f"p{i}.yaml")
+        files[-1].write_text(f"stamp: 2026-03-01T09:0{i}:00\nair: 2{i}.5\n{pose}", encoding="utf-8")
+    raw = read_raw_poses(files)
+    (layout,) = possible_layouts(raw)
+    assert layout.position[1].tolist() == [1, 2, 2]
+    assert covariate_columns(layout, [0, 1], raw.time_s) == {"time_s": ["0", "60"], "air": ["21.5", "22.5"]}
+
+
+def test_files_of_poses_that_are_too_many_are_counted(tmp_path):
+    for i in range(9):
+        (tmp_path / f"pose{i}.yaml").write_text("a: 1\n", encoding="utf-8")
+        (tmp_path / f"scan{i % 3}.ply").write_bytes(b"ply\n")
+    with pytest.raises(InputError, match="3 clouds but 9 files that may hold a pose each, pose0"):
+        find_folder_files(tmp_path)
+
+
+def test_inverted_poses_of_scans_named_by_no_order(still_cells, tmp_path):
+    """Metres, decimal commas, T_flange_base, turns about z, y', x''; the session's views are in the table's order."""
+    write_session(tmp_path / "cell", still_cells["eye_in_hand"], "cell")
+    folder = raw_folder(tmp_path / "cell", tmp_path / "raw", Convention())
+    clouds = sorted((folder).rglob("*.ply"))
+    true = session_poses(tmp_path / "cell")[0]
+    lines = ["Aufnahme;Lage X [m];Lage Y [m];Lage Z [m];Drehung um Z [°];Drehung um Y [°];Drehung um X [°];Zeit"]
+    for i, (name, T, cloud) in enumerate(zip("dbca", true, clouds, strict=True)):
+        cloud.rename(cloud.with_name(f"Aufnahme {name}.ply"))
+        back = np.linalg.inv(T)
+        turns = Rotation.from_matrix(back[:3, :3]).as_euler("ZYX", degrees=True)
+        cells = [f"{x:.9f}".replace(".", ",") for x in (*back[:3, 3] / 1000, *turns)]
+        lines.append(";".join([f"Aufnahme {name}", *cells, f"09:0{i}"]))
+    for table in folder.glob("*.dat"):
+        table.unlink()
+    (folder / "Posen.csv").write_bytes("\r\n".join(lines).encode("cp1252"))
+    first = first_session(folder, StatedFolder())
+    write_draft(folder, first)
+    read = load_session(folder)
+    assert first.choice.determined and [v.name[-1] for v in read.views] == list("dbca")
+    assert [v.time_s for v in read.views] == [0, 60, 120, 180]
+    T = np.array([v.T_base_flange for v in read.views])
+    assert np.abs(T[:, :3, :3] - true[:, :3, :3]).max() < 1e-6
+    assert np.abs(1000 * T[:, :3, 3] - true[:, :3, 3]).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "times"),
+    [
+        ("time", [5.0, 6.5]),
+        ("timestamp", [1773216000.0, 1773216001.5]),
+        ("timestamp", [1773216000e3, 1773216001.5e3]),
+        ("stamp", [1773216000e9, 1773216001.5e9]),
+        ("Time [ms]", [5000.0, 6500.0]),
+        ("t_min", [0.0, 0.025]),
+    ],
+)
+def test_seconds_of_counts_in_whatever_a_controller_counts(tmp_path, name, times):
+    rows = "".join(f"{t!r},{i},0,500,0,0,0,1\n" for i, t in enumerate(times))
+    (tmp_path / "t.csv").write_text(f"{name},x,y,z,qx,qy,qz,qw\n{rows}", encoding="utf-8")
+    (layout,) = possible_layouts(read_raw_poses([tmp_path / "t.csv"]))
+    assert [float(t) for t in covariate_columns(layout, [0, 1])["time_s"]] == pytest.approx([0, 1.5], abs=1e-5)

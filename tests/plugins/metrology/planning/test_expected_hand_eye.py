@@ -1,0 +1,108 @@
+"""The stated uncertainty of a hand-eye against poses drawn and fitted without any of the plan's formulas."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.in_memory import session_of
+from stitch.diagnosis.candidates import candidates_of
+from stitch.errors import NoResultError
+from stitch.model.model import Model
+from stitch.plugins.metrology.planning.detection_chances import ExpectedDiagnosis
+from stitch.plugins.metrology.planning.expected_model import (
+    CellModel,
+    FieldOfView,
+    Scatter,
+    expected_hand_eye,
+    expected_model,
+    simulate_views,
+    surface_of_mesh,
+)
+
+ROTATION, TRANSLATION = 5e-5, 0.03
+DRAWS = 40
+
+
+@pytest.fixture(scope="module", params=["eye_to_hand", "eye_in_hand"])
+def planned(request):
+    """What a blade's cell measured, and its views as planned, with a scanner that has next to no noise."""
+    measured = measured_blade(3, views=7, mount=request.param, pixels=8)
+    reach = measured.scene.scanner.standoff
+    field = FieldOfView(np.array([0.3, 0.3]), 0.6 * reach, 1.4 * reach, standoff=reach, axis=np.array([0.0, 0.0, 1.0]))
+    part = surface_of_mesh(measured.mesh.copy()).moved(measured.scene.T_reference_part)
+    cell = CellModel(Model(measured.T_mount), part, field, Scatter(ROTATION, TRANSLATION, 1e-5, 1.0, {}))
+    found = simulate_views(session_of(measured), cell)
+    return measured, found, expected_model(found, cell)
+
+
+def _matrix(x):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(x[:3]).as_matrix(), x[3:]
+    return T
+
+
+def _six(T, scale):
+    turns = Rotation.from_matrix(T[..., :3, :3]).as_rotvec()
+    return (np.concatenate([turns, T[..., :3, 3]], axis=-1) / scale).ravel()
+
+
+def test_the_stated_covariance_is_that_of_fits(planned):
+    """χ² of the errors of fits of hand-eye and part to scattered flanges, 99.9 % interval."""
+    measured, found, linear = planned
+    stated = expected_hand_eye(linear, found).covariance
+    scale = np.repeat([ROTATION, TRANSLATION], 3)
+    M, reported, rng = measured.T_mount, measured.T_base_flange, np.random.default_rng(5)
+    in_hand = measured.scene.mount == "eye_in_hand"
+    squares = 0.0
+    for _ in range(DRAWS):
+        true = reported @ np.array([_matrix(row) for row in rng.standard_normal((len(reported), 6)) * scale])
+        part = (true if in_hand else np.linalg.inv(true)) @ M  # scans on the part, wherever that is
+
+        def off(x, part=part):
+            """Flanges where hand-eye and part put them, seen from the reported ones."""
+            placed = _matrix(x[6:]) @ part @ np.linalg.inv(M @ _matrix(x[:6]))
+            flange = placed if in_hand else np.linalg.inv(placed)
+            return _six(np.linalg.inv(reported) @ flange, scale)
+
+        x = least_squares(off, np.zeros(12), x_scale=np.tile(scale, 2) * 10, method="lm").x[:6]
+        squares += x @ np.linalg.solve(stated, x)
+    assert chi2.ppf(5e-4, 6 * DRAWS) < squares < chi2.ppf(1 - 5e-4, 6 * DRAWS)
+
+
+def test_twice_the_scatter_is_twice_the_uncertainty(planned):
+    _, found, linear = planned
+    once = expected_hand_eye(linear, found)
+    twice = expected_hand_eye(linear.at(linear.null.variances * 4), found)
+    assert sum(once.shares.values()) == pytest.approx(1)
+    np.testing.assert_allclose(twice.U, 2 * once.U, rtol=0.02)
+
+
+def test_chances_of_nothing_and_of_what_nobody_can_miss(planned):
+    """Nothing is detected about as seldom as the family-wise error says (5 %); a huge backlash always, by its name."""
+    measured, _, linear = planned
+    if measured.scene.mount == "eye_in_hand":
+        pytest.skip("one mount is enough")
+    candidates = candidates_of(linear, empirical=False)[0]
+    expected, rng = ExpectedDiagnosis(linear, candidates), np.random.default_rng(0)
+    nothing = expected.chance("backlash", np.zeros((linear.mixed.size, 200)), rng)
+    assert nothing.detected <= 0.11  # 99.9 % of draws at 5 %
+    own = next(c for c in candidates if c.name == "backlash")
+    column = own.forms[0].columns @ (30 * own.forms[0].sizes)
+    huge = expected.chance("backlash", np.repeat(column[:, None], 50, axis=1), rng)
+    assert huge.detected == 1.0 and huge.named > 0.9 and huge.misnamed == 0.0
+
+
+def test_views_that_see_nothing_are_refused(planned):
+    measured, _, linear = planned
+    session = session_of(measured)
+    reach = measured.scene.scanner.standoff
+    blind = FieldOfView(np.array([0.3, 0.3]), 3 * reach, 4 * reach, standoff=reach, axis=np.array([0.0, 0.0, 1.0]))
+    part = surface_of_mesh(measured.mesh.copy()).moved(measured.scene.T_reference_part)
+    cell = CellModel(Model(measured.T_mount), part, blind, Scatter(ROTATION, TRANSLATION, 1e-5, 1.0, {}))
+    with pytest.raises(NoResultError, match=r"view v000 would see next to nothing"):
+        simulate_views(replace(session, name="blind"), cell)

@@ -1,0 +1,127 @@
+"""`stitch measure` and `stitch verify` on a small cell whose part and artefact are known."""
+
+import csv
+import json
+import re
+import tomllib
+
+import numpy as np
+import pytest
+import tomli_w
+from plyfile import PlyData
+from typer.testing import CliRunner
+
+from data_synth.cells.verified_cell import write_verified_cell
+from stitch.cli.main import build
+from stitch.errors import InputError
+from stitch.plugins.metrology.feature_file import read_features
+from stitch.plugins.metrology.planning.command import place_of
+from tests.in_browser import WAYS, require_for_everybody
+from viz.features_page import write_certificate, write_features
+
+
+def _stitch(*arguments):
+    return CliRunner().invoke(build(), [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory):
+    """A part and an artefact on another day, and the run of the part; one cell for all of this file."""
+    folder = tmp_path_factory.mktemp("cell")
+    made = write_verified_cell(folder, 2, views=6, rays=80)
+    done = _stitch("run", made["part"], "-o", folder / "run", "--no-recording")
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+def test_measure_writes_numbers_budgets_and_a_dfq_file(cell):
+    done = _stitch("measure", cell / "run", cell / "part.toml", "--dfq", cell / "part.dfq")
+    assert done.exit_code == 0, done.output
+    assert re.search(r"[45] of 5 calibrated numbers agree", " ".join(done.output.split()))
+    document = json.loads((cell / "run" / "features.json").read_text())
+    numbers = {f"{n['feature']}.{n['quantity']}": n for n in document["numbers"]}
+    point = numbers["point 1.deviation"]
+    assert abs(point["value"]) < 3 * point["U"] and 0.002 < point["U"] < 0.2
+    assert sum(line["variance_share"] for line in point["budget"]) == pytest.approx(1)
+    matrix = np.array(document["covariance"]["matrix"])
+    assert np.sqrt(np.diag(matrix)) == pytest.approx([n["u"] for n in document["numbers"]])
+    rows = list(csv.DictReader((cell / "run" / "features.csv").open()))
+    by_source = [float(rows[0][key]) for key in rows[0] if key.startswith("u: ")]
+    assert np.sqrt(np.sum(np.square(by_source))) == pytest.approx(float(rows[0]["u"]), rel=1e-6)
+    own = float(rows[0]["cov: point 1.deviation"]), float(rows[0]["cov: point 2.deviation"])
+    assert own == pytest.approx(matrix[0, :2], rel=1e-6)
+    write_features(document, cell / "page.html")
+    page = (cell / "page.html").read_text(encoding="utf-8")
+    assert "point 1.deviation" in page and "conforms" in page and document["not_included"][0] in page
+    assert place_of(cell / "run", "point 2") == ",".join(
+        map(str, [*numbers["point 2.deviation"]["at"], *numbers["point 2.deviation"]["normal"]])
+    )
+    assert place_of(cell / "run", "1,2,3") == "1,2,3"
+    dfq = (cell / "part.dfq").read_text("utf-8-sig")
+    assert f"K0100 {len(numbers)}" in dfq and "K2110/1 -0.1" in dfq
+
+
+def test_measure_without_features_gives_every_point_a_sigma(cell):
+    assert _stitch("measure", cell / "run").exit_code == 0
+    sigma = PlyData.read(cell / "run" / "stitched.ply")["vertex"]["sigma"]
+    assert np.isfinite(sigma).all() and 0.001 < np.median(sigma) < 0.2
+
+
+def test_verify_passes_a_good_cell_and_fails_a_wrong_artefact(cell):
+    done = _stitch("verify", cell / "run", cell / "artefact", "-o", cell / "good")
+    assert done.exit_code == 0, done.output
+    good = json.loads((cell / "good" / "certificate.json").read_text())
+    write_certificate(good, cell / "certificate.html")
+    assert good["sentence"] in (cell / "certificate.html").read_text(encoding="utf-8").replace("\u00a0", " ")
+    assert good["passed"] and good["agreeing"] >= 13 and len(good["numbers"]) == 15
+    document = tomllib.loads((cell / "artefact" / "artefact.toml").read_text())
+    for row in document["feature"]:
+        row["calibrated"] *= 1.002  # 0.2 mm on 100 mm
+    (cell / "wrong.toml").write_text(tomli_w.dumps(document))
+    wrong = _stitch("verify", cell / "run", cell / "artefact", "--features", cell / "wrong.toml", "-o", cell / "bad")
+    assert wrong.exit_code == 3
+    assert not json.loads((cell / "bad" / "certificate.json").read_text())["passed"]
+
+
+@pytest.mark.slow  # a browser
+@pytest.mark.parametrize("way", WAYS)
+def test_the_certificate_is_readable_by_everybody(cell, browser, way):
+    _stitch("verify", cell / "run", cell / "artefact", "-o", cell / "good")
+    write_certificate(json.loads((cell / "good" / "certificate.json").read_text()), cell / "certificate.html")
+    require_for_everybody(browser, cell / "certificate.html", way)
+
+
+def test_the_session_of_the_fit_verifies_nothing(cell):
+    with pytest.raises(InputError, match="was fitted on it"):
+        CliRunner().invoke(build(), ["verify", str(cell / "run"), str(cell / "part")], catch_exceptions=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "asks for nothing"),
+        ('[[feature]]\nkind = "ball"', "kind is"),
+        ('[[feature]]\nkind = "sphere"\nat = [0, 0, 0]', "diameter"),
+        ('[[feature]]\nkind = "sphere"\nat = [0, 0]\ndiameter = 2', "at is"),
+        ('[[feature]]\nkind = "distance"\nbetween = ["a", "b"]', "between is"),
+        ('[[feature]]\nkind = "point"\nat = [0, 0, 0]\nnormal = [0, 0, 1]\nradus = 2', "unknown key"),
+        ('[[feature]]\nkind = "point"\nat = [0, 0, 0]\nnormal = [0, 0, 0]', "no direction"),
+        ('[[feature]]\nkind = "deviation"\nat = [0, 0, 0]', "cad is"),
+    ],
+)
+def test_a_wrong_file_is_refused_by_what_is_wrong(tmp_path, text, message):
+    file = tmp_path / "features.toml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_features(file, "mm", 0.5)
+
+
+def test_lengths_come_into_the_unit_of_the_run(tmp_path):
+    file = tmp_path / "features.toml"
+    file.write_text(
+        'length_unit = "m"\n[frame]\npose = [[0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n'
+        '[[feature]]\nkind = "sphere"\nat = [0.1, 0, 0]\ndiameter = 0.03\ntolerance = [-1e-4, 2e-4]\n'
+    )
+    feature = read_features(file, "mm", 0.5).features[0]
+    assert feature.at == pytest.approx([1000, 100, 0]) and feature.size == pytest.approx(30)
+    assert feature.tolerance == pytest.approx((-0.1, 0.2))

@@ -1,0 +1,181 @@
+"""How features answer to errors of the scanner and of poses, against the whole run repeated with those errors in it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.quiet_scenes import clean, simulated
+from data_synth.shapes.spheres import SpherePlate, centres
+from stitch.api.pipeline import run
+from stitch.numerics import frames
+from stitch.plugins.metrology import error_sources
+from stitch.plugins.metrology.budget import (
+    OWN_NOISE,
+    evaluate,
+    fit_features,
+    monte_carlo,
+    number_table,
+    stack_responses,
+)
+from stitch.plugins.metrology.error_sources import OVERLAPS, SCANNER, error_chain, place_errors
+from stitch.plugins.metrology.feature_file import Contribution, FeatureList
+from stitch.plugins.metrology.features import Feature
+from stitch.plugins.metrology.place_errors import point_sigmas
+
+PLATE = SpherePlate(radius=28.0)
+
+
+@pytest.fixture(scope="module")
+def cell():
+    """A measured session of a sphere plate, its run, and what is asked of it."""
+    scene = clean("spheres", rays=90, noise=0.02)
+    part = replace(scene.part, labelled=False, parameters={"radius": PLATE.radius})
+    scene = replace(scene, part=part, repeatability=(15e-6, 0.01))
+    measured = simulated(scene, {}, 3, views=6)
+    T = scene.T_reference_part
+    balls = frames.transform(T, centres(PLATE))
+    wanted = [Feature(f"ball {i}", "sphere", at=at, size=56.0, within=2.0) for i, at in enumerate(balls[:3])]
+    wanted.append(Feature("apart", "distance", between=("ball 0", "ball 1")))
+    at = frames.transform(T, np.array([[-45.0, 0.0, 0.0]]))[0]
+    wanted.append(Feature("top", "plane", at=at, axis=T[:3, 2], radius=30.0, within=2.0))
+    state = run(session_of(measured))
+    return state, place_errors(state), FeatureList(tuple(wanted))
+
+
+def _numbers(state, wanted):
+    places = place_errors(state)
+    return number_table(wanted.features, fit_features(places.points, wanted.features)).values
+
+
+def _responses(places, wanted):
+    fits = fit_features(places.points, wanted.features)
+    table = number_table(wanted.features, fits)
+    return stack_responses([places.responses(fit.at, fit.gradient) for fit in fits]).combined(table.slopes)
+
+
+def _lengths(wanted, values):
+    """Without slopes, and in the order of the table."""
+    names = [
+        q
+        for f in wanted.features
+        for q in {"plane": ("o", "s", "s"), "distance": ("d",)}.get(f.kind, ("d", "x", "y", "z"))
+    ]
+    return values[np.array(names) != "s"]
+
+
+@pytest.mark.slow  # a whole run again
+def test_smooth_scanner_error_moves_features_as_predicted(cell):
+    state, places, wanted = cell
+    smooth = [s for s in places.sources if s.field.any()]
+    k, size = 2, 0.05  # one that is coarse over the field, mm
+    predicted = _responses(places, wanted).loadings(smooth[k])[:, 0] * size / smooth[k].field[k, 0]
+    views = []
+    for v, view in enumerate(state.session.views):
+        scan = state.measurement.capture.scans[v]
+        moved = scan.points + size * places.field_modes(v, np.arange(len(scan.points)))[k]
+        views.append(replace(view, cloud=replace(view.cloud, points=moved)))
+    again = run(replace(state.session, views=tuple(views)))
+    seen = _lengths(wanted, _numbers(again, wanted) - _numbers(state, wanted))
+    predicted = _lengths(wanted, predicted)
+    assert np.abs(predicted).max() > 0.02
+    _require_alike(seen, predicted)
+
+
+def _require_alike(seen, predicted):
+    """Weights of views and partners of points change with the error, which no linear map says: by a third at most."""
+    assert 0.67 < seen @ predicted / (predicted @ predicted) < 1.5
+    assert np.linalg.norm(seen - predicted) < 0.4 * np.linalg.norm(predicted)
+
+
+@pytest.mark.slow  # two whole runs
+def test_error_of_one_pose_moves_features_as_predicted(cell):
+    state, _, wanted = cell
+    bare = [replace(view, joints=None, approach=None) for view in state.session.views]
+    v, xi = 2, np.array([0.0, 1e-4, 0.0, 0.0, 0.0, 0.02])
+    moved = [*bare]
+    moved[v] = replace(bare[v], T_base_flange=bare[v].T_base_flange @ frames.exp(xi))
+    before, after = (run(replace(state.session, robot=None, views=tuple(views))) for views in (bare, moved))
+    chain, errors = error_chain(before), place_errors(before)
+    left = frames.adjoint(frames.make(np.eye(3), -errors.centre) @ bare[v].T_base_flange) @ xi
+    twist = np.zeros((6 * len(bare), 1))
+    twist[6 * v : 6 * v + 6, 0] = -left  # the true pose is the reported one less this
+    predicted = _lengths(wanted, (_responses(errors, wanted).views @ chain.of_poses(twist)[0])[:, 0])
+    seen = _lengths(wanted, _numbers(after, wanted) - _numbers(before, wanted))
+    _require_alike(seen, predicted)
+
+
+def test_shares_add_up_and_the_largest_source_is_named(cell):
+    _, places, wanted = cell
+    fits = fit_features(places.points, wanted.features)
+    for name in {source.name for source in places.sources}:
+        larger = tuple(
+            replace(s, views=50 * s.views, field=50 * s.field) if s.name == name else s for s in places.sources
+        )
+        found = evaluate(replace(places, sources=larger), wanted, fits)
+        for number in found.numbers:
+            assert sum(number.shares.values()) == pytest.approx(1.0, abs=1e-9)
+        if any(np.abs(s.views).max() > 1e-5 for s in places.sources if s.name == name):
+            assert next(iter(found.numbers[1].shares)) == name
+
+
+def test_a_scanner_without_smooth_errors_is_not_charged_with_large_ones(cell):
+    _, places, _ = cell
+    *field, incidence = [source.field.max() for source in places.sources if source.field.any()]
+    # Usual is 0.3 of the noise; its logarithm scatters by 0.7, so that one sigma more is 0.6.
+    assert max(field) < 0.3 * 0.02 and incidence < 0.6 * 0.02
+
+
+def test_what_smooth_errors_make_of_the_overlaps_is_not_called_noise(cell):
+    state, places, _ = cell
+    chain = error_chain(state)
+    smooth = 0.1 * error_sources._smooth_errors(state, chain)[0]  # mm, five times the noise
+    rig = chain.solution.rig
+    bent = replace(rig, z=rig.z + rig.reduce([smooth]) @ np.random.default_rng(0).standard_normal(smooth.shape[1]))
+    bent = replace(chain, solution=replace(chain.solution, rig=bent))
+    modes = list(error_sources._pose_modes(state, bent, smooth))
+    noise, scanner = (sum(np.sum(m[1][0] ** 2) for m in modes if m[0] == name) for name in (OVERLAPS, SCANNER))
+    before = sum(np.sum(source.views**2) for source in places.sources if source.name == OVERLAPS)
+    assert noise < 5 * before < noise + scanner
+
+
+def test_a_distance_is_better_known_than_its_ends(cell):
+    _, places, wanted = cell
+    found = evaluate(places, wanted, fit_features(places.points, wanted.features))
+    U = {n.name: n.U for n in found.numbers}
+    ends = np.hypot(*(np.linalg.norm([U[f"ball {i}.{axis}"] for axis in "xyz"]) for i in (0, 1)))
+    assert U["apart.distance"] < 0.5 * ends
+    assert np.abs(found.correlation).max() <= 1 + 1e-9
+
+
+def test_monte_carlo_agrees_with_the_propagation(cell):
+    _, places, wanted = cell
+    few = FeatureList((*wanted.features[:2], wanted.features[3]), (Contribution("scale", relative=2e-5),))
+    found = monte_carlo(places, few, fit_features(places.points, few.features), 400)
+    # Five standard deviations of 400 trials.
+    assert np.abs(found.ratio - 1).max() < 5 / np.sqrt(2 * 400)
+
+
+def test_a_stated_contribution_counts_by_its_length(cell):
+    _, places, wanted = cell
+    fits = fit_features(places.points, wanted.features)
+    plain = evaluate(places, wanted, fits)
+    stated = evaluate(places, replace(wanted, contributions=(Contribution("scale", relative=1e-3),)), fits)
+    for before, after in zip(plain.numbers, stated.numbers, strict=True):
+        own = 1e-3 * after.value if after.quantity in ("distance", "diameter") else 0.0
+        assert after.u == pytest.approx(np.hypot(before.u, own), rel=1e-9)
+
+
+def test_every_fused_point_has_a_sigma_of_the_size_of_a_small_patch(cell):
+    state, places, _ = cell
+    sigma = point_sigmas(places, state.fused)
+    assert np.isfinite(sigma).all() and (sigma > 0).all()
+    T = state.fused.points
+    at = T[len(T) // 2]
+    patch = Feature("here", "point", at=at, axis=state.fused.normals[len(T) // 2], radius=8.0, within=3.0)
+    found = evaluate(places, FeatureList((patch,)), fit_features(places.points, (patch,)))
+    known = float(np.median(sigma[np.linalg.norm(T - at, axis=1) < 8.0]))
+    number = found.numbers[0]
+    shared = number.u * np.sqrt(1 - number.shares[OWN_NOISE])
+    assert 0.6 * shared < known < 2.0 * np.hypot(number.u, 0.02)

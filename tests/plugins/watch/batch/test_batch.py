@@ -1,0 +1,103 @@
+"""stitch batch: goes on after whatever befalls a session, and how it ends; the page over all."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stitch.plugins.watch.batch import cluster, run_batch
+from stitch.plugins.watch.batch.run_batch import BatchJob, SessionRow, run_jobs, run_session
+from viz.batch_page import write_page
+from viz.page_parts import unbroken
+
+pytestmark = pytest.mark.usefixtures("no_drawing")
+
+
+def test_it_goes_on_after_whatever_befalls_one_session(sessions, result, monkeypatch, capsys, batch):
+    """Also after an error that nobody foresaw."""
+
+    def fails_once(loaded, recorder):
+        if loaded.path.name == "monday":
+            raise ZeroDivisionError("by\nzero")
+        return replace(result, session=loaded)
+
+    monkeypatch.setattr(run_batch, "run", fails_once)
+    batch(*sessions, "--json", code=1)
+    bad, good = json.loads(capsys.readouterr().out)["sessions"]
+    assert bad["error"] == "ZeroDivisionError: by zero" and good["error"] is None
+    assert sorted(path.name for path in Path("runs").iterdir()) == ["batch.html", "batch.json", "tuesday"]
+    assert {"result.json", "report.html"} <= {path.name for path in Path("runs/tuesday").iterdir()}
+
+
+def test_the_workers_of_a_scheduler(sessions, tmp_path):
+    """Two threads of this process as workers; a session that cannot be read does not stop the others."""
+    distributed = pytest.importorskip("distributed")
+    jobs = [
+        BatchJob(path, tmp_path / "runs" / path.name, "a", recording=False) for path in (*sessions, tmp_path / "gone")
+    ]
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address="127.0.0.1:0"
+    ) as two:
+        rows = {row.name: row for row in run_jobs(jobs, scheduler=two.scheduler_address)}
+    assert "gone/session.toml: not found" in rows["gone"].error and rows["gone"].bad_input
+    alone = run_session(BatchJob(sessions[0], tmp_path / "alone", "b", recording=False))
+    numbers = ("residual_um", "registered_um", "noise_floor_um", "worst_view_um", "coarse_um")
+    assert [getattr(rows["monday"], key) for key in numbers] == [getattr(alone, key) for key in numbers]
+    assert np.isfinite(alone.residual_um)
+
+
+def test_no_answer_is_one_line(sessions, monkeypatch, capsys, batch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(cluster, "_ANSWER_SECONDS", 0.3)
+    batch(*sessions, "--scheduler", "tcp://127.0.0.1:9", code=2)
+    told = capsys.readouterr().err
+    assert told.startswith("stitch: --scheduler tcp://127.0.0.1:9: no answer") and told.count("\n") == 1
+    batch(*sessions, "--scheduler", "what://ever", code=2)
+    batch(*sessions, "--scheduler", "tcp://127.0.0.1:9", "--workers", "2", code=2)
+
+
+def test_where_nothing_can_be_read_nothing_is_left(tmp_path, batch):
+    batch(tmp_path / "nowhere", "-o", tmp_path / "runs", code=2)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "own").mkdir()
+    batch(tmp_path / "nowhere", "-o", tmp_path / "own", code=2)
+    assert list(tmp_path.iterdir()) == [tmp_path / "own"]
+
+
+@pytest.mark.usefixtures("ran")
+def test_without_the_package_one_process_works(sessions, monkeypatch, capsys, batch):
+    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    batch(sessions[0], "--workers", "2", code=2)
+    assert "pip install 'stitch[cluster]'" in capsys.readouterr().err
+    batch(sessions[0])
+
+
+def test_an_interrupt_keeps_what_is_finished(sessions, ran, monkeypatch, capsys, batch):
+    def stopped(jobs, *_):  # as pressed in the middle of the second session
+        yield run_session(jobs[0])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("stitch.plugins.watch.batch.run_batch.run_jobs", stopped)
+    batch(*sessions, code=1)
+    assert "stitch: stopped after 1 of 2 sessions" in capsys.readouterr().err.splitlines()[-1]
+    monkeypatch.setattr("stitch.plugins.watch.batch.run_batch.run_jobs", run_jobs)
+    batch(*sessions)
+    assert ran == ["monday", "tuesday"]
+
+
+def test_the_page_shows_those_first_that_need_somebody(tmp_path):
+    numbers = {"views": 9, "left_out": 1, "coarse_um": 1000.0, "registered_um": 20.0, "noise_floor_um": 20.0}
+    rows = [
+        SessionRow("s/good", "good", str(tmp_path / "good"), residual_um=21.0, verdict="Well.", **numbers),
+        SessionRow("s/odd", "odd", str(tmp_path / "odd"), residual_um=80.0, verdict="<b>Odd</b>.", **numbers),
+        SessionRow("s/bad", "bad", error="no views overlap"),
+    ]
+    write_page(rows, tmp_path / "batch.html")
+    page = (tmp_path / "batch.html").read_text()
+    places = [page.index(text) for text in ("no views overlap", "odd/report.html", "good/report.html")]
+    assert places == sorted(places)
+    assert "3 sessions: 2 run, 1 without a result." in page
+    assert "&lt;b&gt;Odd" in page and "9 of 10" in page and unbroken("80.0 µm") in page
+    assert str(tmp_path) not in page

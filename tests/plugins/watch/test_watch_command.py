@@ -1,0 +1,168 @@
+"""`stitch watch` on run folders: what it says, how it ends, and what it refuses."""
+
+import json
+import os
+import sqlite3
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from data_synth.fixtures.run_folders import bare_run
+from stitch.cli.main import main
+from stitch.plugins.watch.history import mount_twist, open_history, read_record, twist_covariance
+from stitch.plugins.watch.update import append_runs
+
+SIGMA = np.diag([2e-5] * 3 + [0.01] * 3) ** 2
+
+
+def run_folder(folder: Path, name: str, shift: float = 0.0, c2: float = 1e-6) -> Path:
+    """A run that found the mount somewhere, an hour after the one before."""
+    T = np.eye(4)
+    rng = np.random.default_rng(int(name[1:]))
+    T[:3, :3] = Rotation.from_rotvec([0.1, 2.0, 0.3] + 1e-5 * rng.normal(size=3)).as_matrix()
+    T[:3, 3] = [1200.0 + shift, -50.0, 700.0] + 0.005 * rng.normal(size=3)
+    effects = {"joint_compliance": {"c2": (c2 * (1 + 0.02 * rng.normal()), "rad/(N m)")}}
+    run = bare_run(folder / name, T, SIGMA, mount="eye_to_hand", name=name, effects=effects)
+    time = 1.79e9 + 3600 * int(name[1:])
+    os.utime(run / "result.json", (time, time))
+    return run
+
+
+def ends(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(a) for a in arguments])
+    return int(ended.value.code or 0)
+
+
+def test_a_knock_ends_with_3_and_its_session(tmp_path, capsys):
+    runs = [run_folder(tmp_path, f"s{k}", shift=0.2 * (k >= 20)) for k in range(24)]
+    cell = tmp_path / "cell-7"
+    assert ends("watch", cell, "--add", *runs[:20], "--json") == 0
+    quiet = json.loads(capsys.readouterr().out)
+    assert [p["alarm"] for p in quiet["parameters"]] == [None] * 7
+    assert ends("watch", cell, "--add", *runs, "--json") == 3
+    told = json.loads(capsys.readouterr().out)
+    assert told["sessions"] == 24
+    alarm = next(p["alarm"] for p in told["parameters"] if p["name"] == "hand_eye.x")
+    assert (alarm["since"], alarm["kind"]) == ("s20", "step")
+    assert alarm["p_value"] < 1e-6
+    assert alarm["size"] == pytest.approx(0.2, abs=0.01)
+    for name in ("watch.html", "watch.prom", "history.sqlite"):
+        assert (cell / name).stat().st_size > 500
+    assert ends("watch", cell, "--no-page") == 3
+    assert "the mount jumped before session s20" in " ".join(capsys.readouterr().err.split())
+    # A new calibration, of after the knock: what was is settled.
+    assert ends("watch", cell, "--in-use", runs[23], "--json") == 0
+    assert json.loads(capsys.readouterr().out)["in_use"] == "s23"
+
+
+def test_a_plant_has_a_page_with_a_row_a_cell(tmp_path, capsys):
+    cells = []
+    for c in range(2):
+        runs = [run_folder(tmp_path, f"s{10 * c + k}") for k in range(3)]
+        cells.append(tmp_path / f"cell-{c}")
+        assert ends("watch", cells[-1], "--add", *runs, "--no-page") == 0
+    capsys.readouterr()
+    assert ends("watch", *cells, "--json") == 0
+    assert [cell["cell"] for cell in json.loads(capsys.readouterr().out)] == ["cell-0", "cell-1"]
+    page = (tmp_path / "plant.html").read_text(encoding="utf-8")
+    assert 'href="cell-0/watch.html"' in page
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("nowhere",), "no cell with a history"),
+        (("cell", "--add"), "name the cell first"),
+        (("cell", "--add", "nowhere"), "no such run folder"),
+        (("s0", "--add", "s1"), "is a run, no cell"),
+        (("cell", "--add", "s0", "s1", "--at", "2026-01-01"), "name one RUN"),
+        (("cell", "--add", "s0", "--at", "noon"), "no time; to fix"),
+        (("cell", "--add", "s0", "--in-use", "s1"), "is not in the history"),
+        (("cell", "--add", "s0", "--dfq", "s0/result.json"), "ends in .dfq"),
+        (("session/cell", "--add", "s0"), "lies in the session"),
+        (("cell", "--add", "metres"), None),
+        (("cell", "--add", "s0", "copy"), "has the very numbers of"),
+        (("cell", "--add", "reused"), "as it is, so nothing was measured anew"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line_and_leaves_nothing(arguments, told, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("s0", "s1"):
+        run_folder(tmp_path, name)
+    T = np.array(json.loads((tmp_path / "s0" / "result.json").read_text())["hand_eye"])
+    bare_run(tmp_path / "metres", T, SIGMA, length_unit="m", mount="eye_to_hand")
+    effects = {"joint_compliance": {"c2": (read_record(tmp_path / "s0").estimates[0].value, "rad/(N m)")}}
+    bare_run(tmp_path / "copy", T, SIGMA, mount="eye_to_hand", name="other", effects=effects)
+    (tmp_path / "session").mkdir()
+    (tmp_path / "session" / "session.toml").touch()
+    reused = bare_run(tmp_path / "reused", T, SIGMA, mount="eye_to_hand") / "result.json"
+    stage = {"name": "coarse", "rms": 0.1, "correspondences": 9, "iterations": 1, "seconds": 0.0}
+    note = {"note": "hand-eye of another run, used as it is"}
+    reused.write_text(json.dumps(json.loads(reused.read_text()) | {"stages": [stage | note]}))
+    if told is None:
+        # Metres after millimetres: another cell.
+        assert ends("watch", "cell", "--add", "s0", "--no-page") == 0
+        told = "has length_unit m, the cell cell mm"
+        capsys.readouterr()
+        assert ends("watch", *arguments) == 2
+        assert told in capsys.readouterr().err
+        return
+    assert ends("watch", *arguments) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert told in lines[-1]
+    assert not (tmp_path / "cell").exists()
+
+
+def test_a_damaged_history_is_named(tmp_path, capsys):
+    (tmp_path / "cell").mkdir()
+    (tmp_path / "cell" / "history.sqlite").write_bytes(b"no data base" * 500)
+    assert ends("watch", tmp_path / "cell") == 2
+    assert "history.sqlite: damaged" in capsys.readouterr().err
+
+
+def test_a_database_of_something_else_is_left_as_it_is(tmp_path, capsys):
+    run = run_folder(tmp_path, "s0")
+    (tmp_path / "cell").mkdir()
+    file = tmp_path / "cell" / "history.sqlite"
+    connection = sqlite3.connect(file)
+    connection.execute("CREATE TABLE parts (name)")
+    connection.close()
+    before = file.read_bytes()
+    assert ends("watch", tmp_path / "cell", "--add", run) == 2
+    assert "is no history in the form" in capsys.readouterr().err and file.read_bytes() == before
+
+
+def test_many_writers_lose_nothing(tmp_path):
+    runs = [run_folder(tmp_path, f"s{k}") for k in range(12)]
+
+    def append(run: Path) -> int:
+        with open_history(tmp_path / "cell", new=True) as history:
+            return append_runs(history, [read_record(run)])
+
+    with ThreadPoolExecutor(4) as pool:
+        assert sum(pool.map(append, [*runs, *runs])) == 12
+    with open_history(tmp_path / "cell") as history:
+        assert history.sql("SELECT count(*) FROM runs")[0][0] == 12
+        assert history.sql("SELECT max(number) FROM states")[0][0] == 12
+
+
+def test_the_twist_of_the_mount_is_its_motion_about_the_part():
+    first, middle = np.eye(4), np.array([10.0, -20.0, 400.0])
+    first[:3, :3] = Rotation.from_rotvec([0.4, -2.0, 0.3]).as_matrix()
+    first[:3, 3] = [1200.0, -50.0, 700.0]
+    place = first[:3, :3] @ middle + first[:3, 3]
+    turn, shift = np.array([1e-4, -2e-4, 3e-4]), np.array([0.05, -0.02, 0.01])
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    motion[:3, 3] = place + shift - motion[:3, :3] @ place
+    found = mount_twist(motion @ first, first, middle)
+    np.testing.assert_allclose(found, [*turn, *shift], rtol=1e-3, atol=1e-8)
+    # A turn about the scanner's own origin alone moves the part by its lever.
+    only_turn = np.zeros((6, 6))
+    only_turn[1, 1] = 1e-8
+    told = twist_covariance(only_turn, np.eye(4), np.eye(4), np.array([0.0, 0, 400.0]))
+    np.testing.assert_allclose(np.sqrt(np.diag(told)), [0, 1e-4, 0, 0.04, 0, 0], atol=1e-12)

@@ -1,0 +1,79 @@
+"""Views that do not belong, in a cell of known truth: found, named, and where they really stood."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.blade_cells import captured_blade
+from stitch.numerics import frames
+from stitch.screening.conventions import register_scan_pairs
+from stitch.screening.placement import lies_in_a_line
+from stitch.screening.snooping import snoop_views
+from stitch.session.scan import prepare_scan
+
+GATE, OFF = 2.5, 6
+
+
+@pytest.fixture(scope="module")
+def cell():
+    return captured_blade(11, views=12, pixels=60)
+
+
+def with_mounts(own, change):
+    T = np.array(own.T_reference_mount)
+    return replace(own, T_reference_mount=change(T))
+
+
+def test_a_good_session_loses_no_view(cell):
+    measured, own = cell
+    found = snoop_views(own, measured.T_mount, GATE)
+    assert found.left_out == () and len(found.disconnected) == 1
+    # 20 µm and 20 µrad were put in.
+    assert 0.01 < found.translation < 0.04 and 1e-5 < found.rotation < 4e-5
+
+
+@pytest.mark.parametrize("shift", [1.0, 40.0])
+def test_a_displaced_view_is_named_with_how_far_it_is_off(cell, shift):
+    measured, own = cell
+    twist = np.r_[0, 0, 0, shift * np.array([0.6, 0.0, 0.8])]
+
+    def change(T):
+        T[OFF] = frames.exp(twist) @ T[OFF]
+        return T
+
+    found = snoop_views(with_mounts(own, change), measured.T_mount, GATE)
+    assert found.left_out == (OFF,)
+    assert found.misplaced[0].distance == pytest.approx(shift, abs=0.15)
+
+
+def test_a_scan_of_something_else_belongs_nowhere(cell):
+    measured, own = cell
+    xy = np.random.default_rng(0).uniform(-40, 40, (2000, 2))
+    waves = prepare_scan("waves", np.column_stack([xy, 420 + 9 * np.sin(xy[:, 0] / 7)]))
+    scans = (*own.scans[:OFF], waves, *own.scans[OFF + 1 :])
+    found = snoop_views(replace(own, scans=scans), measured.T_mount, GATE)
+    assert [(m.view, m.kind) for m in found.misplaced] == [(OFF, "foreign")]
+
+
+def test_a_scan_of_a_line_on_the_surface_holds_no_pose(cell):
+    """It lies on the surface of the others, as it would if it were turned about itself."""
+    measured, own = cell
+    scan = own.scans[OFF]
+    # Of the scan's own points those near one scan line, drawn into it.
+    along = scan.points[scan.usable][:400] - scan.points[scan.usable][:400].mean(axis=0)
+    direction = np.linalg.svd(along, full_matrices=False)[2][0]
+    line = scan.points.mean(axis=0) + np.linspace(-5, 5, 400)[:, None] * direction
+    assert lies_in_a_line(prepare_scan("line", line)) and not lies_in_a_line(scan)
+    scans = (*own.scans[:OFF], prepare_scan("line", line), *own.scans[OFF + 1 :])
+    assert snoop_views(replace(own, scans=scans), measured.T_mount, GATE).left_out == (OFF,)
+
+
+def test_motions_between_scans_are_those_of_the_cell(cell):
+    measured, own = cell
+    found = register_scan_pairs(own)
+    poses = measured.T_reference_scanner
+    true = np.array([frames.inverse(poses[v]) @ poses[w] for v, w in found.pairs])
+    off = frames.angle_between(true, found.T)
+    assert len(found.pairs) >= 8
+    assert np.mean(off < 2e-3) > 0.7

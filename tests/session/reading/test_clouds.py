@@ -1,0 +1,176 @@
+"""Clouds written by other libraries are read to the same numbers."""
+
+import struct
+
+import imagecodecs
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+
+from stitch.errors import InputError
+from stitch.session.reading.clouds import cloud_of_columns, read_cloud
+
+POINTS = np.random.default_rng(0).normal(size=(500, 3)) * 100
+
+
+@pytest.mark.parametrize(("text", "order"), [(True, "="), (False, "<"), (False, ">")])
+def test_ply(tmp_path, text, order):
+    vertex = np.empty(
+        500, [("x", "f8"), ("y", "f8"), ("z", "f8"), ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), ("intensity", "u2")]
+    )
+    for i, axis in enumerate("xyz"):
+        vertex[axis] = POINTS[:, i]
+        vertex["n" + axis] = i == 2
+    vertex["intensity"] = np.arange(500)
+    PlyData([PlyElement.describe(vertex, "vertex")], text=text, byte_order=order).write(str(tmp_path / "c.ply"))
+    cloud = read_cloud(tmp_path / "c.ply", 0.001)
+    assert np.allclose(cloud.points, POINTS / 1000, atol=1e-9)
+    assert np.allclose(cloud.normals, [0, 0, 1])
+    assert np.array_equal(cloud.scalars["intensity"], np.arange(500))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_pcd_in_each_encoding(tmp_path, encoding):
+    """Packed by LibLZF itself; repeated rows give it something to pack."""
+    points = np.vstack([POINTS, np.repeat(POINTS[:5], 60, axis=0)]).astype("<f4")
+    if encoding == "ascii":
+        body = "\n".join(" ".join(map(repr, row)) for row in points.tolist()).encode()
+    elif encoding == "binary":
+        body = points.tobytes()
+    else:
+        fields = points.T.tobytes()
+        packed = imagecodecs.lzf_encode(fields)
+        assert len(packed) < len(fields)
+        body = struct.pack("<II", len(packed), len(fields)) + packed
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+        f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA {encoding}\n"
+    )
+    (tmp_path / "c.pcd").write_bytes(header.encode() + body)
+    assert np.array_equal(read_cloud(tmp_path / "c.pcd").points, points)
+
+
+def test_pcd_with_padding_vectors_and_odd_names(tmp_path):
+    layout = np.dtype([("Coord._Z", "<f4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f8"), ("_", "u1", 4), ("t", "<u4")])
+    table = np.zeros(500, layout)
+    for i, axis in enumerate("xyz"):
+        table[axis] = POINTS[:, i]
+    table["_"], table["t"] = 255, np.arange(500)
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS Coord._Z x y z _ t\nSIZE 4 4 4 8 1 4\nTYPE F F F F U U\n"
+        "COUNT 1 1 1 1 4 1\nWIDTH 500\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 500\nDATA binary\n"
+    )
+    (tmp_path / "c.pcd").write_bytes(header.encode() + table.tobytes())
+    cloud = read_cloud(tmp_path / "c.pcd")
+    assert np.allclose(cloud.points, POINTS, atol=1e-4)
+    assert set(cloud.scalars) == {"Coord._Z", "t"}
+    (tmp_path / "c.pcd").write_bytes(header.encode() + table.tobytes()[:-40])
+    with pytest.raises(InputError, match="500 points announced"):
+        read_cloud(tmp_path / "c.pcd")
+
+
+def test_real_pcd_with_padding(reghec):
+    for name in ("david", "sphere"):
+        path = reghec(name) / "clouds" / "view1.pcd"
+        header, _, body = path.read_bytes().partition(b"DATA binary\n")
+        assert b"FIELDS x y z _\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 4\n" in header
+        table = np.frombuffer(body, [("place", "<f4", 3), ("_", "u1", 4)])
+        assert np.array_equal(read_cloud(path).points, table["place"])
+
+
+@pytest.mark.parametrize(
+    ("suffix", "text"),
+    [
+        (".xyz", "1 2 3 9\n4 5 6 8\n"),
+        (".csv", "x,y,z,intensity\n1,2,3,9\n4,5,6,8\n"),
+        (".txt", "# c\n1;2;3;9\n4;5;6;8\n"),
+        (".xyz", "# taken at noon\n# X Y Z intensity\n1 2 3 9\n4 5 6 8\n"),
+    ],
+)
+def test_text(tmp_path, suffix, text):
+    path = tmp_path / f"c{suffix}"
+    path.write_text(text)
+    cloud = read_cloud(path)
+    assert np.array_equal(cloud.points, [[1, 2, 3], [4, 5, 6]])
+    (name,) = cloud.scalars
+    assert np.array_equal(cloud.scalars[name], [9, 8])
+    assert name == ("intensity" if "intensity" in text else "scalar_0")
+
+
+def test_points_at_the_scanner_itself_are_no_measurement(tmp_path):
+    """Structured exports keep a place for every pixel; scalars and normals stay with their points."""
+    path = tmp_path / "c.csv"
+    path.write_text("x,y,z,nx,ny,nz,intensity\n0,0,0,0,0,0,0\n1,0,3,0,0,1,9\n-0.0,0,0,0,0,0,0\n0,0,6,0,1,0,8\n")
+    cloud = read_cloud(path)
+    assert np.array_equal(cloud.points, [[1, 0, 3], [0, 0, 6]])
+    assert np.array_equal(cloud.normals, [[0, 0, 1], [0, 1, 0]])
+    assert np.array_equal(cloud.scalars["intensity"], [9, 8])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [("c.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nend_header\n", "cannot be read"),
+     ("c.ply", b"", "the file is empty; export it again"), ("c.ply", b"\x8f\xb7\x02\x9a" * 50, "is not a PLY file"),
+     ("c.pcd", b"not a cloud", "no DATA line"), ("c.fls", b"", "unknown cloud format"), ("c.csv", b"a,b\n1,2\n", "no column"),
+     ("c.pcd", b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 9\nDATA binary_compressed\n" + struct.pack("<II", 50, 108), "cut short")],
+)  # fmt: skip
+def test_broken_files_say_so(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("count", "packed", "size", "told"),
+    [
+        (1, b"\x0b" + bytes(12), 12, "nothing was measured"),
+        # Four bytes, then eight more from four back: a pattern that reads what it writes.
+        (1, b"\x03\0\0\x80\x3f\xc0\x03", 12, None),
+        (1, b"\xff\xff\xff\xff", 12, "do not give its 1 points"),
+        (1, b"\x20\x00abc", 12, "error in compressed data"),
+        (1, b"\x02abc", 12, "do not give its 1 points"),
+        (9, b"\x02abc", 12, "cut short"),
+        (0, b"", 0, "no points"),
+    ],
+)
+def test_compressed_pcd_of_few_bytes(tmp_path, count, packed, size, told):
+    header = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS {count}\nDATA binary_compressed\n"
+    (tmp_path / "c.pcd").write_bytes(header.encode() + struct.pack("<II", len(packed), size) + packed)
+    if told is None:
+        assert read_cloud(tmp_path / "c.pcd").points.tolist() == [[1, 1, 1]]
+        return
+    with pytest.raises(InputError, match=told):
+        read_cloud(tmp_path / "c.pcd")
+
+
+@pytest.mark.parametrize("name", ["s.ply", "s.pcd", "s.xyz", "s.stl", "s.e57", "s.png"])
+def test_what_git_lfs_has_not_fetched_says_how_to_fetch_it(name, tmp_path):
+    """The pointer as the specification of Git LFS has it."""
+    oid = "4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393"
+    pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{oid}\nsize 12345\n"
+    (tmp_path / name).write_text(pointer)
+    with pytest.raises(InputError, match="git lfs pull"):
+        read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "code", [(-99999, -99999, -99999), (np.nan, np.nan, -32.768), (0.0, 0.0, -32.768), (9999, 0, 0)]
+)
+@pytest.mark.parametrize("times", [3, 100, 9000])
+def test_a_code_for_nothing_measured_is_no_point(code, times):
+    """A few of the pixels or most of them; what was measured stays, in its order."""
+    points = np.random.default_rng(0).uniform([-0.1, -0.1, 0.4], [0.1, 0.1, 0.5], (1000, 3))
+    at = np.sort(np.random.default_rng(1).integers(0, 1000, times))
+    code = np.nan_to_num(code, nan=0.05)
+    columns = dict(zip("xyz", np.insert(points, at, code, axis=0).T, strict=True))
+    columns["intensity"] = np.insert(points[:, 2], at, 0.0)
+    cloud = cloud_of_columns("scan", columns)
+    assert np.array_equal(cloud.points, points) and np.array_equal(cloud.scalars["intensity"], points[:, 2])
+    assert cloud.coded == times and set(cloud.codes) <= set(code)
+
+
+def test_what_is_flat_or_stepped_or_quantised_is_no_code():
+    x, y = (g.ravel() for g in np.meshgrid(*[np.arange(40) * 0.5] * 2))
+    for z in (np.full(1600, 500.0), np.where(x > 15, 500.0, 100.0), np.round(300 + 0.3 * x)):
+        cloud = cloud_of_columns("scan", {"x": x.copy(), "y": y.copy(), "z": z.copy()})
+        assert np.array_equal(cloud.points[:, 2], z)
