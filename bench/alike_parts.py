@@ -23,7 +23,7 @@ from data_synth.scene import Scene, load_scene
 from data_synth.shapes.solid import circle, extrude, to_mesh, union
 from stitch.api.pipeline import run
 from stitch.errors import StitchError
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "integrity.md"
 SCENES = ("blade", "blade-table")
@@ -75,7 +75,7 @@ def scene_with(name: str, mesh: Path | None) -> Scene:
     return scene if mesh is None else replace(scene, part=replace(scene.part, mesh=str(mesh), labelled=False))
 
 
-def said_of(session: Session) -> tuple[int, bool, str]:
+def said_of(session: SessionData) -> tuple[int, bool, str]:
     """How many views a run leaves out, whether it tells to type a number, and its first doubt or its refusal."""
     try:
         found = run(session)
@@ -126,7 +126,7 @@ def few(first: int, cells: int) -> list[str]:
     return lines
 
 
-def doubted_and_named(session: Session) -> tuple[bool, set[str]]:
+def doubted_and_named(session: SessionData) -> tuple[bool, set[str]]:
     """Whether a run doubts the session as a whole or refuses it, and the views that it leaves out or says stand out."""
     try:
         found = run(session)

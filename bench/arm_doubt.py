@@ -22,7 +22,7 @@ from stitch.api.pipeline import run
 from stitch.model.model_toml import ModelFile, keep_arm_effects
 from stitch.numerics.frames import Array
 from stitch.output.result_document import model_of
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
 MARKS = ("<!-- arm doubt: begin -->", "<!-- arm doubt: end -->")
@@ -33,7 +33,7 @@ USUAL = 5e-4  # rad, of zeros and gears
 BINS = (0.0, 0.5, 0.8, 1.0, 1.25, 2.0, np.inf)
 
 
-def cell(seed: int, views: int, arm: Array, quiet: bool = False) -> Session:
+def cell(seed: int, views: int, arm: Array, quiet: bool = False) -> SessionData:
     """Labelled points on an arm (3, 6) of wrong zeros and gears."""
     zeros, sines, cosines = arm
 
@@ -55,7 +55,7 @@ def trials(seed: int) -> Iterator[tuple[float, bool]]:
         yield _rms(further, kept) / _rms(further, None), bool(found.doubts)
 
 
-def _rms(session: Session, arm: ModelFile | None) -> float:
+def _rms(session: SessionData, arm: ModelFile | None) -> float:
     return run(session, arm=arm).residual_rms
 
 

@@ -22,7 +22,7 @@ from stitch.numerics.frames import Array
 from stitch.plugins.metrology.calibrate.robot import LINK_TRUSTS, link_table, observe_links
 from stitch.session.reading.robot_description import robot_from_dh
 from stitch.session.robot import Robot, forward
-from stitch.session.session import Scanner, Session, Sighting, View
+from stitch.session.session import Scanner, SessionData, Sighting, View
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "points.md"
 _TARGETS = np.array([[60.0, 10.0, 30.0], [-40.0, 55.0, 25.0], [-20.0, -60.0, 40.0]])
@@ -61,7 +61,7 @@ class SimulatedArm:
         """(V, 4, 4)."""
         return self.wrong.flange(self.arm, q + _BEND * gravity_torques(self.arm, q))
 
-    def session(self) -> Session:
+    def session(self) -> SessionData:
         """What the tracker saw in the half of the calibration."""
         q = self.joints(_VIEWS, "calibrated")
         T = self.true_flange(q) @ frames.exp(_SCATTER * self.rng.normal(size=(_VIEWS, 6)))
@@ -75,7 +75,9 @@ class SimulatedArm:
             for i in range(_VIEWS)
         ]
         scanner = Scanner(None, _NOISE, None, np.array([0, 0, 1.0]), "tracker")
-        return Session(Path("arm"), "arm", "mm", "eye_to_hand", scanner, self.nominal, None, None, None, tuple(views))
+        return SessionData(
+            Path("arm"), "arm", "mm", "eye_to_hand", scanner, self.nominal, None, None, None, tuple(views)
+        )
 
     def error(self, robot: Robot, q: Array) -> float:
         """Rms distance of a reflector from where the table has it, mm, base and tool fitted anew to the first order."""

@@ -21,7 +21,7 @@ from stitch.effects.user_file import load
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.measurement import Measurement
 
 # Evidence counts in views: a few thousand points a view show what millions would.
@@ -152,7 +152,7 @@ def hand_eye_sigma(measured: Measured, covariance: Array) -> float:
     return float(np.sqrt(np.mean([np.trace(J @ covariance @ J.T) for J in jacobians])))
 
 
-def hand_eye_chi_square(measured: Measured, found: Run) -> float:
+def hand_eye_chi_square(measured: Measured, found: RunData) -> float:
     """The error of the hand-eye against its covariance; 6 on the average where that is right."""
     xi = frames.log(frames.inverse(found.T_mount) @ measured.T_mount)
     return float(xi @ np.linalg.solve(found.mount_covariance, xi))

@@ -32,7 +32,7 @@ from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.errors import StitchError
 from stitch.observations.linear_model import LinearModel
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.system.threads import library_threads_off
 
 Row = dict[str, Any]
@@ -96,7 +96,7 @@ def _sizes(job: Row, laws: list[str]) -> dict[str, float] | None:
     return out
 
 
-def _diagnosed(job: Row, hidden: dict[str, float], how: str = "") -> tuple[Measured, Run, Diagnosis, Row]:
+def _diagnosed(job: Row, hidden: dict[str, float], how: str = "") -> tuple[Measured, RunData, Diagnosis, Row]:
     measured = measure(job["scene"], job["seed"], hidden, how, tuple(job.get("useful", ())), _chance(job))
     first = run(session_of(measured))
     found = diagnose(first)
@@ -133,7 +133,7 @@ def _effect(job: Row) -> Row:
     return row
 
 
-def _added(measured: Measured, first: Run, added: Run, job: Row) -> Row:
+def _added(measured: Measured, first: RunData, added: RunData, job: Row) -> Row:
     """What the change brought: held-out residual, hand-eye against the truth, amplitudes in sigmas."""
     true = in_session_units(measured)[job["effect"]]
     fitted = {p.name: p for p in added.terms[0].parameters if not p.grid and p.name in true}
@@ -186,7 +186,7 @@ def _pair(job: Row) -> Row:
     if hidden is None:
         return {"verdict": "not shown"}
     measured = measure(job["scene"], job["seed"], hidden, chance=_chance(job))
-    state: Run = run(session_of(measured))
+    state: RunData = run(session_of(measured))
     result, lines, last = suggest(state, 4)
     return {
         "hidden": dict(measured.hidden), "verdict": last.verdict, "named": list(last.effects),

@@ -35,7 +35,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.urdf_file import to_urdf
 from stitch.session.reading.session_folder import load_session
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 ROOT = Path(__file__).resolve().parents[1]
 CASES = Path(os.environ.get("STITCH_SHARED_CASES") or ROOT.parent / "shared" / "cases")
@@ -134,7 +134,7 @@ def follow(refusal: str, folder: Path, campaign: Campaign | None = None) -> tupl
     return (found[1], found[2]) if found else None
 
 
-def apart(session: Session, T_mount: Array) -> float:
+def apart(session: SessionData, T_mount: Array) -> float:
     """Return the median distance (mm) of points from planes through their neighbours in the next view."""
     scale = {"mm": 1.0, "m": 1e3}[session.length_unit]
     placed = []
@@ -162,7 +162,7 @@ def case_verdict(name: str, out: Path) -> str:
     return "right" if apart(session, T_CASES) < MEET_MM else f"wrong ({apart(session, T_CASES):.2f} mm)"
 
 
-def turns(session: Session, degrees: Sequence[float]) -> bool:
+def turns(session: SessionData, degrees: Sequence[float]) -> bool:
     """True if the poses turn the part about z by these angles, all in one sense."""
     T = np.array([view.T_base_flange for view in session.views])
     angles = np.degrees(np.unwrap(np.arctan2(T[:, 1, 0], T[:, 0, 0])))

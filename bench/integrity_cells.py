@@ -22,7 +22,7 @@ from stitch.screening.snooping import Snooping, snoop_views
 from stitch.screening.view_model import UsualEffects
 from stitch.session.capture import Capture, prepare_capture
 from stitch.session.measurement import measurement_of
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 PARTS: dict[str, dict[str, Any]] = {
     "blade": {},
@@ -56,7 +56,7 @@ def measured(
     return simulated(scene, hidden or {}, seed, VIEWS)
 
 
-def snooped(session: Session, T_mount: np.ndarray) -> tuple[Capture, np.ndarray, Snooping]:
+def snooped(session: SessionData, T_mount: np.ndarray) -> tuple[Capture, np.ndarray, Snooping]:
     """What a run would see: hand-eye corrected, views freed, tests."""
     own = prepare_capture(session)
     T_mount, overlaps, _ = icp_hand_eye([own], T_mount, [_START_GATE])
@@ -105,7 +105,7 @@ def kinds(part: str, mount: str, seed: int, done: set[str], share: tuple[int, in
             yield {"case": case} | judged(fault.apply(session), fault)
 
 
-def judged(session: Session, fault: Fault) -> dict[str, Any]:
+def judged(session: SessionData, fault: Fault) -> dict[str, Any]:
     """What the deep check says of a session with a mistake."""
     start = time.perf_counter()
     try:

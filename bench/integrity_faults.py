@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stitch.numerics import frames
 from stitch.session.robot import forward
-from stitch.session.session import Cloud, Session
+from stitch.session.session import Cloud, SessionData
 
 Array = NDArray[np.float64]
 _OTHER = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
@@ -19,39 +19,39 @@ _OTHER = {"eye_to_hand": "eye_in_hand", "eye_in_hand": "eye_to_hand"}
 class Fault:
     """A mistake: what it does to a session, its accepted kinds, and the views of which one must be named."""
 
-    apply: Callable[[Session], Session]
+    apply: Callable[[SessionData], SessionData]
     kinds: tuple[str, ...]
     views: tuple[int, ...] = ()  # empty: the whole session
 
 
-def poses_of(session: Session) -> Array:
+def poses_of(session: SessionData) -> Array:
     """(V, 4, 4)."""
     return np.array([view.T_base_flange for view in session.views])
 
 
-def with_poses(session: Session, T: Array) -> Session:
+def with_poses(session: SessionData, T: Array) -> SessionData:
     """The session with other poses and no joints."""
     views = zip(session.views, T, strict=True)
     return replace(session, views=tuple(replace(view, T_base_flange=pose, joints=None) for view, pose in views))
 
 
-def with_clouds(session: Session, clouds: dict[int, Array]) -> Session:
+def with_clouds(session: SessionData, clouds: dict[int, Array]) -> SessionData:
     """The session with other points in some views."""
     views = enumerate(session.views)
     return replace(session, views=tuple(replace(w, cloud=Cloud(clouds[v])) if v in clouds else w for v, w in views))
 
 
-def shown(session: Session, v: int) -> Array:
+def shown(session: SessionData, v: int) -> Array:
     """(N, 3) points of one view."""
     cloud = session.views[v].cloud
     assert cloud is not None
     return cloud.points
 
 
-def displaced(twists: dict[int, Array]) -> Callable[[Session], Session]:
+def displaced(twists: dict[int, Array]) -> Callable[[SessionData], SessionData]:
     """Poses of some views with a right twist of the flange (rad, mm)."""
 
-    def apply(session: Session) -> Session:
+    def apply(session: SessionData) -> SessionData:
         T = poses_of(session)
         for v, twist in twists.items():
             T[v] = T[v] @ frames.exp(twist)
@@ -60,15 +60,15 @@ def displaced(twists: dict[int, Array]) -> Callable[[Session], Session]:
     return apply
 
 
-def moved_clouds(order: dict[int, int]) -> Callable[[Session], Session]:
+def moved_clouds(order: dict[int, int]) -> Callable[[SessionData], SessionData]:
     """The cloud of view `order[v]` in the row of v."""
     return lambda session: with_clouds(session, {v: shown(session, w) for v, w in order.items()})
 
 
-def turned(change: Callable[[Rotation], Rotation]) -> Callable[[Session], Session]:
+def turned(change: Callable[[Rotation], Rotation]) -> Callable[[SessionData], SessionData]:
     """Rotations of all poses rewritten."""
 
-    def apply(session: Session) -> Session:
+    def apply(session: SessionData) -> SessionData:
         T = poses_of(session)
         return with_poses(session, frames.make(change(Rotation.from_matrix(T[:, :3, :3])).as_matrix(), T[:, :3, 3]))
 
@@ -81,20 +81,22 @@ def _torn(points: Array, shift: Array) -> Array:
     return points + later[:, None] * shift
 
 
-def _rows(order: Callable[[Array], Array]) -> Callable[[Session], Session]:
+def _rows(order: Callable[[Array], Array]) -> Callable[[SessionData], SessionData]:
     return lambda session: with_poses(session, order(poses_of(session)))
 
 
-def _clouds(change: Callable[[Array], Array], views: Sequence[int] | None = None) -> Callable[[Session], Session]:
-    def apply(session: Session) -> Session:
+def _clouds(
+    change: Callable[[Array], Array], views: Sequence[int] | None = None
+) -> Callable[[SessionData], SessionData]:
+    def apply(session: SessionData) -> SessionData:
         those = range(len(session.views)) if views is None else views
         return with_clouds(session, {v: change(shown(session, v)) for v in those})
 
     return apply
 
 
-def _joints(change: Callable[[Session], Array], v: int) -> Callable[[Session], Session]:
-    def apply(session: Session) -> Session:
+def _joints(change: Callable[[SessionData], Array], v: int) -> Callable[[SessionData], SessionData]:
+    def apply(session: SessionData) -> SessionData:
         assert session.robot is not None
         views = list(session.views)
         q = change(session)
@@ -104,8 +106,8 @@ def _joints(change: Callable[[Session], Array], v: int) -> Callable[[Session], S
     return apply
 
 
-def _reclamped(start: int, twist: Array) -> Callable[[Session], Session]:
-    def apply(session: Session) -> Session:
+def _reclamped(start: int, twist: Array) -> Callable[[SessionData], SessionData]:
+    def apply(session: SessionData) -> SessionData:
         T, K = poses_of(session), frames.exp(twist)
         # The part moves on the flange, or the flange's poses are off by a motion of the base frame.
         T[start:] = T[start:] @ K if session.mount == "eye_to_hand" else K @ T[start:]
@@ -117,7 +119,7 @@ def _reclamped(start: int, twist: Array) -> Callable[[Session], Session]:
 def in_base_frame(T_reference_scanner: Array) -> Fault:
     """All clouds in the reference frame already."""
 
-    def apply(session: Session) -> Session:
+    def apply(session: SessionData) -> SessionData:
         return with_clouds(
             session, {v: frames.transform(T, shown(session, v)) for v, T in enumerate(T_reference_scanner)}
         )

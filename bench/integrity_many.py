@@ -11,7 +11,7 @@ from integrity_faults import displaced, moved_clouds, shown, with_clouds
 from data_synth.fixtures.in_memory import session_of
 from stitch.api.pipeline import run
 from stitch.errors import StitchError
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 WRONG = (5, 6, 7, 8)  # of 14 views
 
@@ -24,7 +24,7 @@ def many(part: str, mount: str, seed: int) -> Iterator[dict[str, Any]]:
         rng = np.random.default_rng([seed, 9, count])
         wrong = [int(v) for v in rng.permutation(VIEWS)[:count]]
         together = _twist(rng)
-        table: dict[str, Callable[[Session], Session]] = {
+        table: dict[str, Callable[[SessionData], SessionData]] = {
             "each somewhere else": displaced({v: _twist(rng) for v in wrong}),
             "all off by the same": displaced(dict.fromkeys(wrong, together)),
             "scans of each other": moved_clouds(dict(zip(wrong, np.roll(wrong, 1).tolist(), strict=True))),
@@ -41,7 +41,7 @@ def _twist(rng: np.random.Generator) -> np.ndarray:
     return np.r_[np.radians(rng.uniform(1, 3)) * turn, rng.uniform(3, 10) * shift]
 
 
-def _judged(session: Session, wrong: list[int]) -> dict[str, Any]:
+def _judged(session: SessionData, wrong: list[int]) -> dict[str, Any]:
     """Refused, the wrong ones left out, or fused with some of them, which must be said."""
     start, names = time.perf_counter(), {session.views[v].name for v in wrong}
     try:

@@ -16,9 +16,9 @@ import numpy as np
 from stitch.api.pipeline import run, run_rig, suggest
 from stitch.model.model_toml import keep_arm_effects
 from stitch.output.result_document import model_of
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.reading.session_folder import load_session
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or ROOT.parent / "shared" / "data")
@@ -27,12 +27,12 @@ SERIES = ("ur10-tmac-A", "ur10-tmac-C")
 MARKS = ("<!-- kept arm: begin -->", "<!-- kept arm: end -->")
 
 
-def every(session: Session, step: int) -> Session:
+def every(session: SessionData, step: int) -> SessionData:
     """Every so many views of a session."""
     return replace(session, views=session.views[::step])
 
 
-def row(name: str, found: Run) -> str:
+def row(name: str, found: RunData) -> str:
     """A line of the table."""
     sigma = 2e3 * np.sqrt(np.diag(found.mount_covariance))[:3].max()
     return f"| {name} | {found.residual_rms:.3f} | {found.heldout_rms:.3f} | {sigma:.2f} |"

@@ -17,13 +17,13 @@ from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.numerics import frames
 from stitch.screening.deep_check import deep_check
 from stitch.session.robot import forward
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 VIEWS = (100, 1_000, 10_000)
 KNOCK = frames.exp(np.array([0.02, -0.03, 0.05, 40.0, -25.0, 10.0]))
 
 
-def wrong_sign(session: Session) -> Session:
+def wrong_sign(session: SessionData) -> SessionData:
     """Joint 2 negated in the table, the poses from there."""
     assert session.robot is not None and session.joints is not None
     q = session.joints * [1, -1, 1, 1, 1, 1]
@@ -31,7 +31,7 @@ def wrong_sign(session: Session) -> Session:
     return replace(session, views=tuple(replace(v, joints=own, T_base_flange=T) for v, own, T in every))
 
 
-def wrong_unit(session: Session) -> Session:
+def wrong_unit(session: SessionData) -> SessionData:
     """Positions in inches where millimetres are stated."""
     views = []
     for view in session.views:
@@ -40,7 +40,7 @@ def wrong_unit(session: Session) -> Session:
     return replace(session, views=tuple(views))
 
 
-def moved_tracker(session: Session) -> Session:
+def moved_tracker(session: SessionData) -> SessionData:
     """From three fifths of the views on the tracker stands elsewhere."""
     views = list(session.views)
     for v in range(int(0.6 * len(views)), len(views)):
@@ -50,7 +50,7 @@ def moved_tracker(session: Session) -> Session:
     return replace(session, views=tuple(views))
 
 
-MISTAKES: dict[str, Callable[[Session], Session]] = {
+MISTAKES: dict[str, Callable[[SessionData], SessionData]] = {
     "a joint of the wrong sign": wrong_sign,
     "a wrong unit": wrong_unit,
     "a moved tracker": moved_tracker,

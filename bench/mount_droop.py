@@ -27,7 +27,7 @@ from stitch.effects import EFFECTS, effect, twist
 from stitch.errors import StitchError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.measurement import Views
 from stitch.system.threads import library_threads_off
 
@@ -58,7 +58,7 @@ def droop(first: int) -> None:
     print(dict(count))
 
 
-def _hand_eye_sigmas(measured: Measured, found: Run) -> Array:
+def _hand_eye_sigmas(measured: Measured, found: RunData) -> Array:
     """(6,) error of the hand-eye of a flange that looks down, in its sigmas."""
     true = frames.exp(end_twist(measured.hidden["mount_droop"], _DOWN)) @ measured.T_mount
     error = frames.log(frames.inverse(found.T_mount) @ true)
@@ -89,7 +89,7 @@ def unknown(first: int) -> None:
     print(dict(count))
 
 
-def _with_the_law(state: Run, course: Array) -> Diagnosis:
+def _with_the_law(state: RunData, course: Array) -> Diagnosis:
     """The diagnosis with the law as a user's effect beside the library."""
 
     def true_law(views: Views, xi: Array) -> Array:

@@ -39,8 +39,8 @@ from stitch.plugins.metrology.planning import plan
 from stitch.plugins.metrology.planning.detection_chances import view_outlook
 from stitch.plugins.metrology.planning.expected_model import CellModel, PlannedCell, Scatter, cell_of_state
 from stitch.plugins.metrology.planning.plan import KnownPlace, PlanRequest
-from stitch.run_data import Run
-from stitch.session.session import Session
+from stitch.run_data import RunData
+from stitch.session.session import SessionData
 from stitch.system.threads import library_threads_off
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "measure.md"
@@ -85,7 +85,7 @@ def expected(kind: str, seed: int) -> tuple[float, float, float, float, float]:
 
 
 def _goal_over(
-    session: Session, cell_model: CellModel, scatter: Scatter, request: PlanRequest, tried: Array
+    session: SessionData, cell_model: CellModel, scatter: Scatter, request: PlanRequest, tried: Array
 ) -> KnownPlace:
     """The goal over the present views and some more (K, n)."""
     every = with_views(session, list(tried), in_turn=False)
@@ -171,7 +171,7 @@ def _plan_of(measured: Measured, further: Array) -> Plan:
     return Plan(joints, kinematics.gravity_torques(arm, joints), np.zeros_like(joints), arm, measured.scene.useful)
 
 
-def _number(state: Run, wanted: Feature) -> Number:
+def _number(state: RunData, wanted: Feature) -> Number:
     return measure_features(place_errors(state), FeatureList((wanted,))).numbers[0]
 
 

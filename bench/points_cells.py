@@ -22,7 +22,7 @@ from stitch.api.pipeline import diagnose, run, suggest
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.robot import forward
-from stitch.session.session import Session, Sighting, View
+from stitch.session.session import SessionData, Sighting, View
 
 _VIEWS, _OFFSET, _SIGMAS = 48, 6e-4, 3.0
 _PROBE_TURN = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
@@ -58,7 +58,7 @@ KINDS = {
 }
 
 
-def session_of_kind(kind: Kind, seed: int) -> Session:
+def session_of_kind(kind: Kind, seed: int) -> SessionData:
     """One session of its own arm."""
     made = SimulatedArm(4 * seed + 1)
     rng, arm = np.random.default_rng([seed, 9]), made.arm

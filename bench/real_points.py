@@ -15,9 +15,9 @@ import numpy as np
 
 from stitch.api.pipeline import run, suggest
 from stitch.output.result_document import model_of
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.reading.session_folder import load_session
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or ROOT.parent / "shared" / "data")
@@ -28,14 +28,14 @@ DATA = {"irb120-tracker": "even → odd", "ur10-tmac": "random halves"}
 _BLOCKS = 4
 
 
-def only(session: Session, index: np.ndarray) -> Session:
+def only(session: SessionData, index: np.ndarray) -> SessionData:
     """The session with the sightings of some views; the others stay, for they say from where the arm came."""
     kept = set(index.tolist())
     views = tuple(view if v in kept else replace(view, sighting=None) for v, view in enumerate(session.views))
     return replace(session, views=views)
 
 
-def splits(session: Session) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+def splits(session: SessionData) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
     """Ways to leave poses out: pairs of views to fit on and views to judge on."""
     count = len(session.views)
     everything = np.arange(count)
@@ -53,12 +53,12 @@ def splits(session: Session) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
     }
 
 
-def judged(session: Session, effects: list[str], way: list[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
+def judged(session: SessionData, effects: list[str], way: list[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
     """Rms and mean of the 3D distances in views that were not fitted."""
     distances = []
     for fit_on, judge_on in way:
         model = model_of(run(only(session, fit_on), effects=effects))
-        found: Run = run(only(session, judge_on), model)
+        found: RunData = run(only(session, judge_on), model)
         assert found.targets is not None
         d = found.targets.rows.distances(found.targets.rows.residual)
         distances.append(d[np.isfinite(d)])
@@ -66,7 +66,7 @@ def judged(session: Session, effects: list[str], way: list[tuple[np.ndarray, np.
     return float(np.sqrt(np.mean(d**2))), float(d.mean())
 
 
-def suggested(session: Session, at_most: int, fit_on: np.ndarray) -> tuple[list[list[str]], list[str]]:
+def suggested(session: SessionData, at_most: int, fit_on: np.ndarray) -> tuple[list[list[str]], list[str]]:
     """The way that the diagnosis takes on some poses alone, and what it says on it."""
     first = run(only(session, fit_on))
     found, lines, last = suggest(first, at_most)

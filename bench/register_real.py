@@ -29,7 +29,7 @@ from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, collect_
 from stitch.session.capture import Capture, part_size, prepare_capture
 from stitch.session.reading.session_folder import load_session
 from stitch.session.scan import Scan
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 OBJECTS = ("cone", "gripperopen", "rubik", "sphere", "david")
 SHOWN = ("DPWVM-style", "GICP inside Tukey", "Tukey", "sign classes")
@@ -63,7 +63,7 @@ def apart(found: Registration, other: Registration) -> Array:
     return np.asarray(xi - xi.mean(axis=0))
 
 
-def rows_of(name: str, session: Session, T_start: Array | None) -> list[str]:
+def rows_of(name: str, session: SessionData, T_start: Array | None) -> list[str]:
     """One line for each way to weigh."""
     own = prepare_capture(session)
     if T_start is None:

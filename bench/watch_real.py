@@ -19,27 +19,27 @@ from stitch.output.run_folder import write_with_page
 from stitch.plugins.watch.history import open_history, read_record
 from stitch.plugins.watch.report import CellReport, cell_report
 from stitch.plugins.watch.update import append_runs
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.reading.session_folder import load_session
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 SHARED = Path(os.environ.get("STITCH_SHARED_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 BLOCKS, POSES, EFFECTS = 24, 120, ["joint_offset", "link_geometry"]
 HOUR = 3600.0
 
 
-def block(session: Session, index: np.ndarray, name: str) -> Session:
+def block(session: SessionData, index: np.ndarray, name: str) -> SessionData:
     """Some views as a session of their own."""
     return replace(session, name=name, views=tuple(session.views[i] for i in index))
 
 
-def blocks(session: Session) -> list[np.ndarray]:
+def blocks(session: SessionData) -> list[np.ndarray]:
     """Views in the order of time, in blocks of equal number; of each as many, evenly spread, as a session has."""
     parts = np.array_split(np.arange(len(session.views)), BLOCKS)
     return [part[np.linspace(0, len(part) - 1, POSES).astype(int)] for part in parts]
 
 
-def distances(found: Run) -> np.ndarray:
+def distances(found: RunData) -> np.ndarray:
     """3D distances of the probe from where the model puts it."""
     assert found.targets is not None
     rows = found.targets.rows
@@ -91,7 +91,7 @@ def _moved(report: CellReport, times: np.ndarray) -> list[str]:
     return lines
 
 
-def _later(session: Session, times: np.ndarray) -> list[str]:
+def _later(session: SessionData, times: np.ndarray) -> list[str]:
     """The model of the first two hours on later poses, beside a model of their own hours."""
     lines = ["**The first two hours, later**: rms 3D distance of poses that took no part in a fit", ""]
     lines += ["| hours | model of hours 0 to 2 | model of these hours | model of all hours | joints off hours 0 to 2 |"]
@@ -110,7 +110,7 @@ def _later(session: Session, times: np.ndarray) -> list[str]:
     return lines
 
 
-def joints_off(session: Session, times: np.ndarray, low: float, high: float) -> float:
+def joints_off(session: SessionData, times: np.ndarray, low: float, high: float) -> float:
     """Median distance in the space of the joints, degrees, to the nearest other pose of the first two hours."""
     joints = np.degrees(np.array([view.joints for view in session.views]))
     early, own = (joints[(times >= a * HOUR) & (times < b * HOUR)] for a, b in ((0, 2), (low, high)))

@@ -6,14 +6,14 @@ from typing import Any, Protocol
 
 from stitch.model.model import Model
 from stitch.numerics.frames import Array
-from stitch.run_data import Run, StageResult
-from stitch.session.session import Session
+from stitch.run_data import RunData, StageResult
+from stitch.session.session import SessionData
 
 
 class Recorder(Protocol):
     """Receives every stage and iteration. All poses are T_reference_scanner, (V, 4, 4)."""
 
-    def start(self, session: Session) -> None:
+    def start(self, session: SessionData) -> None:
         """Called once, before the first stage, with the scans and the robot's path."""
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
@@ -22,17 +22,17 @@ class Recorder(Protocol):
     def stage(self, result: StageResult, poses: Array) -> None:
         """Called at the end of a stage."""
 
-    def finish(self, run: Run) -> None:
+    def finish(self, run: RunData) -> None:
         """Called once, with the result."""
 
 
 class SilentRecorder:
     """A recorder that shows nothing."""
 
-    def start(self, session: Session) -> None: ...
+    def start(self, session: SessionData) -> None: ...
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None: ...
     def stage(self, result: StageResult, poses: Array) -> None: ...
-    def finish(self, run: Run) -> None: ...
+    def finish(self, run: RunData) -> None: ...
 
 
 class IterationMemory(SilentRecorder):
@@ -65,7 +65,7 @@ class RunMemory:
         self._kept: list[tuple[str, tuple[Any, ...]]] = []
         self._finished: list[tuple[Model, list[tuple[str, tuple[Any, ...]]]]] = []
 
-    def start(self, session: Session) -> None:
+    def start(self, session: SessionData) -> None:
         """Begin to keep a run."""
         self._kept = [("start", (session,))]
 
@@ -77,11 +77,11 @@ class RunMemory:
         """Keep the end of a stage."""
         self._kept.append(("stage", told))
 
-    def finish(self, run: Run) -> None:
+    def finish(self, run: RunData) -> None:
         """Keep what was told as that of a run."""
         self._finished.append((run.model, self._kept))
 
-    def tell(self, recorder: Recorder, run: Run) -> None:
+    def tell(self, recorder: Recorder, run: RunData) -> None:
         """Pass on all that was told of a run, and the run as it is now."""
         kept = next((kept for model, kept in self._finished if model is run.model), [])
         for what, told in kept:
@@ -95,7 +95,7 @@ class RecorderGroup:
     def __init__(self, recorders: Sequence[Recorder]) -> None:
         self.recorders = recorders
 
-    def start(self, session: Session) -> None:
+    def start(self, session: SessionData) -> None:
         """Pass on."""
         for recorder in self.recorders:
             recorder.start(session)
@@ -110,7 +110,7 @@ class RecorderGroup:
         for recorder in self.recorders:
             recorder.stage(result, poses)
 
-    def finish(self, run: Run) -> None:
+    def finish(self, run: RunData) -> None:
         """Pass on."""
         for recorder in self.recorders:
             recorder.finish(run)

@@ -15,7 +15,7 @@ from stitch.observations.surfaces.normal_equations import Overlaps
 from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.session.measurement import Measurement
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # A doubt of a session as a whole in one clause: what it means and what to do stands elsewhere.
 
@@ -172,13 +172,13 @@ class Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class RunData:
     """One session, its model and its results, as `result.json` and the report show them.
 
     Of a run that was read from a folder, `fit` is read and matched again when it is first asked for.
     """
 
-    session: Session  # without the views that were left out
+    session: SessionData  # without the views that were left out
     measurement: Measurement  # as it counts: without outliers
     model: Model
     T_mount_coarse: Array  # (4, 4)

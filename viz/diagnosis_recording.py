@@ -12,7 +12,7 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
 from stitch.numerics.units import MICROMETRES
 from stitch.output.diagnosis_document import effect_description, effect_in_words, plain_finding, suggested_command
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 from stitch.system.files import whole_file
 from viz.colours import COLOURS_OF_FEW
 from viz.course_recording import log_course
@@ -25,7 +25,7 @@ _SHOWN = 8
 NOT_YET = "Not asked yet: `stitch diagnose RUN` says which effect is missing."
 
 
-def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, session: Session, path: Path) -> None:
+def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, session: SessionData, path: Path) -> None:
     """Put a diagnosis into a recording, in place of an earlier one; nothing where there is no recording.
 
     Args:
@@ -54,7 +54,9 @@ def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, session: Sess
         own.unlink(missing_ok=True)
 
 
-def log_diagnosis(rec: rr.RecordingStream, found: Diagnosis, screen: dict[str, Any] | None, session: Session) -> None:
+def log_diagnosis(
+    rec: rr.RecordingStream, found: Diagnosis, screen: dict[str, Any] | None, session: SessionData
+) -> None:
     """Verdict with the table of candidate effects, bars of the evidence, displacements of the views."""
     length_unit = session.length_unit
     um = MICROMETRES[length_unit]

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.disagreement_field import effect_changes, full_colour_distance, model_history
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from viz.colours import BLUE, FIELD, GREEN, unsigned_colours
 from viz.figures import colormap
 from viz.part_picture import painted, visible
@@ -17,7 +17,7 @@ from viz.part_surface import camera_for, part_surface
 # The error falling, in one picture: the part where the views disagree, model by model, and the residuals beside it.
 
 
-def error_falling(run: Run) -> Figure:
+def error_falling(run: RunData) -> Figure:
     """The part once for every model of a run with effects added, coloured by how far its views disagree (µm).
 
     Raises:
@@ -45,7 +45,7 @@ def error_falling(run: Run) -> Figure:
     return figure
 
 
-def _bars(axes: Axes, run: Run, um: float) -> None:
+def _bars(axes: Axes, run: RunData, um: float) -> None:
     """Residual and held-out residual of every model, against the noise floor."""
     place = np.arange(len(run.ledger))
     for shift, values, colour, label in (

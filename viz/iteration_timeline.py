@@ -14,9 +14,9 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.disagreement_field import COARSE, REGISTER, ModelHistory
-from stitch.run_data import Run, StageResult
+from stitch.run_data import RunData, StageResult
 from stitch.session.scan import even_indices
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 from stitch.system.threads import take_mapped
 from viz.colours import UNSEEN, robust_limit, unsigned_colours, view_colours
 from viz.model_timeline import FRAMES
@@ -50,15 +50,15 @@ class Moments:
     """What a run told of its stages and iterations."""
 
     def __init__(self) -> None:
-        self.sessions: list[Session] = []  # with all views, and after each round that left some out
+        self.sessions: list[SessionData] = []  # with all views, and after each round that left some out
         self.found: list[Moment] = []
 
     @property
-    def whole(self) -> Session | None:
+    def whole(self) -> SessionData | None:
         """The session with the views that were left out; None before the start."""
         return self.sessions[0] if self.sessions else None
 
-    def start(self, session: Session) -> None:
+    def start(self, session: SessionData) -> None:
         """Keep the views that count from here on."""
         self.sessions.append(session)
 
@@ -77,7 +77,7 @@ class Moments:
         names = tuple(self.sessions[-1].names)
         self.found.append(Moment(stage, title, names, np.array(poses), rms, gate, told))
 
-    def with_models(self, run: Run, history: ModelHistory | None) -> tuple[Moment, ...]:
+    def with_models(self, run: RunData, history: ModelHistory | None) -> tuple[Moment, ...]:
         """Return all moments: the raw scans first, models of the history where they belong."""
         if not self.found:
             return ()
@@ -108,7 +108,7 @@ def steps_reached(moments: Sequence[Moment]) -> dict[int, int]:
     return {moment.step: i for i, moment in enumerate(moments) if moment.step is not None}
 
 
-def log_moments(rec: rr.RecordingStream, run: Run, moments: Sequence[Moment], whole: Session) -> Array:
+def log_moments(rec: rr.RecordingStream, run: RunData, moments: Sequence[Moment], whole: SessionData) -> Array:
     """Log clouds, their motions, and what is said of them, and return places (N, 3) that the raw scans take.
 
     Args:
@@ -132,7 +132,7 @@ def log_moments(rec: rr.RecordingStream, run: Run, moments: Sequence[Moment], wh
     )
 
 
-def _log_clouds(rec: rr.RecordingStream, run: Run, whole: Session, shown: Sequence[str], each: int) -> None:
+def _log_clouds(rec: rr.RecordingStream, run: RunData, whole: SessionData, shown: Sequence[str], each: int) -> None:
     """Every cloud once, in the scanner's frame; grey, and on `iteration` alone, where the view was left out."""
     colours = dict(zip(run.session.names, view_colours(len(run.session.views)), strict=True))
     radius = _CLOUD if whole.has_clouds else _TARGETS
@@ -165,7 +165,7 @@ def _log_motion(rec: rr.RecordingStream, name: str, moments: Sequence[Moment]) -
         _clear(rec, name, here[-1][0] + 1)
 
 
-def _log_fused(rec: rr.RecordingStream, run: Run, shown: Sequence[str], at: int) -> None:
+def _log_fused(rec: rr.RecordingStream, run: RunData, shown: Sequence[str], at: int) -> None:
     """What was fused, in place of the scans."""
     some = even_indices(len(run.fused.points), _OF_FUSED)
     colours = unsigned_colours(take_mapped(run.fused.residual, some), _full(run))
@@ -176,7 +176,7 @@ def _log_fused(rec: rr.RecordingStream, run: Run, shown: Sequence[str], at: int)
     rec.reset_time()
 
 
-def _full(run: Run) -> float:
+def _full(run: RunData) -> float:
     return robust_limit(run.fused.residual)
 
 
@@ -198,7 +198,7 @@ def _path(name: str) -> str:
 # What is said beside the clouds.
 
 
-def _bound_in_words(run: Run, views: int, of: int, each: int) -> str:
+def _bound_in_words(run: RunData, views: int, of: int, each: int) -> str:
     bound = f"At most {each:,} points of a view are shown."
     if views < of:
         bound += f" {views} of the {of} views are shown."
@@ -207,7 +207,7 @@ def _bound_in_words(run: Run, views: int, of: int, each: int) -> str:
     return bound
 
 
-def _log_words(rec: rr.RecordingStream, run: Run, moments: Sequence[Moment], bound: str) -> None:
+def _log_words(rec: rr.RecordingStream, run: RunData, moments: Sequence[Moment], bound: str) -> None:
     """A text for every moment, every model and every view, and a table of all moments."""
     unit = run.session.length_unit
     for i, moment in enumerate(moments):
@@ -245,7 +245,7 @@ def _number(length: float, unit: str) -> str:
     return length_text(length, unit, 4) if np.isfinite(length) else ""
 
 
-def _log_rms(rec: rr.RecordingStream, run: Run, moments: Sequence[Moment]) -> None:
+def _log_rms(rec: rr.RecordingStream, run: RunData, moments: Sequence[Moment]) -> None:
     """The rms of each kind of moment, and that of every view, as series."""
     by_stage = {stage: [(i, m.rms) for i, m in enumerate(moments) if m.stage == stage] for stage in _stages(moments)}
     of_views = {"view": list(enumerate(run.view_rms.tolist()))}

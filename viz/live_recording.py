@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from stitch.api.live import LiveView
-from stitch.session.session import Session, View
+from stitch.session.session import SessionData, View
 from viz.rrd_file import id_of
 
 os.environ.setdefault("RERUN_ANALYTICS", "off")
@@ -39,7 +39,7 @@ def _open_viewer(stream: rr.RecordingStream) -> None:
 class RerunLiveRecording:
     """A `stitch.api.live.LiveRecording` that streams to a viewer or a file."""
 
-    def __init__(self, session: Session, target: str) -> None:
+    def __init__(self, session: SessionData, target: str) -> None:
         self._stream = rr.RecordingStream("stitch", recording_id=id_of(session.name))
         self._count = 0
         if target == "view":

@@ -13,7 +13,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.disagreement_field import ModelHistory, ModelStep, full_colour_distance
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.scan import even_indices
 from stitch.system.threads import take_mapped
 from viz.colours import COLOURS_OF_FEW, GREY, unsigned_colours
@@ -49,7 +49,7 @@ class ModelScene:
         return f"{step.name}: views disagree by {length_text(step.field.mean_abs * self.um / 1e3, 'mm')} on average"
 
 
-def model_scene(run: Run, history: ModelHistory, surface: PartSurface, cell: Array) -> ModelScene:
+def model_scene(run: RunData, history: ModelHistory, surface: PartSurface, cell: Array) -> ModelScene:
     """Return the poses of the views at every step, and the magnification that makes them visible."""
     centre = surface.vertices.mean(axis=0)
     to_centre = frames.make(np.eye(3), -centre)
@@ -105,7 +105,9 @@ _BAR = (244, 114, 43)
 _NAMED = 0.02
 
 
-def log_model(recording: rr.RecordingStream, run: Run, scene: ModelScene, up: Array, reached: dict[int, int]) -> None:
+def log_model(
+    recording: rr.RecordingStream, run: RunData, scene: ModelScene, up: Array, reached: dict[int, int]
+) -> None:
     """Everything that stands still, and all frames of the timeline.
 
     Args:

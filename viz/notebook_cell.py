@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from stitch.numerics.units import MICROMETRES
 from stitch.output.comparison.disagreement_field import full_colour_distance, model_history
 from stitch.output.comparison.run_verdict import run_headline
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from viz.colours import BLUE, ORANGE
 from viz.figures import plain
 from viz.page_parts import render
@@ -23,7 +23,7 @@ _STEPS = 4
 _HEIGHT = 760
 
 
-def notebook_view(run: Run) -> str:
+def notebook_view(run: RunData) -> str:
     """Return HTML for a cell: headline and viewer as report.html has them, in a frame, so that neither styles nor names
     of a notebook's other cells come into it. It asks no server."""
     history = model_history(run)
@@ -36,7 +36,7 @@ def notebook_view(run: Run) -> str:
     )
 
 
-def plot(run: Run) -> Figure:
+def plot(run: RunData) -> Figure:
     """Return the part at the last steps of the model, coloured by how far its views disagree (µm); of labelled points
     alone, the targets as every view puts them."""
     history, um = model_history(run), MICROMETRES[run.session.length_unit]
@@ -54,7 +54,7 @@ _SHARE = 0.25
 _PLANES = ((0, 1), (0, 2), (1, 2))
 
 
-def _sticks(run: Run) -> Figure:
+def _sticks(run: RunData) -> Figure:
     """Draw each target as seen by every view: magnified sticks from the target's place, in three planes."""
     assert run.targets is not None
     target, residual = residual_vectors(run)

@@ -14,9 +14,9 @@ from markupsafe import Markup
 
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.run_verdict import ToleranceVerdict
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.reading.session_folder import session_hash
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 from stitch.system.files import whole_file
 
 # Numbers and their units stay on one line.
@@ -61,7 +61,7 @@ def script_json(data: object) -> str:
 Row = tuple[str, str]
 
 
-def identity(run: Run) -> list[Row]:
+def identity(run: RunData) -> list[Row]:
     """Rows of label and text; nothing that the session does not state."""
     session = run.session
     scanner = "fixed in the cell, part on the flange" if session.mount == "eye_to_hand" else "on the flange, part fixed"
@@ -70,7 +70,7 @@ def identity(run: Run) -> list[Row]:
     joints = "" if session.robot is None else f", {session.robot.n_joints} joints"
     of = f" of {len(session.views) + len(run.left_out)}" if run.left_out else ""
     return [
-        ("Session", session.name),
+        ("SessionData", session.name),
         ("Views", f"{len(session.views)}{of}, {_points(session)}"),
         page_written(),
         ("Arm", ("not stated" if session.robot is None else session.robot.name or "without a name") + joints),
@@ -81,7 +81,7 @@ def identity(run: Run) -> list[Row]:
     ]
 
 
-def _effects_in_words(run: Run) -> list[str]:
+def _effects_in_words(run: RunData) -> list[str]:
     """Of a run without effects nothing of a diagnosis is loaded."""
     if not run.effects:
         return []
@@ -100,7 +100,7 @@ def versions() -> Row:
     return "stitch", f"{version('stitch')}, Python {platform.python_version()}, numpy {version('numpy')}"
 
 
-def _points(session: Session) -> str:
+def _points(session: SessionData) -> str:
     clouds = sum(view.cloud.count for view in session.views if view.cloud is not None)
     labelled = sum(len(view.sighting.targets) for view in session.views if view.sighting is not None)
     told = [f"{n:,} {word}" for n, word in ((clouds, "points"), (labelled, "labelled points")) if n]

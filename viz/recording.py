@@ -10,8 +10,8 @@ from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.disagreement_field import ModelHistory, effect_changes, model_history
 from stitch.output.comparison.run_verdict import run_headline
-from stitch.run_data import Run, StageResult
-from stitch.session.session import Session
+from stitch.run_data import RunData, StageResult
+from stitch.session.session import SessionData
 from viz.blueprint import log_colour_bar, model_blueprint, target_blueprint
 from viz.colours import robust_limit, unsigned_colours
 from viz.course_recording import log_no_course
@@ -26,7 +26,7 @@ from viz.run_numbers import residual_vectors
 # What a run found, as Markdown for the recording.
 
 
-def run_markdown(run: Run, history: ModelHistory | None) -> str:
+def run_markdown(run: RunData, history: ModelHistory | None) -> str:
     """Verdict, the error of each step, what could not be seen."""
     lines = [f"# {run.session.name}", "", f"**{run_headline(run, history)}**", ""]
     for doubt in run.doubts:
@@ -62,7 +62,7 @@ class RerunRecorder:
         self.path = path
         self._moments = Moments()
 
-    def start(self, session: Session) -> None:
+    def start(self, session: SessionData) -> None:
         """Keep the views that count from here on."""
         self._moments.start(session)
 
@@ -74,7 +74,7 @@ class RerunRecorder:
         """Keep where a stage has them when it ends."""
         self._moments.stage(result, poses)
 
-    def finish(self, run: Run) -> None:
+    def finish(self, run: RunData) -> None:
         """Log the run and close the file."""
         file = RecordingFile("stitch", self.path, id_of(run.session.name))
         rec, um = file.stream, MICROMETRES[run.session.length_unit]
@@ -100,7 +100,7 @@ class RerunRecorder:
         file.write()
 
 
-def _log_targets(rec: rr.RecordingStream, run: Run) -> None:
+def _log_targets(rec: rr.RecordingStream, run: RunData) -> None:
     """Targets by the rms of their views, and their offsets under the model, magnified."""
     colours = unsigned_colours(run.fused.residual, robust_limit(run.fused.residual))
     rec.log("targets", rr.Points3D(run.fused.points.astype(np.float32), colors=colours), static=True)

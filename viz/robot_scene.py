@@ -7,7 +7,7 @@ import rerun as rr
 
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.robot import LinkMesh, Robot, link_frames
 from stitch.session.scan import even_indices
 from stitch.system.threads import take_mapped
@@ -68,7 +68,7 @@ _VIEWS = 400
 _SMALL = 0.15
 
 
-def log_robot(recording: rr.RecordingStream, run: Run) -> Array:
+def log_robot(recording: rr.RecordingStream, run: RunData) -> Array:
     """Chain of joints where the arm is known, else the flanges; the scanner's field, small for all views but the first.
 
     Returns:
@@ -132,7 +132,7 @@ def _log_reached(recording: rr.RecordingStream, arm: Array, names: list[str]) ->
     recording.send_columns("robot/reached/flange", at, ends)
 
 
-def _log_arm(recording: rr.RecordingStream, run: Run, flange: Array) -> Array:
+def _log_arm(recording: rr.RecordingStream, run: RunData, flange: Array) -> Array:
     """Log the arm at all views, and return its joints (V, P, 3), or its flange alone where no joints are known."""
     robot, joints = run.session.robot, run.session.joints
     if robot is None or joints is None:
@@ -153,7 +153,7 @@ def _log_arm(recording: rr.RecordingStream, run: Run, flange: Array) -> Array:
     return np.asarray(chains)
 
 
-def _frustum(run: Run) -> list[Array]:
+def _frustum(run: RunData) -> list[Array]:
     """Line strips in the scanner frame: what the scanner sees, to the farthest points."""
     points = np.concatenate([shown_points(view) for view in run.session.views])
     # A tracker sees all around: it has no frustum.

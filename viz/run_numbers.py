@@ -3,11 +3,11 @@
 import numpy as np
 
 from stitch.numerics.frames import Array
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.session import View
 
 
-def view_shifts(run: Run) -> Array:
+def view_shifts(run: RunData) -> Array:
     """(V, 3) how far register moved the middle of each view, reference frame, length_unit."""
     out = []
     for view, T_before, T_after in zip(run.session.views, run.poses_model, run.poses, strict=True):
@@ -24,7 +24,7 @@ def shown_points(view: View) -> Array:
     return np.zeros((0, 3)) if view.sighting is None else view.sighting.points
 
 
-def residual_vectors(run: Run) -> tuple[Array, Array]:
+def residual_vectors(run: RunData) -> tuple[Array, Array]:
     """Number of the target (N,) and its offset (N, 3) under the model, reference frame, for all in use."""
     assert run.targets is not None
     rows, s = run.targets.rows, run.targets.rows.sightings

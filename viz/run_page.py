@@ -12,7 +12,7 @@ from stitch.numerics.units import MICROMETRES, value_uncertainty_text
 from stitch.observations.observability import NUMBERS
 from stitch.output.comparison.disagreement_field import ModelHistory, effect_changes, model_history
 from stitch.output.comparison.run_verdict import run_headline, run_light
-from stitch.run_data import Run, doubt_headline
+from stitch.run_data import RunData, doubt_headline
 from viz import captions
 from viz.page_parts import Head, Subject, Tile, identity, page_written, script_json, sections_of, write_page
 from viz.part_data import part_data
@@ -26,7 +26,7 @@ from viz.target_scene import target_scene
 _VIEWS = 60
 
 
-def view_rows(run: Run, history: ModelHistory | None) -> list[dict[str, Any]]:
+def view_rows(run: RunData, history: ModelHistory | None) -> list[dict[str, Any]]:
     """A row for every view, those that disagree most first."""
     um = MICROMETRES[run.session.length_unit]
     apart = np.full(len(run.poses), np.nan)
@@ -50,7 +50,7 @@ def view_rows(run: Run, history: ModelHistory | None) -> list[dict[str, Any]]:
     return [row | {"share": 100 * np.nan_to_num(row[key]) / largest} for row in rows[:_VIEWS]]
 
 
-def target_rows(run: Run) -> list[dict[str, object]]:
+def target_rows(run: RunData) -> list[dict[str, object]]:
     """A row for every target: name, views that see it, rms, position."""
     sightings = run.measurement.capture.sightings
     if run.targets is None or sightings is None:
@@ -63,7 +63,7 @@ def target_rows(run: Run) -> list[dict[str, object]]:
     ]
 
 
-def effect_rows(run: Run) -> list[dict[str, str]]:
+def effect_rows(run: RunData) -> list[dict[str, str]]:
     """Parameters that were fitted or tried; those that the views do not show are left out."""
     return [
         {
@@ -80,7 +80,7 @@ def effect_rows(run: Run) -> list[dict[str, str]]:
     ]
 
 
-def note_rows(run: Run) -> list[dict[str, str]]:
+def note_rows(run: RunData) -> list[dict[str, str]]:
     """Return the remarks of reviewers on the steps of the ledger."""
     return [
         {
@@ -93,7 +93,7 @@ def note_rows(run: Run) -> list[dict[str, str]]:
     ]
 
 
-def hand_eye_rows(run: Run) -> list[dict[str, str]]:
+def hand_eye_rows(run: RunData) -> list[dict[str, str]]:
     """Name, coarse, corrected, U (k = 2) and unit of every number of the hand-eye; all in the mount frame."""
     mm = MICROMETRES[run.session.length_unit] / 1e3
     values = []
@@ -121,14 +121,14 @@ def _told(coarse: float, corrected: float, U: float) -> dict[str, str]:
     return {name: text.replace("-", "−") for name, text in (("coarse", begun), ("corrected", value), ("U", U_text))}
 
 
-def matrix(run: Run) -> str:
+def matrix(run: RunData) -> str:
     """The corrected hand-eye as four rows to copy, in the form of session.toml."""
     open_numbers = f"# Not shown by these views: {', '.join(run.unknown)}\n" if run.unknown else ""
     rows = ",\n  ".join(str([float(f"{x:.12g}") for x in row]) for row in run.T_mount)
     return f"{open_numbers}pose = [\n  {rows},\n]"
 
 
-def ledger_rows(run: Run) -> list[dict[str, Any]]:
+def ledger_rows(run: RunData) -> list[dict[str, Any]]:
     """Return a row for every model that was fitted: its name and its errors, µm."""
     um = MICROMETRES[run.session.length_unit]
     largest = np.nanmax([step.heldout_rms for step in run.ledger]) if run.ledger else 1.0
@@ -143,7 +143,7 @@ def ledger_rows(run: Run) -> list[dict[str, Any]]:
     ]
 
 
-def write_report(run: Run, path: Path, tolerance: float | None = None) -> None:
+def write_report(run: RunData, path: Path, tolerance: float | None = None) -> None:
     """Write the page of a run; it needs nothing beside it. What a diagnosis of this very model said on the page that
     stands there stays.
 
@@ -165,7 +165,7 @@ def write_report(run: Run, path: Path, tolerance: float | None = None) -> None:
     )
 
 
-def _is_diagnosed(run: Run, folder: Path) -> bool:
+def _is_diagnosed(run: RunData, folder: Path) -> bool:
     """Whether the diagnosis in a folder is of this very model; where there is none nothing is loaded to ask."""
     if not (folder / "diagnosis.json").is_file():
         return False
@@ -174,7 +174,7 @@ def _is_diagnosed(run: Run, folder: Path) -> bool:
     return bool(standing_diagnosis(folder, run))
 
 
-def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> Head:
+def _head(run: RunData, history: ModelHistory | None, tolerance: float | None) -> Head:
     light = None if tolerance is None else run_light(run, history, tolerance)
     gone = [f"View {item.view} does not fit its robot pose and was left out: {item.why}." for item in run.left_out]
     hidden = [f"Not observable from these motions: {direction}." for direction in run.unobservable]
@@ -192,7 +192,7 @@ def _head(run: Run, history: ModelHistory | None, tolerance: float | None) -> He
 
 
 def _content(
-    run: Run, history: ModelHistory | None, tolerance: float | None, shape: PartShape | None
+    run: RunData, history: ModelHistory | None, tolerance: float | None, shape: PartShape | None
 ) -> dict[str, object]:
     um = MICROMETRES[run.session.length_unit]
     return {
@@ -217,7 +217,7 @@ def _content(
     }
 
 
-def run_tiles(run: Run, history: ModelHistory | None) -> list[Tile]:
+def run_tiles(run: RunData, history: ModelHistory | None) -> list[Tile]:
     """Return the three numbers of a run: those of the model before and of the present one."""
     unit, before = run.session.length_unit, len(run.ledger) > 1
     heldout = [step.heldout_rms for step in run.ledger[-2:]] if before else [run.heldout_or_fit_rms]
@@ -231,7 +231,7 @@ def run_tiles(run: Run, history: ModelHistory | None) -> list[Tile]:
     return tiles
 
 
-def shown_part(run: Run, history: ModelHistory | None, shape: PartShape | None = None) -> dict[str, Any] | None:
+def shown_part(run: RunData, history: ModelHistory | None, shape: PartShape | None = None) -> dict[str, Any] | None:
     """Return what the viewer of a page shows: the part, or the labelled points; None where there is neither.
 
     Args:
@@ -240,7 +240,7 @@ def shown_part(run: Run, history: ModelHistory | None, shape: PartShape | None =
     return _targets(run) if history is None else _part(run, history, shape)
 
 
-def _part(run: Run, history: ModelHistory, shape: PartShape | None) -> dict[str, Any]:
+def _part(run: RunData, history: ModelHistory, shape: PartShape | None) -> dict[str, Any]:
     """Data of the viewer, and its words."""
     surface = part_surface(run.fused, history.patches, shape)
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
@@ -255,7 +255,7 @@ def _part(run: Run, history: ModelHistory, shape: PartShape | None) -> dict[str,
     }
 
 
-def _targets(run: Run) -> dict[str, Any] | None:
+def _targets(run: RunData) -> dict[str, Any] | None:
     """The same of labelled points; None where there are none."""
     scene = target_scene(run)
     return (

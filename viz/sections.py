@@ -21,7 +21,7 @@ from stitch.output.diagnosis_document import (
     suggested_command,
 )
 from stitch.output.finding_screen import CandidateFields, candidate_fields
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.system.files import whole_file
 from viz import captions
 from viz.diagnosis_plots import Plots, alias_rows, budget_rows, comparison_plots, diagnosis_plots
@@ -35,7 +35,7 @@ _SHOWN = 8
 _NAMING = ("missing_effect", "cannot_tell")
 
 
-def write_diagnosis(found: Diagnosis, state: Run, folder: Path) -> None:
+def write_diagnosis(found: Diagnosis, state: RunData, folder: Path) -> None:
     """Put a diagnosis on the screen and into the evidence of report.html, and into the recording."""
     screen = diagnosis_screen(found)
     # Rerun's program writes the recording anew while the page is made.
@@ -164,7 +164,7 @@ def _rms(found: Diagnosis, candidate: CandidateEffect, which: int, um: float) ->
     return "–" if validation is None else f"{um * found.rms_if_added(validation)[which]:.1f}"
 
 
-def write_comparison(found: ResidualTables, state: Run, folder: Path) -> None:
+def write_comparison(found: ResidualTables, state: RunData, folder: Path) -> None:
     """Put a comparison into the evidence of report.html."""
     unit = state.session.length_unit
     um = MICROMETRES[unit]

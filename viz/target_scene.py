@@ -9,7 +9,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.units import MICROMETRES
 from stitch.output.comparison.disagreement_field import TargetStep, target_history
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from viz.colours import robust_limit
 from viz.part_data import colour_stops, extent_of, packed_surface, packed_values
 from viz.part_surface import Camera, PartSurface, camera_for
@@ -44,7 +44,7 @@ class Marks:
         return np.column_stack([self.view, self.target])
 
 
-def marks_of(run: Run) -> Marks:
+def marks_of(run: RunData) -> Marks:
     """Return the marks of a cell: a moving body stands wherever it stood.
 
     A carried scanner: the targets, and the scanner of every view. Carried targets: each wherever a view saw it.
@@ -216,7 +216,7 @@ _PICTURE = "The targets in 3D, coloured by how far off their place they are seen
 _ENDS = ["on their place", "off their place"]
 
 
-def target_scene(run: Run) -> dict[str, Any] | None:
+def target_scene(run: RunData) -> dict[str, Any] | None:
     """Return the data of the viewer; None where no targets were seen."""
     steps = target_history(run)
     if run.targets is None or not steps:
@@ -229,7 +229,7 @@ def target_scene(run: Run) -> dict[str, Any] | None:
     return packed | _told(run, steps, values, limit) | {"marks": _names(run, marks)}
 
 
-def step_values(run: Run, marks: Marks, step: TargetStep) -> Array:
+def step_values(run: RunData, marks: Marks, step: TargetStep) -> Array:
     """(M,) what the marks count at a step, length_unit."""
     assert run.targets is not None
     s = run.targets.rows.sightings
@@ -237,7 +237,7 @@ def step_values(run: Run, marks: Marks, step: TargetStep) -> Array:
     return mark_values(marks.counted, v, s.target[v, slot], step.distances[v, slot])
 
 
-def _told(run: Run, steps: tuple[TargetStep, ...], values: list[Array], limit: float) -> dict[str, Any]:
+def _told(run: RunData, steps: tuple[TargetStep, ...], values: list[Array], limit: float) -> dict[str, Any]:
     """Return values and titles of every step for the viewer; µm."""
     assert run.targets is not None
     um = MICROMETRES[run.session.length_unit]
@@ -257,7 +257,7 @@ def _told(run: Run, steps: tuple[TargetStep, ...], values: list[Array], limit: f
     }
 
 
-def _names(run: Run, marks: Marks) -> list[list[str | None]]:
+def _names(run: RunData, marks: Marks) -> list[list[str | None]]:
     """View and target of every mark, null where it stands for all of them; both null where it counts nothing."""
     assert run.targets is not None
     views, targets = run.session.names, run.targets.rows.sightings.targets

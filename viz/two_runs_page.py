@@ -10,7 +10,7 @@ from stitch.numerics.units import MICROMETRES, length_text, value_uncertainty_te
 from stitch.output.comparison.disagreement_field import full_colour_distance
 from stitch.output.comparison.run_verdict import ToleranceVerdict, run_light, run_verdict
 from stitch.output.comparison.two_runs import ComparedRun, TwoRuns, comparison_sentence
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from viz import captions
 from viz.page_parts import Head, Subject, identity, script_json, write_page
 from viz.part_data import Extent, extent_of, part_data
@@ -57,7 +57,7 @@ def _facts(side: ComparedRun) -> dict[str, str]:
     }
 
 
-def _begun(run: Run) -> str:
+def _begun(run: RunData) -> str:
     x, y, z = run.T_mount_coarse[:3, 3]
     source = run.stages[0].note if run.stages else ""
     return f"at {x:.6g}, {y:.6g}, {z:.6g} {run.session.length_unit}{f' ({source})' if source else ''}"
@@ -118,7 +118,7 @@ def parameter_rows(both: TwoRuns) -> list[dict[str, str]]:
     ]
 
 
-def _parameters(run: Run) -> dict[tuple[str, str, str], str]:
+def _parameters(run: RunData) -> dict[tuple[str, str, str], str]:
     return {
         (term.name, p.name, told.unit): str(told._replace(unit=""))
         for term in run.terms

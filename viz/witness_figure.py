@@ -8,13 +8,13 @@ from matplotlib.figure import Figure
 
 from stitch.numerics.units import MICROMETRES
 from stitch.output.comparison.open3d_witness import Witness
-from stitch.run_data import Run
+from stitch.run_data import RunData
 
 _DPI = 110
 _SPAN_QUANTILE = 0.98
 
 
-def write_witness(witness: Witness, run: Run, folder: Path) -> None:
+def write_witness(witness: Witness, run: RunData, folder: Path) -> None:
     """Write witness.png: the run's cloud seen along its thinnest axis, and the views' shifts, in µm."""
     to_um = MICROMETRES[run.session.length_unit]
     figure = Figure(figsize=(11, 5), layout="constrained")

@@ -31,11 +31,10 @@ from stitch.recorder import Recorder, SilentRecorder
 from stitch.screening.pose_tests import BlunderSearch, find_blunders, least_displacement
 from stitch.screening.view_model import UsualEffects, ViewModel, view_model
 from stitch.screening.view_screening import fit_screened_views
-from stitch.session import session as measured
 from stitch.session.capture import Capture, build_capture, prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.robot import Robot
-from stitch.session.session import Scanner, View
+from stitch.session.session import Scanner, SessionData, View
 from stitch.system.threads import library_threads_off
 
 Verdict = Literal["waiting", "fits", "does_not_belong", "adds_nothing"]
@@ -404,7 +403,7 @@ def live(
     return LiveSession(session, None if recording is None else _recording(session, str(recording)), cloud_unit)
 
 
-def follow(session: measured.Session) -> LiveSession:
+def follow(session: SessionData) -> LiveSession:
     """Begin a live session with what a session folder states of its cell; its views come by `LiveSession.take`."""
     return LiveSession(public_session(replace(session, views=())))
 

@@ -20,7 +20,7 @@ from stitch.fit.rig import require_effects, require_measured_once, require_same_
 from stitch.fusion.register import DEFAULT, method_named
 from stitch.model.model_toml import ModelFile, arm_model, convert_unit
 from stitch.recorder import Recorder, SilentRecorder
-from stitch.run_data import Run, StageResult
+from stitch.run_data import RunData, StageResult
 from stitch.screening.deep_check import refuse_explained_mistake
 from stitch.screening.model_transfer import (
     ArmTransfer,
@@ -31,7 +31,7 @@ from stitch.screening.model_transfer import (
 from stitch.screening.view_screening import ScreenedFit, fit_screened_views, session_warnings
 from stitch.session.capture import Capture, part_size, prepare_capture
 from stitch.session.measurement import Measurement, measurement_of, with_part_origin
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 from stitch.system.threads import Clock, library_threads_off
 
 if TYPE_CHECKING:
@@ -41,14 +41,14 @@ if TYPE_CHECKING:
 
 
 def run(
-    session: Session,
+    session: SessionData,
     model: ModelFile | None = None,
     recorder: Recorder | None = None,
     effects: Sequence[str] = (),
     keep: bool = False,
     arm: ModelFile | None = None,
     register: str = DEFAULT,
-) -> Run:
+) -> RunData:
     """Stitch one session; with `model`, use its hand-eye and effects as they are instead of correcting.
 
     Args:
@@ -65,7 +65,7 @@ def run(
 
 
 def run_rig(
-    sessions: Sequence[Session],
+    sessions: Sequence[SessionData],
     model: ModelFile | None = None,
     recorders: Sequence[Recorder] | None = None,
     effects: Sequence[str] = (),
@@ -74,7 +74,7 @@ def run_rig(
     *,
     register: str = DEFAULT,
     captures: Sequence[Future[Capture]] | None = None,
-) -> list[Run]:
+) -> list[RunData]:
     """Stitch several sessions of one rig with common effects and, of scans, one hand-eye; one run per session.
 
     Args:
@@ -131,11 +131,11 @@ def run_rig(
 
 
 def _fit_and_report(
-    fit: Callable[[Sequence[Session], Sequence[Measurement]], FittedRig],
-    begin_to_register: Callable[[FittedRig, Sequence[Session]], FittedRig],
-    whole: Sequence[Session],
+    fit: Callable[[Sequence[SessionData], Sequence[Measurement]], FittedRig],
+    begin_to_register: Callable[[FittedRig, Sequence[SessionData]], FittedRig],
+    whole: Sequence[SessionData],
     recorders: Sequence[Recorder],
-    sessions: Sequence[Session],
+    sessions: Sequence[SessionData],
     measurements: Sequence[Measurement],
 ) -> FittedRig:
     """Fit the views that are left, tell the recorders where these are fewer, and begin to register and to fuse.
@@ -168,13 +168,13 @@ def _fit_own_model(pipeline: Pipeline, found: ScreenedFit, initial_model: Initia
 
 
 def _assemble_runs(
-    sessions: Sequence[Session],
+    sessions: Sequence[SessionData],
     found: ScreenedFit,
     end: FitSummary,
     before: Sequence[StageResult],
     recorders: Sequence[Recorder],
     keep: bool,
-) -> list[Run]:
+) -> list[RunData]:
     """Return one run per session, with its own notes."""
     runs = []
     for i, (session, own) in enumerate(zip(found.sessions, found.screenings, strict=True)):
@@ -186,7 +186,7 @@ def _assemble_runs(
     return runs
 
 
-def effects_with(run: Run, further: Sequence[str], where: object) -> list[str]:
+def effects_with(run: RunData, further: Sequence[str], where: object) -> list[str]:
     """Return the effects of a run's model and further ones, for `change`.
 
     Args:
@@ -202,7 +202,7 @@ def effects_with(run: Run, further: Sequence[str], where: object) -> list[str]:
     return [*run.effects, *further]
 
 
-def effects_without(run: Run, dropped: Sequence[str], where: object) -> list[str]:
+def effects_without(run: RunData, dropped: Sequence[str], where: object) -> list[str]:
     """Return the effects of a run's model but some, for `change`.
 
     Raises:
@@ -215,7 +215,7 @@ def effects_without(run: Run, dropped: Sequence[str], where: object) -> list[str
     return [name for name in run.effects if name not in dropped]
 
 
-def change(state: Run, effects: Sequence[str], recorder: Recorder | None = None) -> Run:
+def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = None) -> RunData:
     """Fit a run again with these effects in its model: matches, hand-eye and all effects.
 
     Raises:
@@ -254,7 +254,7 @@ def change(state: Run, effects: Sequence[str], recorder: Recorder | None = None)
         return replace(assemble_run(session, 0, end, before, recorder), tried=tried)
 
 
-def diagnose(run: Run) -> Diagnosis:
+def diagnose(run: RunData) -> Diagnosis:
     """Find which effect is missing in the model of a run.
 
     Raises:
@@ -268,8 +268,8 @@ def diagnose(run: Run) -> Diagnosis:
 
 
 def suggest(
-    state: Run, at_most: int, known: Finding | None = None, recorder: Recorder | None = None
-) -> tuple[Run | None, list[str], Diagnosis]:
+    state: RunData, at_most: int, known: Finding | None = None, recorder: Recorder | None = None
+) -> tuple[RunData | None, list[str], Diagnosis]:
     """Return the run with everything that the diagnosis names, what happened in lines, and the last diagnosis.
 
     The run is None where nothing is named. What was found together is added together, and what does not hold its place
@@ -283,7 +283,7 @@ def suggest(
         recorder: told of every run that is tried, one after the other.
     """
     lines, given, left = list[str](), set(state.model.effects), at_most
-    result: Run | None = None
+    result: RunData | None = None
     while True:
         found = None if known is not None and left else diagnose(state)
         finding = known if found is None else _finding_of(found)
@@ -327,8 +327,8 @@ def _reason_to_stop(found: Diagnosis, left: int, at_most: int) -> list[str] | No
 
 
 def _add_found(
-    state: Run, found: Finding, at_most: int, given: set[str], recorder: Recorder | None
-) -> tuple[Run, list[str]]:
+    state: RunData, found: Finding, at_most: int, given: set[str], recorder: Recorder | None
+) -> tuple[RunData, list[str]]:
     """Return the run with what was found together, as far as it earns its place, and what happened.
 
     Args:
@@ -355,7 +355,7 @@ def _add_found(
     return state, []
 
 
-def _exchange_added(state: Run, given: set[str], recorder: Recorder | None = None) -> tuple[Run, list[str]]:
+def _exchange_added(state: RunData, given: set[str], recorder: Recorder | None = None) -> tuple[RunData, list[str]]:
     """Return the run with others in place of effects that were added in several rounds, where these do better, and
     what happened: what was found first may hold the parameters of what would have come later.
 
@@ -375,7 +375,7 @@ def _exchange_added(state: Run, given: set[str], recorder: Recorder | None = Non
     return tried, [f"{' and '.join(names)}: views left out are predicted better than with {gone}, which went."]
 
 
-def suggest_group(state: Run, recorder: Recorder | None = None) -> tuple[Run | None, list[str], Diagnosis]:
+def suggest_group(state: RunData, recorder: Recorder | None = None) -> tuple[RunData | None, list[str], Diagnosis]:
     """Return the run with all effects of an undecided group, what to say of it, and the diagnosis.
 
     The run is None where the diagnosis names no such group, or where the group does not help on views left out.
@@ -415,7 +415,7 @@ def _finding_and_evidence(found: Diagnosis) -> list[str]:
     return [plain_finding(found, found.linear.measurement.length_unit), found.sentence]
 
 
-def _drop_unneeded(result: Run, given: set[str], recorder: Recorder | None) -> tuple[Run, list[str]]:
+def _drop_unneeded(result: RunData, given: set[str], recorder: Recorder | None) -> tuple[RunData, list[str]]:
     """Return the run without added effects that others made idle, which it remembers, and why each was dropped.
 
     Of labelled points alone: scans are matched anew for every effect that is asked.

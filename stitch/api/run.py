@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stitch import run_data as runs
 from stitch.api.session import Session, public_session
 from stitch.errors import InputError
 from stitch.model.model import COVERAGE_FACTOR
@@ -24,10 +23,10 @@ from stitch.output.run_folder import recordings, residual_table
 from stitch.plugins.export.cloud_formats import Colours, coloured
 from stitch.plugins.metrology.planning.expected_model import displacement
 from stitch.recorder import Recorder
-from stitch.run_data import FusedCloud, StageResult
-from stitch.session import session as measured
+from stitch.run_data import FusedCloud, RunData, StageResult
 from stitch.session.capture import Capture
 from stitch.session.reading.session_folder import content_hash, measured_files
+from stitch.session.session import SessionData
 from stitch.system.open3d_library import import_open3d
 
 
@@ -99,7 +98,7 @@ class FittedHandEye:
 
 
 def fitted_hand_eye(
-    session: measured.Session, capture: Capture, T_mount: Array, covariance: Array, *, unknown: tuple[str, ...]
+    session: SessionData, capture: Capture, T_mount: Array, covariance: Array, *, unknown: tuple[str, ...]
 ) -> FittedHandEye:
     """Return a hand-eye (4, 4) with its covariance (6, 6), for the place where the views of a capture see the part.
 
@@ -229,7 +228,7 @@ class RunView:
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Run(runs.Run):
+class Run(RunData):
     """The results of one session; lengths in the session's length_unit, angles in rad.
 
     `print(run)` writes it as one block; in a notebook the last line of a cell shows the part as report.html does.
@@ -357,7 +356,7 @@ class ReplayRecorder:
         self.other = other  # gets every call too
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
 
-    def start(self, session: measured.Session) -> None:
+    def start(self, session: SessionData) -> None:
         """Keep the session; a run that leaves views out starts anew with the others."""
         self._keep("start", session)
 
@@ -369,7 +368,7 @@ class ReplayRecorder:
         """Keep the end of a stage."""
         self._keep("stage", result, poses)
 
-    def finish(self, run: runs.Run) -> None:
+    def finish(self, run: RunData) -> None:
         """Pass on alone: `Run.save` finishes the recording."""
         if self.other is not None:
             self.other.finish(run)
@@ -380,14 +379,14 @@ class ReplayRecorder:
             getattr(self.other, call)(*arguments)
 
 
-def public_run(run: runs.Run, whole: Session | None, recorder: ReplayRecorder | None = None) -> Run:
+def public_run(run: RunData, whole: Session | None, recorder: ReplayRecorder | None = None) -> Run:
     """Return a run as people hold it.
 
     Args:
         whole: its session with the views that were left out; None: as the run has it.
         recorder: was told of it.
     """
-    own = {f.name: getattr(run, f.name) for f in fields(runs.Run)}
+    own = {f.name: getattr(run, f.name) for f in fields(RunData)}
     calls = () if recorder is None else tuple(recorder.calls)
     return Run(**own | {"session": public_session(run.session)}, measured=whole, recorded=calls)
 
@@ -423,6 +422,6 @@ def _save_session_of_run(session: Session, folder: Path) -> Path:
     return beside
 
 
-def _entry_point(group: str) -> Callable[[runs.Run], Any] | None:
+def _entry_point(group: str) -> Callable[[RunData], Any] | None:
     """Return what another package offers under an entry-point group; None where there is none."""
     return next((entry.load() for entry in entry_points(group=group)), None)

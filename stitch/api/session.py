@@ -26,7 +26,6 @@ from stitch.plugins.intake.readings import all_readings
 from stitch.plugins.metrology.calibrate.robot import repeatability_table, robot_toml
 from stitch.screening.conventions import register_scan_pairs
 from stitch.screening.deep_check import refuse_whole
-from stitch.session import session as measured
 from stitch.session.capture import MAX_POINTS
 from stitch.session.reading import session_folder
 from stitch.session.reading.session_folder import (
@@ -39,7 +38,7 @@ from stitch.session.reading.session_folder import (
 from stitch.session.reading.session_tables import require_agreement
 from stitch.session.reading.text_files import require_folder_name, require_name, table_choice
 from stitch.session.robot import Robot, forward
-from stitch.session.session import Cloud, Mount, Scanner, StatedRepeatability, View
+from stitch.session.session import Cloud, Mount, Scanner, SessionData, StatedRepeatability, View
 from stitch.system.threads import parallel
 
 # Two motions, the fewest that tell a reading.
@@ -49,7 +48,7 @@ _PLAIN = re.compile(r"[\w+-][\w.+-]*")
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Session(measured.Session):
+class Session(SessionData):
     """The measured session: views with a scan each, their poses, the scanner and the robot.
 
     Lengths in `length_unit`, angles in rad. Scans lie in the scanner frame; a view's `T_base_flange` (4, 4) maps flange
@@ -222,11 +221,11 @@ def load_session(
     return public_session(session_folder.load_session(path, scans, start, at_most, memory))
 
 
-def public_session(session: measured.Session) -> Session:
+def public_session(session: SessionData) -> Session:
     """Return a session that was read as the one that people hold."""
     if isinstance(session, Session):
         return session
-    return Session(**{f.name: getattr(session, f.name) for f in fields(measured.Session)})
+    return Session(**{f.name: getattr(session, f.name) for f in fields(SessionData)})
 
 
 @dataclass(frozen=True)
@@ -422,7 +421,7 @@ class _WholeClouds(Mapping[str, Cloud]):
         return len(self.clouds)
 
 
-def _files_of(session: measured.Session) -> SessionFiles:
+def _files_of(session: SessionData) -> SessionFiles:
     """Return everything that a folder of the session holds."""
     plain = all(_PLAIN.fullmatch(name) for name in session.names)
     files = [f"clouds/{view.name if plain else f'v{i:03d}'}.ply" for i, view in enumerate(session.views)]
@@ -449,7 +448,7 @@ def _files_of(session: measured.Session) -> SessionFiles:
     )
 
 
-def _view_columns(session: measured.Session, files: list[str] | None) -> dict[str, list[str]]:
+def _view_columns(session: SessionData, files: list[str] | None) -> dict[str, list[str]]:
     """views.csv with all digits; an empty cell where nothing is known."""
     views = session.views
     columns: dict[str, list[str]] = {"view": session.names}
@@ -467,7 +466,7 @@ def _view_columns(session: measured.Session, files: list[str] | None) -> dict[st
     return columns | {name: [_cell(view.covariates.get(name)) for view in views] for name in names}
 
 
-def _labelled_columns(session: measured.Session) -> tuple[dict[str, list[str]] | None, dict[str, list[str]] | None]:
+def _labelled_columns(session: SessionData) -> tuple[dict[str, list[str]] | None, dict[str, list[str]] | None]:
     """Columns of points.csv, or of frames.csv where views show a probe."""
     rows = [(view.name, view.sighting) for view in session.views if view.sighting is not None]
     if not rows:
@@ -495,7 +494,7 @@ def _columns(names: Sequence[str], rows: list[list[str]]) -> dict[str, list[str]
     return {name: column for name, column in columns.items() if any(column)}
 
 
-def _tables(session: measured.Session) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+def _tables(session: SessionData) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     """Tables of session.toml beside its head, and texts that lie beside it."""
     own, texts = session.scanner, dict[str, str]()
     scanner: dict[str, Any] = {"optical_axis": "-z" if own.optical_axis[2] < 0 else "+z"}

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from stitch import run_data as runs
 from stitch.api import pipeline
 from stitch.api.run import ReplayRecorder, Run, public_run
 from stitch.api.session import Session, public_session
@@ -33,18 +32,19 @@ from stitch.plugins.metrology.planning import plan as planning
 from stitch.plugins.metrology.planning.expected_model import PlannedCell, cell_of_session, cell_of_state
 from stitch.plugins.metrology.planning.plan import Plan, PlanRequest
 from stitch.recorder import Recorder
-from stitch.session import session as measured
+from stitch.run_data import RunData
+from stitch.session.session import SessionData
 from stitch.system.files import whole_file
 from stitch.system.threads import library_threads_off
 
 
 def run(
-    session: measured.Session,
-    model: ModelFile | runs.Run | None = None,
+    session: SessionData,
+    model: ModelFile | RunData | None = None,
     recorder: Recorder | None = None,
     effects: Sequence[str] = (),
     keep: bool = False,
-    arm: ModelFile | runs.Run | None = None,
+    arm: ModelFile | RunData | None = None,
     register: str = DEFAULT,
 ) -> Run:
     """Stitch one session: correct the hand-eye from the scans, register, fuse.
@@ -74,12 +74,12 @@ def run(
 
 
 def run_rig(
-    sessions: Sequence[measured.Session],
-    model: ModelFile | runs.Run | None = None,
+    sessions: Sequence[SessionData],
+    model: ModelFile | RunData | None = None,
     recorders: Sequence[Recorder] | None = None,
     effects: Sequence[str] = (),
     keep: bool = False,
-    arm: ModelFile | runs.Run | None = None,
+    arm: ModelFile | RunData | None = None,
     register: str = DEFAULT,
 ) -> list[Run]:
     """Stitch several sessions of one rig with common effects and, of scans, one hand-eye; one run a session.
@@ -102,7 +102,7 @@ def run_rig(
     """
     others: Sequence[Recorder | None] = recorders or [None] * len(sessions)
     replays = [ReplayRecorder(other) for other in others]
-    stated = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, runs.Run) else arm
+    stated = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, RunData) else arm
     fitted = None if model is None else _model(model)
     found = pipeline.run_rig(sessions, fitted, replays, _names(effects), keep, stated, register=register)
     return [public_run(*own) for own in zip(found, map(public_session, sessions), replays, strict=True)]
@@ -133,7 +133,7 @@ def load_run(folder: Path | str, effects_file: Path | None = None, trust: bool =
     return public_run(replace(run, source=run.fit), None)
 
 
-def diagnose(run: runs.Run) -> Diagnosis:
+def diagnose(run: RunData) -> Diagnosis:
     """Find which effect is missing in the model of a run, as `stitch diagnose` does.
 
     Args:
@@ -153,7 +153,7 @@ def diagnose(run: runs.Run) -> Diagnosis:
     return pipeline.diagnose(_state(run))
 
 
-def add(run: runs.Run, *effects: str, recorder: Recorder | None = None) -> Run:
+def add(run: RunData, *effects: str, recorder: Recorder | None = None) -> Run:
     """Return the run with further effects in its model, hand-eye and all effects fitted anew.
 
     Args:
@@ -175,7 +175,7 @@ def add(run: runs.Run, *effects: str, recorder: Recorder | None = None) -> Run:
     return _changed(run, pipeline.effects_with(run, effects, run.session.name), recorder)
 
 
-def drop(run: runs.Run, *effects: str, recorder: Recorder | None = None) -> Run:
+def drop(run: RunData, *effects: str, recorder: Recorder | None = None) -> Run:
     """Return the run without some effects, hand-eye and the rest fitted anew.
 
     Args:
@@ -196,7 +196,7 @@ def drop(run: runs.Run, *effects: str, recorder: Recorder | None = None) -> Run:
     return _changed(run, pipeline.effects_without(run, effects, run.session.name), recorder)
 
 
-def compare(run: runs.Run) -> ResidualTables:
+def compare(run: RunData) -> ResidualTables:
     """Compute how the residuals of a run depend on everything that is known of its views, as `stitch compare` does.
 
     Returns:
@@ -214,7 +214,7 @@ def compare(run: runs.Run) -> ResidualTables:
     return compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
 
 
-def explain(run: runs.Run) -> Explanation:
+def explain(run: RunData) -> Explanation:
     """Find a formula for what the model of a run leaves, as `stitch explain` does.
 
     Returns:
@@ -239,7 +239,7 @@ def explain(run: runs.Run) -> Explanation:
 
 
 def plan(
-    cell: measured.Session | runs.Run,
+    cell: SessionData | RunData,
     *,
     views: int | None = None,
     split: tuple[str, str] | None = None,
@@ -277,14 +277,14 @@ def plan(
     at = None if feature is None else np.asarray(feature, float).reshape(-1)
     split_any = not halve and at is None
     wanted = PlanRequest(halve=halve or split is None, split=split, split_any=split_any, views=views, feature=at)
-    if isinstance(cell, runs.Run):
+    if isinstance(cell, RunData):
         return planning.plan_further_views(cell.session, _cell_of(cell), wanted)
     planned = cell_of_session(cell, None if part is None else Path(part), size, field)
     return planning.plan_further_views(cell, planned, wanted)
 
 
 def export_run(
-    run: runs.Run,
+    run: RunData,
     to: str,
     file: Path | str | None = None,
     *,
@@ -335,7 +335,7 @@ def export_run(
     return text
 
 
-def _cloud(run: runs.Run, to: str, file: Path | None) -> None:
+def _cloud(run: RunData, to: str, file: Path | None) -> None:
     """Write the stitched cloud; precision as of stitched.ply, which holds it in a run folder."""
     if file is None or file.suffix.lower() != f".{to}":
         raise InputError(f"{to}: where to? to fix: name the file NAME.{to}")
@@ -352,8 +352,8 @@ def _single(values: Array) -> Array:
     return np.asarray(values, np.float32).astype(np.float64)
 
 
-def _model(model: ModelFile | runs.Run) -> ModelFile:
-    return model_of(model) if isinstance(model, runs.Run) else model
+def _model(model: ModelFile | RunData) -> ModelFile:
+    return model_of(model) if isinstance(model, RunData) else model
 
 
 def _names(effects: Sequence[str]) -> list[str]:
@@ -361,19 +361,19 @@ def _names(effects: Sequence[str]) -> list[str]:
     return [find_effect(name).name for name in effects]
 
 
-def _state(run: runs.Run) -> runs.Run:
+def _state(run: RunData) -> RunData:
     """Return what a command reads of the run's folder: partners are looked for within the gate of the model alone."""
     with library_threads_off():
         return replace(run, gate=gate_of_model(corrected_capture(run.measurement, run.model), run.T_mount))
 
 
-def _changed(run: runs.Run, effects: Sequence[str], recorder: Recorder | None) -> Run:
+def _changed(run: RunData, effects: Sequence[str], recorder: Recorder | None) -> Run:
     replay = ReplayRecorder(recorder)
     whole_session: Session | None = run.measured if isinstance(run, Run) else None
     return public_run(pipeline.change(_state(run), effects, replay), whole_session, replay)
 
 
-def _cell_of(run: runs.Run) -> PlannedCell:
+def _cell_of(run: RunData) -> PlannedCell:
     if not run.session.has_clouds:
         raise InputError(f"{run.session.name}: a run of labelled points; plans are made for scans; to fix: diagnose it")
     return cell_of_state(_state(run), _single(run.fused.points), _single(run.fused.normals))

@@ -15,7 +15,7 @@ from stitch.errors import InputError
 from stitch.system.process import end_at_once
 
 if TYPE_CHECKING:
-    from stitch.run_data import Run
+    from stitch.run_data import RunData
 
 _AT_MOST = 5  # effects that --suggested adds one by one
 _RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder; changed in place.")]
@@ -103,7 +103,7 @@ def drop_effects(
         _refit_run(run, state, effects_without(state, effects, run), recording, as_json)
 
 
-def _refit_run(run: Path, state: Run, effects: list[str], recording: bool, as_json: bool) -> None:
+def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, as_json: bool) -> None:
     """Give the run folder the model with these effects, and show it; what was fitted before is not fitted anew."""
     from stitch.api.pipeline import change
     from stitch.output import run_folder
@@ -183,7 +183,7 @@ def _show_unchanged(run: Path, as_json: bool) -> None:
         say("Nothing was added: the model is as it was.")
 
 
-def _show_changed(result: Run, run: Path, as_json: bool) -> None:
+def _show_changed(result: RunData, run: Path, as_json: bool) -> None:
     from stitch.cli.run import show_report
     from stitch.output.json_file import others_of_rig, to_json
     from stitch.output.result_document import result_document
@@ -203,7 +203,7 @@ def _show_changed(result: Run, run: Path, as_json: bool) -> None:
         )
 
 
-def remarks(result: Run) -> list[str]:
+def remarks(result: RunData) -> list[str]:
     """Return whether the effects earned their place, and whether they are of a believable size."""
     from stitch.diagnosis.thresholds import FAINT_SIGMAS, HELDOUT_FALL, HELDOUT_RISE
 

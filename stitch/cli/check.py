@@ -14,7 +14,7 @@ from stitch.cli.terminal import emit, say, show_block
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
-    from stitch.session.session import Session
+    from stitch.session.session import SessionData
 
 
 def check(
@@ -82,7 +82,7 @@ def _check_deeply(sessions: list[Path], as_json: bool) -> None:
         raise typer.Exit(2)
 
 
-def session_summary(session: Session) -> dict[str, object]:
+def session_summary(session: SessionData) -> dict[str, object]:
     """Return what a session holds, in plain numbers."""
     import numpy as np
 

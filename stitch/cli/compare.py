@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stitch.output.comparison.displaced_views import FollowedCovariate
     from stitch.output.comparison.open3d_witness import Witness
     from stitch.output.comparison.residual_tables import ResidualTable, ResidualTables
-    from stitch.run_data import Run
+    from stitch.run_data import RunData
 
 _SCOPE = "This look shows what the error follows, one covariate at a time. The cause is for stitch diagnose to name."
 _WORST_ROWS = 5
@@ -104,7 +104,7 @@ def _show_witness(witness: Witness, length_unit: str, run: Path) -> None:
     show_files(run, ("witness.json", "witness.png"))
 
 
-def write_comparison(state: Run, run: Path) -> ResidualTables:
+def write_comparison(state: RunData, run: Path) -> ResidualTables:
     """Return the comparison of a run, after compare.json and what other packages make of it are written."""
     from stitch.output.comparison.residual_tables import compare_surfaces, compare_targets, comparison_document
     from stitch.output.json_file import write_json
@@ -118,7 +118,7 @@ def write_comparison(state: Run, run: Path) -> ResidualTables:
     return found
 
 
-def show_comparison(comparison: ResidualTables, state: Run, run: Path) -> None:
+def show_comparison(comparison: ResidualTables, state: RunData, run: Path) -> None:
     """Print what follows something, the worst views and places, and the clearest tables."""
     from stitch.numerics.units import MICROMETRES, length_text
 
@@ -207,7 +207,7 @@ def _group_names(group: Sequence[ResidualTable]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def _worst_rows(table: ResidualTable, state: Run, to_um: float) -> str:
+def _worst_rows(table: ResidualTable, state: RunData, to_um: float) -> str:
     """Return the worst rows of a table with their rms; of places, in which unit and frame they are written."""
     import numpy as np
 

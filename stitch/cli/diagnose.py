@@ -15,7 +15,7 @@ from stitch.system.process import end_at_once
 if TYPE_CHECKING:
     from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
     from stitch.diagnosis.residual_structure import BudgetLine
-    from stitch.run_data import Run
+    from stitch.run_data import RunData
 
 _LISTED_CANDIDATES = 3
 _LISTED_DEPENDENCES = 3
@@ -101,7 +101,7 @@ def _diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple
         return found, write_diagnosis(found, state, run), state.session.length_unit
 
 
-def write_diagnosis(diagnosis: Diagnosis, state: Run, run: Path) -> dict[str, object]:
+def write_diagnosis(diagnosis: Diagnosis, state: RunData, run: Path) -> dict[str, object]:
     """Return the diagnosis as a document, after diagnosis.json and what other packages make of it are written."""
     from stitch.output.diagnosis_document import diagnosis_document
     from stitch.output.json_file import write_json

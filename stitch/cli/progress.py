@@ -21,8 +21,8 @@ from stitch.system.process import AGAIN, QUIET
 if TYPE_CHECKING:
     from stitch.numerics.frames import Array
     from stitch.recorder import Recorder
-    from stitch.run_data import Run, StageResult
-    from stitch.session.session import Session
+    from stitch.run_data import RunData, StageResult
+    from stitch.session.session import SessionData
 
 _SOON = 1.0  # a loop that ends sooner (s) needs no time left
 PROGRESS_VARIABLE = "STITCH_PROGRESS"  # json: lines for programs; off: none on what is no terminal
@@ -189,7 +189,7 @@ class Progress:
     def __init__(self) -> None:
         self.unit = "mm"
 
-    def start(self, session: Session) -> None:
+    def start(self, session: SessionData) -> None:
         """Name what is being done."""
         self.unit = session.length_unit
         live_line().begin(f"{session.name}: {len(session.views)} views, finding the hand-eye")
@@ -205,7 +205,7 @@ class Progress:
     def stage(self, result: StageResult, poses: Array) -> None:
         """A stage has ended."""
 
-    def finish(self, run: Run) -> None:
+    def finish(self, run: RunData) -> None:
         """What follows takes its time too."""
         live_line().begin(f"{run.session.name}: writing cloud and page")
 
@@ -221,7 +221,7 @@ class ProgressLines:
     def __init__(self) -> None:
         self.to_um = 1e3
 
-    def start(self, session: Session) -> None:
+    def start(self, session: SessionData) -> None:
         """What is worked on."""
         from stitch.numerics.units import MICROMETRES
 
@@ -236,7 +236,7 @@ class ProgressLines:
         """A stage has ended."""
         _print_line(progress=result.name, ended=True, rms_um=result.rms * self.to_um)
 
-    def finish(self, run: Run) -> None:
+    def finish(self, run: RunData) -> None:
         """Recording and page are written next."""
         _print_line(
             progress="writing", residual_um=run.residual_rms * self.to_um, heldout_um=run.heldout_rms * self.to_um

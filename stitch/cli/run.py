@@ -31,9 +31,9 @@ from stitch.system.process import end_at_once, load_on_use
 if TYPE_CHECKING:
     from stitch.api.live import LiveSession
     from stitch.model.model_toml import ModelFile
-    from stitch.run_data import Run
+    from stitch.run_data import RunData
     from stitch.session.capture import Capture
-    from stitch.session.session import Session
+    from stitch.session.session import SessionData
 
 # Seconds between two looks, and how long a file may be half-written before that is said.
 _EVERY, _PATIENCE = 0.3, 5.0
@@ -161,7 +161,7 @@ def _require_known(
         method_named(register)
 
 
-def _begin_to_prepare(sessions: list[Session]) -> list[Future[Capture]]:
+def _begin_to_prepare(sessions: list[SessionData]) -> list[Future[Capture]]:
     """Return what `prepare_capture` will find of each session, in a thread that has begun with it."""
     from stitch.session.capture import prepare_capture
     from stitch.system.threads import begin
@@ -263,7 +263,7 @@ def _current_session() -> Path:
     return Path.cwd()
 
 
-def _load_sessions(paths: list[Path], memory: str | None) -> list[Session]:
+def _load_sessions(paths: list[Path], memory: str | None) -> list[SessionData]:
     """Return the sessions; refuse names that cannot be those of their folders in the folder of a rig."""
     from stitch.output.json_file import FILES
     from stitch.session.reading.session_folder import load_session
@@ -306,13 +306,13 @@ def _given_models(
     return None, kept, own or file
 
 
-def _run_folders(target: Path, sessions: list[Session]) -> list[Path]:
+def _run_folders(target: Path, sessions: list[SessionData]) -> list[Path]:
     """Return the folders of the runs: of a rig one for each session."""
     return [target] if len(sessions) == 1 else [target / session.name for session in sessions]
 
 
 def _write_runs(
-    runs: list[Run], folders: list[Path], scratch: Path, mesh: str | None, tolerance: float | None
+    runs: list[RunData], folders: list[Path], scratch: Path, mesh: str | None, tolerance: float | None
 ) -> list[str]:
     """Write what was found, and return how each mesh lies to its cloud, in words."""
     from stitch.model.model_toml import write_model
@@ -335,7 +335,7 @@ def _write_runs(
     return fits
 
 
-def _show_runs(runs: list[Run], tolerance: float | None) -> None:
+def _show_runs(runs: list[RunData], tolerance: float | None) -> None:
     """Print a report for each run; clouds of one rig have one hand-eye."""
     live_line().stop()
     each = not runs[0].session.has_clouds
@@ -352,7 +352,7 @@ def _show_written(folders: list[Path], fits: list[str]) -> None:
     show_next(f"Next: stitch diagnose {shlex.quote(str(folders[0]))}")
 
 
-def show_report(result: Run, tolerance: float | None = None, with_hand_eye: bool = True) -> None:
+def show_report(result: RunData, tolerance: float | None = None, with_hand_eye: bool = True) -> None:
     """Print what a run found: a headline, what to do about it, numbers in a block, the hand-eye, and notes."""
     from stitch.output.comparison.disagreement_field import model_history
     from stitch.output.comparison.run_verdict import run_headline
@@ -384,7 +384,7 @@ def show_report(result: Run, tolerance: float | None = None, with_hand_eye: bool
         say(note)
 
 
-def show_light(result: Run, tolerance: float | None) -> None:
+def show_light(result: RunData, tolerance: float | None) -> None:
     """Print whether the part is within a tolerance, as the page's light says it; nothing where none is stated."""
     from stitch.output.comparison.disagreement_field import model_history
     from stitch.output.comparison.run_verdict import run_light

@@ -13,7 +13,7 @@ from stitch.plugins.metrology.planning.expected_model import FEWEST, CellModel, 
 from stitch.session.capture import Sightings, build_capture
 from stitch.session.measurement import PAYLOAD, Measurement, Torques, Views, torques_of
 from stitch.session.robot import Robot, forward
-from stitch.session.session import Session, View
+from stitch.session.session import SessionData, View
 
 _SAMPLES = 6000
 _SPREAD = np.radians(40.0)  # about joint angles that were driven before
@@ -103,7 +103,7 @@ _SHARE = 0.4
 _TRIES = 4
 
 
-def with_views(session: Session, joints: Sequence[Array], in_turn: bool = True) -> Session:
+def with_views(session: SessionData, joints: Sequence[Array], in_turn: bool = True) -> SessionData:
     """The session with further views at joint angles (n,) rad, after the last one, called p01, p02 …
 
     Args:
@@ -132,7 +132,7 @@ def with_views(session: Session, joints: Sequence[Array], in_turn: bool = True) 
     return replace(session, views=tuple(views))
 
 
-def candidate_joints(session: Session, cell: CellModel, count: int, chosen: Array | None = None) -> Array:
+def candidate_joints(session: SessionData, cell: CellModel, count: int, chosen: Array | None = None) -> Array:
     """(K, n) joint angles near those that are planned, or closer to chosen ones (C, n), in which the scanner would see
     the part, K ≤ count."""
     T_mount = cell.model.T_mount

@@ -28,12 +28,12 @@ from stitch.diagnosis.verdict import Evidence
 from stitch.fit.results import linearise
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.system.process import announce
 from stitch.system.threads import library_threads_off, parallel, return_large_arrays
 
 
-def diagnose_state(state: Run) -> Diagnosis:
+def diagnose_state(state: RunData) -> Diagnosis:
     """Find which effect is missing in the model of a run; what to measure next is planned elsewhere.
 
     Raises:
@@ -45,7 +45,7 @@ def diagnose_state(state: Run) -> Diagnosis:
         return _diagnose(state)
 
 
-def _diagnose(state: Run) -> Diagnosis:
+def _diagnose(state: RunData) -> Diagnosis:
     announce("diagnosing: what every view tells of its pose")
     linear, limit = linear_model_of(state), scatter_limit(state.session)
     announce("diagnosing: trying every effect")
@@ -135,7 +135,7 @@ def _with_joint_law(linear: LinearModel, reported: Sequence[RepeatingError]) -> 
     return laws[0].model if laws else linear
 
 
-def linear_model_of(state: Run) -> LinearModel:
+def linear_model_of(state: RunData) -> LinearModel:
     """Linearise a session under the model of a run."""
     return linearise(state.session, state.measurement, state.model, state.gate)
 

@@ -28,7 +28,7 @@ from stitch.numerics.units import METRES
 from stitch.numerics.variance_posterior import satterthwaite
 from stitch.observations.linear_model import LinearModel
 from stitch.session.measurement import Measurement
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 from stitch.system.threads import parallel
 
 # One form of a candidate beside a model: what it gains, and its free amplitudes.
@@ -258,7 +258,12 @@ def weights_of_masks(masks: Sequence[Mask]) -> Array:
 
 
 def start_with_effects(
-    session: Session, effects: Sequence[str], arm: ModelFile | None, measurement: Measurement, model: Model, gate: float
+    session: SessionData,
+    effects: Sequence[str],
+    arm: ModelFile | None,
+    measurement: Measurement,
+    model: Model,
+    gate: float,
 ) -> Model:
     """The model with another run's arm in place of its effects, if any, and with further effects by name.
 
@@ -315,7 +320,7 @@ class ScatterLimit:
         return self.rotation_stated or self.translation_stated
 
 
-def scatter_limit(session: Session) -> ScatterLimit:
+def scatter_limit(session: SessionData) -> ScatterLimit:
     """Return what the session states under [robot] repeatability, else the largest usual scatter."""
     stated, (rotation, translation) = session.repeatability, limits.IMPLAUSIBLE
     usual = translation * METRES["mm"] / METRES[session.length_unit]

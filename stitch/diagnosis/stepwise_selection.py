@@ -14,13 +14,13 @@ from stitch.diagnosis.validation import Extrapolation, cross_validate, extrapola
 from stitch.fit.results import linearise
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.system.threads import parallel
 
 # Whether the effects of a model still hold their place beside each other.
 
 
-def find_effect_to_drop(state: Run, names: Collection[str]) -> tuple[str, str] | None:
+def find_effect_to_drop(state: RunData, names: Collection[str]) -> tuple[str, str] | None:
     """The weakest effect of labelled points that does not hold its place beside all others, and why; None if all do.
 
     Effects are asked at once, of many poses one after the other. Scans, whose overlaps are found by all cores already,
@@ -39,7 +39,7 @@ def find_effect_to_drop(state: Run, names: Collection[str]) -> tuple[str, str] |
     return name, reason
 
 
-def _test_effect(state: Run, term: Term) -> tuple[float, str | None]:
+def _test_effect(state: RunData, term: Term) -> tuple[float, str | None]:
     """Log Bayes factor of an effect beside the others, and why it should go, if it should."""
     name = term.name
     linear = linearise(state.session, state.measurement, state.model.without(name), state.gate)
@@ -135,7 +135,7 @@ def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best
     return found
 
 
-def find_better_effects(state: Run, added: Collection[str]) -> list[str]:
+def find_better_effects(state: RunData, added: Collection[str]) -> list[str]:
     """Effects that together do better than those that were added to a model, some of which they do without; else none.
 
     Args:

@@ -28,7 +28,7 @@ from stitch.recorder import IterationMemory, Recorder
 from stitch.run_data import Fit, FusedCloud, LedgerStep, StageResult, Unsupported
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 from stitch.system.threads import Clock, begin, take_mapped
 
 # Places of the fused cloud that tell its rms to a part in a thousand.
@@ -47,7 +47,7 @@ class BegunRegistration:
 
 
 def begin_to_register_views(
-    fitted: "FittedRig", sessions: Sequence[Session], method: Method
+    fitted: "FittedRig", sessions: Sequence[SessionData], method: Method
 ) -> tuple[BegunRegistration, ...]:
     """Begin to register and to fuse the views of every session under the common model, one session after the other."""
     correction = fitted.correction
@@ -57,7 +57,7 @@ def begin_to_register_views(
         for session in sessions
     ]
 
-    def register_one(i: int, session: Session, begun: BegunRegistration) -> None:
+    def register_one(i: int, session: SessionData, begun: BegunRegistration) -> None:
         clock, model, own = Clock(), correction.geometry, correction.captures[i]
         poses, scatter = own.poses(model.T_mount), correction.scatter[i]
         overlaps, start = correction.overlaps[i], correction.unconstrained[i].poses
@@ -89,7 +89,7 @@ def _pass_errors_to(future: Future[Any]) -> Iterator[None]:
 
 
 def finish_surfaces(
-    session: Session,
+    session: SessionData,
     measurement: Measurement,
     correction: Correction,
     *,
@@ -166,7 +166,7 @@ def _overlap_stage(name: str, overlaps: Overlaps, iterations: int, seconds: floa
 
 
 def finish_targets(
-    session: Session, found: TargetModelFit, before: StageResult, recorder: Recorder, seconds: float
+    session: SessionData, found: TargetModelFit, before: StageResult, recorder: Recorder, seconds: float
 ) -> tuple[Fit, LedgerStep]:
     """Register single views by their labelled points, and show it to the recorder; there is no cloud to fuse."""
     clock, rows = Clock(), found.rows
@@ -255,7 +255,7 @@ class Pipeline(Protocol):
     """How a run goes with what was observed; a further kind of observation is one more module with these functions."""
 
     def initial_hand_eyes(
-        self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None
+        self, sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile | None
     ) -> list[CoarseHandEye]:
         """The hand-eye of every session to begin with."""
         ...
@@ -268,7 +268,7 @@ class Pipeline(Protocol):
 
     def fit(
         self,
-        sessions: Sequence[Session],
+        sessions: Sequence[SessionData],
         measurements: Sequence[Measurement],
         starts: Sequence[CoarseHandEye],
         initial_model: InitialModel | None,
@@ -279,7 +279,7 @@ class Pipeline(Protocol):
 
     def refit(
         self,
-        sessions: Sequence[Session],
+        sessions: Sequence[SessionData],
         measurements: Sequence[Measurement],
         model: Model,
         gates: Sequence[float],
@@ -288,21 +288,21 @@ class Pipeline(Protocol):
         """Hand-eye and the effects of a model fitted anew from where it stands."""
         ...
 
-    def apply(self, sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
+    def apply(self, sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
         """The sessions under a model of another run as it is."""
         ...
 
-    def linearise(self, session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+    def linearise(self, session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
         """What was observed, as one linear model about a model."""
         ...
 
-    def begin_to_register(self, fitted: FittedRig, sessions: Sequence[Session], register: str) -> FittedRig:
+    def begin_to_register(self, fitted: FittedRig, sessions: Sequence[SessionData], register: str) -> FittedRig:
         """The same, with single views being registered by a method, and fused, while other things go on."""
         ...
 
     def finish(
         self,
-        session: Session,
+        session: SessionData,
         fitted: FittedRig,
         index: int,
         before: StageResult,
@@ -312,6 +312,6 @@ class Pipeline(Protocol):
         """Single views registered by a method, and fused."""
         ...
 
-    def notes(self, session: Session, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
+    def notes(self, session: SessionData, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
         """What a user should know before trusting the result."""
         ...

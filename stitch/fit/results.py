@@ -11,17 +11,17 @@ from stitch.model.model import Model
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.observability import unknown_numbers, unobservable
 from stitch.recorder import Recorder
-from stitch.run_data import ExcludedView, LedgerStep, Run, StageResult, ViewLinks
+from stitch.run_data import ExcludedView, LedgerStep, RunData, StageResult, ViewLinks
 from stitch.session.measurement import Measurement, session_notes
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 
-def pipeline_for(session: Session) -> Pipeline:
+def pipeline_for(session: SessionData) -> Pipeline:
     """How a run goes with what was observed."""
     return surface_steps if session.has_clouds else target_steps
 
 
-def linearise(session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+def linearise(session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
     """What a session says about what a model lacks.
 
     Args:
@@ -50,7 +50,7 @@ class FitSummary:
     notes: tuple[str, ...] = ()  # of the rig
 
 
-def assemble_run(session: Session, index: int, end: FitSummary, before: StageResult, recorder: Recorder) -> Run:
+def assemble_run(session: SessionData, index: int, end: FitSummary, before: StageResult, recorder: Recorder) -> RunData:
     """Register and fuse one session, collect its result with its line in the history, and show it."""
     course, fitted = pipeline_for(session), end.fitted
     found, step = course.finish(session, fitted, index, before, recorder, end.seconds)
@@ -72,7 +72,7 @@ def assemble_run(session: Session, index: int, end: FitSummary, before: StageRes
             *end.notes,
         ),
     )
-    result = Run(
+    result = RunData(
         session=session,
         measurement=own.measurement,
         model=model,

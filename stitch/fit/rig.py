@@ -8,13 +8,13 @@ from stitch.effects.contract import find_effect, parameters_in, require_availabl
 from stitch.errors import InputError
 from stitch.model.model_toml import ModelFile
 from stitch.session.measurement import Measurement
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # No two measured scans begin with so many points alike.
 _COMPARED_POINTS = 100
 
 
-def require_same_rig(sessions: Sequence[Session], model: ModelFile | None) -> None:
+def require_same_rig(sessions: Sequence[SessionData], model: ModelFile | None) -> None:
     """Refuse sessions that cannot share a hand-eye, or that show nothing.
 
     Raises:
@@ -46,7 +46,7 @@ def require_same_rig(sessions: Sequence[Session], model: ModelFile | None) -> No
             raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")
 
 
-def _require_same_arm(first: Session, other: Session) -> None:
+def _require_same_arm(first: SessionData, other: SessionData) -> None:
     """Sessions of labelled points share an arm; its loads may differ."""
     a, b = first.robot, other.robot
     if a is None or b is None:
@@ -59,13 +59,13 @@ def _require_same_arm(first: Session, other: Session) -> None:
         )
 
 
-def require_measured_once(sessions: Sequence[Session]) -> None:
+def require_measured_once(sessions: Sequence[SessionData]) -> None:
     """Refuse a scan that stands in two sessions: it would count as two, and the hand-eye seem surer than it is.
 
     Raises:
         InputError: names both sessions and views.
     """
-    known: dict[bytes, tuple[Session, str]] = {}
+    known: dict[bytes, tuple[SessionData, str]] = {}
     for session in sessions:
         clouds = {
             view.name: view.cloud.points[:_COMPARED_POINTS].tobytes()

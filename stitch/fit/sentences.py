@@ -12,7 +12,7 @@ from stitch.observations.surfaces.hand_eye_fit import HandEyeFit, Repeatability
 from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.run_data import ExcludedView, Unsupported
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # Sources of the hand-eye's variance in words; the keys are the names of the components of its covariance.
 
@@ -79,7 +79,7 @@ def surface_sentence(
     )
 
 
-def register_note(found: Registration, session: Session, unseen: Array) -> str:
+def register_note(found: Registration, session: SessionData, unseen: Array) -> str:
     """Return which surfaces lie off as a whole, which moves mean nothing, and whether register ended early.
 
     Args:
@@ -199,7 +199,7 @@ def view_notes(
     return tuple(notes)
 
 
-def target_notes(found: TargetModelFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:
+def target_notes(found: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> tuple[str, ...]:
     """Return notes on outliers, targets seen once, clouds that were not used, and a widened covariance."""
     notes = _unused_points(found, outliers, session)
     if any(view.cloud is not None for view in session.views):
@@ -212,7 +212,7 @@ def target_notes(found: TargetModelFit, outliers: Sequence[Outlier], session: Se
     return tuple(notes)
 
 
-def mixed_notes(found: TargetModelFit, outliers: Sequence[Outlier], session: Session) -> tuple[str, ...]:
+def mixed_notes(found: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> tuple[str, ...]:
     """Return notes on outliers, targets seen once, and labelled data that clouds replace."""
     notes = _unused_points(found, outliers, session)
     if session.nominal is not None:
@@ -222,7 +222,7 @@ def mixed_notes(found: TargetModelFit, outliers: Sequence[Outlier], session: Ses
     return tuple(notes)
 
 
-def _unused_points(found: TargetModelFit, outliers: Sequence[Outlier], session: Session) -> list[str]:
+def _unused_points(found: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> list[str]:
     notes = []
     if outliers:
         named_outliers = [
@@ -237,7 +237,7 @@ def _unused_points(found: TargetModelFit, outliers: Sequence[Outlier], session: 
     return notes
 
 
-def outlier_name(outlier: Outlier, session: Session) -> str:
+def outlier_name(outlier: Outlier, session: SessionData) -> str:
     """Return the names of an outlier's target and view."""
     view = session.views[outlier.view].name
     return f"view {view}" if outlier.target is None else f"{outlier.target} in view {view}"

@@ -25,11 +25,11 @@ from stitch.recorder import Recorder
 from stitch.run_data import Fit, LedgerStep, StageResult
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 
 def initial_hand_eyes(
-    sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None
+    sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile | None
 ) -> list[CoarseHandEye]:
     """The hand-eye to begin with, one for all sessions: of a model, stated in session.toml, or searched.
 
@@ -40,7 +40,7 @@ def initial_hand_eyes(
 
 
 def _initial_hand_eye(
-    sessions: Sequence[Session], captures: Sequence[Capture], file: ModelFile | None
+    sessions: Sequence[SessionData], captures: Sequence[Capture], file: ModelFile | None
 ) -> CoarseHandEye:
     if file:
         return use_given_hand_eye(captures, file.T_mount, REUSED)
@@ -57,7 +57,7 @@ def initial_stage(measurement: Measurement, start: CoarseHandEye, seconds: float
 
 
 def fit(
-    sessions: Sequence[Session],
+    sessions: Sequence[SessionData],
     measurements: Sequence[Measurement],
     starts: Sequence[CoarseHandEye],
     initial_model: InitialModel | None,
@@ -85,7 +85,7 @@ def fit(
 
 
 def refit(
-    sessions: Sequence[Session],
+    sessions: Sequence[SessionData],
     measurements: Sequence[Measurement],
     model: Model,
     gates: Sequence[float],
@@ -99,7 +99,7 @@ def refit(
     return _fitted_rig(*fit_without_outliers(measurements, once, _locate_targets))
 
 
-def apply(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
+def apply(sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
     """The sessions under a model of another run, neither hand-eye nor effects changed."""
 
     def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
@@ -109,7 +109,7 @@ def apply(sessions: Sequence[Session], measurements: Sequence[Measurement], file
     return _fitted_rig(*fit_without_outliers(measurements, once, _locate_targets))
 
 
-def linearise(session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+def linearise(session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
     """Views freed under the model by their overlaps and common targets.
 
     Raises:
@@ -119,13 +119,13 @@ def linearise(session: Session, measurement: Measurement, model: Model, gate: fl
     return surface_model(measurement, model, own, unconstrained_poses(own, own.poses(model.T_mount), gate))
 
 
-def begin_to_register(fitted: FittedRig, sessions: Sequence[Session], register: str) -> FittedRig:
+def begin_to_register(fitted: FittedRig, sessions: Sequence[SessionData], register: str) -> FittedRig:
     """The same, with the views of all sessions being registered by a method, and fused."""
     return replace(fitted, begun=begin_to_register_views(fitted, sessions, METHODS[register]))
 
 
 def finish(
-    session: Session,
+    session: SessionData,
     fitted: FittedRig,
     index: int,
     before: StageResult,
@@ -146,7 +146,7 @@ def finish(
     )
 
 
-def notes(session: Session, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
+def notes(session: SessionData, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
     """What a user should know before trusting the result."""
     assert fitted.correction is not None
     own = fitted.sessions[index]

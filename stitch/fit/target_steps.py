@@ -21,11 +21,11 @@ from stitch.recorder import Recorder
 from stitch.run_data import Fit, LedgerStep, StageResult
 from stitch.session.capture import Sightings
 from stitch.session.measurement import Measurement
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 
 def initial_hand_eyes(
-    sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile | None
+    sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile | None
 ) -> list[CoarseHandEye]:
     """The hand-eye of each session to begin with: of a model, stated in session.toml, or in closed form.
 
@@ -38,7 +38,7 @@ def initial_hand_eyes(
     ]
 
 
-def _initial_hand_eye(session: Session, measurement: Measurement, file: ModelFile | None) -> CoarseHandEye:
+def _initial_hand_eye(session: SessionData, measurement: Measurement, file: ModelFile | None) -> CoarseHandEye:
     if file is None and _sightings(measurement).view_counts.max() < 2:
         raise NoResultError(
             f"{session.path}: no target is seen in two views; nothing shows whether the poses agree; to fix: with the "
@@ -62,7 +62,7 @@ def initial_stage(measurement: Measurement, start: CoarseHandEye, seconds: float
 
 
 def fit(
-    sessions: Sequence[Session],
+    sessions: Sequence[SessionData],
     measurements: Sequence[Measurement],
     starts: Sequence[CoarseHandEye],
     initial_model: InitialModel | None,
@@ -79,7 +79,7 @@ def fit(
 
 
 def refit(
-    sessions: Sequence[Session],
+    sessions: Sequence[SessionData],
     measurements: Sequence[Measurement],
     model: Model,
     gates: Sequence[float],
@@ -90,7 +90,7 @@ def refit(
 
 
 def _refit(
-    sessions: Sequence[Session], measurements: Sequence[Measurement], models: Sequence[Model], recorder: Recorder
+    sessions: Sequence[SessionData], measurements: Sequence[Measurement], models: Sequence[Model], recorder: Recorder
 ) -> FittedRig:
     drawings = [drawing_of(s.nominal, _sightings(m)) for s, m in zip(sessions, measurements, strict=True)]
 
@@ -106,7 +106,7 @@ def _refit(
     return _fitted_rig(measurements, once)
 
 
-def apply(sessions: Sequence[Session], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
+def apply(sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
     """The sessions under a model of another run; nothing is fitted but targets that it does not know."""
 
     def once(measurements: Sequence[Measurement], _: list[TargetModelFit] | None) -> list[TargetModelFit]:
@@ -115,18 +115,18 @@ def apply(sessions: Sequence[Session], measurements: Sequence[Measurement], file
     return _fitted_rig(measurements, once)
 
 
-def linearise(session: Session, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+def linearise(session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
     """Labelled points as they are."""
     return target_model(measurement, model, drawing_of(session.nominal, _sightings(measurement)))
 
 
-def begin_to_register(fitted: FittedRig, sessions: Sequence[Session], register: str) -> FittedRig:
+def begin_to_register(fitted: FittedRig, sessions: Sequence[SessionData], register: str) -> FittedRig:
     """The same: `register` names a method of surfaces, which labelled points do not need."""
     return fitted
 
 
 def finish(
-    session: Session,
+    session: SessionData,
     fitted: FittedRig,
     index: int,
     before: StageResult,
@@ -139,7 +139,7 @@ def finish(
     return finish_targets(session, found, before, recorder, seconds)
 
 
-def notes(session: Session, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
+def notes(session: SessionData, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
     """What a user should know before trusting the result."""
     own = fitted.sessions[index]
     assert own.targets is not None

@@ -29,7 +29,7 @@ from stitch.run_data import FusedCloud, Unsupported
 from stitch.session.capture import Capture
 from stitch.session.measurement import MIN_COSINE, Measurement, intensity_scale
 from stitch.session.scan import Scan, box_corners
-from stitch.session.session import Cloud, Session, WholeCloud
+from stitch.session.session import Cloud, SessionData, WholeCloud
 from stitch.system.threads import map_parts, parallel
 
 # Points seen at a grazing angle weigh little and edges less, but a place only they saw stays.
@@ -129,7 +129,7 @@ _SIGMAS, _OFF_PLANE = 4.0, 0.15
 class RegisteredSession:
     """A session under its model, with single views registered."""
 
-    session: Session
+    session: SessionData
     measurement: Measurement  # with the effects in use
     model: Model
     own: Capture  # without them
@@ -141,7 +141,7 @@ class RegisteredSession:
         return intensity_scale(self.session)
 
 
-def has_whole_clouds(session: Session) -> bool:
+def has_whole_clouds(session: SessionData) -> bool:
     """True if memory holds only some of the points that were scanned."""
     return any(view.cloud is not None and view.cloud.whole is not None for view in session.views)
 

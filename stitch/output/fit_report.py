@@ -7,7 +7,7 @@ from stitch.model.model import hand_eye_lines
 from stitch.numerics.units import angle_text, length_text, uncertainty_text
 from stitch.output.comparison.disagreement_field import effect_changes, model_history
 from stitch.output.comparison.run_verdict import run_verdict
-from stitch.run_data import Run
+from stitch.run_data import RunData
 
 # Scanners leave a few points in the air beside edges, which is no news.
 _WORTH_A_LINE = 0.005
@@ -16,7 +16,7 @@ _WORTH_A_LINE = 0.005
 _WIDTH = 100
 
 
-def fit_report(run: Run, at_part: tuple[float, float]) -> str:
+def fit_report(run: RunData, at_part: tuple[float, float]) -> str:
     """Return the block, as lmfit's fit_report has it: a heading in double brackets, and its lines.
 
     Args:
@@ -41,7 +41,7 @@ def fit_report(run: Run, at_part: tuple[float, float]) -> str:
     return "\n".join(line for part in parts for line in part)
 
 
-def run_hand_eye_lines(run: Run) -> list[str]:
+def run_hand_eye_lines(run: RunData) -> list[str]:
     """Return the hand-eye of a run with U (k = 2); what its views do not show is not known, or as it was stated."""
     return hand_eye_lines(
         run.T_mount,
@@ -53,7 +53,7 @@ def run_hand_eye_lines(run: Run) -> list[str]:
     )
 
 
-def report_rows(run: Run) -> list[tuple[str, str]]:
+def report_rows(run: RunData) -> list[tuple[str, str]]:
     """Return names and values: errors, of every model so far on views left out, noise, scatter, fitted effects."""
     (_, heldout), (_, inside), (_, noise), scatter = _errors(run)
     parameters = {
@@ -70,7 +70,7 @@ def report_rows(run: Run) -> list[tuple[str, str]]:
     ]
 
 
-def _unsupported(run: Run) -> str:
+def _unsupported(run: RunData) -> str:
     dropped = run.fit.unsupported
     alone, through = (n / dropped.points for n in (dropped.alone, dropped.looked_through))
     return f"{dropped.share:.1%} ({alone:.1%} on no surface, {through:.1%} where other views look past)"
@@ -87,7 +87,7 @@ def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
     return [f"{name + ':':<30}{text}" for name, text in rows]
 
 
-def _errors(run: Run) -> list[tuple[str, str]]:
+def _errors(run: RunData) -> list[tuple[str, str]]:
     """Residuals, noise and the scatter of the poses."""
     unit, scatter = run.session.length_unit, run.repeatability
     return [
@@ -98,14 +98,14 @@ def _errors(run: Run) -> list[tuple[str, str]]:
     ]
 
 
-def _effects(run: Run) -> list[tuple[str, str]]:
+def _effects(run: RunData) -> list[tuple[str, str]]:
     """Parameters that were fitted or tried."""
     return [
         (f"{term.name}.{p.name}", str(p.formatted)) for term in run.terms for p in term.parameters if p.fitted or p.grid
     ]
 
 
-def _history(run: Run) -> list[tuple[str, str]]:
+def _history(run: RunData) -> list[tuple[str, str]]:
     """Every step of the model, where there are several, with its error on views left out."""
     steps = run.ledger if len(run.ledger) > 1 else ()
     return [

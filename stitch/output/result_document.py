@@ -14,9 +14,9 @@ from stitch.observations.targets.target_model import TargetModelFit
 from stitch.output.comparison.disagreement_field import model_history
 from stitch.output.comparison.run_verdict import run_verdict
 from stitch.output.json_file import FORMAT
-from stitch.run_data import ExcludedView, Run, StageResult
+from stitch.run_data import ExcludedView, RunData, StageResult
 from stitch.session.measurement import Measurement
-from stitch.session.session import Session, View
+from stitch.session.session import SessionData, View
 
 # What labelled points add to model.toml, result.json and residuals.parquet, and back.
 
@@ -48,7 +48,7 @@ def target_rows(found: TargetModelFit | None) -> list[dict[str, Any]]:
     ]
 
 
-def labelled_facts(run: Run) -> dict[str, Any]:
+def labelled_facts(run: RunData) -> dict[str, Any]:
     """What the rms of a run on labelled points counts, the errors left out and inside, and the outliers."""
     if run.targets is None:
         return {}
@@ -74,7 +74,7 @@ def _sizes(distances: Array) -> dict[str, float]:
     return {"mean": float(d.mean()), "median": float(np.median(d)), "max": float(d.max())}
 
 
-def residual_columns(found: TargetModelFit, session: Session) -> dict[str, Array]:
+def residual_columns(found: TargetModelFit, session: SessionData) -> dict[str, Array]:
     """Columns of residuals.parquet, a row per target and view: `partner` is the target, `residual` the 3D distance."""
     rows, s = found.rows, found.rows.sightings
     v, slot = np.nonzero(s.used)
@@ -91,7 +91,7 @@ def residual_columns(found: TargetModelFit, session: Session) -> dict[str, Array
     return out | {"time_s": np.array([view.time_s for view in session.views], float)[v]}
 
 
-def restore_counted_targets(measurement: Measurement, session: Session, document: dict[str, Any]) -> Measurement:
+def restore_counted_targets(measurement: Measurement, session: SessionData, document: dict[str, Any]) -> Measurement:
     """The measurement as result.json counts its labelled points: less the outliers, and weighed against the clouds."""
     s, outliers = measurement.capture.sightings, document.get("outliers", ())
     if s is None:
@@ -107,7 +107,7 @@ def restore_counted_targets(measurement: Measurement, session: Session, document
 _VERSIONS = ("stitch", "numpy", "scipy", "pykdtree", "libigl", "rerun-sdk", "kiss-icp", "trimesh")
 
 
-def model_of(run: Run) -> ModelFile:
+def model_of(run: RunData) -> ModelFile:
     """The model that a run fitted, as model.toml states it; a file of effects is named while one of them is in use."""
     own = any(term.effect.tier == "user" for term in run.terms)
     return ModelFile(
@@ -123,7 +123,7 @@ def model_of(run: Run) -> ModelFile:
     )
 
 
-def result_document(run: Run) -> dict[str, Any]:
+def result_document(run: RunData) -> dict[str, Any]:
     """result.json as a dictionary."""
     unit = run.session.length_unit
     return {
@@ -178,7 +178,7 @@ def points_of(view: View) -> int:
     return labelled + (0 if view.cloud is None else view.cloud.count)
 
 
-def ledger(run: Run) -> list[dict[str, Any]]:
+def ledger(run: RunData) -> list[dict[str, Any]]:
     """The model's history, one step per change."""
     numbers = ["residual_rms", "heldout_rms", "noise_floor"]
     return [
@@ -189,7 +189,7 @@ def ledger(run: Run) -> list[dict[str, Any]]:
     ]
 
 
-def _effects(run: Run) -> dict[str, dict[str, Any]]:
+def _effects(run: RunData) -> dict[str, dict[str, Any]]:
     return {
         term.name: {
             p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} | ({"view": p.view} if p.view else {})
@@ -199,7 +199,7 @@ def _effects(run: Run) -> dict[str, dict[str, Any]]:
     }
 
 
-def _linkage(run: Run) -> dict[str, Any]:
+def _linkage(run: RunData) -> dict[str, Any]:
     """Groups of views that surfaces connect, and views that hang on a single pair."""
     return {
         "components": [list(part) for part in run.links.components],
@@ -207,7 +207,7 @@ def _linkage(run: Run) -> dict[str, Any]:
     }
 
 
-def _disagreement(run: Run) -> dict[str, Any] | None:
+def _disagreement(run: RunData) -> dict[str, Any] | None:
     """How far the views disagree on the part at every step of the model's history; None without clouds."""
     history = model_history(run)
     if history is None or run.registered is None:
@@ -222,7 +222,7 @@ def _disagreement(run: Run) -> dict[str, Any] | None:
     }
 
 
-def _views(run: Run) -> list[dict[str, Any]]:
+def _views(run: RunData) -> list[dict[str, Any]]:
     """All views of the session in their order; those that were left out stand between those that are fused."""
     rows = {int(number): _view(run, v) for v, number in enumerate(run.measurement.views.number)}
     free = (number for number in range(len(rows) + len(run.left_out)) if number not in rows)
@@ -241,7 +241,7 @@ def _left_out_view(item: ExcludedView) -> dict[str, Any]:
     }
 
 
-def _view(run: Run, v: int) -> dict[str, Any]:
+def _view(run: RunData, v: int) -> dict[str, Any]:
     return {
         "view": run.session.views[v].name,
         "pose": run.poses[v].tolist(),

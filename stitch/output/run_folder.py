@@ -26,9 +26,9 @@ from stitch.observations.surfaces.matching import Match
 from stitch.output.json_file import FILES, FITS, is_run_file, require_free, write_json
 from stitch.output.result_document import ledger, model_of, residual_columns, result_document
 from stitch.recorder import Recorder
-from stitch.run_data import FusedCloud, Run
+from stitch.run_data import FusedCloud, RunData
 from stitch.session.reading.session_folder import measured_files
-from stitch.session.session import Session, View
+from stitch.session.session import SessionData, View
 from stitch.system.files import claim_folder, rewrite_folder
 from stitch.system.threads import release_mapped
 
@@ -72,7 +72,7 @@ def write_cloud(cloud: FusedCloud, path: Path) -> None:
                 release_mapped(values)
 
 
-def write_residuals(run: Run, path: Path) -> None:
+def write_residuals(run: RunData, path: Path) -> None:
     """Write the table of residuals as Parquet."""
     import pyarrow.parquet as pq
 
@@ -82,7 +82,7 @@ def write_residuals(run: Run, path: Path) -> None:
     pq.write_table(table, path, compression="zstd", use_dictionary=repeated)
 
 
-def residual_table(run: Run) -> Any:
+def residual_table(run: RunData) -> Any:
     """Return one row per residual of the model, before the register stage moves single views, as a pyarrow.Table.
 
     `time_s` is NaN where nobody states it; a covariate that is called like another column becomes `covariate_NAME`.
@@ -115,7 +115,7 @@ def _joined(pa: Any, parts: Sequence[Array]) -> Any:
     return pa.chunked_array(encoded).unify_dictionaries().combine_chunks()
 
 
-def _without_reserved_covariates(session: Session) -> Session:
+def _without_reserved_covariates(session: SessionData) -> SessionData:
     """The session without covariates that would take the place of a column."""
 
     def free(values: dict[str, _Value]) -> dict[str, _Value]:
@@ -128,7 +128,7 @@ def _without_reserved_covariates(session: Session) -> Session:
     return replace(session, views=tuple(renamed(view) for view in session.views))
 
 
-def _columns(session: Session, m: Match, of_views: Iterable[str], of_points: Iterable[str]) -> dict[str, Array]:
+def _columns(session: SessionData, m: Match, of_views: Iterable[str], of_points: Iterable[str]) -> dict[str, Array]:
     """Columns of one pair of views, a row per correspondence."""
     size = len(m.residual)
     own, time = session.views[m.v].covariates, session.views[m.v].time_s
@@ -273,7 +273,7 @@ def preload_entry_points(*groups: str) -> None:
     Thread(target=load, daemon=True).start()
 
 
-def write_with_page(run: Run, folder: Path, tolerance: float | None = None) -> None:
+def write_with_page(run: RunData, folder: Path, tolerance: float | None = None) -> None:
     """Write model.toml, result.json, ledger.json, stitched.ply, residuals.parquet and report.html into `folder`.
 
     Args:
@@ -292,6 +292,6 @@ def write_with_page(run: Run, folder: Path, tolerance: float | None = None) -> N
             written.result()
 
 
-def _write_points(run: Run, folder: Path) -> None:
+def _write_points(run: RunData, folder: Path) -> None:
     write_cloud(run.fused, folder / "stitched.ply")
     write_residuals(run, folder / "residuals.parquet")

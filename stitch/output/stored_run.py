@@ -26,7 +26,17 @@ from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, Overlaps, collect_overlaps
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.output.result_document import restore_counted_targets
-from stitch.run_data import ExcludedView, Fit, FusedCloud, LedgerStep, Note, Run, StageResult, Unsupported, ViewLinks
+from stitch.run_data import (
+    ExcludedView,
+    Fit,
+    FusedCloud,
+    LedgerStep,
+    Note,
+    RunData,
+    StageResult,
+    Unsupported,
+    ViewLinks,
+)
 from stitch.session.capture import Capture, prepare_capture
 from stitch.session.measurement import measurement_of, with_part_origin
 from stitch.session.reading.clouds import require_room
@@ -268,7 +278,7 @@ def trusted_model(
 # A run folder as the run that wrote it: its numbers as they stand there, its correspondences found again.
 
 
-def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False) -> Run:
+def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False) -> RunData:
     """Read a run folder; its session is read again and nothing is fitted.
 
     Args:
@@ -292,7 +302,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
         model = bind_to_session(file, measurement)
         measurement = restore_counted_targets(measurement, session, document)
         gate = gate_of_model(corrected_capture(measurement, model), model.T_mount)
-    return Run(
+    return RunData(
         session=session,
         measurement=measurement,
         model=model,
@@ -312,7 +322,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
     )
 
 
-def diagnosed_state(run: Run, folder: Path) -> str:
+def diagnosed_state(run: RunData, folder: Path) -> str:
     """Return what a diagnosis is of: stitch's version, and hashes of the session, the result and the effects' file."""
     file = None if run.effects_file is None else Path(run.effects_file)
     own = content_hash(folder, [folder / "model.toml", folder / "result.json"])
@@ -320,7 +330,7 @@ def diagnosed_state(run: Run, folder: Path) -> str:
     return " ".join((version("stitch"), session_hash(run.session), own, effects)).strip()
 
 
-def standing_diagnosis(folder: Path, run: Run) -> dict[str, Any]:
+def standing_diagnosis(folder: Path, run: RunData) -> dict[str, Any]:
     """Return the diagnosis in a run's folder; {} where there is none, or one of another state or version."""
     try:
         told = read_diagnosis(folder)
@@ -330,7 +340,7 @@ def standing_diagnosis(folder: Path, run: Run) -> dict[str, Any]:
     return told if UNKNOWN not in state and told.get("of") == state else {}
 
 
-def named_before(run: Run, told: dict[str, Any]) -> "Finding | None":
+def named_before(run: RunData, told: dict[str, Any]) -> "Finding | None":
     """Return the effects that a standing diagnosis of a run names to be added; None where it names none."""
     from stitch.diagnosis.diagnosis import Finding
     from stitch.diagnosis.validation import CrossValidation
@@ -357,7 +367,7 @@ def _dropped_before(folder: Path) -> dict[str, str]:
         return {}
 
 
-def _read_fit(folder: Path, run: Run) -> Fit:
+def _read_fit(folder: Path, run: RunData) -> Fit:
     """Read what the stages found; correspondences are found again, nothing is fitted.
 
     Raises:
@@ -373,7 +383,7 @@ def _read_fit(folder: Path, run: Run) -> Fit:
         raise InputError(f"{folder}: its files are damaged ({reason}); to fix: run `stitch run` again") from None
 
 
-def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, run: Run) -> None:
+def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, run: RunData) -> None:
     """Refuse a model or a session that is not that of the result any more."""
     stated = {name: {p: f["value"] for p, f in own.items()} for name, own in document["effects"].items()}
     values = {name: {p: f.value for p, f in own.items()} for name, own in model.effects.items()}
@@ -387,7 +397,7 @@ def _require_one(folder: Path, document: dict[str, Any], model: ModelFile, run: 
         raise InputError(f"{run.session.path}/views.csv: changed after {folder}; to fix: run `stitch run` again")
 
 
-def _restore_fit(folder: Path, document: dict[str, Any], run: Run) -> Fit:
+def _restore_fit(folder: Path, document: dict[str, Any], run: RunData) -> Fit:
     model = run.model
     gone = {item.view for item in run.left_out}
     views = [view for view in document["views"] if view["view"] not in gone]
@@ -445,7 +455,7 @@ def _stage_result(row: dict[str, Any]) -> StageResult:
     return StageResult(row["name"], rms, row["correspondences"], row["iterations"], row["seconds"], *words)
 
 
-def _target_fit(folder: Path, run: Run) -> TargetModelFit:
+def _target_fit(folder: Path, run: RunData) -> TargetModelFit:
     """What the labelled points say under the model; the distances of views left out are those of the fit."""
     found = evaluate_targets(run.measurement, run.model)
     used = found.rows.sightings.used

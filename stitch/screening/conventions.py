@@ -27,7 +27,7 @@ from stitch.screening.hypotheses import (
 )
 from stitch.screening.placement import Placement, place_scan, shows_no_surface, surface_of
 from stitch.session.capture import Capture, part_size
-from stitch.session.session import Mount, Session
+from stitch.session.session import Mount, SessionData
 from stitch.system.threads import parallel
 
 # How the scanner moved between views, from the scans alone: what every hypothesis about the poses has to explain.
@@ -467,7 +467,7 @@ _AXIS_NEAR = 0.05
 
 
 def poses_on_linear_axis(
-    session: Session, rows: Indices, stated: MotionFit, motions: RelativeScans
+    session: SessionData, rows: Indices, stated: MotionFit, motions: RelativeScans
 ) -> Iterator[Hypothesis]:
     """The poses with a column beside them added along the direction that the motions ask for: a rail, a lift.
 
@@ -580,7 +580,7 @@ _MANY_CLOSED, _FEW_CLOSED, _AS_MANY = 0.4, 0.2, 0.75
 _ALL = 0.95
 
 
-def rank_hypotheses(session: Session, motions: RelativeScans, rows: Indices | None = None) -> list[MotionFit]:
+def rank_hypotheses(session: SessionData, motions: RelativeScans, rows: Indices | None = None) -> list[MotionFit]:
     """Return all hypotheses about the poses of a session, best first; empty if the scans show too little motion.
 
     Args:

@@ -41,7 +41,7 @@ from stitch.screening.view_model import UsualEffects
 from stitch.session.capture import Capture, part_size, sightings_of, thin_session
 from stitch.session.measurement import measurement_of
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES, find_intrinsics
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # No arm scatters by more.
 _ROTATION, _TRANSLATION_M = 0.010, 0.005
@@ -49,7 +49,7 @@ _ROTATION, _TRANSLATION_M = 0.010, 0.005
 _VIEW_ROTATION, _VIEW_M = 0.005, 0.0025
 
 
-def apply_displacement_limits(session: Session, found: Snooping) -> Snooping:
+def apply_displacement_limits(session: SessionData, found: Snooping) -> Snooping:
     """Return the findings with those suspected views misplaced that are surely off by more than effects of an arm."""
     sure = [m for m in found.suspected if _beyond_effects(session, *m.at_least)]
     return replace(
@@ -59,39 +59,39 @@ def apply_displacement_limits(session: Session, found: Snooping) -> Snooping:
     )
 
 
-def _beyond_effects(session: Session, rotation: float, translation: float) -> bool:
+def _beyond_effects(session: SessionData, rotation: float, translation: float) -> bool:
     """True if no effect of an arm is believed to displace a single view so far."""
     return rotation > _VIEW_ROTATION or translation * METRES[session.length_unit] > _VIEW_M
 
 
-def poses_contradict_scans(session: Session, found: Snooping) -> bool:
+def poses_contradict_scans(session: SessionData, found: Snooping) -> bool:
     """True if the poses contradict the scans beyond what any arm does."""
     lost = len(found.not_belonging) > len(session.views) / 2
     return lost or beyond_any_arm(session, found.rotation, found.translation)
 
 
-def scatter_is_doubtful(session: Session, found: Snooping) -> bool:
+def scatter_is_doubtful(session: SessionData, found: Snooping) -> bool:
     """True if all poses together scatter by what no arm is believed to do to a single view."""
     return _beyond_effects(session, found.rotation, found.translation)
 
 
-def beyond_any_arm(session: Session, rotation: float, translation: float) -> bool:
+def beyond_any_arm(session: SessionData, rotation: float, translation: float) -> bool:
     """True if a rotation (rad) or a translation (length_unit) is larger than what any arm does."""
     return rotation > _ROTATION or translation > _TRANSLATION_M / METRES[session.length_unit]
 
 
-def displacement_in_words(session: Session, found: MisplacedView) -> str:
+def displacement_in_words(session: SessionData, found: MisplacedView) -> str:
     """Return how far a suspected view is off, in words."""
     amount = displacement_text(found.at_least, found.at_least, session.length_unit)
     return f"is off by at least {amount}" if amount else "is off by an amount that its surface does not show"
 
 
-def _contradiction_in_words(session: Session, found: Snooping) -> str:
+def _contradiction_in_words(session: SessionData, found: Snooping) -> str:
     """Return the scatter by which the poses contradict the scans, in words."""
     return f"{1e3 * found.rotation:.3g} mrad and {found.translation:.3g} {session.length_unit}"
 
 
-def background_problems(session: Session, own: Capture, T_mount: Array, found: Snooping) -> list[SessionProblem]:
+def background_problems(session: SessionData, own: Capture, T_mount: Array, found: Snooping) -> list[SessionProblem]:
     """Return the problems of what the scans show beside the part: static background, or what only one scan shows.
 
     Args:
@@ -115,7 +115,7 @@ _NUMBERS = {2: "two", 3: "three", 4: "four", 5: "five"}
 _FEW_VIEWS_CHANCE = 1e-4
 
 
-def check_few_views(session: Session, found: Snooping) -> str | None:
+def check_few_views(session: SessionData, found: Snooping) -> str | None:
     """Return a warning of few views whose poses disagree by more than arms repeat, or that nothing can be tested by.
 
     They show few motions: that something is wrong, but not which scan, row or effect. None where poses agree, or where
@@ -154,7 +154,7 @@ def _global_model_test(found: Snooping, variances: Array) -> bool:
 _TIMES_ROUNDING = 2.0
 
 
-def rounding_that_explains(session: Session, found: Snooping) -> Rounding | None:
+def rounding_that_explains(session: SessionData, found: Snooping) -> Rounding | None:
     """Return the rounding of the table's rotations, if it turns poses by more than arms do and as much as they scatter.
 
     It is asked before rows are blamed: no row of such a table is wrong.
@@ -169,7 +169,7 @@ def rounding_that_explains(session: Session, found: Snooping) -> Rounding | None
 _LISTED = 3
 
 
-def snooping_warnings(session: Session, own: Capture, found: Snooping, T_mount: Array) -> tuple[str, ...]:
+def snooping_warnings(session: SessionData, own: Capture, found: Snooping, T_mount: Array) -> tuple[str, ...]:
     """Return session-level warnings: background in the scans, steps between views, implausible pose errors.
 
     Args:
@@ -205,7 +205,7 @@ _GATE, _STATED_GATE = 0.15, 0.35
 _CLOSES = 0.5
 
 
-def deep_check(session: Session) -> list[SessionProblem]:
+def deep_check(session: SessionData) -> list[SessionProblem]:
     """Return what is wrong with a session; empty if nothing is found.
 
     Raises:
@@ -215,7 +215,7 @@ def deep_check(session: Session) -> list[SessionProblem]:
     return [*found, *target_problems(session, sightings_of(session))]
 
 
-def _check_clouds(session: Session) -> list[SessionProblem]:
+def _check_clouds(session: SessionData) -> list[SessionProblem]:
     session, capture = thin_session(session, _POINTS)
     capture = replace(capture, sightings=drop_mislabelled(capture.sightings))
     found = rank_hypotheses(session, register_scan_pairs(capture))
@@ -243,7 +243,9 @@ def _check_clouds(session: Session) -> list[SessionProblem]:
     return problems if undone is None else [undone]
 
 
-def _check_views(session: Session, capture: Capture, found: Sequence[MotionFit]) -> tuple[list[SessionProblem], bool]:
+def _check_views(
+    session: SessionData, capture: Capture, found: Sequence[MotionFit]
+) -> tuple[list[SessionProblem], bool]:
     """Return problems of single views under the stated poses, and True if these contradict the scans altogether."""
     T_mount, snooped = snoop_from_start(session, capture, _starting_hand_eye(session, capture, found))
     size = length_problem(snooped.model, capture.T_reference_mount, snooped.blunder_search.mean_columns)
@@ -270,7 +272,7 @@ def _check_views(session: Session, capture: Capture, found: Sequence[MotionFit])
     return problems + background_problems(session, capture, T_mount, snooped), contradicted
 
 
-def _starting_hand_eye(session: Session, capture: Capture, found: Sequence[MotionFit]) -> tuple[Array, float]:
+def _starting_hand_eye(session: SessionData, capture: Capture, found: Sequence[MotionFit]) -> tuple[Array, float]:
     """Return a hand-eye that these poses allow, and the distance between partners to begin with."""
     stated = next((e for e in found if e.hypothesis.kind == "stated" and e.scale == 1.0), None)
     size = part_size([capture])
@@ -282,7 +284,7 @@ def _starting_hand_eye(session: Session, capture: Capture, found: Sequence[Motio
     return coarse.T_mount, coarse.gate
 
 
-def snoop_from_start(session: Session, capture: Capture, start: tuple[Array, float]) -> tuple[Array, Snooping]:
+def snoop_from_start(session: SessionData, capture: Capture, start: tuple[Array, float]) -> tuple[Array, Snooping]:
     """Return the hand-eye refined from a start (hand-eye, gate), and what snooping finds under it."""
     T_mount, overlaps, _ = icp_hand_eye([capture], start[0], [start[1]])
     unconstrained = unconstrained_poses(capture, capture.poses(T_mount), overlaps[0].gate)
@@ -292,7 +294,7 @@ def snoop_from_start(session: Session, capture: Capture, start: tuple[Array, flo
     )
 
 
-def _mistake_from_surfaces(session: Session, capture: Capture, found: Sequence[MotionFit]) -> SessionProblem | None:
+def _mistake_from_surfaces(session: SessionData, capture: Capture, found: Sequence[MotionFit]) -> SessionProblem | None:
     """Return the mistake that, undone, lets the surfaces agree without contradiction; None if there is none."""
     fallen = hypotheses_by_surface(capture, found)
     if not fallen:
@@ -312,13 +314,13 @@ def _mistake_from_surfaces(session: Session, capture: Capture, found: Sequence[M
     return _convention_problem(session, fallen)
 
 
-def _mistake_from_motions(session: Session, found: Sequence[MotionFit]) -> SessionProblem | None:
+def _mistake_from_motions(session: SessionData, found: Sequence[MotionFit]) -> SessionProblem | None:
     """Return the mistake that the motions show short of proof; None if there is none."""
     likely = likeliest_hypotheses(found)
     return _convention_problem(session, likely) if likely else None
 
 
-def _convention_problem(session: Session, named: Sequence[MotionFit | SurfaceFit]) -> SessionProblem:
+def _convention_problem(session: SessionData, named: Sequence[MotionFit | SurfaceFit]) -> SessionProblem:
     """Return one problem from hypotheses that are as likely, the best first."""
     best = named[0].hypothesis
     fixes = [e.hypothesis.fix for e in named]
@@ -327,7 +329,7 @@ def _convention_problem(session: Session, named: Sequence[MotionFit | SurfaceFit
     return SessionProblem(best.kind, names_of_views(best.rows, session.names), likeliest_text(fixes))
 
 
-def depth_scale_fix(session: Session, scale: float) -> list[str]:
+def depth_scale_fix(session: SessionData, scale: float) -> list[str]:
     """Return what to write beside depth images whose counts are of another length; nothing for other clouds."""
     factor, table = known_unit_ratio(scale), session.path / "views.csv"
     if factor is None or not table.is_file():
@@ -357,14 +359,14 @@ _SINGLE_VIEW_KINDS = ("displaced", "disconnected", "foreign", "duplicate_scan", 
 _KINDS_LEAVING_A_REST = ("reclamped", "exchanged")
 
 
-def refuse(session: Session, problems: Sequence[SessionProblem]) -> None:
+def refuse(session: SessionData, problems: Sequence[SessionProblem]) -> None:
     """Raise what a deep check found; do nothing where it found nothing certain."""
     for problem in (p for p in problems if p.certain):
         kind = NoResultError if problem.kind in ("displaced", "disconnected") else InputError
         raise kind(f"{session.path}: the poses contradict what was measured: {problem.line(session.names)}")
 
 
-def refuse_whole(session: Session) -> list[SessionProblem]:
+def refuse_whole(session: SessionData) -> list[SessionProblem]:
     """Refuse a mistake of the whole session, such as a wrong order of angles.
 
     Returns:
@@ -379,7 +381,7 @@ def refuse_whole(session: Session) -> list[SessionProblem]:
 
 
 @contextmanager
-def refuse_explained_mistake(session: Session) -> Iterator[None]:
+def refuse_explained_mistake(session: SessionData) -> Iterator[None]:
     """Where views do not overlap, refuse the mistake of the whole session that explains it, if there is one.
 
     Raises:
@@ -395,7 +397,7 @@ def refuse_explained_mistake(session: Session) -> Iterator[None]:
         raise
 
 
-def require_majority(session: Session, left_out: Sequence[ExcludedView]) -> None:
+def require_majority(session: SessionData, left_out: Sequence[ExcludedView]) -> None:
     """Refuse a session of which so many views do not belong that the rest cannot say which of them are wrong.
 
     Args:
@@ -417,7 +419,7 @@ def require_majority(session: Session, left_out: Sequence[ExcludedView]) -> None
         )
 
 
-def require_own_model(session: Session, correction: Correction, index: int) -> None:
+def require_own_model(session: SessionData, correction: Correction, index: int) -> None:
     """Refuse a model whose hand-eye is off by more than any arm moves it, as these scans clearly show."""
     own, T_mount = correction.captures[index], correction.model.T_mount
     fitted = fit_hand_eye([own], [correction.unconstrained[index]], T_mount)
@@ -437,7 +439,7 @@ def require_own_model(session: Session, correction: Correction, index: int) -> N
         )
 
 
-def require_two_motions(session: Session) -> None:
+def require_two_motions(session: SessionData) -> None:
     """Refuse two views from which no hand-eye was found: one motion leaves two directions of it open.
 
     Raises:
@@ -450,12 +452,12 @@ def require_two_motions(session: Session) -> None:
         )
 
 
-def unexplained_error(session: Session, found: Snooping) -> NoResultError:
+def unexplained_error(session: SessionData, found: Snooping) -> NoResultError:
     """Return the refusal of poses that contradict the scans beyond any arm, where no usual mistake explains it."""
     return NoResultError(f"{session.path}: {_unexplained_text(session, found)}")
 
 
-def _unexplained_text(session: Session, found: Snooping) -> str:
+def _unexplained_text(session: SessionData, found: Snooping) -> str:
     return (
         f"the poses contradict the scans by {_contradiction_in_words(session, found)}, more than any arm, and no usual "
         f"mistake explains it; to fix: {_CHECK_ROWS}"

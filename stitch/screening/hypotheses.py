@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
 from stitch.session.robot import forward
-from stitch.session.session import Mount, Session
+from stitch.session.session import Mount, SessionData
 
 _AXES = "xyz"
 _CORRECT_TABLE = "to fix: correct the table of poses"
@@ -192,14 +192,14 @@ class Hypothesis:
         return frames.inverse(self.T_base_flange) if self.mount == "eye_to_hand" else self.T_base_flange
 
 
-def stated_hypothesis(session: Session, rows: Indices | None = None) -> Hypothesis:
+def stated_hypothesis(session: SessionData, rows: Indices | None = None) -> Hypothesis:
     """Return the poses as stated, of some rows or of all."""
     T = np.array([view.T_base_flange for view in session.views])
     return Hypothesis("stated", T if rows is None else T[rows], session.mount, "")
 
 
 def hypotheses(
-    session: Session, rows: Indices | None = None, exchangeable: Sequence[int] | None = None
+    session: SessionData, rows: Indices | None = None, exchangeable: Sequence[int] | None = None
 ) -> list[Hypothesis]:
     """Return the poses as stated, first, and with every mistake undone that can be undone.
 
@@ -215,7 +215,7 @@ def hypotheses(
     return [*out, *_row_mistakes(session, every), *_exchanges(stated, exchangeable)]
 
 
-def _joint_mistakes(session: Session, rows: Indices) -> Iterator[Hypothesis]:
+def _joint_mistakes(session: SessionData, rows: Indices) -> Iterator[Hypothesis]:
     """Yield mistakes with joint angles, and with the mount, which they tell from inverted poses."""
     mount, robot, q = session.mount, session.robot, session.joints
     T = stated_hypothesis(session, rows).T_base_flange
@@ -291,7 +291,7 @@ def _mount_or_inverse(mount: Mount) -> str:
     )
 
 
-def _row_mistakes(session: Session, rows: Indices) -> Iterator[Hypothesis]:
+def _row_mistakes(session: SessionData, rows: Indices) -> Iterator[Hypothesis]:
     """Yield poses that belong to other rows, for all views alike."""
     T, mount, V = stated_hypothesis(session).T_base_flange, session.mount, len(session.views)
     yield Hypothesis("reversed", T[::-1][rows], mount, "the poses are in reverse order; to fix: turn the list around")

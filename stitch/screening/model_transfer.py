@@ -21,7 +21,7 @@ from stitch.numerics.units import length_text
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.screening.deep_check import beyond_any_arm
 from stitch.screening.view_screening import ScreenedFit
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # That an arm which is right is doubted.
 _ARM_CHANCE = 0.01
@@ -226,7 +226,7 @@ def check_model_transfer(found: ScreenedFit, fit: Callable[[], FittedRig]) -> Sc
     return replace(found, screenings=doubted)
 
 
-def _transfer_warnings(session: Session, applied: FittedSession, own: FittedSession | None) -> tuple[str, ...]:
+def _transfer_warnings(session: SessionData, applied: FittedSession, own: FittedSession | None) -> tuple[str, ...]:
     """Return warnings; none where the other run holds."""
     there = applied.targets
     assert there is not None

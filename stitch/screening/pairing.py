@@ -20,7 +20,7 @@ from stitch.screening.scan_faults import find_copies, find_same_poses, scale_fau
 from stitch.screening.snooping import MisplacedView, Snooping, end_runs
 from stitch.session.capture import Capture, part_size
 from stitch.session.robot import forward
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # So many views make a step, and this share of those on its side; displacements agree within this share of their size.
 _FEWEST, _SHARE, _AGREES = 3, 0.7, 0.2
@@ -66,7 +66,7 @@ _MAX_REMAINING_SHARE = 0.1
 
 
 def find_wrong_joint(
-    session: Session, capture: Capture, T_mount: Array, m: MisplacedView
+    session: SessionData, capture: Capture, T_mount: Array, m: MisplacedView
 ) -> tuple[str, float, float, bool] | None:
     """Find the joint that alone explains a displacement: name, degrees stated and that fit, whether a neighbour's."""
     robot, joints = session.robot, session.views[m.view].joints
@@ -187,7 +187,7 @@ _SEVERAL = (
 _COPY = "this scan is a copy of that of {}; to fix: put the right file in its row"
 
 
-def explain_misplaced(session: Session, capture: Capture, T_mount: Array, found: Snooping) -> list[SessionProblem]:
+def explain_misplaced(session: SessionData, capture: Capture, T_mount: Array, found: Snooping) -> list[SessionProblem]:
     """Return one problem for everything that snooping found, with the rows and what to do.
 
     Args:
@@ -244,7 +244,7 @@ def _reclamped(views: range, moved: str, names: Sequence[str]) -> tuple[range, s
 
 
 def _single_view_problem(
-    session: Session,
+    session: SessionData,
     capture: Capture,
     T_mount: Array,
     found: Snooping,

@@ -27,7 +27,7 @@ from stitch.screening.conventions import RelativeScans, rank_hypotheses
 from stitch.screening.hypotheses import UNITS, Hypothesis, distinct, hypotheses, stated_hypothesis
 from stitch.screening.problems import SessionProblem, likeliest_text, names_of_views
 from stitch.session.capture import Capture, Sightings, build_capture, sightings_of
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # Labelled points that sit elsewhere among the others from some view on: a ball that was bumped, a nest put back wrong.
 #
@@ -184,7 +184,7 @@ def _median_steps(distances: Array, start: int, scatter: float) -> tuple[Array, 
     return steps, steps / (_MEDIAN * scatter * np.sqrt(1 / before + 1 / after))
 
 
-def target_problems(session: Session, sightings: Sightings | None) -> list[SessionProblem]:
+def target_problems(session: SessionData, sightings: Sightings | None) -> list[SessionProblem]:
     """Return views with names mixed up, then targets that moved, with the views from there on."""
     if sightings is None:
         return []
@@ -198,7 +198,7 @@ def target_problems(session: Session, sightings: Sightings | None) -> list[Sessi
     return out
 
 
-def target_warnings(session: Session, sightings: Sightings | None) -> tuple[str, ...]:
+def target_warnings(session: SessionData, sightings: Sightings | None) -> tuple[str, ...]:
     """Return the same problems as sentences."""
     return tuple(problem.fix for problem in target_problems(session, sightings))
 
@@ -223,7 +223,7 @@ class ConventionFit:
     middles: Array  # (K, 3) of the targets, reference frame; NaN where fewer than two views show one
 
 
-def check_targets(session: Session) -> list[SessionProblem]:
+def check_targets(session: SessionData) -> list[SessionProblem]:
     """Return what is wrong with the poses of a session of labelled points; empty if nothing is found."""
     rows, names = _tried_rows(len(session.views)), session.names
     stated = stated_hypothesis(session, rows)
@@ -262,14 +262,14 @@ def _tried_rows(views: int) -> Indices:
     return np.asarray(np.unique(starts[:, None] + np.arange(_IN_A_ROW)), np.int64)
 
 
-def _capture_of(session: Session, rows: Indices) -> Capture:
+def _capture_of(session: SessionData, rows: Indices) -> Capture:
     """Return the labelled points of some rows under the poses as stated."""
     some = replace(session, views=tuple(session.views[v] for v in rows))
     T = stated_hypothesis(some).T_base_flange
     return build_capture(session.name, (), T, session.mount, sightings_of(some))
 
 
-def _find_common_move(session: Session, rows: Indices, limit: float) -> SessionProblem | None:
+def _find_common_move(session: SessionData, rows: Indices, limit: float) -> SessionProblem | None:
     """Find the row from which on everything that the sensor shows stands elsewhere; None if there is none.
 
     A tracker that was knocked over, or a table that was moved: each side of it fits by itself. One side is fitted to a
@@ -307,7 +307,7 @@ def _find_common_move(session: Session, rows: Indices, limit: float) -> SessionP
     return None
 
 
-def _fit_some(session: Session, rows: Indices, limit: float) -> ConventionFit | None:
+def _fit_some(session: SessionData, rows: Indices, limit: float) -> ConventionFit | None:
     """Return the fit to some rows; None where they do not hold together."""
     fit = _fit_hypothesis(_capture_of(session, rows), stated_hypothesis(session, rows))
     return None if fit is None or fit.spread > limit else fit
@@ -321,7 +321,7 @@ def _distances_from_middles(capture: Capture, fit: ConventionFit) -> Array:
     return np.nan_to_num(nan_median(np.where(s.used, apart, np.nan).T))
 
 
-def _hypotheses_to_try(session: Session, rows: Indices, capture: Capture, length: float) -> Iterator[Hypothesis]:
+def _hypotheses_to_try(session: SessionData, rows: Indices, capture: Capture, length: float) -> Iterator[Hypothesis]:
     """Yield hypotheses to try: where targets show how the sensor moved, those that explain its motions best."""
     ranked, stated = rank_hypotheses(session, _sensor_motions(capture), rows), stated_hypothesis(session, rows)
     if ranked:

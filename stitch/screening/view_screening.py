@@ -35,7 +35,7 @@ from stitch.screening.target_checks import check_targets, target_warnings
 from stitch.screening.view_model import UsualEffects
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
-from stitch.session.session import Session, View
+from stitch.session.session import SessionData, View
 from stitch.system.process import announce
 
 
@@ -59,12 +59,12 @@ class ViewScreening:
         groups = {w: [item.view for item in self.left_out if item.why == w] for w in why}
         return "; ".join(f"{list_views(views, order)}: {w}" for w, views in groups.items())
 
-    def indices(self, session: Session) -> list[int]:
+    def indices(self, session: SessionData) -> list[int]:
         """Return the indices of the views that are left out."""
         return [v for v, view in enumerate(session.views) if view.name in self.names]
 
 
-def screen_views(session: Session, measurement: Measurement, correction: Correction, index: int) -> ViewScreening:
+def screen_views(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> ViewScreening:
     """Examine the views of one session of a rig under a corrected model.
 
     Args:
@@ -110,7 +110,7 @@ def screen_views(session: Session, measurement: Measurement, correction: Correct
 
 
 def session_warnings(
-    session: Session, measurement: Measurement, correction: Correction | None, index: int
+    session: SessionData, measurement: Measurement, correction: Correction | None, index: int
 ) -> tuple[str, ...]:
     """Return the warnings of a session as a whole under a model, whose views were screened before.
 
@@ -125,7 +125,7 @@ def session_warnings(
     return (*targets, *snooping_warnings(session, correction.captures[index], found, correction.geometry.T_mount))
 
 
-def _snoop_session(session: Session, measurement: Measurement, correction: Correction, index: int) -> Snooping:
+def _snoop_session(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> Snooping:
     usual, gate = UsualEffects(measurement, correction.geometry), correction.overlaps[index].gate
     found = snoop_views(
         correction.captures[index], correction.geometry.T_mount, gate, correction.unconstrained[index], usual
@@ -137,7 +137,7 @@ def _snoop_session(session: Session, measurement: Measurement, correction: Corre
     return apply_displacement_limits(session, found)
 
 
-def screen_targets(session: Session, found: TargetModelFit) -> ViewScreening:
+def screen_targets(session: SessionData, found: TargetModelFit) -> ViewScreening:
     """Labelled points: outliers are taken out one by one; poses that contradict them all are refused.
 
     Raises:
@@ -150,7 +150,7 @@ def screen_targets(session: Session, found: TargetModelFit) -> ViewScreening:
     return ViewScreening(doubts=target_warnings(session, found.rows.sightings))
 
 
-def _suspected_view(session: Session, own: Capture, found: MisplacedView, T_mount: Array) -> ExcludedView:
+def _suspected_view(session: SessionData, own: Capture, found: MisplacedView, T_mount: Array) -> ExcludedView:
     view = session.views[found.view]
     return ExcludedView(
         view.name, displacement_in_words(session, found), own.poses(T_mount)[found.view], _point_count(view)
@@ -161,7 +161,7 @@ _NO_SURFACE = "it shares no surface with the others; to fix: add views that over
 
 
 def _excluded_views(
-    session: Session, own: Capture, found: Snooping, T_mount: Array, problems: Sequence[SessionProblem]
+    session: SessionData, own: Capture, found: Snooping, T_mount: Array, problems: Sequence[SessionProblem]
 ) -> tuple[ExcludedView, ...]:
     poses = own.poses(T_mount)
     out = []
@@ -176,7 +176,7 @@ def _point_count(view: View) -> int:
     return 0 if view.cloud is None else view.cloud.count
 
 
-def _view_links(session: Session, found: Snooping) -> ViewLinks:
+def _view_links(session: SessionData, found: Snooping) -> ViewLinks:
     names = session.names
     return ViewLinks(
         components=tuple(tuple(names[v] for v in part) for part in found.linkage.components),
@@ -194,16 +194,16 @@ _MAX_ROUNDS = 3
 class ScreenedFit:
     """A rig with the views that belong, its fit, and what each session left out."""
 
-    sessions: list[Session]
+    sessions: list[SessionData]
     measurements: list[Measurement]
     fitted: FittedRig
     screenings: list[ViewScreening]
 
 
 def fit_screened_views(
-    sessions: Sequence[Session],
+    sessions: Sequence[SessionData],
     measurements: Sequence[Measurement],
-    fit: Callable[[Sequence[Session], Sequence[Measurement]], FittedRig],
+    fit: Callable[[Sequence[SessionData], Sequence[Measurement]], FittedRig],
     keep: bool = False,
 ) -> ScreenedFit:
     """Fit all sessions with the views that belong.
@@ -250,7 +250,7 @@ def _discarded_if_refused(fitted: FittedRig) -> Iterator[None]:
 
 
 @contextmanager
-def _naming_excluded_views(sessions: Sequence[Session], taken: Sequence[ViewScreening]) -> Iterator[None]:
+def _naming_excluded_views(sessions: Sequence[SessionData], taken: Sequence[ViewScreening]) -> Iterator[None]:
     """Where the views that are left lead nowhere, say which were left out before, and why."""
     try:
         yield
@@ -261,7 +261,7 @@ def _naming_excluded_views(sessions: Sequence[Session], taken: Sequence[ViewScre
         raise NoResultError(f"{error}; left out before: {gone}") from error
 
 
-def _screen_fitted_session(session: Session, fitted: FittedRig, index: int) -> ViewScreening:
+def _screen_fitted_session(session: SessionData, fitted: FittedRig, index: int) -> ViewScreening:
     if fitted.correction is not None:
         return screen_views(session, fitted.sessions[index].measurement, fitted.correction, index)
     found = fitted.sessions[index].targets

@@ -20,7 +20,7 @@ from stitch.session.scan import (
     prepare_scan,
     subsample,
 )
-from stitch.session.session import Cloud, Scanner, Session, View, WholeCloud
+from stitch.session.session import Cloud, Scanner, SessionData, View, WholeCloud
 from stitch.system.threads import parallel
 
 # Labelled points of all views in arrays of one shape: S slots a view, empty where a target was not seen.
@@ -66,7 +66,7 @@ class Sightings:
         return replace(self, **{name: values[keep] for name, values in known.items()})
 
 
-def sightings_of(session: Session) -> Sightings | None:
+def sightings_of(session: SessionData) -> Sightings | None:
     """All labelled points of a session, its views in order; None without any."""
     seen = [view.sighting for view in session.views]
     names = sorted({name for s in seen if s is not None for name in s.targets})
@@ -163,7 +163,7 @@ class Capture:
 _AT_ONCE = 1_000_000
 
 
-def prepare_capture(session: Session) -> Capture:
+def prepare_capture(session: SessionData) -> Capture:
     """Prepare the scans and labelled points of a session and place them on the chain of frames.
 
     Raises:
@@ -180,7 +180,7 @@ def prepare_capture(session: Session) -> Capture:
     return build_capture(session.name, scans, T_base_flange, session.mount, sightings_of(session))
 
 
-def _prepare_scans(session: Session) -> tuple[Scan, ...]:
+def _prepare_scans(session: SessionData) -> tuple[Scan, ...]:
     """The scans of all views.
 
     Where room is no matter, all neighbours first: a library finds them without Python, for which the rest waits again
@@ -251,7 +251,7 @@ def points_within(memory: float, views: int) -> int:
     return min(room, MAX_POINTS)
 
 
-def thin_session(session: Session, at_most: int = MAX_POINTS) -> tuple[Session, Capture]:
+def thin_session(session: SessionData, at_most: int = MAX_POINTS) -> tuple[SessionData, Capture]:
     """A session with at most `at_most` points a view, evenly over the scan order, and its capture."""
 
     def of_view(view: View) -> View:

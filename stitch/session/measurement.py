@@ -17,12 +17,12 @@ from stitch.numerics.frames import Array, Indices
 from stitch.session import robot as kinematics
 from stitch.session.capture import Capture
 from stitch.session.robot import Robot
-from stitch.session.session import Mount, SensorKind, Session
+from stitch.session.session import Mount, SensorKind, SessionData
 
 # Columns of views.csv that do not count, since in some views nothing stands there.
 
 
-def gaps_note(session: Session) -> str:
+def gaps_note(session: SessionData) -> str:
     """In one sentence, with a view that lacks each; empty where there is no gap."""
     lacking = dict[str, list[str]]()
     columns = sorted({name for view in session.views for name in view.covariates})
@@ -93,7 +93,7 @@ def torque_columns(covariates: Mapping[str, Array], joints: int) -> Array | None
     return np.column_stack([covariates[name] for name in names]) if whole else None
 
 
-def payload_note(session: Session) -> str:
+def payload_note(session: SessionData) -> str:
     """Where a payload counts whose centre of mass nobody states; empty where one is stated, or nothing is carried."""
     robot = session.robot
     if robot is None or not robot.carries_at_flange or any(view.joints is None for view in session.views):
@@ -148,12 +148,12 @@ def _independent_links(torques: Array, links: Sequence[int]) -> list[int]:
 # What is said of a session before anything is fitted: how a stated payload counts, and what does not count.
 
 
-def session_notes(session: Session) -> list[str]:
+def session_notes(session: SessionData) -> list[str]:
     """A sentence each; `check` and `run` say the same."""
     return [note for note in (payload_note(session), gaps_note(session), sensor_note(session)) if note]
 
 
-def sensor_note(session: Session) -> str:
+def sensor_note(session: SessionData) -> str:
     """Return what the sensor of labelled points is taken for, where session.toml does not state it; else nothing."""
     shown = [view.sighting.points for view in session.views if view.sighting is not None]
     if session.scanner.kind is not None or session.has_clouds or not shown:
@@ -172,7 +172,7 @@ def sensor_note(session: Session) -> str:
 _SAME_FRAME = 0.05
 
 
-def sensor_kind(session: Session) -> SensorKind | None:
+def sensor_kind(session: SessionData) -> SensorKind | None:
     """Return the kind as stated, or a tracker where its points are given in the robot's base; None if unknown.
 
     No scanner stands inside the robot. Points on the flange stand still in its frame if the sensor's frame is the base.
@@ -357,7 +357,7 @@ class ScanView:
         return float(self.views.hours[self.index])
 
 
-def views_of(session: Session) -> Views:
+def views_of(session: SessionData) -> Views:
     """Collect what effects may know; joints count only where the robot's kinematics are known too."""
     rows = session.views
     count = len(rows)
@@ -413,7 +413,7 @@ def _torques(robot: Robot, joints: Array, covariates: dict[str, Array]) -> Torqu
     return torques_of(robot, joints, covariates.get(PAYLOAD))
 
 
-def _median_range(session: Session) -> float:
+def _median_range(session: SessionData) -> float:
     ranges = [np.median(np.linalg.norm(v.cloud.points, axis=1)) for v in session.views if v.cloud]
     ranges += [np.median(np.linalg.norm(v.sighting.points, axis=1)) for v in session.views if v.sighting]
     return float(np.median(ranges)) if ranges else 1.0
@@ -481,7 +481,7 @@ class Measurement:
         return f"Measurement({self.capture.name!r}, {self.views.count} views)"
 
 
-def measurement_of(session: Session, capture: Capture) -> Measurement:
+def measurement_of(session: SessionData, capture: Capture) -> Measurement:
     """Collect a session and its prepared scans."""
     views = views_of(session)
     intensity = _intensities(session)
@@ -534,7 +534,7 @@ def with_part_origin(measurement: Measurement, T_mount: Array) -> Measurement:
     return replace(measurement, views=views, scan_views=scan_views, target_views=target_views)
 
 
-def intensity_scale(session: Session) -> tuple[float, float] | None:
+def intensity_scale(session: SessionData) -> tuple[float, float] | None:
     """Mean and standard deviation over all points in memory; None where some have none, or all the same."""
     raw = [None if v.cloud is None else v.cloud.scalars.get("intensity") for v in session.views]
     if any(values is None for values in raw):
@@ -546,7 +546,7 @@ def intensity_scale(session: Session) -> tuple[float, float] | None:
     return float(everything.mean()), float(everything.std())
 
 
-def _intensities(session: Session) -> list[Array | None]:
+def _intensities(session: SessionData) -> list[Array | None]:
     """Standardised over the session: (I − Ī)/σ_I."""
     scale = intensity_scale(session)
     clouds = [None if scale is None else view.cloud for view in session.views]

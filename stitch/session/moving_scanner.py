@@ -8,13 +8,13 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.odometry import hand_eye_of_stream, is_stream
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # Fewer views say nothing of how the robot moved between them.
 _FEWEST = 4
 
 
-def stand_still(session: Session) -> Session:
+def stand_still(session: SessionData) -> SessionData:
     """Return the session with every point moved to where it would lie had the scanner stood at the pose of its view.
 
     The robot's path runs smoothly through the poses of the views. The hand-eye that carries it over to the scanner
@@ -52,13 +52,13 @@ def stand_still(session: Session) -> Session:
     return replace(session, views=tuple(views))
 
 
-def mount_poses(session: Session) -> Array:
+def mount_poses(session: SessionData) -> Array:
     """Return T_reference_mount (V, 4, 4): the flange in the base frame, or for a scanner that stands the inverse."""
     T = np.array([view.T_base_flange for view in session.views])
     return T if session.mount == "eye_in_hand" else frames.inverse(T)
 
 
-def stream_hand_eye(session: Session) -> Array | None:
+def stream_hand_eye(session: SessionData) -> Array | None:
     """Return T_mount (4, 4) of A·X = X·B over the odometry of a stream; None where the scans are none."""
     clouds = [view.cloud for view in session.views if view.cloud is not None]
     scans, T_reference_mount = [cloud.points for cloud in clouds], mount_poses(session)

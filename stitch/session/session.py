@@ -155,7 +155,7 @@ class StatedRepeatability:
 
 
 @dataclass(frozen=True)
-class Session:
+class SessionData:
     """Measured data of one session. Lengths in length_unit, angles in rad."""
 
     path: Path
@@ -187,7 +187,7 @@ class Session:
         """Of the views, in the session's order."""
         return [view.name for view in self.views]
 
-    def without(self, names: Collection[str]) -> "Session":
+    def without(self, names: Collection[str]) -> "SessionData":
         """Return the session less some views.
 
         Example:

@@ -22,7 +22,7 @@ from stitch.numerics.frames import Array, Indices, Mask
 from stitch.observations.surfaces.matching import Match, signed_distances
 from stitch.observations.surfaces.normal_equations import RMS_GATE
 from stitch.observations.targets.target_model import rms_of
-from stitch.run_data import LedgerStep, Run
+from stitch.run_data import LedgerStep, RunData
 from stitch.session.capture import Sightings
 from stitch.session.measurement import Measurement
 
@@ -255,11 +255,11 @@ class ModelHistory:
 
 
 # The history of the run that was asked for last: files, page, recording and terminal ask for it one after another.
-_last_history: tuple[weakref.ref[Run], ModelHistory | None] | None = None
+_last_history: tuple[weakref.ref[RunData], ModelHistory | None] | None = None
 _one_at_a_time = Lock()
 
 
-def model_history(run: Run) -> ModelHistory | None:
+def model_history(run: RunData) -> ModelHistory | None:
     """The field at every step of a run's history; None without clouds.
 
     Steps whose effects are not known any more are left out.
@@ -271,7 +271,7 @@ def model_history(run: Run) -> ModelHistory | None:
         return _last_history[1]
 
 
-def _build_history(run: Run) -> ModelHistory | None:
+def _build_history(run: RunData) -> ModelHistory | None:
     if run.registered is None:
         return None
     matches = run.registered.matches
@@ -292,7 +292,7 @@ def effect_changes(ledger: Sequence[LedgerStep], i: int) -> str:
     return ", ".join([*new, *gone]) or "fitted again"
 
 
-def models_of(run: Run) -> list[tuple[str, Model]]:
+def models_of(run: RunData) -> list[tuple[str, Model]]:
     """Name of the step and model: coarse, each line of the ledger, the present one as the last."""
     out = [(COARSE, Model(run.T_mount_coarse))]
     for i, step in enumerate(run.ledger[:-1]):
@@ -325,7 +325,7 @@ class TargetStep:
     rms: float  # over all of them, as the ledger has it
 
 
-def target_history(run: Run) -> tuple[TargetStep, ...]:
+def target_history(run: RunData) -> tuple[TargetStep, ...]:
     """All steps on the same sightings, those that count now; empty where no targets were seen.
 
     The model in use is the last but one. Steps whose effects are not known any more are left out.

@@ -14,7 +14,7 @@ from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import angle_text, length_text
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.system.open3d_library import import_open3d
 
 _FORMAT = "stitch-witness/1"
@@ -81,7 +81,7 @@ def _summary(distance: Array) -> dict[str, float]:
     return {"median": float(median), "p95": float(p95), "mean": float(distance.mean())}
 
 
-def open3d_witness(run: Run) -> Witness:
+def open3d_witness(run: RunData) -> Witness:
     """Compute the poses of a run's views by Open3D: pairs by robust point-to-plane ICP, then a graph of poses.
 
     Bits repeat: it works on one thread.

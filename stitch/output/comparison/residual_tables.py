@@ -16,7 +16,7 @@ from stitch.observations.surfaces.matching import Match, sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, RMS_GATE, collect_overlaps
 from stitch.observations.targets.rows import drawing_of, initial_landmarks, target_rows
 from stitch.output.comparison.displaced_views import FollowedCovariate, followed_covariates
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.measurement import Views
 from stitch.system.threads import library_threads_off
 
@@ -329,7 +329,7 @@ _ENOUGH = 30
 _PLACES = 4  # cells along each axis of the part
 
 
-def compare_surfaces(state: Run) -> ResidualTables:
+def compare_surfaces(state: RunData) -> ResidualTables:
     """Tables of the residual by view, pair, joint, torque, approach, range, incidence, field, time, covariate, place.
 
     Raises:
@@ -360,7 +360,7 @@ def compare_surfaces(state: Run) -> ResidualTables:
 class _CorrespondenceRows:
     """Both sides of every correspondence inside the robust gate."""
 
-    def __init__(self, state: Run, poses: Array, matches: Sequence[Match], scale: float) -> None:
+    def __init__(self, state: RunData, poses: Array, matches: Sequence[Match], scale: float) -> None:
         self.count = len(poses)
         parts: list[list[Array]] = [[], [], [], [], [], []]
         for m in matches:
@@ -406,7 +406,7 @@ def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTabl
     return _labelled_table("pair", [f"{names[int(a)]}–{names[int(b)]}" for a, b in zip(v, w, strict=True)], told)
 
 
-def _correspondence_properties(state: Run, rows: _CorrespondenceRows) -> list[tuple[str, str, Array]]:
+def _correspondence_properties(state: RunData, rows: _CorrespondenceRows) -> list[tuple[str, str, Array]]:
     """Name, unit and value of every property, per row."""
     views, unit = state.measurement.views, state.session.length_unit
     x, y, z = rows.points.T
@@ -465,7 +465,7 @@ class _Offsets:
         return view_statistics(n, s, q, directions=_DIRECTIONS)
 
 
-def compare_targets(state: Run) -> ResidualTables:
+def compare_targets(state: RunData) -> ResidualTables:
     """Tables of the offsets by view, target, joint, move, torque, approach, range, time and covariate."""
     rows = _target_offsets(state)
     s = state.measurement.capture.sightings
@@ -488,7 +488,7 @@ def compare_targets(state: Run) -> ResidualTables:
     return ResidualTables(tuple(tables), rms, rms, tuple(state.session.names), of_views, followed)
 
 
-def _target_offsets(state: Run) -> _Offsets:
+def _target_offsets(state: RunData) -> _Offsets:
     """Return offsets from where hand-eye and effects put the targets best."""
     own = corrected_capture(state.measurement, state.model)
     s = own.sightings

@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch.numerics.units import length_text
 from stitch.output.comparison.disagreement_field import DisagreementField, ModelHistory, effect_changes
-from stitch.run_data import Run, doubt_headline
+from stitch.run_data import RunData, doubt_headline
 
 # What a run found in one sentence that everybody on the shop floor understands, and how it stands to a tolerance.
 
@@ -71,7 +71,7 @@ def _field_reach(field: DisagreementField) -> float:
     return field.quantile() + _COVERAGE * float(np.nanmedian(field.sigma))
 
 
-def run_verdict(run: Run, history: ModelHistory | None) -> str:
+def run_verdict(run: RunData, history: ModelHistory | None) -> str:
     """Return for everybody what is wrong with the session, how far its views disagree, and what effects brought.
 
     Args:
@@ -80,7 +80,7 @@ def run_verdict(run: Run, history: ModelHistory | None) -> str:
     return " ".join([*run.doubts, _agreement_sentence(run, history)])
 
 
-def run_headline(run: Run, history: ModelHistory | None) -> str:
+def run_headline(run: RunData, history: ModelHistory | None) -> str:
     """Return the same, of every doubt no more than its first clause: what it means and what to do stands elsewhere."""
     return shorten_doubts(run_verdict(run, history), run.doubts)
 
@@ -92,7 +92,7 @@ def shorten_doubts(verdict: str, doubts: Sequence[str]) -> str:
     return verdict
 
 
-def _agreement_sentence(run: Run, history: ModelHistory | None) -> str:
+def _agreement_sentence(run: RunData, history: ModelHistory | None) -> str:
     unit = run.session.length_unit
     if history is not None:
         return plain_verdict(history, unit)
@@ -108,7 +108,7 @@ def _agreement_sentence(run: Run, history: ModelHistory | None) -> str:
     return f"Adding {' and '.join(added)} brought the targets from {before} to {now} off their place, {rest}"
 
 
-def run_light(run: Run, history: ModelHistory | None, tolerance: float) -> ToleranceVerdict | None:
+def run_light(run: RunData, history: ModelHistory | None, tolerance: float) -> ToleranceVerdict | None:
     """Return whether 95 % of the part, or of what was seen of the targets, agree within a tolerance (length_unit).
 
     None where neither surfaces nor targets say anything of it.

@@ -13,7 +13,7 @@ from stitch.numerics.distributions import chi2_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.units import length_text
 from stitch.output.comparison.disagreement_field import ModelHistory, model_history
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.reading.session_folder import UNKNOWN, session_hash
 
 # Probability below which chance does not explain a difference (5 %, as k = 2 covers 95 %).
@@ -27,7 +27,7 @@ class ComparedRun:
     """One of two runs, with what is asked of it more than once."""
 
     name: str  # of its folder
-    run: Run
+    run: RunData
     history: ModelHistory | None  # None without clouds
     data: str  # hash of its session
 
@@ -77,7 +77,7 @@ class TwoRuns:
         return hand_eye_change(self.a.run, self.b.run)
 
 
-def compare_runs(runs: Sequence[Run], names: Sequence[str]) -> TwoRuns:
+def compare_runs(runs: Sequence[RunData], names: Sequence[str]) -> TwoRuns:
     """Return two runs with the names of their folders.
 
     Raises:
@@ -101,11 +101,11 @@ def compare_runs(runs: Sequence[Run], names: Sequence[str]) -> TwoRuns:
     return TwoRuns(*sides)
 
 
-def _seen_points(run: Run) -> str:
+def _seen_points(run: RunData) -> str:
     return "labelled points alone" if run.registered is None else "surfaces"
 
 
-def hand_eye_change(a: Run, b: Run) -> HandEyeChange:
+def hand_eye_change(a: RunData, b: RunData) -> HandEyeChange:
     """Return the difference of two hand-eyes with what is known of both, to first order in their errors."""
     same = np.array_equal(a.T_mount, b.T_mount)  # else rounding would make a difference of it
     D = np.eye(4) if same else frames.inverse(a.T_mount) @ b.T_mount

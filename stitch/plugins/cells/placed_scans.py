@@ -16,7 +16,7 @@ from stitch.plugins.cells.job_files import POSE_COLUMNS, JobTable, poses_from_co
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.session_folder import load_session
 from stitch.session.scan import Scan, prepare_scan
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # Fewer points have no neighbourhoods from which normals could be taken.
 _MIN_SCAN_POINTS = 50
@@ -144,7 +144,7 @@ def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
 SWEEP = ("sweep_x", "sweep_y", "sweep_z")
 
 
-def _sweeps(session: Session) -> tuple[Array, ...]:
+def _sweeps(session: SessionData) -> tuple[Array, ...]:
     """How far the flange had moved when each point was seen, (N, 3) a view; empty where no view is a sweep.
 
     Raises:

@@ -47,7 +47,7 @@ from stitch.session.capture import Capture, distinct_points, thin_session
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES, find_intrinsics
 from stitch.session.reading.range_image import poses_in_scans
-from stitch.session.session import Cloud, Mount, Scanner, Session, Sighting, View
+from stitch.session.session import Cloud, Mount, Scanner, SessionData, Sighting, View
 from stitch.system.process import steps
 
 # What a person states with flags, of a table of poses and of the folder it lies in; None where nothing is stated.
@@ -449,10 +449,10 @@ def capture_of(clouds: Sequence[Cloud], scale: float) -> Capture:
     return thin_session(bare_session(views, "eye_in_hand"), _POINTS)[1]
 
 
-def bare_session(views: Sequence[View], mount: Mount) -> Session:
+def bare_session(views: Sequence[View], mount: Mount) -> SessionData:
     """A session in mm of which nothing but the views is known."""
     scanner = Scanner(None, None, None, np.array([0.0, 0.0, 1.0]))
-    return Session(
+    return SessionData(
         Path(), "", "mm", mount, scanner, robot=None, sphere_radius=None, cad=None, cad_unit=None, views=tuple(views)
     )
 

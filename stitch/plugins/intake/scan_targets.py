@@ -19,7 +19,7 @@ from stitch.session.reading.range_image import read_range_image
 from stitch.session.reading.session_folder import read_session_document
 from stitch.session.reading.session_tables import read_views
 from stitch.session.reading.text_files import import_extra
-from stitch.session.session import Session, Sighting
+from stitch.session.session import SessionData, Sighting
 
 # How the scanner moved between views, from targets that both show: a flat board tells as much as any.
 
@@ -83,7 +83,7 @@ class ViewScans:
         return self.unit / MM
 
 
-def scans_of_session(session: Session) -> ViewScans:
+def scans_of_session(session: SessionData) -> ViewScans:
     """The scans of a session, in its length_unit."""
     rows = read_views(session.path / "views.csv", session.robot)
     cloud_unit = read_session_document(session.path / "session.toml").get("cloud_unit", session.length_unit)

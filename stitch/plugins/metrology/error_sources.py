@@ -38,7 +38,7 @@ from stitch.observations.surfaces.hand_eye_fit import (
 from stitch.observations.surfaces.scanner_errors import half_field, shared_error_likelihood, sum_smooth_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.capture import Capture
 from stitch.system.threads import library_threads_off
 
@@ -59,7 +59,7 @@ _MANY = 1e6
 _ROUNDING = 1e-12
 
 
-def place_errors(run: Run) -> PlaceErrors:
+def place_errors(run: RunData) -> PlaceErrors:
     """Return the places of a run's points with all that its own views say may be wrong about them.
 
     Raises:
@@ -111,7 +111,7 @@ class ErrorChain:
         return np.asarray(self.to_views @ x), x
 
 
-def error_chain(run: Run) -> ErrorChain:
+def error_chain(run: RunData) -> ErrorChain:
     """Return the linear maps by which errors reach the registered views of a run."""
     measurement, model = run.measurement, run.model
     own = corrected_capture(measurement, model)
@@ -142,7 +142,7 @@ def error_chain(run: Run) -> ErrorChain:
     )
 
 
-def _follow_overlaps(run: Run, own: Capture, found: HandEyeSolution, centre: Array) -> Array:
+def _follow_overlaps(run: RunData, own: Capture, found: HandEyeSolution, centre: Array) -> Array:
     """(6V, 6V) K: by how much of what the overlaps show register moves the views, twists about `centre` (3,)."""
     assert run.registered is not None
     scatter, method = found.scatter[0], METHODS[run.register_method]
@@ -163,7 +163,7 @@ def _follow_overlaps(run: Run, own: Capture, found: HandEyeSolution, centre: Arr
 _Modes = tuple[str, tuple[Array, Array], float, int | None]
 
 
-def _sources(run: Run, chain: ErrorChain) -> Iterator[ErrorSource]:
+def _sources(run: RunData, chain: ErrorChain) -> Iterator[ErrorSource]:
     twists, sizes, degrees = _smooth_errors(run, chain)
     smooth = [
         (SCANNER, chain.of_overlaps(twists[:, [k]] * size), known, k)
@@ -177,7 +177,7 @@ def _sources(run: Run, chain: ErrorChain) -> Iterator[ErrorSource]:
         yield ErrorSource(name, views, parameters[chain.of_points], field, known)
 
 
-def _smooth_errors(run: Run, chain: ErrorChain) -> tuple[Array, Array, Array]:
+def _smooth_errors(run: RunData, chain: ErrorChain) -> tuple[Array, Array, Array]:
     """Twists (6V, K) that the overlaps show for unit smooth errors, their sizes (K,), and degrees of freedom (K,).
 
     Sizes are those that the covariance of the hand-eye counts. One whose logarithm is known to s has ½/s² degrees of
@@ -194,7 +194,7 @@ def _smooth_errors(run: Run, chain: ErrorChain) -> tuple[Array, Array, Array]:
     return twists, (noise * shares)[of_mode], (0.5 / spread**2)[of_mode]
 
 
-def _pose_modes(run: Run, chain: ErrorChain, smooth: Array) -> Iterator[_Modes]:
+def _pose_modes(run: RunData, chain: ErrorChain, smooth: Array) -> Iterator[_Modes]:
     """Errors of the poses and the noise of the overlaps, as large as the views show them.
 
     What the overlaps vary by more than they would if smooth errors (6V, K) were known is not noise but the scanner's.
@@ -221,7 +221,7 @@ def _pose_modes(run: Run, chain: ErrorChain, smooth: Array) -> Iterator[_Modes]:
         yield names.get(name, ARM), chain.of_poses(sigma[k] * _root(component)), float(known[k]), None
 
 
-def _model_modes(run: Run, chain: ErrorChain) -> Iterator[_Modes]:
+def _model_modes(run: RunData, chain: ErrorChain) -> Iterator[_Modes]:
     """Errors of a model that other views fitted, or of what these did not show."""
     kept = chain.columns @ kept_root(run.terms, run.model.effects_covariance)
     if kept.any():

@@ -15,7 +15,7 @@ from stitch.errors import InputError
 
 if TYPE_CHECKING:
     from stitch.plugins.metrology.budget import MeasuredFeatures, MonteCarlo, Number
-    from stitch.run_data import Run
+    from stitch.run_data import RunData
 
 _SOURCES = 3  # that are shown of a budget
 _FEWEST_TRIALS = 200
@@ -87,7 +87,7 @@ def _require_measure_options(features: Path | None, trials: int, dfq: Path | Non
         raise InputError(f"--dfq {dfq}: to fix: name a file that ends in .dfq, in a folder that exists")
 
 
-def _write_point_sigmas(state: Run, folder: Path) -> int:
+def _write_point_sigmas(state: RunData, folder: Path) -> int:
     """Write the column `sigma` of stitched.ply and return the number of its points."""
     from stitch.plugins.metrology.error_sources import place_errors
     from stitch.plugins.metrology.place_errors import point_sigmas, write_sigmas

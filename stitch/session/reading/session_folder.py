@@ -37,7 +37,7 @@ from stitch.session.session import (
     NominalTargets,
     Scanner,
     SensorKind,
-    Session,
+    SessionData,
     Sighting,
     StatedRepeatability,
     View,
@@ -105,7 +105,7 @@ _FIELD_SIZE = (2e-3, 30.0)
 _OTHER_UNIT = {"mm": "m", "m": "mm"}
 
 
-def check_scale(session: Session, cloud_unit: str) -> None:
+def check_scale(session: SessionData, cloud_unit: str) -> None:
     """Refuse clouds or poses whose size only makes sense in the other unit.
 
     Raises:
@@ -161,7 +161,7 @@ def _refuse(size_m: float, limits: tuple[float, float], what: str, how: str, key
     raise InputError(f'{what} {shown}{" " * bool(how)}{how} with {key} = "{unit}"; {hint}')
 
 
-def _compare_motions(session: Session, flange: Array) -> None:
+def _compare_motions(session: SessionData, flange: Array) -> None:
     """Labelled points have no size of their own, but a target that several views see moves with the arm."""
     seen = [view.sighting for view in session.views if view.sighting is not None]
     if len(seen) < 3 or session.has_clouds:
@@ -183,7 +183,7 @@ def _extent(points: Array) -> float:
     return float(np.ptp(points, axis=0).max())
 
 
-def _compare_standoff(session: Session, cloud_unit: str) -> None:
+def _compare_standoff(session: SessionData, cloud_unit: str) -> None:
     """Against the working distance that the session itself states."""
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
     if not clouds or not session.scanner.standoff:
@@ -399,7 +399,7 @@ _BLOCK = 1 << 20
 UNKNOWN = "–"
 
 
-def session_hash(session: Session) -> str:
+def session_hash(session: SessionData) -> str:
     """SHA-256 over the session's tables and the clouds that they name, in this order; first 16 digits.
 
     A dash where the session does not lie on disk any more.
@@ -536,7 +536,7 @@ def load_session(
     at_most: int | None = MAX_POINTS,
     memory: float | None = None,
     only: str | None = None,
-) -> Session:
+) -> SessionData:
     """Read and check a session folder.
 
     Args:
@@ -563,7 +563,7 @@ def load_session(
     at_most = None if scanner.moving else at_most
     views = _read_session_views(path, document, rows, scanner, scans=scans, at_most=at_most, memory=memory)
     cad, cad_unit = cad_file(file, document.get("part", {}))
-    session = Session(
+    session = SessionData(
         path=path,
         name=session_name(file, document),
         length_unit=unit,

@@ -28,7 +28,7 @@ from stitch.session.measurement import (
 )
 from stitch.session.reading.session_folder import load_session
 from stitch.session.robot import Robot
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def arm_of_run(folder: Path, effects_file: Path | None = None, trust: bool = Fal
     return arm_from(load_session(path, scans=False), file)
 
 
-def arm_from(session: Session, file: ModelFile) -> ArmModel:
+def arm_from(session: SessionData, file: ModelFile) -> ArmModel:
     """Return the arm of a session with the arm's effects of a model.
 
     Raises:

@@ -14,7 +14,7 @@ from stitch.cli.terminal import emit, say, show_block, show_files, show_table, s
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
-    from stitch.run_data import Run
+    from stitch.run_data import RunData
 
 calibrate = typer.Typer(
     help="Find hand-eyes from known objects and from trackers, and an arm's own errors.",
@@ -146,7 +146,7 @@ def robot(
         show_robot(result, document, lines, target)
 
 
-def show_robot(result: Run, document: dict[str, Any], lines: list[str], target: Path) -> None:
+def show_robot(result: RunData, document: dict[str, Any], lines: list[str], target: Path) -> None:
     """Print the way, the result, the rows of the arm, and poses to add."""
     from stitch.cli.run import show_report
 

@@ -22,11 +22,11 @@ from stitch.numerics.reml import fit_variances, whitener
 from stitch.numerics.units import length_text
 from stitch.output.result_document import result_document
 from stitch.output.urdf_file import to_urdf
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.reading.robot_description import robot_from_dh, robot_from_urdf
 from stitch.session.reading.session_tables import has_reported_poses
 from stitch.session.robot import Robot, elementary, forward
-from stitch.session.session import Session, StatedRepeatability, View
+from stitch.session.session import SessionData, StatedRepeatability, View
 
 # An arm as the [robot] table of session.toml.
 
@@ -92,7 +92,7 @@ class CalibratedRobot:
     held: tuple[str, ...] = ()
 
 
-def calibrated_robot_of_run(run: Run) -> CalibratedRobot:
+def calibrated_robot_of_run(run: RunData) -> CalibratedRobot:
     """The session's robot with the joint offsets and link errors of a run.
 
     Raises:
@@ -146,7 +146,7 @@ def with_geometry(robot: Robot, terms: Sequence[Term]) -> Robot:
     return replace(robot, **errors)
 
 
-def poses_to_add(run: Run) -> Array:
+def poses_to_add(run: RunData) -> Array:
     """(K, n) joint angles in degrees whose measurement would tell most of the effects' parameters.
 
     The determinant of the parameters' covariance falls most (D-optimal design, Fedorov 1972), one pose after
@@ -224,7 +224,7 @@ class LinkTable:
         return f"Proved for {', '.join(each)}; beyond, nothing was measured."
 
 
-def link_table(session: Session) -> LinkTable:
+def link_table(session: SessionData) -> LinkTable:
     """The table that the ends of the joints' ranges trust; the nominal one where none leaves clearly less.
 
     Raises:
@@ -297,7 +297,7 @@ class SeenLinks:
         return with_geometry(nominal, with_parameter_values(self.terms, values))
 
 
-def observe_links(session: Session) -> SeenLinks:
+def observe_links(session: SessionData) -> SeenLinks:
     """Linearise the targets of a session about its nominal arm."""
     found = run(session)
     if found.targets is None or found.session.joints is None:
@@ -319,7 +319,7 @@ def observe_links(session: Session) -> SeenLinks:
     return SeenLinks(names, found.session.joints[shown], terms, base.shape[2], products)
 
 
-def _judge(session: Session, names: Sequence[str], proof: Sequence[tuple[Mask, Robot | None]]) -> Array | None:
+def _judge(session: SessionData, names: Sequence[str], proof: Sequence[tuple[Mask, Robot | None]]) -> Array | None:
     """(V,) mean squares of the targets' distances in views that took no part, with each arm as its file says it; NaN
     where a view was never left out. None where a part is too little for it.
 
@@ -357,7 +357,7 @@ def _read_back(robot: Robot, unit: str) -> Robot:
         return robot_from_urdf(file, "base_link", "flange", unit, robot.gravity)
 
 
-def _with_reported_arm(session: Session, robot: Robot) -> Session:
+def _with_reported_arm(session: SessionData, robot: Robot) -> SessionData:
     """As the arm of a table would have reported its poses; what a controller corrects beside its table, stays."""
     assert session.robot is not None
     nominal = session.robot
@@ -375,7 +375,7 @@ def _with_reported_arm(session: Session, robot: Robot) -> Session:
 _HEADER = "The [robot] table of session.toml: put it there in place of the nominal one."
 
 
-def write_robot(table: LinkTable, run: Run, folder: Path) -> None:
+def write_robot(table: LinkTable, run: RunData, folder: Path) -> None:
     """robot.toml (for an arm of DH rows) and robot.urdf."""
     (folder / "robot.urdf").write_text(to_urdf(table.robot), encoding="utf-8")
     told = [_HEADER, *robot_notes(table, run)]
@@ -384,14 +384,14 @@ def write_robot(table: LinkTable, run: Run, folder: Path) -> None:
         (folder / "robot.toml").write_text(text, encoding="utf-8")
 
 
-def robot_notes(table: LinkTable, run: Run) -> list[str]:
+def robot_notes(table: LinkTable, run: RunData) -> list[str]:
     """What the table is worth, what is not in it, and what has to be done so that it counts; a line each."""
     told = [table.sentence(run.session.length_unit), *filter(None, [table.range_sentence])]
     told += [beyond_sentence(calibrated_robot_of_run(run), table.effects)]
     return [*told, *filter(None, [_reported_pose_note(table, run.session)])]
 
 
-def _reported_pose_note(table: LinkTable, session: Session) -> str:
+def _reported_pose_note(table: LinkTable, session: SessionData) -> str:
     """How a session whose controller reports poses comes to use the table; empty where nothing stands in its way."""
     if not table.effects or session.robot is None or not has_reported_poses(session.path / "views.csv"):
         return ""
@@ -403,7 +403,7 @@ def _reported_pose_note(table: LinkTable, session: Session) -> str:
     )
 
 
-def robot_document(run: Run, table: LinkTable, notes: list[str], sentence: str) -> dict[str, Any]:
+def robot_document(run: RunData, table: LinkTable, notes: list[str], sentence: str) -> dict[str, Any]:
     """The JSON document."""
     result, found = result_document(run), calibrated_robot_of_run(run)
     steps = [

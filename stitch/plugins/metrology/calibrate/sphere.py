@@ -21,7 +21,7 @@ from stitch.plugins.metrology.calibrate.sphere_fit import (
     sphere_view,
 )
 from stitch.plugins.metrology.calibrate.tracker import hand_eye_document, weak_components, weak_notes
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # Answers whose fits differ by less than this factor cannot be told apart.
 _CLEAR = 1.3
@@ -50,7 +50,7 @@ class SphereCalibration:
     nominal: float  # radius given
 
 
-def calibrate_sphere(session: Session, radius_free: bool = False) -> SphereCalibration:
+def calibrate_sphere(session: SessionData, radius_free: bool = False) -> SphereCalibration:
     """Hand-eye of a session whose clouds all show one sphere, on either mount.
 
     Raises:
@@ -93,7 +93,7 @@ def calibrate_sphere(session: Session, radius_free: bool = False) -> SphereCalib
     )
 
 
-def _require_radius(session: Session, fitted_radius: float, sigma: float) -> None:
+def _require_radius(session: SessionData, fitted_radius: float, sigma: float) -> None:
     """Refuse a radius that the scans contradict: a hand-eye from it would be off by many times the difference.
 
     Raises:
@@ -107,7 +107,7 @@ def _require_radius(session: Session, fitted_radius: float, sigma: float) -> Non
         )
 
 
-def _fit_view(session: Session, k: int, radius: float) -> SphereView:
+def _fit_view(session: SessionData, k: int, radius: float) -> SphereView:
     view = session.views[k]
     if view.cloud is None:
         raise InputError(
@@ -213,7 +213,7 @@ def _radius_note(result: SphereCalibration, unit: str) -> list[str]:
     ]
 
 
-def sphere_document(result: SphereCalibration, session: Session) -> dict[str, Any]:
+def sphere_document(result: SphereCalibration, session: SessionData) -> dict[str, Any]:
     """The JSON document."""
     fit, unit, free = result.fit, session.length_unit, result.free
     return {

@@ -19,7 +19,7 @@ from stitch.numerics.frames import Array
 from stitch.numerics.hand_eye import axis_spread, motions_from_first, park_martin, shah, weight_roots
 from stitch.numerics.least_squares import grouped_inflation
 from stitch.session.reading.session_tables import read_frames
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 # Covariance counted in views: leaving one out at a time, from normal equations alone.
 #
@@ -173,7 +173,7 @@ _VIEWS = 60
 
 
 def hand_eye_document(
-    kind: str, session: Session, T_mount: Array, covariance: Array, inflation: float, G: Array
+    kind: str, session: SessionData, T_mount: Array, covariance: Array, inflation: float, G: Array
 ) -> dict[str, Any]:
     """What the JSON documents of all calibrations of a hand-eye share.
 
@@ -266,7 +266,7 @@ class TrackerCalibration:
         return self.fit.covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
 
 
-def calibrate_tracker(session: Session) -> TrackerCalibration:
+def calibrate_tracker(session: SessionData) -> TrackerCalibration:
     """Base and tool of a frames session.
 
     Raises:
@@ -295,7 +295,7 @@ def _neighbourhoods(A: Array) -> Array | None:
     return np.asarray(kmeans2(A[:, :3, 3], _PLACES, minit="++", rng=0)[1])
 
 
-def tracker_document(result: TrackerCalibration, session: Session) -> dict[str, Any]:
+def tracker_document(result: TrackerCalibration, session: SessionData) -> dict[str, Any]:
     """The JSON document."""
     fit, h = result.fit, result.hand_eye
     sigma = np.sqrt(np.diag(result.covariance_of(1 - h)))
@@ -342,7 +342,7 @@ def compare_closed_forms(result: TrackerCalibration) -> dict[str, dict[str, floa
     return out
 
 
-def tracker_notes(result: TrackerCalibration, session: Session) -> list[str]:
+def tracker_notes(result: TrackerCalibration, session: SessionData) -> list[str]:
     """Sentences about the wrist, weak components, and errors that base and tool do not explain."""
     unit, fit = session.length_unit, result.fit
     notes = weak_notes(result.A, _weak_phrases(result, unit))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stitch.plugins.metrology.planning.detection_chances import EffectOutlook, EffectPair, Outlook
     from stitch.plugins.metrology.planning.expected_model import CellModel, ExpectedHandEye, PlannedCell
     from stitch.plugins.metrology.planning.plan import Plan, PlanRequest
-    from stitch.session.session import Session
+    from stitch.session.session import SessionData
 
 # Pairs that are shown, and the share of wrong names from which they are told.
 _PAIRS, _MISTAKEN = 3, 0.05
@@ -143,7 +143,7 @@ def _plan_request(views: int | None, split: tuple[str, str] | None, halve: bool,
     return PlanRequest(halve=halve or split is None, split=split, split_any=split_any, views=views, feature=at)
 
 
-def _cell_of_run(folder: Path, stated: Mapping[str, object], trust: bool) -> tuple[Session, PlannedCell]:
+def _cell_of_run(folder: Path, stated: Mapping[str, object], trust: bool) -> tuple[SessionData, PlannedCell]:
     """Return the cell of a finished run, which says all of it."""
     from stitch.output.stored_run import load_run
     from stitch.plugins.metrology.planning.expected_model import cell_of_run
@@ -157,7 +157,7 @@ def _cell_of_run(folder: Path, stated: Mapping[str, object], trust: bool) -> tup
 
 def _cell_of_session(
     folder: Path, part: Path | None, size: float | None, field: float | None, start: str | None
-) -> tuple[Session, PlannedCell]:
+) -> tuple[SessionData, PlannedCell]:
     """Return the cell of a session, of which options may say what the session does not."""
     import numpy as np
 

@@ -34,7 +34,7 @@ from stitch.plugins.metrology.planning.expected_model import (
     simulate_views,
     with_scatter,
 )
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 from stitch.system.process import steps
 
 # One candidate beside a model of planned views: its log Bayes factor and its F test on whatever these may see.
@@ -312,7 +312,7 @@ class Outlook:
 
 
 def view_outlook(
-    session: Session,
+    session: SessionData,
     cell: CellModel,
     fitted_scatter: FittedScatter | None = None,
     feature: Array | None = None,

@@ -25,13 +25,13 @@ from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.observations.surfaces.scanner_errors import ALARM_SHARE, USUAL_SHARE
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.observations.surfaces.view_poses import SAMPLES, UnconstrainedPoses
-from stitch.run_data import Run
+from stitch.run_data import RunData
 from stitch.session.capture import Capture, build_capture
 from stitch.session.measurement import Measurement, measurement_of, with_part_origin
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.text_files import reason_of, require_file
 from stitch.session.scan import GRAZING_COSINE, even_indices, prepare_scan
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 
 if TYPE_CHECKING:
     import trimesh
@@ -194,7 +194,7 @@ class Scatter:
         return np.array([*white, *(max(self.errors.get(name, 0.0), 1e-30) for name in names)])
 
 
-def stated_scatter(session: Session) -> Scatter:
+def stated_scatter(session: SessionData) -> Scatter:
     """Return the scatter that session.toml states, or the usual one; no errors that repeat."""
     unit, stated, assumed = session.length_unit, session.repeatability, list[str]()
     mm = METRES["mm"] / METRES[unit]
@@ -286,7 +286,9 @@ def expected_scans(cell: CellModel, T_reference_scanner: Array) -> list[Indices]
     return [expected_scan(cell.part, T, cell.field) for T in T_reference_scanner]
 
 
-def simulate_views(session: Session, cell: CellModel, samples: int = SAMPLES, fewest: int = FEWEST) -> SimulatedViews:
+def simulate_views(
+    session: SessionData, cell: CellModel, samples: int = SAMPLES, fewest: int = FEWEST
+) -> SimulatedViews:
     """Simulate what the views of a session would show, whatever clouds it has.
 
     Args:
@@ -364,7 +366,7 @@ class PlannedCell:
 
 
 def cell_of_session(
-    session: Session, part: Path | None = None, size_mm: float | None = None, field_deg: float | None = None
+    session: SessionData, part: Path | None = None, size_mm: float | None = None, field_deg: float | None = None
 ) -> PlannedCell:
     """The cell as session.toml and the options describe it.
 
@@ -401,7 +403,7 @@ def cell_of_session(
     return PlannedCell(cell, (*scatter.assumed, *assumed, *words))
 
 
-def cell_of_run(state: Run, folder: Path) -> PlannedCell:
+def cell_of_run(state: RunData, folder: Path) -> PlannedCell:
     """The cell as a run found it: its model, its scatter, its fused cloud, the field that its scans fill.
 
     Raises:
@@ -416,7 +418,7 @@ def cell_of_run(state: Run, folder: Path) -> PlannedCell:
     return cell_of_state(state, cloud.points, cloud.normals)
 
 
-def cell_of_state(state: Run, points: Array, normals: Array) -> PlannedCell:
+def cell_of_state(state: RunData, points: Array, normals: Array) -> PlannedCell:
     """Return the cell as a run found it.
 
     Args:
@@ -440,7 +442,7 @@ def cell_of_state(state: Run, points: Array, normals: Array) -> PlannedCell:
     return PlannedCell(CellModel(state.model, thinned_surface(points, normals), field, told.believed), (), told)
 
 
-def _part_of_session(session: Session, part: Path | None, size_mm: float | None) -> tuple[PlannedPart, list[str]]:
+def _part_of_session(session: SessionData, part: Path | None, size_mm: float | None) -> tuple[PlannedPart, list[str]]:
     """The part's surface, and what is assumed of it."""
     unit = METRES[session.length_unit]
     if part is not None:

@@ -28,7 +28,7 @@ from stitch.plugins.metrology.planning.expected_model import (
     simulate_views,
     thinned_surface,
 )
-from stitch.session.session import Session
+from stitch.session.session import SessionData
 from stitch.system.threads import library_threads_off
 
 # All views that a plan may hold, with what they would say of the hand-eye and of rival effects.
@@ -50,7 +50,7 @@ class EffectColumns:
 class PossibleViews:
     """N views: those of the session first, then those that could be added."""
 
-    session: Session
+    session: SessionData
     cell: CellModel
     simulated: SimulatedViews
     scatter: Scatter  # with the errors of the arm that the views are expected to leave open
@@ -299,7 +299,7 @@ class Plan:
         ((6,), (4, 4))
     """
 
-    session: Session
+    session: SessionData
     assumed: tuple[str, ...]
     now: Outlook | None  # None where there are too few views for a hand-eye
     split: tuple[str, str] | None
@@ -308,7 +308,7 @@ class Plan:
     place_now: float | None = None  # U of the feature's place by the present views, length_unit; None: not asked for
 
 
-def plan_further_views(session: Session, planned: PlannedCell, request: PlanRequest) -> Plan:
+def plan_further_views(session: SessionData, planned: PlannedCell, request: PlanRequest) -> Plan:
     """Plan further views of a cell.
 
     Raises:
@@ -343,7 +343,7 @@ def plan_further_views(session: Session, planned: PlannedCell, request: PlanRequ
 
 
 def _search_views(
-    session: Session, cell: CellModel, scatter: Scatter, now: Outlook | None, request: PlanRequest
+    session: SessionData, cell: CellModel, scatter: Scatter, now: Outlook | None, request: PlanRequest
 ) -> tuple[list[Goal], list[int], Array]:
     """Return goals over all views that were tried, the indices of the C chosen ones there, and their joints (C, n)."""
     assert session.joints is not None
@@ -409,7 +409,7 @@ def _hardest_pair_goal(views: PossibleViews, now: Outlook) -> list[Goal]:
 
 
 def _proposed_views(
-    goals: Sequence[Goal], chosen: Sequence[int], further: Session, U_after: float | None
+    goals: Sequence[Goal], chosen: Sequence[int], further: SessionData, U_after: float | None
 ) -> tuple[ProposedView, ...]:
     """Return what the views bring one after the other.
 
