@@ -27,7 +27,7 @@ import numpy as np
 from dataclasses import replace
 from data_synth.fixtures.labelled_arm import labelled_cell
 import stitch
-from stitch import frames
+from stitch.numerics import frames
 from stitch.diagnosis import candidates
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.score import ScatterLimit
