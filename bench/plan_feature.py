@@ -26,7 +26,6 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.moment import Plan
 from data_synth.simulate import Measured
 from stitch.api.pipeline import run
-from stitch.diagnosis.candidate_views import candidate_joints, with_views
 from stitch.numerics.frames import Array
 from stitch.numerics.reml import MixedModel, VarianceFit
 from stitch.numerics.variance_posterior import mean_variances
@@ -39,6 +38,7 @@ from stitch.plugins.metrology.planning import plan
 from stitch.plugins.metrology.planning.detection_chances import view_outlook
 from stitch.plugins.metrology.planning.expected_model import CellModel, PlannedCell, Scatter, cell_of_state
 from stitch.plugins.metrology.planning.plan import KnownPlace, PlanRequest
+from stitch.plugins.metrology.planning.planned_views import candidate_joints, with_views
 from stitch.run_data import RunData
 from stitch.session.session import SessionData
 from stitch.system.threads import library_threads_off

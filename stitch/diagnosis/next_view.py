@@ -14,7 +14,6 @@ import numpy as np
 
 from stitch.diagnosis.candidate_views import candidate_measurement, candidate_rows, nearby, reachable
 from stitch.diagnosis.diagnosis import Diagnosis, Proposal
-from stitch.diagnosis.information import separations
 from stitch.diagnosis.score import Score
 from stitch.diagnosis.sensitivity import alias_matrix
 from stitch.diagnosis.thresholds import ALIAS_CORRELATION, SEPARATION_LAMBDA, WORTHWHILE_GAIN
@@ -22,6 +21,7 @@ from stitch.model.forward import moves_points, perturbed_frames, pose_derivative
 from stitch.model.model import Model
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
+from stitch.numerics.least_squares import equilibrated
 from stitch.numerics.reml import NOISE
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import SurfaceObservation
@@ -33,6 +33,8 @@ from stitch.system.threads import library_threads_off
 
 # Poses that are tried; and the likeliest candidates among which an alias of the best is sought.
 _TRIED, _LIKELIEST = 250, 6
+# Precision of ten plausible sizes: a rival may take each of its parameters that large.
+RIDGE = 0.01
 
 ARTEFACTS = {
     "range_scale": "scan a sphere or ball bar of known size, or the part's CAD: overlaps alone hardly show a scale",
@@ -126,6 +128,27 @@ def _gains(linear: LinearModel, a: Score, b: Score) -> _Gains | None:
     apart = float(separations(present, own, rival)[0])
     each = separations(present + white.transpose(0, 2, 1) @ white, own, rival)[:, 0]
     return _Gains(apart, views.joints, each - apart)
+
+
+def separations(normal: Array, own: slice, rival: slice) -> Array:
+    """(..., p) squared length of what every column of a pattern keeps when a rival's imitate it, all else being free.
+
+    Args:
+        normal: (..., q, q) normal matrix; columns at plausible sizes.
+        own: of the pattern.
+        rival: of the rival.
+    """
+    q = normal.shape[-1]
+    rest = np.setdiff1d(np.arange(q), np.arange(own.start, own.stop))
+    ridge = np.where((rest >= rival.start) & (rest < rival.stop), RIDGE, 0.0)
+    free = normal[..., rest[:, None], rest] + np.diag(ridge)
+    across = normal[..., rest[:, None], np.arange(own.start, own.stop)]
+    same_units, unit = equilibrated(free)
+    inverse = np.linalg.pinv(same_units, rcond=1e-12, hermitian=True)
+    scaled = across * unit[..., :, None]
+    imitated = np.einsum("...ap,...ab,...bp->...p", scaled, inverse, scaled)
+    left = np.diagonal(normal[..., own, own], axis1=-2, axis2=-1) - imitated
+    return np.maximum(left, 0.0)
 
 
 # How candidate views would answer to a model and to two effects.

@@ -14,7 +14,7 @@ import numpy as np
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, candidates_of
-from stitch.diagnosis.information import RIDGE
+from stitch.diagnosis.next_view import RIDGE
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.sensitivity import detectable_sizes

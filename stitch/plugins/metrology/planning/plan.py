@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.diagnosis.candidate_views import candidate_joints, with_views
 from stitch.diagnosis.candidates import free_masks
-from stitch.diagnosis.information import TwistChannel, noise_of, separations
+from stitch.diagnosis.next_view import separations
 from stitch.diagnosis.score import weights_of_masks
 from stitch.diagnosis.thresholds import SEPARATION_LAMBDA
 from stitch.effects.contract import find_effect, require_available
@@ -28,6 +27,8 @@ from stitch.plugins.metrology.planning.expected_model import (
     simulate_views,
     thinned_surface,
 )
+from stitch.plugins.metrology.planning.information import TwistChannel, noise_of
+from stitch.plugins.metrology.planning.planned_views import candidate_joints, with_views
 from stitch.session.session import SessionData
 from stitch.system.threads import library_threads_off
 

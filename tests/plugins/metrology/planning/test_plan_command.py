@@ -13,7 +13,6 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.write import write_session
 from stitch.cli.main import main
-from stitch.diagnosis.candidate_views import with_views
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import scatter_limit
@@ -22,6 +21,7 @@ from stitch.observations.surfaces.surface_model import surface_model
 from stitch.plugins.metrology.planning import plan
 from stitch.plugins.metrology.planning.expected_model import cell_of_session, simulate_views
 from stitch.plugins.metrology.planning.plan import PlanRequest, plan_further_views
+from stitch.plugins.metrology.planning.planned_views import with_views
 from stitch.session.reading.session_folder import load_session
 
 VIEWS = 6

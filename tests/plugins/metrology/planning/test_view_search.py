@@ -5,8 +5,9 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from stitch.diagnosis.information import TwistChannel, noise_of, separations
+from stitch.diagnosis.next_view import separations
 from stitch.numerics import frames
+from stitch.plugins.metrology.planning.information import TwistChannel, noise_of
 from stitch.plugins.metrology.planning.plan import KnownPlace, choose_views, place_lever, travel_order
 
 
