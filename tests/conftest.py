@@ -42,9 +42,9 @@ gc.disable()
 
 # The longest files, which begin first: with files spread over two processes none is left alone at the end.
 LONGEST = (
-    "test_review_in_browser.py",
+    "test_review.py",
     "test_blade_diagnosis.py",
-    "test_diagnosis_commands.py",
+    "test_diagnose.py",
     "test_admission.py",
     "test_run_folder.py",
     "test_window.py",

@@ -1,4 +1,4 @@
-"""What a diagnosis says on the shop floor, and the command that it names."""
+"""What a diagnosis says on the shop floor, the command that it names, and its sources of error."""
 
 from types import SimpleNamespace
 
@@ -10,11 +10,20 @@ import stitch.diagnosis.validation as validation
 import stitch.output.diagnosis_document as plain
 import stitch.output.finding_screen as finding_screen
 from bench.docs.page_blocks import refused
+from stitch.cli.diagnose import show_budget
 from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
-from stitch.observations.surfaces.scanner_errors import FieldError
-from stitch.output.diagnosis_document import effect_in_words, plain_finding, remedy_at_machine, suggested_command
+from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap
+from stitch.output.diagnosis_document import (
+    _field_map,
+    effect_in_words,
+    largest_error_sources,
+    plain_finding,
+    remedy_at_machine,
+    suggested_command,
+)
 from stitch.screening.pose_tests import PoseStep
 
 
@@ -250,3 +259,35 @@ def test_where_no_effect_is_named_the_machine_is_still_told_of(curves, said):
 def test_an_effect_that_makes_views_left_out_worse_is_offered_only_where_it_is_named(heldout, shown):
     assert len(finding_screen.compared(_found("adequate", 0.4, heldout=heldout))) == shown
     assert len(finding_screen.compared(_found("missing_effect", 0.4, heldout=heldout))) == 1
+
+
+SHARES = {"sensor noise": 0.1, "backlash": 0.885, "smooth, unnamed": 0.009, "scanner field": 0.006, "joint_offset": 0.0}
+BUDGET = tuple(BudgetLine(name, share, 0.02 * share**0.5, "mm") for name, share in SHARES.items())
+
+
+def test_small_sources_are_told_together_and_nothing_is_lost():
+    told = largest_error_sources(BUDGET)
+    assert [line.source for line in told] == ["backlash", "sensor noise", "others"]
+    assert sum(line.variance_share for line in told) == pytest.approx(1.0)
+    assert sum(line.sigma**2 for line in told) == pytest.approx(0.02**2)
+    assert largest_error_sources(()) == []
+
+
+def test_the_terminal_tells_source_share_and_size(capsys):
+    show_budget(BUDGET, "mm")
+    told = "backlash 88 % (19 µm), sensor noise 10 % (6.3 µm), others 2 % (2.4 µm)"
+    assert capsys.readouterr().err == f"The error of whole views (rms) comes from: {told}.\n"
+    show_budget((), "mm")
+    assert not capsys.readouterr().err
+
+
+def test_a_map_is_written_with_null_where_nothing_was_seen():
+    error = np.array([[0.01, np.nan], [-0.01, 0.0], [0.02, 0.03]])
+    drawn = FieldMap(
+        np.array([-0.2, 0.2]), np.array([-0.1, 0.0, 0.1]), error, np.where(np.isfinite(error), 0.002, np.nan)
+    )
+    written = _field_map(FieldError(0.02, 0.0, 9.0, over_noise=True, map=drawn))
+    assert written["x_over_z"] == [-0.2, 0.2] and written["y_over_z"] == [-0.1, 0.0, 0.1]
+    assert written["error"] == [[0.01, None], [-0.01, 0.0], [0.02, 0.03]]
+    assert written["sigma"][0] == [0.002, None]
+    assert _field_map(FieldError(0.02, 0.0, 9.0, over_noise=True)) is _field_map(None) is None

@@ -1,17 +1,30 @@
-"""The pages say what is there: paths, names, commands, the walk of a cloud."""
+"""The pages say what is there: paths, names, commands, the walk of a cloud, keys, formats, links; benches import what is there."""
 
+import ast
+import importlib
+import json
+import posixpath
 import re
 import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import stitch
+from bench.docs.page_blocks import ROOT, blocks
+from bench.docs.site_pages import pages
+from data_synth.fixtures.labelled_arm import DH_ROWS, labelled_cell
+from stitch.api.pipeline import diagnose, run
+from stitch.output.diagnosis_document import diagnosis_document
+from stitch.output.result_document import ledger, result_document
 from stitch.output.run_folder import write_with_page
+from stitch.plugins.intake.raw_poses import PROGRAMS, STRUCTURED, TABLES
+from stitch.session.reading.clouds import CLOUD_SUFFIXES
+from stitch.session.reading.session_folder import load_session
 from stitch.system import threads
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 FOLDERS = ("stitch", "viz", "data_synth", "bench", "tests", "docs", "examples")
 # Files of somebody's own, of sessions and of run folders.
@@ -118,3 +131,120 @@ def test_a_cloud_walks_as_the_page_says(session, tmp_path):
     calls = iter(seen)
     for name, file in walk:
         assert (name, str(ROOT / file)) in calls, f"{name} was not called after the ones before it"
+
+
+@pytest.fixture(scope="module")
+def site():
+    """Every page by its path."""
+    return pages()
+
+
+def test_every_page_has_its_place(site):
+    order = re.findall(r"([\w.-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(order) == sorted(name for name in site if not name.startswith("source/"))
+
+
+def test_every_link_stays_in_the_site(site):
+    for name, text in site.items():
+        if name.startswith("source/"):
+            continue
+        prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+        for link in re.findall(r"\]\(([^)\s]+)\)|src=\"([^\"]+)\"", prose):
+            path, _, anchor = "".join(link).partition("#")
+            if path.startswith("data:"):
+                continue
+            target = posixpath.normpath(posixpath.join(posixpath.dirname(name), path)) if path else name
+            assert target in site or (ROOT / "docs" / target).is_file(), f"{name}: {path}"
+            assert not anchor or anchor in anchors(site[target]), f"{name}: {path}#{anchor}"
+
+
+def anchors(page):
+    headings = re.findall(r"^#+ (.*)$", page, re.MULTILINE)
+    return {re.sub(r"[\s]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower()) for heading in headings}
+
+
+def test_the_reference_has_every_command_effect_and_function(site):
+    import typer
+
+    import stitch
+    from stitch.cli.main import build
+    from stitch.effects import EFFECTS
+
+    commands = typer.main.get_command(build()).commands
+    assert not [name for name in commands if f"## `stitch {name}`" not in site["cli.md"]]
+    assert not [name for name in EFFECTS if f"| `{name}` |" not in site["effects-table.md"]]
+    assert not [name for name in stitch.__all__ if f".{name}\n" not in site["python-reference.md"]]
+
+
+SESSION_PAGE = ROOT / "docs" / "session.md"
+
+
+def test_the_session_of_the_page_is_read(session):
+    (text,) = (b.text for b in blocks(SESSION_PAGE) if b.language == "toml")
+    rows = ", ".join("{ " + ", ".join(f"{key} = {x}" for key, x in row.items()) + " }" for row in DH_ROWS)
+    text = text.replace("[[…4],[…4],[…4],[0,0,0,1]]", json.dumps(np.eye(4).tolist()))
+    text = re.sub(r"joints = \[ (\{.*?\}), … \]", rf"joints = [ \1, {rows} ]", text)
+    # A radius says that every cloud shows one sphere, which a blade does not.
+    text = re.sub(r"(?m)^radius = .*$", "", text)
+    assert "…" not in text
+    (session / "session.toml").write_text(text, encoding="utf-8")
+    (session / "blade.stl").write_text("solid s\nendsolid s\n")
+    found = load_session(session)
+    assert found.name == "blade-17" and found.scanner.noise == 0.02 and found.repeatability.position == 0.05
+
+
+def test_every_key_that_a_run_writes_stands_on_the_page(few_effects):
+    cell, *_ = labelled_cell(1, views=12)
+    found = run(cell)
+    diagnosed = diagnosis_document(diagnose(found))
+    candidates = [row | {"candidates": None} for row in diagnosed.pop("candidates")]
+    named = set(re.findall(r"`([\w]+)`", SESSION_PAGE.read_text(encoding="utf-8")))
+    documents = (result_document(found), *ledger(found), diagnosed, *candidates)
+    missing = sorted({key for document in documents for key in document} - named)
+    assert not missing
+
+
+FORMATS_PAGE = ROOT / "docs" / "formats.md"
+BAGS = (".bag", ".db3", ".mcap")
+
+
+def rows():
+    table = FORMATS_PAGE.read_text(encoding="utf-8").split("\n| file ")[1]
+    return [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| ")][1:]
+
+
+def test_every_kind_of_file_stands_in_the_table():
+    named = {ending for row in rows() for ending in re.findall(r"\.[a-z0-9]+\b", row[0])}
+    assert {*CLOUD_SUFFIXES, *TABLES, *STRUCTURED, *PROGRAMS, *BAGS} <= named
+
+
+def test_every_row_has_its_tests():
+    for row in rows():
+        tests = re.findall(r"\[`(\w+)`\]\(([^)]+)\)", row[3])
+        assert tests, row[0]
+        for name, file in tests:
+            text = (FORMATS_PAGE.parent / file).read_text(encoding="utf-8")
+            assert re.search(rf"^def {name}\(", text, re.MULTILINE), f"{file} has no {name}"
+
+
+OWN = {"stitch", "data_synth", "viz"}
+
+
+@pytest.mark.parametrize("folder", ["bench", "examples"])
+def test_what_benches_import_is_there(folder):
+    lacking = []
+    for file in sorted((ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in OWN:
+                lacking += [
+                    f"{file.name}: {node.module}.{a.name}" for a in node.names if not found(node.module, a.name)
+                ]
+    assert not lacking
+
+
+def found(module, name):
+    """Whether a module has a name, or a module below it."""
+    try:
+        return hasattr(importlib.import_module(module), name) or bool(importlib.import_module(f"{module}.{name}"))
+    except ModuleNotFoundError:
+        return False

@@ -1,19 +1,29 @@
-"""The page of a run: what it says, what it needs, and whether it can be read."""
+"""The page of a run: what it says and needs, its screen in a browser, runs on labelled points."""
 
+import base64
+import html
 import json
 import re
+import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from markupsafe import escape
 
+from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
+from stitch.cli.main import main
 from stitch.output.comparison.disagreement_field import model_history
 from stitch.output.comparison.run_verdict import check_tolerance, plain_verdict, run_headline
 from stitch.output.result_document import result_document
 from tests.in_browser import require_for_everybody
 from viz.page_parts import render, unbroken
+from viz.review.chosen_field import Choice
+from viz.review.run_review import RunReview
 from viz.run_page import write_report
 
 LARGEST = 1_500_000  # bytes that open at once on a phone
@@ -137,3 +147,252 @@ def luminance(colour):
     shares = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
     red, green, blue = (s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in shares)
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+# A model with one more effect: a screen of diagnosis.json whose prediction halves the field.
+_SCREEN = "<!-- screen begins --><!-- screen ends -->"
+_MISSING = re.compile("<!-- missing begins -->.*?<!-- missing ends -->", re.S)
+
+
+@pytest.fixture(scope="module")
+def diagnosed_page(recorded, tmp_path_factory):
+    """A page after a diagnosis whose numbers are known."""
+    run = recorded[0]
+    field = model_history(run).models[-1].field.overall
+    now = [float(x) if np.isfinite(x) else None for x in field]
+    why = {
+        "follows": "view order",
+        "unit": "",
+        "of": "the part",
+        "value_unit": "mm",
+        "views": list(range(5)),
+        "at": [0.0, 1.0, 2.0, 3.0, 4.0],
+        "measured": [0.0, 0.002, 0.1, 0.104, 0.098],
+        "sigma": [0.003] * 5,
+        "predicted": [0.0, 0.0, 0.1, 0.1, 0.1],
+    }
+    mean, worst = float(np.nanmean(field)), float(np.nanmax(field))
+    half = {
+        "effect": "part_slip",
+        "field": [x and x / 2 for x in now],
+        "heldout": 0.02,
+        "mean": mean / 2,
+        "worst": worst / 2,
+    }
+    screen = {
+        "now": {"heldout": 0.04, "mean": mean, "worst": worst, "field": now},
+        "why": why,
+        "candidates": [half | {"why": why}],
+        "places": model_history(run).patches.points.tolist(),
+        "verdict": "missing_effect",
+        "named": ["part_slip"],
+        "um": 1e3,
+    }
+    path = tmp_path_factory.mktemp("screen") / "r.html"
+    write_report(run, path, tolerance=0.05)
+    page = path.read_text(encoding="utf-8")
+    assert _SCREEN in page
+    page = page.replace(_SCREEN, f'<script type="application/json" id="screen-data">{json.dumps(screen)}</script>')
+    button = '<button type="button" data-show="part_slip" aria-pressed="false">Show</button>'
+    path.write_text(_MISSING.sub(f'<div class="card missing">{button}</div>', page), encoding="utf-8")
+    return SimpleNamespace(path=path, mean=1e3 * mean, worst=1e3 * worst, views=run.session.names)
+
+
+@pytest.fixture
+def screen(browser, diagnosed_page):
+    page, wrong = browser.new_page(viewport={"width": 1300, "height": 950}), []
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.goto(diagnosed_page.path.as_uri(), timeout=120_000)
+    page.wait_for_selector("[data-why] svg")
+    yield page
+    assert not wrong
+    page.close()
+
+
+def test_left_is_now_and_right_is_what_is_predicted(screen, diagnosed_page):
+    now, then = (screen.locator(f"[data-{side}] h2").inner_text().replace("\u00a0", " ") for side in ("now", "then"))
+    shown = [float(re.search(r"([\d.]+) µm on average", title)[1]) for title in (now, then)]
+    assert now.startswith("Now") and "part_slip (predicted)" in then
+    assert shown == pytest.approx([diagnosed_page.mean, diagnosed_page.mean / 2], rel=0.06)
+    colours = screen.evaluate(
+        "() => ['now', 'then'].map(side => { const c = document.querySelector(`[data-${side}] canvas`); const d = document"
+        ".createElement('canvas'); d.width = d.height = 9; d.getContext('2d').drawImage(c, 0, 0, 9, 9); return [...d"
+        ".getContext('2d').getImageData(4, 4, 1, 1).data]; })"
+    )
+    assert colours[0] != colours[1]
+
+
+def test_why_has_a_dot_for_every_view_and_a_line_that_jumps(screen, diagnosed_page):
+    dots = screen.locator("[data-why] .dot")
+    assert dots.count() == len(diagnosed_page.views)
+    said = dots.nth(3).get_attribute("aria-label").replace("\u00a0", " ")
+    assert said == f"{diagnosed_page.views[3]}, 3: measured 104 ± 6 µm, predicted 100 µm"
+    assert screen.locator("[data-why] text", has_text=f"from {diagnosed_page.views[2]} on").count() == 1
+
+
+def test_a_dot_shows_its_view_and_again_all(screen, diagnosed_page):
+    dot = screen.locator("[data-why] .dot").nth(2)
+    dot.press("Enter")
+    assert f"view {diagnosed_page.views[2]} against the others" in screen.locator("[data-now] h2").inner_text()
+    dot.press("Enter")
+    assert "on average" in screen.locator("[data-now] h2").inner_text()
+
+
+def test_a_click_on_the_part_tells_the_place_before_and_after(screen):
+    canvas = screen.locator("[data-now] canvas")
+    box = canvas.bounding_box()
+    canvas.click(position={"x": box["width"] / 2, "y": box["height"] / 2})
+    said = screen.locator("[data-told]").inner_text().replace("\u00a0", " ")
+    before, after = re.search(r"This place: ([\d.]+) µm → ([\d.]+) µm, ± [\d.]+ µm, \d views see it", said).groups()
+    assert float(after) == pytest.approx(float(before) / 2, rel=0.02)
+
+
+def test_both_parts_turn_together(screen):
+    before = [screen.locator(f"[data-{side}] canvas").screenshot() for side in ("now", "then")]
+    screen.locator("[data-now] canvas").press("ArrowLeft")
+    screen.wait_for_timeout(300)
+    assert all(
+        old != screen.locator(f"[data-{side}] canvas").screenshot()
+        for old, side in zip(before, ("now", "then"), strict=True)
+    )
+
+
+def test_the_legend_tells_what_share_is_within_the_tolerance(screen):
+    legend = screen.locator("[data-within]").inner_text().replace("\u00a0", " ")
+    first, second = (int(x) for x in re.search(r"Within 50 µm: (\d+) % → (\d+) %", legend).groups())
+    assert 0 < first <= second <= 100
+    assert "Hatched: no other view" in screen.locator("#screen").inner_text()
+
+
+def test_without_webgl_the_part_is_drawn_all_the_same(browser, diagnosed_page):
+    page = browser.new_page(viewport={"width": 1300, "height": 950})
+    page.add_init_script(
+        "const own = HTMLCanvasElement.prototype.getContext; HTMLCanvasElement.prototype.getContext = function (kind, ...m) "
+        "{ return kind === 'webgl2' ? null : own.call(this, kind, ...m); };"
+    )
+    page.goto(diagnosed_page.path.as_uri(), timeout=120_000)
+    page.wait_for_selector("[data-why] svg")
+    page.wait_for_timeout(800)
+    seen = page.evaluate(
+        "() => { const c = document.querySelector('[data-now] canvas'); return c.getContext('2d').getImageData(0, 0, c.width,"
+        " c.height).data.some((v, i) => i % 4 === 3 && v > 0); }"
+    )
+    assert seen
+    page.close()
+
+
+def said(capsys, *words):
+    """What a command says to people, as one line."""
+    try:
+        main([str(word) for word in words])
+    except SystemExit as ended:
+        assert not ended.code
+    return " ".join(capsys.readouterr().err.split())
+
+
+def unpacked(values):
+    """Numbers as the browser unpacks them; NaN where nobody knows."""
+    counts = np.frombuffer(base64.b64decode(values["data"]), "<i2")
+    return np.where(counts == -32768, np.nan, counts * values["count"])
+
+
+@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.parametrize("kind", ["points", pytest.param("frames", marks=pytest.mark.slow)])
+def test_labelled_runs_say_the_same_everywhere(kind, tmp_path, few_effects, capsys):
+    offset = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
+    session, *_ = labelled_cell(2, views=24, offset=offset, probe=kind == "frames")
+    folder, before, run = write_labelled(tmp_path / "s", session, kind), tmp_path / "before", tmp_path / "after"
+    said(capsys, "run", folder, "-o", run, "--no-recording")
+    shutil.copytree(run, before)
+    diagnosed = said(capsys, "diagnose", run)
+    finding = json.loads((run / "diagnosis.json").read_text())
+    named = "Missing in the model: joint_offset (a joint counts its angle from a wrong zero). "
+    assert finding["plain"].startswith(f"{named}Adding it should reduce the error from ")
+    state = RunReview(run).state()
+    assert f"{finding['plain']} {finding['sentence']}" in diagnosed
+    assert (state["diagnosis"]["plain"], state["diagnosis"]["sentence"]) == (finding["plain"], finding["sentence"])
+    page = (run / "report.html").read_text()
+    assert page.count(unbroken(finding["plain"])) == 1  # where the evidence stands
+    screen = finding["screen"]
+    assert all(unbroken(said) in html.unescape(page) for said in (screen["headline"], screen["proof"]))
+    assert screen["candidates"][0]["effect"] == "joint_offset" and screen["why"]["of"].startswith("joint ")
+    holds = "U of the hand-eye holds for a complete model"
+    assert f"{holds}; whether an effect is missing has not been asked" in (before / "report.html").read_text()
+    assert all(
+        f"{holds}, and this one seems to lack" in said for said in (diagnosed, (run / "report.html").read_text())
+    )
+    added = said(capsys, "add", run, "joint_offset", "--no-recording")
+    result, ledger = (json.loads((run / f"{name}.json").read_text()) for name in ("result", "ledger"))
+    rms = [f"{1e3 * step['residual_rms']:.3g} µm" for step in ledger]
+    assert result["plain"].startswith(
+        f"Adding joint_offset brought the targets from {rms[0]} to {rms[1]} off their place"
+    )
+    state = RunReview(run).state()
+    assert result["plain"] in added
+    assert (state["sentence"], state["evidence"], state["part"]) == (result["plain"], result["verdict"], True)
+    assert state["labelled"] and not state["outdated"]
+    # The picture counts what the ledger does, step by step.
+    scene = json.loads(RunReview(run).snapshot().part)
+    names = ["coarse", "hand-eye alone", "+ joint_offset", "register"]
+    assert [step["name"] for step in scene["steps"]] == names
+    shown = [step["mean"] for step in scene["steps"][1:3]]
+    assert shown == pytest.approx([1e3 * step["residual_rms"] for step in ledger], rel=0.02)
+    assert shown[1] == pytest.approx(1e3 * result["residual_rms"], rel=1e-6)
+    # Every mark has the value that residuals.parquet has of its view and target, also where one of them was chosen.
+    table = pq.read_table(run / "residuals.parquet")
+    distance = {
+        (v, t): 1e3 * e
+        for v, t, e in zip(*(table[c].to_pylist() for c in ("view", "partner", "residual")), strict=True)
+    }
+    marks = [tuple(mark) for mark in scene["marks"]]
+    assert sorted(mark for mark in marks if any(mark)) == sorted(distance)
+    some = {view for view, _ in distance if view.endswith("1")}
+    for values, known in (
+        (scene["steps"][2]["values"], distance),
+        (
+            RunReview(run).chosen(Choice(views=frozenset(some)))["chosen"]["values"],
+            {key: e for key, e in distance.items() if key[0] in some},
+        ),
+    ):
+        expected = np.array([known.get(mark, np.nan) for mark in marks])
+        np.testing.assert_allclose(unpacked(values), expected, atol=values["count"])
+    # Chosen in a plot, the numbers are those of `stitch compare`.
+    said(capsys, "compare", run)
+    tables = json.loads((run / "compare.json").read_text())["tables"]
+    for table in (next(t for t in tables if t["name"] == name) for name in ("order", "j2")):
+        chosen = RunReview(run).chosen(Choice(bins={table["name"]: (1, 1)}))["chosen"]
+        assert (chosen["correspondences"], chosen["views"]) == (table["count"][1], table["views"][1])
+        assert chosen["rms"] == pytest.approx(1e3 * table["rms"][1], rel=0.02)
+    # The tolerance counts: 95 % of the distances as residuals.parquet has them, to a percent.
+    reach = np.quantile(pq.read_table(run / "residuals.parquet")["residual"].to_numpy(), 0.95)
+    for tolerance, light in ((1.01 * reach, "light good"), (0.99 * reach, "light bad")):
+        said(capsys, "report", run, "--no-diagnosis", "--tolerance", tolerance)
+        page = (run / "report.html").read_text()
+        assert f'class="{light}"' in page
+        assert unbroken(result["plain"]).replace("'", "&#39;") in page
+    of_two = said(capsys, "report", before, run, "--tolerance", 1.01 * reach)
+    assert f"by {rms[1]} instead of {rms[0]}, rms over the labelled points. The hand-eyes put the targets" in of_two
+    page = (run / "two-runs.html").read_text()
+    assert re.findall(r'class="light (\w+)"', page) == ["bad", "good"]
+    assert "views of B" in page and "<canvas" not in page
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ("21.9 µm: by 18.6 µm and 0.044 mrad", "21.9~µm: by 18.6~µm and 0.044~mrad"),
+        ("c2 = 0.43 ± 0.04 µrad/(N m), c3", "c2~=~0.43~±~0.04~µrad/(N~m), c3"),
+        ("g = −3 ± 1 ppm/°C", "g~=~−3~±~1~ppm/°C"),
+        ("95 % of the part, 2.5 MB, 120 °C (1 σ)", "95~% of the part, 2.5~MB, 120~°C (1~σ)"),
+        ("12 views, 3 scans, 4 models, 2 hours, 5 mms", "12 views, 3 scans, 4 models, 2 hours, 5 mms"),
+        ("3 minutes; [1 0 0]; x = x* + u; p = 2e-22", "3 minutes; [1 0 0]; x = x* + u; p~=~2e-22"),
+    ],
+)
+def test_numbers_stay_with_their_units(text, kept):
+    assert unbroken(text).replace("\u00a0", "~") == kept
+
+
+def test_pages_keep_them_together_and_markup_as_it_is():
+    page = render("review.html.j2", nonce="", run="<b>5 mm</b>")
+    assert "&lt;b&gt;5\u00a0mm&lt;/b&gt;" in page
+    assert "1px solid" in page

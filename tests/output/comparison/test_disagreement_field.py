@@ -1,6 +1,7 @@
-"""The field of disagreement against the truth of simulated cells."""
+"""The field of disagreement against the truth of simulated cells, and what its history says for everybody."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from stitch.numerics import frames
 from stitch.observations.surfaces.matching import sample_points, signed_distances
 from stitch.observations.surfaces.normal_equations import collect_overlaps
 from stitch.output.comparison.disagreement_field import model_history, patches_of
+from stitch.output.comparison.run_verdict import plain_verdict
 from stitch.output.result_document import result_document
 from stitch.output.run_folder import write_with_page
 from stitch.output.stored_run import load_run
@@ -110,3 +112,22 @@ def test_the_history_is_the_same_when_it_is_read_again(changed, tmp_path):
     np.testing.assert_allclose(
         [s.field.mean_abs for s in again.steps], [row["mean"] for row in stated["steps"]], rtol=1e-6
     )
+
+
+def history(*names):
+    """Steps between coarse and register whose views disagree by 100, 90, 80 … µm, 5 µm after register."""
+    models = [
+        SimpleNamespace(name=name, field=SimpleNamespace(mean_abs=0.1 - 0.01 * i)) for i, name in enumerate(names)
+    ]
+    register = SimpleNamespace(name="register", field=SimpleNamespace(mean_abs=0.005))
+    return SimpleNamespace(models=models, steps=(*models, register))
+
+
+def test_an_effect_that_was_dropped_again_has_brought_nothing():
+    told = plain_verdict(history("hand-eye alone", "+ backlash", "− backlash"), "mm")
+    assert "backlash" not in told and "the views disagree by 80 µm" in told and "5 µm remain" in told
+
+
+def test_what_was_added_and_stayed_is_named_with_all_that_it_brought():
+    told = plain_verdict(history("hand-eye alone", "+ backlash", "+ settling, − backlash", "+ latency"), "mm")
+    assert told.startswith("Adding settling and latency brought the views from 100 µm to 70 µm of each other")

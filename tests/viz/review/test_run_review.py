@@ -1,4 +1,4 @@
-"""What a review knows of a run: undo and redo, commands, trust, one moment of a folder that changes."""
+"""What a review knows of a run: undo and redo, commands, trust, one moment of a folder that changes, its diagnosis."""
 
 import json
 import re
@@ -12,7 +12,7 @@ from viz.page_parts import unbroken
 from viz.review import run_snapshot
 from viz.review.residual_rows import read_rows
 from viz.review.run_review import RunReview
-from viz.review.run_snapshot import read_snapshot, undo_history
+from viz.review.run_snapshot import read_snapshot, told_diagnosis, undo_history
 
 
 @pytest.fixture
@@ -129,3 +129,19 @@ def test_own_effects_stay_in_the_run_folder_and_go_with_every_command(run):
     assert review.arguments("note", {"text": "--step 0", "by": ""}) == ["note", str(run), "--", "--step 0"]
     (run / "recording.rrd").touch()
     assert "--no-recording" not in review.arguments("drop", {"effects": ["a"]})
+
+
+EVIDENCE = "backlash is missing (b5 = 0.0004 rad)."
+
+
+@pytest.mark.parametrize(
+    "document, told",
+    [
+        ({"plain": "Missing in the model: backlash."}, ("Missing in the model: backlash.", EVIDENCE)),
+        # Written before there was a sentence for everybody.
+        ({}, (EVIDENCE, "")),
+    ],
+)
+def test_no_sentence_stands_twice(document, told):
+    found = told_diagnosis({"verdict": "missing_effect", "effects": ["backlash"], "sentence": EVIDENCE} | document, 1e3)
+    assert (found["plain"], found["sentence"]) == told

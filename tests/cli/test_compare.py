@@ -1,4 +1,4 @@
-"""What `stitch compare` says: whether anything is clear, every table once, and what to type next."""
+"""What stitch compare says: whether anything is clear, every table once, and what to type next."""
 
 from types import SimpleNamespace
 

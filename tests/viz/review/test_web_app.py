@@ -1,10 +1,11 @@
-"""Who is answered, what a page may ask for, and what becomes of a run while it is looked at."""
+"""Who is answered, what a page may ask for, what becomes of a run while it is looked at, and the files of the Rerun viewer."""
 
 import json
 import os
 import re
 import shutil
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from stitch.cli.main import main
 from stitch.errors import InputError
 from tests.viz.review.conftest import ended, served, until
+from viz.review import rerun_viewer
 
 
 @pytest.fixture(scope="module")
@@ -196,3 +198,28 @@ def test_what_is_no_run_and_a_taken_port_end_in_a_line(run, server, tmp_path, ca
         told = capsys.readouterr().err
         assert told.startswith("stitch: ")
         assert told.count("\n") == 1
+
+
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="/proc tells which programs run")
+def test_no_program_outlives_what_was_asked_of_it(monkeypatch):
+    free, ports = rerun_viewer._free_port, []
+    monkeypatch.setattr(rerun_viewer, "_free_port", lambda: ports.append(free()) or ports[-1])
+    viewer = rerun_viewer.RerunViewer()
+    assert b"<html" in viewer.file("index.html").read_bytes().lower()
+    viewer.close()
+    # The launcher was waited for; what it had started belongs to nobody and may take a moment to die.
+    end = time.monotonic() + 30
+    while (left := {str(port).encode() for port in ports} & running()) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not left
+
+
+def running():
+    """Words of all command lines."""
+    words = set()
+    for file in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words.update(file.read_bytes().split(b"\0"))
+        except OSError:
+            continue
+    return words

@@ -1,4 +1,4 @@
-"""`stitch init` at the command line: what it writes, asks and refuses."""
+"""stitch init at the command line: what it writes, asks and refuses."""
 
 import json
 import shutil

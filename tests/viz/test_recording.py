@@ -1,4 +1,4 @@
-"""What people see: the recording of a small run, and of one to which an effect was added; its page."""
+"""What people see: the recording of a small run, and of one to which an effect was added; its page; numbers that agree at every step."""
 
 import json
 import re
@@ -20,11 +20,10 @@ from stitch.numerics.units import length_text
 from stitch.output.comparison.disagreement_field import model_history
 from stitch.output.result_document import result_document
 from stitch.run_data import Note
-from tests.viz.test_steps_told import told_at
 from viz.colours import UNSEEN, signed_colours
 from viz.course_recording import apart, log_course
 from viz.diagnosis_recording import log_diagnosis
-from viz.model_timeline import one_above_the_other
+from viz.model_timeline import FRAMES, one_above_the_other
 from viz.page_parts import unbroken
 from viz.rrd_file import RecordingFile
 from viz.run_page import write_report
@@ -185,3 +184,35 @@ def test_colours_say_below_above_and_unseen():
     assert above[0] > above[2]
     assert level.min() > 230
     assert tuple(unseen) == UNSEEN
+
+
+def told_at(recording):
+    """Frame of the timeline `model` → the words beside the part."""
+    chunks = (c.to_record_batch() for c in RrdReader(str(recording)).stream() if c.entity_path == "/now")
+    rows = (zip(b.column("model"), b.column("TextDocument:text"), strict=True) for b in chunks)
+    return {frame.as_py(): text.as_py()[0] for batch in rows for frame, text in batch}
+
+
+def require_steps(recording, rows):
+    """Rows of `disagreement.steps` of a result in mm."""
+    told = told_at(recording)
+    assert max(told) == FRAMES * (len(rows) - 1)
+    for k, row in enumerate(rows):
+        words = unbroken(f"## {row['step']}\nviews disagree by {length_text(row['mean'], 'mm')} on average.")
+        assert told[FRAMES * k].startswith(words)
+
+
+def test_the_recording_of_a_small_run(recorded):
+    run, path = recorded
+    require_steps(path, result_document(run)["disagreement"]["steps"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rubik"])
+def test_page_and_recording_of_a_real_object(reghec, name, tmp_path, stitch_command):
+    stitch_command("run", reghec(name), "-o", tmp_path / "r")
+    rows = json.loads((tmp_path / "r" / "result.json").read_text())["disagreement"]["steps"]
+    require_steps(tmp_path / "r" / "recording.rrd", rows)
+    page = (tmp_path / "r" / "report.html").read_text(encoding="utf-8")
+    shown = json.loads(re.search(r'id="part-data">(.*?)</script>', page, re.S)[1])["steps"]
+    assert [(s["name"], s["mean"]) for s in shown] == [(r["step"], pytest.approx(1e3 * r["mean"])) for r in rows]
