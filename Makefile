@@ -57,16 +57,17 @@ test: export PYTHONDONTWRITEBYTECODE =
 test: install
 	$(PYTHON) -m pytest
 
-# Style, format, types and which room may import which.
+# Style, format, types, which room may import which, and how large each part may be.
 lint: install
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports --no-logo
+	$(PYTHON) bench/budget.py
 
 check: lint
 	$(PYTHON) -m pytest -m "slow or not slow" --cov
-	@$(VENV)/bin/coverage report --include='stitch/*' --format=total --fail-under=90
+	@$(VENV)/bin/coverage report --include='stitch/*' --format=total --fail-under=93
 
 # The pages as a site in build/site, which needs no server: open index.html. A warning or a dead link ends it.
 docs: install
