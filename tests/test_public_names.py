@@ -21,10 +21,10 @@ VERBS = {"Compute", "Find", "Fit", "Read", "Return", "Stitch", "Write"}
 
 
 def imported_for_type_checkers():
-    """Names and modules of the `if TYPE_CHECKING:` block of the package, names exported by `as` alone."""
-    tree = ast.parse(Path(stitch.__file__).read_text(encoding="utf-8"))
-    block = next(n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
-    return {(alias.asname, node.module) for node in block.body for alias in node.names if alias.asname == alias.name}
+    """Names and modules of the package's stub, names exported by `as` alone."""
+    tree = ast.parse(Path(stitch.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    return {(alias.asname, node.module) for node in imports for alias in node.names if alias.asname == alias.name}
 
 
 @pytest.mark.parametrize("name", stitch.__all__)

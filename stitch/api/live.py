@@ -18,7 +18,7 @@ from stitch.errors import InputError, NoResultError
 from stitch.fit import surface_steps
 from stitch.fit.coarse import turn_about
 from stitch.fit.live_fit import LiveFit, fit_live_hand_eye, place_view, start_live_fit, without_view
-from stitch.model.model import Model
+from stitch.model.model import Model, displacement
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import length_text
@@ -26,7 +26,6 @@ from stitch.observations.observability import unknown_numbers
 from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
 from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.plugins.metrology.planning.expected_model import displacement
 from stitch.recorder import Recorder, SilentRecorder
 from stitch.screening.pose_tests import BlunderSearch, find_blunders, least_displacement
 from stitch.screening.view_model import UsualEffects, ViewModel, view_model

@@ -13,15 +13,14 @@ import numpy as np
 
 from stitch.api.session import Session, public_session
 from stitch.errors import InputError
-from stitch.model.model import COVERAGE_FACTOR
+from stitch.model.model import COVERAGE_FACTOR, displacement
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
 from stitch.output import run_folder
+from stitch.output.cloud_colours import Colours, residual_colours
 from stitch.output.fit_report import fit_report
 from stitch.output.result_document import points_of
 from stitch.output.run_folder import recordings, residual_table
-from stitch.plugins.export.cloud_formats import Colours, coloured
-from stitch.plugins.metrology.planning.expected_model import displacement
 from stitch.recorder import Recorder
 from stitch.run_data import FusedCloud, RunData, StageResult
 from stitch.session.capture import Capture
@@ -148,7 +147,7 @@ class Stitched:
     @property
     def colours(self) -> Colours:
         """(N, 3) bytes, by residual from dark to yellow; grey where one view alone saw it."""
-        return coloured(self.fused, self.length_unit).colours
+        return residual_colours(self.residual)[0]
 
     def to_open3d(self, tensor: bool = False) -> Any:
         """Return an Open3D PointCloud with normals and colours by residual; lengths in length_unit.

@@ -5,7 +5,8 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
-from functools import cache, partial
+from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -14,20 +15,19 @@ import numpy as np
 from stitch.errors import InputError, NoResultError, StitchError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
-from stitch.output.session_files import SessionFiles, pose_columns, table_text, write_session
+from stitch.output.session_files import (
+    SessionFiles,
+    pose_columns,
+    repeatability_table,
+    robot_toml,
+    table_text,
+    write_session,
+)
 from stitch.output.urdf_file import to_urdf
-from stitch.plugins.intake.arrays import cloud_of, per_view, poses_of, sighting_of
-from stitch.plugins.intake.cloud_pairs import pairings
-from stitch.plugins.intake.convention_choice import choose_convention, require_own_frames
-from stitch.plugins.intake.first_session import StatedFolder, capture_of
-from stitch.plugins.intake.layouts import MM
-from stitch.plugins.intake.raw_poses import RawPoses
-from stitch.plugins.intake.readings import all_readings
-from stitch.plugins.metrology.calibrate.robot import repeatability_table, robot_toml
-from stitch.screening.conventions import register_scan_pairs
 from stitch.screening.deep_check import refuse_whole
 from stitch.session.capture import MAX_POINTS
 from stitch.session.reading import session_folder
+from stitch.session.reading.arrays import cloud_of, per_view, poses_of, sighting_of
 from stitch.session.reading.session_folder import (
     check_scale,
     checked_scan,
@@ -41,8 +41,6 @@ from stitch.session.robot import Robot, forward
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, StatedRepeatability, View
 from stitch.system.threads import parallel
 
-# Two motions, the fewest that tell a reading.
-_FEWEST = 3
 # Names of views that can be those of files.
 _PLAIN = re.compile(r"[\w+-][\w.+-]*")
 
@@ -364,32 +362,18 @@ def _described(
 def check_convention(session: Session) -> None:
     """Refuse poses that the scans contradict, tried in both directions and in other orders as `stitch init` does.
 
+    Where no package searches conventions (entry-point group `stitch.pose_checks`), they are as stated unless a deep
+    check contradicts.
+
     Raises:
         InputError: another reading of the poses brings the scans together, or they lie in one frame already.
     """
-    if session.has_clouds and _scans_confirm(session):
+    checks = entry_points(group="stitch.pose_checks")
+    if session.has_clouds and any(check.load()(session) for check in checks):
         return
     # That nothing overlaps under any reading is for the run to say, which names the mistakes that it knows.
     with suppress(NoResultError):
         refuse_whole(session)
-
-
-def _scans_confirm(session: Session) -> bool:
-    """Return True if the scans tell one reading of the poses from all others, and it is the one that was stated."""
-    T = np.array([view.T_base_flange for view in session.views])
-    if len(T) < _FEWEST:
-        return False
-    clouds = [view.cloud for view in session.views if view.cloud is not None]
-    raw = RawPoses(str(session.path), None, T.reshape(-1, 16), ((),) * len(T), "an array")
-    stated = StatedFolder(length_unit=session.length_unit)
-    capture = capture_of(clouds, METRES[session.length_unit] / MM)
-    motions = cache(lambda: register_scan_pairs(capture))
-    pairs = pairings([Path("scan")] * len(T), raw.labels)
-    decided = choose_convention(capture, motions, all_readings(raw, None, stated), pairs, [session.length_unit])
-    require_own_frames(session.path, motions, decided)
-    way = decided.best.interpretation
-    in_order = way.pairing.rows == tuple(range(len(T)))
-    return decided.determined and in_order and way.carries == (session.mount == "eye_in_hand")
 
 
 @contextmanager

@@ -1,40 +1,29 @@
-"""What the commands do, from Python: run, diagnose, add, drop, compare, explain, plan, export."""
+"""What the commands do, from Python: run, diagnose, add, drop, compare; plug-ins add verbs of their own.
+
+An entry point of the group `stitch.verbs` makes the function NAME of a plug-in `stitch.NAME`.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from stitch.api import pipeline
 from stitch.api.run import ReplayRecorder, Run, public_run
 from stitch.api.session import Session, public_session
-from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.effects.contract import find_effect
-from stitch.errors import InputError
 from stitch.fit.correct import gate_of_model
 from stitch.fusion.register import DEFAULT
 from stitch.model.forward import corrected_capture
 from stitch.model.model_toml import ModelFile, keep_arm_effects
-from stitch.numerics.frames import Array
 from stitch.output import stored_run
 from stitch.output.comparison.residual_tables import ResidualTables, compare_surfaces, compare_targets
-from stitch.output.diagnosis_document import diagnosis_document
-from stitch.output.result_document import model_of, result_document
-from stitch.plugins.explain import explain as explanation
-from stitch.plugins.explain.explain import EFFECT_NAME, Explanation
-from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured
-from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_from
-from stitch.plugins.metrology.calibrate.arm_model import ARM_FORMATS, arm_from
-from stitch.plugins.metrology.planning import plan as planning
-from stitch.plugins.metrology.planning.expected_model import PlannedCell, cell_of_session, cell_of_state
-from stitch.plugins.metrology.planning.plan import Plan, PlanRequest
+from stitch.output.result_document import model_of
 from stitch.recorder import Recorder
-from stitch.run_data import RunData
+from stitch.run_data import FusedCloud, RunData
 from stitch.session.session import SessionData
-from stitch.system.files import whole_file
 from stitch.system.threads import library_threads_off
 
 
@@ -150,7 +139,7 @@ def diagnose(run: RunData) -> Diagnosis:
         >>> found.verdict in ("adequate", "missing_effect", "cannot_tell", "unknown_effect")
         True
     """
-    return pipeline.diagnose(_state(run))
+    return pipeline.diagnose(stored_state(run))
 
 
 def add(run: RunData, *effects: str, recorder: Recorder | None = None) -> Run:
@@ -210,146 +199,20 @@ def compare(run: RunData) -> ResidualTables:
         >>> found.rms > 0, len(found.table("view").label)
         (True, 5)
     """
-    state = _state(run)
+    state = stored_state(run)
     return compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
 
 
-def explain(run: RunData) -> Explanation:
-    """Find a formula for what the model of a run leaves, as `stitch explain` does.
-
-    Returns:
-        `found`, `why` in a sentence, `formula` in rad and length_unit, and `source`, a Python file of effects.
-
-    Raises:
-        InputError: a formula of such a search is in the model already.
-        NoResultError: no two views overlap.
-
-    Example:
-        >>> stitch.explain(run).found
-        False
-    """
-    state = _state(run)
-    if EFFECT_NAME in state.model.effects:
-        raise InputError(
-            f"{state.session.name}: has an effect {EFFECT_NAME!r} in its model; to fix: give it another name in "
-            "its file, "
-            "and add that"
-        )
-    return explanation.explain(linear_model_of(state), f"Found by `stitch explain` in {state.session.name}.")
+def stored_state(run: RunData) -> RunData:
+    """Return what a command reads of the run's folder: partners are looked for within the gate of the model alone."""
+    with library_threads_off():
+        return replace(run, gate=gate_of_model(corrected_capture(run.measurement, run.model), run.T_mount))
 
 
-def plan(
-    cell: SessionData | RunData,
-    *,
-    views: int | None = None,
-    split: tuple[str, str] | None = None,
-    halve: bool = False,
-    feature: Any = None,
-    part: Path | str | None = None,
-    size: float | None = None,
-    field: float | None = None,
-) -> Plan:
-    """Compute what views would show before they are taken, and which further ones help most, as `stitch plan` does.
-
-    Args:
-        cell: a run, which knows its cell, or a session whose views are planned.
-        views: at most so many further ones.
-        split: two effects that they are to tell apart.
-        halve: they are to halve the uncertainty of the hand-eye and nothing else.
-        feature: (3,) at which the uncertainty counts, reference frame, length_unit; or (6,) with a normal, along it.
-        part: mesh, or cloud with normals, of a session's part.
-        size: its longest side, mm, where nothing else is known.
-        field: full angle of the scanner's field, degrees.
-
-    Returns:
-        `now`, `proposed` with joints (n,) in rad and T_base_flange (4, 4) in length_unit, and `after`.
-
-    Raises:
-        InputError: an effect that is not known, or a cell of which too little is.
-
-    Example:
-        >>> outlook = stitch.plan(run, views=2).now
-        >>> outlook.views
-        5
-    """
-    for name in split or ():
-        find_effect(name)
-    at = None if feature is None else np.asarray(feature, float).reshape(-1)
-    split_any = not halve and at is None
-    wanted = PlanRequest(halve=halve or split is None, split=split, split_any=split_any, views=views, feature=at)
-    if isinstance(cell, RunData):
-        return planning.plan_further_views(cell.session, _cell_of(cell), wanted)
-    planned = cell_of_session(cell, None if part is None else Path(part), size, field)
-    return planning.plan_further_views(cell, planned, wanted)
-
-
-def export_run(
-    run: RunData,
-    to: str,
-    file: Path | str | None = None,
-    *,
-    parent: str | None = None,
-    child: str = "scanner",
-    diagnosis: Diagnosis | None = None,
-) -> str | None:
-    """Write what a run found for other programs, as `stitch export RUN --to` does.
-
-    It is not called `stitch.export`, which is the package that does it.
-
-    Args:
-        to: ros, urdf, opencv, zivid, kuka, fanuc, abb or ur for the hand-eye; arm-dh or arm-urdf; ply, pcd, las, laz,
-            e57 or glb for the stitched cloud.
-        file: is written, whole or not at all; a cloud needs one.
-        parent, child: names of the frames that carry the scanner and are the scanner's own.
-        diagnosis: of the run; what is written says what it found.
-
-    Returns:
-        The text, of T_parent_child (4, 4) in the unit that it states, U beside it; None of a cloud, which is written in
-        the reference frame.
-
-    Raises:
-        InputError: a format that is not known, no file for a cloud, or a run that has no such thing.
-
-    Example:
-        >>> "T_flange_scanner" in stitch.export_run(run, "ros")
-        True
-        >>> stitch.export_run(run, "ply", folder / "cloud.ply")
-    """
-    path = None if file is None else Path(file)
-    if to in CLOUD_FORMATS:
-        _cloud(run, to, path)
-        return None
-    if to in ARM_FORMATS:
-        session = run.measured if isinstance(run, Run) and run.measured is not None else run.session
-        text = ARM_FORMATS[to](arm_from(session, model_of(run)))
-    elif to in HAND_EYE_FORMATS:
-        document = {} if diagnosis is None else diagnosis_document(diagnosis)
-        text = HAND_EYE_FORMATS[to](hand_eye_from(result_document(run), model_of(run), document, parent, child))
-    else:
-        raise InputError(
-            f"{to}: no such format; to fix: one of {', '.join((*HAND_EYE_FORMATS, *ARM_FORMATS, *CLOUD_FORMATS))}"
-        )
-    if path is not None:
-        with whole_file(path) as out:
-            out.write_text(text, encoding="utf-8")
-    return text
-
-
-def _cloud(run: RunData, to: str, file: Path | None) -> None:
-    """Write the stitched cloud; precision as of stitched.ply, which holds it in a run folder."""
-    if file is None or file.suffix.lower() != f".{to}":
-        raise InputError(f"{to}: where to? to fix: name the file NAME.{to}")
-    if not len(run.fused.points):
-        raise InputError(f"{run.session.name}: labelled points alone give no cloud; there is none to export")
+def stored_cloud(run: RunData) -> FusedCloud:
+    """Return the stitched cloud with the digits that the run's folder keeps: stitched.ply is of single precision."""
     names = ("points", "normals", "residual")
-    fused = replace(run.fused, **{name: _single(getattr(run.fused, name)) for name in names})
-    with whole_file(file) as out:
-        CLOUD_FORMATS[to][0](coloured(fused, run.session.length_unit), out)
-
-
-def _single(values: Array) -> Array:
-    """Numbers with the digits that a file of single precision keeps."""
-    return np.asarray(values, np.float32).astype(np.float64)
+    return replace(run.fused, **{name: getattr(run.fused, name).astype(np.float32).astype(float) for name in names})
 
 
 def _model(model: ModelFile | RunData) -> ModelFile:
@@ -361,19 +224,7 @@ def _names(effects: Sequence[str]) -> list[str]:
     return [find_effect(name).name for name in effects]
 
 
-def _state(run: RunData) -> RunData:
-    """Return what a command reads of the run's folder: partners are looked for within the gate of the model alone."""
-    with library_threads_off():
-        return replace(run, gate=gate_of_model(corrected_capture(run.measurement, run.model), run.T_mount))
-
-
 def _changed(run: RunData, effects: Sequence[str], recorder: Recorder | None) -> Run:
     replay = ReplayRecorder(recorder)
     whole_session: Session | None = run.measured if isinstance(run, Run) else None
-    return public_run(pipeline.change(_state(run), effects, replay), whole_session, replay)
-
-
-def _cell_of(run: RunData) -> PlannedCell:
-    if not run.session.has_clouds:
-        raise InputError(f"{run.session.name}: a run of labelled points; plans are made for scans; to fix: diagnose it")
-    return cell_of_state(_state(run), _single(run.fused.points), _single(run.fused.normals))
+    return public_run(pipeline.change(stored_state(run), effects, replay), whole_session, replay)

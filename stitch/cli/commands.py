@@ -1,4 +1,4 @@
-"""The commands of `stitch`: its own, and those that other packages add through the entry-point group `stitch.commands`.
+"""The commands of `stitch`: those of the core, and those of plug-ins, by the entry-point group `stitch.commands`.
 
 A command is imported when it is asked for, and a list of all reads what they are for from their source: nobody waits
 for the libraries of all.
@@ -19,9 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from stitch.cli.terminal import stdout_for_results
 
 GROUP = "stitch.commands"
-_OWN_COMMANDS = {
-    "init": "stitch.plugins.intake.init:init",
-    "detect": "stitch.plugins.intake.detect:detect",
+_CORE_COMMANDS = {
     "run": "stitch.cli.run:run",
     "check": "stitch.cli.check:check",
     "compare": "stitch.cli.compare:compare_run",
@@ -30,27 +28,24 @@ _OWN_COMMANDS = {
     "drop": "stitch.cli.change:drop",
     "note": "stitch.cli.note:note",
     "next": "stitch.cli.diagnose:next_measurement",
-    "plan": "stitch.plugins.metrology.planning.command:plan_views",
-    "measure": "stitch.plugins.metrology.measure:measure",
-    "verify": "stitch.plugins.metrology.verify:verify",
-    "explain": "stitch.plugins.explain.command:explain_run",
     "effects": "stitch.cli.effects:effects",
     "report": "stitch.cli.report:report",
-    "watch": "stitch.plugins.watch.watch_command:watch",
-    "batch": "stitch.plugins.watch.batch.command:batch",
-    "import": "stitch.plugins.intake.import_file:import_command",
-    "export": "stitch.plugins.export.export_run:export_run",
-    "calibrate": "stitch.plugins.metrology.calibrate.command:calibrate",
 }
+# In the order of use; the others follow by name.
+_ORDER = (
+    *("init", "detect", "run", "check", "compare", "diagnose", "add", "drop", "note", "next", "plan", "measure"),
+    *("verify", "explain", "effects", "report", "watch", "batch", "import", "export", "calibrate"),
+)
 
 
 class Commands(MutableMapping[str, Any]):
     """Name to command, loaded at first use."""
 
     def __init__(self) -> None:
-        own = [EntryPoint(name, place, GROUP) for name, place in _OWN_COMMANDS.items()]
-        added = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
-        self._entries = {entry.name: entry for entry in (*own, *added)}
+        core = [EntryPoint(name, place, GROUP) for name, place in _CORE_COMMANDS.items()]
+        entries = {entry.name: entry for entry in (*core, *entry_points(group=GROUP))}
+        first = [name for name in _ORDER if name in entries]
+        self._entries = {name: entries[name] for name in (*first, *sorted(entries.keys() - _ORDER))}
         self._load = cache(_load_command)
 
     def __getitem__(self, name: str) -> Any:
@@ -80,7 +75,7 @@ def _load_command(entry: EntryPoint) -> Any:
     if not isinstance(found, typer.Typer):
         alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
         alone.command(entry.name, cls=Command)(
-            stdout_for_results(found) if entry.value in _OWN_COMMANDS.values() else found
+            stdout_for_results(found) if entry.value in _CORE_COMMANDS.values() else found
         )
         found = alone
     command = typer.main.get_command(found)

@@ -214,6 +214,12 @@ def expanded_uncertainty(T_mount: Array, covariance: Array) -> Array:
     return COVERAGE_FACTOR * np.sqrt(np.diag(printed_covariance(T_mount, covariance)))
 
 
+def displacement(covariance: Array, middle: Array) -> float:
+    """U (k = 2) of a point (3,) of the scanner's frame under the hand-eye's covariance (6, 6), all directions."""
+    lever = np.hstack([-frames.skew(middle), np.eye(3)])
+    return float(COVERAGE_FACTOR * np.sqrt(np.trace(lever @ covariance @ lever.T)))
+
+
 def hand_eye_lines(
     T_mount: Array,
     covariance: Array,

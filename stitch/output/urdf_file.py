@@ -1,6 +1,7 @@
 """A robot as URDF (http://wiki.ros.org/urdf/XML), in metres and radians."""
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -65,6 +66,11 @@ def roll_pitch_yaw(R: Array) -> Array:
     yaw = np.arctan2(R[1, 0], R[0, 0])
     rest = elementary("z", -yaw)[:3, :3] @ R
     return np.array([np.arctan2(-rest[1, 2], rest[1, 1]), np.arctan2(-rest[2, 0], rest[0, 0]), yaw])
+
+
+def xml_comment(lines: Sequence[str]) -> str:
+    """Return lines of comment; two hyphens, which would end one, become a dash."""
+    return "".join(f"<!-- {' '.join(line.replace('--', '–').split())} -->\n" for line in lines)
 
 
 def _text(values: Array) -> str:

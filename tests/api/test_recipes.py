@@ -17,10 +17,10 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import stitch
-from stitch.plugins.intake.arrays import cloud_of, poses_of
 from stitch.plugins.intake.layouts import possible_layouts
 from stitch.plugins.intake.raw_poses import read_raw_poses
 from stitch.plugins.intake.readings import readings
+from stitch.session.reading.arrays import cloud_of, poses_of
 from tests.needs import needs_open3d
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "recipes.md").read_text(encoding="utf-8")

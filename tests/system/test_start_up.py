@@ -28,14 +28,28 @@ def test_dear_libraries_are_loaded_when_they_are_needed(module, also_without):
 
 
 def test_a_run_loads_nothing_of_the_diagnosis():
-    """Nor of plans, pictures and meshes: all that it needs from the first file to the page."""
+    """Nor of plug-ins, pictures and meshes: all that it needs from the first file to the page."""
     on_use = "from stitch.system.process import load_on_use; load_on_use('numpy.f2py', 'numpy.testing')\n"
     modules = loaded(f"{on_use}import stitch.cli.run, stitch.api.pipeline, stitch.output.run_folder, viz.run_page")
     assert {"stitch.fusion.register", "scipy.optimize", "numpy.f2py"} <= modules
     without = {"scipy.cluster", "scipy.interpolate", "scipy.ndimage", "yaml", "numpy.f2py.rules", "unittest"}
-    assert not modules & (DEAR | without | {"stitch.diagnosis", "stitch.planning", "stitch.explanation"})
+    assert not modules & (DEAR | without | {"stitch.diagnosis", "stitch.plugins"})
     asked = "import scipy.optimize, numpy; numpy.testing.assert_allclose(1, 1); numpy.f2py.run_main"
     assert {"numpy.f2py.rules", "unittest"} <= loaded(on_use + asked)
+
+
+def test_a_run_from_arrays_loads_no_plug_in_but_the_search_of_a_convention():
+    code = """
+import numpy, stitch
+from data_synth.fixtures.blade_cells import measured_blade
+cell = measured_blade(0, views=4, mount="eye_in_hand", pixels=30)
+clouds, poses = [cloud.points for cloud in cell.clouds], numpy.array(cell.T_base_flange)
+stitch.run(stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", check=CHECK))
+"""
+    plug_ins = {name for name in loaded(code.replace("CHECK", "False")) if name.startswith("stitch.plugins")}
+    assert not plug_ins
+    searching = {name for name in loaded(code.replace("CHECK", "True")) if name.startswith("stitch.plugins.")}
+    assert searching and all(name.startswith("stitch.plugins.intake") for name in searching)
 
 
 def test_scans_are_read_and_prepared_while_scipy_is_loaded():

@@ -10,13 +10,14 @@ import typer
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust, require_new
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, say, show_next
+from stitch.cli.terminal import emit, say, show_next, stdout_for_results
 from stitch.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from stitch.plugins.explain.explain import Explanation
 
 
+@stdout_for_results
 def explain_run(
     run: RunFolder,
     output: Annotated[

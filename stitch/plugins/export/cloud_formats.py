@@ -11,23 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 from pykdtree.kdtree import KDTree
 
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model
-from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
+from stitch.output.cloud_colours import Colours, residual_colours
 from stitch.output.stored_run import fused_cloud
 from stitch.run_data import FusedCloud
 from stitch.session.reading.text_files import shortened
 
-Colours = NDArray[np.uint8]
-# Residuals from zero to that of so many points span the colours: a few large ones would make the rest one colour.
-_SPAN = 0.98
-# Of places that one view alone has seen.
-_UNKNOWN = (150, 150, 150)
 # LAS counts places in whole steps of 32 bits, which hold so many on either side of the middle.
 _LAS_STEPS = 1e9
 
@@ -67,19 +61,8 @@ def coloured_cloud(folder: Path) -> ColouredCloud:
 
 def coloured(fused: FusedCloud, length_unit: str, mesh: Path | None = None) -> ColouredCloud:
     """Return a stitched cloud with its residuals as colours."""
-    known = fused.residual[np.isfinite(fused.residual)]
-    span = float(np.quantile(known, _SPAN)) if len(known) else 0.0
-    return ColouredCloud(fused, residual_colours(fused.residual, span), span, length_unit, mesh)
-
-
-def residual_colours(residual: Array, span: float) -> Colours:
-    """Return (N, 3) from dark blue at zero over green to yellow at `span` (viridis); grey where one view alone saw."""
-    from matplotlib import colormaps
-
-    share = np.clip(np.nan_to_num(residual) / max(span, 1e-300), 0, 1)
-    colours = np.asarray(colormaps["viridis"](share)[:, :3] * 255).round().astype(np.uint8)
-    colours[~np.isfinite(residual)] = _UNKNOWN
-    return np.asarray(colours)
+    colours, span = residual_colours(fused.residual)
+    return ColouredCloud(fused, colours, span, length_unit, mesh)
 
 
 def write_ply(cloud: ColouredCloud, path: Path) -> None:

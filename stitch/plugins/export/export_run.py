@@ -10,7 +10,7 @@ import typer
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust, require_new
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, results_stream, say, show_table
+from stitch.cli.terminal import emit, results_stream, say, show_table, stdout_for_results
 from stitch.errors import InputError
 from stitch.plugins.export.formats import ARM, CLOUD, HAND_EYE, LIMIT_MM
 
@@ -53,6 +53,7 @@ _J3 = Annotated[
 _Part = Annotated[int, typer.Option("--part", metavar="N", help="Of a fit with several parts: the one to follow.")]
 
 
+@stdout_for_results
 def export_run(
     run: RunFolder,
     to: _To = None,

@@ -18,7 +18,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES, length_text
 from stitch.output.stored_run import read_diagnosis, read_result
-from stitch.output.urdf_file import roll_pitch_yaw
+from stitch.output.urdf_file import roll_pitch_yaw, xml_comment
 from stitch.plugins.intake.controllers.taught_points import NUMBERS, fixed_xyz_numbers, quaternion_w_first_numbers
 
 _PARENTS = {"eye_to_hand": "base_link", "eye_in_hand": "flange"}
@@ -318,11 +318,6 @@ def row(numbers: Iterable[float], separator: str = " ") -> str:
     return separator.join(digits(x) for x in numbers)
 
 
-def commented(mark: str, lines: Sequence[str], end: str = "") -> str:
-    """Return lines of comment between a mark and an end."""
-    return "".join(f"{mark}{' '.join(line.split())}{end}\n" for line in lines)
-
-
-def xml_comment(lines: Sequence[str]) -> str:
-    """Return the same in XML, where two hyphens would end a comment."""
-    return commented("<!-- ", [line.replace("--", "–") for line in lines], " -->")
+def commented(mark: str, lines: Sequence[str]) -> str:
+    """Return lines of comment behind a mark."""
+    return "".join(f"{mark}{' '.join(line.split())}\n" for line in lines)

@@ -11,7 +11,7 @@ import typer
 
 from stitch.cli.options import Json, require_new
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, results_stream, say
+from stitch.cli.terminal import emit, results_stream, say, stdout_for_results
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ BallOption = Annotated[
 ]
 
 
+@stdout_for_results
 def detect(
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Session folder.")],
     board: BoardOption = None,

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stitch.cli.options import require_new, split_names
-from stitch.cli.terminal import results_stream, say
+from stitch.cli.terminal import results_stream, say, stdout_for_results
 
 _File = Annotated[
     Path,
@@ -39,6 +39,7 @@ _FileUnit = Annotated[str | None, typer.Option("--file-unit", help="Of a table: 
 _Inverse = Annotated[bool, typer.Option("--inverse", help="The table holds T_flange_base.")]
 
 
+@stdout_for_results
 def import_command(
     file: _File,
     output: _Output = None,

@@ -15,7 +15,7 @@ import typer
 
 from stitch.cli.options import split_names
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, say, show_next
+from stitch.cli.terminal import emit, say, show_next, stdout_for_results
 from stitch.errors import InputError
 from stitch.plugins.intake.detect import BallOption, BoardOption, parse_target_options
 
@@ -69,6 +69,7 @@ _Force = Annotated[bool, typer.Option("--force", help="Replace session.toml and 
 _Json = Annotated[bool, typer.Option("--json", help="Print the guesses as JSON.")]
 
 
+@stdout_for_results
 def init(
     folder: _Folder,
     poses: _Poses = None,

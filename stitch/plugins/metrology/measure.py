@@ -10,7 +10,7 @@ import typer
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, say, show_block, show_files, show_next, show_table
+from stitch.cli.terminal import emit, say, show_block, show_files, show_next, show_table, stdout_for_results
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ _SOURCES = 3  # that are shown of a budget
 _FEWEST_TRIALS = 200
 
 
+@stdout_for_results
 def measure(
     run: RunFolder,
     features: Annotated[

@@ -9,7 +9,7 @@ import typer
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, say, show_block, show_table
+from stitch.cli.terminal import emit, say, show_block, show_table, stdout_for_results
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _FAILS = 3  # exit code where the artefact fails
 
 
+@stdout_for_results
 def verify(
     run: RunFolder,
     session: Annotated[Path, typer.Argument(metavar="SESSION", help="Scans of an artefact, taken with that cell.")],

@@ -10,7 +10,7 @@ import typer
 
 from stitch.cli.options import Json, require_tolerance
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, say, show_table
+from stitch.cli.terminal import emit, say, show_table, stdout_for_results
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _DRIFTS = 3  # exit code where something drifts
 
 
+@stdout_for_results
 def watch(
     cells: Annotated[list[Path], typer.Argument(metavar="CELL...", help="Folder of a cell; after --add, its runs.")],
     add: Annotated[bool, typer.Option("--add", help="CELL RUN...: append runs to the history of the cell.")] = False,

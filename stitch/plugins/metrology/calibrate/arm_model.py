@@ -11,10 +11,10 @@ from stitch.model.forward import perturbed_frames
 from stitch.model.model import EffectsCovariance, Term
 from stitch.model.model_toml import ARM_PLACES, ModelFile, bind_to_session, convert_unit
 from stitch.numerics.frames import Array
+from stitch.output.session_files import robot_toml
 from stitch.output.stored_run import read_result, trusted_model
-from stitch.output.urdf_file import to_urdf
-from stitch.plugins.export.hand_eye_formats import xml_comment
-from stitch.plugins.metrology.calibrate.robot import CalibratedRobot, beyond_sentence, calibrated_robot, robot_toml
+from stitch.output.urdf_file import to_urdf, xml_comment
+from stitch.plugins.metrology.calibrate.robot import CalibratedRobot, beyond_sentence, calibrated_robot
 from stitch.session import robot as kinematics
 from stitch.session.capture import build_capture
 from stitch.session.measurement import (

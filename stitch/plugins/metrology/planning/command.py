@@ -10,7 +10,7 @@ import typer
 
 from stitch.cli.options import Json, Trust
 from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, say, show_block, show_table
+from stitch.cli.terminal import emit, say, show_block, show_table, stdout_for_results
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ _Output = Annotated[
 ]
 
 
+@stdout_for_results
 def plan_views(
     folder: _Folder,
     views: _Views = None,

@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.errors import InputError, NoResultError
-from stitch.model.model import COVERAGE_FACTOR, Model
+from stitch.model.model import Model, displacement
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.least_squares import equilibrated, generalised_fit
@@ -472,12 +472,6 @@ class ExpectedHandEye:
     def U(self) -> float:
         """Expanded uncertainty (k = 2) of the place of `middle`, length_unit: one number for all six."""
         return displacement(self.covariance, self.middle)
-
-
-def displacement(covariance: Array, middle: Array) -> float:
-    """U (k = 2) of a point (3,) of the scanner's frame under the hand-eye's covariance (6, 6), all directions."""
-    lever = np.hstack([-frames.skew(middle), np.eye(3)])
-    return float(COVERAGE_FACTOR * np.sqrt(np.trace(lever @ covariance @ lever.T)))
 
 
 def expected_hand_eye(

@@ -11,7 +11,7 @@ from uuid import uuid4
 import typer
 
 from stitch.cli.options import Json
-from stitch.cli.terminal import emit, say, show_files, show_table
+from stitch.cli.terminal import emit, say, show_files, show_table, stdout_for_results
 from stitch.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 _MOST = 100
 
 
+@stdout_for_results
 def batch(
     sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where the runs go.")] = Path("runs"),

@@ -17,8 +17,9 @@ from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
 from stitch.model.forward import corrected_capture
 from stitch.model.model import term_of
+from stitch.output.session_files import dh_rows
 from stitch.output.urdf_file import to_urdf
-from stitch.plugins.metrology.calibrate.robot import calibrated_robot_of_run, dh_rows
+from stitch.plugins.metrology.calibrate.robot import calibrated_robot_of_run
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.reading.robot_description import robot_from_dh, robot_from_urdf

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from stitch.errors import InputError
-from stitch.plugins.intake.arrays import cloud_of, poses_of, sighting_of
+from stitch.session.reading.arrays import cloud_of, poses_of, sighting_of
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.session import Cloud
 from tests.needs import needs_open3d

@@ -13,9 +13,6 @@ from scipy.spatial.transform import Rotation
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.plugins.intake.layouts import possible_layouts
-from stitch.plugins.intake.raw_poses import RawPoses
-from stitch.plugins.intake.readings import readings
 from stitch.session.reading.clouds import cloud_of_columns, measured_pixels
 from stitch.session.reading.depth_image import Intrinsics, lifted
 from stitch.session.session import Cloud, Sighting
@@ -27,8 +24,10 @@ _KNOWN = (
 )
 _NORMALS = ("nx", "ny", "nz")
 _COLOURS = ("red", "green", "blue")
-# A rotation that is one within this is taken as it is, to the last digit; another is made one.
+# A matrix that is a rotation within the first is taken as it is, to the last digit; within the second it is made one.
 _ORTHONORMAL = 1e-9
+_NEARLY_ORTHONORMAL = 1e-2
+_LAST_ROW = (0, 0, 0, 1)
 
 
 def cloud_of(item: Any, where: str, scale: float = 1.0) -> Cloud:
@@ -219,15 +218,25 @@ def poses_of(poses: Any, where: str) -> Array:
     if not np.isfinite(T).all():
         bad = int((~np.isfinite(T).all(axis=(1, 2))).argmax())
         raise InputError(f"{where}: pose {bad} is not finite; to fix: leave that view out")
-    try:
-        (layout, *_) = possible_layouts(RawPoses(where, None, T.reshape(-1, 16), ((),) * len(T), "an array"))
-    except InputError:
-        raise InputError(f"{where}: {_no_motion(T)}; write a rotation, and 0 0 0 1 in the last row") from None
-    (reading, *_) = readings(layout)
+    by_rows = _are_motions(T)
+    M = T if by_rows else T.transpose(0, 2, 1)
+    if not by_rows and not _are_motions(M):
+        raise InputError(f"{where}: {_no_motion(T)}; write a rotation, and 0 0 0 1 in the last row")
+    R = M[:, :3, :3]
+    if by_rows and _off_orthonormal(R) < _ORTHONORMAL:
+        return T
+    return frames.make(Rotation.from_matrix(R).as_matrix(), M[:, :3, 3])
+
+
+def _are_motions(T: Array) -> bool:
+    """Return True of matrices with the last row 0 0 0 1 and nearly a rotation beside it."""
     R = T[:, :3, :3]
-    plain = np.array_equal(layout.position, T[:, :3, 3])
-    exact = plain and bool(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < _ORTHONORMAL)
-    return T if exact else reading.T
+    last_row = np.allclose(T[:, 3], _LAST_ROW, atol=1e-6)
+    return last_row and _off_orthonormal(R) < _NEARLY_ORTHONORMAL and bool((np.linalg.det(R) > 0).all())
+
+
+def _off_orthonormal(R: Array) -> float:
+    return float(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max())
 
 
 def _matrices(poses: Any, where: str) -> Array:
@@ -266,7 +275,7 @@ def _joined(R: Rotation, t: Any, where: str) -> Array:
 def _no_motion(T: Array) -> str:
     """Say why the worst of the matrices is no rigid motion."""
     R = T[:, :3, :3]
-    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) + np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1)
+    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) + np.abs(T[:, 3] - _LAST_ROW).max(axis=1)
     det = np.linalg.det(R)
     worst = int(np.argmax(off + (det < 0)))
     size = np.abs(R[worst] @ R[worst].T - np.eye(3)).max()

@@ -1,0 +1,75 @@
+"""`stitch.export_run`: what `stitch export RUN --to` does, of a run in memory."""
+
+from pathlib import Path
+
+from stitch.api.run import Run
+from stitch.api.verbs import stored_cloud
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.errors import InputError
+from stitch.output.diagnosis_document import diagnosis_document
+from stitch.output.result_document import model_of, result_document
+from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured
+from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_from
+from stitch.plugins.metrology.calibrate.arm_model import ARM_FORMATS, arm_from
+from stitch.run_data import RunData
+from stitch.system.files import whole_file
+
+
+def export_run(
+    run: RunData,
+    to: str,
+    file: Path | str | None = None,
+    *,
+    parent: str | None = None,
+    child: str = "scanner",
+    diagnosis: Diagnosis | None = None,
+) -> str | None:
+    """Write what a run found for other programs, as `stitch export RUN --to` does.
+
+    Args:
+        to: ros, urdf, opencv, zivid, kuka, fanuc, abb or ur for the hand-eye; arm-dh or arm-urdf; ply, pcd, las, laz,
+            e57 or glb for the stitched cloud.
+        file: is written, whole or not at all; a cloud needs one.
+        parent, child: names of the frames that carry the scanner and are the scanner's own.
+        diagnosis: of the run; what is written says what it found.
+
+    Returns:
+        The text, of T_parent_child (4, 4) in the unit that it states, U beside it; None of a cloud, which is written in
+        the reference frame.
+
+    Raises:
+        InputError: a format that is not known, no file for a cloud, or a run that has no such thing.
+
+    Example:
+        >>> "T_flange_scanner" in stitch.export_run(run, "ros")
+        True
+        >>> stitch.export_run(run, "ply", folder / "cloud.ply")
+    """
+    path = None if file is None else Path(file)
+    if to in CLOUD_FORMATS:
+        _write_cloud(run, to, path)
+        return None
+    if to in ARM_FORMATS:
+        session = run.measured if isinstance(run, Run) and run.measured is not None else run.session
+        text = ARM_FORMATS[to](arm_from(session, model_of(run)))
+    elif to in HAND_EYE_FORMATS:
+        document = {} if diagnosis is None else diagnosis_document(diagnosis)
+        text = HAND_EYE_FORMATS[to](hand_eye_from(result_document(run), model_of(run), document, parent, child))
+    else:
+        raise InputError(
+            f"{to}: no such format; to fix: one of {', '.join((*HAND_EYE_FORMATS, *ARM_FORMATS, *CLOUD_FORMATS))}"
+        )
+    if path is not None:
+        with whole_file(path) as out:
+            out.write_text(text, encoding="utf-8")
+    return text
+
+
+def _write_cloud(run: RunData, to: str, file: Path | None) -> None:
+    if file is None or file.suffix.lower() != f".{to}":
+        raise InputError(f"{to}: where to? to fix: name the file NAME.{to}")
+    if not len(run.fused.points):
+        raise InputError(f"{run.session.name}: labelled points alone give no cloud; there is none to export")
+    write, _ = CLOUD_FORMATS[to]
+    with whole_file(file) as out:
+        write(coloured(stored_cloud(run), run.session.length_unit), out)
