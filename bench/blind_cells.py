@@ -105,7 +105,7 @@ def smallest(linear: LinearModel, effect: str, true: dict[str, float]) -> float 
     candidate = candidate_of(linear, EFFECTS[effect])
     if candidate is None:
         return None
-    linear = linear.without([effect])
+    linear = linear.restricted(linear.causes - {effect})
     values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
     fitted = np.array([not p.grid for p in candidate.parameters])
     found = []

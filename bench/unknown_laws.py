@@ -51,7 +51,7 @@ def trials(part: str, cells: Sequence[Asked], as_before: bool = False, fewer: in
         if part in MUST_SHOW and not hidden:
             continue  # these views do not show it at any size
         linear, begun = seen(a, world, rng), time.process_time()
-        linear = linear.scatter_only if as_before else linear
+        linear = linear.restricted(()) if as_before else linear
         found = gather_evidence(linear, a.candidates, USUAL)
         names = tuple(r.name for r in found.named) + ((found.second.name,) if found.second else ())
         then, group = named_after(a, world, linear, found) if part in AGAIN else ((), ())

@@ -145,7 +145,7 @@ def _laws(a: Asked, hidden: dict[str, float], rng: np.random.Generator) -> natur
 
 def _least(a: Asked, world: World) -> float:
     """Factor on the errors of a world at which one test for them, of as many as there are effects, finds them."""
-    plain = a.linear.scatter_only
+    plain = a.linear.restricted(())
     seen = plain.residual(plain.reduce(true_column(a, world)[:, None]))
     scatter = plain.satterthwaite.degrees_of_freedom(plain.in_blocks(seen))
     return float(np.sqrt(least_noncentrality(seen, 1.0, len(EFFECTS), scatter, {1.0: 1.0})) / np.linalg.norm(seen))
@@ -174,7 +174,7 @@ def _several(a: Asked, count: int, rng: np.random.Generator, k: int) -> tuple[Wo
 
 def _at(a: Asked, laws: Sequence[str], multiple: float, rng: np.random.Generator) -> tuple[World, tuple[str, ...]]:
     chance = int(rng.integers(1 << 30))
-    plain = a.linear.scatter_only
+    plain = a.linear.restricted(())
     true = drawn(a.cell.scene, a.cell.plan, a.cell.measurement, laws, chance)
     sizes = {law: smallest(plain, law, true[law]) for law in laws}
     hidden = {law: multiple * size for law, size in sizes.items() if size is not None}

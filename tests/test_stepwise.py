@@ -90,7 +90,7 @@ def test_the_uncertainty_of_the_error_on_views_left_out_is_that_between_folds(di
     """As a ratio of sums over folds (Cochran 1977, eq. 2.39), by leaving folds out one by one."""
     found = diagnosed
     judged = found.candidates[0].cross_validation
-    scored, linear = found.candidates[0].ranked.score, found.linear.scatter_only
+    scored, linear = found.candidates[0].ranked.score, found.linear.restricted(())
     squares = _squares_by_fold(linear, scored)[1]
     folds = squares.shape[1]
     shares = [np.delete(squares[0], k).sum() / np.delete(squares[1], k).sum() for k in range(folds)]

@@ -116,7 +116,7 @@ def _rescore_pair(linear: LinearModel, evidence: Evidence) -> tuple[Ranked, Rank
 def _pose_scatter(linear: LinearModel, reported: Sequence[RepeatingError]) -> tuple[float, float]:
     """Return the scatter of the poses (rad, length_unit): beside errors said to repeat, or else all of it."""
     process = reported[0].process if reported else None
-    beside = _with_joint_law(linear, reported) if reported else linear.scatter_only
+    beside = _with_joint_law(linear, reported) if reported else linear.restricted(())
     rotation, translation = np.sqrt(process.flange_scatter if process else beside.flange_scatter(beside.null))
     return float(rotation), float(translation)
 

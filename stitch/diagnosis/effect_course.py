@@ -54,7 +54,7 @@ def course_of_candidate(linear: LinearModel, scored: Score) -> EffectCourse | No
     """The course of a candidate's best form; None where nothing of it was fitted."""
     if not scored.fitted:
         return None
-    fitted = linear.scatter_only
+    fitted = linear.restricted(())
     # As the field of the part predicts it: beside scatter alone, hand-eye and effects in use fitted anew.
     own = scored if fitted is linear else score(fitted, scored.candidate)
     if not own.fitted:
@@ -72,14 +72,14 @@ def course_in_model(linear: LinearModel, term: Term) -> EffectCourse | None:
     """The course of an effect that is in the model, as it was fitted; None for one that changes points."""
     if moves_points([term]) or not (~term.gridded & (term.values != 0)).any():
         return None
-    fitted = linear.scatter_only
+    fitted = linear.restricted(())
     form = candidate_as_fitted(fitted, term).forms[0]
     return _course_of_views(fitted, term, form, term.values[form.keep], fitted.design @ fitted.baseline_trial.solve())
 
 
 def course_of_curve(linear: LinearModel, curve: JointCurve) -> EffectCourse | None:
     """How far a joint is off along what its error follows without a name, beside its mean."""
-    fitted, joint = linear.scatter_only, curve.joint - 1
+    fitted, joint = linear.restricted(()), curve.joint - 1
     law = np.interp(curve.view_values, curve.at, curve.error)
     turned = _joint_columns(fitted)[:, joint : joint + 1]
     response = turned * _of_rows(fitted, law[:, None], len(turned))

@@ -126,7 +126,7 @@ def score_pair(linear: LinearModel, first: Ranked, second: Ranked, tests: int) -
 def rescore_contenders(linear: LinearModel, contenders: Sequence[Ranked]) -> tuple[list[Ranked], LinearModel]:
     """Contenders, likeliest first, where none of them is among the errors that remain; and the model in which they
     are not: there their Bayes factors are over one and the same."""
-    base = linear.without([r.name for r in contenders])
+    base = linear.restricted(linear.causes - {r.name for r in contenders})
     if len(contenders) < 2 or base is linear:
         return list(contenders), base
     return sorted((rescored_in(base, r) for r in contenders), key=lambda r: -r.log_posterior), base
@@ -150,23 +150,28 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
         tests: candidates among which the best is chosen.
     """
     families = () if linear.pose_errors is None else tuple(linear.pose_errors.effects)
-    if not families or linear.without(families).null.deviance < linear.null.deviance:
+    if not families or linear.restricted(linear.causes - set(families)).null.deviance < linear.null.deviance:
         # No error of joints or links helps: none stands in for another.
         return ()
     known = {c.name: c for c in candidates if not c.empirical}
-    ranked = rank([score(linear.without(families), c) for c in known.values()], tests)[0]
+    ranked = rank([score(linear.restricted(linear.causes - set(families)), c) for c in known.values()], tests)[0]
     best = next((r for r in ranked if is_certain(r)), None)
     if best is None:
         return ()
     removed = {best.name}
-    while not is_certain(rank_one(linear.without(removed), known[best.name], tests)):
+    while not is_certain(rank_one(linear.restricted(linear.causes - removed), known[best.name], tests)):
         others = [name for name in families if name in known and name not in removed]
         if not others:
             return ()
         removed.add(
-            max(others, key=lambda name: score(linear.without({*removed, name}), known[best.name]).log_bayes_factor)
+            max(
+                others,
+                key=lambda name: (
+                    score(linear.restricted(linear.causes - {*removed, name}), known[best.name]).log_bayes_factor
+                ),
+            )
         )
-    base = linear.without(removed)
+    base = linear.restricted(linear.causes - removed)
     again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
     if unnamed_law_log_posterior(base) > again[0].log_posterior - limits.ODDS:
         return ()

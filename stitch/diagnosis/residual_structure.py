@@ -61,7 +61,7 @@ def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Arr
     surfaces = surfaces_of(linear)
     if surfaces is None:
         return None
-    fitted = linear.scatter_only
+    fitted = linear.restricted(())
     if scored is not None and fitted is not linear:
         scored = score(fitted, scored.candidate)
     linear = fitted
@@ -200,7 +200,7 @@ def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Depend
     Over scatter alone: what follows a covariate may also be an error of the poses that repeats; this says where it is.
     """
     if linear.pose_errors is not None:
-        linear = linear.scatter_only
+        linear = linear.restricted(())
         empirical = rank_all(linear, [r.score.candidate for r in empirical])[1]
     views = linear.measurement.views
     best: dict[str, Ranked] = {}

@@ -174,7 +174,7 @@ def score(linear: LinearModel, candidate: Candidate, start: Array | None = None)
     Args:
         start: (c,) variances to begin with; None: those of the null, or where else their maximum may lie.
     """
-    base = linear.without([candidate.name])
+    base = linear.restricted(linear.causes - {candidate.name})
     starts = (base, *base.alternative_starts)
     gained, shown = zip(*(_gains_at_null(base, at, candidate) for at in starts), strict=True)
     quick, seen = np.array([[gain.log_bayes_factor for gain in own] for own in gained]).T, any(shown)
@@ -339,7 +339,7 @@ def implausible(linear: LinearModel, limit: ScatterLimit) -> bool:
     freedom exceeds a stated one by χ²(ν)/ν at most; ν where the scatter is as stated, since what is large by chance
     looks well known.
     """
-    linear = linear.scatter_only
+    linear = linear.restricted(())
     for i, (allowed, stated) in enumerate(
         ((limit.rotation, limit.rotation_stated), (limit.translation, limit.translation_stated))
     ):

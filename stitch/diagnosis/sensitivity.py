@@ -159,7 +159,7 @@ def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -
 def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
     """Smallest detectable size of every free parameter of a candidate among so many, where it alone is not zero, by the
     form that shows it best."""
-    linear = linear.without([candidate.name])
+    linear = linear.restricted(linear.causes - {candidate.name})
     found: dict[str, dict[tuple[str, ...], list[float]]] = {}
     for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
         white, names = linear.residual(form.columns), tuple(p.name for p in form.free)

@@ -47,6 +47,7 @@ from stitch.observations.pose_errors import (
     ALL_ANGLES,
     DRIFT_MEMORY,
     JOINT_LOAD,
+    NOT_OF_ARM,
     OWN_ANGLE,
     SMOOTH_SCALE,
     TIME_ONLY,
@@ -465,7 +466,7 @@ def _laws_without_arm_errors(linear: LinearModel) -> tuple[JointLaw, ...]:
     than all of them together."""
     if not _joint_processes(linear):
         return ()
-    right = linear.without_arm
+    right = linear.restricted(NOT_OF_ARM)
     tried = joint_laws(right)
     whole = 0.5 * (right.null.deviance - linear.null.deviance)
     if tried[0].log_bayes_factor < whole:

@@ -31,7 +31,9 @@ from stitch.numerics.reml import NOISE, at_variances, fit_variances
 from stitch.numerics.units import duration_text
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import (
+    DRIFT,
     DRIFT_MEMORY,
+    JOINT_SCATTER,
     STOP_COMPONENTS,
     flange_twists,
     time_in_steps,
@@ -207,7 +209,7 @@ def significant_time_law(linear: LinearModel) -> TimeLaw | None:
 def _law_replacing_wander(linear: LinearModel) -> TimeLaw | None:
     """Return the law of a flange that wanders only by it: 20 to 1 likelier than none, and no less likely than all that
     wanders, which can do what a stretch does, so that beside it a stretch gains nothing."""
-    steady = linear.without_drift
+    steady = linear.restricted(linear.causes - DRIFT)
     law = likeliest_time_law(steady)
     wandering = 0.5 * (steady.null.deviance - linear.null.deviance)
     if law is None or law.log_bayes_factor <= max(limits.ODDS, wandering):
@@ -328,7 +330,7 @@ def significant_course(linear: LinearModel) -> FittedProcess | None:
     that errs by many small laws at once seems to scatter by its joints, and of two tracked arms of one series one was
     then not what it was named for on the other's poses.
     """
-    courses = unnamed_courses(linear.independent_only)
+    courses = unnamed_courses(linear.restricted({JOINT_SCATTER}))
     return next((course for course in courses if course.log_bayes_factor > limits.ODDS), None)
 
 
@@ -381,7 +383,7 @@ def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
     if linear.pose_errors is None:
         return _course_errors(linear)
     law = _likelier_errors(_joint_law_errors(linear), _time_law_errors(linear))
-    if _log_evidence_gain(linear, linear.independent_only.null.deviance) < limits.ODDS:
+    if _log_evidence_gain(linear, linear.restricted({JOINT_SCATTER}).null.deviance) < limits.ODDS:
         return () if law is None else (law,)
     names = linear.pose_errors.names
     kinds = {
@@ -455,5 +457,5 @@ def _deviance_without(linear: LinearModel, kind: tuple[str, ...]) -> float:
     every = np.append(np.ones(NOISE + 1, bool), keep)
     further = linear.mixed.further.select(keep)
     mixed = replace(linear.mixed, components=linear.mixed.components[every], further=further)
-    plain = np.append(linear.scatter_only.null.variances, 1e-2 * further.scales**2)
+    plain = np.append(linear.restricted(()).null.variances, 1e-2 * further.scales**2)
     return min(fit_variances(mixed, start=start).deviance for start in (linear.null.variances[every], plain))

@@ -160,7 +160,7 @@ def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
     What would be left is told of the fit that `add` makes, in which poses scatter independently; whether views left out
     are predicted, beside everything else that poses may err by.
     """
-    fitted = linear.scatter_only
+    fitted = linear.restricted(())
     beside = scored.base_model or linear
     trial, squares, scatter = _squares_by_fold(beside, scored)
     whole, alone = trial, scatter

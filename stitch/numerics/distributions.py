@@ -24,12 +24,12 @@ def nan_median(values: Array) -> Array:
     """(n,) medians over the first axis of values (m, n) without their NaN; NaN where there is nothing else."""
     known, ordered, column = np.isfinite(values).sum(axis=0), np.sort(values, axis=0), np.arange(values.shape[1])
     low, high = np.maximum(known - 1, 0) // 2, np.minimum(known // 2, len(values) - 1)
-    return np.asarray((ordered[low, column] + ordered[high, column]) / 2)
+    return (ordered[low, column] + ordered[high, column]) / 2
 
 
 def tukey(e: Array, scale: float) -> Array:
     """Biweight of residuals at a robust sigma."""
-    return np.asarray(np.clip(1 - (e / (_TUKEY * scale)) ** 2, 0, None) ** 2)
+    return np.clip(1 - (e / (_TUKEY * scale)) ** 2, 0, None) ** 2
 
 
 def chi2_tail(x: float, degrees: float) -> float:

@@ -141,11 +141,11 @@ def _normalised(histograms: Array) -> Array:
     """Each of the three histograms of a point sums to 100; one without neighbours stays 0."""
     parts = histograms.reshape(len(histograms), 3, _BINS)
     total = parts.sum(axis=2, keepdims=True)
-    return np.asarray((100 * parts / np.where(total > 0, total, 1)).reshape(len(histograms), -1))
+    return (100 * parts / np.where(total > 0, total, 1)).reshape(len(histograms), -1)
 
 
 def _unit(vectors: Array) -> Array:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
 def _sums(group: Indices, values: Array, groups: int) -> Array:
@@ -163,7 +163,7 @@ def _partners(a: Array, b: Array) -> tuple[Indices, Indices]:
 def _same_shape(a: Array, b: Array) -> NDArray[np.bool_]:
     """Whether the edges of triples a and b (K, 3, 3) have the same length."""
     edges = [np.linalg.norm(triples - np.roll(triples, 1, axis=1), axis=2) for triples in (a, b)]
-    return np.asarray((np.minimum(*edges) > _EDGE_RATIO * np.maximum(*edges)).all(axis=1))
+    return (np.minimum(*edges) > _EDGE_RATIO * np.maximum(*edges)).all(axis=1)
 
 
 def _msac_costs(T: Array, a: Array, b: Array, reach: float) -> Array:

@@ -91,7 +91,7 @@ def joint_ends(joints: Array, observed: Indices) -> list[JointEnd]:
 
 def _pose_offsets(T_base_flange: Array, lever: float) -> Array:
     """(V, 6) twists of the flange from its first pose, as lengths: the same wherever the base's frame lies."""
-    return np.asarray(frames.log(frames.inverse(T_base_flange[:1]) @ T_base_flange) * np.repeat([lever, 1.0], 3))
+    return frames.log(frames.inverse(T_base_flange[:1]) @ T_base_flange) * np.repeat([lever, 1.0], 3)
 
 
 def _regions(T_base_flange: Array, lever: float, groups: int) -> list[Indices]:

@@ -105,7 +105,7 @@ def left_jacobian(xi: Array) -> Array:
     for n in range(2, 16):
         term = term @ ad / n
         out = out + term
-    return np.asarray(out)
+    return out
 
 
 def transform(T: Array, points: Array) -> Array:
@@ -122,7 +122,7 @@ def rotate(T: Array, vectors: Array) -> Array:
     """Turn directions (..., N, 3) by the rotation of T (..., 4, 4)."""
     # A factor that lies transposed in memory costs a product of thousands of rows three times as much.
     turned = np.ascontiguousarray(np.swapaxes(np.asarray(T, float)[..., :3, :3], -1, -2))
-    return np.asarray(np.asarray(vectors) @ turned)
+    return np.asarray(vectors) @ turned
 
 
 def plane_rows(arms: Array, normals: Array) -> Array:
@@ -153,7 +153,7 @@ def to_quaternion(T: Array) -> Array:
     """Quaternions (..., 4) in the order x, y, z, w, with w ≥ 0."""
     R = np.asarray(T, float)[..., :3, :3]
     quaternion = rotations(R).as_quat(canonical=True)
-    return np.asarray(quaternion.reshape(*R.shape[:-2], 4))
+    return quaternion.reshape(*R.shape[:-2], 4)
 
 
 def rotations(R: Array) -> Any:
@@ -169,7 +169,7 @@ def nearest_rotation(matrix: Array) -> Array:
     sign = np.linalg.det(U @ Vt)
     U = U.copy()
     U[..., :, 2] *= np.sign(sign)[..., None]
-    return np.asarray(U @ Vt)
+    return U @ Vt
 
 
 def is_rigid(T: Array, tolerance: float = 1e-5) -> bool:
@@ -186,18 +186,18 @@ def angle_between(T_a: Array, T_b: Array) -> Array:
     """(...,) rotation angle (rad) between transforms (..., 4, 4)."""
     R = np.swapaxes(np.asarray(T_a, float)[..., :3, :3], -1, -2) @ np.asarray(T_b, float)[..., :3, :3]
     twice_sine = np.linalg.norm([R[..., i, j] - R[..., j, i] for i, j in ((0, 1), (1, 2), (2, 0))], axis=0)
-    return np.asarray(np.arctan2(twice_sine, np.trace(R, axis1=-2, axis2=-1) - 1))
+    return np.arctan2(twice_sine, np.trace(R, axis1=-2, axis2=-1) - 1)
 
 
 def right_jacobian_inverse(rotation: Array) -> Array:
     """(3, 3) with log(exp(r)·exp(φ)) = r + J⁻¹φ for a rotation vector r (3,) and a small turn φ (Barfoot, 7.1.4)."""
     angle, hat = float(np.linalg.norm(rotation)), skew(rotation)
     if angle < _SMALL_ANGLE:
-        return np.asarray(np.eye(3) + hat / 2 + hat @ hat / 12)
-    return np.asarray(np.eye(3) + hat / 2 + (1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2))) * hat @ hat)
+        return np.eye(3) + hat / 2 + hat @ hat / 12
+    return np.eye(3) + hat / 2 + (1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2))) * hat @ hat
 
 
 def moved_about(centre: Array, twists: Array, T: Array) -> Array:
     """Return poses T (..., 4, 4) after left twists (..., 6) about a point (3,)."""
     to_centre = make(np.eye(3), -centre)
-    return np.asarray(inverse(to_centre) @ exp(twists) @ to_centre @ T)
+    return inverse(to_centre) @ exp(twists) @ to_centre @ T

@@ -79,7 +79,7 @@ def solve_translation(left: Array, right: Array, weights: Array | None = None) -
     """t (K,) of left (M, 3, K) · t = right (M, 3), weighted least squares."""
     root = weight_roots(left, weights)[:, None]
     rows = (root[..., None] * left).reshape(right.size, -1)
-    return np.asarray(np.linalg.lstsq(rows, (root * right).ravel(), rcond=None)[0])
+    return np.linalg.lstsq(rows, (root * right).ravel(), rcond=None)[0].astype(float)
 
 
 def matched_rotations(A: Array, B: Array) -> tuple[Array, Array, Array]:
@@ -119,7 +119,7 @@ def _branch(A: Array, B: Array, alpha: Array, beta: Array, open_sign: Array) -> 
             raise NoResultError(
                 "all motions are half turns and fit two hand-eyes equally well; add views turned by another angle"
             )
-    return np.asarray(best)
+    return best
 
 
 def _triad(a1: Array, a2: Array, b1: Array, b2: Array) -> Array:
@@ -131,7 +131,7 @@ def _triad(a1: Array, a2: Array, b1: Array, b2: Array) -> Array:
         z = z / max(float(np.linalg.norm(z)), 1e-300)
         return np.column_stack([x, np.cross(z, x), z])
 
-    return np.asarray(basis(a1, a2) @ basis(b1, b2).T)
+    return basis(a1, a2) @ basis(b1, b2).T
 
 
 def _misfit(A: Array, B: Array, R: Array) -> float:
@@ -183,7 +183,7 @@ def _on_sphere(H: Array, g: Array, radius: float) -> Array:
     missing = max(radius**2 - float(x @ x), 0.0)
     if gap[0] <= 1e-12 * values[-1]:
         x[0] = np.sqrt(missing)
-    return np.asarray(vectors @ x)
+    return vectors @ x
 
 
 def daniilidis(A: Array, B: Array, weights: Array | None = None) -> Array:
@@ -297,7 +297,7 @@ def tsai_lenz(A: Array, B: Array, weights: Array | None = None) -> Array:
 
     def rodrigues(rotation: Array) -> Array:
         angle = np.linalg.norm(rotation, axis=1, keepdims=True)
-        return np.asarray(2 * np.sin(angle / 2) * rotation / np.maximum(angle, 1e-12))
+        return 2 * np.sin(angle / 2) * rotation / np.maximum(angle, 1e-12)
 
     alpha, beta, _ = matched_rotations(A, B)
     root = weight_roots(A, weights)[:, None]

@@ -31,32 +31,32 @@ def joint_kernel_factors(some: Array, others: Array, reach: float = REACH) -> Ar
     """(S, O, n) factors of that product between joints (S, n) and (O, n), rad; alike as far as `reach`, rad."""
     # cos(a − b) = 1 − 2 sin²((a − b)/2), from sines and cosines of each angle alone.
     alike = np.cos(some)[:, None] * np.cos(others) + np.sin(some)[:, None] * np.sin(others)
-    return np.asarray((1 + np.exp((alike - 1) / reach**2)) / 2)
+    return (1 + np.exp((alike - 1) / reach**2)) / 2
 
 
 def short_range_kernel(some: Array, others: Array) -> Array:
     """(S, O) of a function of one joint's angle alone, (S,) and (O,) rad, that may change within a few degrees."""
-    return np.asarray(2 * joint_kernel_factors(some[:, None], others[:, None], SHORT_REACH)[..., 0] - 1)
+    return 2 * joint_kernel_factors(some[:, None], others[:, None], SHORT_REACH)[..., 0] - 1
 
 
 def periodic_kernel(some: Array, others: Array, period: float) -> Array:
     """(S, O) of a function of one joint's angle, (S,) and (O,) rad, that repeats after a period, rad; smooth within it
     (MacKay 1998)."""
     phase = np.pi * (some[:, None] - others[None, :]) / period
-    return np.asarray(np.exp(-2 * np.sin(phase) ** 2))
+    return np.exp(-2 * np.sin(phase) ** 2)
 
 
 def two_joint_kernel(one: Array, other: Array) -> Array:
     """(V, V) of a smooth function of the angles of two joints, (V,) rad each."""
     both = np.column_stack([one, other])
-    return np.asarray((2 * joint_kernel_factors(both, both) - 1).prod(axis=2))
+    return (2 * joint_kernel_factors(both, both) - 1).prod(axis=2)
 
 
 def direction_kernel(joint: Array, travel: Array) -> Array:
     """(V, V) of a function of one joint's angle (V,) rad, smooth, and of how far it came, (V,) rad, by any law:
     continuous and no more (Ornstein–Uhlenbeck, over the range of the joint), as play, friction and settling are.
     """
-    return np.asarray(rbf_joints(joint[:, None]) * exponential_kernel(travel, travel, direction_reach(joint)))
+    return rbf_joints(joint[:, None]) * exponential_kernel(travel, travel, direction_reach(joint))
 
 
 def exponential_kernel(some: Array, others: Array, reach: float) -> Array:
@@ -68,7 +68,7 @@ def load_kernel(torques: Array) -> Array:
     """(V, V) of a continuous function of the torques (V, m) that bend one joint, each of which changes
     (Ornstein–Uhlenbeck, over the range of each)."""
     share = torques / np.ptp(torques, axis=0)
-    return np.asarray(np.exp(-np.abs(share[:, None] - share[None]).mean(axis=2)))
+    return np.exp(-np.abs(share[:, None] - share[None]).mean(axis=2))
 
 
 def direction_reach(joint: Array) -> float:
@@ -83,7 +83,7 @@ def ornstein_uhlenbeck(time: Array, memory: float, others: Array | None = None) 
         time: (V,) and memory in steps from view to view.
     """
     apart = time[:, None] - (time if others is None else others)[None, :]
-    return np.asarray(np.exp(-np.abs(apart) / memory))
+    return np.exp(-np.abs(apart) / memory)
 
 
 def same_stop(T_base_flange: Array) -> Mask:
@@ -91,7 +91,7 @@ def same_stop(T_base_flange: Array) -> Mask:
     turned = np.abs(T_base_flange[:, None, :3, :3] - T_base_flange[None, :, :3, :3]).max(axis=(2, 3))
     away = np.linalg.norm(T_base_flange[:, None, :3, 3] - T_base_flange[None, :, :3, 3], axis=2)
     reach = float(np.linalg.norm(T_base_flange[:, :3, 3], axis=1).mean())
-    return np.asarray((turned < _SAME) & (away < _SAME * max(reach, 1e-300)))
+    return (turned < _SAME) & (away < _SAME * max(reach, 1e-300))
 
 
 @dataclass(frozen=True)
@@ -126,4 +126,4 @@ def process_covariance(columns: Array, kernel: Array) -> Array:
     """
     views = len(kernel)
     own = (columns @ columns.T).reshape(views, 6, views, 6)
-    return np.asarray((own * kernel[:, None, :, None]).reshape(6 * views, 6 * views))
+    return (own * kernel[:, None, :, None]).reshape(6 * views, 6 * views)

@@ -31,7 +31,7 @@ def anderson_step(step: Array, last_step: Array, last_taken: Array) -> Array:
     change = step - last_step
     square = float(change @ change)
     share = 0.0 if square == 0 else float(np.clip(-(change @ step) / square, _NEAREST, _FARTHEST))
-    return np.asarray(step + share * (last_taken + change))
+    return step + share * (last_taken + change)
 
 
 # Where every column of a unit diagonal has more than this share of its root beside those before it, a Cholesky factor
@@ -142,7 +142,7 @@ class BlockLeastSquares:
     @cached_property
     def _weights(self) -> Array:
         """(B, m) W."""
-        return np.asarray(1 / np.einsum("bii->bi", self.covariance))
+        return 1 / np.einsum("bii->bi", self.covariance)
 
     @cached_property
     def _rows(self) -> Array:
@@ -161,7 +161,7 @@ class BlockLeastSquares:
 
     def residual_vectors(self, estimates: Array) -> Array:
         """(B, k) XᵀW(z − X·x) of every block."""
-        return np.asarray(np.einsum("bmk,bm->bk", self.X, self._weights * (self.z - self.X @ estimates)))
+        return np.einsum("bmk,bm->bk", self.X, self._weights * (self.z - self.X @ estimates))
 
     def solve(self, left_out: Array | Indices | None = None) -> Array:
         """(k,) estimates, without some blocks."""
@@ -179,20 +179,20 @@ class BlockLeastSquares:
         scaled = (sums[:k, :k] + prior) * np.outer(unit, unit)
         root, failed = dpotrf(scaled, lower=1, clean=0)
         if not failed and np.diag(root).min() > _SOLVABLE:
-            return np.asarray(dpotrs(root, vector * unit, lower=1)[0] * unit)
-        return np.asarray(_pseudo_inverse(scaled, unit) @ vector)
+            return dpotrs(root, vector * unit, lower=1)[0] * unit
+        return _pseudo_inverse(scaled, unit) @ vector
 
     def estimates_covariance(self) -> Array:
         """(k, k) of the estimates under the blocks' full covariance."""
         weighted = self.X * self._weights[..., None]
         spread = np.einsum("bmk,bmn,bnl->kl", weighted, self.covariance, weighted, optimize=True)
         inverse = self._inverse
-        return np.asarray(inverse @ (spread + np.diag(self.precision)) @ inverse)
+        return inverse @ (spread + np.diag(self.precision)) @ inverse
 
     def shift_by_errors(self, errors: Array) -> Array:
         """(k, q) how far errors (B, m, q) of the blocks, which nobody models, move the estimates."""
         pulls = np.einsum("bmk,bm,bmq->kq", self.X, self._weights, errors, optimize=True)
-        return np.asarray(self._inverse @ pulls)
+        return self._inverse @ pulls
 
     @cached_property
     def _inverse(self) -> Array:
@@ -207,7 +207,7 @@ class BlockLeastSquares:
 def _summed(X: Array) -> Array:
     """(k, k) Σ_b XᵀX of (B, m, k)."""
     flat = X.reshape(-1, X.shape[2])
-    return np.asarray(flat.T @ flat)
+    return flat.T @ flat
 
 
 def _pseudo_inverse(scaled: Array, unit: Array) -> Array:
@@ -215,7 +215,7 @@ def _pseudo_inverse(scaled: Array, unit: Array) -> Array:
     values, vectors = np.linalg.eigh(scaled)
     shown = np.abs(values) > 1e-14 * np.abs(values).max(initial=0.0)
     vectors = vectors[:, shown] * unit[:, None]
-    return np.asarray((vectors / values[shown]) @ vectors.T)
+    return (vectors / values[shown]) @ vectors.T
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ class GeneralisedFit:
 
     def solve(self, z: Array, prior_vector: Array) -> Array:
         """(a,) from what was seen (n,), and the prior's precision times its middle (a,)."""
-        return np.asarray(self.gain @ z + self.covariance @ prior_vector)
+        return self.gain @ z + self.covariance @ prior_vector
 
 
 def generalised_fit(noise: Array, columns: Array, precision: Array) -> GeneralisedFit:
@@ -250,15 +250,15 @@ def column_space(columns: Array, relative: float = 1e-9) -> Array:
         values, vectors = np.linalg.eigh(scaled.T @ scaled)
         says = values > _SAYS_SOMETHING
         if relative**2 <= _SAYS_NOTHING and (says | (values < _SAYS_NOTHING)).all():
-            return np.asarray(scaled @ (vectors[:, says] / np.sqrt(values[says])))
+            return scaled @ (vectors[:, says] / np.sqrt(values[says]))
     U, s, _ = np.linalg.svd(scaled, full_matrices=False)
-    return np.asarray(U[:, s > relative * s[0]])
+    return U[:, s > relative * s[0]]
 
 
 def fit_columns(columns: Array, values: Array) -> Array:
     """(K,) least squares of columns (n, K), whatever their units, to values (n,)."""
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    return np.asarray(np.linalg.lstsq(columns / scale, values, rcond=1e-10)[0] / scale)
+    return np.linalg.lstsq(columns / scale, values, rcond=1e-10)[0] / scale
 
 
 def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Array:
@@ -267,7 +267,7 @@ def least_squares(matrix: Array, vector: Array, relative: float = 1e-10) -> Arra
     values, vectors = np.linalg.eigh(scaled)
     keep = values > relative * values[-1]
     projected = vectors[:, keep].T @ (-vector * unit) / values[keep]
-    return np.asarray(unit * (vectors[:, keep] @ projected))
+    return unit * (vectors[:, keep] @ projected)
 
 
 def summed_squares(blocks: Array) -> Array:
@@ -276,7 +276,7 @@ def summed_squares(blocks: Array) -> Array:
     One matrix product: with hundreds of views a sum over three indices takes a hundred times as long.
     """
     wide = blocks.transpose(1, 0, 2).reshape(blocks.shape[1], -1)
-    return np.asarray(wide @ wide.T)
+    return wide @ wide.T
 
 
 # Which parameters the views can know: absolute first, then beside the hand-eye and each other.
@@ -306,7 +306,7 @@ def project_out(base: Array, columns: Array) -> Array:
     if not base.shape[1]:
         return columns
     U = column_space(base)
-    return np.asarray(columns - U @ (U.T @ columns))
+    return columns - U @ (U.T @ columns)
 
 
 # What one of two models leaves of the mean square error that the other leaves.

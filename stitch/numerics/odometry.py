@@ -133,10 +133,10 @@ class _ToTheTimeOfTheScan:
     def preprocess(self, points: Array, times: Array, T_last_now: Array) -> Array:
         """Return points (N, 3) as seen from where the scanner was at time 0."""
         if not len(times):
-            return np.asarray(self._own.preprocess(points, times, T_last_now))
+            return self._own.preprocess(points, times, T_last_now)
         velocity = frames.log(T_last_now) / self._interval
         at_end = self._own.preprocess(points, times, frames.exp(np.ptp(times) * velocity))
-        return np.asarray(frames.transform(frames.exp(times.max() * velocity), at_end))
+        return frames.transform(frames.exp(times.max() * velocity), at_end)
 
 
 def turned_pairs(T_reference_mount: Array) -> list[tuple[int, int]]:
@@ -164,7 +164,7 @@ def motions_of_stream(T_reference_mount: Array, odometry: Array) -> tuple[Array,
 
 def angle_differences(A: Array, B: Array) -> Array:
     """Return by how much the rotation angles of motions (M, 4, 4) differ, (M,) rad."""
-    return np.asarray(np.abs(frames.angle_between(np.eye(4), A) - frames.angle_between(np.eye(4), B)))
+    return np.abs(frames.angle_between(np.eye(4), A) - frames.angle_between(np.eye(4), B))
 
 
 def motions_between(poses: Array, pairs: Sequence[tuple[int, int]]) -> Array:

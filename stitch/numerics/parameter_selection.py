@@ -44,7 +44,7 @@ def log_evidence(information: Array, vector: Array, precision: Array | None = No
     both = information * np.outer(unit, unit) + P
     pull = vector * unit + P @ m
     square = np.sum(pull * np.linalg.solve(both, pull[..., None])[..., 0], axis=-1) - m @ P @ m
-    return np.asarray(0.5 * (square - np.linalg.slogdet(both)[1] + np.linalg.slogdet(P)[1]))
+    return 0.5 * (square - np.linalg.slogdet(both)[1] + np.linalg.slogdet(P)[1])
 
 
 def log_evidence_at_scales(information: Array, vector: Array, scales: dict[float, float]) -> Array:
@@ -69,7 +69,7 @@ def log_mixture(logs: Array, scales: dict[float, float]) -> float:
 
 def log_mean_exp(logs: Sequence[float] | Array) -> Array:
     """(…) log of the mean over n factors, from their logs (n, …)."""
-    return np.asarray(logsumexp(logs, axis=0) - np.log(len(logs)))
+    return logsumexp(logs, axis=0) - np.log(len(logs))
 
 
 # Log Bayes factor that a group must add: 12 to 1, as a name must in the diagnosis.

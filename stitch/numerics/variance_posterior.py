@@ -146,7 +146,7 @@ def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
                 total[i] += (turn >= burnt) * float(weights @ grid)
         if kin:
             factor = _draw_factor(rng, [densities[i][:, at[i]] for i in kin])
-    return np.asarray(total / rounds)
+    return total / rounds
 
 
 def _common_factor_mask(mixed: MixedModel) -> Mask:
@@ -211,4 +211,4 @@ def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, dens
     times = np.maximum(1 + (grid[:, None] - current[i]) * values, 1e-12)
     logs = density - 0.5 * (np.log(times) + along**2 / values * (1 / times - 1)).sum(axis=1)
     weights = np.exp(logs - logs.max())
-    return np.asarray(weights / weights.sum())
+    return weights / weights.sum()

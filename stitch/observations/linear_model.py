@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -38,8 +38,6 @@ from stitch.numerics.variance_posterior import Satterthwaite, satterthwaite
 from stitch.observations.pose_errors import JOINT_SCATTER, USUAL_JOINT_SCATTER, PoseErrors
 from stitch.session.measurement import Measurement
 
-# Numbers that were seen, and how they may err: components of a covariance, their sizes, models with fewer.
-
 # The first components of whatever was observed, by their names; what poses err beside follows them.
 WHITE_COMPONENTS = ("white rotation", "white translation", "sensor noise")
 # A component that is as good as absent, as a share of the variance that it usually has.
@@ -51,12 +49,6 @@ _REMEMBERED, _REMEMBERED_NUMBERS = 12, 200_000
 _SETS_AT_ONCE = 16
 # Among more numbers a search takes a second: one from the likeliest start must do.
 _SINGLE_START_SIZE = 250
-
-
-def with_pose_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
-    """The mixed model of one block with scatter, noise, and what the poses err beside."""
-    components = np.concatenate([mixed.components[: NOISE + 1], errors.components[:, None]])
-    return replace(mixed, components=components, further=errors.prior, common=None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,13 +70,11 @@ class ErrorModel:
         return satterthwaite(self.mixed, self.null)
 
     def flange_scatter(self, fit: VarianceFit) -> Array:
-        """(2,) variances along an axis by which the flange turns and moves anew in every view, by its joints too."""
-        own = fit.variances[:NOISE]
+        """Return variances (2,) along an axis by which the flange turns and moves anew in a view, by its joints too."""
+        white = fit.variances[:NOISE]
         if JOINT_SCATTER not in self.component_names:
-            return own
-        return np.asarray(
-            own + fit.variances[NOISE + 1 + self.component_names.index(JOINT_SCATTER)] * self.flange_per_joint
-        )
+            return white
+        return white + fit.variances[NOISE + 1 + self.component_names.index(JOINT_SCATTER)] * self.flange_per_joint
 
     @property
     def component_names(self) -> tuple[str, ...]:
@@ -92,6 +82,11 @@ class ErrorModel:
         if self.pose_errors is not None:
             return self.pose_errors.names
         return (JOINT_SCATTER,) if self.mixed.further is not None else ()
+
+    @property
+    def causes(self) -> frozenset[str]:
+        """Names of all that poses err by beside white scatter: effects of the library, and other components."""
+        return frozenset(self.component_names) if self.pose_errors is None else self.pose_errors.causes
 
     def in_blocks(self, columns: Array) -> Array:
         """(B, m, P) columns (n, P) as the variance components take them."""
@@ -108,97 +103,77 @@ class ErrorModel:
         return whitener(self.mixed, self.null.variances)
 
     def whiten(self, columns: Array, blocks: Indices | None = None) -> Array:
-        """(n, P) columns of the channel in units of the null's scatter; of some of its blocks alone, if named."""
-        own, half = self.in_blocks(columns), self._whitening
+        """Return columns (n, P) in units of the null's scatter; of some of the blocks alone, if named."""
+        X, half = self.in_blocks(columns), self._whitening
         if blocks is not None:
-            own, half = own[blocks], half[blocks]
-        return np.asarray((half @ own).reshape(-1, columns.shape[1]))
+            X, half = X[blocks], half[blocks]
+        return (half @ X).reshape(-1, columns.shape[1])
 
-    def without(self, effects: Collection[str]) -> Self:
-        """The model in which an arm does not err by some effects of the library, of any size."""
-        own = frozenset(effects) & frozenset({} if self.pose_errors is None else self.pose_errors.effects)
-        if not own or self.pose_errors is None:
+    def restricted(self, keep: Collection[str]) -> Self:
+        """Return the model in which poses err by these `causes` alone, sizes fitted anew; () leaves white scatter.
+
+        Each set is fitted once. Where the covariance counts no scatter of known joints, it does if that is to stay.
+        """
+        possible = self.causes if self.offsets is None else self.causes | {JOINT_SCATTER}
+        kept = possible.intersection(keep)
+        if kept == self.causes:
             return self
-        if own not in self._reduced:
-            errors = self.pose_errors.without(own)
-            started = replace(self, mixed=with_pose_errors(self.mixed, errors), pose_errors=errors, full_model=self)
-            self._reduced[own] = started.refit()
-        return self._reduced[own]
+        if kept not in self._restricted:
+            self._restricted[kept] = self._fit_restricted(kept)
+        return self._restricted[kept]
 
     @cached_property
-    def _reduced(self) -> dict[frozenset[str], Self]:
-        """What `without` has found already."""
+    def _restricted(self) -> dict[frozenset[str], Self]:
+        """What `restricted` has fitted already."""
         return {}
 
-    def refit(self) -> Self:
-        """The same with the null fitted anew, from every place where its maximum may lie."""
-        starts = [other.null for other in self.alternative_starts]
-        starts += [at_variances(self.mixed, self.null.variances)] if self.full_model is None else []
-        if self.mixed.size > _SINGLE_START_SIZE:
-            starts = [min(starts, key=lambda fit: fit.deviance)]
-        begun = [fit_variances(self.mixed, start=fit.variances) for fit in starts]
-        return replace(self, null=min(begun, key=lambda fit: fit.deviance))
-
-    @cached_property
-    def scatter_only(self) -> Self:
-        """As if the flange alone erred, anew in every view."""
-        if self.mixed.further is None:
-            return self
-        mixed = replace(self.mixed, components=self.mixed.components[: NOISE + 1], further=None)
-        return replace(
-            self, mixed=mixed, null=fit_variances(mixed, both_starts=True), pose_errors=None, full_model=None
-        )
-
-    @cached_property
-    def without_arm(self) -> Self:
-        """As if neither joints nor links erred again, from pose to pose."""
-        return self if self.pose_errors is None else self._restricted_to(self.pose_errors.without_arm())
-
-    @cached_property
-    def independent_only(self) -> Self:
-        """As if poses erred anew in every view, by their joints or as a whole."""
+    def _fit_restricted(self, kept: frozenset[str]) -> Self:
+        if not kept:
+            mixed = replace(self.mixed, components=self.mixed.components[: NOISE + 1], further=None)
+            null = fit_variances(mixed, both_starts=True)
+            return replace(self, mixed=mixed, null=null, pose_errors=None, full_model=None)
         if self.pose_errors is not None:
-            return self._restricted_to(self.pose_errors.independent_only())
-        if self.offsets is None:
-            return self
+            errors = self.pose_errors.restricted(kept)
+            mixed = with_pose_errors(self.mixed, errors)
+            return replace(self, mixed=mixed, pose_errors=errors, full_model=self).refit()
+        assert self.offsets is not None
         components = np.concatenate([self.mixed.components, (self.offsets @ self.offsets.transpose(0, 2, 1))[None]])
         further = FurtherPrior(np.array([USUAL_JOINT_SCATTER]), np.array([ALWAYS_PRESENT]), np.zeros(1, bool))
         mixed = replace(self.mixed, components=components, further=further, common=None)
         return replace(self, mixed=mixed, offsets=None, null=fit_variances(mixed, both_starts=True))
 
-    @cached_property
-    def without_drift(self) -> Self:
-        """As if the flange did not wander in time."""
-        return self if self.pose_errors is None else self._restricted_to(self.pose_errors.without_drift())
-
-    def _restricted_to(self, errors: PoseErrors) -> Self:
-        """With some of the pose errors alone."""
-        assert self.pose_errors is not None
-        mixed = with_pose_errors(self.mixed, errors)
-        few = np.append(self.scatter_only.null.variances, _NEGLIGIBLE_SHARE * errors.scales**2)
-        kept = np.array([name in errors.names for name in self.pose_errors.names], bool)
-        same = self.null.variances[np.append(np.ones(NOISE + 1, bool), kept)]
-        null = min((fit_variances(mixed, start=start) for start in (few, same)), key=lambda fit: fit.deviance)
-        return replace(self, mixed=mixed, null=null, pose_errors=errors, full_model=None)
+    def refit(self) -> Self:
+        """Return the same with the null fitted anew, from every place where its maximum may lie."""
+        starts = [other.null for other in self.alternative_starts]
+        starts += [at_variances(self.mixed, self.null.variances)] if self.full_model is None else []
+        if self.mixed.size > _SINGLE_START_SIZE:
+            starts = [min(starts, key=lambda fit: fit.deviance)]
+        fits = [fit_variances(self.mixed, start=fit.variances) for fit in starts]
+        return replace(self, null=min(fits, key=lambda fit: fit.deviance))
 
     @cached_property
     def alternative_starts(self) -> tuple[Self, ...]:
-        """The same at other variances than those of the null, where beside a further effect its maximum may lie: where
-        there is nothing but scatter, as much as without other errors or as much as beside them, and where the whole of
-        the pose errors has them."""
+        """The same at other variances, where beside a further effect the maximum may lie.
+
+        Where there is nothing but scatter, as much as without other errors or as much as beside them; and where the
+        whole of the pose errors has them.
+        """
         if self.pose_errors is None:
             return ()
         whole = self.full_model or self
         few = _NEGLIGIBLE_SHARE * self.pose_errors.scales**2
-        found = [np.append(null.variances[: NOISE + 1], few) for null in (whole.scatter_only.null, self.null)]
+        starts = [np.append(fit.variances[: NOISE + 1], few) for fit in (whole.restricted(()).null, self.null)]
         if self.full_model is not None and self.full_model.pose_errors is not None:
-            own = dict(zip(self.full_model.pose_errors.names, self.full_model.null.variances[NOISE + 1 :], strict=True))
-            kept = [own[name] for name in self.pose_errors.names]
-            found.append(np.append(self.full_model.null.variances[: NOISE + 1], kept))
-        return tuple(replace(self, null=at_variances(self.mixed, variances)) for variances in found)
+            fitted = self.full_model.null.variances
+            by_name = dict(zip(self.full_model.pose_errors.names, fitted[NOISE + 1 :], strict=True))
+            starts.append(np.append(fitted[: NOISE + 1], [by_name[name] for name in self.pose_errors.names]))
+        return tuple(replace(self, null=at_variances(self.mixed, variances)) for variances in starts)
 
 
-# How what was seen answers to the parameters of one effect.
+def with_pose_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
+    """Return the mixed model of one block with scatter, noise, and what the poses err beside."""
+    components = np.concatenate([mixed.components[: NOISE + 1], errors.components[:, None]])
+    return replace(mixed, components=components, further=errors.prior, common=None)
 
 
 class PointSums(Protocol):
@@ -363,12 +338,12 @@ class LinearModel(ErrorModel):
     def residual(self, columns: Array) -> Array:
         """(n, P) whitened columns of the channel, what the model explains projected out."""
         white = self.whiten(columns)
-        return np.asarray(white - self._explained @ (self._explained.T @ white))
+        return white - self._explained @ (self._explained.T @ white)
 
     def information(self, columns: Sequence[SelectedColumns]) -> Iterator[tuple[Array, Array]]:
         """Per set of columns (n, P) of the channel what the views tell of their coefficients θ beside the model: (P, P)
         and (P,) of the log likelihood vᵀθ − ½ θᵀIθ."""
-        kept = self.mixed.common is not None and self.mixed.are_kept
+        kept = self.mixed.common is not None and self.mixed.sums.are_kept
         if kept and all(own.keep is not None for own in columns):
             yield from map(self._own_information.of, columns)
             return
@@ -387,7 +362,7 @@ class LinearModel(ErrorModel):
     def conditioned_on(
         self, columns: Array | Sequence[SelectedColumns], sizes: Array, start: Array | None = None
     ) -> "LinearModel":
-        """The linear model with further free columns (n, p) of the channel, of parameters of plausible sizes (p,).
+        """Return the linear model with further free columns (n, p), of parameters of plausible sizes (p,).
 
         Args:
             start: (c,) variances to begin with; None: those of the null.
@@ -395,26 +370,33 @@ class LinearModel(ErrorModel):
         sets = [SelectedColumns(columns)] if isinstance(columns, np.ndarray) else columns
         if self.mixed.common is None:
             # Nothing holds the whole sets: asked as columns.
-            sets = [SelectedColumns(np.hstack([own.columns for own in sets]))]
-        key = hash(tuple(own.key for own in sets)), hash(sizes.tobytes())
-        found = self._conditioned.get(key)
-        if found is None:
+            sets = [SelectedColumns(np.hstack([selected.columns for selected in sets]))]
+        key = (*(selected.key for selected in sets), sizes.tobytes())
+        conditioned = self._conditioned.get(key)
+        if conditioned is None:
             further = FurtherColumns(self.mixed, sets)
-            mixed, new = further.in_mean(), further.G.reshape(self.mixed.z.size, -1)
-            design = np.hstack([self.design, self.observation.expand(new)])
-            own = np.append(self.sizes, sizes), np.append(self.values, np.zeros(len(sizes)))
-            found = replace(self, design=design, sizes=own[0], values=own[1], mixed=mixed, full_model=None)
+            mixed = further.in_mean()
+            response = self.observation.expand(further.G.reshape(self.mixed.z.size, -1))
+            conditioned = replace(
+                self,
+                design=np.hstack([self.design, response]),
+                sizes=np.append(self.sizes, sizes),
+                values=np.append(self.values, np.zeros(len(sizes))),
+                mixed=mixed,
+                full_model=None,
+            )
             if self.pose_errors is None:
-                found = replace(found, null=fit_variances(mixed, start=self.null.variances if start is None else start))
+                null = fit_variances(mixed, start=self.null.variances if start is None else start)
+                conditioned = replace(conditioned, null=null)
             else:
-                found = found.refit()
+                conditioned = conditioned.refit()
             if len(self._conditioned) >= min(_REMEMBERED, _REMEMBERED_NUMBERS // max(self.mixed.size, 1)):
                 self._conditioned.clear()
-            self._conditioned[key] = found
-        return found
+            self._conditioned[key] = conditioned
+        return conditioned
 
     @cached_property
-    def _conditioned(self) -> dict[tuple[int, int], "LinearModel"]:
+    def _conditioned(self) -> dict[tuple[Any, ...], "LinearModel"]:
         """What `conditioned_on` has found last: effects are asked beside the same others several times."""
         return {}
 

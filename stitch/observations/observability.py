@@ -73,7 +73,7 @@ def visible_twists(captures: Sequence[Capture], T_mount: Array, part: tuple[Arra
     # A turn about the part carries the scanner along; where it stands is not seen, so there it stays.
     shifts = hidden_translations(captures, T_mount)
     columns[3:] -= shifts @ (shifts.T @ columns[3:])
-    return np.asarray(columns)
+    return columns
 
 
 def hidden_translations(captures: Sequence[Capture], T_mount: Array) -> Array:
@@ -85,7 +85,7 @@ def hidden_translations(captures: Sequence[Capture], T_mount: Array) -> Array:
         total += np.einsum("vji,vjk->ik", off, off)
         views += len(R)
     values, vectors = np.linalg.eigh(total / views)
-    return np.asarray(T_mount[:3, :3].T @ vectors[:, values < _VISIBLE**2])
+    return T_mount[:3, :3].T @ vectors[:, values < _VISIBLE**2]
 
 
 def unknown_numbers(captures: Sequence[Capture], T_mount: Array) -> tuple[str, ...]:

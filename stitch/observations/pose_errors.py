@@ -39,8 +39,6 @@ from stitch.numerics.kernels import (
 from stitch.numerics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
 from stitch.session.measurement import STILL, Measurement, Torques
 
-# What joints and links of any arm do a little wrong: effects of the library, and the twists of the views by them.
-
 # What every joint does anew in every view, and how much of it is usual, as a share of a plausible offset: as much as
 # the flange turns.
 JOINT_SCATTER, USUAL_JOINT_SCATTER = "joint scatter", 0.02
@@ -48,6 +46,36 @@ _OFFSET = "joint_offset"
 # What every arm does wrong: numbers for every joint that its angles or its torques alone decide.
 _ARM_COVARIATES = ("joints", "torque")
 EFFECT_FAMILY = {"gear_eccentricity": "gears", "gear_harmonic": "gears", "backlash": "play", "settling": "play"}
+# Usual sizes, rad and mm.
+_ROTATION, _TRANSLATION = 2e-5, 0.02
+_PER_MM = {"mm": 1.0, "m": 1e-3}
+# What wanders, with correlation times in steps from view to view: what the next views forget, and what lasts as long as
+# a usual session. Each has a size of its own: how much neighbours differ says how large it is, its memory what of it
+# all views share; with both in one size that was understated.
+DRIFT_MEMORY = {"quickly wandering": 2.0, "slowly wandering": 20.0}
+# Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
+# smaller.
+_ARM_SCALE, SMOOTH_SCALE = 0.1, 0.03
+# What the scans of a stop share.
+STOP_COMPONENTS = ("stop rotation", "stop translation")
+# Dense matrices of more views take minutes in a fit; there the scatter alone must do.
+_MOST_VIEWS = 150
+# A diagnosis scores every candidate beside all errors that poses may have, which takes a minute for so many views. From
+# there on poses count as scattering independently, and effects are sought several at once (`diagnosis/regime.py`).
+MANY_VIEWS = 100
+_CONSTANT_EFFECTS = ("joint_offset", "link_geometry")
+# Causes by what they are: what wanders in time, what the scans of a stop share, and all that is none of the arm's.
+DRIFT, STOP = frozenset(DRIFT_MEMORY), frozenset(STOP_COMPONENTS)
+NOT_OF_ARM = DRIFT | STOP | {JOINT_SCATTER}
+# What a joint may follow that errs by no law that anybody wrote down: all joint angles smoothly, its own and one other,
+# its own within a few degrees or in waves, the way it came, time, at each pose in another way or in the same, or what
+# bends it.
+ALL_ANGLES, OWN_ANGLE, TRAVEL, WITH_TIME = "all angles", "own angle", "the way it came", "time"
+JOINT_LOAD, TWO_ANGLES, WAVES, TIME_ONLY = "its load", "its angle and another", "waves of its angle", "time alone"
+# A joint that turns less stands still, rad: what follows its angle alone is the same in all views, and has a name.
+_STATIONARY_RANGE = 1e-3
+# Waves along a joint: two over its range at the least, half a wave more or less looks alike, none shorter than 10°.
+_MIN_WAVES, _WAVE_STEP, _SHORTEST_PERIOD, _MAX_WAVES = 2.0, 0.5, float(np.radians(10.0)), 14.0
 
 
 def arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
@@ -84,17 +112,6 @@ def joint_offset_twists(measurement: Measurement, model: Model, centre: Array) -
     return effect_twists(measurement, model, centre, [EFFECTS[_OFFSET]])
 
 
-# How a flange errs whatever the joints do: how much it usually turns and moves, and how long that lasts.
-
-# Usual sizes, rad and mm.
-_ROTATION, _TRANSLATION = 2e-5, 0.02
-_PER_MM = {"mm": 1.0, "m": 1e-3}
-# What wanders, with correlation times in steps from view to view: what the next views forget, and what lasts as long as
-# a usual session. Each has a size of its own: how much neighbours differ says how large it is, its memory what of it
-# all views share; with both in one size that was understated.
-DRIFT_MEMORY = {"quickly wandering": 2.0, "slowly wandering": 20.0}
-
-
 def usual_twist(length_unit: str) -> Array:
     """(6,) how much a flange usually turns (rad) and moves."""
     return np.repeat([_ROTATION, _TRANSLATION * _PER_MM[length_unit]], 3)
@@ -111,7 +128,7 @@ def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array])
         frames.adjoint(frames.make(np.eye(3), -centre) @ m.capture.T_reference_flange)
         for m, centre in zip(measurements, centres, strict=True)
     ]
-    return np.asarray(np.concatenate(own).reshape(-1, 6) * unit)
+    return np.concatenate(own).reshape(-1, 6) * unit
 
 
 def mean_square_per_axis(columns: Array, measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
@@ -121,7 +138,7 @@ def mean_square_per_axis(columns: Array, measurements: Sequence[Measurement], ce
     unit = usual_twist(measurements[0].length_unit)
     own = unit[:, None] * np.linalg.solve(flange, columns.reshape(len(flange), 6, -1))
     squares = (own**2).sum(axis=2).mean(axis=0)
-    return np.asarray(squares.reshape(2, 3).mean(axis=1))
+    return squares.reshape(2, 3).mean(axis=1)
 
 
 def drift_kernel(measurements: Sequence[Measurement], memory: float) -> Array:
@@ -141,27 +158,13 @@ def drift_kernel(measurements: Sequence[Measurement], memory: float) -> Array:
 def time_in_steps(measurement: Measurement) -> Array:
     """(V,) times of the views in usual steps from one to the next; their numbers where no time is stated."""
     views, step = measurement.views, usual_time_step(measurement)
-    return np.asarray(views.time / step if step > 0 else np.arange(views.count, dtype=float))
+    return views.time / step if step > 0 else np.arange(views.count, dtype=float)
 
 
 def usual_time_step(measurement: Measurement) -> float:
     """From one view to the next, s; 0 where no time is stated."""
     steps = np.diff(measurement.views.time)
     return float(np.median(steps)) if measurement.views.has("time") and (steps > 0).any() else 0.0
-
-
-# What one joint may do by no law that anybody wrote down: processes by what it follows, in none of the components of
-# the prior of pose errors.
-
-# What a joint may follow that errs by no law that anybody wrote down: all joint angles smoothly, its own and one other,
-# its own within a few degrees or in waves, the way it came, time, at each pose in another way or in the same, or what
-# bends it.
-ALL_ANGLES, OWN_ANGLE, TRAVEL, WITH_TIME = "all angles", "own angle", "the way it came", "time"
-JOINT_LOAD, TWO_ANGLES, WAVES, TIME_ONLY = "its load", "its angle and another", "waves of its angle", "time alone"
-# A joint that turns less stands still, rad: what follows its angle alone is the same in all views, and has a name.
-_STATIONARY_RANGE = 1e-3
-# Waves along a joint: two over its range at the least, half a wave more or less looks alike, none shorter than 10°.
-_MIN_WAVES, _WAVE_STEP, _SHORTEST_PERIOD, _MAX_WAVES = 2.0, 0.5, float(np.radians(10.0)), 14.0
 
 
 def joint_processes(
@@ -189,7 +192,7 @@ def joint_processes(
 
 def _moving_joints(joints: Array) -> Mask:
     """(n,) joints that do not stand still in all views (V, n), rad."""
-    return np.asarray(np.ptp(joints, axis=0) > _STATIONARY_RANGE)
+    return np.ptp(joints, axis=0) > _STATIONARY_RANGE
 
 
 def _own_angle_processes(joints: Array, travel: Array, offsets: Array) -> dict[str, SmoothErrors]:
@@ -273,19 +276,6 @@ def _load_processes(torques: Sequence[Torques], offsets: Array) -> dict[str, Smo
     return {JOINT_LOAD: SmoothErrors(offsets[:, bent], alike, bent)}
 
 
-# Scales of the half-Cauchy priors: of the arm in plausible sizes of the library's effects; what is smooth is usually
-# smaller.
-_ARM_SCALE, SMOOTH_SCALE = 0.1, 0.03
-# What the scans of a stop share.
-STOP_COMPONENTS = ("stop rotation", "stop translation")
-# Dense matrices of more views take minutes in a fit; there the scatter alone must do.
-_MOST_VIEWS = 150
-# A diagnosis scores every candidate beside all errors that poses may have, which takes a minute for so many views. From
-# there on poses count as scattering independently, and effects are sought several at once (`diagnosis/regime.py`).
-MANY_VIEWS = 100
-_CONSTANT_EFFECTS = ("joint_offset", "link_geometry")
-
-
 def usual_sizes() -> dict[str, float]:
     """Variances that errors of a usual arm have, by component; what repeats at one stop is part of the others."""
     arm = ("joint_offset", "link_geometry", "joint_compliance", *EFFECT_FAMILY.values())
@@ -312,20 +302,21 @@ class PoseErrors:
     scatter: tuple[float, float] | None = None
 
     @property
+    def causes(self) -> frozenset[str]:
+        """Names of all that poses may err by: effects of the library, and components that are not made of such."""
+        of_effects = {component for component, _ in self.effects.values()}
+        return frozenset(self.effects) | {name for name in self.names if name not in of_effects}
+
+    @property
     def arm_components(self) -> Mask:
         """(c,) what joints and links do again: on a good arm all of it is small."""
-        return np.array([name not in (*DRIFT_MEMORY, *STOP_COMPONENTS, JOINT_SCATTER) for name in self.names], bool)
+        return np.array([name not in NOT_OF_ARM for name in self.names], bool)
 
     @property
     def prior(self) -> FurtherPrior:
         """What is believed of their sizes; every arm scatters by its joints, all else may be absent."""
-        shapes = np.where(self._independent, ALWAYS_PRESENT, MAY_BE_ABSENT)
+        shapes = np.where(np.array(self.names) == JOINT_SCATTER, ALWAYS_PRESENT, MAY_BE_ABSENT)
         return FurtherPrior(self.scales, shapes, self.arm_components, self.scatter)
-
-    @property
-    def _independent(self) -> Mask:
-        """(c,) what joints do anew in every view."""
-        return np.array([name == JOINT_SCATTER for name in self.names], bool)
 
     def project(self, reduction: Array) -> "PoseErrors":
         """The same of numbers reduction (n, 6V) @ twists."""
@@ -335,41 +326,22 @@ class PoseErrors:
             effects={name: (component, reduction @ own) for name, (component, own) in self.effects.items()},
         )
 
-    def without(self, effects: Collection[str]) -> "PoseErrors":
-        """What poses may err beside some effects of the library: these are asked for by name."""
-        left = {name: own for name, own in self.effects.items() if name not in effects}
-        keep, components = list[int](), list[Array]()
+    def restricted(self, keep: Collection[str]) -> "PoseErrors":
+        """Return what poses may err by these `causes` alone."""
+        left = {name: part for name, part in self.effects.items() if name in keep}
+        kept, components = list[int](), list[Array]()
         for i, name in enumerate(self.names):
-            every = [own for component, own in self.effects.values() if component == name]
-            those = [own for component, own in left.values() if component == name]
-            if not every or those:
-                keep.append(i)
+            every = [columns for component, columns in self.effects.values() if component == name]
+            those = [columns for component, columns in left.values() if component == name]
+            if those or (not every and name in keep):
+                kept.append(i)
                 # What is left is summed anew: a difference of large numbers would not be positive.
                 untouched = len(every) == len(those)
-                components.append(self.components[i] if untouched else np.sum([own @ own.T for own in those], axis=0))
+                components.append(self.components[i] if untouched else np.sum([X @ X.T for X in those], axis=0))
         n = self.components.shape[1]
-        names, kept = tuple(self.names[i] for i in keep), np.array(components).reshape(-1, n, n)
-        return replace(self, names=names, components=kept, scales=self.scales[keep], effects=left)
-
-    def without_arm(self) -> "PoseErrors":
-        """What wanders in time, what scans of a stop share and what scatters; neither joints nor links err again."""
-        return replace(self._select(~self.arm_components), effects={})
-
-    def independent_only(self) -> "PoseErrors":
-        """What scatters alone; nothing errs again."""
-        return replace(self._select(self._independent), effects={})
-
-    def repeating_only(self) -> "PoseErrors":
-        """All but what joints do anew."""
-        return self._select(~self._independent)
-
-    def without_drift(self) -> "PoseErrors":
-        """What joints and links do and what scans of a stop share; nothing wanders."""
-        return self._select(np.array([name not in DRIFT_MEMORY for name in self.names], bool))
-
-    def _select(self, keep: Mask) -> "PoseErrors":
-        names = tuple(name for name, kept in zip(self.names, keep, strict=True) if kept)
-        return replace(self, names=names, components=self.components[keep], scales=self.scales[keep])
+        names = tuple(self.names[i] for i in kept)
+        stacked = np.array(components).reshape(-1, n, n)
+        return replace(self, names=names, components=stacked, scales=self.scales[kept], effects=left)
 
     def with_component(self, name: str, component: Array, scale: float) -> "PoseErrors":
         """The same with a further component (n, n)."""

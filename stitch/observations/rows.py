@@ -51,7 +51,7 @@ class Rows:
     @cached_property
     def used(self) -> Mask:
         """(V, m) bool: rows of the views that were measured."""
-        return np.asarray(self.noise[: len(self.lever)] > 0)
+        return self.noise[: len(self.lever)] > 0
 
     @cached_property
     def distances_used(self) -> Mask:
@@ -154,7 +154,7 @@ class RowTrial:
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
         """(V,) sums of the squares of a view's distances, of all views or of some."""
         units = np.arange(len(self.rows.lever)) if units is None else units
-        return np.asarray(np.sum(self._rest(coefficients, units) ** 2 * self.rows.distances_used[units], axis=1))
+        return np.sum(self._rest(coefficients, units) ** 2 * self.rows.distances_used[units], axis=1)
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
         """Of the left-out views' distances, in units of the sensor's noise: each is seen as it is."""
@@ -171,7 +171,7 @@ class RowTrial:
 
     def _rest(self, coefficients: Array, views: Indices | Mask) -> Array:
         V = len(self.rows.lever)
-        return np.asarray(self.rows.residual[:V][views] + self.X[:V][views] @ coefficients)
+        return self.rows.residual[:V][views] + self.X[:V][views] @ coefficients
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class RowObservation(Observation):
 
     def affected_squares(self, views: Indices) -> Mask:
         """(V,) the views themselves."""
-        return np.asarray(np.isin(np.arange(len(self.rows.lever)), views))
+        return np.isin(np.arange(len(self.rows.lever)), views)
 
     def joint_ends(self, joints: Array) -> list[JointEnd]:
         """Both ends of every joint's range, of the views that show anything."""
@@ -226,7 +226,7 @@ class RowObservation(Observation):
         V = len(self.rows.lever)
         shifts = self.rows.lever[..., 3:] * self.rows.distances_used[..., None]
         left = numbers.reshape(self.rows.residual.shape)[:V, :, None]
-        return np.asarray((np.linalg.pinv(shifts) @ left)[..., 0])
+        return (np.linalg.pinv(shifts) @ left)[..., 0]
 
 
 def row_model(measurement: Measurement, model: Model, observation: RowObservation) -> LinearModel:

@@ -23,7 +23,16 @@ from stitch.diagnosis.unnamed_joint_laws import (
     significant_laws,
 )
 from stitch.numerics import frames
-from stitch.observations.pose_errors import JOINT_LOAD, TIME_ONLY, TRAVEL, TWO_ANGLES, WAVES, WITH_TIME, usual_time_step
+from stitch.observations.pose_errors import (
+    JOINT_LOAD,
+    NOT_OF_ARM,
+    TIME_ONLY,
+    TRAVEL,
+    TWO_ANGLES,
+    WAVES,
+    WITH_TIME,
+    usual_time_step,
+)
 from tests.diagnosis.freed_blade import freed_blade
 
 
@@ -121,7 +130,7 @@ def test_the_teeth_of_a_belt_are_told_as_waves_with_their_period(cell):
     tooth = np.radians(20.0)
     off = np.zeros_like(q)
     off[:, 4] = 6e-4 * (np.mod(q[:, 4] / tooth, 1.0) - 0.5)
-    laws = joint_laws(with_joints_off(cell, off).without_arm)
+    laws = joint_laws(with_joints_off(cell, off).restricted(NOT_OF_ARM))
     law = laws[0]
     assert (law.joint, law.follows) == (5, WAVES)
     # Half a wave more or less over the range looks alike.
@@ -183,7 +192,7 @@ def test_the_course_under_load_of_a_spring_that_stiffens_is_the_true_one_within_
     yields = Polynomial.fit(load, (load / np.abs(load).max()) ** 3, 5)
     off = np.zeros_like(plan.joints)
     off[:, 1] = 1e-3 * yields(load)
-    laws = joint_laws(with_joints_off(cell, off).without_arm)
+    laws = joint_laws(with_joints_off(cell, off).restricted(NOT_OF_ARM))
     (course,) = joint_curves([next(law for law in laws if law.joint == 2 and law.follows == JOINT_LOAD)])
     assert course.covariate == "j2_torque_nm"
     true = 1e-3 * yields(course.at) - off[:, 1].mean()

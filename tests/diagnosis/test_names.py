@@ -131,7 +131,7 @@ def test_what_a_joint_may_do_in_time_and_under_load_stands_against_every_name(ce
     plan = cell.measured.plan
     warm = 1e-3 * (1 - np.exp(-np.arange(len(plan.joints)) / 4.0))
     linear = cell.seen(kinematics.flange(plan.arm, plan.joints + warm[:, None] * np.eye(6)[4]))
-    base = linear.without(["joint_offset"])
+    base = linear.restricted(linear.causes - {"joint_offset"})
     found = {kind: laws_of_kinds(base, (kind,)) for kind in (ALL_ANGLES, OWN_ANGLE, WITH_TIME, JOINT_LOAD)}
     best = {kind: max(law.log_bayes_factor for law in laws) for kind, laws in found.items()}
     assert best[WITH_TIME] > max(own for kind, own in best.items() if kind != WITH_TIME)

@@ -90,7 +90,7 @@ def test_the_effect_can_do_what_a_beam_does(still_cells, beam, free, left_over):
 def test_a_bracket_of_nature_is_told_from_an_arm_that_errs():
     """Certain, and ahead of what bends and turns the wrist as gravity does; the smallest cell that shows it."""
     cell = replace(clean("blade-table", rays=40), repeatability=(1e-5, 0.01))
-    linear = linear_model_of(run(session_of(simulated(cell, {"mount_droop": 2.0}, 3, views=12)))).scatter_only
+    linear = linear_model_of(run(session_of(simulated(cell, {"mount_droop": 2.0}, 3, views=12)))).restricted(())
     asked = [candidate_of(linear, EFFECTS[name]) for name in ("mount_droop", "joint_compliance", "gear_eccentricity")]
     first, second, *_ = rank_all(linear, asked)[0]
     assert first.name == "mount_droop" and is_certain(first)

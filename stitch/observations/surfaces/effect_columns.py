@@ -64,7 +64,7 @@ def stream_point_sums(
     def slopes(v: int, index: Indices, normal: Array) -> Array:
         """(N, K) how far points of view v move along normals (N, 3) of the reference frame, per unit."""
         own = frames.rotate(frames.inverse(unconstrained.poses[v]), normal)
-        return np.asarray(np.einsum("kni,ni->nk", of_points(v, index), own))
+        return np.einsum("kni,ni->nk", of_points(v, index), own)
 
     def of_block(block: Sequence[tuple[int, Match]]) -> list[tuple[Array, Array, Array]]:
         out, end = [], 0

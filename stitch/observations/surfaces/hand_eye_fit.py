@@ -28,7 +28,7 @@ from stitch.numerics.reml import MixedModel, fit_variances
 from stitch.numerics.variance_posterior import mean_variances
 from stitch.observations.linear_model import WHITE_COMPONENTS
 from stitch.observations.observability import seen_part, visible_twists
-from stitch.observations.pose_errors import PoseErrors, white_scatter_only
+from stitch.observations.pose_errors import JOINT_SCATTER, PoseErrors, white_scatter_only
 from stitch.observations.surfaces.normal_equations import Gram, pair_squares
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.session.capture import Capture
@@ -125,7 +125,7 @@ def repeatability_from(variances: Array) -> Repeatability:
 
 def pose_covariance(channel: ReducedPoses, scatter: Repeatability) -> Array:
     """(n, n) covariance of the channel's z."""
-    return np.asarray(
+    return (
         scatter.rotation**2 * channel.rotation
         + scatter.translation**2 * channel.translation
         + scatter.noise_factor * channel.noise
@@ -312,7 +312,7 @@ def _hidden_twists(captures: Sequence[Capture], T_mount: Array, prior: Array) ->
     """Return twists (6, m) of the hand-eye, one sigma of the prior each, across those that the motions show."""
     sigma = np.diag(prior)[:6] ** -0.5
     visible = visible_twists(captures, T_mount, seen_part(captures)) / sigma[:, None]
-    return np.asarray(sigma[:, None] * null_space(visible.T, rcond=1e-9))
+    return sigma[:, None] * null_space(visible.T, rcond=1e-9)
 
 
 def step_hand_eye(
@@ -392,7 +392,7 @@ def fit_hand_eye(
     """
     found = solved or solve_hand_eye(captures, unconstrained, T_mount, columns)
     errors = errors or white_scatter_only(sum(len(f.poses) for f in unconstrained))
-    sources = _variance_sources(found, errors.repeating_only(), scanner_errors or {})
+    sources = _variance_sources(found, errors.restricted(errors.causes - {JOINT_SCATTER}), scanner_errors or {})
     covariance = np.sum(list(sources.values()), axis=0)
     log_ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(found.gls.covariance)[1]
     # Held where they are, the hidden directions are no better known than before.
@@ -445,7 +445,7 @@ def _posterior_root(rig: RigModel, scatter: Array, errors: Array) -> Array:
     own, seen = free[:, :-1], free[:, -1]
     variance = np.linalg.inv(np.eye(errors.shape[1]) + own.T @ own)
     likeliest = variance @ (own.T @ seen)
-    return np.asarray(np.linalg.cholesky(variance + np.outer(likeliest, likeliest)))
+    return np.linalg.cholesky(variance + np.outer(likeliest, likeliest)).astype(float)
 
 
 def _source_shares(sources: dict[str, Array], axes: slice) -> dict[str, float]:

@@ -237,7 +237,7 @@ def signed_distances(matches: Sequence[Match], poses: Array, points: Sequence[Ar
 
     def along(m: Match) -> Array:
         apart = placed[m.v].take(m.index_v, axis=0) - placed[m.w].take(m.index_w, axis=0)
-        return np.asarray(np.einsum("ij,ij->i", apart, m.normal))
+        return np.einsum("ij,ij->i", apart, m.normal)
 
     return np.concatenate([along(m) for m in matches])
 

@@ -130,7 +130,7 @@ def _target_only_directions(H: Array, vectors: Array) -> Array:
     if not unseen.shape[1]:
         return unseen
     values, within = np.linalg.eigh(unseen.T @ H @ unseen)
-    return np.asarray(unseen @ within[:, values > _NULL * np.linalg.eigvalsh(H)[-1]])
+    return unseen @ within[:, values > _NULL * np.linalg.eigvalsh(H)[-1]]
 
 
 def robust_scale(matches: Iterable[Match]) -> float:
@@ -199,7 +199,7 @@ def pair_squares(g: Gram, twists: Array) -> Array:
     difference = twists[g.pairs[:, 0]] - twists[g.pairs[:, 1]]
     linear = np.einsum("pi,pi->p", g.vector, difference)
     quadratic = np.einsum("pi,pij,pj->p", difference, g.matrix, difference)
-    return np.asarray(g.square + 2 * linear + quadratic)
+    return g.square + 2 * linear + quadratic
 
 
 # Labelled points as pairs of views, beside the pairs of overlapping surfaces.

@@ -77,7 +77,7 @@ def half_field(measurement: Measurement) -> Array:
     """(2,) |x/z| and |y/z| in the scanner's frame up to which it sees, but for the corners."""
     away = np.concatenate([scan.points - scan.eye for scan in measurement.capture.scans])
     slopes = np.abs(away[:, :2] / away[:, 2:])
-    return np.asarray(np.maximum(np.quantile(slopes, _FIELD_QUANTILE, axis=0), 1e-6))
+    return np.maximum(np.quantile(slopes, _FIELD_QUANTILE, axis=0), 1e-6)
 
 
 def smooth_corrections(away: Array, cosine: Array, half: Array) -> Array:
@@ -86,7 +86,7 @@ def smooth_corrections(away: Array, cosine: Array, half: Array) -> Array:
     Legendre products over the field, of unit rms together, and the slope with incidence.
     """
     along = [*legendre_products(away, half, _DEGREE), 1 / cosine - 1]
-    return np.asarray(-np.array(along)[..., None] * _unit_vectors(away))
+    return -np.array(along)[..., None] * _unit_vectors(away)
 
 
 def _shared_shapes(away: Array, half: Array, standoff: float) -> Array:
@@ -115,7 +115,7 @@ def legendre_products(away: Array, half: Array, degree: int = _FINE_DEGREE) -> l
 
 
 def _unit_vectors(away: Array) -> Array:
-    return np.asarray(away / np.linalg.norm(away, axis=1)[:, None])
+    return away / np.linalg.norm(away, axis=1)[:, None]
 
 
 # How large smooth errors are that the overlaps show: variance components by likelihood, one for each cause.
@@ -183,7 +183,7 @@ class SmoothErrorLikelihood:
 
         start = np.full(len(self.design), np.log(USUAL_SHARE))
         bounds = [tuple(np.log(SHARE_BOUNDS))] * len(start)
-        return np.asarray(np.exp(minimize(deviance, start, jac=True, method="L-BFGS-B", bounds=bounds).x))
+        return np.exp(minimize(deviance, start, jac=True, method="L-BFGS-B", bounds=bounds).x)
 
     def share_spread(self, shares: Array) -> Array:
         """(C,) standard deviations of the logarithms of `map_shares`, from the curvature of their posterior there."""
@@ -192,7 +192,7 @@ class SmoothErrorLikelihood:
         curvature = np.array(slopes) / 4e-3 + np.eye(len(shares)) / _SHARE_SPREAD**2
         # Where the likelihood bends the other way the prior alone counts.
         values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
-        return np.asarray(np.sqrt((vectors**2) @ (1 / np.maximum(values, _SHARE_SPREAD**-2.0))))
+        return np.sqrt((vectors**2) @ (1 / np.maximum(values, _SHARE_SPREAD**-2.0)))
 
     def ml_shares(self, most: Sequence[float]) -> tuple[Array, float]:
         """Shares (C,) without a prior, at most so large, and −2 log likelihood."""
@@ -206,21 +206,19 @@ class SmoothErrorLikelihood:
 
     def estimate(self, cause: int, shares: Array) -> Array:
         """(K_c,) the likeliest errors of one cause in units of its size, where all causes have shares (C,)."""
-        return np.asarray(
-            shares[cause] * self.design[cause].T @ np.linalg.solve(self._data_covariance(shares), self.data)
-        )
+        return shares[cause] * self.design[cause].T @ np.linalg.solve(self._data_covariance(shares), self.data)
 
     def posterior_covariance(self, cause: int, shares: Array) -> Array:
         """(K_c, K_c) covariance of the errors of one cause about their estimate, in units of its size: one where the
         overlaps tell nothing of them.
         """
         told = shares[cause] * self.design[cause]
-        return np.asarray(np.eye(told.shape[1]) - told.T @ np.linalg.solve(self._data_covariance(shares), told))
+        return np.eye(told.shape[1]) - told.T @ np.linalg.solve(self._data_covariance(shares), told)
 
     def _data_covariance(self, shares: Array) -> Array:
         """(n, n) variance of `seen` where all causes have shares (C,)."""
         parts = [share**2 * t @ t.T for share, t in zip(shares, self.design, strict=True)]
-        return np.asarray(sum(parts, np.diag(self.scatter)))
+        return sum(parts, np.diag(self.scatter))
 
     def _deviance(self, log_shares: Array) -> tuple[float, Array]:
         """−2 log likelihood and its slopes (C,)."""
@@ -324,9 +322,9 @@ def field_scatter(
     if not np.isfinite(noise):
         return np.zeros_like(twists)
     if share is not None:
-        return np.asarray(twists * noise * share)
+        return twists * noise * share
     field, incidence = shared_error_likelihood(sums, twists, unconstrained, noise).map_shares
-    return np.asarray(twists * noise * np.append(np.full(twists.shape[1] - 1, field), incidence))
+    return twists * noise * np.append(np.full(twists.shape[1] - 1, field), incidence)
 
 
 def shared_error_likelihood(
@@ -382,7 +380,7 @@ def scale_scatter(measurement: Measurement, unconstrained: UnconstrainedPoses) -
     if not measurement.has_optics:
         return np.zeros((6 * len(unconstrained.poses), 1))
     away = unconstrained.poses[:, :3, 3] - unconstrained.overlaps.gram.centre
-    return np.asarray(SCALE_SIGMA * np.hstack([np.zeros_like(away), away]).reshape(-1, 1))
+    return SCALE_SIGMA * np.hstack([np.zeros_like(away), away]).reshape(-1, 1)
 
 
 # A map of the smooth error that a scanner makes in every view alike: what the overlaps tell of it, place by place.
@@ -513,7 +511,7 @@ def _observed_places(measurement: Measurement, x: Array, y: Array, forward: floa
         away = scan.points - scan.eye
         slopes = forward * away[:, :2] / away[:, 2:]
         counts += np.histogram2d(slopes[:, 1], slopes[:, 0], bins=edges)[0]
-    return np.asarray(counts > _MIN_POINT_DENSITY * counts.mean())
+    return counts > _MIN_POINT_DENSITY * counts.mean()
 
 
 # Smooth errors larger than every scanner has, as the overlaps show them: the same in every view, or not.

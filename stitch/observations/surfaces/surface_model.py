@@ -81,7 +81,7 @@ class SurfaceTrial:
         difference = moved[g.pairs[:, 0]] - moved[g.pairs[:, 1]]
         cross = np.einsum("pi,pik,k->p", difference, points.vector, theta)
         quadratic = np.einsum("k,pkl,l->p", theta, points.square, theta)
-        return np.asarray(pair_squares(g, moved) + 2 * points.residual @ theta + 2 * cross + quadratic)
+        return pair_squares(g, moved) + 2 * points.residual @ theta + 2 * cross + quadratic
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
         """In the directions of the whitened channel that the left-out views alone move."""
@@ -101,7 +101,7 @@ class SurfaceTrial:
         return np.eye(len(self.X))[:, (6 * np.asarray(views)[:, None] + np.arange(6)).ravel()]
 
     def _moved(self, X: Array, coefficients: Array) -> Array:
-        return np.asarray((X @ coefficients).reshape(-1, 6) - self.unconstrained.twists)
+        return (X @ coefficients).reshape(-1, 6) - self.unconstrained.twists
 
 
 # Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
@@ -141,11 +141,11 @@ class SurfaceObservation(Observation):
 
     def reduce(self, response: Array) -> Array:
         """(n, P) visible directions of twists (6V, P)."""
-        return np.asarray(self.reduced_poses.reduction @ response)
+        return self.reduced_poses.reduction @ response
 
     def expand(self, columns: Array) -> Array:
         """(6V, P) the shortest twists that make numbers (n, P) of the channel."""
-        return np.asarray(self.reduced_poses.expansion @ columns)
+        return self.reduced_poses.expansion @ columns
 
     def trial(self, linear: LinearModel, response: Array, points: PointSums | None = None) -> SurfaceTrial:
         """A model with the columns of twists (6V, k)."""
@@ -153,12 +153,13 @@ class SurfaceObservation(Observation):
 
     def affected_squares(self, views: Indices) -> Mask:
         """(pairs,) with one of the views."""
-        return np.asarray(np.isin(self.unconstrained.overlaps.gram.pairs, views).any(axis=1))
+        touched: Mask = np.isin(self.unconstrained.overlaps.gram.pairs, views)
+        return touched.any(axis=1)
 
     def part_displacements(self, numbers: Array) -> Array:
         """(V, 3) translations of the twists that make numbers (n,) of the channel, less the common motion."""
         out = self.expand(numbers).reshape(-1, 6)[:, 3:]
-        return np.asarray(out - out.mean(axis=0))
+        return out - out.mean(axis=0)
 
 
 def surfaces_of(linear: LinearModel) -> SurfaceObservation | None:

@@ -146,4 +146,4 @@ def solve_view_sums(g: Gram, by_surfaces: Array, by_targets: Array) -> Array:
     if g.labelled.any():
         # Where surfaces see nothing, their pull is noise of normals: there the targets' own counts alone.
         b = scale * by_targets + by_normals @ (by_normals.T @ b)
-    return np.asarray(scale * (vectors @ ((vectors.T @ b) / seen.values[:, None])))
+    return scale * (vectors @ ((vectors.T @ b) / seen.values[:, None]))

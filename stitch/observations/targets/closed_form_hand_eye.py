@@ -74,7 +74,7 @@ def _solve_rotation_translation(L: Array, p: Array, target: Indices, targets: in
         weight /= weight.mean()
     if R is None:
         return frames.nearest_rotation(x[:9].reshape(3, 3))
-    return np.asarray(x[:3, None])
+    return x[:3, None]
 
 
 def _from_probe(capture: Capture, points: Array, rotation: Array, used: Mask) -> Array:

@@ -166,7 +166,7 @@ def drop_mislabelled(sightings: Sightings | None) -> Sightings | None:
 def _compared_targets(place: Array) -> Indices:
     """Of the targets (K, 3) that a view shows as many as are compared pair by pair."""
     shown = np.flatnonzero(np.isfinite(place[:, 0]))
-    return np.asarray(shown[np.linspace(0, len(shown) - 1, min(len(shown), COMPARED_TARGETS)).astype(int)])
+    return shown[np.linspace(0, len(shown) - 1, min(len(shown), COMPARED_TARGETS)).astype(int)]
 
 
 def _distance_deviations(places: Array, compared: Sequence[Indices]) -> tuple[Array, float]:

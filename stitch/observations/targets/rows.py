@@ -36,7 +36,7 @@ def target_positions(sightings: Sightings) -> Array:
 
 def target_distances(places: Array) -> Array:
     """(V, K, K) between targets, NaN where a view does not show both."""
-    return np.asarray(np.linalg.norm(places[:, :, None] - places[:, None], axis=3))
+    return np.linalg.norm(places[:, :, None] - places[:, None], axis=3)
 
 
 def distance_sigma(sightings: Sightings) -> float:
@@ -145,7 +145,7 @@ class TargetRows(Rows):
     @cached_property
     def distances_used(self) -> Mask:
         """(V, m) bool: coordinates that were measured; a probe's turn is no length."""
-        return np.asarray(self.used & (np.arange(self.residual.shape[1]) < self.positions))
+        return self.used & (np.arange(self.residual.shape[1]) < self.positions)
 
     def point_rows(self, moved: Array) -> Array:
         """(P, V, m) the coordinates; a probe's turn stays."""
@@ -268,4 +268,4 @@ def fit_landmarks(own: Capture, T_mount: Array) -> tuple[Landmarks, BlockLeastSq
 def landmarks_covariance(blocks: BlockLeastSquares, rows: TargetRows, hand_eye: Array) -> Array:
     """(U, U) by the scatter of the poses, the sensor's noise and the uncertainty (6, 6) of the hand-eye."""
     moved = blocks.shift_by_errors(rows.hand_eye)
-    return np.asarray(blocks.estimates_covariance() + moved @ hand_eye @ moved.T)
+    return blocks.estimates_covariance() + moved @ hand_eye @ moved.T

@@ -85,7 +85,7 @@ def also_clear(found: Sequence[FollowedCovariate]) -> tuple[FollowedCovariate, .
 
 def followed_covariates(linear: LinearModel) -> tuple[FollowedCovariate, ...]:
     """Find what the displacements of whole views follow, clearest first; () where too few numbers are free."""
-    linear = linear.scatter_only
+    linear = linear.restricted(())
     courses = list(_courses(linear))
     if not courses:
         return ()

@@ -141,7 +141,7 @@ def test_refitted_scatter(
         splits: views in which the sum was chosen, and those in which it is tested; both leave numbers free beside it.
     """
     own = terms.columns(ingredients)
-    other = HalfModel(linear.scatter_only, terms, splits[0])
+    other = HalfModel(linear.restricted(()), terms, splits[0])
     sizes = (
         _PRIOR_WIDTH * np.abs(np.linalg.lstsq(other.residual_columns(own), other.z, rcond=None)[0]) + _MIN_PRIOR_SIGMA
     )
@@ -398,7 +398,7 @@ def search_sums(linear: LinearModel, terms: Dictionary) -> list[TestedSum]:
     # Each was chosen in some views: what they and the others say of it counts.
     found.sort(key=lambda c: (not c.holds, -c.both))
     every = _thinned_views(np.arange(linear.measurement.views.count), 2)
-    whole = HalfModel(linear.scatter_only, terms, every)
+    whole = HalfModel(linear.restricted(()), terms, every)
     told = [
         replace(c, ingredients=round_parameters(refine_parameters(c.ingredients, whole)))
         for c in found[:_REPORTED_SUMS]
@@ -424,7 +424,7 @@ def _ingredient_group(ingredient: Ingredient) -> tuple[str, bool]:
 def _half_models(linear: LinearModel, terms: Dictionary, slow: bool) -> Iterator[tuple[HalfModel, HalfModel]]:
     """Views in which a sum is chosen, and those in which it is tested, as long as either may say something of one."""
     for views in _view_splits(linear, slow):
-        chosen, other = (HalfModel(linear.scatter_only, terms, own) for own in views)
+        chosen, other = (HalfModel(linear.restricted(()), terms, own) for own in views)
         if chosen.has_room() and other.has_room():
             yield chosen, other
 

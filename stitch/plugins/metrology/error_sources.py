@@ -27,7 +27,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array, Mask
 from stitch.numerics.reml import NOISE, fit_variances
 from stitch.numerics.variance_posterior import mean_variances, satterthwaite
-from stitch.observations.pose_errors import DRIFT_MEMORY, STOP_COMPONENTS, prior_pose_errors
+from stitch.observations.pose_errors import DRIFT_MEMORY, JOINT_SCATTER, STOP_COMPONENTS, prior_pose_errors
 from stitch.observations.surfaces.effect_columns import apparent_twists, view_columns
 from stitch.observations.surfaces.hand_eye_fit import (
     FittedEffects,
@@ -200,7 +200,8 @@ def _pose_modes(run: RunData, chain: ErrorChain, smooth: Array) -> Iterator[_Mod
     What the overlaps vary by more than they would if smooth errors (6V, K) were known is not noise but the scanner's.
     """
     found, g = chain.solution, chain.freed.overlaps.gram
-    errors = prior_pose_errors([run.measurement], run.model, [g.centre]).repeating_only()
+    errors = prior_pose_errors([run.measurement], run.model, [g.centre])
+    errors = errors.restricted(errors.causes - {JOINT_SCATTER})
     mixed = found.rig.mixed(errors)
     sizes = fit_variances(mixed, both_starts=True)
     sigma = np.sqrt(mean_variances(mixed, sizes))

@@ -42,7 +42,7 @@ def test_columns_view_by_view_are_the_columns_of_the_whole(of, labelled):
         linear = labelled
     terms = build_dictionary(linear, view_quantities(linear.measurement.views))
     some = terms.ingredients[:: len(terms.ingredients) // 40]
-    half = HalfModel(linear.scatter_only, terms, halves(linear)[0])
+    half = HalfModel(linear.restricted(()), terms, halves(linear)[0])
     expected = half.residual_columns(terms.columns(some))
     np.testing.assert_allclose(half.columns(some), expected, atol=1e-9 * np.abs(expected).max())
 
@@ -52,7 +52,7 @@ def test_a_bump_is_moved_to_its_place_and_width(labelled):
     views = labelled.measurement.views
     terms = build_dictionary(labelled, view_quantities(views))
     begun = Ingredient("robot", 2, bump_of_joint(views, 2, MIDDLE + 0.07, 0.2))
-    (found,) = refine_parameters([begun], HalfModel(labelled.scatter_only, terms, halves(labelled)[0]))
+    (found,) = refine_parameters([begun], HalfModel(labelled.restricted(()), terms, halves(labelled)[0]))
     middle, width = (p.value for p in found.quantity.nonlinear)
     assert middle == pytest.approx(MIDDLE, abs=0.02) and width == pytest.approx(WIDTH, rel=0.15)
     (told,) = round_parameters([found])

@@ -144,7 +144,7 @@ def effect_pairs(linear: LinearModel, candidates: Sequence[Candidate]) -> list[E
     out = []
     for i, a in enumerate(candidates):
         for b in candidates[i + 1 :]:
-            base = linear.without([a.name, b.name])
+            base = linear.restricted(linear.causes - {a.name, b.name})
             out.append(EffectPair(a.name, b.name, identifiable_size(base, a, b), identifiable_size(base, b, a)))
     return sorted(out, key=lambda pair: -pair.size)
 
@@ -222,7 +222,9 @@ class ExpectedDiagnosis:
         """A candidate where some effects are none of the errors that remain."""
         key = frozenset(removed & self._of_arm), candidate.name
         if key not in self._tests:
-            self._tests[key] = test_of_candidate(self.linear.without(removed), candidate, self.tests)
+            self._tests[key] = test_of_candidate(
+                self.linear.restricted(self.linear.causes - set(removed)), candidate, self.tests
+            )
         return self._tests[key]
 
     def _best(self, numbers: Array, factor: Array) -> Array:
@@ -264,7 +266,10 @@ class ExpectedDiagnosis:
 
 def _is_visible(linear: LinearModel, candidate: Candidate) -> bool:
     """True if one parameter at its plausible size is half a sigma at the least, as a diagnosis has it."""
-    white = linear.without([candidate.name]).residual(candidate.forms[0].columns) * candidate.forms[0].sizes
+    white = (
+        linear.restricted(linear.causes - {candidate.name}).residual(candidate.forms[0].columns)
+        * candidate.forms[0].sizes
+    )
     return bool((np.linalg.norm(white, axis=0) > limits.SEEN_SIGMAS).any())
 
 

@@ -61,7 +61,8 @@ class PossibleViews:
         itself."""
         m, freed, model = self.simulated.measurement, self.simulated.unconstrained, self.cell.model
         g = freed.overlaps.gram
-        errors = prior_pose_errors([m], model, [g.centre]).without(set(foreign_effects))
+        errors = prior_pose_errors([m], model, [g.centre])
+        errors = errors.restricted(errors.causes - set(foreign_effects))
         sizes = self.scatter.variances(errors.names)
         covariance = np.einsum("c,cij->ij", sizes[3:], errors.components) + self._white()
         field = field_scatter(m, freed)
