@@ -13,10 +13,11 @@ from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.validation import CrossValidation, _squares_by_fold
 from stitch.effects.contract import find_effect, parameters_in
 from stitch.model.model import Term
-from stitch.output.diagnosis_document import diagnosis_document, suggested_command
+from stitch.output.diagnosis_document import diagnosis_document, named_before
 from stitch.output.json_file import write_json
+from stitch.output.plain_finding import suggested_command
 from stitch.output.run_folder import write_with_page
-from stitch.output.stored_run import diagnosed_state, load_run, named_before, standing_diagnosis
+from stitch.output.stored_run import diagnosed_state, load_run, standing_diagnosis
 from stitch.session.reading.session_folder import load_session
 
 OFFSET = np.array([0, 1e-3, -1.5e-3, 0, 2e-3, 0])
@@ -140,7 +141,7 @@ def test_a_diagnosis_of_the_same_state_is_read_and_not_made_again(monkeypatch, t
         diagnosis_document(found) | {"of": diagnosed_state(first, tmp_path / "run")}, tmp_path / "run/diagnosis.json"
     )
     again = load_run(tmp_path / "run")
-    known = named_before(again, standing_diagnosis(tmp_path / "run", again))
+    known = named_before(standing_diagnosis(tmp_path / "run", again), again.tried)
 
     def of_what_was_added(state):
         made.append(state.effects)
@@ -152,7 +153,7 @@ def test_a_diagnosis_of_the_same_state_is_read_and_not_made_again(monkeypatch, t
     assert lines[: len(known.lines)] == [said(found), found.sentence, *(f"{note}." for note in found.notes)]
     with open(folder / "views.csv", "a") as table:
         table.write("\n")
-    assert standing_diagnosis(tmp_path / "run", again) == {} and named_before(again, {}) is None
+    assert standing_diagnosis(tmp_path / "run", again) == {} and named_before({}, again.tried) is None
 
 
 def said(found):

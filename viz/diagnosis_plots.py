@@ -15,7 +15,7 @@ from stitch.numerics.units import MICROMETRES, covariate_text, length_text
 from stitch.observations.pose_errors import time_in_steps
 from stitch.observations.surfaces.scanner_errors import FieldMap
 from stitch.output.comparison.residual_tables import ResidualTable, ResidualTables
-from stitch.output.diagnosis_document import OTHER_SOURCES, largest_error_sources, share_text
+from stitch.output.plain_finding import OTHER_SOURCES, largest_error_sources, share_text
 from viz import captions
 
 _HOURS_FROM = 7200.0  # s that are better told in hours than in minutes

@@ -11,7 +11,8 @@ import rerun as rr
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.sentences import curve_sentences, fitted_amounts
 from stitch.numerics.units import MICROMETRES
-from stitch.output.diagnosis_document import effect_description, effect_in_words, plain_finding, suggested_command
+from stitch.output.plain_finding import plain_finding, suggested_command
+from stitch.output.plain_words import effect_description, effect_in_words
 from stitch.session.session import SessionData
 from stitch.system.files import whole_file
 from viz.colours import COLOURS_OF_FEW

@@ -85,7 +85,7 @@ def _effects_in_words(run: RunData) -> list[str]:
     """Of a run without effects nothing of a diagnosis is loaded."""
     if not run.effects:
         return []
-    from stitch.output.diagnosis_document import effect_in_words
+    from stitch.output.plain_words import effect_in_words
 
     return [effect_in_words(name) for name in run.effects]
 

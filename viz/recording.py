@@ -32,7 +32,7 @@ def run_markdown(run: RunData, history: ModelHistory | None) -> str:
     for doubt in run.doubts:
         lines += [doubt, ""]
     if run.effects:
-        from stitch.output.diagnosis_document import effect_in_words
+        from stitch.output.plain_words import effect_in_words
 
         lines += [f"In the model: {', '.join(map(effect_in_words, run.effects))}.", ""]
     lines += [run.verdict, ""]

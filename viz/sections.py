@@ -12,15 +12,9 @@ from stitch.diagnosis.sentences import fitted_amounts
 from stitch.model.model import uncertainty_scope
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.residual_tables import ResidualTables
-from stitch.output.diagnosis_document import (
-    diagnosis_screen,
-    effect_description,
-    largest_error_sources,
-    plain_finding,
-    remedy_at_machine,
-    suggested_command,
-)
-from stitch.output.finding_screen import CandidateFields, candidate_fields
+from stitch.output.finding_screen import CandidateFields, candidate_fields, finding_screen
+from stitch.output.plain_finding import largest_error_sources, plain_finding, remedy_at_machine, suggested_command
+from stitch.output.plain_words import effect_description
 from stitch.run_data import RunData
 from stitch.system.files import whole_file
 from viz import captions
@@ -37,7 +31,7 @@ _NAMING = ("missing_effect", "cannot_tell")
 
 def write_diagnosis(found: Diagnosis, state: RunData, folder: Path) -> None:
     """Put a diagnosis on the screen and into the evidence of report.html, and into the recording."""
-    screen = diagnosis_screen(found)
+    screen = finding_screen(found)
     # Rerun's program writes the recording anew while the page is made.
     with ThreadPoolExecutor(1) as beside:
         recorded = beside.submit(add_diagnosis, found, screen, state.session, folder / "recording.rrd")

@@ -410,7 +410,7 @@ def suggest_group(state: RunData, recorder: Recorder | None = None) -> tuple[Run
 
 def _finding_and_evidence(found: Diagnosis) -> list[str]:
     """Return the plain finding and the evidence, as `stitch diagnose` prints them."""
-    from stitch.output.diagnosis_document import plain_finding
+    from stitch.output.plain_finding import plain_finding
 
     return [plain_finding(found, found.linear.measurement.length_unit), found.sentence]
 

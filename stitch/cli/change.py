@@ -129,8 +129,9 @@ def _add_diagnosed(
     from stitch.api.pipeline import suggest, suggest_group
     from stitch.cli.diagnose import write_diagnosis
     from stitch.output import run_folder
-    from stitch.output.diagnosis_document import plain_finding, suggested_command
-    from stitch.output.stored_run import load_run, named_before, standing_diagnosis
+    from stitch.output.diagnosis_document import named_before
+    from stitch.output.plain_finding import plain_finding, suggested_command
+    from stitch.output.stored_run import load_run, standing_diagnosis
     from stitch.recorder import RunMemory
 
     memory = RunMemory()
@@ -145,7 +146,7 @@ def _add_diagnosed(
             if at_most is None:
                 result, lines, found = suggest_group(state, memory)
             else:
-                result, lines, found = suggest(state, at_most, named_before(state, told), memory)
+                result, lines, found = suggest(state, at_most, named_before(told, state.tried), memory)
         for line in lines if in_full() else ():
             say(line)
         if result is None:

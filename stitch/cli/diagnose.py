@@ -38,8 +38,8 @@ def diagnose_run(
       stitch diagnose runs/blade-17
       stitch diagnose runs/blade-17 --effects-file mine.py --json
     """
-    from stitch.output.diagnosis_document import suggested_command
     from stitch.output.json_file import to_json
+    from stitch.output.plain_finding import suggested_command
 
     found, document, unit = _diagnose_folder(run, effects_file, trust)
     if as_json:
@@ -117,7 +117,7 @@ def write_diagnosis(diagnosis: Diagnosis, state: RunData, run: Path) -> dict[str
 
 def show_diagnosis(diagnosis: Diagnosis, length_unit: str) -> None:
     """Print the finding for everybody, the evidence, the likeliest effects, and where the error comes from."""
-    from stitch.output.diagnosis_document import open_doubts, plain_finding
+    from stitch.output.plain_finding import open_doubts, plain_finding
     from stitch.run_data import doubt_remedy
 
     say(plain_finding(diagnosis, length_unit), bold=True)
@@ -167,7 +167,7 @@ def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], l
 def show_budget(budget: Sequence[BudgetLine], length_unit: str) -> None:
     """Print source, share of the variance and size (rms) of all that the poses leave; nothing without a budget."""
     from stitch.numerics.units import length_text
-    from stitch.output.diagnosis_document import largest_error_sources, share_text
+    from stitch.output.plain_finding import largest_error_sources, share_text
 
     told = [
         f"{line.source} {share_text(line)} ({length_text(line.sigma, length_unit, 2)})"

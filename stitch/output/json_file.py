@@ -1,7 +1,7 @@
 """JSON without NaN, written whole or not at all."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -153,14 +153,3 @@ def _without_nan(value: Any) -> Any:
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value
-
-
-def rows_of_fields(items: Iterable[Any], fields: str) -> list[dict[str, Any]]:
-    """One row an item with some of its fields, arrays and tuples as lists."""
-    return [{name: _plain(getattr(item, name)) for name in fields.split()} for item in items]
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return list(value) if isinstance(value, tuple) else value

@@ -1,115 +1,70 @@
-"""result.json, ledger.json and the model of a run, as plain data."""
+"""result.json, ledger.json and the model of a run, as plain data, and what is read of them again."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from operator import attrgetter, itemgetter
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from stitch.model.model import Target
+from stitch.effects.contract import Parameter
+from stitch.errors import InputError
+from stitch.model.model import EffectsCovariance, Target
 from stitch.model.model_toml import ModelFile
 from stitch.numerics.frames import Array
+from stitch.observations.surfaces.hand_eye_fit import Repeatability
 from stitch.observations.targets.outliers import Outlier, mask_outliers
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.output.comparison.disagreement_field import model_history
 from stitch.output.comparison.run_verdict import run_verdict
 from stitch.output.json_file import FORMAT
-from stitch.run_data import ExcludedView, RunData, StageResult
+from stitch.output.schema import (
+    COUNT,
+    MATRIX,
+    NUMBER,
+    NUMBER_OR_NULL,
+    TEXT,
+    TEXTS,
+    Document,
+    Key,
+    Kind,
+    array_of,
+    list_of,
+    number,
+    table_of,
+)
+from stitch.run_data import ExcludedView, Fit, LedgerStep, Note, RunData, StageResult, Unsupported, ViewLinks
 from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData, View
 
-# What labelled points add to model.toml, result.json and residuals.parquet, and back.
+_PACKAGES = ("stitch", "numpy", "scipy", "pykdtree", "libigl", "rerun-sdk", "kiss-icp", "trimesh")
 
 
-def targets_of(found: TargetModelFit | None) -> dict[str, Target]:
-    """The targets that were seen, for model.toml."""
-    if found is None:
-        return {}
-    sightings = found.rows.sightings
-    sigma = found.landmark_sigmas
-    return {
-        name: Target(found.landmarks.positions[k], sigma[k], found.landmarks.orientation)
-        for k, name in enumerate(sightings.targets)
-        if np.isfinite(found.landmarks.positions[k]).all()
-    }
+class ViewRow(NamedTuple):
+    """A view as result.json lists it."""
+
+    view: str
+    pose: Array  # (4, 4) T_reference_scanner; of a view that is not fused as robot and model say
+    correction: Array  # (6,) twist in the reference frame, rad and length_unit
+    rms: float | None  # length_unit; null without partners, and of a view that is not fused
+    points: int = 0
 
 
-def target_rows(found: TargetModelFit | None) -> list[dict[str, Any]]:
-    """The list `targets` of result.json, reference frame."""
-    targets = targets_of(found)
-    if found is None:
-        return []
-    sightings = found.rows.sightings
-    seen = dict(zip(sightings.targets, sightings.view_counts, strict=True))
-    return [
-        {"target": name, "position": t.position.tolist(), "sigma": t.sigma.tolist(), "seen": int(seen[name])}
-        | ({} if t.orientation is None else {"orientation": t.orientation.tolist()})
-        for name, t in targets.items()
-    ]
+def result_document(run: RunData) -> dict[str, Any]:
+    """Return result.json as a dictionary."""
+    return RESULT.write(run)
 
 
-def labelled_facts(run: RunData) -> dict[str, Any]:
-    """What the rms of a run on labelled points counts, the errors left out and inside, and the outliers."""
-    if run.targets is None:
-        return {}
-    rows = run.targets.rows
-    facts = {
-        "position_error": _sizes(rows.distances(rows.residual)),
-        "outliers": [
-            {"view": run.session.views[o.view].name, "target": o.target, "distance": o.distance, "times_usual": o.times}
-            for o in run.outliers
-        ],
-    }
-    if run.overlaps is not None:
-        # The rms of the run is that of its surfaces, and views are left out with both.
-        return facts | {"cloud_noise_factor": run.measurement.capture.noise_factor}
-    return facts | {
-        "rms_of": "3D distances of the targets from their place",
-        "heldout_position_error": _sizes(run.targets.heldout),
-    }
-
-
-def _sizes(distances: Array) -> dict[str, float]:
-    d = distances[np.isfinite(distances)]
-    return {"mean": float(d.mean()), "median": float(np.median(d)), "max": float(d.max())}
-
-
-def residual_columns(found: TargetModelFit, session: SessionData) -> dict[str, Array]:
-    """Columns of residuals.parquet, a row per target and view: `partner` is the target, `residual` the 3D distance."""
-    rows, s = found.rows, found.rows.sightings
-    v, slot = np.nonzero(s.used)
-    left = rows.residual[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)[v, slot]
-    names = np.array(session.names)
-    out: dict[str, Array] = {"view": names[v], "partner": np.array(s.targets)[s.target[v, slot]]}
-    out |= dict(zip("xyz", found.landmarks.positions[s.target[v, slot]].T, strict=True))
-    distance = np.linalg.norm(left, axis=1)
-    out |= dict(zip(("nx", "ny", "nz"), (left / np.maximum(distance, 1e-300)[:, None]).T, strict=True))
-    out |= {"residual": distance, "heldout": found.heldout[v, slot]}
-    covariates = sorted({key for view in session.views for key in view.covariates})
-    out |= {key: np.array([view.covariates.get(key, np.nan) for view in session.views])[v] for key in covariates}
-    # As floats, NaN where nobody states it.
-    return out | {"time_s": np.array([view.time_s for view in session.views], float)[v]}
-
-
-def restore_counted_targets(measurement: Measurement, session: SessionData, document: dict[str, Any]) -> Measurement:
-    """The measurement as result.json counts its labelled points: less the outliers, and weighed against the clouds."""
-    s, outliers = measurement.capture.sightings, document.get("outliers", ())
-    if s is None:
-        return measurement
-    number = {view.name: v for v, view in enumerate(session.views)}
-    gone = [Outlier(number[o["view"]], o["target"], np.nan, np.nan) for o in outliers if o["view"] in number]
-    used = mask_outliers(s.used, gone, s.targets, s.target)
-    factor = document.get("cloud_noise_factor", measurement.capture.noise_factor)
-    own = replace(measurement.capture, sightings=replace(s, used=used), noise_factor=factor)
-    return replace(measurement, capture=own)
-
-
-_VERSIONS = ("stitch", "numpy", "scipy", "pykdtree", "libigl", "rerun-sdk", "kiss-icp", "trimesh")
+def ledger(run: RunData) -> list[dict[str, Any]]:
+    """Return the model's history, one step per change."""
+    return [{"step": i} | _LEDGER_STEP.write(step) for i, step in enumerate(run.ledger)]
 
 
 def model_of(run: RunData) -> ModelFile:
-    """The model that a run fitted, as model.toml states it; a file of effects is named while one of them is in use."""
-    own = any(term.effect.tier == "user" for term in run.terms)
+    """Return the model that a run fitted, as model.toml states it; a file of effects while one of them is in use."""
+    uses_file = any(term.effect.tier == "user" for term in run.terms)
     return ModelFile(
         length_unit=run.session.length_unit,
         mount=run.session.mount,
@@ -117,98 +72,199 @@ def model_of(run: RunData) -> ModelFile:
         T_mount_coarse=run.T_mount_coarse,
         covariance=run.mount_covariance,
         effects={term.name: {p.name: p for p in term.parameters} for term in run.terms},
-        effects_file=run.effects_file if own else None,
-        targets=targets_of(run.targets),
+        effects_file=run.effects_file if uses_file else None,
+        targets=_targets(run.targets),
         effects_covariance=run.model.effects_covariance,
     )
 
 
-def result_document(run: RunData) -> dict[str, Any]:
-    """result.json as a dictionary."""
-    unit = run.session.length_unit
+def residual_columns(fit: TargetModelFit, session: SessionData) -> dict[str, Array]:
+    """Return columns of residuals.parquet of labelled points, a row per target and view.
+
+    `partner` is the target, `residual` the 3D distance; `time_s` is NaN where nobody states it.
+    """
+    rows = fit.rows
+    sightings = rows.sightings
+    v, slot = np.nonzero(sightings.used)
+    target = sightings.target[v, slot]
+    offset = rows.residual[: len(sightings.used), : rows.positions].reshape(*sightings.used.shape, 3)[v, slot]
+    distance = np.linalg.norm(offset, axis=1)
+    covariates = sorted({key for view in session.views for key in view.covariates})
     return {
-        "format": FORMAT,
-        "session": str(run.session.path.resolve()),
-        "name": run.session.name,
-        "length_unit": unit,
-        "mount": run.session.mount,
-        "reference_frame": "flange" if run.session.mount == "eye_to_hand" else "base",
-        "hand_eye": run.T_mount.tolist(),
-        "hand_eye_coarse": run.T_mount_coarse.tolist(),
-        "hand_eye_sigma": np.sqrt(np.diag(run.mount_covariance)).tolist(),
-        "hand_eye_covariance": run.mount_covariance.tolist(),
-        "unobservable": list(run.unobservable),
-        "hand_eye_unknown": list(run.unknown),
-        "hand_eye_stated": run.session.scanner.T_mount is not None,
-        "stages": [_stage(s) for s in run.stages],
-        "residual_rms": run.residual_rms,
-        "heldout_rms": run.heldout_rms,
-        "noise_floor": run.noise_floor,
-        "repeatability": {"rotation": run.repeatability.rotation, "translation": run.repeatability.translation},
-        "effects": _effects(run),
-        "effects_covariance": {
-            "parameters": list(run.model.effects_covariance.names),
-            "matrix": run.model.effects_covariance.matrix.tolist(),
-        },
-        "views": _views(run),
-        "left_out": [{"view": item.view, "why": item.why} for item in run.left_out],
-        "linkage": _linkage(run),
-        "unsupported_points": asdict(run.fit.unsupported),
-        "targets": target_rows(run.targets),
-        **labelled_facts(run),
-        "convergence": run.convergence,
-        "disagreement": _disagreement(run),
-        "plain": run_verdict(run, model_history(run)),
-        "verdict": run.verdict,
-        "doubts": list(run.doubts),
-        "notes": list(run.notes),
-        "versions": _versions(),
+        "view": np.array(session.names)[v],
+        "partner": np.array(sightings.targets)[target],
+        **dict(zip("xyz", fit.landmarks.positions[target].T, strict=True)),
+        **dict(zip(("nx", "ny", "nz"), (offset / np.maximum(distance, 1e-300)[:, None]).T, strict=True)),
+        "residual": distance,
+        "heldout": fit.heldout[v, slot],
+        **{key: np.array([view.covariates.get(key, np.nan) for view in session.views])[v] for key in covariates},
+        "time_s": np.array([view.time_s for view in session.views], float)[v],
     }
 
 
-def _stage(stage: StageResult) -> dict[str, Any]:
-    """A row of the stages; only register has a method."""
-    row = asdict(stage) | {"seconds": round(stage.seconds, 3)}
-    return row if stage.method else {key: value for key, value in row.items() if key != "method"}
-
-
 def points_of(view: View) -> int:
-    """Number of points that a view shows, of its cloud and by name."""
+    """Return the number of points that a view shows, of its cloud and by name."""
     labelled = 0 if view.sighting is None else len(view.sighting.targets)
     return labelled + (0 if view.cloud is None else view.cloud.count)
 
 
-def ledger(run: RunData) -> list[dict[str, Any]]:
-    """The model's history, one step per change."""
-    numbers = ["residual_rms", "heldout_rms", "noise_floor"]
+def _effect_rows(run: RunData) -> dict[str, dict[str, Any]]:
+    return {term.name: {p.name: parameter_row(p) for p in term.parameters} for term in run.terms}
+
+
+def parameter_row(parameter: Parameter) -> dict[str, Any]:
+    """Return a parameter of an effect as the documents list it."""
+    row = {"value": parameter.value, "sigma": parameter.sigma, "unit": parameter.unit}
+    return row | ({"view": parameter.view} if parameter.view else {})
+
+
+def ledger_steps(document: list[dict[str, Any]]) -> tuple[LedgerStep, ...]:
+    """Return the history of a model as ledger.json has it."""
+    steps: tuple[LedgerStep, ...] = LEDGER.read(document)
+    return steps
+
+
+def excluded_views(document: dict[str, Any]) -> tuple[ExcludedView, ...]:
+    """Return the views that the run of a result left out."""
+    rows = {row.view: row for row in view_rows(document)}
+    return tuple(
+        ExcludedView(item["view"], item["why"], rows[item["view"]].pose, rows[item["view"]].points)
+        for item in document.get("left_out", ())
+        if item["view"] in rows
+    )
+
+
+def view_rows(document: dict[str, Any]) -> tuple[ViewRow, ...]:
+    """Return all views of a result in their order."""
+    rows: tuple[ViewRow, ...] = _VIEWS.read(document["views"])
+    return rows
+
+
+def has_model(document: dict[str, Any], model: ModelFile) -> bool:
+    """Return whether hand-eye and parameters of a result are those of a model."""
+    stated = {effect: {p: row["value"] for p, row in rows.items()} for effect, rows in document["effects"].items()}
+    values = {effect: {p: fitted.value for p, fitted in rows.items()} for effect, rows in model.effects.items()}
+    return stated == values and np.array_equal(document["hand_eye"], model.T_mount)
+
+
+def register_method(document: dict[str, Any]) -> str:
+    """Return by which method a run registered single views; empty without clouds."""
+    return next((stage["method"] for stage in document["stages"] if "method" in stage), "")
+
+
+def registered_gate(document: dict[str, Any]) -> float | None:
+    """Return the largest distance between partners after register; None where a result does not state it."""
+    return (document.get("disagreement") or {}).get("gate")
+
+
+def effects_covariance(document: dict[str, Any], file: Path) -> EffectsCovariance:
+    """Return what a result, read from a file, says of its effects' parameters; nothing where it does not.
+
+    Raises:
+        InputError: a matrix of another size than its names, or without variances.
+    """
+    if not (stated := document.get("effects_covariance")):
+        return EffectsCovariance()
+    names, rows = _COVARIANCE.fields(stated).values()
+    if [len(row) for row in rows] != [len(names)] * len(names):
+        raise InputError(
+            f"{file}: effects_covariance.matrix is not {len(names)}x{len(names)} for its {len(names)} parameters; "
+            "to fix: run `stitch run` again, or take the entry out"
+        )
+    matrix = np.array(rows, float).reshape(len(names), len(names))
+    if not np.isfinite(matrix).all() or (np.diag(matrix) <= 0).any():
+        raise InputError(f"{file}: effects_covariance holds no variances; to fix: run `stitch run` again")
+    return EffectsCovariance(names, matrix)
+
+
+def restore_counted_targets(measurement: Measurement, session: SessionData, document: dict[str, Any]) -> Measurement:
+    """Return the measurement as a result counts its labelled points: less the outliers, weighed against the clouds."""
+    capture = measurement.capture
+    sightings = capture.sightings
+    if sightings is None:
+        return measurement
+    place = {view.name: v for v, view in enumerate(session.views)}
+    outliers = [
+        Outlier(place[row["view"]], row["target"], np.nan, np.nan)
+        for row in document.get("outliers", ())
+        if row["view"] in place
+    ]
+    used = mask_outliers(sightings.used, outliers, sightings.targets, sightings.target)
+    factor = document.get("cloud_noise_factor", capture.noise_factor)
+    counted = replace(capture, sightings=replace(sightings, used=used), noise_factor=factor)
+    return replace(measurement, capture=counted)
+
+
+def _targets(fit: TargetModelFit | None) -> dict[str, Target]:
+    """Return the targets that were seen."""
+    if fit is None:
+        return {}
+    places = fit.landmarks.positions
+    return {
+        name: Target(places[k], fit.landmark_sigmas[k], fit.landmarks.orientation)
+        for k, name in enumerate(fit.rows.sightings.targets)
+        if np.isfinite(places[k]).all()
+    }
+
+
+def _target_rows(run: RunData) -> list[dict[str, Any]]:
+    """Return the targets in the reference frame, and in how many views each was seen."""
+    if run.targets is None:
+        return []
+    sightings = run.targets.rows.sightings
+    seen = dict(zip(sightings.targets, sightings.view_counts, strict=True))
     return [
-        {"step": i, "effects": list(s.effects), "parameters": s.values, "hand_eye": s.T_mount.tolist()}
-        | {key: getattr(s, key) for key in numbers}
-        | ({"notes": [asdict(note) for note in s.notes]} if s.notes else {})
-        for i, s in enumerate(run.ledger)
+        {"target": name, "position": t.position.tolist(), "sigma": t.sigma.tolist(), "seen": int(seen[name])}
+        | ({} if t.orientation is None else {"orientation": t.orientation.tolist()})
+        for name, t in _targets(run.targets).items()
     ]
 
 
-def _effects(run: RunData) -> dict[str, dict[str, Any]]:
-    return {
-        term.name: {
-            p.name: {"value": p.value, "sigma": p.sigma, "unit": p.unit} | ({"view": p.view} if p.view else {})
-            for p in term.parameters
-        }
-        for term in run.terms
-    }
+def _sizes(distances: Array) -> dict[str, float]:
+    known = distances[np.isfinite(distances)]
+    return {"mean": float(known.mean()), "median": float(np.median(known)), "max": float(known.max())}
 
 
-def _linkage(run: RunData) -> dict[str, Any]:
-    """Groups of views that surfaces connect, and views that hang on a single pair."""
-    return {
-        "components": [list(part) for part in run.links.components],
-        "weak": [{"view": v, "partner": w, "directions": "all, through one pair"} for v, w in run.links.weak],
+def _outlier_rows(run: RunData) -> list[dict[str, Any]]:
+    return [
+        {"view": run.session.views[o.view].name, "target": o.target, "distance": o.distance, "times_usual": o.times}
+        for o in run.outliers
+    ]
+
+
+def _labelled(run: RunData) -> bool:
+    return run.targets is not None
+
+
+def _labelled_alone(run: RunData) -> bool:
+    """Return whether the rms of the run is that of labelled points; beside clouds it is that of the surfaces."""
+    return run.targets is not None and run.overlaps is None
+
+
+def _labelled_beside_clouds(run: RunData) -> bool:
+    return run.targets is not None and run.overlaps is not None
+
+
+def _all_views(run: RunData) -> list[ViewRow]:
+    """Return all views of the session in their order; those that were left out stand between those that are fused."""
+    rows = {
+        int(place): ViewRow(
+            run.session.views[v].name,
+            run.poses[v],
+            run.corrections[v],
+            float(run.view_rms[v]),
+            points_of(run.session.views[v]),
+        )
+        for v, place in enumerate(run.measurement.views.number)
     }
+    free = (place for place in range(len(rows) + len(run.left_out)) if place not in rows)
+    for place, item in zip(list(free), run.left_out, strict=True):
+        rows[place] = ViewRow(item.view, item.pose, np.zeros(6), None, item.points)
+    return [rows[place] for place in sorted(rows)]
 
 
 def _disagreement(run: RunData) -> dict[str, Any] | None:
-    """How far the views disagree on the part at every step of the model's history; None without clouds."""
+    """Return how far the views disagree on the part at every step of the model's history; None without clouds."""
     history = model_history(run)
     if history is None or run.registered is None:
         return None
@@ -222,40 +278,122 @@ def _disagreement(run: RunData) -> dict[str, Any] | None:
     }
 
 
-def _views(run: RunData) -> list[dict[str, Any]]:
-    """All views of the session in their order; those that were left out stand between those that are fused."""
-    rows = {int(number): _view(run, v) for v, number in enumerate(run.measurement.views.number)}
-    free = (number for number in range(len(rows) + len(run.left_out)) if number not in rows)
-    rows |= {number: _left_out_view(item) for number, item in zip(free, run.left_out, strict=True)}
-    return [rows[number] for number in sorted(rows)]
-
-
-def _left_out_view(item: ExcludedView) -> dict[str, Any]:
-    """A view that is not fused: its pose is what the robot and the model say."""
-    return {
-        "view": item.view,
-        "pose": item.pose.tolist(),
-        "correction": [0.0] * 6,
-        "rms": None,
-        "points": item.points,
-    }
-
-
-def _view(run: RunData, v: int) -> dict[str, Any]:
-    return {
-        "view": run.session.views[v].name,
-        "pose": run.poses[v].tolist(),
-        "correction": run.corrections[v].tolist(),
-        "rms": float(run.view_rms[v]),
-        "points": points_of(run.session.views[v]),
-    }
-
-
 def _versions() -> dict[str, str]:
-    found = {}
-    for name in _VERSIONS:
+    versions = {}
+    for package in _PACKAGES:
         try:
-            found[name] = version(name)
+            versions[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return versions
+
+
+_NOTE = Document(Key("at", TEXT), Key("by", TEXT), Key("text", TEXT))
+_LEDGER_STEP = Document(
+    Key("effects", TEXTS),
+    Key("parameters", table_of(table_of(NUMBER)), "values", optional=True),
+    Key("hand_eye", MATRIX, "T_mount"),
+    Key("residual_rms", NUMBER),
+    Key("heldout_rms", NUMBER_OR_NULL),
+    Key("noise_floor", NUMBER),
+    Key("notes", _NOTE.rows(Note), when=attrgetter("notes")),
+)
+LEDGER = _LEDGER_STEP.rows(LedgerStep)
+_STAGE = Document(
+    Key("name", TEXT),
+    Key("rms", NUMBER_OR_NULL),
+    Key("correspondences", COUNT),
+    Key("iterations", COUNT),
+    Key("seconds", NUMBER, write=lambda stage: round(stage.seconds, 3)),
+    Key("note", TEXT, optional=True),
+    Key("method", TEXT, when=attrgetter("method")),
+)
+_VIEW = Document(
+    Key("view", TEXT),
+    Key("pose", MATRIX),
+    Key("correction", array_of(6)),
+    Key("rms", NUMBER_OR_NULL),
+    Key("points", COUNT, optional=True),
+)
+_VIEWS = _VIEW.rows(ViewRow)
+_PARAMETER = Kind({"type": "object", "properties": {"value": NUMBER.schema}, "required": ["value"]})
+_SCATTER = Document(Key("rotation", NUMBER_OR_NULL), Key("translation", NUMBER_OR_NULL))
+_LEFT_OUT = Document(Key("view", TEXT), Key("why", TEXT))
+_WEAK = Document(
+    Key("view", TEXT, write=itemgetter(0)),
+    Key("partner", TEXT, write=itemgetter(1), optional=True),
+    Key("directions", write=lambda _: "all, through one pair"),
+)
+_LINKAGE = Document(
+    Key("components", list_of(TEXTS), optional=True),
+    Key("weak", _WEAK.rows(lambda view, partner="": (view, partner)), optional=True),
+)
+_UNSUPPORTED = Document(*(Key(name, COUNT, optional=True) for name in ("points", "alone", "looked_through")))
+_COVARIANCE = Document(Key("parameters", TEXTS, "names"), Key("matrix", Kind(list_of(list_of(NUMBER)).schema)))
+_OUTLIER = Document(Key("view", TEXT), Key("target", Kind({"type": ["string", "null"]})))
+_NUMBERS = Kind(list_of(NUMBER_OR_NULL).schema, read=lambda values: [number(value) for value in values])
+# Lengths in length_unit, angles in rad; twists and covariances rotation first.
+RESULT = Document(
+    Key("format", write=lambda run: FORMAT),
+    Key(
+        "session",
+        Kind({"type": "string", "pattern": "^[^\\u0000]+$", "maxLength": 4000}),
+        write=lambda run: str(run.session.path.resolve()),
+    ),
+    Key("name", write=lambda run: run.session.name),
+    Key("length_unit", write=lambda run: run.session.length_unit),
+    Key("mount", write=lambda run: run.session.mount),
+    Key("reference_frame", write=lambda run: "flange" if run.session.mount == "eye_to_hand" else "base"),
+    Key("hand_eye", MATRIX, "T_mount"),
+    Key("hand_eye_coarse", field="T_mount_coarse"),
+    Key("hand_eye_sigma", write=lambda run: np.sqrt(np.diag(run.mount_covariance))),
+    Key("hand_eye_covariance", field="mount_covariance"),
+    Key("unobservable", TEXTS, of=Fit),
+    Key("hand_eye_unknown", TEXTS, "unknown", of=Fit, optional=True),
+    Key("hand_eye_stated", write=lambda run: run.session.scanner.T_mount is not None),
+    Key("stages", _STAGE.rows(StageResult), of=Fit),
+    Key("residual_rms", NUMBER, of=RunData),
+    Key("heldout_rms", NUMBER_OR_NULL, of=RunData),
+    Key("noise_floor", NUMBER, of=RunData),
+    Key("repeatability", _SCATTER.kind(partial(Repeatability, noise_factor=float("nan"))), of=Fit),
+    Key("effects", table_of(table_of(_PARAMETER)), write=_effect_rows),
+    Key("effects_covariance", _COVARIANCE.kind(), write=lambda run: run.model.effects_covariance, optional=True),
+    Key("views", _VIEWS, write=_all_views),
+    Key("left_out", _LEFT_OUT.rows(), optional=True),
+    Key("linkage", _LINKAGE.kind(ViewLinks), "links", of=RunData, optional=True),
+    Key(
+        "unsupported_points",
+        _UNSUPPORTED.kind(Unsupported),
+        "unsupported",
+        of=Fit,
+        write=lambda run: run.fit.unsupported,
+        optional=True,
+    ),
+    Key("targets", write=_target_rows),
+    Key(
+        "position_error",
+        write=lambda run: _sizes(run.targets.rows.distances(run.targets.rows.residual)),
+        when=_labelled,
+    ),
+    Key("outliers", Kind(list_of(_OUTLIER.kind()).schema), write=_outlier_rows, when=_labelled),
+    Key(
+        "cloud_noise_factor",
+        NUMBER,
+        write=lambda run: run.measurement.capture.noise_factor,
+        when=_labelled_beside_clouds,
+    ),
+    Key("rms_of", write=lambda run: "3D distances of the targets from their place", when=_labelled_alone),
+    Key("heldout_position_error", write=lambda run: _sizes(run.targets.heldout), when=_labelled_alone),
+    Key("convergence", table_of(_NUMBERS), of=Fit),
+    Key(
+        "disagreement",
+        Kind({"type": ["object", "null"], "properties": {"gate": NUMBER.schema}}),
+        write=_disagreement,
+        optional=True,
+    ),
+    Key("plain", write=lambda run: run_verdict(run, model_history(run))),
+    Key("verdict", TEXT, of=Fit),
+    Key("doubts", TEXTS, of=RunData, optional=True),
+    Key("notes", TEXTS, of=Fit),
+    Key("versions", write=lambda run: _versions()),
+)

@@ -7,8 +7,8 @@ import pytest
 
 import stitch.api.pipeline as stepwise
 import stitch.diagnosis.validation as validation
-import stitch.output.diagnosis_document as plain
 import stitch.output.finding_screen as finding_screen
+import stitch.output.plain_finding as plain
 from bench.docs.page_blocks import refused
 from stitch.cli.diagnose import show_budget
 from stitch.diagnosis.diagnosis import Diagnosis
@@ -16,14 +16,9 @@ from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
 from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap
-from stitch.output.diagnosis_document import (
-    _field_map,
-    effect_in_words,
-    largest_error_sources,
-    plain_finding,
-    remedy_at_machine,
-    suggested_command,
-)
+from stitch.output.diagnosis_document import _field_map
+from stitch.output.plain_finding import largest_error_sources, plain_finding, remedy_at_machine, suggested_command
+from stitch.output.plain_words import effect_in_words
 from stitch.screening.pose_tests import PoseStep
 
 
@@ -40,7 +35,7 @@ def test_every_effect_of_the_library_has_words():
 @pytest.mark.parametrize("follows_field", [False, True])
 def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve, follows_field):
     """No formula is looked for of what the scanner itself errs by."""
-    monkeypatch.setattr("stitch.output.diagnosis_document.group_share", lambda linear, group: (0.7, 0.1))
+    monkeypatch.setattr("stitch.output.plain_finding.group_share", lambda linear, group: (0.7, 0.1))
     found = SimpleNamespace(
         verdict=verdict,
         curves=curves,

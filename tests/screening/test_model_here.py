@@ -10,7 +10,7 @@ from stitch.api.pipeline import change, diagnose, run
 from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.output.comparison.run_verdict import run_light, run_verdict
-from stitch.output.diagnosis_document import plain_finding, suggested_command
+from stitch.output.plain_finding import plain_finding, suggested_command
 from stitch.output.result_document import model_of
 
 

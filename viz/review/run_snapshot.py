@@ -11,7 +11,7 @@ from stitch.errors import InputError
 from stitch.numerics.units import MICROMETRES, format_amount
 from stitch.output.comparison.disagreement_field import effect_changes
 from stitch.output.comparison.run_verdict import shorten_doubts
-from stitch.output.diagnosis_document import effect_description, effect_in_words
+from stitch.output.plain_words import effect_description, effect_in_words
 from stitch.output.stored_run import read_documents
 from stitch.run_data import LedgerStep
 from stitch.session.reading.text_files import shortened

@@ -4,11 +4,9 @@ The distance of two matched points carries the noise of both. Averaged over a pa
 what repeats stays: the error of the model as it shows on the part.
 """
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from threading import Lock
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -22,6 +20,7 @@ from stitch.numerics.frames import Array, Indices, Mask
 from stitch.observations.surfaces.matching import Match, signed_distances
 from stitch.observations.surfaces.normal_equations import RMS_GATE
 from stitch.observations.targets.target_model import rms_of
+from stitch.output.remembered import remembered
 from stitch.run_data import LedgerStep, RunData
 from stitch.session.capture import Sightings
 from stitch.session.measurement import Measurement
@@ -254,24 +253,12 @@ class ModelHistory:
         return tuple(step for step in self.steps if step.name not in (COARSE, REGISTER))
 
 
-# The history of the run that was asked for last: files, page, recording and terminal ask for it one after another.
-_last_history: tuple[weakref.ref[RunData], ModelHistory | None] | None = None
-_one_at_a_time = Lock()
-
-
+@remembered
 def model_history(run: RunData) -> ModelHistory | None:
-    """The field at every step of a run's history; None without clouds.
+    """Return the field at every step of a run's history; None without clouds.
 
     Steps whose effects are not known any more are left out.
     """
-    global _last_history
-    with _one_at_a_time:
-        if _last_history is None or _last_history[0]() is not run:
-            _last_history = weakref.ref(run), _build_history(run)
-        return _last_history[1]
-
-
-def _build_history(run: RunData) -> ModelHistory | None:
     if run.registered is None:
         return None
     matches = run.registered.matches

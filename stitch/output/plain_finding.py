@@ -1,0 +1,188 @@
+"""What a diagnosis found in sentences that everybody on the shop floor understands.
+
+Terminal, page, recording and review all say it so: what is missing, what would end it at the machine, the command that
+most would type next, and where the error of whole views comes from.
+"""
+
+import math
+from collections.abc import Sequence
+
+from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.residual_structure import BudgetLine
+from stitch.diagnosis.sentences import odds_text
+from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, HELDOUT_FALL, MAX_REMAINING_SHARE
+from stitch.diagnosis.validation import CrossValidation, group_helps, group_share
+from stitch.numerics.units import length_text
+from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.output.plain_words import REMEDIES, effect_in_words, plain_covariate
+from stitch.run_data import doubt_headline, effect_cure
+
+# Sources of the error below this share of the variance stand in one line.
+_MIN_SHARE = 0.01
+OTHER_SOURCES = "others"
+
+
+def plain_finding(diagnosis: Diagnosis, length_unit: str) -> str:
+    """Return the doubts about the session, what is missing, and how far the error should fall with it."""
+    finding = _finding(diagnosis, length_unit)
+    doubts = open_doubts(diagnosis)
+    if not doubts:
+        return finding
+    headlines = " ".join(doubt_headline(doubt) for doubt in doubts)
+    return f"{headlines} The findings below may only be consequences of this problem. {finding}"
+
+
+def open_doubts(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Return the doubts about the session that are something else than the effect which is missing."""
+    return tuple(doubt for doubt in diagnosis.doubts if doubt != _same_as_finding(diagnosis))
+
+
+def _same_as_finding(diagnosis: Diagnosis) -> str | None:
+    """Return the doubt that the effect which is missing would hold; None where there is none, or several."""
+    if not diagnosis.doubts or diagnosis.verdict != "missing_effect" or not diagnosis.likelier_than_not:
+        return None
+    same = [doubt for doubt in diagnosis.doubts if effect_cure(diagnosis.effects[0]) in doubt]
+    return same[0] if len(same) == 1 else None
+
+
+def _finding(diagnosis: Diagnosis, length_unit: str) -> str:
+    """Return what is missing, and how far the error should fall with it."""
+    named = " or ".join(effect_in_words(name) for name in diagnosis.effects)
+    odds = "" if diagnosis.certain else f" The odds against chance are {odds_text(diagnosis.log_odds_over_nothing)}."
+    match diagnosis.verdict:
+        case "adequate":
+            return (
+                f"No missing effect was found: {_remaining_error(diagnosis.scanner_error, length_unit)} explain the "
+                "remaining error."
+            )
+        case "cannot_tell":
+            something = "Something is" if diagnosis.certain else "Something may be"
+            return f"{something} missing in the model: {named}. These views cannot tell which.{odds}"
+        case "unknown_effect":
+            return f"Something is missing in the model, and no known effect explains it{_error_location(diagnosis)}."
+    validation = next(c for c in diagnosis.candidates if c.name == diagnosis.effects[0]).cross_validation
+    though = "" if diagnosis.likelier_than_not else ", though chance is more likely"
+    missing = "Missing in the model" if diagnosis.certain else f"Perhaps missing in the model{though}"
+    if (doubt := _same_as_finding(diagnosis)) is not None:
+        headline = doubt_headline(doubt).removesuffix(".")
+        named = f"{diagnosis.effects[0]} ({headline[0].lower()}{headline[1:]})"
+    if diagnosis.dropped_before is not None:
+        return f"{missing}: {named}.{odds} It was tried in this run and dropped: {diagnosis.dropped_before}."
+    if validation is None:
+        return f"{missing}: {named}.{odds}"
+    return f"{missing}: {named}.{odds} {_expected_gain(diagnosis.residual_rms, validation, length_unit)}"
+
+
+def _expected_gain(residual_rms: float, validation: CrossValidation, length_unit: str) -> str:
+    """Return how far the error should fall, or where else the effect shows.
+
+    A small one moves poses by less than chance moves a residual.
+    """
+    share = validation.inside**0.5
+    before = length_text(residual_rms, length_unit)
+    after = length_text(share * residual_rms, length_unit)
+    if share < HELDOUT_FALL:
+        return f"Adding it should reduce the error from {before} to {after} (rms)."
+    small = f"The effect is too small to change the error visibly ({before} now, {after} with it, rms)"
+    if validation.poses > MAX_REMAINING_SHARE:
+        return f"{small}."
+    better = f"about {1 - validation.poses**0.5:.0%} better, in units of their scatter"
+    return f"{small}. Views left out should be predicted {better}."
+
+
+def _remaining_error(scanner_error: FieldError | None, length_unit: str) -> str:
+    """Return what explains the remaining error where no effect is missing."""
+    if scanner_error is None:
+        return "noise and the arm's scatter"
+    if scanner_error.by_view:
+        source = f"each scan's own error ({length_text(scanner_error.rms_by_view, length_unit, 2)}"
+    else:
+        source = f"the scanner's own error ({length_text(scanner_error.rms, length_unit, 2)} over its field"
+    return f"noise, the arm's scatter and {source}, which no pose corrects)"
+
+
+def _error_location(diagnosis: Diagnosis) -> str:
+    """Return the scanner or the joint that errs, or what the rest follows as clearly as in the diagnosis' sentence."""
+    if diagnosis.follows_field and diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view:
+        return ": each scan has its own error, as if the part bent or the scanner changed"
+    if diagnosis.follows_field:
+        return ": the scanner's error depends on the position in its field of view"
+    if diagnosis.curves:
+        joints = " or ".join(f"joint {k}" for k in sorted({curve.joint for curve in diagnosis.curves}))
+        return f": the error follows {joints}, but no known formula"
+    if diagnosis.time_curve is not None:
+        return ": the pose errors change over time, but follow no known formula"
+    if diagnosis.overlap_misfit:
+        return ": the scanner or the part's shape is wrong, not only the poses"
+    follows = [x.covariate for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
+    if follows:
+        return f": the remaining error follows {' and '.join(follows[:2])}"
+    # The likeliest name, and why it does not hold.
+    return f": {diagnosis.notes[0]}" if diagnosis.notes else ""
+
+
+def remedy_at_machine(diagnosis: Diagnosis) -> str:
+    """Return what would end the effect that is named, or where to look for one without a name, as a sentence.
+
+    Empty where nothing is named, or only perhaps.
+    """
+    remedy = ""
+    if diagnosis.verdict == "unknown_effect" and diagnosis.follows_field:
+        by_view = diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view
+        remedy = "" if by_view else "have the scanner calibrated"
+    elif diagnosis.verdict == "unknown_effect" and diagnosis.curves:
+        remedy = f"have joint {diagnosis.curves[0].joint} checked: gear, bearing, and what hangs on it"
+    elif diagnosis.verdict == "unknown_effect":
+        follows = [plain_covariate(x.covariate) for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
+        remedy = f"look for what changes with {follows[0]}" if follows else ""
+    elif diagnosis.verdict == "missing_effect" and diagnosis.certain:
+        remedy = REMEDIES.get(diagnosis.effects[0], "")
+    return f"At the machine: {remedy}." if remedy else ""
+
+
+def suggested_command(diagnosis: Diagnosis, run: str) -> str:
+    """Return the command that most would type now, with what it is for; `run` as it has to be typed."""
+    if open_doubts(diagnosis):
+        return f"Next: fix the problem above; for details: stitch review {run}"
+    match diagnosis.verdict:
+        case "missing_effect" if not diagnosis.likelier_than_not:
+            return f"Next, for views that would separate it from chance: stitch next {run}"
+        case "missing_effect" if diagnosis.dropped_before is not None:
+            return f"Next, to see where the model fails: stitch review {run}"
+        case "missing_effect":
+            return f"Next: stitch add {run} --suggested"
+        case "cannot_tell" if not _group_helps(diagnosis):
+            return f"Next, for views that would separate them: stitch next {run}"
+        case "cannot_tell":
+            return f"Next, to fit them as one group: stitch add {run} --group"
+        case "unknown_effect" if not diagnosis.follows_field and (diagnosis.curves or diagnosis.time_curve):
+            return f"Next, to look for a formula: stitch explain {run} -o mine.py"
+        case "unknown_effect":
+            return f"Next, to see where the model fails: stitch review {run}"
+    return f"Next: stitch export {run} --to ros"
+
+
+def _group_helps(diagnosis: Diagnosis) -> bool:
+    """Return False where `stitch add --group` would refuse, or has just refused: it predicts no view left out."""
+    members = [c.ranked.score for c in diagnosis.candidates if c.name in diagnosis.effects]
+    return group_helps(*group_share(diagnosis.linear, members))
+
+
+def largest_error_sources(budget: Sequence[BudgetLine]) -> list[BudgetLine]:
+    """Return sources of at least 1 % of the variance, largest first, then all others as one line; shares add up to 1.
+
+    Empty where there is no budget, or nothing in it.
+    """
+    sources = sorted((line for line in budget if line.variance_share > 0), key=lambda line: -line.variance_share)
+    large = [line for line in sources if line.variance_share >= _MIN_SHARE]
+    small = sources[len(large) :]
+    if not small:
+        return large
+    share = sum(line.variance_share for line in small)
+    sigma = math.sqrt(sum(line.sigma**2 for line in small))
+    return [*large, BudgetLine(OTHER_SOURCES, share, sigma, small[0].unit)]
+
+
+def share_text(line: BudgetLine) -> str:
+    """Return a share of the variance in per cent."""
+    return "< 1 %" if line.variance_share < _MIN_SHARE else f"{line.variance_share:.0%}".replace("%", " %")
