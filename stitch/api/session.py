@@ -28,15 +28,11 @@ from stitch.screening.deep_check import refuse_whole
 from stitch.session.capture import MAX_POINTS
 from stitch.session.reading import session_folder
 from stitch.session.reading.arrays import cloud_of, per_view, poses_of, sighting_of
-from stitch.session.reading.session_folder import (
-    check_scale,
-    checked_scan,
-    read_repeatability,
-    read_robot,
-    read_scanner,
-)
-from stitch.session.reading.session_tables import require_agreement
+from stitch.session.reading.scale_checks import check_scale
+from stitch.session.reading.session_folder import checked_scan
+from stitch.session.reading.session_toml import read_repeatability, read_robot, read_scanner
 from stitch.session.reading.text_files import require_folder_name, require_name, table_choice
+from stitch.session.reading.views_table import require_agreement
 from stitch.session.robot import Robot, forward
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, StatedRepeatability, View
 from stitch.system.threads import parallel

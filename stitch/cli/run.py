@@ -201,7 +201,8 @@ def _follow_session(folder: Path, views: int | None) -> None:
         InputError: session.toml is missing or wrong, or the poses are of another convention than it states.
     """
     from stitch.api.live import follow
-    from stitch.session.reading.session_folder import load_session, read_session_document
+    from stitch.session.reading.session_folder import load_session
+    from stitch.session.reading.session_toml import read_session_document
 
     table = folder / "views.csv"
     read_session_document(folder / "session.toml")

@@ -19,7 +19,7 @@ from plyfile import PlyData, PlyElement
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.session.reading.session_folder import SESSION_FORMAT
+from stitch.session.reading.session_toml import SESSION_FORMAT
 from stitch.session.robot import Robot
 from stitch.session.session import Cloud, StatedRepeatability
 

@@ -42,7 +42,7 @@ from stitch.plugins.intake.raw_poses import PROGRAMS, STRUCTURED, TABLES
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, readings
 from stitch.plugins.intake.session_draft import comment_lines, joint_columns, require_free, robot_lines, session_name
 from stitch.session.capture import Capture, build_capture, sightings_of
-from stitch.session.reading.session_folder import SESSION_FORMAT
+from stitch.session.reading.session_toml import SESSION_FORMAT
 from stitch.session.reading.text_files import WORKBOOKS
 from stitch.session.session import Mount, Sighting, View
 from stitch.system.files import whole_file

@@ -27,7 +27,7 @@ from stitch.plugins.intake.stops import AROUND, middle_of_stops, stationary_scan
 from stitch.screening.conventions import register_scan_pairs
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.robot_description import moving_joints, robot_from_urdf
-from stitch.session.reading.session_folder import SESSION_FORMAT
+from stitch.session.reading.session_toml import SESSION_FORMAT
 from stitch.session.reading.text_files import import_extra, shortened
 from stitch.session.robot import forward
 

@@ -16,9 +16,9 @@ from stitch.plugins.intake.folder_files import FolderFiles, Guess
 from stitch.plugins.intake.layouts import MM
 from stitch.screening.conventions import RelativeScans
 from stitch.session.reading.range_image import read_range_image
-from stitch.session.reading.session_folder import read_session_document
-from stitch.session.reading.session_tables import read_views
+from stitch.session.reading.session_toml import read_session_document
 from stitch.session.reading.text_files import import_extra
+from stitch.session.reading.views_table import read_views
 from stitch.session.session import SessionData, Sighting
 
 # How the scanner moved between views, from targets that both show: a flat board tells as much as any.

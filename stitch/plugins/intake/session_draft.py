@@ -20,7 +20,7 @@ from stitch.plugins.intake.folder_files import Guess
 from stitch.plugins.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, covariate_columns
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, arm_from_urdf
 from stitch.plugins.intake.scan_targets import points_columns
-from stitch.session.reading.session_folder import SESSION_FORMAT
+from stitch.session.reading.session_toml import SESSION_FORMAT
 from stitch.system.files import whole_file
 
 _WIDTH = 118

@@ -24,7 +24,7 @@ from stitch.numerics.frames import Array
 from stitch.output.stored_run import read_result
 from stitch.plugins.watch.run_record import Estimate, RunRecord
 from stitch.session.reading.csv_files import is_number, read_csv_lines
-from stitch.session.reading.session_tables import covariate_names
+from stitch.session.reading.views_table import covariate_names
 
 # When a session was measured, and under which conditions: the means of its covariates.
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stitch.errors import InputError
 from stitch.output.stored_run import read_ledger, read_result
 from stitch.session.reading.clouds import read_cloud
-from stitch.session.reading.session_folder import (
+from stitch.session.reading.session_toml import (
     cad_file,
     positive_number,
     read_crop_box,
@@ -21,7 +21,8 @@ from stitch.session.reading.session_folder import (
     read_session_document,
     session_name,
 )
-from stitch.session.reading.session_tables import read_frames, read_points, read_views
+from stitch.session.reading.target_tables import read_frames, read_points
+from stitch.session.reading.views_table import read_views
 
 quick = settings(
     max_examples=60, deadline=timedelta(seconds=5), suppress_health_check=[HealthCheck.function_scoped_fixture]

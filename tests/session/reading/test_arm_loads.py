@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from stitch.errors import InputError
-from stitch.session.reading.session_tables import require_loads
+from stitch.session.reading.views_table import require_loads
 
 BOTH = ["j1_torque_nm", "j2_torque_nm"]
 

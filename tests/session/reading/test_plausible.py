@@ -9,7 +9,8 @@ from data_synth.fixtures.edits import edit
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.errors import InputError
 from stitch.session.reading.clouds import read_cloud
-from stitch.session.reading.session_folder import check_scale, load_session
+from stitch.session.reading.scale_checks import check_scale
+from stitch.session.reading.session_folder import load_session
 
 
 def moved(session, change):

@@ -24,7 +24,7 @@ from stitch.output.session_files import dh_rows, robot_toml
 from stitch.output.urdf_file import to_urdf
 from stitch.run_data import RunData
 from stitch.session.reading.robot_description import robot_from_dh, robot_from_urdf
-from stitch.session.reading.session_tables import has_reported_poses
+from stitch.session.reading.views_table import has_reported_poses
 from stitch.session.robot import Robot, elementary, forward
 from stitch.session.session import SessionData, View
 

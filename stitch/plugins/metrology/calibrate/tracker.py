@@ -18,7 +18,7 @@ from stitch.numerics.distributions import mad_sigma
 from stitch.numerics.frames import Array
 from stitch.numerics.hand_eye import axis_spread, motions_from_first, park_martin, shah, weight_roots
 from stitch.numerics.least_squares import grouped_inflation
-from stitch.session.reading.session_tables import read_frames
+from stitch.session.reading.target_tables import read_frames
 from stitch.session.session import SessionData
 
 # Covariance counted in views: leaving one out at a time, from normal equations alone.
@@ -273,19 +273,21 @@ def calibrate_tracker(session: SessionData) -> TrackerCalibration:
         InputError: frames.csv missing or broken.
         NoResultError: poses that cannot show both, or poses and frames that belong to different motions.
     """
-    measured = read_frames(session.path / "frames.csv", session.names)
+    seen = read_frames(session.path / "frames.csv", session.names)
     flange = {view.name: view.T_base_flange for view in session.views}
-    A = np.array([flange[name] for name in measured.views])
+    A = np.array([flange[name] for name in seen])
+    T_sensor_probe = np.array([frames.make(s.rotation, s.points[0]) for s in seen.values() if s.rotation is not None])
+    sigma = np.array([s.sigma[0] for s in seen.values()])
     eye_to_hand = session.mount == "eye_to_hand"
-    B = measured.T_sensor_probe if eye_to_hand else frames.inverse(measured.T_sensor_probe)
-    weights = None if measured.sigma is None else (np.median(measured.sigma) / measured.sigma) ** 2
+    B = T_sensor_probe if eye_to_hand else frames.inverse(T_sensor_probe)
+    weights = None if np.isnan(sigma).any() else (np.median(sigma) / sigma) ** 2
     fit = refine_axzb(A, B, weights=weights, robust=True, groups=_neighbourhoods(A))
     if fit.sigma[0] > _UNRELATED:
         raise NoResultError(
             f"flange poses and frames.csv do not fit together (rotations scatter by {np.degrees(fit.sigma[0]):.0f}°); "
             f"check the mount ({session.mount}), the order of the views, and the quaternions"
         )
-    return TrackerCalibration(fit, measured.views, A, B, session.mount)
+    return TrackerCalibration(fit, tuple(seen), A, B, session.mount)
 
 
 def _neighbourhoods(A: Array) -> Array | None:

@@ -93,7 +93,7 @@ def _batch_jobs(sessions: list[Path], output: Path, force: bool, recording: bool
 
 def _session_name(session: Path) -> str:
     """Return what a session is called; one that cannot be read is refused when it is its turn."""
-    from stitch.session.reading.session_folder import read_session_document, session_name
+    from stitch.session.reading.session_toml import read_session_document, session_name
 
     try:
         file = session / "session.toml"

@@ -12,7 +12,7 @@ from stitch.numerics import frames
 from stitch.plugins.intake.controllers.program import import_file
 from stitch.plugins.intake.controllers.taught_points import fixed_xyz, quaternion_w_first, rotation_vector, zyx
 from stitch.session.reading.robot_description import robot_from_dh
-from stitch.session.reading.session_tables import read_views
+from stitch.session.reading.views_table import read_views
 from tests.plugins.intake.controllers.program_samples import ABB, FANUC, KUKA_DAT, KUKA_SRC, UR
 
 
@@ -38,7 +38,7 @@ def rows(tmp_path, name, text, **options):
         robot = robot_from_dh(
             "r", "standard", [{"a": 0, "alpha_deg": 90, "d": 100, "theta_deg": 0}] * 6, None, np.zeros(3), "mm"
         )
-    return {row.name: row for row in read_views(views, robot)}, imported
+    return {row.view.name: row.view for row in read_views(views, robot)}, imported
 
 
 def test_orientations_by_hand():

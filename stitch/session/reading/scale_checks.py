@@ -1,0 +1,164 @@
+"""Is the scale of a session right? Metres read as millimetres, or the reverse, are off by 1000.
+
+Sizes and motions are judged, and how far things can lie; not how near: the origin of many structured-light and line
+scanners lies in the middle of what they measure. A few clouds of another size than the others are wrong by themselves,
+not by the session's unit.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics.frames import Array
+from stitch.numerics.units import METRES
+from stitch.session.session import SessionData
+
+Limits = tuple[float, float]
+# What one scan of a robot's scanner shows, in metres: from a borescope to a hull.
+_SIZE_M = (3e-3, 20.0)
+# How far the middle of a scan may lie from the sensor's origin, and any single point.
+_RANGE_M = (0.0, 20.0)
+_FARTHEST_M = 1000.0
+# Trackers see as far as a hall is long.
+_SIGHT_M = (0.0, 100.0)
+# Reach of robots, in metres.
+_REACH_M = (0.03, 60.0)
+# A target moves about as far as the flange: not a few hundred times more or less.
+_MOTION_RATIO = 300.0
+# Fields of view over the working distance; a 1000 times less or more is another unit.
+_FIELD_SIZE = (2e-3, 30.0)
+_OTHER_UNIT = {"mm": "m", "m": "mm"}
+_LISTED_CLOUDS = 4
+
+
+def check_scale(session: SessionData, cloud_unit: str) -> None:
+    """Refuse clouds or poses whose size only makes sense in the other unit.
+
+    Raises:
+        InputError: names the quantity, its size and the key to change.
+    """
+    metres = METRES[session.length_unit]
+    toml = session.path / "session.toml"
+    clouds = {view.name: view.cloud.points for view in session.views if view.cloud is not None}
+    distances = {name: metres * _median_distance(points) for name, points in clouds.items()}
+    extents = {name: metres * _trimmed_extent(points) for name, points in clouds.items()}
+    for sizes, limits, does in ((distances, _RANGE_M, "lie {} away"), (extents, _SIZE_M, "extend over {}")):
+        _require_one_unit(toml, sizes, limits, does, cloud_unit)
+        for name, size in sizes.items():
+            _require_plausible(size, limits, f"{toml}: the points of view {name}", does, "cloud_unit", cloud_unit)
+    for view in session.views:
+        if view.sighting is not None:
+            distance = _median_distance(view.sighting.points) * metres
+            what = f"{toml}: the targets of view {view.name}"
+            _require_plausible(distance, _SIGHT_M, what, "lie {} away", "length_unit", session.length_unit)
+    flange = np.array([view.T_base_flange[:3, 3] for view in session.views]) * metres
+    reach = float(np.linalg.norm(flange, axis=1).max())
+    _require_plausible(
+        reach, _REACH_M, f"{toml}: the flange", "stands at most {} away", "length_unit", session.length_unit
+    )
+    _compare_motions(session, flange)
+    _compare_standoff(session, cloud_unit)
+
+
+def require_near(where: str, points: Array) -> None:
+    """Refuse single points (N, 3), m, that no sensor measures: one of them would stretch every grid over the cloud.
+
+    Raises:
+        InputError: how many, and the first of them.
+    """
+    if np.abs(points).max() > _FARTHEST_M:
+        far = np.abs(points).max(axis=1) > _FARTHEST_M
+        raise InputError(
+            f"{where}: {far.sum()} of {len(points)} points lie more than {_FARTHEST_M:g} m from the scanner, the first "
+            f"is point {int(far.argmax()) + 1}; to fix: remove them from the cloud, or check cloud_unit"
+        )
+
+
+def _require_one_unit(toml: Path, sizes: Mapping[str, float], limits: Limits, does: str, cloud_unit: str) -> None:
+    """Refuse a few clouds whose size only makes sense in another unit than that of the others.
+
+    Args:
+        sizes: by view, m.
+        does: what a cloud does over that size, with {} in its place.
+    """
+    odd = {name: size for name, size in sizes.items() if not _is_plausible(size, limits)}
+    others = [size for name, size in sizes.items() if name not in odd]
+    if not odd or len(odd) > len(others):
+        return
+    names = ", ".join([*odd][:_LISTED_CLOUDS]) + " …" * (len(odd) > _LISTED_CLOUDS)
+    size = _length_text(float(np.median([*odd.values()])))
+    usual = _length_text(float(np.median(others)))
+    one = len(odd) == 1
+    raise InputError(
+        f"{toml}: the points of view{'' if one else 's'} {names} {does.format(size)}, those of the others (usually) "
+        f'{usual}, with cloud_unit = "{cloud_unit}": {"that cloud alone is" if one else "those clouds are"} in another '
+        f"unit than the others; to fix: export {'it' if one else 'them'} again in {cloud_unit}"
+    )
+
+
+def _require_plausible(size_m: float, limits: Limits, what: str, does: str, key: str, unit: str) -> None:
+    """Refuse a size, m, beyond its limits; `does` has {} in the place of the size."""
+    if not _is_plausible(size_m, limits):
+        hint = f'the scale looks off by 1000: set {key} = "{_OTHER_UNIT[unit]}"'
+        raise InputError(f'{what} {does.format(_length_text(size_m))} with {key} = "{unit}"; {hint}')
+
+
+def _is_plausible(size_m: float, limits: Limits) -> bool:
+    """Return whether a size, m, can be; 0 says nothing."""
+    return limits[0] <= size_m <= limits[1] or size_m == 0
+
+
+def _length_text(size_m: float) -> str:
+    return f"{size_m * 1e3:.3g} mm" if size_m < 1 else f"{size_m:.3g} m"
+
+
+def _compare_motions(session: SessionData, flange: Array) -> None:
+    """Labelled points have no size of their own, but a target that several views see moves with the arm."""
+    sightings = [view.sighting for view in session.views if view.sighting is not None]
+    if len(sightings) < 3 or session.has_clouds:
+        return
+    names = np.concatenate([sighting.targets for sighting in sightings])
+    points = np.concatenate([sighting.points for sighting in sightings]) * METRES[session.length_unit]
+    moved = max(_extent(points[names == name]) for name in np.unique(names))
+    arm = _extent(flange)
+    # A target that one view sees has not moved at all.
+    if min(moved, arm) > 0 and not 1 / _MOTION_RATIO < moved / arm < _MOTION_RATIO:
+        raise InputError(
+            f"{session.path / 'session.toml'}: the targets move over {moved * 1e3:.3g} mm, the flange over "
+            f"{arm * 1e3:.3g} mm; the scale looks off by 1000: write poses and targets in length_unit "
+            f'(is "{session.length_unit}")'
+        )
+
+
+def _compare_standoff(session: SessionData, cloud_unit: str) -> None:
+    """Against the working distance that the session itself states."""
+    clouds = [view.cloud.points for view in session.views if view.cloud is not None]
+    standoff = session.scanner.standoff
+    if not clouds or not standoff:
+        return
+    size = float(np.median([_trimmed_extent(points) for points in clouds]))
+    distance = float(np.median([_median_distance(points) for points in clouds]))
+    low, high = _FIELD_SIZE
+    if size < low * standoff or max(size, distance) > high * standoff:
+        raise InputError(
+            f"{session.path / 'session.toml'}: points lie {distance:.3g} {session.length_unit} away over "
+            f"{size:.3g}, but scanner.standoff is {standoff:.3g}; "
+            f'the scale looks off by 1000: check cloud_unit (is "{cloud_unit}")'
+        )
+
+
+def _median_distance(points: Array) -> float:
+    return float(np.median(np.linalg.norm(points, axis=1)))
+
+
+def _extent(points: Array) -> float:
+    """Return the longest side of the box around points (N, 3)."""
+    return float(np.ptp(points, axis=0).max())
+
+
+def _trimmed_extent(points: Array) -> float:
+    """Return the longest side of the box around all but the outermost points (N, 3)."""
+    low, high = np.percentile(points, (5, 95), axis=0)
+    return float((high - low).max())

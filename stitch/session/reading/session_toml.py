@@ -1,0 +1,219 @@
+"""session.toml: every key checked, tables turned to what they describe."""
+
+import shlex
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import METRES
+from stitch.session.reading.robot_description import (
+    LARGEST,
+    require_known_keys,
+    robot_from_dh,
+    robot_from_urdf,
+    table_numbers,
+)
+from stitch.session.reading.text_files import (
+    optional_text,
+    read_toml,
+    require_folder_name,
+    require_name,
+    shortened,
+    table_choice,
+)
+from stitch.session.robot import Robot
+from stitch.session.session import (
+    Scanner,
+    SensorKind,
+    StatedRepeatability,
+)
+
+SESSION_FORMAT = "stitch-session/1"
+_KEYS = {
+    "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part"},
+    "scanner": {"pose", "noise", "standoff", "optical_axis", "kind", "within", "moving"},
+    "robot": {"name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity", "repeatability"},
+    "sphere": {"radius"},
+    "part": {"cad", "cad_unit"},
+}
+# Effects of the scanner count its field as x/z and y/z: they know no scanner that looks along x or y.
+_AXES = {"+z": np.array([0.0, 0.0, 1.0]), "-z": np.array([0.0, 0.0, -1.0])}
+
+
+def read_session_document(file: Path) -> dict[str, Any]:
+    """Return the document, with known tables and keys only.
+
+    Raises:
+        InputError: missing, not TOML, of another format, or with a key that nobody knows.
+    """
+    hint = "a session is a folder with session.toml and views.csv"
+    if file.parent.is_dir():
+        # Whoever names the folder of the raw scans comes here first.
+        hint += f"; to fix: `stitch init {shlex.quote(str(file.parent))}` makes one of scans and poses as they are"
+    elif file.parent.exists():
+        hint += f"; to fix: name a folder, {shlex.quote(str(file.parent))} is a file"
+    else:
+        hint += f"; to fix: name a folder that exists, {shlex.quote(str(file.parent))} does not"
+    document = read_toml(file, hint)
+    if document.get("format") != SESSION_FORMAT:
+        raise InputError(f'{file}: format is {shortened(document.get("format"))}; expected "{SESSION_FORMAT}"')
+    for table, known in _KEYS.items():
+        entries = document if not table else document.get(table, {})
+        if not isinstance(entries, dict):
+            raise InputError(f"{file}: [{table}] must be a table")
+        for key in entries:
+            if key not in known:
+                close = get_close_matches(key, known, 1)
+                raise InputError(
+                    f"{file}: unknown key {f'{table}.{key}' if table else key!r}"
+                    + (f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(sorted(known))}")
+                )
+    return document
+
+
+def session_name(file: Path, document: dict[str, Any]) -> str:
+    """Return what the session is called: its name, or that of its folder.
+
+    Raises:
+        InputError: a name that cannot be that of its run's folder.
+    """
+    stated = optional_text(file, document, "", "name")
+    return require_folder_name(str(file), file.resolve().parent.name if stated is None else stated, "name")
+
+
+def read_scanner(file: Path, table: dict[str, Any]) -> Scanner:
+    """Return the scanner of [scanner]: where it sits and what it is; lengths in length_unit.
+
+    Raises:
+        InputError: a value that cannot be, and how to fix it.
+    """
+    axis = table.get("optical_axis", "+z")
+    if axis not in tuple(_AXES):
+        raise InputError(
+            f"{file}: scanner.optical_axis is {shortened(axis)}; turn the clouds until their scanner looks along z, "
+            'and write the side: "+z" or "-z"'
+        )
+    T_mount = _read_pose(file, table["pose"]) if "pose" in table else None
+    noise = positive_number(file, table, "scanner", "noise")
+    standoff = positive_number(file, table, "scanner", "standoff")
+    kind = table_choice(file, table, "kind", get_args(SensorKind)) if "kind" in table else None
+    moving = table.get("moving", False)
+    if not isinstance(moving, bool):
+        raise InputError(f"{file}: scanner.moving is {shortened(moving)}; use true or false")
+    return Scanner(T_mount, noise, standoff, _AXES[axis], cast(SensorKind | None, kind), moving)
+
+
+def _read_pose(file: Path, value: Any) -> Array:
+    try:
+        T = np.array(value, float)
+    except (TypeError, ValueError, OverflowError):
+        T = np.empty(0)
+    if T.shape != (4, 4) or not (np.abs(T) < LARGEST).all():
+        raise InputError(f"{file}: scanner.pose is no 4×4 matrix; to fix: write four rows of four numbers")
+    off = float(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max())
+    if off > 1e-3 or np.linalg.det(T[:3, :3]) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
+        raise InputError(
+            f"{file}: scanner.pose is not a rigid motion (R·Rᵀ differs from 1 by {off:.2g}, "
+            f"det {np.linalg.det(T[:3, :3]):+.3f}); write a rotation, and 0 0 0 1 in the last row"
+        )
+    return frames.make(frames.nearest_rotation(T[:3, :3]), T[:3, 3])
+
+
+def read_crop_box(file: Path, table: dict[str, Any]) -> Array | None:
+    """Return [scanner] within: (2, 3) lowest and highest corner of the box that counts, scanner frame, length_unit.
+
+    None where all counts.
+
+    Raises:
+        InputError: not two corners, or the second one not above the first.
+    """
+    if "within" not in table:
+        return None
+    try:
+        box = np.array(table["within"])
+    except ValueError:
+        box = np.zeros(0)
+    # Words and true are numbers to NumPy; integers of hundreds of digits are objects.
+    is_box = box.shape == (2, 3) and box.dtype.kind in "if" and bool(np.isfinite(box).all())
+    if not is_box or not (box[0] < box[1]).all():
+        raise InputError(
+            f"{file}: scanner.within is {shortened(table['within'])}; state the lowest and the highest corner of the "
+            "box that counts, in the scanner's frame: [[-200, -200, 300], [200, 200, 600]]"
+        )
+    return box.astype(float)
+
+
+def read_robot(file: Path, table: dict[str, Any] | None, unit: str) -> Robot | None:
+    """Return the robot of [robot], by its DH rows or URDF; None without one.
+
+    Raises:
+        InputError: a value that cannot be, and how to fix it.
+    """
+    if not table:
+        return None
+    name = require_name(f"{file}: robot", optional_text(file, table, "robot", "name") or "robot", "name")
+    gravity = table_numbers(f"{file}: robot", {"gravity": [0.0, 0.0, -9.81]} | table, "gravity", (3,))
+    payload = table.get("payload")
+    urdf = optional_text(file, table, "robot", "urdf")
+    base = optional_text(file, table, "robot", "base_link")
+    flange = optional_text(file, table, "robot", "flange_link")
+    if urdf is not None:
+        return robot_from_urdf(file.parent / urdf, base, flange, unit, gravity, payload)
+    if "joints" not in table and "repeatability" in table:
+        return None
+    if "joints" not in table:
+        raise InputError(f"{file}: [robot] needs joints (DH rows) or urdf")
+    try:
+        return robot_from_dh(name, str(table.get("dh", "standard")), table["joints"], payload, gravity, unit)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise InputError(f"{file}: robot.joints: {error}; every row is {{ a, alpha_deg, d, theta_deg }}") from None
+
+
+def read_repeatability(file: Path, table: dict[str, Any] | None) -> StatedRepeatability:
+    """Return [robot] repeatability = { position, rotation_mrad }; position in length_unit.
+
+    Raises:
+        InputError: another key, or no positive number.
+    """
+    stated = (table or {}).get("repeatability")
+    if stated is None:
+        return StatedRepeatability()
+    where = f"{file}: robot.repeatability"
+    require_known_keys(where, stated, ("position", "rotation_mrad"))
+    position = positive_number(file, stated, "robot.repeatability", "position")
+    rotation_mrad = positive_number(file, stated, "robot.repeatability", "rotation_mrad")
+    return StatedRepeatability(position, None if rotation_mrad is None else rotation_mrad / 1e3)
+
+
+def cad_file(file: Path, table: dict[str, Any]) -> tuple[Path | None, str | None]:
+    """Return path and unit of the CAD file of [part]; None where they are absent.
+
+    Raises:
+        InputError: no such file, or another unit.
+    """
+    name = optional_text(file, table, "part", "cad")
+    path = None if name is None else file.parent / name
+    if path is not None and not path.is_file():
+        raise InputError(f"{file}: part.cad names {path}, which is no file; to fix: correct the path")
+    return path, table_choice(file, table, "cad_unit", tuple(METRES)) if "cad_unit" in table else None
+
+
+def positive_number(file: Path, table: dict[str, Any], name: str, key: str) -> float | None:
+    """Return the positive number at `key` of the table that is called `name`; None where it is absent.
+
+    Raises:
+        InputError: anything else.
+    """
+    value = table.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < LARGEST:
+        raise InputError(f"{file}: {name}.{key} is {shortened(value)}; use a positive number")
+    return float(value)

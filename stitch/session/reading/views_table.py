@@ -1,0 +1,331 @@
+"""views.csv: one row per scan, columns by name.
+
+A row has the pose of the flange, reported or from joint angles, and maybe time, loads of the arm, and numbers that
+errors may follow.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.session.reading.csv_files import finite_number, is_number, read_csv_lines
+from stitch.session.reading.text_files import require_file, require_name
+from stitch.session.robot import Robot, forward
+from stitch.session.session import View
+
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_JOINT = re.compile(r"j([1-9]\d*)_deg$")
+_OTHER_JOINT_NAME = re.compile(r"(?:j|joint|axis|a|q|theta)[_ ]?([1-9]\d?)(?:[_ ]?[\[(]?(?:deg|rad|°)[\])]?)?", re.I)
+_APPROACH = re.compile(r"j([1-9]\d*)_approach$")
+_PAYLOAD = "payload_kg"
+_TORQUE = re.compile(r"j([1-9]\d*)_torque_nm$")
+# No arm carries a hundred tonnes, no drive exerts a million N·m.
+_LARGEST_KG = 1e5
+_LARGEST_NM = 1e6
+_LISTED_COLUMNS = 4
+# A quaternion with six digits is unit within 1e-6; beyond 1e-3 something else is written there.
+_FLANGE_QUATERNION_TOLERANCE = 1e-3
+# Joints and reported pose of a nominal model differ by the calibration (mm, tenths of a degree);
+# degrees and percents of the reach are another convention.
+_ANGLE_TOLERANCE = np.radians(2.0)
+_REACH_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class ViewRow:
+    """One row, checked."""
+
+    line: int
+    cloud: str  # file of its scan; empty where it names none
+    view: View  # without what was seen; lengths in length_unit
+
+
+def read_views(file: Path, robot: Robot | None) -> list[ViewRow]:
+    """Read and check views.csv.
+
+    Columns that hold text in every row (notes) are left alone. Where joints and a reported pose both
+    stand, the reported pose is used and must agree with the joints.
+
+    Raises:
+        InputError: names the line and how to fix it.
+    """
+    require_file(file, "a session needs a row per scan there")
+    header, lines = read_csv_lines(file)
+    joint_count = _check_header(file, header, robot)
+    if not lines:
+        raise InputError(f"{file}: no views; write one row per scan")
+    cells = [(line, {name: cell.strip() for name, cell in zip(header, row, strict=True)}) for line, row in lines]
+    covariates = covariate_names(header, cells)
+    joints = [_row_joints(file, line, row, joint_count) for line, row in cells]
+    require_loads(file, header, cells, joint_count)
+    rows: list[ViewRow] = []
+    names: dict[str, int] = {}
+    latest = -np.inf
+    for i, (line, row) in enumerate(cells):
+        name = row["view"]
+        if not name or name in names:
+            mend = f"is used on line {names[name]} already" if name else "is empty"
+            raise InputError(f"{file} line {line}: view {name!r} {mend}; every view needs an id of its own")
+        names[require_name(f"{file} line {line}", name, "view")] = line
+        time_s = finite_number(file, line, "time_s", row["time_s"]) if row.get("time_s") else None
+        if time_s is not None and time_s < latest:
+            # Direction of approach, settling and drifts count on the order.
+            raise InputError(
+                f"{file} line {line}: time_s {time_s:g} stands below {latest:g}; sort the rows by time, or let it go "
+                "on counting"
+            )
+        latest = latest if time_s is None else time_s
+        view = View(
+            name=name,
+            cloud=None,
+            covariates={column: finite_number(file, line, column, row[column]) for column in covariates if row[column]},
+            T_base_flange=_flange_pose(file, line, name, row, joints[i], robot),
+            joints=joints[i],
+            approach=_row_approach(file, line, row, joints[i], joints[i - 1] if i else None),
+            time_s=time_s,
+        )
+        rows.append(ViewRow(line, row.get("cloud", ""), view))
+    _require_no_hidden_joints(file, cells, [row.view.T_base_flange for row in rows], robot)
+    return rows
+
+
+def row_at(file: Path, robot: Robot | None, joints: Array) -> ViewRow:
+    """Return the row of a view that stands in no table, at joint angles (n,) rad.
+
+    Args:
+        file: session.toml.
+
+    Raises:
+        InputError: no robot, or one with another number of joints.
+    """
+    if robot is None:
+        raise InputError(f"{file}: no [robot], so that joint angles mean nothing; to fix: state its DH rows or URDF")
+    if len(joints) != robot.n_joints:
+        raise InputError(
+            f"{file}: {len(joints)} joint angles, but the robot has {robot.n_joints}; to fix: give one a joint"
+        )
+    still = np.zeros(len(joints))
+    return ViewRow(0, "", View("start", None, forward(robot, joints), joints, still, time_s=None, covariates={}))
+
+
+def has_reported_poses(file: Path) -> bool:
+    """Return True if some row of a views.csv that was read before reports a pose; False where there is no such file."""
+    if not file.is_file():
+        return False
+    header, rows = read_csv_lines(file)
+    columns = [k for k, name in enumerate(header) if name in POSE_COLUMNS]
+    return any(cells[k].strip() for _, cells in rows for k in columns)
+
+
+def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> int:
+    """Return how many joints have a column.
+
+    Raises:
+        InputError: neither poses nor joint angles, some of their columns alone, or a column twice.
+    """
+    if "view" not in header:
+        raise InputError(f"{file} line 1: no column 'view'; columns are {', '.join(header) or 'none'}")
+    double = sorted({name for name in header if header.count(name) > 1})
+    if double:
+        raise InputError(f"{file} line 1: column {double[0]!r} stands twice; rename one")
+    joint_count = _require_joint_columns(file, header, robot)
+    missing = [name for name in POSE_COLUMNS if name not in header]
+    if 0 < len(missing) < len(POSE_COLUMNS):
+        raise InputError(f"{file} line 1: a pose needs {', '.join(POSE_COLUMNS)}; missing {', '.join(missing)}")
+    if missing and not joint_count:
+        raise InputError(
+            f"{file} line 1: neither joints (j1_deg …) nor poses ({','.join(POSE_COLUMNS)}); one of them is needed"
+        )
+    if missing and not robot:
+        raise InputError(f"{file} line 1: joints without poses need a [robot] in session.toml")
+    return joint_count
+
+
+def _require_joint_columns(file: Path, header: Sequence[str], robot: Robot | None) -> int:
+    """Return how many joints have a column, which are all of the robot's or none."""
+    numbers = sorted(int(match[1]) for name in header if (match := _JOINT.match(name)))
+    if not numbers:
+        return 0
+    count = max(numbers[-1], robot.n_joints if robot else 0)
+    missing = list(islice((i for i in range(1, count + 1) if i not in numbers), _LISTED_COLUMNS))
+    columns = ", ".join(f"j{i}_deg" for i in missing)
+    if missing and missing[0] < numbers[-1]:
+        raise InputError(
+            f"{file} line 1: no column {columns}; joint columns must be j1_deg … jN_deg without a gap; to fix: add it"
+        )
+    if robot and len(numbers) != robot.n_joints:
+        mend = f"add {columns}" if missing else "leave out those beyond, or correct [robot] in session.toml"
+        raise InputError(
+            f"{file} line 1: {len(numbers)} joint columns, but the robot has {robot.n_joints}; to fix: {mend}"
+        )
+    return len(numbers)
+
+
+def covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]]) -> list[str]:
+    """Return the columns of numbers that are neither poses nor joints: what errors may follow.
+
+    Args:
+        cells: line number and cells by column of every row.
+    """
+    known = {"view", "cloud", "time_s", *POSE_COLUMNS}
+    rest = [name for name in header if name not in known and not _JOINT.match(name) and not _APPROACH.match(name)]
+    return [name for name in rest if any(is_number(row[name]) for _, row in cells)]
+
+
+def _row_joints(file: Path, line: int, row: dict[str, str], count: int) -> Array | None:
+    """Return the joint angles (n,) of a row, rad; None where it has none."""
+    names = [f"j{i + 1}_deg" for i in range(count)]
+    if not any(row[name] for name in names):
+        return None
+    return np.radians([finite_number(file, line, name, row[name]) for name in names])
+
+
+def _row_approach(
+    file: Path, line: int, row: dict[str, str], joints: Array | None, before: Array | None
+) -> Array | None:
+    """Return how each joint (n,) comes to its place, −1, 0, +1: as stated, else from the row before."""
+    if joints is None:
+        return None
+    approach = np.zeros(len(joints)) if before is None else np.sign(joints - before)
+    for k in range(len(joints)):
+        column = f"j{k + 1}_approach"
+        if row.get(column):
+            approach[k] = finite_number(file, line, column, row[column])
+            if approach[k] not in (-1, 0, 1):
+                raise InputError(f"{file} line {line}: {column} is {row[column]}; use -1, 0 or 1")
+    return approach
+
+
+def require_loads(file: Path, header: Sequence[str], cells: Sequence[tuple[int, dict[str, str]]], joints: int) -> None:
+    """Refuse loads of some views or some joints alone: gravity would silently take their place.
+
+    Args:
+        cells: line number and cells by column of every row.
+        joints: how many the table has.
+
+    Raises:
+        InputError: names the line or the columns, and how to fix it.
+    """
+    filled = [name for name in header if any(row[name] for _, row in cells)]
+    torques = [name for name in filled if _TORQUE.match(name)]
+    if torques and joints and sorted(torques) != sorted(f"j{i + 1}_torque_nm" for i in range(joints)):
+        raise InputError(
+            f"{file} line 1: torques of {', '.join(torques)}, but the table has {joints} joints; to fix: write one "
+            "column a joint, or take them out"
+        )
+    for name in [*torques, *(name for name in filled if name == _PAYLOAD)]:
+        for line, row in cells:
+            value = finite_number(file, line, name, row[name], "write a number in every row, or take the column out")
+            if name == _PAYLOAD and value < 0:
+                raise InputError(f"{file} line {line}: {name} is {value:g}; to fix: write a mass, 0 for none")
+            if abs(value) > (_LARGEST_KG if name == _PAYLOAD else _LARGEST_NM):
+                raise InputError(f"{file} line {line}: {name} is {value:g}, as on no arm; to fix: correct its unit")
+
+
+def _flange_pose(
+    file: Path, line: int, name: str, row: dict[str, str], joints: Array | None, robot: Robot | None
+) -> Array:
+    """Return T_base_flange (4, 4) of a view; a reported pose is used where it stands, and must agree with the joints.
+
+    Args:
+        row: cells by their column.
+        joints: (n,) rad.
+
+    Raises:
+        InputError: neither stands there, or what stands there is no pose, or not that of the joints.
+    """
+    from_joints = forward(robot, joints) if robot and joints is not None else None
+    given = [row.get(column, "") for column in POSE_COLUMNS]
+    if not any(given):
+        if from_joints is None:
+            raise InputError(
+                f"{file} line {line}: view {name} has no pose; fill {','.join(POSE_COLUMNS)} or the joints, or "
+                "remove the row"
+            )
+        return from_joints
+    values = np.array([finite_number(file, line, c, cell) for c, cell in zip(POSE_COLUMNS, given, strict=True)])
+    norm = float(np.linalg.norm(values[3:]))
+    if abs(norm - 1) > _FLANGE_QUATERNION_TOLERANCE:
+        raise InputError(
+            f"{file} line {line}: view {name}: qx,qy,qz,qw has length {norm:.4f}, not a rotation; "
+            "write a unit quaternion, w last"
+        )
+    reported = frames.from_quaternion(values[:3], values[3:] / norm)
+    if robot is not None and from_joints is not None:
+        require_agreement(f"{file} line {line}: view {name}", reported, from_joints, robot.metres_per_unit)
+    return reported
+
+
+def require_agreement(where: str, reported: Array, from_joints: Array, metres: float) -> None:
+    """Refuse a reported pose (4, 4) that is not that of the joints.
+
+    Args:
+        where: row and view, for messages.
+        metres: in one length_unit.
+
+    Raises:
+        InputError: by how much they differ, and what to check.
+    """
+    angle, distance, reach = _disagreement(reported, from_joints)
+    if angle > _ANGLE_TOLERANCE or distance > _REACH_TOLERANCE * reach:
+        raise InputError(
+            f"{where}: joints and reported pose differ by {1e3 * metres * distance:.4g} mm and "
+            f"{np.degrees(angle):.3g}°; check robot.dh, theta_deg, length_unit, or leave one of them out"
+        )
+
+
+def _require_no_hidden_joints(
+    file: Path, cells: Sequence[tuple[int, dict[str, str]]], poses: Sequence[Array], robot: Robot | None
+) -> None:
+    """Refuse columns whose names and numbers are those of joint angles, but that would count as covariates.
+
+    Args:
+        poses: (4, 4) T_base_flange of every row; columns that do not lead there are covariates, whatever their names.
+
+    Raises:
+        InputError: names the columns, and what to call them.
+    """
+    header = [*cells[0][1]] if cells else []
+    names = [] if any(map(_JOINT.match, header)) else _otherwise_named_joints(header)
+    if robot is None or not names or len(names) != robot.n_joints:
+        return
+    rows = [([row[name] for name in names], T) for (_, row), T in zip(cells, poses, strict=True)]
+    table = [([float(cell) for cell in row], T) for row, T in rows if all(map(is_number, row))]
+    for unit, factor in (("", np.pi / 180), (", in degrees", 1.0)):
+        if table and all(_reaches_pose(robot, factor * np.array(joints), T) for joints, T in table):
+            raise InputError(
+                f"{file} line 1: columns {', '.join(names)} hold the joint angles of the robot; to fix: call them "
+                f"j1_deg … j{len(names)}_deg{unit}"
+            )
+
+
+def _otherwise_named_joints(header: Sequence[str]) -> list[str]:
+    """Return columns J1, J2 …, in the order of their numbers; none where one is missing or twice."""
+    numbers = {name: int(match[1]) for name in header if (match := _OTHER_JOINT_NAME.fullmatch(name))}
+    names = sorted(numbers, key=lambda name: numbers[name])
+    return names if [numbers[name] for name in names] == [*range(1, len(names) + 1)] else []
+
+
+def _reaches_pose(robot: Robot, joints: Array, T: Array) -> bool:
+    if not np.isfinite(joints).all():
+        return False
+    from_joints = forward(robot, joints)
+    angle, distance, reach = _disagreement(T, from_joints)
+    return angle <= _ANGLE_TOLERANCE and distance <= _REACH_TOLERANCE * reach
+
+
+def _disagreement(reported: Array, from_joints: Array) -> tuple[float, float, float]:
+    """Return angle (rad) and distance between two flange poses (4, 4), and the reach of the second, length_unit."""
+    distance = np.linalg.norm(reported[:3, 3] - from_joints[:3, 3])
+    return (
+        float(frames.angle_between(reported, from_joints)),
+        float(distance),
+        float(np.linalg.norm(from_joints[:3, 3])),
+    )
