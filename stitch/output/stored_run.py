@@ -26,7 +26,7 @@ from stitch.output.schema import read_checked
 from stitch.run_data import Fit, FusedCloud, LedgerStep, RunData
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of, with_part_origin
-from stitch.session.reading.clouds import require_room
+from stitch.session.reading.scan_files import require_room
 from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, session_hash
 from stitch.session.reading.text_files import shortened
 from stitch.system.threads import library_threads_off

@@ -40,7 +40,8 @@ from stitch.screening.target_checks import check_targets, target_problems
 from stitch.screening.view_model import UsualEffects
 from stitch.session.capture import Capture, part_size, sightings_of, thin_session
 from stitch.session.measurement import measurement_of
-from stitch.session.reading.depth_image import DEPTH_SUFFIXES, find_intrinsics
+from stitch.session.reading.depth_image import DEPTH_SUFFIXES
+from stitch.session.reading.intrinsics import find_intrinsics
 from stitch.session.session import SessionData
 
 # No arm scatters by more.

@@ -45,8 +45,9 @@ from stitch.plugins.intake.stops import rows_with_scans
 from stitch.screening.conventions import RelativeScans, register_scan_pairs
 from stitch.session.capture import Capture, distinct_points, thin_session
 from stitch.session.reading.clouds import read_cloud
-from stitch.session.reading.depth_image import DEPTH_SUFFIXES, find_intrinsics
-from stitch.session.reading.range_image import poses_in_scans
+from stitch.session.reading.depth_image import DEPTH_SUFFIXES
+from stitch.session.reading.intrinsics import find_intrinsics
+from stitch.session.reading.scan_headers import poses_in_scans
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, Sighting, View
 from stitch.system.process import steps
 

@@ -23,9 +23,10 @@ from stitch.plugins.intake.raw_poses import (
     read_by_its_program,
     read_raw_poses,
 )
-from stitch.session.reading.clouds import CLOUD_SUFFIXES, ptx_scans
+from stitch.session.reading.clouds import CLOUD_SUFFIXES
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
-from stitch.session.reading.range_image import poses_in_scans
+from stitch.session.reading.scan_files import ptx_scans
+from stitch.session.reading.scan_headers import poses_in_scans
 from stitch.session.reading.text_files import WORKBOOKS, import_extra, readable
 
 # Which files of a folder are scans, and which of them are the scans of its campaign.

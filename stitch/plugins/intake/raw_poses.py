@@ -17,7 +17,7 @@ from stitch.plugins.intake.clock_times import ClockTimes, find_clock_column
 from stitch.plugins.intake.controllers.program import POSE_COLUMNS, csv_text, import_file
 from stitch.plugins.intake.pose_formats import PoseRow, joint_state_rows, open3d_rows, read_pose_text
 from stitch.plugins.intake.pose_tables import NumberTable, parse_number_table, with_one_header
-from stitch.session.reading.range_image import poses_in_scans, times_in_scans
+from stitch.session.reading.scan_headers import poses_in_scans, times_in_scans
 from stitch.session.reading.text_files import (
     WORKBOOKS,
     read_any_text,

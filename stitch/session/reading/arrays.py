@@ -13,8 +13,10 @@ from scipy.spatial.transform import Rotation
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.session.reading.clouds import cloud_of_columns, measured_pixels
-from stitch.session.reading.depth_image import Intrinsics, lifted
+from stitch.session.reading.clouds import cloud_of_columns
+from stitch.session.reading.depth_image import lifted
+from stitch.session.reading.intrinsics import Intrinsics
+from stitch.session.reading.scan_files import measured_pixels
 from stitch.session.session import Cloud, Sighting
 
 Columns = dict[str, Array]

@@ -10,68 +10,14 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.session.reading.text_files import not_utf8, require_file, require_name, shortened
 
-# Numbers in the cells of tables, or one line that says where there is none.
-
 # No quantity of a cell is larger in any unit; beyond, squares overflow.
 _LARGEST = 1e30
-
-
-def is_number(cell: str) -> bool:
-    """True for what Python reads as a number, finite or not."""
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def finite_number(file: Path, line: int, column: str, cell: str, remedy: str = "write a finite number") -> float:
-    """A finite number.
-
-    Raises:
-        InputError: names file, line and column, and how to fix it.
-    """
-    try:
-        value = float(cell)
-    except ValueError:
-        value = float("nan")
-    if not np.abs(value) < _LARGEST:
-        raise InputError(f"{file} line {line}: {column} is {shortened(cell.strip())}; {remedy}")
-    return value
-
-
-# A table whose cells are apart by something else than commas, as spreadsheets of many countries write it.
-
-_OTHERS = {";": "semicolons", "\t": "tabs"}
-
-
-def require_commas(file: Path, header: str) -> None:
-    """Refuse a table whose first line holds semicolons or tabs and no comma.
-
-    Raises:
-        InputError: names what it is separated by, and how to fix it.
-    """
-    separator = next((s for s in _OTHERS if s in header.strip()), None)
-    if separator is None or "," in header:
-        return
-    cell = rf"(?:^|[{separator}\n])\s*[+-]?\d+,\d+\s*(?=$|[{separator}\r\n])"
-    decimal = re.search(cell, file.read_text(encoding="utf-8", errors="replace")) is not None
-    mend = f"save it with commas between the cells{' and decimal points' * decimal}"
-    if file.name == "views.csv":
-        folder = shlex.quote(str(file.parent))
-        mend += (
-            f", or let `stitch init {folder} --poses {shlex.quote(str(file))} -o OTHER` make a session of it as it is"
-        )
-    raise InputError(
-        f"{file} line 1: is separated by {_OTHERS[separator]}{', with decimal commas' * decimal}; to fix: {mend}"
-    )
-
-
+_SEPARATORS = {";": "semicolons", "\t": "tabs"}
 _LONGEST_HEADER = 1 << 20
 
 
 def read_csv_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Names of the columns, and line number and cells of every line that is not empty.
+    """Return names of the columns, and line number and cells of every line that is not empty.
 
     Raises:
         InputError: the file is not text, is not separated by commas, a quote stays open, or a row has more or fewer
@@ -82,7 +28,7 @@ def read_csv_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     first = 1
     try:
         with file.open(newline="", encoding="utf-8-sig") as stream:
-            require_commas(file, stream.readline(_LONGEST_HEADER))
+            _require_commas(file, stream.readline(_LONGEST_HEADER))
             stream.seek(0)
             reader = csv.reader(stream, skipinitialspace=True)
             header = [require_name(f"{file} line 1", name.strip(), "column") for name in next(reader, [])]
@@ -100,9 +46,55 @@ def read_csv_lines(file: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     return header, rows
 
 
+def _require_commas(file: Path, header: str) -> None:
+    """Refuse a table whose first line holds semicolons or tabs and no comma, as spreadsheets of many countries do.
+
+    Raises:
+        InputError: names what it is separated by, and how to fix it.
+    """
+    separator = next((s for s in _SEPARATORS if s in header.strip()), None)
+    if separator is None or "," in header:
+        return
+    cell = rf"(?:^|[{separator}\n])\s*[+-]?\d+,\d+\s*(?=$|[{separator}\r\n])"
+    decimal = re.search(cell, file.read_text(encoding="utf-8", errors="replace")) is not None
+    mend = f"save it with commas between the cells{' and decimal points' * decimal}"
+    if file.name == "views.csv":
+        folder = shlex.quote(str(file.parent))
+        mend += (
+            f", or let `stitch init {folder} --poses {shlex.quote(str(file))} -o OTHER` make a session of it as it is"
+        )
+    raise InputError(
+        f"{file} line 1: is separated by {_SEPARATORS[separator]}{', with decimal commas' * decimal}; to fix: {mend}"
+    )
+
+
 def _require_cells(file: Path, line: int, row: list[str], header: list[str]) -> None:
     if len(row) != len(header):
         raise InputError(
             f"{file} line {line}: {len(row)} cells, the header has {len(header)}; to fix: write one cell a column, in "
             "quotes where it holds a comma"
         )
+
+
+def is_number(cell: str) -> bool:
+    """Return True for what Python reads as a number, finite or not."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def finite_number(file: Path, line: int, column: str, cell: str, remedy: str = "write a finite number") -> float:
+    """Return the finite number of a cell.
+
+    Raises:
+        InputError: names file, line and column, and how to fix it.
+    """
+    try:
+        value = float(cell)
+    except ValueError:
+        value = float("nan")
+    if not np.abs(value) < _LARGEST:
+        raise InputError(f"{file} line {line}: {column} is {shortened(cell.strip())}; {remedy}")
+    return value

@@ -1,4 +1,7 @@
-"""Robots from URDF. URDF counts in metres and radians (http://wiki.ros.org/urdf/XML)."""
+"""Robots from DH rows of the [robot] table, and from URDF; what is stated is checked.
+
+A wrong number would move the arm without a word. URDF counts in metres and radians (http://wiki.ros.org/urdf/XML).
+"""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
@@ -15,11 +18,11 @@ from stitch.numerics.units import METRES
 from stitch.session.reading.text_files import require_file, shortened
 from stitch.session.robot import LinkMesh, Robot, elementary
 
-# DH rows, payload and gravity of the [robot] table, checked: a wrong number would move the arm without a word.
-
+Element = ElementTree.Element
 # No length, angle or mass of an arm is larger in any unit; beyond, squares overflow.
 LARGEST = 1e12
 _DH_KEYS = ("a", "alpha_deg", "d", "theta_deg", "mass", "com")
+_MOVING = ("revolute", "continuous", "prismatic")
 
 
 def robot_from_dh(
@@ -30,7 +33,7 @@ def robot_from_dh(
     gravity: Array,
     length_unit: str,
 ) -> Robot:
-    """A robot from DH rows with keys a, alpha_deg, d, theta_deg, mass, com (missing ones are 0).
+    """Return a robot from DH rows with keys a, alpha_deg, d, theta_deg, mass, com (missing ones are 0).
 
     Raises:
         InputError: unknown convention or key, no row, or a value that is not a finite number.
@@ -40,14 +43,17 @@ def robot_from_dh(
     rows = [(f"robot.joints, joint {i + 1}", row) for i, row in enumerate(joints)]
     for where, row in rows:
         require_known_keys(where, row, _DH_KEYS)
-    a, alpha, d, theta = (
-        np.array([float(table_numbers(where, row, key, ())) for where, row in rows])
-        for key in ("a", "alpha_deg", "d", "theta_deg")
-    )
-    alpha, theta = np.radians(alpha), np.radians(theta)
+
+    def column(key: str) -> Array:
+        return np.array([float(table_numbers(where, row, key, ())) for where, row in rows])
+
+    a = column("a")
+    alpha = np.radians(column("alpha_deg"))
+    d = column("d")
+    theta = np.radians(column("theta_deg"))
     before, after = _joint_transforms(convention, a, alpha, d)
-    masses = [point_mass(where, row) for where, row in rows]
-    payload_mass, payload_com = payload_of(payload)
+    masses = [_point_mass(where, row) for where, row in rows]
+    payload_mass, payload_com = _payload_of(payload)
     return Robot(
         name=name,
         convention=convention,
@@ -58,7 +64,7 @@ def robot_from_dh(
         com=np.array([c for _, c in masses]),
         payload_mass=payload_mass,
         payload_com=payload_com,
-        gravity=gravity_of(gravity),
+        gravity=table_numbers("robot", {"gravity": gravity}, "gravity", (3,)),
         metres_per_unit=METRES[length_unit],
         a=a,
         alpha=alpha,
@@ -67,7 +73,7 @@ def robot_from_dh(
 
 
 def _joint_transforms(convention: str, a: Array, alpha: Array, d: Array) -> tuple[Array, Array]:
-    """(n, 4, 4) each: what stands before and behind the turn of every joint."""
+    """Return (n, 4, 4) each: what stands before and behind the turn of every joint."""
     if convention == "standard":
         return np.broadcast_to(np.eye(4), (len(a), 4, 4)), elementary("z", 0, d) @ elementary("x", alpha, a)
     if convention == "modified":
@@ -75,21 +81,16 @@ def _joint_transforms(convention: str, a: Array, alpha: Array, d: Array) -> tupl
     raise InputError(f'robot.dh is {convention!r}; use "standard" or "modified"')
 
 
-def payload_of(payload: dict[str, Any] | None) -> tuple[float, Array]:
-    """Mass (kg) and centre of mass (3,) in the flange frame of [robot] payload; both 0 without one."""
+def _payload_of(payload: dict[str, Any] | None) -> tuple[float, Array]:
+    """Return mass (kg) and centre of mass (3,) in the flange frame of [robot] payload; both 0 without one."""
     if payload is None:
         return 0.0, np.zeros(3)
     require_known_keys("robot.payload", payload, ("mass", "com"))
-    return point_mass("robot.payload", payload)
+    return _point_mass("robot.payload", payload)
 
 
-def gravity_of(gravity: Array) -> Array:
-    """Gravity (3,) in m/s² in the base frame, checked."""
-    return table_numbers("robot", {"gravity": gravity}, "gravity", (3,))
-
-
-def point_mass(where: str, table: dict[str, Any]) -> tuple[float, Array]:
-    """mass (kg, not negative) and com (3,) of a table; 0 where absent."""
+def _point_mass(where: str, table: dict[str, Any]) -> tuple[float, Array]:
+    """Return mass (kg, not negative) and com (3,) of a table; 0 where absent."""
     mass = float(table_numbers(where, table, "mass", ()))
     if mass < 0:
         raise InputError(f"{where}: mass is {mass:g} kg; use a positive number")
@@ -110,7 +111,7 @@ def require_known_keys(where: str, table: Any, known: tuple[str, ...]) -> None:
 
 
 def table_numbers(where: str, table: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
-    """The finite number, shape (), or triple, shape (3,), at `key`; 0 where absent."""
+    """Return the finite number, shape (), or triple, shape (3,), at `key`; 0 where absent."""
     try:
         value = np.array(table.get(key, np.zeros(shape)), float)
     except (TypeError, ValueError, OverflowError):
@@ -121,123 +122,6 @@ def table_numbers(where: str, table: dict[str, Any], key: str, shape: tuple[int,
     return value
 
 
-# Elements of a URDF: numbers, origins, ends of joints, what is fixed to a link.
-
-Element = ElementTree.Element
-
-
-def link_name(joint: Element, kind: str) -> str:
-    """Name of the link at the `parent` or `child` end of a joint.
-
-    Raises:
-        InputError: it names none.
-    """
-    element = joint.find(kind)
-    if element is None or not element.get("link"):
-        raise InputError(f"joint {joint.get('name')} has no <{kind} link=…>; to fix: write it")
-    return str(element.get("link"))
-
-
-def fixed_links(root: Element, link: str, scale: float) -> Iterator[tuple[Element, Array]]:
-    """A link and every link fixed to it, and where each stands in the frame of the first (4, 4)."""
-    waiting = [(link, np.eye(4))]
-    while waiting:
-        name, T = waiting.pop()
-        element = next((e for e in root.findall("link") if e.get("name") == name), None)
-        if element is not None:
-            yield element, T
-        for joint in root.findall("joint"):
-            if joint.get("type") == "fixed" and link_name(joint, "parent") == name:
-                waiting.append((link_name(joint, "child"), T @ origin(joint, scale)))
-
-
-def origin(owner: Element, scale: float, where: str = "") -> Array:
-    """(4, 4) of the <origin> of an element, lengths times `scale`; unity where it has none.
-
-    Raises:
-        InputError: something that is no number.
-    """
-    where = where or f"joint {owner.get('name')}"
-    element = owner.find("origin")
-    from scipy.spatial.transform import Rotation
-
-    xyz, rpy = (attribute_numbers(element, key, "0 0 0", where) for key in ("xyz", "rpy"))
-    return frames.make(Rotation.from_euler("xyz", rpy).as_matrix(), xyz * scale)
-
-
-def attribute_numbers(element: Element | None, key: str, default: str, where: str) -> Array:
-    """(n,) the numbers of an attribute, as many as its default has.
-
-    Raises:
-        InputError: other than so many finite numbers.
-    """
-    text = default if element is None else element.get(key) or default
-    try:
-        found = np.array(text.split(), float)
-    except ValueError:
-        found = np.array([np.nan])
-    if len(found) != len(default.split()) or not (np.abs(found) < LARGEST).all():
-        raise InputError(f"{where}: {key} is {text!r}, not numbers; expand xacro files first")
-    return found
-
-
-# How the links of a URDF look: the mesh files that its <visual> elements name.
-
-
-def link_meshes(
-    root: Element, chain: list[Element], folder: Path, scale: float, T_flange_last: Array
-) -> tuple[LinkMesh, ...]:
-    """Meshes of the links of a chain and of what is fixed to them.
-
-    What has no file, or no numbers where it stands, is left out: a picture is no reason to refuse an arm.
-
-    Args:
-        chain: joints from base to flange, fixed ones among them.
-        folder: of the URDF; names begin there, those of a package wherever above it the rest of the name fits.
-        scale: length_unit in a metre.
-        T_flange_last: (4, 4) frame of the last turning joint's link in that of the flange.
-    """
-    turning = [joint for joint in chain if joint.get("type") != "fixed"]
-    links = [link_name(chain[0], "parent"), *(link_name(joint, "child") for joint in turning)]
-    found = []
-    for i, link in enumerate(links):
-        T_frame_link = T_flange_last if i == len(turning) else np.eye(4)
-        for element, T in fixed_links(root, link, scale):
-            for visual in element.findall("visual"):
-                mesh = _mesh(visual, folder, scale)
-                if mesh is not None:
-                    T_link_mesh, file, own = mesh
-                    found.append(LinkMesh(i, T_frame_link @ T @ T_link_mesh, file, own))
-    return tuple(found)
-
-
-def _mesh(visual: Element, folder: Path, scale: float) -> tuple[Array, Path, Array] | None:
-    """Where a visual stands on its link (4, 4), its file and scale (3,)."""
-    mesh = visual.find("geometry/mesh")
-    file = None if mesh is None else _file(mesh.get("filename") or "", folder)
-    if file is None:
-        return None
-    try:
-        return origin(visual, scale, "visual"), file, attribute_numbers(mesh, "scale", "1 1 1", "visual") * scale
-    except InputError:
-        return None
-
-
-def _file(name: str, folder: Path) -> Path | None:
-    """The file that a URDF names: beside it, or package://name/rest in a folder above it."""
-    kind, mark, rest = name.rpartition("://")
-    if not rest or (mark and kind not in ("file", "package")):
-        return None
-    places = [folder / rest]
-    if kind == "package":
-        inside = rest.partition("/")[2]
-        places = [above / path for above in (folder, *folder.resolve().parents) for path in (rest, inside) if path]
-    try:
-        return next((place for place in places if place.is_file()), None)
-    except (OSError, ValueError):
-        return None
-
-
 def robot_from_urdf(
     path: Path | str,
     base_link: str | None,
@@ -246,7 +130,7 @@ def robot_from_urdf(
     gravity: Array,
     payload: dict[str, Any] | None = None,
 ) -> Robot:
-    """The serial chain base_link → flange_link, in length_unit.
+    """Return the serial chain base_link → flange_link, in length_unit.
 
     Fixed joints are merged. A link's mass includes all links fixed to it, a tool beyond the flange too:
     `payload` comes on top. Links on moving side branches (fingers) are not counted.
@@ -261,9 +145,10 @@ def robot_from_urdf(
     except (OSError, ValueError, LookupError, ElementTree.ParseError) as error:
         raise InputError(f"{path}: not a readable URDF: {error}; to fix: export it as plain URDF") from None
     try:
-        scale, chain = 1 / METRES[length_unit], _joint_chain(robot, base_link, flange_link)
+        scale = 1 / METRES[length_unit]
+        chain = _joint_chain(robot, base_link, flange_link)
         before, after, mass, com, T_last_flange = _serial_chain(robot, chain, scale)
-        payload_mass, payload_com = payload_of(payload)
+        payload_mass, payload_com = _payload_of(payload)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return Robot(
@@ -276,54 +161,31 @@ def robot_from_urdf(
         com=com,
         payload_mass=payload_mass,
         payload_com=payload_com,
-        gravity=gravity_of(gravity),
+        gravity=table_numbers("robot", {"gravity": gravity}, "gravity", (3,)),
         metres_per_unit=METRES[length_unit],
-        meshes=link_meshes(robot, chain, path.parent, scale, frames.inverse(T_last_flange)),
+        meshes=_link_meshes(robot, chain, path.parent, scale, frames.inverse(T_last_flange)),
     )
 
 
-_MOVING = ("revolute", "continuous", "prismatic")
-
-
-def moving_joints(urdf: str, base_link: str, flange_link: str) -> list[tuple[str, str]]:
-    """Name and kind of each joint that moves between two links of a URDF's text; none where no chain joins them."""
-    try:
-        chain = _joint_chain(ElementTree.fromstring(urdf), base_link, flange_link)
-    except (ValueError, LookupError, ElementTree.ParseError, InputError):
-        return []
-    return [(j.get("name") or "", str(j.get("type"))) for j in chain if j.get("type") in _MOVING]
-
-
-def poses_of_urdf(urdf: str, base_link: str, flange_link: str, joints: Array) -> Array:
-    """T_base_flange (V, 4, 4), mm, for joints (V, n), rad or m, that turn or slide along their axes."""
-    T, moved = np.tile(np.eye(4), (len(joints), 1, 1)), iter(joints.T)
-    for joint in _joint_chain(ElementTree.fromstring(urdf), base_link, flange_link):
-        T = T @ origin(joint, 1e3)
-        if joint.get("type") in _MOVING:
-            turn, q = _turn_to_z(joint), next(moved)
-            slides = joint.get("type") == "prismatic"
-            T = T @ turn @ (elementary("z", 0.0, 1e3 * q) if slides else elementary("z", q)) @ frames.inverse(turn)
-    return T
-
-
 def _serial_chain(root: Element, chain: list[Element], scale: float) -> tuple[Array, Array, Array, Array, Array]:
-    """What stands before and behind the turn of every joint (n, 4, 4), what it moves: mass (n,), com (n, 3).
+    """Return what stands before and behind the turn of every joint (n, 4, 4), and what it moves: mass (n,), com (n, 3).
 
     And T_last_flange (4, 4): the flange's frame in that of the last link.
     """
     before: list[Array] = []
     after: list[Array] = []
-    mass, com = [], []
+    mass: list[float] = []
+    com: list[Array] = []
     pending = np.eye(4)
     for joint in chain:
-        pending = pending @ origin(joint, scale)
+        pending = pending @ _origin(joint, scale)
         if joint.get("type") == "fixed":
             continue
         _require_turning(joint)
         turn = _turn_to_z(joint)
         before.append(pending @ turn)
         after.append(frames.inverse(turn))
-        body = list(_rigid_body(root, link_name(joint, "child"), scale))
+        body = list(_rigid_body(root, _link_name(joint, "child"), scale))
         mass.append(sum(m for m, _ in body))
         com.append(sum((m * c for m, c in body), np.zeros(3)) / (mass[-1] or 1.0))
         pending = np.eye(4)
@@ -336,16 +198,17 @@ def _serial_chain(root: Element, chain: list[Element], scale: float) -> tuple[Ar
 
 
 def _joint_chain(root: Element, base_link: str | None, flange_link: str | None) -> list[Element]:
-    """Joints from base to flange; walked backwards, because a link has one parent."""
+    """Return the joints from base to flange; walked backwards, because a link has one parent."""
     parent_of: dict[str, Element] = {}
     for joint in root.findall("joint"):
-        child = link_name(joint, "child")
+        child = _link_name(joint, "child")
         if child in parent_of:
             raise InputError(f"link {child} hangs on two joints; a URDF is a tree")
         parent_of[child] = joint
     if not base_link or not flange_link:
-        parents = {link_name(joint, "parent") for joint in parent_of.values()}
-        roots, ends = (", ".join(sorted(names)) for names in (parents - set(parent_of), set(parent_of) - parents))
+        parents = {_link_name(joint, "parent") for joint in parent_of.values()}
+        roots = ", ".join(sorted(parents - set(parent_of)))
+        ends = ", ".join(sorted(set(parent_of) - parents))
         raise InputError(
             "robot.urdf needs base_link and flange_link in session.toml; the tree starts at "
             f"{roots or '?'} and ends at {ends}"
@@ -356,7 +219,7 @@ def _joint_chain(root: Element, base_link: str | None, flange_link: str | None) 
         if link not in parent_of or parent_of[link] in chain:
             raise InputError(f"no chain from {base_link} to {flange_link} (stops at {link}); check the link names")
         chain.append(parent_of[link])
-        link = link_name(chain[-1], "parent")
+        link = _link_name(chain[-1], "parent")
     return chain[::-1]
 
 
@@ -369,19 +232,19 @@ def _require_turning(joint: Element) -> None:
 
 
 def _rigid_body(root: Element, link: str, scale: float) -> Iterator[tuple[float, Array]]:
-    """Mass and centre of mass (in the frame of `link`) of it and of every link fixed to it."""
-    for element, T in fixed_links(root, link, scale):
+    """Yield mass and centre of mass (in the frame of `link`) of it and of every link fixed to it."""
+    for element, T in _fixed_links(root, link, scale):
         name, inertial = element.get("name"), element.find("inertial")
         if inertial is not None and inertial.find("mass") is not None:
-            mass = attribute_numbers(inertial.find("mass"), "value", "0", f"link {name}")
+            mass = _attribute_numbers(inertial.find("mass"), "value", "0", f"link {name}")
             if len(mass) != 1 or mass[0] < 0:
                 raise InputError(f"link {name}: mass is not a positive number")
-            yield float(mass[0]), (T @ origin(inertial, scale, f"link {name}"))[:3, 3]
+            yield float(mass[0]), (T @ _origin(inertial, scale, f"link {name}"))[:3, 3]
 
 
 def _turn_to_z(joint: Element) -> Array:
-    """A rotation whose z axis is the joint's axis; URDF's default axis is x."""
-    direction = attribute_numbers(joint.find("axis"), "xyz", "1 0 0", f"axis of joint {joint.get('name')}")
+    """Return a rotation whose z axis is the joint's axis; URDF's default axis is x."""
+    direction = _attribute_numbers(joint.find("axis"), "xyz", "1 0 0", f"axis of joint {joint.get('name')}")
     length = np.linalg.norm(direction)
     if length < 1e-9:
         raise InputError(f"axis of joint {joint.get('name')} has no direction; to fix: write its axis")
@@ -390,3 +253,136 @@ def _turn_to_z(joint: Element) -> Array:
     x = np.cross(helper, direction)
     x /= np.linalg.norm(x)
     return frames.make(np.column_stack([x, np.cross(direction, x), direction]), np.zeros(3))
+
+
+def moving_joints(urdf: str, base_link: str, flange_link: str) -> list[tuple[str, str]]:
+    """Return name and kind of each joint that moves between two links of a URDF's text; none without a chain."""
+    try:
+        chain = _joint_chain(ElementTree.fromstring(urdf), base_link, flange_link)
+    except (ValueError, LookupError, ElementTree.ParseError, InputError):
+        return []
+    return [(j.get("name") or "", str(j.get("type"))) for j in chain if j.get("type") in _MOVING]
+
+
+def poses_of_urdf(urdf: str, base_link: str, flange_link: str, joints: Array) -> Array:
+    """Return T_base_flange (V, 4, 4), mm, for joints (V, n), rad or m, that turn or slide along their axes."""
+    T = np.tile(np.eye(4), (len(joints), 1, 1))
+    values = iter(joints.T)
+    for joint in _joint_chain(ElementTree.fromstring(urdf), base_link, flange_link):
+        T = T @ _origin(joint, 1e3)
+        if joint.get("type") in _MOVING:
+            turn = _turn_to_z(joint)
+            q = next(values)
+            slides = joint.get("type") == "prismatic"
+            T = T @ turn @ (elementary("z", 0.0, 1e3 * q) if slides else elementary("z", q)) @ frames.inverse(turn)
+    return T
+
+
+def _link_meshes(
+    root: Element, chain: list[Element], folder: Path, scale: float, T_flange_last: Array
+) -> tuple[LinkMesh, ...]:
+    """Return the meshes that <visual> elements name, of the links of a chain and of what is fixed to them.
+
+    What has no file, or no numbers where it stands, is left out: a picture is no reason to refuse an arm.
+
+    Args:
+        chain: joints from base to flange, fixed ones among them.
+        folder: of the URDF; names begin there, those of a package wherever above it the rest of the name fits.
+        scale: length_unit in a metre.
+        T_flange_last: (4, 4) frame of the last turning joint's link in that of the flange.
+    """
+    turning = [joint for joint in chain if joint.get("type") != "fixed"]
+    links = [_link_name(chain[0], "parent"), *(_link_name(joint, "child") for joint in turning)]
+    meshes = []
+    for i, link in enumerate(links):
+        T_frame_link = T_flange_last if i == len(turning) else np.eye(4)
+        for element, T in _fixed_links(root, link, scale):
+            for visual in element.findall("visual"):
+                mesh = _mesh(visual, folder, scale)
+                if mesh is not None:
+                    T_link_mesh, file, mesh_scale = mesh
+                    meshes.append(LinkMesh(i, T_frame_link @ T @ T_link_mesh, file, mesh_scale))
+    return tuple(meshes)
+
+
+def _mesh(visual: Element, folder: Path, scale: float) -> tuple[Array, Path, Array] | None:
+    """Return where a visual stands on its link (4, 4), its file and scale (3,); None without a mesh."""
+    mesh = visual.find("geometry/mesh")
+    file = None if mesh is None else _file(mesh.get("filename") or "", folder)
+    if file is None:
+        return None
+    try:
+        return _origin(visual, scale, "visual"), file, _attribute_numbers(mesh, "scale", "1 1 1", "visual") * scale
+    except InputError:
+        return None
+
+
+def _file(name: str, folder: Path) -> Path | None:
+    """Return the file that a URDF names: beside it, or package://name/rest in a folder above it."""
+    kind, mark, rest = name.rpartition("://")
+    if not rest or (mark and kind not in ("file", "package")):
+        return None
+    places = [folder / rest]
+    if kind == "package":
+        inside = rest.partition("/")[2]
+        places = [above / path for above in (folder, *folder.resolve().parents) for path in (rest, inside) if path]
+    try:
+        return next((place for place in places if place.is_file()), None)
+    except (OSError, ValueError):
+        return None
+
+
+def _fixed_links(root: Element, link: str, scale: float) -> Iterator[tuple[Element, Array]]:
+    """Yield a link and every link fixed to it, and where each stands in the frame of the first (4, 4)."""
+    waiting = [(link, np.eye(4))]
+    while waiting:
+        name, T = waiting.pop()
+        element = next((e for e in root.findall("link") if e.get("name") == name), None)
+        if element is not None:
+            yield element, T
+        for joint in root.findall("joint"):
+            if joint.get("type") == "fixed" and _link_name(joint, "parent") == name:
+                waiting.append((_link_name(joint, "child"), T @ _origin(joint, scale)))
+
+
+def _link_name(joint: Element, kind: str) -> str:
+    """Return the name of the link at the `parent` or `child` end of a joint.
+
+    Raises:
+        InputError: it names none.
+    """
+    element = joint.find(kind)
+    if element is None or not element.get("link"):
+        raise InputError(f"joint {joint.get('name')} has no <{kind} link=…>; to fix: write it")
+    return str(element.get("link"))
+
+
+def _origin(owner: Element, scale: float, where: str = "") -> Array:
+    """Return (4, 4) of the <origin> of an element, lengths times `scale`; unity where it has none.
+
+    Raises:
+        InputError: something that is no number.
+    """
+    from scipy.spatial.transform import Rotation
+
+    where = where or f"joint {owner.get('name')}"
+    element = owner.find("origin")
+    xyz = _attribute_numbers(element, "xyz", "0 0 0", where)
+    rpy = _attribute_numbers(element, "rpy", "0 0 0", where)
+    return frames.make(Rotation.from_euler("xyz", rpy).as_matrix(), xyz * scale)
+
+
+def _attribute_numbers(element: Element | None, key: str, default: str, where: str) -> Array:
+    """Return (n,) the numbers of an attribute, as many as its default has.
+
+    Raises:
+        InputError: other than so many finite numbers.
+    """
+    text = default if element is None else element.get(key) or default
+    try:
+        numbers = np.array(text.split(), float)
+    except ValueError:
+        numbers = np.array([np.nan])
+    if len(numbers) != len(default.split()) or not (np.abs(numbers) < LARGEST).all():
+        raise InputError(f"{where}: {key} is {text!r}, not numbers; expand xacro files first")
+    return numbers

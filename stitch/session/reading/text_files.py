@@ -1,4 +1,7 @@
-"""The text of a file that may be anything: missing, a pipe, a folder, without end, or no text at all."""
+"""The text of a file that may be anything: missing, a pipe, a folder, without end, or no text at all.
+
+What it holds as TOML, JSON or sheets; names that people write there; and values for messages.
+"""
 
 import codecs
 import csv
@@ -13,81 +16,60 @@ from typing import Any
 
 from stitch.errors import InputError
 
-# Packages that only some files need; they come with extras of the package.
-
-
-def import_extra(name: str, where: Path | str, extra: str) -> Any:
-    """A package by its name of import.
-
-    Args:
-        where: the file, or the flag, that needs it.
-        extra: with which it is installed.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise InputError(f"{where}: needs the package {name}; to fix: pip install 'stitch[{extra}]'") from None
-
-
-# A JSON file of which nobody knows whether it is there, whole, or what it should be.
-
-
-def read_json_object(file: Path) -> dict[str, Any]:
-    """What a JSON file holds; nothing where it is missing, damaged, or no object."""
-    if not file.is_file():
-        return {}
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
-        return {}
-    return document if isinstance(document, dict) else {}
-
-
-# Why a file is missing: the folder is a run, or a run that has lost some of its files.
-
+# Tables and descriptions are far smaller; a larger one is another file.
+LARGEST_MB = 200
+# A description written by hand; the model of a run with thousands of targets is smaller too.
+_LARGEST_TOML_MB = 20
+# How the small file begins that Git LFS leaves in place of a large one.
+_POINTER = b"version https://git-lfs"
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+WORKBOOKS = (".xlsx", ".xlsm", ".xls", ".xlsb", ".ods")
 # What every run of one session holds.
 _DOCUMENTS = ("model.toml", "result.json", "ledger.json")
 _SESSION = "session.toml"
-_RUN, _MODEL = "stitch-run/", "stitch-model/"
+_RUN = "stitch-run/"
+_MODEL = "stitch-model/"
+_LONGEST = 200  # characters of an id; a folder's name may have 255 bytes, and scratch folders lengthen it
+_RESERVED = "/\\"
 
 
-def reason_missing(file: Path) -> str | None:
-    """What to say in place of "not found", where the folder tells what it is; None where it does not."""
-    folder = file.parent
-    if file.name == _SESSION and _is_run(folder):
-        sessions = ", ".join(_sessions_of_run(folder))
-        return f"{folder}: is a run{f' of {sessions}' * bool(sessions)}, not a session; to fix: name the session"
-    if file.name not in _DOCUMENTS or (folder / _SESSION).exists() or not _is_run(folder):
-        return None
-    # The folder of a rig has a model for all its runs, and no result of its own.
-    if file.name != "model.toml" and any(folder.glob("*/result.json")):
-        return None
-    return f"{folder}: damaged, its {file.name} is missing; to fix: `stitch run` the session again into another folder"
+def read_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
+    """Return the text of a file, with or without the mark of UTF-8 (BOM) in front.
+
+    Raises:
+        InputError: no such file, too large, or not UTF-8.
+    """
+    _require_size(file, hint, largest_mb)
+    try:
+        return file.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(not_utf8(file, "UTF-8")) from None
 
 
-def _is_run(folder: Path) -> bool:
-    if _session_of_result(folder / "result.json") is not None:
-        return True
-    model = folder / "model.toml"
-    return model.is_file() and _MODEL in model.read_text(encoding="utf-8", errors="replace")
+def read_any_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
+    """Return the text of a file of another program: UTF-8, UTF-16 with its mark, else Windows' Western European.
+
+    Spreadsheets write the last two; of a wrong guess only letters in names suffer, digits are the same in all.
+
+    Raises:
+        InputError: no such file, too large, or no text.
+    """
+    _require_size(file, hint, largest_mb)
+    content = file.read_bytes()
+    marked = content.startswith(_UTF16)
+    for encoding in ("utf-16",) if marked else ("utf-8-sig", "cp1252"):
+        with suppress(UnicodeDecodeError):
+            text = content.decode(encoding)
+            if "\0" not in text:
+                return text
+    raise InputError(f"{file}: is no text; to fix: save it as UTF-8")
 
 
-def _sessions_of_run(folder: Path) -> list[str]:
-    """The session of a run, or those of a rig."""
-    files = (folder / "result.json", *sorted(folder.glob("*/result.json")))
-    return [*dict.fromkeys(session for file in files if (session := _session_of_result(file)))]
-
-
-def _session_of_result(file: Path) -> str | None:
-    """Where the session of a result lies, empty where it does not say; None for a file that is no result."""
-    document = read_json_object(file)
-    return str(document.get("session") or "") if str(document.get("format")).startswith(_RUN) else None
-
-
-# What may not be read says so.
+def _require_size(file: Path, hint: str, largest_mb: float) -> None:
+    require_file(file, hint)
+    size = file.stat().st_size / 1e6
+    if size > largest_mb:
+        raise InputError(f"{file}: has {size:,.0f} MB, more than {largest_mb:g}; to fix: name the right file")
 
 
 @contextmanager
@@ -107,13 +89,6 @@ def readable(place: Path | None = None) -> Iterator[None]:
         raise InputError(f"{name}: may not be read; to fix: change its rights, or name another") from None
 
 
-# Tables and descriptions are far smaller; a larger one is another file.
-LARGEST_MB = 200
-# How the small file begins that Git LFS leaves in place of a large one.
-_POINTER = b"version https://git-lfs"
-_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-
-
 @readable()
 def require_file(file: Path, hint: str) -> None:
     """Refuse what cannot be read to its end: a pipe, a device, a folder.
@@ -125,7 +100,9 @@ def require_file(file: Path, hint: str) -> None:
         InputError: no such file, none of this kind, one that may not be read, or that Git LFS has not fetched.
     """
     if file.is_file():
-        _require_no_pointer(file)
+        with file.open("rb") as stream:
+            if stream.read(len(_POINTER)) == _POINTER:
+                raise InputError(f"{file}: Git LFS has left a pointer in place of the file; to fix: git lfs pull")
         return
     if file.is_dir():
         raise InputError(f"{file}: is a folder; to fix: {hint}")
@@ -133,67 +110,108 @@ def require_file(file: Path, hint: str) -> None:
         raise InputError(f"{file}: is a pipe or a device; to fix: put a file there")
     if file.is_symlink():
         raise InputError(f"{file}: is a link to {file.readlink()}, which does not exist; to fix: {hint}")
-    raise InputError(reason_missing(file) or f"{file}: not found; {hint}")
+    raise InputError(_reason_missing(file) or f"{file}: not found; {hint}")
 
 
-def _require_no_pointer(file: Path) -> None:
-    with file.open("rb") as stream:
-        if stream.read(len(_POINTER)) == _POINTER:
-            raise InputError(f"{file}: Git LFS has left a pointer in place of the file; to fix: git lfs pull")
+def _reason_missing(file: Path) -> str | None:
+    """Return what to say in place of "not found", where the folder tells what it is; None where it does not."""
+    folder = file.parent
+    if file.name == _SESSION and _is_run(folder):
+        # The session of a run, or those of a rig.
+        results = (folder / "result.json", *sorted(folder.glob("*/result.json")))
+        sessions = ", ".join(dict.fromkeys(session for file in results if (session := _session_of_result(file))))
+        return f"{folder}: is a run{f' of {sessions}' * bool(sessions)}, not a session; to fix: name the session"
+    if file.name not in _DOCUMENTS or (folder / _SESSION).exists() or not _is_run(folder):
+        return None
+    # The folder of a rig has a model for all its runs, and no result of its own.
+    if file.name != "model.toml" and any(folder.glob("*/result.json")):
+        return None
+    return f"{folder}: damaged, its {file.name} is missing; to fix: `stitch run` the session again into another folder"
 
 
-def read_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
-    """The text of a file, with or without the mark of UTF-8 (BOM) in front.
+def _is_run(folder: Path) -> bool:
+    if _session_of_result(folder / "result.json") is not None:
+        return True
+    model = folder / "model.toml"
+    return model.is_file() and _MODEL in model.read_text(encoding="utf-8", errors="replace")
 
-    Raises:
-        InputError: no such file, too large, or not UTF-8.
-    """
-    _require_size(file, hint, largest_mb)
-    try:
-        return file.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(not_utf8(file, "UTF-8")) from None
+
+def _session_of_result(file: Path) -> str | None:
+    """Return where the session of a result lies, empty where it does not say; None for a file that is no result."""
+    document = read_json_object(file)
+    return str(document.get("session") or "") if str(document.get("format")).startswith(_RUN) else None
 
 
 def not_utf8(file: Path, save_as: str) -> str:
-    """What to say of a file that is not UTF-8: where its first byte stands that is none.
+    """Return what to say of a file that is not UTF-8: where its first byte stands that is none.
 
     Args:
         save_as: the kind to save it as.
     """
-    told = file.read_bytes()
+    content = file.read_bytes()
     mend = f"to fix: save it as {save_as}"
-    if told.startswith(_UTF16):
+    if content.startswith(_UTF16):
         return f"{file} line 1: is UTF-16 text, not UTF-8; {mend}"
     try:
-        told.decode("utf-8-sig")
+        content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        start = error.start + len(codecs.BOM_UTF8) * told.startswith(codecs.BOM_UTF8)
-        line = told.count(b"\n", 0, start) + 1
-        return f"{file} line {line}: not UTF-8 text, byte 0x{told[start]:02x} is the first that is none; {mend}"
+        start = error.start + len(codecs.BOM_UTF8) * content.startswith(codecs.BOM_UTF8)
+        line = content.count(b"\n", 0, start) + 1
+        return f"{file} line {line}: not UTF-8 text, byte 0x{content[start]:02x} is the first that is none; {mend}"
     return f"{file}: not UTF-8 text; {mend}"
 
 
-def read_any_text(file: Path, hint: str, largest_mb: float = LARGEST_MB) -> str:
-    """The text of a file that another program wrote: UTF-8, UTF-16 with its mark, else Windows' Western European.
+def read_toml(file: Path, hint: str) -> dict[str, Any]:
+    """Return the document of a TOML file.
 
-    Spreadsheets write the last two; of a wrong guess only letters in names suffer, digits are the same in all.
+    Args:
+        hint: what to do where there is no such file.
 
     Raises:
-        InputError: no such file, too large, or no text.
+        InputError: the file is missing, no file, or not TOML.
     """
-    _require_size(file, hint, largest_mb)
-    told = file.read_bytes()
-    marked = told.startswith(_UTF16)
-    for encoding in ("utf-16",) if marked else ("utf-8-sig", "cp1252"):
-        with suppress(UnicodeDecodeError):
-            text = told.decode(encoding)
-            if "\0" not in text:
-                return text
-    raise InputError(f"{file}: is no text; to fix: save it as UTF-8")
+    text = read_text(file, hint, _LARGEST_TOML_MB)
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:  # wrong TOML, and integers of thousands of digits
+        raise InputError(f"{file}: not valid TOML: {error}; to fix: correct it there") from None
+    except RecursionError:
+        raise InputError(f"{file}: not valid TOML: nested too deeply; to fix: write plain tables and lists") from None
 
 
-WORKBOOKS = (".xlsx", ".xlsm", ".xls", ".xlsb", ".ods")
+def table_choice(file: Path, table: dict[str, Any], key: str, allowed: tuple[str, ...]) -> str:
+    """Return the word at `key`, one of those allowed.
+
+    Raises:
+        InputError: another one, or none.
+    """
+    value = table.get(key)
+    if not isinstance(value, str) or value not in allowed:
+        raise InputError(f"{file}: {key} is {shortened(value)}; use {' or '.join(repr(a) for a in allowed)}")
+    return str(value)
+
+
+def optional_text(file: Path, table: dict[str, Any], name: str, key: str) -> str | None:
+    """Return the text at `key` of the table that is called `name`, or None where it is absent.
+
+    Raises:
+        InputError: something else than text.
+    """
+    value = table.get(key)
+    if value is not None and not isinstance(value, str):
+        raise InputError(f"{file}: {f'{name}.' * bool(name)}{key} is {shortened(value)}; write a name in quotes")
+    return value
+
+
+def read_json_object(file: Path) -> dict[str, Any]:
+    """Return what a JSON file holds; nothing where it is missing, damaged, or no object."""
+    if not file.is_file():
+        return {}
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        return {}
+    return document if isinstance(document, dict) else {}
 
 
 def workbook_sheets(file: Path) -> dict[str, str]:
@@ -209,49 +227,33 @@ def workbook_sheets(file: Path) -> dict[str, str]:
         sheets = {name: book.get_sheet_by_name(name).to_python() for name in book.sheet_names}
     except (calamine.CalamineError, OSError, ValueError) as error:
         raise InputError(f"{file}: no readable workbook ({reason_of(error)}); to fix: save its sheets as CSV") from None
-    out = {}
+    texts = {}
     for name, rows in sheets.items():
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows(rows)
         if rows:
-            out[name] = text.getvalue()
-    return out
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerows(rows)
+            texts[name] = text.getvalue()
+    return texts
 
 
-def _require_size(file: Path, hint: str, largest_mb: float) -> None:
-    require_file(file, hint)
-    size = file.stat().st_size / 1e6
-    if size > largest_mb:
-        raise InputError(f"{file}: has {size:,.0f} MB, more than {largest_mb:g}; to fix: name the right file")
+def import_extra(name: str, where: Path | str, extra: str) -> Any:
+    """Return a package by its name of import; only some files need it, and an extra of this package installs it.
 
+    Args:
+        where: the file, or the flag, that needs it.
+        extra: of this package.
 
-def reason_of(error: Exception) -> str:
-    """What a library says of bytes that it cannot read, on one line.
-
-    A mesh that is no mesh may be text in an encoding for which the library lacks a package: that helps nobody.
+    Raises:
+        InputError: it is not installed.
     """
-    if isinstance(error, ImportError):
-        return "its bytes are not what its name says"
-    return shortened(" ".join(str(error).split()) or type(error).__name__)
-
-
-def shortened(value: object, most: int = 80) -> str:
-    """`repr` of a value for a message, cut where it is long."""
     try:
-        told = repr(value)
-    except ValueError:  # an integer of thousands of digits
-        told = "a number of thousands of digits"
-    return told if len(told) <= most else f"{told[: most // 2]}…{told[-most // 4 :]}"
-
-
-# Names that people give to sessions, views and targets: as ids in tables, and as folders.
-
-_LONGEST = 200  # characters of an id; a folder's name may have 255 bytes, and scratch folders lengthen it
-_RESERVED = "/\\"
+        return importlib.import_module(name)
+    except ImportError:
+        raise InputError(f"{where}: needs the package {name}; to fix: pip install 'stitch[{extra}]'") from None
 
 
 def require_name(where: str, name: str, what: str) -> str:
-    """An id that can be printed on a line.
+    """Return an id that can be printed on a line.
 
     Raises:
         InputError: too long, or with characters that nobody sees.
@@ -267,7 +269,7 @@ def require_name(where: str, name: str, what: str) -> str:
 
 
 def require_folder_name(where: str, name: str, what: str) -> str:
-    """A name under which a folder can be made: that of a session is one of its run.
+    """Return a name under which a folder can be made: that of a session is one of its run.
 
     Raises:
         InputError: empty, a path, hidden, or longer than a file system allows.
@@ -283,49 +285,20 @@ def require_folder_name(where: str, name: str, what: str) -> str:
     return name
 
 
-# A TOML file as a document, and values of its tables.
+def reason_of(error: Exception) -> str:
+    """Return what a library says of bytes that it cannot read, on one line.
 
-# A description written by hand; the model of a run with thousands of targets is smaller too.
-_LARGEST_MB = 20
-
-
-def read_toml(file: Path, hint: str) -> dict[str, Any]:
-    """The document of a file.
-
-    Args:
-        hint: what to do where there is no such file.
-
-    Raises:
-        InputError: the file is missing, no file, or not TOML.
+    A mesh that is no mesh may be text in an encoding for which the library lacks a package: that helps nobody.
     """
-    told = read_text(file, hint, _LARGEST_MB)
+    if isinstance(error, ImportError):
+        return "its bytes are not what its name says"
+    return shortened(" ".join(str(error).split()) or type(error).__name__)
+
+
+def shortened(value: object, most: int = 80) -> str:
+    """Return `repr` of a value for a message, cut where it is long."""
     try:
-        return tomllib.loads(told)
-    except ValueError as error:  # wrong TOML, and integers of thousands of digits
-        raise InputError(f"{file}: not valid TOML: {error}; to fix: correct it there") from None
-    except RecursionError:
-        raise InputError(f"{file}: not valid TOML: nested too deeply; to fix: write plain tables and lists") from None
-
-
-def table_choice(file: Path, table: dict[str, Any], key: str, allowed: tuple[str, ...]) -> str:
-    """The word at `key`, one of those allowed.
-
-    Raises:
-        InputError: another one, or none.
-    """
-    value = table.get(key)
-    if not isinstance(value, str) or value not in allowed:
-        raise InputError(f"{file}: {key} is {shortened(value)}; use {' or '.join(repr(a) for a in allowed)}")
-    return str(value)
-
-
-def optional_text(file: Path, table: dict[str, Any], name: str, key: str) -> str | None:
-    """The text at `key` of the table that is called `name`, or None where it is absent.
-
-    Raises:
-        InputError: something else than text.
-    """
-    value = table.get(key)
-    if value is not None and not isinstance(value, str):
-        raise InputError(f"{file}: {f'{name}.' * bool(name)}{key} is {shortened(value)}; write a name in quotes")
-    return value
+        text = repr(value)
+    except ValueError:  # an integer of thousands of digits
+        text = "a number of thousands of digits"
+    return text if len(text) <= most else f"{text[: most // 2]}…{text[-most // 4 :]}"

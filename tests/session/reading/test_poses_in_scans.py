@@ -8,7 +8,7 @@ import pytest
 from stitch.errors import InputError
 from stitch.plugins.intake.first_session import StatedFolder, first_session
 from stitch.session.reading.clouds import read_cloud
-from stitch.session.reading.range_image import poses_in_scans, times_in_scans
+from stitch.session.reading.scan_headers import poses_in_scans, times_in_scans
 from tests.needs import needs
 
 POINTS = "0 0 100 0.5\n10 0 100 0.25\n0 10 100 1\n10 10 100 1\n"

@@ -1,0 +1,170 @@
+"""A camera's intrinsics, from the file that lies beside a depth image.
+
+Read as tools write them: ROS camera_info and OpenCV's YAML (camera_matrix, or K and D), Open3D's JSON (intrinsic_matrix
+by columns), RealSense's (fx, fy, ppx, ppy, coeffs), Zivid's YAML (FX, FY, CX, CY, K1 …), a 3×3 matrix as text.
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics.frames import Array
+from stitch.session.reading.text_files import read_text, shortened
+
+_NAMED = re.compile(r"intrinsic|camera_?info|calib|camera|^k$", re.IGNORECASE)
+_ENDINGS = (".json", ".yaml", ".yml", ".txt")
+_LARGEST_MB = 5.0
+_FIX = "to fix: put them beside it or in the folder above, as intrinsics.json with fx, fy, cx, cy"
+# Units per metre are more, metres per unit less: what lies between means neither.
+_PER_METRE = 50.0
+_METRES_PER = 0.02
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole with OpenCV's distortion, in pixels; (0, 0) is the middle of the first pixel."""
+
+    source: Path
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: Array  # (n,) k1, k2, p1, p2, k3 …; none where all are zero
+    size: tuple[int, int] | None  # width, height
+    units_per_metre: float | None  # of the depth, where the file states it
+
+
+def find_intrinsics(image: Path) -> Intrinsics:
+    """Return the intrinsics of an image: of a file of its own name, of its folder, or of the folder above.
+
+    Raises:
+        InputError: none, several, or one that cannot be read.
+    """
+    for ending in _ENDINGS:
+        file = image.with_suffix(ending)
+        camera = _read_intrinsics(file) if file.is_file() else None
+        if camera is not None:
+            return camera
+    for folder in (image.parent, image.parent.parent):
+        files = [f for f in sorted(folder.iterdir()) if f.suffix.lower() in _ENDINGS and _NAMED.search(f.stem)]
+        of_depth = [f for f in files if "depth" in f.stem.lower()]
+        cameras = [camera for f in of_depth or files if (camera := _read_intrinsics(f)) is not None]
+        if len(cameras) > 1:
+            names = ", ".join(camera.source.name for camera in cameras[:3])
+            raise InputError(
+                f"{folder}: several files hold intrinsics ({names}); to fix: call that of the depth depth_…"
+            )
+        if cameras:
+            return cameras[0]
+    raise InputError(f"{image}: a depth image needs intrinsics, none lie beside it; {_FIX}")
+
+
+def _read_intrinsics(file: Path) -> Intrinsics | None:
+    """Return what a file states; None where it holds no intrinsics."""
+    if file.stat().st_size > _LARGEST_MB * 1e6:
+        return None
+    try:
+        text = read_text(file, "name a file of intrinsics", _LARGEST_MB)
+        if file.suffix.lower() == ".txt":
+            document: Any = {"K": np.array(text.replace(",", " ").split(), float).tolist()}
+        elif file.suffix.lower() == ".json":
+            document = json.loads(text)
+        else:
+            from stitch.session.reading.yaml_file import parse_yaml
+
+            documents = parse_yaml(file, text)
+            document = documents[0] if documents else None
+    except (ValueError, RecursionError, InputError):
+        return None
+    cameras = (_intrinsics_of_level(file, level) for level in _document_levels(document))
+    return next((camera for camera in cameras if camera is not None), None)
+
+
+def _document_levels(document: Any) -> Iterator[dict[str, Any]]:
+    """Yield every mapping of a document, those of the depth first."""
+    if isinstance(document, dict):
+        plain = {str(key).lower(): value for key, value in document.items()}
+        yield plain
+        for key in sorted(plain, key=lambda key: "depth" not in key):
+            yield from _document_levels(plain[key])
+
+
+def _intrinsics_of_level(file: Path, level: dict[str, Any]) -> Intrinsics | None:
+    matrix = _camera_matrix(level)
+    if matrix is None:
+        return None
+    fx, fy, cx, cy = matrix
+    if not (np.isfinite(matrix).all() and fx > 0 and fy > 0):
+        raise InputError(
+            f"{file}: fx = {fx:g}, fy = {fy:g} are no focal lengths; to fix: state them in pixels, above 0"
+        )
+    width = _whole_number(level, "width", "image_width")
+    height = _whole_number(level, "height", "image_height")
+    size = None if width is None or height is None else (width, height)
+    return Intrinsics(
+        file, fx, fy, cx, cy, distortion=_distortion(level), size=size, units_per_metre=_units_per_metre(file, level)
+    )
+
+
+def _camera_matrix(level: dict[str, Any]) -> tuple[float, float, float, float] | None:
+    """Return fx, fy, cx, cy; None where a mapping has none."""
+    inner = level.get("cameramatrix")
+    if isinstance(inner, dict):
+        level = {str(key).lower(): value for key, value in inner.items()}
+    for names in (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy")):
+        if all(isinstance(level.get(name), (int, float)) for name in names):
+            fx, fy, cx, cy = (float(level[name]) for name in names)
+            return fx, fy, cx, cy
+    for name, by_columns in (("camera_matrix", False), ("k", False), ("intrinsic_matrix", True)):
+        K = _list_numbers(level.get(name))
+        if len(K) == 9:
+            K = K.reshape(3, 3)
+            # Open3D writes by columns: its last row 0 0 1 tells.
+            K = K.T if by_columns and np.allclose(K[:, 2], [0, 0, 1]) else K
+            return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+    return None
+
+
+def _list_numbers(value: Any) -> Array:
+    """Return the numbers (n,) of a list, of a list of lists, or of a mapping with `data`; none of anything else."""
+    if isinstance(value, dict):
+        value = value.get("data", [])
+    try:
+        return np.asarray(value if isinstance(value, list) else [], float).ravel()
+    except (TypeError, ValueError):
+        return np.zeros(0)
+
+
+def _distortion(level: dict[str, Any]) -> Array:
+    inner = level.get("distortion")
+    if isinstance(inner, dict):
+        named = {str(key).lower(): value for key, value in inner.items()}
+        distortion = np.array([float(named.get(name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")])
+    else:
+        names = ("distortion_coefficients", "coeffs", "d", "distortion")
+        distortion = next((x for name in names if len(x := _list_numbers(level.get(name)))), np.zeros(0))
+    return distortion if distortion.any() else np.zeros(0)
+
+
+def _whole_number(level: dict[str, Any], *names: str) -> int | None:
+    return next((int(level[name]) for name in names if isinstance(level.get(name), (int, float))), None)
+
+
+def _units_per_metre(file: Path, level: dict[str, Any]) -> float | None:
+    value = level.get("depth_scale")
+    if value is None:
+        return None
+    if isinstance(value, (int, float)) and value >= _PER_METRE:
+        return float(value)
+    if isinstance(value, (int, float)) and 0 < value <= _METRES_PER:
+        return 1.0 / float(value)
+    raise InputError(
+        f"{file}: depth_scale {shortened(value)} is neither units per metre (1000) nor metres per unit (0.001); to "
+        "fix: write one of these"
+    )

@@ -1,0 +1,239 @@
+"""Columns of one scan as its file has them: PLY, text, meshes, NumPy arrays, and formats of other trades by packages.
+
+A mesh counts by its vertices, with the normals of its faces. A file with several scans is refused; points stay in the
+scanner's own frame. Where a scan is stored pixel by pixel, a pixel that measured nothing is NaN three times, and is no
+error.
+"""
+
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stitch.errors import InputError
+from stitch.numerics.frames import Array
+from stitch.session.reading.csv_files import is_number
+from stitch.session.reading.depth_image import is_depth_image, read_depth_columns
+from stitch.session.reading.text_files import import_extra, require_file
+
+MESHES = (".stl", ".obj", ".off", ".glb", ".gltf")
+TEXTS = (".xyz", ".csv", ".txt", ".asc", ".pts")
+# Headers of PCD and PLY are shorter.
+_HEADER_BYTES = 65536
+_PTX_HEADER = 10
+_COLOURS = ("red", "green", "blue")
+# Three numbers or more, apart by blanks or semicolons, with commas before the decimals.
+_DECIMAL_COMMAS = re.compile(r"(?=.*,)(?:[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?(?:[ \t]+|;[ \t]*|$)){3,}")
+
+
+def read_ply(path: Path) -> dict[str, Array]:
+    """Return columns (N,) of the vertices of a PLY by name, as stored."""
+    from plyfile import PlyData
+
+    require_room(path)
+    with path.open("rb") as stream:
+        if stream.read(3) != b"ply":
+            raise InputError(f"{path}: is not a PLY file; export it again, or name it by its kind")
+    data: NDArray[np.void] = PlyData.read(_without_blank_lines(path))["vertex"].data
+    # List properties have no column of numbers.
+    return {name: data[name] for name in data.dtype.names or () if not data.dtype[name].hasobject}
+
+
+def _without_blank_lines(path: Path) -> Path | io.BytesIO:
+    """Return the file, or its bytes without the blank lines that some programs leave in the header."""
+    with path.open("rb") as stream:
+        header, end, _ = stream.read(_HEADER_BYTES).partition(b"end_header")
+        lines = header.splitlines(keepends=True)
+        if not end or all(line.strip() for line in lines):
+            return path
+        stream.seek(len(header))
+        return io.BytesIO(b"".join(line for line in lines if line.strip()) + stream.read())
+
+
+def require_room(path: Path) -> None:
+    """Refuse a PLY whose header announces more elements than the file has bytes, before room is made for them.
+
+    Raises:
+        InputError: no such file, or the header promises too much.
+    """
+    require_file(path, "name a PLY file")
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        header = stream.read(_HEADER_BYTES).split(b"end_header", 1)[0]
+    for line in header.splitlines():
+        words = line.split()
+        if len(words) == 3 and words[0] == b"element" and words[2].isdigit() and int(words[2]) > size:
+            raise InputError(f"{path}: {words[2].decode()} elements announced in {size} bytes; export it again")
+
+
+def grid_shape(path: Path) -> tuple[int, int] | None:
+    """Return rows and columns of pixels of a PCD, and of a PLY that says num_rows as range scanners do; else None."""
+    with path.open("rb") as stream:
+        head = stream.read(_HEADER_BYTES)
+    size: dict[bytes, int] = {}
+    for line in head.split(b"DATA" if path.suffix.lower() == ".pcd" else b"end_header", 1)[0].splitlines():
+        words = line.split()
+        if len(words) > 1 and words[-1].isdigit() and (words[0] in (b"WIDTH", b"HEIGHT") or words[0] == b"obj_info"):
+            size[words[-2]] = int(words[-1])
+    rows = size.get(b"HEIGHT", size.get(b"num_rows", 0))
+    return (rows, size.get(b"WIDTH", size.get(b"num_cols", 0))) if rows > 1 else None
+
+
+def measured_pixels(columns: dict[str, Array]) -> dict[str, Array]:
+    """Return the columns (N,) without pixels of which x, y and z are NaN."""
+    if not all(axis in columns for axis in "xyz"):
+        return columns
+    empty = np.isnan(np.asarray([columns[axis] for axis in "xyz"], float)).all(axis=0)
+    return {name: column[~empty] for name, column in columns.items()} if empty.any() else columns
+
+
+def read_text_columns(path: Path) -> dict[str, Array]:
+    """Return columns (N,) of a text, by comma, semicolon, space or tab; a header line names them, else x y z …
+
+    The header may be a comment, as numpy writes it: the last line before the numbers, if it names x, y and z.
+    """
+    text = path.read_text(encoding="utf-8-sig")
+    filled = [line for line in text.splitlines() if line.strip()]
+    lines = [line for line in filled if not line.lstrip().startswith("#")]
+    # Leica's .pts and others write the number of points above them.
+    if len(lines) > 1 and lines[0].strip().isdigit() and int(lines[0]) == len(lines) - 1:
+        lines = lines[1:]
+    if not lines:
+        return {axis: np.empty(0) for axis in "xyz"}
+    if _DECIMAL_COMMAS.fullmatch(lines[-1].strip()):
+        filled = [line.replace(",", ".") for line in filled]
+        lines = [line.replace(",", ".") for line in lines]
+    separator = next((s for s in ",;" if s in lines[0]), None)
+    first = _column_names(lines[0], separator)
+    header = any(not is_number(cell) for cell in first)
+    above = filled[: filled.index(lines[0])]
+    names = first if header or not above else _column_names(above[-1].lstrip(" #"), separator)
+    if not header and not (len(names) == len(first) and {*"xyz"} <= {*names}):
+        names = ["x", "y", "z", *(f"scalar_{i}" for i in range(len(first) - 3))][: len(first)]
+    if len(lines) == header:
+        return {name: np.empty(0) for name in names}
+    table = np.loadtxt(lines[header:], delimiter=separator, ndmin=2).reshape(-1, len(names))
+    return dict(zip(names, table.T, strict=True))
+
+
+def _column_names(line: str, separator: str | None) -> list[str]:
+    cells = [cell.strip() for cell in line.split(separator)]
+    return [cell.lower() if cell.lower() in "xyz" else cell for cell in cells]
+
+
+def read_mesh(path: Path) -> dict[str, Array]:
+    """Return columns (N,) of the vertices, each once, with the mean normal of the faces around them, if any."""
+    import trimesh
+
+    scene = trimesh.load_scene(str(path))
+    pieces = [g for g in scene.dump() if hasattr(g, "vertices") and len(g.vertices)]
+    if not pieces:
+        raise InputError(f"{path}: holds no surface; export the scan again")
+    points, normals = [], []
+    for piece in pieces:
+        if getattr(piece, "faces", None) is not None and len(piece.faces):
+            piece.merge_vertices(merge_norm=True, merge_tex=True)
+            normals.append(np.asarray(piece.vertex_normals))
+        points.append(np.asarray(piece.vertices))
+    columns = dict(zip("xyz", np.vstack(points).T, strict=True))
+    if len(normals) == len(points):
+        columns |= dict(zip(("nx", "ny", "nz"), np.vstack(normals).T, strict=True))
+    return columns
+
+
+def read_array(path: Path) -> dict[str, Array]:
+    """Return columns (N,) of a .npy: (N, 3) or more, an image (H, W, 3) with NaN in empty pixels, or depths (H, W)."""
+    if is_depth_image(path):
+        return read_depth_columns(path)
+    array = np.load(path, allow_pickle=False)
+    if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or array.shape[-1] < 3:
+        raise InputError(f"{path}: an array {array.shape} is no cloud; save (N, 3) or (H, W, 3) numbers")
+    table = array.reshape(-1, array.shape[-1])
+    names = [*"xyz", *(f"scalar_{i}" for i in range(table.shape[1] - 3))]
+    columns = dict(zip(names, table.T, strict=True))
+    return measured_pixels(columns) if array.ndim == 3 else columns
+
+
+def read_ptx(path: Path) -> dict[str, Array]:
+    """Return columns (N,) of Leica's PTX.
+
+    The file has columns, rows, ten lines of frames, then x y z intensity; 0 0 0 where nothing was measured.
+    """
+    scans = ptx_scans(path)
+    if len(scans) != 1:
+        raise InputError(_several_scans_message(path, f"{len(scans)} scans"))
+    rows = scans[0][_PTX_HEADER:]
+    count = int(scans[0][0]) * int(scans[0][1])
+    if len(rows) < count:
+        raise InputError(f"{path}: {count} points announced, data for {len(rows)}; export it again")
+    return dict(zip([*"xyz", "intensity"], np.loadtxt(rows, ndmin=2).T, strict=False))
+
+
+def ptx_scans(path: Path) -> list[list[str]]:
+    """Return the lines of each scan of a PTX file; columns and rows in the first two tell how many."""
+    lines = [line for line in path.read_text(encoding="ascii", errors="replace").splitlines() if line.strip()]
+    scans = []
+    while lines:
+        end = _PTX_HEADER + int(lines[0]) * int(lines[1])
+        scans.append(lines[:end])
+        lines = lines[end:]
+    return scans
+
+
+def read_las(path: Path) -> dict[str, Array]:
+    """Return columns (N,) x, y, z and intensity of LAS and LAZ, by laspy."""
+    las = import_extra("laspy", path, "formats").read(path)
+    xyz = np.asarray(las.xyz, float)
+    return {**dict(zip("xyz", xyz.T, strict=True)), "intensity": np.asarray(las.intensity, float)}
+
+
+def read_e57(path: Path) -> dict[str, Array]:
+    """Return columns (N,) of the one scan of an E57 in its own frame, by pye57."""
+    file = import_extra("pye57", path, "formats").E57(str(path))
+    if file.scan_count != 1:
+        raise InputError(_several_scans_message(path, f"{file.scan_count} scans"))
+    scan = file.read_scan(0, ignore_missing_fields=True, transform=False)
+    columns = {axis: np.asarray(scan[f"cartesian{axis.upper()}"], float) for axis in "xyz"}
+    if "intensity" in scan:
+        columns["intensity"] = np.asarray(scan["intensity"], float)
+    return measured_pixels(columns)
+
+
+def _several_scans_message(path: Path, held: str) -> str:
+    return f"{path}: holds {held}, a file is one view; to fix: export every scan to a file of its own"
+
+
+def read_zdf(path: Path) -> dict[str, Array]:
+    """Return columns (N,) of the measured pixels of Zivid's .zdf, with their colours.
+
+    Raises:
+        InputError: h5py is not installed, or another layout.
+    """
+    points, colours = read_zdf_image(path)
+    columns = dict(zip("xyz", points.reshape(-1, 3).T, strict=True))
+    if colours is not None:
+        columns |= dict(zip(_COLOURS, colours.reshape(3, -1), strict=True))
+    return measured_pixels(columns)
+
+
+def read_zdf_image(path: Path) -> tuple[Array, Array | None]:
+    """Return points (H, W, 3) of Zivid's .zdf and colours (3, H, W), these where the file has them.
+
+    It is an HDF5 file as netCDF-4 writes it, read by h5py in the layout of Zivid's own sample programs: data/pointcloud
+    is (H, W, 3), mm, NaN where nothing was measured, data/rgba_image is (H, W, 4) with 8 bits. Source:
+    read_zdf_without_zivid.py in github.com/zivid/zivid-python-samples.
+
+    Raises:
+        InputError: h5py is not installed, or another layout.
+    """
+    with import_extra("h5py", path, "formats").File(path, "r") as file:
+        cloud = file.get("data/pointcloud")
+        image = file.get("data/rgba_image")
+        if cloud is None or len(cloud.shape) != 3 or cloud.shape[2] != 3:
+            raise InputError(f"{path}: no data/pointcloud of x, y, z in it; to fix: save it as PLY in Zivid Studio")
+        points = np.asarray(cloud, float)
+        if image is None or image.shape[:2] != points.shape[:2] or image.shape[2] < len(_COLOURS):
+            return points, None
+        return points, np.moveaxis(np.asarray(image[..., :3], float), 2, 0)

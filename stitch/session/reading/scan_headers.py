@@ -1,0 +1,94 @@
+"""Poses that stand in the headers of scans (E57, Leica's PTX, PCD), and the times that stand in those of E57.
+
+Robot cells that save such files write the flange's pose there; software that has registered the scans already writes
+the scanner's own.
+"""
+
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.session.reading.text_files import import_extra
+
+_HEAD = 4096
+# From here E57 counts seconds (ASTM E2807).
+_GPS_EPOCH = datetime(1980, 1, 6)
+_LATEST_S = 1e10
+# PTX: sizes and four lines of the scanner's place stand above the matrix.
+_PTX_MATRIX = slice(6, 10)
+
+
+def poses_in_scans(files: list[Path]) -> Array | None:
+    """Return poses (N, 4, 4) of scans of one format in the files' unit; None where one has none, or all are the same.
+
+    Raises:
+        InputError: the package that reads such files is not installed.
+    """
+    readers = {".e57": _e57, ".ptx": _ptx, ".pcd": _pcd}
+    kinds = {file.suffix.lower() for file in files}
+    if len(kinds) != 1 or not kinds <= readers.keys():
+        return None
+    read = readers[kinds.pop()]
+    headers = []
+    for file in files:
+        try:
+            T = read(file)
+        except (ValueError, IndexError, OSError):
+            return None
+        if T is None or not frames.is_rigid(T):
+            return None
+        headers.append(T)
+    poses = np.stack(headers)
+    return None if np.allclose(poses, poses[0]) else poses
+
+
+def _e57(file: Path) -> Array | None:
+    # A header is good for as long as its file is open.
+    opened = import_extra("pye57", file, "formats").E57(str(file))
+    header = opened.get_header(0)
+    return frames.make(header.rotation_matrix, header.translation) if header.has_pose() else None
+
+
+def _ptx(file: Path) -> Array:
+    """Return (4, 4) of the four lines of a matrix for rows of points: the translation stands in the last of them."""
+    with file.open(encoding="ascii", errors="replace") as stream:
+        lines = [line.split() for _, line in zip(range(_PTX_MATRIX.stop), stream, strict=False)]
+    T = np.array(lines[_PTX_MATRIX], float).T
+    # Seven digits of a rotation are not quite one.
+    return frames.make(frames.rotations(T[:3, :3]).as_matrix()[0], T[:3, 3])
+
+
+def _pcd(file: Path) -> Array | None:
+    with file.open("rb") as stream:
+        words = [line.split() for line in stream.read(_HEAD).split(b"\n")]
+    viewpoint = next((line[1:] for line in words if line[:1] == [b"VIEWPOINT"]), None)
+    if viewpoint is None or len(viewpoint) != 7:
+        return None
+    x, y, z, w, *axis = (float(word) for word in viewpoint)
+    return frames.from_quaternion(np.array([x, y, z]), np.array([*axis, w]))
+
+
+def times_in_scans(files: list[Path]) -> list[str] | None:
+    """Return when each scan began, as 2026-12-31T23:59:59.250000, of E57; None where one does not say it.
+
+    Raises:
+        InputError: the package that reads such files is not installed.
+    """
+    if {file.suffix.lower() for file in files} != {".e57"}:
+        return None
+    seconds = [_e57_seconds(file) for file in files]
+    if not all(0 < s < _LATEST_S for s in seconds):
+        return None
+    return [(_GPS_EPOCH + timedelta(seconds=s)).isoformat(timespec="microseconds") for s in seconds]
+
+
+def _e57_seconds(file: Path) -> float:
+    """Return seconds since _GPS_EPOCH; zero where the header has no time."""
+    opened = import_extra("pye57", file, "formats").E57(str(file))
+    try:
+        return float(opened.get_header(0).acquisitionStart_dateTimeValue)
+    except Exception:  # of libe57's own kinds: the standard lets the entry out
+        return 0.0
