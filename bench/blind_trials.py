@@ -25,7 +25,8 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.moment import Plan
 from data_synth.nature import LAWS
 from data_synth.simulate import Measured
-from stitch.api.pipeline import change, diagnose, run, suggest
+from stitch.api.pipeline import change, diagnose, run
+from stitch.api.stepwise import suggest
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.validation import CrossValidation

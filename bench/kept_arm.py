@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.api.pipeline import run, run_rig, suggest
+from stitch.api.pipeline import run, run_rig
+from stitch.api.stepwise import suggest
 from stitch.model.model_toml import keep_arm_effects
 from stitch.output.result_document import model_of
 from stitch.run_data import RunData

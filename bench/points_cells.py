@@ -18,7 +18,8 @@ from blind_trials import pin
 from scipy.spatial.transform import Rotation
 
 from data_synth.kinematics import flange, gravity_torques
-from stitch.api.pipeline import diagnose, run, suggest
+from stitch.api.pipeline import diagnose, run
+from stitch.api.stepwise import suggest
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.robot import forward

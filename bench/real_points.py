@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.api.pipeline import run, suggest
+from stitch.api.pipeline import run
+from stitch.api.stepwise import suggest
 from stitch.output.result_document import model_of
 from stitch.run_data import RunData
 from stitch.session.reading.session_folder import load_session

@@ -35,57 +35,65 @@ class SilentRecorder:
     def finish(self, run: RunData) -> None: ...
 
 
-class IterationMemory(SilentRecorder):
-    """Keeps the iterations of a stage that runs beside others, to tell them in their turn."""
+class RecorderMemory:
+    """Keeps what it is told by stages that run beside others, to tell it in their turn."""
 
     def __init__(self) -> None:
-        self._kept: list[tuple[str, int, Array, float, float]] = []
+        self._calls: list[tuple[str, tuple[Any, ...]]] = []
         self.stopped = False
 
+    def start(self, session: SessionData) -> None:
+        """Keep that a run begins."""
+        self._keep("start", session)
+
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Keep one iteration.
+        """Keep one iteration."""
+        self._keep("iteration", stage, index, poses, rms, gate)
+
+    def stage(self, result: StageResult, poses: Array) -> None:
+        """Keep the end of a stage."""
+        self._keep("stage", result, poses)
+
+    def finish(self, run: RunData) -> None:
+        """Keep the result."""
+        self._keep("finish", run)
+
+    def _keep(self, method: str, *arguments: Any) -> None:
+        """Keep one call.
 
         Raises:
-            CancelledError: nobody wants the stage any more (`stopped`).
+            CancelledError: nobody wants the stages any more (`stopped`), so that they end here.
         """
         if self.stopped:
             raise CancelledError
-        self._kept.append((stage, index, poses, rms, gate))
+        self._calls.append((method, arguments))
 
-    def tell(self, recorder: Recorder) -> None:
+    def replay(self, recorder: Recorder) -> None:
         """Pass on all that was kept."""
-        for kept in self._kept:
-            recorder.iteration(*kept)
+        for method, arguments in self._calls:
+            getattr(recorder, method)(*arguments)
 
 
-class RunMemory:
+class RunMemory(RecorderMemory):
     """Keeps what is told of runs that are tried one after the other, to tell it of the one that counts."""
 
     def __init__(self) -> None:
-        self._kept: list[tuple[str, tuple[Any, ...]]] = []
+        super().__init__()
         self._finished: list[tuple[Model, list[tuple[str, tuple[Any, ...]]]]] = []
 
     def start(self, session: SessionData) -> None:
-        """Begin to keep a run."""
-        self._kept = [("start", (session,))]
-
-    def iteration(self, *told: Any) -> None:
-        """Keep one iteration."""
-        self._kept.append(("iteration", told))
-
-    def stage(self, *told: Any) -> None:
-        """Keep the end of a stage."""
-        self._kept.append(("stage", told))
+        """Begin to keep another run."""
+        self._calls = []
+        super().start(session)
 
     def finish(self, run: RunData) -> None:
-        """Keep what was told as that of a run."""
-        self._finished.append((run.model, self._kept))
+        """Take what was kept as that of a run."""
+        self._finished.append((run.model, self._calls))
 
     def tell(self, recorder: Recorder, run: RunData) -> None:
-        """Pass on all that was told of a run, and the run as it is now."""
-        kept = next((kept for model, kept in self._finished if model is run.model), [])
-        for what, told in kept:
-            getattr(recorder, what)(*told)
+        """Pass on all that was kept of a run, and the run as it is now."""
+        self._calls = next((calls for model, calls in self._finished if model is run.model), [])
+        self.replay(recorder)
         recorder.finish(run)
 
 

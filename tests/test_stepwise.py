@@ -8,7 +8,7 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.api import pipeline as stepwise
+from stitch.api import stepwise
 from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.validation import CrossValidation, _squares_by_fold
 from stitch.effects.contract import find_effect, parameters_in

@@ -17,6 +17,7 @@ from stitch.api.verbs import run
 from stitch.errors import InputError, NoResultError
 from stitch.fit import surface_steps
 from stitch.fit.coarse import turn_about
+from stitch.fit.fit import FitStart
 from stitch.fit.live_fit import LiveFit, fit_live_hand_eye, place_view, start_live_fit, without_view
 from stitch.model.model import Model, displacement
 from stitch.numerics import frames
@@ -288,12 +289,12 @@ class LiveSession:
         check_convention(self.session)
         measurement = measurement_of(self.session, prepare_capture(self.session))
         try:
-            starts = surface_steps.initial_hand_eyes([self.session], [measurement], None)
+            starts = surface_steps.start([self.session], [measurement], None)
             if starts[0].is_ambiguous:
                 return self._report(
                     view, "waiting", "Two hand-eyes fit these views equally well; a turned view decides."
                 )
-            fit = partial(surface_steps.fit, starts=starts, initial_model=None, recorder=SilentRecorder())
+            fit = partial(surface_steps.fit, start=FitStart(starts), recorder=SilentRecorder())
             found = fit_screened_views([self.session], [measurement], fit)
         except NoResultError as error:
             return self._report(view, "waiting", f"No hand-eye yet: {error}.")

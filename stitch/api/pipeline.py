@@ -1,43 +1,46 @@
-"""Stitch sessions (coarse → correct → fit → register → fuse), change a run's effects, and find what is missing.
+"""Stitch sessions (coarse → correct → fit → register → fuse), change a run's effects, diagnose what is missing.
 
-The steps stand in `stages`: `surface_steps` for clouds, `target_steps` for labelled points alone.
+The steps stand in `fit`: `surface_steps` for clouds, `target_steps` for labelled points alone. What runs beside the
+main thread is started here, by `_Conductor`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from collections.abc import Sequence
+from concurrent.futures import CancelledError, Future
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from threading import Event
 from typing import TYPE_CHECKING
 
-from stitch.effects.contract import find_effect, require_available
+import numpy as np
+
+from stitch.effects.contract import find_effect, parameters_in, require_available
 from stitch.errors import InputError
-from stitch.fit.coarse import COARSE_GATE, CoarseHandEye
-from stitch.fit.register_and_fuse import FittedRig, InitialModel, Pipeline
-from stitch.fit.results import FitSummary, assemble_run, pipeline_for
-from stitch.fit.rig import require_effects, require_measured_once, require_same_rig
+from stitch.fit.coarse import COARSE_GATE, REUSED, CoarseHandEye
+from stitch.fit.fit import FitStart, FittedRig, InitialModel
+from stitch.fit.pipelines import coarse_stage, pipeline_for
+from stitch.fit.sentences import view_notes
 from stitch.fusion.register import DEFAULT, method_named
 from stitch.model.model_toml import ModelFile, arm_model, convert_unit
-from stitch.recorder import Recorder, SilentRecorder
-from stitch.run_data import RunData, StageResult
+from stitch.observations.observability import unknown_numbers, unobservable
+from stitch.recorder import Recorder, RecorderMemory, SilentRecorder
+from stitch.run_data import Fit, LedgerStep, RunData, StageResult
 from stitch.screening.deep_check import refuse_explained_mistake
-from stitch.screening.model_transfer import (
-    ArmTransfer,
-    check_arm_transfer,
-    check_model_transfer,
-    find_disagreeing_sessions,
-)
-from stitch.screening.view_screening import ScreenedFit, fit_screened_views, session_warnings
+from stitch.screening.model_transfer import check_arm_transfer, check_model_transfer, find_disagreeing_sessions
+from stitch.screening.view_screening import ScreenedFit, ViewScreening, fit_screened_views, session_warnings
 from stitch.session.capture import Capture, part_size, prepare_capture
-from stitch.session.measurement import Measurement, measurement_of, with_part_origin
+from stitch.session.measurement import Measurement, measurement_of, session_notes, with_part_origin
 from stitch.session.session import SessionData
-from stitch.system.threads import Clock, library_threads_off
-
-if TYPE_CHECKING:
-    from stitch.diagnosis.diagnosis import Diagnosis, Finding
+from stitch.system.threads import Clock, begin, library_threads_off
 
 # A run loads nothing of the diagnosis.
+if TYPE_CHECKING:
+    from stitch.diagnosis.diagnosis import Diagnosis
+
+# No two measured scans begin with so many points alike.
+_COMPARED_POINTS = 100
 
 
 def run(
@@ -84,135 +87,330 @@ def run_rig(
     require_same_rig(sessions, model)
     recorders = recorders or [SilentRecorder() for _ in sessions]
     with library_threads_off():
-        clock, steps = Clock(), pipeline_for(sessions[0])
+        clock = Clock()
         for session, recorder in zip(sessions, recorders, strict=True):
             recorder.start(session)
-        prepared = (own.result() for own in captures) if captures else map(prepare_capture, sessions)
-        measurements = [measurement_of(session, own) for session, own in zip(sessions, prepared, strict=True)]
+        prepared = (capture.result() for capture in captures) if captures else map(prepare_capture, sessions)
+        measurements = [measurement_of(session, capture) for session, capture in zip(sessions, prepared, strict=True)]
         effects = list(dict.fromkeys(effects))
         model = convert_unit(model, sessions[0].length_unit) if model else None
         arm = convert_unit(arm, sessions[0].length_unit) if arm else None
         require_effects(measurements, [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())])
         require_measured_once(sessions)
-        begun = steps.initial_hand_eyes(sessions, measurements, model)
-        measurements = [with_part_origin(m, own.T_mount) for m, own in zip(measurements, begun, strict=True)]
+        hand_eyes = pipeline_for(sessions[0]).start(sessions, measurements, model)
+        measurements = [with_part_origin(m, start.T_mount) for m, start in zip(measurements, hand_eyes, strict=True)]
         seconds = clock.lap()
-        before = []
-        for session, measurement, own, recorder in zip(sessions, measurements, begun, recorders, strict=True):
+        coarse = []
+        for session, measurement, hand_eye, recorder in zip(sessions, measurements, hand_eyes, recorders, strict=True):
             with refuse_explained_mistake(session):
-                before.append(steps.initial_stage(measurement, own, seconds, recorder))
-        clock.lap()
-
-        def with_arm(arm: ModelFile | None) -> InitialModel | None:
-            if not effects and not arm:
-                return None
-            from stitch.diagnosis.score import start_with_effects
-
-            return partial(start_with_effects, sessions[0], effects, arm)
-
-        if model:
-            fit = partial(steps.apply, file=model)
-        else:
-            fit = partial(steps.fit, starts=begun, initial_model=with_arm(arm), recorder=recorders[0])
-        fit = partial(_fit_and_report, fit, partial(steps.begin_to_register, register=register), sessions, recorders)
-        found = fit_screened_views(sessions, measurements, fit, keep)
-        end = FitSummary(begun, found.fitted, clock.lap(), model.effects_file if model else None)
-        if model and not sessions[0].has_clouds:
-            found = check_model_transfer(found, partial(_fit_own_model, steps, found, with_arm(arm_model(model))))
-        if len(sessions) > 1 and effects:
-            alone = partial(_fit_single_session, steps, found, begun, with_arm(arm))
-            apart = find_disagreeing_sessions([s.name for s in found.sessions], found.fitted, alone)
-            end = replace(end, doubts=tuple(own.doubt(sessions[0].length_unit) for own in apart))
-        if arm:
-            again = partial(steps.fit, found.sessions, found.measurements, begun, recorder=SilentRecorder())
-            here = check_arm_transfer(lambda other: again(initial_model=with_arm(other)), arm, found.fitted)
-            end = _note_arm_transfer(end, here, sessions[0].length_unit)
-        return _assemble_runs(sessions, found, end, before, recorders, keep)
+                coarse.append(_show_coarse_stage(session, measurement, hand_eye, seconds, recorder))
+        start = FitStart(hand_eyes, _initial_model(sessions[0], effects, arm), given=model)
+        with closing(_Conductor(sessions, start, coarse, recorders, register)) as conductor:
+            screened = fit_screened_views(sessions, measurements, conductor.fit, keep)
+            if model and not sessions[0].has_clouds:
+                screened = _check_against_own_model(screened, effects, model)
+            notes, doubts = _check_common_model(screened, hand_eyes, effects, arm)
+            fits = conductor.finish()
+        runs = []
+        for i, (session, whole, screening) in enumerate(
+            zip(screened.sessions, sessions, screened.screenings, strict=True)
+        ):
+            left_out = tuple(sorted(screening.left_out, key=lambda item: whole.names.index(item.view)))
+            screening = replace(screening, left_out=left_out, doubts=(*doubts, *screening.doubts))
+            run = _assemble_run(session, i, screened.fitted, hand_eyes[i], fits[i], screening, keep=keep, notes=notes)
+            runs.append(replace(run, effects_file=model.effects_file if model else None))
+        for run, recorder in zip(runs, recorders, strict=True):
+            recorder.finish(run)
+        return runs
 
 
-def _fit_and_report(
-    fit: Callable[[Sequence[SessionData], Sequence[Measurement]], FittedRig],
-    begin_to_register: Callable[[FittedRig, Sequence[SessionData]], FittedRig],
-    whole: Sequence[SessionData],
-    recorders: Sequence[Recorder],
-    sessions: Sequence[SessionData],
-    measurements: Sequence[Measurement],
-) -> FittedRig:
-    """Fit the views that are left, tell the recorders where these are fewer, and begin to register and to fuse.
+def require_same_rig(sessions: Sequence[SessionData], model: ModelFile | None) -> None:
+    """Refuse sessions that cannot share a hand-eye, or that show nothing.
 
-    Nearly always all views belong: they are registered and fused while they are screened.
+    Raises:
+        InputError: names the session and what is wrong.
     """
-    for before, session, recorder in zip(whole, sessions, recorders, strict=True):
-        if len(session.views) < len(before.views):
-            recorder.start(session)
-    return begin_to_register(fit(sessions, measurements), sessions)
+    first = sessions[0]
+    for other in sessions[1:]:
+        if (other.mount, other.length_unit) != (first.mount, first.length_unit):
+            raise InputError(
+                f"{other.path}: mount {other.mount} in {other.length_unit}, but {first.path} has {first.mount} "
+                f"in {first.length_unit}; only sessions of one rig share a hand-eye"
+            )
+    if model and model.mount != first.mount:
+        raise InputError(
+            f"the model's mount is {model.mount}, that of {first.path} is {first.mount}; use a run of the same rig"
+        )
+    for session in sessions:
+        if not session.has_clouds and not session.has_sightings:
+            raise InputError(f"{session.path}: some views name no cloud and there is no points.csv or frames.csv")
+        if session.has_clouds != first.has_clouds:
+            clouds, points = (first, session) if first.has_clouds else (session, first)
+            raise InputError(
+                f"{clouds.path} has clouds and {points.path} labelled points alone; to fix: run them apart, one with "
+                "the model of the other (--hand-eye, --arm)"
+            )
+        if not session.has_clouds:
+            _require_same_arm(first, session)
+        if len(session.views) < 2:
+            raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")
 
 
-def _note_arm_transfer(end: FitSummary, here: ArmTransfer, length_unit: str) -> FitSummary:
-    """Return the fit with a note that the arm of another run holds here, or a doubt that it does not."""
-    told = (here.sentence(length_unit),)
-    return replace(end, notes=told) if here.holds else replace(end, doubts=(*end.doubts, *told))
+def _require_same_arm(first: SessionData, other: SessionData) -> None:
+    """Sessions of labelled points share an arm; its loads may differ."""
+    a, b = first.robot, other.robot
+    if a is None or b is None:
+        return
+    same_size = a.n_joints == b.n_joints
+    if not (
+        same_size
+        and np.allclose(a.before, b.before)
+        and np.allclose(a.after, b.after)
+        and np.allclose(a.theta, b.theta)
+    ):
+        raise InputError(
+            f"{other.path}: its [robot] is another arm than that of {first.path}; only sessions of one arm share its "
+            "effects; to fix: state the same rows, or run them apart"
+        )
 
 
-def _fit_single_session(
-    pipeline: Pipeline, found: ScreenedFit, starts: Sequence[CoarseHandEye], initial_model: InitialModel | None, i: int
-) -> FittedRig:
-    """Fit one session of a rig by itself."""
-    return pipeline.fit([found.sessions[i]], [found.measurements[i]], [starts[i]], initial_model, SilentRecorder())
+def require_measured_once(sessions: Sequence[SessionData]) -> None:
+    """Refuse a scan that stands in two sessions: it would count as two, and the hand-eye seem surer than it is.
+
+    Raises:
+        InputError: names both sessions and views.
+    """
+    known: dict[bytes, tuple[SessionData, str]] = {}
+    for session in sessions:
+        clouds = {
+            view.name: view.cloud.points[:_COMPARED_POINTS].tobytes()
+            for view in session.views
+            if view.cloud is not None
+        }
+        for name, points in clouds.items():
+            if points in known:
+                other, view = known[points]
+                raise InputError(
+                    f"{session.path}: the scan of view {name} is that of view {view} in {other.path}, measured once "
+                    "and given twice; to fix: name each session once"
+                )
+        known |= {points: (session, name) for name, points in clouds.items()}
 
 
-def _fit_own_model(pipeline: Pipeline, found: ScreenedFit, initial_model: InitialModel | None) -> FittedRig:
-    """Fit hand-eye and targets from the sessions themselves."""
-    begun = pipeline.initial_hand_eyes(found.sessions, found.measurements, None)
-    return pipeline.fit(found.sessions, found.measurements, begun, initial_model, SilentRecorder())
+def require_effects(measurements: Sequence[Measurement], effects: Sequence[str]) -> None:
+    """Refuse effects that a session cannot have, or that have other parameters in another session of the rig.
+
+    Raises:
+        InputError: names the effect, the session and what is missing or different.
+    """
+    for effect in map(find_effect, effects):
+        for measurement in measurements:
+            require_available(measurement, effect)
+        parameters = [{f"{p.name} ({p.unit})" for p in parameters_in(m, effect)} for m in measurements]
+        for measurement, names in zip(measurements, parameters, strict=True):
+            if names != parameters[0]:
+                raise InputError(
+                    f"effect {effect.name}: sessions {measurements[0].capture.name} and {measurement.capture.name} "
+                    f"do not share {', '.join(sorted(parameters[0] ^ names))}; give both the same arm, link masses and "
+                    "temperatures, or run them apart"
+                )
 
 
-def _assemble_runs(
-    sessions: Sequence[SessionData],
-    found: ScreenedFit,
-    end: FitSummary,
-    before: Sequence[StageResult],
-    recorders: Sequence[Recorder],
-    keep: bool,
-) -> list[RunData]:
-    """Return one run per session, with its own notes."""
-    runs = []
-    for i, (session, own) in enumerate(zip(found.sessions, found.screenings, strict=True)):
-        left_out = tuple(sorted(own.left_out, key=lambda item: sessions[i].names.index(item.view)))
-        out, kept = ((), left_out) if keep else (left_out, ())
-        last = replace(end, left_out=out, kept=kept, suspected=own.suspected, links=own.links)
-        last = replace(last, doubts=(*end.doubts, *own.doubts))
-        runs.append(assemble_run(session, i, last, before[i], recorders[i]))
-    return runs
+def _show_coarse_stage(
+    session: SessionData, measurement: Measurement, start: CoarseHandEye, seconds: float, recorder: Recorder
+) -> StageResult:
+    stage = coarse_stage(session, measurement, start, seconds)
+    recorder.stage(stage, measurement.capture.poses(start.T_mount))
+    return stage
 
 
-def effects_with(run: RunData, further: Sequence[str], where: object) -> list[str]:
-    """Return the effects of a run's model and further ones, for `change`.
+def _initial_model(session: SessionData, effects: Sequence[str], arm: ModelFile | None) -> InitialModel | None:
+    """Return what gives the model from which effects beside another run's arm are fitted; None without any."""
+    if not effects and not arm:
+        return None
+    from stitch.diagnosis.score import start_with_effects
+
+    return partial(start_with_effects, session, effects, arm)
+
+
+class _Conductor:
+    """Fits the sessions of a rig, and lets their last steps go on while the views are screened.
+
+    Nearly always all views belong: they are registered and fused meanwhile, and how certain the hand-eye is is found in
+    a thread of its own. What was begun for views that are then left out ends with the next iteration.
+    """
+
+    def __init__(
+        self,
+        sessions: Sequence[SessionData],
+        start: FitStart,
+        coarse: Sequence[StageResult],
+        recorders: Sequence[Recorder],
+        register: str,
+    ) -> None:
+        self._sessions, self._start, self._coarse, self._recorders = sessions, start, coarse, recorders
+        self._register = register
+        self._clock = Clock()
+        self._seconds = 0.0
+        self._memories: list[RecorderMemory] = []  # of the sessions under way
+        self._screened = Event()
+
+    def fit(self, sessions: Sequence[SessionData], measurements: Sequence[Measurement]) -> FittedRig:
+        """Fit the views that are left, tell the recorders where these are fewer, and begin to register and to fuse."""
+        self.close()
+        for whole, session, recorder in zip(self._sessions, sessions, self._recorders, strict=True):
+            if len(session.views) < len(whole.views):
+                recorder.start(session)
+        steps = pipeline_for(sessions[0])
+        fitted = steps.fit(sessions, measurements, self._start, self._recorders[0])
+        self._seconds += self._clock.lap()
+        memories = self._memories = [RecorderMemory() for _ in sessions]
+        screened = self._screened = Event()
+
+        def until_screened() -> None:
+            screened.wait()
+            if memories[0].stopped:
+                raise CancelledError
+
+        def finish() -> list[tuple[Fit, float]]:
+            return [
+                steps.finish(
+                    session,
+                    fitted,
+                    i,
+                    self._coarse[i],
+                    memories[i],
+                    seconds=self._seconds,
+                    method=self._register,
+                    until_screened=until_screened,
+                )
+                for i, session in enumerate(sessions)
+            ]
+
+        self._certain = begin(lambda: None if fitted.correction is None else fitted.correction.hand_eye)
+        self._finished = begin(finish)
+        return fitted
+
+    def finish(self) -> list[tuple[Fit, float]]:
+        """Wait until every session is registered and fused, and show it to its recorder; with its noise floor."""
+        self._screened.set()
+        fits = self._finished.result()
+        for memory, recorder in zip(self._memories, self._recorders, strict=True):
+            memory.replay(recorder)
+        self._certain.result()
+        return fits
+
+    def close(self) -> None:
+        """End what is under way: it is not wanted any more."""
+        for memory in self._memories:
+            memory.stopped = True
+        self._screened.set()
+
+
+def _check_against_own_model(screened: ScreenedFit, effects: Sequence[str], model: ModelFile) -> ScreenedFit:
+    """Hold labelled points under the model of another run against a fit of hand-eye and targets from themselves."""
+    session = screened.sessions[0]
+    steps = pipeline_for(session)
+
+    def fit() -> FittedRig:
+        hand_eyes = steps.start(screened.sessions, screened.measurements, None)
+        start = FitStart(hand_eyes, _initial_model(session, effects, arm_model(model)))
+        return steps.fit(screened.sessions, screened.measurements, start, SilentRecorder())
+
+    return check_model_transfer(screened, fit)
+
+
+def _check_common_model(
+    screened: ScreenedFit, hand_eyes: Sequence[CoarseHandEye], effects: Sequence[str], arm: ModelFile | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return notes on, and doubts of, what the sessions share: effects, and the arm of another run."""
+    first = screened.sessions[0]
+    steps = pipeline_for(first)
+    notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+
+    def fit_session(i: int) -> FittedRig:
+        start = FitStart([hand_eyes[i]], _initial_model(first, effects, arm))
+        return steps.fit([screened.sessions[i]], [screened.measurements[i]], start, SilentRecorder())
+
+    def fit_with_arm(other: ModelFile | None) -> FittedRig:
+        start = FitStart(hand_eyes, _initial_model(first, effects, other))
+        return steps.fit(screened.sessions, screened.measurements, start, SilentRecorder())
+
+    if len(screened.sessions) > 1 and effects:
+        apart = find_disagreeing_sessions([s.name for s in screened.sessions], screened.fitted, fit_session)
+        doubts = tuple(disagreement.doubt(first.length_unit) for disagreement in apart)
+    if arm:
+        transfer = check_arm_transfer(fit_with_arm, arm, screened.fitted)
+        sentence = transfer.sentence(first.length_unit)
+        if transfer.holds:
+            notes = (sentence,)
+        else:
+            doubts = (*doubts, sentence)
+    return notes, doubts
+
+
+def _assemble_run(
+    session: SessionData,
+    index: int,
+    fitted: FittedRig,
+    start: CoarseHandEye,
+    finished: tuple[Fit, float],
+    screening: ViewScreening,
+    *,
+    keep: bool = False,
+    notes: tuple[str, ...] = (),
+) -> RunData:
+    """Return the result of one session of a rig, with its line in the history.
 
     Args:
-        where: name of the run, for messages.
-
-    Raises:
-        InputError: an effect that is not known, that the session cannot have, or that is in the model already.
+        finished: the session registered and fused, and its noise floor.
+        keep: views that do not belong were fused all the same.
     """
-    for name in further:
-        require_available(run.measurement, find_effect(name))
-        if name in run.effects:
-            raise InputError(f"{where}: {name} is in its model already; to fix: leave it out")
-    return [*run.effects, *further]
-
-
-def effects_without(run: RunData, dropped: Sequence[str], where: object) -> list[str]:
-    """Return the effects of a run's model but some, for `change`.
-
-    Raises:
-        InputError: an effect that is not in the model.
-    """
-    for name in dropped:
-        if name not in run.effects:
-            has = f"name one of {', '.join(run.effects)}" if run.effects else "leave it out: the model has no effects"
-            raise InputError(f"{where}: {name} is not in its model; to fix: {has}")
-    return [name for name in run.effects if name not in dropped]
+    fit, noise_floor = finished
+    model = fitted.model_of(index)
+    left_out, kept = ((), screening.left_out) if keep else (screening.left_out, ())
+    # Where several sessions share a hand-eye no joint has one place for all.
+    shared = fitted.captures if session.has_clouds else [fitted.captures[index]]
+    joints = session.joints if len(shared) == 1 else None
+    fit = replace(
+        fit,
+        targets=fitted.sessions[index].targets,
+        outliers=fitted.sessions[index].outliers,
+        unobservable=unobservable(shared, model.T_mount, session.robot, joints),
+        # A hand-eye of another run is as well known as it was there.
+        unknown=() if start.source == REUSED else unknown_numbers(shared, model.T_mount),
+        notes=(
+            *view_notes(left_out, kept, screening.suspected),
+            *pipeline_for(session).notes(session, fitted, index, start),
+            *session_notes(session),
+            *notes,
+        ),
+    )
+    step = LedgerStep(
+        effects=tuple(model.effects),
+        residual_rms=next(stage.rms for stage in fit.stages if stage.name == "correct"),
+        heldout_rms=fitted.heldout_rms(index),
+        noise_floor=noise_floor,
+        T_mount=model.T_mount,
+        values={term.name: {p.name: p.value for p in term.parameters} for term in model.terms},
+    )
+    return RunData(
+        session=session,
+        measurement=fitted.sessions[index].measurement,
+        model=model,
+        T_mount_coarse=start.T_mount,
+        gate=float("nan") if fit.overlaps is None else fit.overlaps.gate,
+        residual_rms=step.residual_rms,
+        heldout_rms=step.heldout_rms,
+        noise_floor=step.noise_floor,
+        source=fit,
+        register_method=next((stage.method for stage in fit.stages if stage.method), ""),
+        ledger=(step,),
+        doubts=screening.doubts,
+        left_out=left_out,
+        links=screening.links,
+    )
 
 
 def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = None) -> RunData:
@@ -225,37 +423,34 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
     from stitch.diagnosis.score import start_with_effects
 
     recorder = recorder or SilentRecorder()
+    session, measurement = state.session, state.measurement
     with library_threads_off():
-        clock, steps = Clock(), pipeline_for(state.session)
-        session, measurement, effects = state.session, state.measurement, list(dict.fromkeys(effects))
+        clock = Clock()
+        effects = list(dict.fromkeys(effects))
         recorder.start(session)
         require_effects([measurement], effects)
         new = [name for name in effects if name not in state.model.effects]
         model = start_with_effects(session, new, None, measurement, state.model, state.gate)
         model = model.with_terms([term for term in model.terms if term.name in effects])
         gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
-        begun = CoarseHandEye(state.T_mount_coarse, gate, "of the first run", ())
-        before = steps.initial_stage(measurement, begun, clock.lap(), recorder)
-        clock.lap()
-        fitted = steps.refit([session], [measurement], model, [state.gate], recorder)
-        fitted = steps.begin_to_register(fitted, [session], state.register_method or DEFAULT)
-        own = fitted.sessions[0].measurement
-        end = FitSummary(
-            starts=[begun],
-            fitted=fitted,
-            seconds=clock.lap(),
-            effects_file=state.effects_file,
-            ledger=state.ledger,
-            left_out=state.left_out,
-            links=state.links,
-            doubts=session_warnings(session, own, fitted.correction, 0),
-        )
+        hand_eye = CoarseHandEye(state.T_mount_coarse, gate, "of the first run", ())
+        coarse = _show_coarse_stage(session, measurement, hand_eye, clock.lap(), recorder)
+        start = FitStart([hand_eye], model=model, gate=state.gate)
+        register = state.register_method or DEFAULT
+        with closing(_Conductor([session], start, [coarse], [recorder], register)) as conductor:
+            fitted = conductor.fit([session], [measurement])
+            warnings = session_warnings(session, fitted.sessions[0].measurement, fitted.correction, 0)
+            (finished,) = conductor.finish()
+        screening = ViewScreening(left_out=state.left_out, links=state.links, doubts=warnings)
+        run = _assemble_run(session, 0, fitted, hand_eye, finished, screening)
+        run = replace(run, ledger=(*state.ledger, *run.ledger), effects_file=state.effects_file)
+        recorder.finish(run)
         tried = {name: why for name, why in state.tried.items() if name not in effects}
-        return replace(assemble_run(session, 0, end, before, recorder), tried=tried)
+        return replace(run, tried=tried)
 
 
 def diagnose(run: RunData) -> Diagnosis:
-    """Find which effect is missing in the model of a run.
+    """Return which effect is missing in the model of a run, and what to measure next.
 
     Raises:
         NoResultError: no two views overlap.
@@ -263,172 +458,5 @@ def diagnose(run: RunData) -> Diagnosis:
     from stitch.diagnosis.diagnose import diagnose_state
     from stitch.diagnosis.next_view import propose_measurements
 
-    found = diagnose_state(run)
-    return replace(found, next=propose_measurements(found))
-
-
-def suggest(
-    state: RunData, at_most: int, known: Finding | None = None, recorder: Recorder | None = None
-) -> tuple[RunData | None, list[str], Diagnosis]:
-    """Return the run with everything that the diagnosis names, what happened in lines, and the last diagnosis.
-
-    The run is None where nothing is named. What was found together is added together, and what does not hold its place
-    beside the rest goes again. An effect stays if it lowers the error on views left out beyond its uncertainty
-    (`CrossValidation.fit_rejection_reason`); one that was dropped in this run is not tried again. What is less likely
-    than nothing being missing is not added. What was in the model before stays; what was added gives way to other
-    effects that together do better.
-
-    Args:
-        known: what a diagnosis of this state has named to be added; None: it is diagnosed.
-        recorder: told of every run that is tried, one after the other.
-    """
-    lines, given, left = list[str](), set(state.model.effects), at_most
-    result: RunData | None = None
-    while True:
-        found = None if known is not None and left else diagnose(state)
-        finding = known if found is None else _finding_of(found)
-        assert finding is not None
-        lines += finding.lines
-        if found is not None and (why := _reason_to_stop(found, left, at_most)) is not None:
-            return result, [*lines, *why], found
-        before, known = result, None
-        result, told = _add_found(state, finding, left, given, recorder)
-        lines += told
-        if not set(result.effects) - set(state.effects):
-            return before, lines, replace(found or diagnose(state), tried=result.tried)
-        left -= min(len(set(result.effects) - set(state.effects)), left)
-        if set(state.effects) - given:
-            result, told = _exchange_added(result, given, recorder)
-            lines += told
-        state = result
-        # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
-        del found
-
-
-def _finding_of(found: Diagnosis) -> Finding:
-    from stitch.diagnosis.diagnosis import Finding
-
-    notes = (f"{note}." for note in found.notes if note not in found.sentence)
-    validations = {c.name: c.cross_validation for c in found.candidates if c.cross_validation is not None}
-    return Finding((*_finding_and_evidence(found), *notes), found.together, validations)
-
-
-def _reason_to_stop(found: Diagnosis, left: int, at_most: int) -> list[str] | None:
-    """Return why nothing is added after a diagnosis, in lines; None where something is."""
-    if found.verdict != "missing_effect":
-        return []
-    name = found.effects[0]
-    if not found.likelier_than_not:
-        return [f"{name} was not added: chance is more likely. To add it anyway: stitch add RUN {name}."]
-    if found.dropped_before is not None:
-        return [f"{name} was dropped in this run before. To add it all the same: stitch add RUN {name}."]
-    effects = "1 effect" if at_most == 1 else f"{at_most} effects"
-    return None if left else [f"Stopped after {effects}; run it again to go on."]
-
-
-def _add_found(
-    state: RunData, found: Finding, at_most: int, given: set[str], recorder: Recorder | None
-) -> tuple[RunData, list[str]]:
-    """Return the run with what was found together, as far as it earns its place, and what happened.
-
-    Args:
-        given: effects that stay in any case.
-    """
-    from stitch.diagnosis.thresholds import FAINT_SIGMAS
-
-    names = [name for name in found.names if name not in state.tried][:at_most]
-    while names:
-        tried, lines = _drop_unneeded(change(state, [*state.effects, *names], recorder), given, recorder)
-        kept = [name for name in names if name in tried.effects]
-        share = (tried.heldout_rms / state.heldout_or_fit_rms) ** 2
-        validation = found.validations.get(names[0])
-        zero = max((t.sigmas_from_zero for t in tried.terms if t.name in kept), default=0.0) < FAINT_SIGMAS
-        reason = validation.fit_rejection_reason(" and ".join(kept), share, zero=zero) if validation and kept else None
-        if kept and reason is None:
-            return tried, [*lines, f"Added {' and '.join(kept)}. With it:"]
-        if len(names) == 1:
-            why = reason or tried.tried[names[0]]
-            dropped = replace(state, tried=state.tried | tried.tried | {names[0]: why})
-            return dropped, [f"{names[0]} was tried and dropped: {why}."]
-        # Together they do not earn their place: the one that is named is asked alone.
-        names = names[:1]
-    return state, []
-
-
-def _exchange_added(state: RunData, given: set[str], recorder: Recorder | None = None) -> tuple[RunData, list[str]]:
-    """Return the run with others in place of effects that were added in several rounds, where these do better, and
-    what happened: what was found first may hold the parameters of what would have come later.
-
-    Of labelled points alone, as where effects are dropped.
-    """
-    from stitch.diagnosis.stepwise_selection import find_better_effects
-    from stitch.diagnosis.thresholds import HELDOUT_FALL
-
-    added = [name for name in state.effects if name not in given]
-    names = [] if state.session.has_clouds else find_better_effects(state, added)
-    if not names:
-        return state, []
-    tried = change(state, [*(name for name in state.effects if name in given), *names], recorder)
-    if tried.heldout_rms >= HELDOUT_FALL * state.heldout_or_fit_rms:
-        return state, []
-    gone = " and ".join(name for name in added if name not in names)
-    return tried, [f"{' and '.join(names)}: views left out are predicted better than with {gone}, which went."]
-
-
-def suggest_group(state: RunData, recorder: Recorder | None = None) -> tuple[RunData | None, list[str], Diagnosis]:
-    """Return the run with all effects of an undecided group, what to say of it, and the diagnosis.
-
-    The run is None where the diagnosis names no such group, or where the group does not help on views left out.
-    """
-    from stitch.diagnosis.validation import group_helps, group_share
-
-    found = diagnose(state)
-    if found.verdict != "cannot_tell":
-        return (
-            None,
-            [*_finding_and_evidence(found), "These views leave no group of effects undecided."],
-            found,
-        )
-    names = " + ".join(found.effects)
-    asked = [c.ranked.score for c in found.candidates if c.name in found.effects]
-    share, sigma = group_share(found.linear, asked)
-    judged = f"of the mean square error of poses left out they leave {share:.2f} ± {sigma:.2f}"
-    if not group_helps(share, sigma):
-        return (
-            None,
-            [*_finding_and_evidence(found), f"{names} together do not help on views left out: {judged}."],
-            found,
-        )
-    tried = change(state, [*state.model.effects, *found.effects], recorder)
-    told = (
-        f"{names} are fitted as one group: {judged}, and together they stand for what is missing; these views do not "
-        "tell its parts apart, so that none of their values means anything alone"
-    )
-    tried = tried.with_fit(notes=(f"{told}.", *tried.notes))
-    return tried, [*_finding_and_evidence(found), f"{told}."], diagnose(tried)
-
-
-def _finding_and_evidence(found: Diagnosis) -> list[str]:
-    """Return the plain finding and the evidence, as `stitch diagnose` prints them."""
-    from stitch.output.plain_finding import plain_finding
-
-    return [plain_finding(found, found.linear.measurement.length_unit), found.sentence]
-
-
-def _drop_unneeded(result: RunData, given: set[str], recorder: Recorder | None) -> tuple[RunData, list[str]]:
-    """Return the run without added effects that others made idle, which it remembers, and why each was dropped.
-
-    Of labelled points alone: scans are matched anew for every effect that is asked.
-    """
-    from stitch.diagnosis.stepwise_selection import find_effect_to_drop
-
-    lines: list[str] = []
-    while not result.session.has_clouds and len(added := set(result.effects) - given) > 1:
-        idle = find_effect_to_drop(result, added)
-        if idle is None:
-            break
-        name, reason = idle
-        lines.append(f"{reason}; it was dropped.")
-        fewer = change(result, [other for other in result.effects if other != name], recorder)
-        result = replace(fewer, tried=result.tried | {name: reason})
-    return result, lines
+    diagnosis = diagnose_state(run)
+    return replace(diagnosis, next=propose_measurements(diagnosis))

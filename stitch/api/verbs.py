@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.api import pipeline
+from stitch.api import pipeline, stepwise
 from stitch.api.run import ReplayRecorder, Run, public_run
 from stitch.api.session import Session, public_session
 from stitch.diagnosis.diagnosis import Diagnosis
@@ -161,7 +161,7 @@ def add(run: RunData, *effects: str, recorder: Recorder | None = None) -> Run:
         >>> better.effects, len(better.ledger)
         (['range_scale'], 2)
     """
-    return _changed(run, pipeline.effects_with(run, effects, run.session.name), recorder)
+    return _changed(run, stepwise.effects_with(run, effects, run.session.name), recorder)
 
 
 def drop(run: RunData, *effects: str, recorder: Recorder | None = None) -> Run:
@@ -182,7 +182,7 @@ def drop(run: RunData, *effects: str, recorder: Recorder | None = None) -> Run:
         >>> stitch.drop(better, *better.effects).effects
         []
     """
-    return _changed(run, pipeline.effects_without(run, effects, run.session.name), recorder)
+    return _changed(run, stepwise.effects_without(run, effects, run.session.name), recorder)
 
 
 def compare(run: RunData) -> ResidualTables:

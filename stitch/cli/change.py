@@ -77,7 +77,7 @@ def add_effects(
     Raises:
         InputError, NoResultError: as `stitch add` ends.
     """
-    from stitch.api.pipeline import effects_with
+    from stitch.api.stepwise import effects_with
     from stitch.output import run_folder
     from stitch.output.stored_run import load_run
 
@@ -94,7 +94,7 @@ def drop_effects(
     Raises:
         InputError, NoResultError: as `stitch drop` ends.
     """
-    from stitch.api.pipeline import effects_without
+    from stitch.api.stepwise import effects_without
     from stitch.output import run_folder
     from stitch.output.stored_run import load_run
 
@@ -126,7 +126,7 @@ def _add_diagnosed(
     run: Path, at_most: int | None, effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
 ) -> None:
     """Add what a diagnosis chooses: at most so many effects one by one, or None: a group that it cannot tell apart."""
-    from stitch.api.pipeline import suggest, suggest_group
+    from stitch.api.stepwise import suggest, suggest_group
     from stitch.cli.diagnose import write_diagnosis
     from stitch.output import run_folder
     from stitch.output.diagnosis_document import named_before

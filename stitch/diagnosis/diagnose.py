@@ -25,7 +25,7 @@ from stitch.diagnosis.unnamed_joint_laws import joint_curves
 from stitch.diagnosis.unnamed_time_laws import RepeatingError, find_repeating_errors, reportable
 from stitch.diagnosis.validation import cross_validate
 from stitch.diagnosis.verdict import Evidence
-from stitch.fit.results import linearise
+from stitch.fit.pipelines import linearise
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.run_data import RunData

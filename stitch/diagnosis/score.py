@@ -17,7 +17,7 @@ from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, Form, candidate_of
 from stitch.diagnosis.regime import regime_of
 from stitch.effects.contract import Effect, find_effect
-from stitch.fit.results import linearise
+from stitch.fit.pipelines import linearise
 from stitch.model.model import Model, Term, term_of
 from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.numerics.distributions import chi2_limit, f_tail

@@ -11,7 +11,7 @@ from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import promising, score
 from stitch.diagnosis.thresholds import CANDIDATES_TRIED, MANY_POSES, MAX_JOINT_EFFECTS, NEAR_BEST_GAIN
 from stitch.diagnosis.validation import Extrapolation, cross_validate, extrapolate, untested_ends_reason
-from stitch.fit.results import linearise
+from stitch.fit.pipelines import linearise
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
 from stitch.run_data import RunData

@@ -2,9 +2,10 @@
 
 Candidates come from two independent ideas: (1) the centroids of the clouds as crude labelled points
 of one fixed target, minimised from many starting rotations (`centroid_hand_eyes`); (2) relative scan motions
-against the robot's (AX = XB, five solvers; `motion_candidates`). Every candidate is then closed in on the scans
-at low resolution, and the consistency of the whole set decides: the truncated mean square distance
-between all views that ought to meet. Objects without features (sphere, cone, plane) pass the same way.
+against the robot's (AX = XB, five solvers; `motion_candidates`): neighbouring views are registered by features (FPFH,
+RANSAC; Rusu et al. 2009), a stream of scans in small steps by KISS-ICP's odometry (Vizzo et al. 2023). Every candidate
+is then closed in on the scans at low resolution, and the consistency of the whole set decides: the truncated mean
+square distance between all views that ought to meet. Objects without features (sphere, cone, plane) pass the same way.
 """
 
 from collections.abc import Sequence
@@ -37,57 +38,30 @@ from stitch.session.scan import Scan, even_indices, subsample
 from stitch.system.process import steps
 from stitch.system.threads import parallel
 
-# Hand-eyes from the clouds' centroids, as crude labelled points of one fixed target.
-
-_STARTS = 24
-
-
-def scanner_centre(captures: Sequence[Capture]) -> Array:
-    """Mean centroid of the scans in the scanner frame (3,)."""
-    return np.asarray(np.mean([scan.points.mean(axis=0) for c in captures for scan in c.scans], axis=0))
-
-
-def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
-    """Hand-eyes (4, 4) that bring the clouds' centroids of each capture to one point, best first.
-
-    The centroid of a view leans to the side it sees, so this is coarse: 2–17° and 20–60 mm.
-    """
-    centroids = [np.array([s.points.mean(axis=0) for s in c.scans]) for c in captures]
-    # A shift that moves all views alike has a column of zeros but for rounding: along it the start stays at zero.
-    hidden = hidden_translations(captures, np.eye(4))
-    shifts = null_space(hidden.T) if hidden.size else np.eye(3)
-
-    def hand_eye(x: Array) -> Array:
-        return frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), shifts @ x[3:])
-
-    def residual(x: Array) -> Array:
-        T = hand_eye(x)
-        rows = []
-        for c, centroid in zip(captures, centroids, strict=True):
-            placed = frames.transform(c.poses(T), centroid[:, None])[:, 0]
-            rows.append((placed - placed.mean(axis=0)).ravel())
-        return np.concatenate(rows)
-
-    fits = []
-    for start in Rotation.random(_STARTS, rng=np.random.default_rng(0)):
-        first = np.r_[start.as_rotvec(), np.zeros(shifts.shape[1])]
-        fit = least_squares(residual, first, method="trf", max_nfev=100, x_scale="jac")
-        fits.append((float(fit.cost), fit.x))
-    fits.sort(key=lambda pair: pair[0])
-    found: list[Array] = []
-    for _, x in fits:
-        T = hand_eye(x)
-        if all(np.degrees(frames.angle_between(T, other)) > 3 for other in found):
-            found.append(T)
-    return found
-
-
-# Hand-eyes that were tried, and which of them are the same answer.
-
+# Where a hand-eye came from that was not searched.
+STATED, REUSED = "given in session.toml", "of another run, used as it is"
+# First gate of the search and truncation of the score, as shares of the part's size.
+COARSE_GATE, SCORE_SHARE = 0.35, 0.05
 # Points of a view that are asked for their nearest neighbours while a hand-eye is searched.
 SEARCH_SAMPLES = 120
+_SEARCH_POINTS = 2000
+# The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
+_STEPS_TO_MEET, _STEPS_AFTER = 4, 3
+# Two answers of the search whose scores differ by less than this ratio are equally good.
+_CLOSE = 1.1
 # Two candidates are the same answer if they place the part within this share of its size.
 _SAME_SHARE = 0.03
+# Rotations from which centroids are brought together.
+_STARTS = 24
+# Restarts about the best centroid solution: its error on real parts was 2–17°.
+_RESTART_DEG = 15.0
+# The angle of a conjugate motion is an invariant: |angle(A) − angle(B)| small (Chen 1991).
+_ANGLE_TOLERANCE = np.radians(3.0)
+_MINIMUM_MOTIONS = 3
+_FEATURE_SPACINGS = 6.0
+_POINTS = 1500
+# One partner in twelve right leaves five good triples among so many.
+_DRAWS = 10_000
 
 
 @dataclass(frozen=True)
@@ -98,160 +72,6 @@ class HandEyeCandidate:
     T_mount: Array  # (4, 4) after closing in
     score: float  # length_unit, lower is better
     reached: int = 1  # starts that ended here
-
-
-def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> float:
-    """Root mean square distance of points to every other view, truncated at `limit`.
-
-    Views that fail to meet count with the limit, so falling apart cannot pay.
-    """
-    squares: list[float] = []
-    for c in captures:
-        poses = c.poses(T_mount)
-        picked = [sample_points(scan, SEARCH_SAMPLES) for scan in c.scans]
-        every = neighbour_queries(c.scans, poses, picked)
-
-        def mean_squares(w: int, every: NeighbourQueries = every) -> list[float]:
-            parts = [(v, slice(None)) for v in range(len(every.scans)) if v != w and len(every.index[v])]
-            if not parts:
-                return []
-            _, points, normals = every.gather(parts)
-            distance, facing = every.search(w, points, normals, limit)
-            by_view = np.split(np.where(facing, distance, limit) ** 2, np.cumsum(every.counts(parts))[:-1])
-            return [float(np.mean(own)) for own in by_view]
-
-        squares += chain.from_iterable(parallel(mean_squares, range(len(c.scans))))
-    return float(np.sqrt(np.mean(squares)))
-
-
-def distinct_hand_eyes(
-    captures: Sequence[Capture], tried: Sequence[HandEyeCandidate], size: float
-) -> list[HandEyeCandidate]:
-    """Distinct answers, best first; each keeps its best hand-eye and the name of its first start."""
-    groups: list[list[HandEyeCandidate]] = []
-    for candidate in tried:
-        for group in groups:
-            if same_hand_eye(captures, size, candidate.T_mount, group[0].T_mount):
-                group.append(candidate)
-                break
-        else:
-            groups.append([candidate])
-    best = [
-        replace(min(group, key=lambda c: c.score), source=group[0].source, reached=sum(c.reached for c in group))
-        for group in groups
-    ]
-    return sorted(best, key=lambda c: c.score)
-
-
-def same_hand_eye(captures: Sequence[Capture], size: float, T_a: Array, T_b: Array) -> bool:
-    """True if two hand-eyes place a part of this size (length_unit) alike: by its largest displacement."""
-    centre = scanner_centre(captures)
-    corners = centre + size / 2 * np.vstack([np.eye(3), -np.eye(3)])
-    off = np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1)
-    return bool(off.max() < _SAME_SHARE * size)
-
-
-# Relative scanner motions from the scans alone, and hand-eyes from them (AX = XB).
-#
-# Neighbouring views are registered by features (FPFH, RANSAC; Rusu et al. 2009); a stream of scans in small steps
-# by KISS-ICP's odometry (Vizzo et al. 2023). The motions are matched with the robot's by five solvers.
-# Single motions may be wrong: a motion counts only if its rotation angle agrees with the robot's,
-# which holds for any hand-eye.
-
-# The angle of a conjugate motion is an invariant: |angle(A) − angle(B)| small (Chen 1991).
-_ANGLE_TOLERANCE = np.radians(3.0)
-_MINIMUM_MOTIONS = 3
-_FEATURE_SPACINGS = 6.0
-_POINTS = 1500
-# One partner in twelve right leaves five good triples among so many.
-_DRAWS = 10_000
-
-
-def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
-    """(source, T_mount (4, 4)) of every solver on every kind of motion that has enough of them."""
-    out: list[tuple[str, Array]] = []
-    for kind, motions in (("features", feature_motions), ("KISS-ICP", sequence_motions)):
-        robot, scanner = [], []
-        for capture in captures:
-            A, B = consistent_motions(*motions(capture))
-            robot.append(A)
-            scanner.append(B)
-        A, B = np.concatenate(robot), np.concatenate(scanner)
-        if len(A) < _MINIMUM_MOTIONS:
-            continue
-        for name, solver in AXXB_SOLVERS.items():
-            try:
-                T_mount = solver(A, B)
-            except (NoResultError, np.linalg.LinAlgError):
-                continue
-            if np.isfinite(T_mount).all():
-                out.append((f"{kind}, {name}", T_mount))
-    return out
-
-
-def robot_motions(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
-    """A (M, 4, 4) with A·X = X·B, B the motion that maps view w's scanner frame into view v's."""
-    return motions_between(capture.T_reference_mount, pairs)
-
-
-def consistent_motions(A: Array, B: Array) -> tuple[Array, Array]:
-    """The motions whose rotation angles agree."""
-    keep = angle_differences(A, B) < _ANGLE_TOLERANCE
-    return A[keep], B[keep]
-
-
-def feature_motions(capture: Capture) -> tuple[Array, Array]:
-    """(A, B), each (M, 4, 4): motions between neighbours of the sequence (and its ends) by feature matching."""
-    size = _FEATURE_SPACINGS * capture.spacing
-
-    def described(scan: Scan) -> FeaturedSurface:
-        points, normals = feature_matching.voxel_downsample(
-            scan.points, scan.normals, max(size / 2, even_grid_size(scan.points))
-        )
-        return feature_matching.compute_fpfh(points, normals, 2.5 * size)
-
-    surfaces = list(parallel(described, capture.scans))
-
-    def motion(pair: tuple[int, int]) -> Array:
-        target, source = (surfaces[v] for v in pair)
-        T = feature_matching.register_ransac(source, target, reach=1.5 * size, draws=_DRAWS)
-        return feature_matching.align_icp(source, target, T, reach=size)
-
-    pairs = neighbouring_views(len(capture.scans))
-    return robot_motions(capture, pairs), np.array(list(parallel(motion, pairs, "pairs of scans"))).reshape(-1, 4, 4)
-
-
-def neighbouring_views(views: int) -> list[tuple[int, int]]:
-    """Pairs of views one and two apart, of two views the pair."""
-    steps = [(v, v + step) for step in (1, 2) for v in range(views - step)]
-    return steps if views > 2 else [(0, 1)]
-
-
-def even_grid_size(points: Array) -> float:
-    """Grid size that leaves about `_POINTS` points of a surface."""
-    extent = np.ptp(points, axis=0)
-    return float(np.sqrt(np.prod(np.sort(extent)[1:]) / _POINTS))
-
-
-def sequence_motions(capture: Capture) -> tuple[Array, Array]:
-    """(A, B), each (M, 4, 4): motions of a stream of scans by its odometry; none of separate views."""
-    scans = [scan.points[even_indices(len(scan.points), _POINTS)] for scan in capture.scans]
-    if not is_stream(capture.T_reference_mount, scans):
-        return np.zeros((0, 4, 4)), np.zeros((0, 4, 4))
-    return motions_of_stream(capture.T_reference_mount, scan_odometry(scans))
-
-
-_SEARCH_POINTS = 2000
-# The gate shrinks by 0.6 a step: from a third of the part to a hundredth.
-_STEPS_TO_MEET, _STEPS_AFTER = 4, 3
-# First gate of the search and truncation of the score, as shares of the part's size.
-COARSE_GATE, SCORE_SHARE = 0.35, 0.05
-# Where a hand-eye came from that was not searched.
-STATED, REUSED = "given in session.toml", "of another run, used as it is"
-# Two answers of the search whose scores differ by less than this ratio are equally good.
-_CLOSE = 1.1
-# Restarts about the best centroid solution: its error on real parts was 2–17°.
-_RESTART_DEG = 15.0
 
 
 @dataclass(frozen=True)
@@ -350,13 +170,6 @@ def _starting_hand_eyes(captures: Sequence[Capture], size: float) -> list[tuple[
     return starts + kept
 
 
-def turn_about(rotation: Array, centre: Array) -> Array:
-    """Return the (4, 4) turn by a rotation vector (3,) about a point (3,)."""
-    T = frames.make(Rotation.from_rotvec(rotation).as_matrix(), np.zeros(3))
-    T[:3, 3] = centre - T[:3, :3] @ centre
-    return T
-
-
 def icp_from_starts(
     captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], size: float
 ) -> list[HandEyeCandidate]:
@@ -392,3 +205,175 @@ def _icp_steps(
     except NoResultError:
         return None
     return T_mount, next_gates(captures, overlaps)
+
+
+def distinct_hand_eyes(
+    captures: Sequence[Capture], tried: Sequence[HandEyeCandidate], size: float
+) -> list[HandEyeCandidate]:
+    """Distinct answers, best first; each keeps its best hand-eye and the name of its first start."""
+    groups: list[list[HandEyeCandidate]] = []
+    for candidate in tried:
+        for group in groups:
+            if same_hand_eye(captures, size, candidate.T_mount, group[0].T_mount):
+                group.append(candidate)
+                break
+        else:
+            groups.append([candidate])
+    best = [
+        replace(min(group, key=lambda c: c.score), source=group[0].source, reached=sum(c.reached for c in group))
+        for group in groups
+    ]
+    return sorted(best, key=lambda c: c.score)
+
+
+def same_hand_eye(captures: Sequence[Capture], size: float, T_a: Array, T_b: Array) -> bool:
+    """True if two hand-eyes place a part of this size (length_unit) alike: by its largest displacement."""
+    centre = scanner_centre(captures)
+    corners = centre + size / 2 * np.vstack([np.eye(3), -np.eye(3)])
+    off = np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1)
+    return bool(off.max() < _SAME_SHARE * size)
+
+
+def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> float:
+    """Root mean square distance of points to every other view, truncated at `limit`.
+
+    Views that fail to meet count with the limit, so falling apart cannot pay.
+    """
+    squares: list[float] = []
+    for c in captures:
+        poses = c.poses(T_mount)
+        picked = [sample_points(scan, SEARCH_SAMPLES) for scan in c.scans]
+        every = neighbour_queries(c.scans, poses, picked)
+
+        def mean_squares(w: int, every: NeighbourQueries = every) -> list[float]:
+            parts = [(v, slice(None)) for v in range(len(every.scans)) if v != w and len(every.index[v])]
+            if not parts:
+                return []
+            _, points, normals = every.gather(parts)
+            distance, facing = every.search(w, points, normals, limit)
+            by_view = np.split(np.where(facing, distance, limit) ** 2, np.cumsum(every.counts(parts))[:-1])
+            return [float(np.mean(own)) for own in by_view]
+
+        squares += chain.from_iterable(parallel(mean_squares, range(len(c.scans))))
+    return float(np.sqrt(np.mean(squares)))
+
+
+def scanner_centre(captures: Sequence[Capture]) -> Array:
+    """Mean centroid of the scans in the scanner frame (3,)."""
+    return np.asarray(np.mean([scan.points.mean(axis=0) for c in captures for scan in c.scans], axis=0))
+
+
+def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
+    """Hand-eyes (4, 4) that bring the clouds' centroids of each capture to one point, best first.
+
+    The centroid of a view leans to the side it sees, so this is coarse: 2–17° and 20–60 mm.
+    """
+    centroids = [np.array([s.points.mean(axis=0) for s in c.scans]) for c in captures]
+    # A shift that moves all views alike has a column of zeros but for rounding: along it the start stays at zero.
+    hidden = hidden_translations(captures, np.eye(4))
+    shifts = null_space(hidden.T) if hidden.size else np.eye(3)
+
+    def hand_eye(x: Array) -> Array:
+        return frames.make(Rotation.from_rotvec(x[:3]).as_matrix(), shifts @ x[3:])
+
+    def residual(x: Array) -> Array:
+        T = hand_eye(x)
+        rows = []
+        for c, centroid in zip(captures, centroids, strict=True):
+            placed = frames.transform(c.poses(T), centroid[:, None])[:, 0]
+            rows.append((placed - placed.mean(axis=0)).ravel())
+        return np.concatenate(rows)
+
+    fits = []
+    for start in Rotation.random(_STARTS, rng=np.random.default_rng(0)):
+        first = np.r_[start.as_rotvec(), np.zeros(shifts.shape[1])]
+        fit = least_squares(residual, first, method="trf", max_nfev=100, x_scale="jac")
+        fits.append((float(fit.cost), fit.x))
+    fits.sort(key=lambda pair: pair[0])
+    found: list[Array] = []
+    for _, x in fits:
+        T = hand_eye(x)
+        if all(np.degrees(frames.angle_between(T, other)) > 3 for other in found):
+            found.append(T)
+    return found
+
+
+def turn_about(rotation: Array, centre: Array) -> Array:
+    """Return the (4, 4) turn by a rotation vector (3,) about a point (3,)."""
+    T = frames.make(Rotation.from_rotvec(rotation).as_matrix(), np.zeros(3))
+    T[:3, 3] = centre - T[:3, :3] @ centre
+    return T
+
+
+def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
+    """(source, T_mount (4, 4)) of every solver on every kind of motion that has enough of them."""
+    out: list[tuple[str, Array]] = []
+    for kind, motions in (("features", feature_motions), ("KISS-ICP", sequence_motions)):
+        robot, scanner = [], []
+        for capture in captures:
+            A, B = consistent_motions(*motions(capture))
+            robot.append(A)
+            scanner.append(B)
+        A, B = np.concatenate(robot), np.concatenate(scanner)
+        if len(A) < _MINIMUM_MOTIONS:
+            continue
+        for name, solver in AXXB_SOLVERS.items():
+            try:
+                T_mount = solver(A, B)
+            except (NoResultError, np.linalg.LinAlgError):
+                continue
+            if np.isfinite(T_mount).all():
+                out.append((f"{kind}, {name}", T_mount))
+    return out
+
+
+def robot_motions(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
+    """A (M, 4, 4) with A·X = X·B, B the motion that maps view w's scanner frame into view v's."""
+    return motions_between(capture.T_reference_mount, pairs)
+
+
+def consistent_motions(A: Array, B: Array) -> tuple[Array, Array]:
+    """The motions whose rotation angles agree."""
+    keep = angle_differences(A, B) < _ANGLE_TOLERANCE
+    return A[keep], B[keep]
+
+
+def feature_motions(capture: Capture) -> tuple[Array, Array]:
+    """(A, B), each (M, 4, 4): motions between neighbours of the sequence (and its ends) by feature matching."""
+    size = _FEATURE_SPACINGS * capture.spacing
+
+    def described(scan: Scan) -> FeaturedSurface:
+        points, normals = feature_matching.voxel_downsample(
+            scan.points, scan.normals, max(size / 2, even_grid_size(scan.points))
+        )
+        return feature_matching.compute_fpfh(points, normals, 2.5 * size)
+
+    surfaces = list(parallel(described, capture.scans))
+
+    def motion(pair: tuple[int, int]) -> Array:
+        target, source = (surfaces[v] for v in pair)
+        T = feature_matching.register_ransac(source, target, reach=1.5 * size, draws=_DRAWS)
+        return feature_matching.align_icp(source, target, T, reach=size)
+
+    pairs = neighbouring_views(len(capture.scans))
+    return robot_motions(capture, pairs), np.array(list(parallel(motion, pairs, "pairs of scans"))).reshape(-1, 4, 4)
+
+
+def neighbouring_views(views: int) -> list[tuple[int, int]]:
+    """Pairs of views one and two apart, of two views the pair."""
+    steps = [(v, v + step) for step in (1, 2) for v in range(views - step)]
+    return steps if views > 2 else [(0, 1)]
+
+
+def even_grid_size(points: Array) -> float:
+    """Grid size that leaves about `_POINTS` points of a surface."""
+    extent = np.ptp(points, axis=0)
+    return float(np.sqrt(np.prod(np.sort(extent)[1:]) / _POINTS))
+
+
+def sequence_motions(capture: Capture) -> tuple[Array, Array]:
+    """(A, B), each (M, 4, 4): motions of a stream of scans by its odometry; none of separate views."""
+    scans = [scan.points[even_indices(len(scan.points), _POINTS)] for scan in capture.scans]
+    if not is_stream(capture.T_reference_mount, scans):
+        return np.zeros((0, 4, 4)), np.zeros((0, 4, 4))
+    return motions_of_stream(capture.T_reference_mount, scan_odometry(scans))

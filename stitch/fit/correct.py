@@ -2,18 +2,19 @@
 
 All overlapping pairs, nearest neighbours in both directions, one ξ for every view of every session
 of the rig, T ← T·exp(ξ) (source A, step 3). Matching tightens from the data's own scale; a last
-generalised least-squares step weighs the views by the robot's own scatter (`hand_eye_fit.py`).
+generalised least-squares step weighs the views by the robot's own scatter (`hand_eye_fit.py`). A hand-eye that was
+corrected on another object of the same rig is used as it is: only the overlaps are found.
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from stitch.model.model import Model
 from stitch.numerics import frames
-from stitch.numerics.frames import Array
+from stitch.numerics.frames import Array, Indices
 from stitch.numerics.least_squares import least_squares
 from stitch.observations.observability import seen_part, visible_twists
 from stitch.observations.pose_errors import PoseErrors
@@ -40,17 +41,33 @@ from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstr
 from stitch.recorder import Recorder, SilentRecorder
 from stitch.session.capture import Capture, part_size
 from stitch.system.process import announce
-from stitch.system.threads import begin, known
 
-# What the correction of a model from overlapping surfaces found.
+# Queries per view, at most, while the gate closes; the final normal equations take FINE_SAMPLES. While partners may lie
+# farther away than so many spacings, a quarter of them do: what is missing is not points, but the right partners.
+COARSE_SAMPLES = 600
+_WIDE_SAMPLES, _WIDE_SPACINGS = 150, 4.0
+_MAXIMUM_ITERATIONS = 40
+# A step that moves the part by less than this share of the robust sigma changes nothing: views that are moved by their
+# overlaps alone tell what is left. After one below the second share the gate closes at once to what the distances ask.
+_CONVERGED, _AT_REST = 1e-2, 0.1
+# A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
+REUSE_GATE = 0.05
+_TIGHTENINGS = 4
+_GATE_CONVERGED = 0.99
+
+# From free-network poses per capture to the twists (6V, K) of each by the scanner's errors that all views repeat, by
+# source.
+ScannerErrors = Callable[[Sequence[UnconstrainedPoses]], dict[str, list[Array]]]
+# From free-network poses per capture and a hand-eye to how the robot's poses may err.
+PoseErrorPrior = Callable[[Sequence[UnconstrainedPoses], Array], PoseErrors]
 
 
 @dataclass(frozen=True)
 class Correction:
-    """The model of a rig; overlaps, freed poses and captures in the order of its sessions."""
+    """The model of a rig; overlaps, free-network poses and captures in the order of its sessions."""
 
     geometry: Model  # hand-eye and effects, maybe without how certain the hand-eye is
-    statistics: Future[HandEyeFit]  # of the hand-eye: they take half a second of one core, and register needs none
+    statistics: Callable[[], HandEyeFit]  # of the hand-eye: half a second of one core, and register needs none
     scatter: tuple[Repeatability, ...]  # of the poses
     overlaps: tuple[Overlaps, ...]
     unconstrained: tuple[UnconstrainedPoses, ...]  # views moved by the overlaps alone: where register starts
@@ -58,104 +75,15 @@ class Correction:
     captures: tuple[Capture, ...]  # without the effects in use
     given: bool = False  # the model is that of another run, nothing was fitted
 
-    @property
+    @cached_property
     def hand_eye(self) -> HandEyeFit:
-        """Statistics of the hand-eye, waited for."""
-        return self.statistics.result()
+        """Statistics of the hand-eye, found when they are first asked for."""
+        return self.statistics()
 
     @property
     def model(self) -> Model:
         """The model, with how certain its hand-eye is."""
         return replace(self.geometry, covariance=self.hand_eye.covariance)
-
-
-# Queries per view, at most, while the gate closes; the final normal equations take FINE_SAMPLES. While partners may lie
-# farther away than so many spacings, a quarter of them do: what is missing is not points, but the right partners.
-COARSE_SAMPLES = 600
-_WIDE_SAMPLES, _WIDE_SPACINGS = 150, 4.0
-_MAXIMUM_ITERATIONS = 40
-# A step that moves the part by less than this share of the robust sigma changes nothing: views that are freed from
-# there tell what is left. After one below the second share the gate closes at once to what the distances ask for.
-_CONVERGED, _AT_REST = 1e-2, 0.1
-
-
-def common_step(
-    captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array, visible: Array
-) -> tuple[Array, float]:
-    """Return ξ (6,) = −D⁻¹b over all captures, along visible twists (6, k), and how far it moves the part, rms."""
-    D, b = np.zeros((6, 6)), np.zeros(6)
-    jacobians = [
-        hand_eye_jacobian(c.hand_eye_frames(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)
-    ]
-    for J, o in zip(jacobians, overlaps, strict=True):
-        # Sessions of different noise count by their own variance.
-        H, vector = assemble(o.gram)
-        D += J.T @ H @ J / o.gram.scale**2
-        b += J.T @ vector / o.gram.scale**2
-    xi = visible @ least_squares(visible.T @ D @ visible, visible.T @ b)
-    moved = [(J @ xi).reshape(-1, 6)[:, 3:] / o.gram.scale for J, o in zip(jacobians, overlaps, strict=True)]
-    return xi, float(np.sqrt(np.mean(np.concatenate(moved) ** 2)))
-
-
-def icp_hand_eye(
-    captures: Sequence[Capture],
-    T_mount: Array,
-    gates: Sequence[float],
-    *,
-    first: Sequence[Overlaps] | None = None,
-    samples: int = COARSE_SAMPLES,
-    maximum: int = _MAXIMUM_ITERATIONS,
-    recorder: Recorder | None = None,
-) -> tuple[Array, list[Overlaps], list[float]]:
-    """Iterate matching and the common step until it no longer moves the parts.
-
-    Args:
-        T_mount: (4, 4) start, T_mount_scanner.
-        gates: first distance between partners per capture, length_unit.
-        first: overlaps per capture under the start, if they are at hand.
-
-    Returns:
-        T_mount (4, 4), the last overlaps per capture and the rms per iteration.
-    """
-    recorder = recorder or SilentRecorder()
-    few, many = (
-        [common_samples(capture.scans, own) for capture in captures] for own in (min(samples, _WIDE_SAMPLES), samples)
-    )
-    gates, history, part = list(gates), [], seen_part(captures)
-    before: Sequence[Overlaps | None] = [None] * len(captures)
-    closing = True
-    for index in range(maximum):
-        wide = closing and all(gate > _WIDE_SPACINGS * c.spacing for c, gate in zip(captures, gates, strict=True))
-        every = zip(captures, gates, few if wide else many, before, strict=True)
-        if first is not None and index == 0:
-            overlaps = list(first)
-        else:
-            overlaps = [collect_overlaps(c, c.poses(T_mount), gate, own, last) for c, gate, own, last in every]
-        before = overlaps
-        history.append(pooled_rms(overlaps))
-        recorder.iteration("correct", index, captures[0].poses(T_mount), history[-1], gates[0])
-        xi, moved = common_step(captures, overlaps, T_mount, visible_twists(captures, T_mount, part))
-        T_mount = T_mount @ frames.exp(xi)
-        tighter = [min(g, next_gate(o, c)) for g, o, c in zip(gates, overlaps, captures, strict=True)]
-        settled = all(new > 0.9 * old for new, old in zip(tighter, gates, strict=True))
-        if moved < _CONVERGED and settled:
-            if not wide:
-                break
-            # Surfaces that agree no better than a few spacings keep the gate wide.
-            closing = False
-        gates = tighter if moved < _AT_REST else next_gates(captures, overlaps)
-    return T_mount, overlaps, history
-
-
-def next_gates(captures: Sequence[Capture], overlaps: Sequence[Overlaps]) -> list[float]:
-    """The next gates, not tighter than 0.6 of the last: the first fits at a wide gate are still far off."""
-    return [max(min(o.gate, next_gate(o, c)), 0.6 * o.gate) for c, o in zip(captures, overlaps, strict=True)]
-
-
-# From freed views per capture to the twists (6V, K) of each by the scanner's errors that all views repeat, by source.
-ScannerErrors = Callable[[Sequence[UnconstrainedPoses]], dict[str, list[Array]]]
-# From freed views per capture and a hand-eye to how their poses may err.
-PoseErrorPrior = Callable[[Sequence[UnconstrainedPoses], Array], PoseErrors]
 
 
 def correct(
@@ -183,68 +111,125 @@ def correct(
     T_mount, overlaps, history = icp_hand_eye(captures, T_mount, [gate] * len(captures), first=met, recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
     announce("correct: what every view tells of its pose")
-    freed = tuple(
-        unconstrained_poses(c, c.poses(T_mount), gate, own)
-        for c, gate, own in zip(captures, gates, overlaps, strict=True)
+    unconstrained = tuple(
+        unconstrained_poses(c, c.poses(T_mount), gate, o) for c, gate, o in zip(captures, gates, overlaps, strict=True)
     )
-    T_first, scatters = step_hand_eye(captures, freed, T_mount)
+    T_first, scatters = step_hand_eye(captures, unconstrained, T_mount)
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
     captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
-    freed = _update_unconstrained(captures, freed, gates, T_first)
-    solved = solve_hand_eye(captures, freed, T_first)
+    # Where clouds now weigh otherwise beside labelled points, the views are moved anew.
+    unconstrained = tuple(
+        f.relative_to(c.poses(T_first)) if c.sightings is None else unconstrained_poses(c, c.poses(T_first), gate)
+        for c, f, gate in zip(captures, unconstrained, gates, strict=True)
+    )
+    solved = solve_hand_eye(captures, unconstrained, T_first)
 
     def statistics() -> HandEyeFit:
-        common = None if scanner_errors is None else scanner_errors(freed)
-        errors = None if pose_error_prior is None else pose_error_prior(freed, T_first)
-        return fit_hand_eye(captures, freed, T_first, scanner_errors=common, errors=errors, solved=solved)
+        common = None if scanner_errors is None else scanner_errors(unconstrained)
+        errors = None if pose_error_prior is None else pose_error_prior(unconstrained, T_first)
+        return fit_hand_eye(captures, unconstrained, T_first, scanner_errors=common, errors=errors, solved=solved)
 
-    # Where the hand-eye is says least squares at once; how certain it is may wait until the end of the run.
-    begun = begin(statistics)
     announce("correct: what the corrected hand-eye leaves")
-    samples = [[sample_points(scan, FINE_SAMPLES) for scan in c.scans] for c in captures]
     final = tuple(
-        collect_overlaps(c, c.poses(solved.T_mount), gate, own, f.overlaps)
-        for c, f, gate, own in zip(captures, freed, gates, samples, strict=True)
+        collect_overlaps(c, c.poses(solved.T_mount), gate, _fine_samples(c), f.overlaps)
+        for c, f, gate in zip(captures, unconstrained, gates, strict=True)
     )
     return Correction(
         geometry=Model(solved.T_mount),
-        statistics=begun,
+        statistics=statistics,
         scatter=solved.scatter,
         overlaps=final,
-        unconstrained=freed,
+        unconstrained=unconstrained,
         history=(*history, pooled_rms(final)),
         captures=tuple(captures),
     )
 
 
-def _update_unconstrained(
-    captures: Sequence[Capture], unconstrained: Sequence[UnconstrainedPoses], gates: Sequence[float], T_mount: Array
-) -> tuple[UnconstrainedPoses, ...]:
-    """The freed views against another hand-eye; where clouds now weigh otherwise beside labelled points, freed anew."""
-    return tuple(
-        f.relative_to(c.poses(T_mount)) if c.sightings is None else unconstrained_poses(c, c.poses(T_mount), gate)
-        for c, f, gate in zip(captures, unconstrained, gates, strict=True)
-    )
+def icp_hand_eye(
+    captures: Sequence[Capture],
+    T_mount: Array,
+    gates: Sequence[float],
+    *,
+    first: Sequence[Overlaps] | None = None,
+    samples: int = COARSE_SAMPLES,
+    maximum: int = _MAXIMUM_ITERATIONS,
+    recorder: Recorder | None = None,
+) -> tuple[Array, list[Overlaps], list[float]]:
+    """Iterate matching and the common step until it no longer moves the parts.
+
+    Args:
+        T_mount: (4, 4) start, T_mount_scanner.
+        gates: first distance between partners per capture, length_unit.
+        first: overlaps per capture under the start, if they are at hand.
+
+    Returns:
+        T_mount (4, 4), the last overlaps per capture and the rms per iteration.
+    """
+    recorder = recorder or SilentRecorder()
+    coarse_queries = [common_samples(c.scans, min(samples, _WIDE_SAMPLES)) for c in captures]
+    fine_queries = [common_samples(c.scans, samples) for c in captures]
+    gates = list(gates)
+    history: list[float] = []
+    part = seen_part(captures)
+    before: Sequence[Overlaps | None] = [None] * len(captures)
+    closing = True
+    for index in range(maximum):
+        wide = closing and all(gate > _WIDE_SPACINGS * c.spacing for c, gate in zip(captures, gates, strict=True))
+        if first is not None and index == 0:
+            overlaps = list(first)
+        else:
+            views = zip(captures, gates, coarse_queries if wide else fine_queries, before, strict=True)
+            overlaps = [collect_overlaps(c, c.poses(T_mount), gate, queries, last) for c, gate, queries, last in views]
+        before = overlaps
+        history.append(pooled_rms(overlaps))
+        recorder.iteration("correct", index, captures[0].poses(T_mount), history[-1], gates[0])
+        xi, moved = common_step(captures, overlaps, T_mount, visible_twists(captures, T_mount, part))
+        T_mount = T_mount @ frames.exp(xi)
+        tighter = [min(g, next_gate(o, c)) for g, o, c in zip(gates, overlaps, captures, strict=True)]
+        settled = all(new > 0.9 * old for new, old in zip(tighter, gates, strict=True))
+        if moved < _CONVERGED and settled:
+            if not wide:
+                break
+            # Surfaces that agree no better than a few spacings keep the gate wide.
+            closing = False
+        gates = tighter if moved < _AT_REST else next_gates(captures, overlaps)
+    return T_mount, overlaps, history
+
+
+def common_step(
+    captures: Sequence[Capture], overlaps: Sequence[Overlaps], T_mount: Array, visible: Array
+) -> tuple[Array, float]:
+    """Return ξ (6,) = −D⁻¹b over all captures, along visible twists (6, k), and how far it moves the part, rms."""
+    D = np.zeros((6, 6))
+    b = np.zeros(6)
+    jacobians = [
+        hand_eye_jacobian(c.hand_eye_frames(T_mount), o.gram.centre) for c, o in zip(captures, overlaps, strict=True)
+    ]
+    for J, o in zip(jacobians, overlaps, strict=True):
+        # Sessions of different noise count by their own variance.
+        H, vector = assemble(o.gram)
+        D += J.T @ H @ J / o.gram.scale**2
+        b += J.T @ vector / o.gram.scale**2
+    xi = visible @ least_squares(visible.T @ D @ visible, visible.T @ b)
+    moved = [(J @ xi).reshape(-1, 6)[:, 3:] / o.gram.scale for J, o in zip(jacobians, overlaps, strict=True)]
+    return xi, float(np.sqrt(np.mean(np.concatenate(moved) ** 2)))
+
+
+def next_gates(captures: Sequence[Capture], overlaps: Sequence[Overlaps]) -> list[float]:
+    """Return the next gates, not tighter than 0.6 of the last: the first fits at a wide gate are still far off."""
+    return [max(min(o.gate, next_gate(o, c)), 0.6 * o.gate) for c, o in zip(captures, overlaps, strict=True)]
 
 
 def with_noise_factor(capture: Capture, scatter: Repeatability) -> Capture:
-    """The capture with clouds that weigh beside its labelled points by the scatter that they have shown.
+    """Return the capture with clouds that weigh beside its labelled points by the scatter that they have shown.
 
     Correspondences share points and normals, so that they never know more than as many independent distances.
     """
     return capture if capture.sightings is None else replace(capture, noise_factor=max(scatter.noise_factor, 1.0))
 
 
-# Use a model that was fitted on another object of the same rig, without correcting again.
-
-# A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
-REUSE_GATE = 0.05
-_TIGHTENINGS = 4
-_GATE_CONVERGED = 0.99
-
-
 def apply_given_hand_eye(captures: Sequence[Capture], model: Model) -> Correction:
-    """Overlaps and pose scatter of `captures` under a model, as `correct` returns them.
+    """Return overlaps and pose scatter of `captures` under a model, as `correct` returns them.
 
     Args:
         captures: without the model's effects.
@@ -255,14 +240,15 @@ def apply_given_hand_eye(captures: Sequence[Capture], model: Model) -> Correctio
     size = part_size(captures)
     overlaps = tuple(converged_overlaps(c, model.T_mount, REUSE_GATE * size) for c in captures)
     poses = [c.poses(model.T_mount) for c in captures]
-    freed = [unconstrained_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True)]
-    scatter = tuple(capture_repeatability(c, f, model.T_mount) for c, f in zip(captures, freed, strict=True))
+    unconstrained = tuple(unconstrained_poses(c, T, o.gate) for c, T, o in zip(captures, poses, overlaps, strict=True))
+    scatter = tuple(capture_repeatability(c, f, model.T_mount) for c, f in zip(captures, unconstrained, strict=True))
+    hand_eye = HandEyeFit(model.T_mount, model.covariance, 1.0, scatter, 1.0)
     return Correction(
         geometry=model,
-        statistics=known(HandEyeFit(model.T_mount, model.covariance, 1.0, scatter, 1.0)),
+        statistics=lambda: hand_eye,
         scatter=scatter,
         overlaps=overlaps,
-        unconstrained=tuple(freed),
+        unconstrained=unconstrained,
         history=(pooled_rms(overlaps),),
         captures=tuple(with_noise_factor(c, s) for c, s in zip(captures, scatter, strict=True)),
         given=True,
@@ -270,38 +256,47 @@ def apply_given_hand_eye(captures: Sequence[Capture], model: Model) -> Correctio
 
 
 def converged_overlaps(capture: Capture, T_mount: Array, gate: float) -> Overlaps:
-    """Correspondences under a hand-eye that is right but for pose errors; the gate closes to the data's scale.
+    """Return correspondences under a hand-eye that is right but for pose errors; the gate closes to the data's scale.
 
     Raises:
         NoResultError: no two views overlap.
     """
-    samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
-    return collect_overlaps(capture, capture.poses(T_mount), converged_gate(capture, T_mount, gate), samples)
+    gate = converged_gate(capture, T_mount, gate)
+    return collect_overlaps(capture, capture.poses(T_mount), gate, _fine_samples(capture))
 
 
-def gate_of_model(own: Capture, T_mount: Array) -> float:
+def gate_of_model(capture: Capture, T_mount: Array) -> float:
     """Return the distance that partners may have under a model that was fitted, length_unit; NaN without clouds.
 
     Args:
-        own: the capture without the model's effects.
+        capture: without the model's effects.
 
     Raises:
         NoResultError: no two views overlap.
     """
-    return converged_gate(own, T_mount, REUSE_GATE * part_size([own])) if own.scans else float("nan")
+    if not capture.scans:
+        return float("nan")
+    return converged_gate(capture, T_mount, REUSE_GATE * part_size([capture]))
 
 
 def converged_gate(capture: Capture, T_mount: Array, gate: float) -> float:
-    """The distance that partners may have, from one that is too large.
+    """Return the distance that partners may have, from one that is too large.
 
     Raises:
         NoResultError: no two views overlap.
     """
     samples = common_samples(capture.scans, FINE_SAMPLES)
-    poses, overlaps = capture.poses(T_mount), None
+    poses = capture.poses(T_mount)
+    overlaps: Overlaps | None = None
     for _ in range(_TIGHTENINGS):
         overlaps = collect_overlaps(capture, poses, gate, samples, overlaps)
-        last, gate = gate, float(np.minimum(gate, next_gate(overlaps, capture)))
-        if gate > _GATE_CONVERGED * last:
+        tighter = float(np.minimum(gate, next_gate(overlaps, capture)))
+        settled = tighter > _GATE_CONVERGED * gate
+        gate = tighter
+        if settled:
             break
     return gate
+
+
+def _fine_samples(capture: Capture) -> list[Indices]:
+    return [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]

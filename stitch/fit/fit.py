@@ -1,124 +1,214 @@
 """The one fit of hand-eye, effects and whatever else is unknown: linearise, choose what is fitted, solve, repeat.
 
 What was observed says how: overlapping surfaces of all sessions of a rig (`surface_fit.py`), or labelled points
-(`target_fit.py`).
+(`target_fit.py`). About either goes a second loop: labelled points that contradict the rest are taken out, and what is
+left is fitted again.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from stitch.effects.contract import one_by_one
+from stitch.errors import NoResultError
+from stitch.fit.coarse import CoarseHandEye
+from stitch.fit.correct import Correction
 from stitch.model.model import Model, Term, sizes_of
+from stitch.model.model_toml import ModelFile
 from stitch.numerics.frames import Mask
 from stitch.numerics.least_squares import independent
 from stitch.numerics.parameter_selection import UNSEEN, WhitenedData, select_supported
+from stitch.observations.targets.outliers import Outlier, find_mislabelled, find_outliers, mask_outliers
+from stitch.observations.targets.target_model import TargetModelFit
+from stitch.session.capture import Capture, Sightings
+from stitch.session.measurement import Measurement
 
 # Iterations in which it is still open what is fitted.
 _CHOICE_STEPS = 2
 # The prior of a fitted parameter about zero, in plausible sizes: it keeps the unseen finite, moves nothing else.
 WEAK = 10.0
+# More outliers than this share of what was seen, and it is the rest that is wrong.
+_MOST_OUTLIERS = 1 / 3
+
+# From a measurement, its model and the gate to the model that the fit of effects begins with.
+InitialModel = Callable[[Measurement, Model, float], Model]
+FitResult = TypeVar("FitResult")
+LinearisedT = TypeVar("LinearisedT", bound="Linearised")
+SolutionT = TypeVar("SolutionT")
 
 
-class FitStep(Protocol):
-    """One step of a fit."""
+@dataclass(frozen=True)
+class FitStart:
+    """From what a fit begins: coarse hand-eyes, a model that was fitted before, or one that stays as it is."""
+
+    hand_eyes: Sequence[CoarseHandEye]  # of every session
+    effects: InitialModel | None = None  # effects that are fitted with the hand-eye
+    model: Model | None = None  # fitted before: the fit goes on from there
+    gate: float = float("nan")  # of that model: largest distance between partners, length_unit
+    given: ModelFile | None = None  # of another run: neither hand-eye nor effects are fitted
+
+
+@dataclass(frozen=True)
+class FittedSession:
+    """One session after the fit, as far as its labelled points are concerned."""
+
+    measurement: Measurement  # with the sightings that count
+    targets: TargetModelFit | None  # None without labelled points
+    outliers: tuple[Outlier, ...]
+
+
+@dataclass(frozen=True)
+class FittedRig:
+    """The common model of a rig, and its sessions as they count."""
+
+    sessions: list[FittedSession]
+    correction: Correction | None = None  # of surfaces; None where there are labelled points alone
 
     @property
-    def model(self) -> Model:
-        """The model after the step."""
-        ...
+    def captures(self) -> list[Capture]:
+        """Of every session, without the effects in use."""
+        if self.correction is not None:
+            return list(self.correction.captures)
+        return [session.targets.rows.capture for session in self.sessions if session.targets is not None]
 
-    @property
-    def moved(self) -> float:
-        """The largest move of an unknown in its sigmas."""
-        ...
+    def model_of(self, index: int) -> Model:
+        """Of one session: labelled points of an arm share its effects, and each session has its own hand-eye."""
+        if self.correction is not None:
+            return self.correction.model
+        targets = self.sessions[index].targets
+        assert targets is not None
+        return targets.model
 
-    @property
-    def rms(self) -> float:
-        """What remained before the step, length_unit."""
-        ...
+    def heldout_rms(self, index: int) -> float:
+        """Of one session on views left out, length_unit."""
+        if self.correction is not None:
+            return self.correction.overlaps[index].gram.rms * self.correction.hand_eye.heldout_ratio
+        targets = self.sessions[index].targets
+        assert targets is not None
+        return targets.heldout_rms
 
 
-StepT = TypeVar("StepT", bound=FitStep)
-StepT_co = TypeVar("StepT_co", bound=FitStep, covariant=True)
-
-
-class LinearisedFit(Protocol[StepT_co]):
+class Linearised(Protocol):
     """What was observed, linearised about a model."""
 
     def choose(self, before: Any) -> Any:
         """What is fitted, given what was so far: None at first."""
         ...
 
-    def solve(self, choice: Any) -> StepT_co:
-        """The step of all unknowns."""
+    def solve(self, choice: Any) -> Any:
+        """The `Step` of all unknowns."""
         ...
 
 
-class FitProblem(Protocol[StepT]):
-    """What was observed, ready to be linearised about any model."""
+@dataclass(frozen=True)
+class Step(Generic[LinearisedT, SolutionT]):
+    """One step of a fit: from where it was taken, and where it led."""
 
-    @property
-    def maximum_iterations(self) -> int: ...
-    @property
-    def converged(self) -> float:
-        """Moves below so many sigmas end the fit."""
-        ...
-
-    def linearise(self, model: Model, previous: StepT | None) -> LinearisedFit[StepT]:
-        """About a model, with what the step before knows beside it."""
-        ...
+    linearised: LinearisedT  # about the model before the step
+    choice: Any  # what was fitted, as `linearised.choose` returned it
+    solution: SolutionT  # of the linear problem
+    model: Model  # after the step; of the first session, where each has its own hand-eye
+    moved: float  # the largest move of an unknown, in its sigmas
+    rms: float  # what remained before the step, length_unit
 
 
 def iterate(
-    problem: FitProblem[StepT], model: Model, watch: Callable[[int, StepT], None] | None = None
-) -> tuple[StepT, list[float]]:
-    """The last step from a model that is near, converged or the last allowed, and the rms before every step.
+    linearise: Callable[[Step[LinearisedT, SolutionT] | None], LinearisedT], *, at_most: int, converged: float
+) -> Iterator[Step[LinearisedT, SolutionT]]:
+    """Yield the steps of a fit from a model that is near, until one moves nothing.
 
     Args:
-        watch: told of every step, with its number from 0.
+        linearise: about where the step before led; None: about the first model.
+        at_most: steps.
+        converged: a step that moves no unknown by so many sigmas is the last.
 
     Raises:
         NoResultError: no two views overlap.
     """
-    step: StepT | None = None
+    step: Step[LinearisedT, SolutionT] | None = None
     choice: Any = None
-    history: list[float] = []
-    while step is None or (len(history) < problem.maximum_iterations and step.moved >= problem.converged):
-        linearised = problem.linearise(model, step)
-        if choice is None or len(history) < _CHOICE_STEPS:
+    for index in range(at_most):
+        linearised = linearise(step)
+        if index < _CHOICE_STEPS:
             choice = linearised.choose(choice)
         step = linearised.solve(choice)
-        model = step.model
-        if watch is not None:
-            watch(len(history), step)
-        history.append(step.rms)
-    return step, history
+        yield step
+        if step.moved < converged:
+            return
 
 
 def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[Mask], WhitenedData]) -> Mask:
-    """(P,) parameters that the views support and can tell apart.
+    """Return (P,) parameters that the views support and can tell apart.
 
     Args:
         before: (P,) what explained scatter so far; never what another run's arm brought.
         whitened: the observation in units of the scatter that is left when some parameters explain theirs.
     """
     sizes = sizes_of(terms)
-    groups, effects, at = list[list[int]](), list[int](), 0
+    groups, effects, first = list[list[int]](), list[int](), 0
     for number, term in enumerate(terms):
-        kept = any(p.kept for p in term.parameters)
-        own = [] if kept else one_by_one(term.effect, term.parameters)
-        groups += [[at + i for i in group] for group in own]
-        effects += [number] * len(own)
-        at += len(term.parameters)
+        if not any(p.kept for p in term.parameters):
+            of_term = one_by_one(term.effect, term.parameters)
+            groups += [[first + i for i in group] for group in of_term]
+            effects += [number] * len(of_term)
+        first += len(term.parameters)
     if not groups:
         return before
-    free, seen = before, whitened(before)
+    free, data = before, whitened(before)
     for _ in range(_CHOICE_STEPS):
-        # What is found explains scatter, and less scatter shows more.
-        found = select_supported(seen, sizes, groups, effects)
-        if (found == free).all():
+        # What is fitted explains scatter, and less scatter shows more.
+        supported = select_supported(data, sizes, groups, effects)
+        if (supported == free).all():
             break
-        free, seen = found, whitened(found)
-    return np.logical_and(free, independent(seen.base, seen.further * free, sizes, 1 / UNSEEN))
+        free, data = supported, whitened(supported)
+    return np.logical_and(free, independent(data.base, data.further * free, sizes, 1 / UNSEEN))
+
+
+def fit_without_outliers(
+    measurements: Sequence[Measurement],
+    fit: Callable[[Sequence[Measurement], FitResult | None], FitResult],
+    targets_of: Callable[[Sequence[Measurement], FitResult], Sequence[TargetModelFit | None]],
+) -> tuple[FitResult, list[FittedSession]]:
+    """Fit, take out the labelled points that contradict the rest, and again, until none does.
+
+    Args:
+        fit: from the measurements, and the result of the round before, to the result.
+        targets_of: the labelled points of every session under that.
+
+    Raises:
+        NoResultError: more than a third of the labelled points of a session would have to go.
+    """
+    whole = [_with_sightings(m, s.with_outliers) if (s := m.capture.sightings) else m for m in measurements]
+    # Views whose targets bear each other's names would pull the fit to where these lie.
+    outliers = [[m.outlier for m in find_mislabelled(s)] if (s := w.capture.sightings) else [] for w in whole]
+    measurements = [_remove_points(m, taken) for m, taken in zip(whole, outliers, strict=True)]
+    result: FitResult | None = None
+    while True:
+        result = fit(measurements, result)
+        targets = targets_of(measurements, result)
+        further = [find_outliers(t.rows, t.variances) if t else [] for t in targets]
+        if not any(further):
+            sessions = zip(measurements, targets, outliers, strict=True)
+            return result, [FittedSession(m, t, tuple(taken)) for m, t, taken in sessions]
+        measurements = [_remove_points(m, more) for m, more in zip(measurements, further, strict=True)]
+        outliers = [[*taken, *more] for taken, more in zip(outliers, further, strict=True)]
+
+
+def _remove_points(measurement: Measurement, outliers: Sequence[Outlier]) -> Measurement:
+    """Return the measurement without some of its labelled points."""
+    sightings = measurement.capture.sightings
+    if not outliers or sightings is None:
+        return measurement
+    used = mask_outliers(sightings.used, outliers, sightings.targets, sightings.target)
+    if used.sum() < (1 - _MOST_OUTLIERS) * sightings.with_outliers.used.sum():
+        raise NoResultError(
+            f"{measurement.capture.name}: more than a third of the labelled points contradict the rest; check the "
+            "names of the targets, the order of the views, mount and pose convention"
+        )
+    return _with_sightings(measurement, replace(sightings, used=used))
+
+
+def _with_sightings(measurement: Measurement, sightings: Sightings) -> Measurement:
+    return replace(measurement, capture=replace(measurement.capture, sightings=sightings))

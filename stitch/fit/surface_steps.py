@@ -1,175 +1,221 @@
 """A run from clouds, with labelled points beside them or without: how it starts, fits, goes on and ends."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from stitch.fit.coarse import REUSED, STATED, CoarseHandEye, find_coarse_hand_eye, use_given_hand_eye
 from stitch.fit.correct import Correction, apply_given_hand_eye, correct
-from stitch.fit.register_and_fuse import FittedRig, InitialModel, begin_to_register_views, finish_surfaces
-from stitch.fit.sentences import coarse_note, mixed_notes, warnings
+from stitch.fit.fit import FitStart, FittedRig, fit_without_outliers
+from stitch.fit.sentences import correct_note, mixed_notes, register_note, support_note, surface_sentence, warnings
 from stitch.fit.surface_fit import fit_surfaces
-from stitch.fit.target_fit import FittedSession, fit_without_outliers, locate_targets
-from stitch.fusion.register import METHODS
+from stitch.fit.target_fit import locate_targets
+from stitch.fusion.fuse import RegisteredSession, fuse_every_point, has_whole_clouds
+from stitch.fusion.register import METHODS, register, unseen_moves
 from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile, bind_to_session
+from stitch.numerics import frames
+from stitch.numerics.distributions import MAD_TO_SIGMA
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import PoseErrors, prior_pose_errors
+from stitch.observations.surfaces.normal_equations import RMS_GATE, Overlaps
 from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.surface_model import surface_model
-from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, noise_floor, unconstrained_poses
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.recorder import Recorder
-from stitch.run_data import Fit, LedgerStep, StageResult
-from stitch.session.capture import Capture
+from stitch.run_data import Fit, StageResult
 from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData
+from stitch.system.threads import Clock, take_mapped
+
+# Places of the fused cloud that tell its rms to a part in a thousand.
+_RMS_SAMPLES = 2_000_000
 
 
-def initial_hand_eyes(
+def start(
     sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile | None
 ) -> list[CoarseHandEye]:
-    """The hand-eye to begin with, one for all sessions: of a model, stated in session.toml, or searched.
+    """Return the hand-eye to begin with, one for all sessions: of a model, stated in session.toml, or searched.
 
     Raises:
         NoResultError: no hand-eye makes the views overlap.
     """
-    return [_initial_hand_eye(sessions, [m.capture for m in measurements], file)] * len(sessions)
-
-
-def _initial_hand_eye(
-    sessions: Sequence[SessionData], captures: Sequence[Capture], file: ModelFile | None
-) -> CoarseHandEye:
-    if file:
-        return use_given_hand_eye(captures, file.T_mount, REUSED)
+    captures = [measurement.capture for measurement in measurements]
     stated = next((s.scanner.T_mount for s in sessions if s.scanner.T_mount is not None), None)
-    return find_coarse_hand_eye(captures) if stated is None else use_given_hand_eye(captures, stated, STATED)
-
-
-def initial_stage(measurement: Measurement, start: CoarseHandEye, seconds: float, recorder: Recorder) -> StageResult:
-    """How well the views of one session meet under the coarse hand-eye."""
-    g, poses = start.overlaps(measurement.capture).gram, measurement.capture.poses(start.T_mount)
-    stage = StageResult("coarse", g.rms, int(g.count.sum()), len(start.candidates), seconds, coarse_note(start))
-    recorder.stage(stage, poses)
-    return stage
+    if file:
+        hand_eye = use_given_hand_eye(captures, file.T_mount, REUSED)
+    elif stated is not None:
+        hand_eye = use_given_hand_eye(captures, stated, STATED)
+    else:
+        hand_eye = find_coarse_hand_eye(captures)
+    return [hand_eye] * len(sessions)
 
 
 def fit(
-    sessions: Sequence[SessionData],
-    measurements: Sequence[Measurement],
-    starts: Sequence[CoarseHandEye],
-    initial_model: InitialModel | None,
-    recorder: Recorder,
+    sessions: Sequence[SessionData], measurements: Sequence[Measurement], start: FitStart, recorder: Recorder
 ) -> FittedRig:
-    """The hand-eye from the scans; with effects, both."""
+    """Fit the hand-eye to the scans; with effects, both. Labelled points that contradict the rest are taken out."""
 
     def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
-        repeating = partial(rig_scanner_errors, measurements)
-        captures = [m.capture for m in measurements]
-
-        def pose_error_prior(unconstrained: Sequence[UnconstrainedPoses], T_mount: Array) -> PoseErrors:
-            return prior_pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in unconstrained])
-
-        met = [starts[0].overlaps(capture) for capture in captures]
-        first = correct(captures, starts[0].T_mount, starts[0].gate, recorder, repeating, pose_error_prior, met)
-        if initial_model is None:
-            return first
-        gates = [overlaps.gate for overlaps in first.overlaps]
-        weighed = [_with_noise_factor(m, own.noise_factor) for m, own in zip(measurements, first.captures, strict=True)]
+        if start.given is not None:
+            model = bind_to_session(start.given, measurements[0])
+            return apply_given_hand_eye([corrected_capture(m, model) for m in measurements], model)
+        if start.model is not None:
+            return fit_surfaces(measurements, start.model, [start.gate] * len(measurements), recorder)
+        correction = _correct_hand_eye(measurements, start.hand_eyes[0], recorder)
+        if start.effects is None:
+            return correction
+        gates = [overlaps.gate for overlaps in correction.overlaps]
+        weighed = _weighed(measurements, correction)
         # An event or a time constant is one for the whole rig: the first session says where it begins.
-        return fit_surfaces(weighed, initial_model(weighed[0], Model(first.model.T_mount), gates[0]), gates, recorder)
+        model = start.effects(weighed[0], Model(correction.geometry.T_mount), gates[0])
+        return fit_surfaces(weighed, model, gates, recorder)
 
-    return _fitted_rig(*fit_without_outliers(measurements, once, _locate_targets))
-
-
-def refit(
-    sessions: Sequence[SessionData],
-    measurements: Sequence[Measurement],
-    model: Model,
-    gates: Sequence[float],
-    recorder: Recorder,
-) -> FittedRig:
-    """Hand-eye and the effects of a model fitted anew, matched anew."""
-
-    def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
-        return fit_surfaces(measurements, model, gates, recorder)
-
-    return _fitted_rig(*fit_without_outliers(measurements, once, _locate_targets))
+    correction, fitted = fit_without_outliers(measurements, once, _locate_targets)
+    weighed = _weighed([session.measurement for session in fitted], correction)
+    return FittedRig([replace(s, measurement=m) for s, m in zip(fitted, weighed, strict=True)], correction)
 
 
-def apply(sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
-    """The sessions under a model of another run, neither hand-eye nor effects changed."""
+def _correct_hand_eye(measurements: Sequence[Measurement], hand_eye: CoarseHandEye, recorder: Recorder) -> Correction:
+    captures = [measurement.capture for measurement in measurements]
 
-    def once(measurements: Sequence[Measurement], _: Correction | None) -> Correction:
-        model = bind_to_session(file, measurements[0])
-        return apply_given_hand_eye([corrected_capture(m, model) for m in measurements], model)
+    def pose_error_prior(unconstrained: Sequence[UnconstrainedPoses], T_mount: Array) -> PoseErrors:
+        return prior_pose_errors(measurements, Model(T_mount), [f.overlaps.gram.centre for f in unconstrained])
 
-    return _fitted_rig(*fit_without_outliers(measurements, once, _locate_targets))
-
-
-def linearise(session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
-    """Views freed under the model by their overlaps and common targets.
-
-    Raises:
-        NoResultError: no two views overlap.
-    """
-    own = corrected_capture(measurement, model)
-    return surface_model(measurement, model, own, unconstrained_poses(own, own.poses(model.T_mount), gate))
-
-
-def begin_to_register(fitted: FittedRig, sessions: Sequence[SessionData], register: str) -> FittedRig:
-    """The same, with the views of all sessions being registered by a method, and fused."""
-    return replace(fitted, begun=begin_to_register_views(fitted, sessions, METHODS[register]))
-
-
-def finish(
-    session: SessionData,
-    fitted: FittedRig,
-    index: int,
-    before: StageResult,
-    recorder: Recorder,
-    seconds: float,
-) -> tuple[Fit, LedgerStep]:
-    """Register and fuse session `index` under the common model."""
-    assert fitted.correction is not None
-    return finish_surfaces(
-        session,
-        fitted.sessions[index].measurement,
-        fitted.correction,
-        index=index,
-        before=before,
-        recorder=recorder,
-        seconds=seconds,
-        begun=fitted.begun[index],
+    return correct(
+        captures,
+        hand_eye.T_mount,
+        hand_eye.gate,
+        recorder,
+        scanner_errors=partial(rig_scanner_errors, measurements),
+        pose_error_prior=pose_error_prior,
+        met=[hand_eye.overlaps(capture) for capture in captures],
     )
 
 
-def notes(session: SessionData, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
-    """What a user should know before trusting the result."""
-    assert fitted.correction is not None
-    own = fitted.sessions[index]
-    more = () if own.targets is None else mixed_notes(own.targets, own.outliers, session)
-    return (*warnings(start, fitted.correction.hand_eye), *more)
+def _weighed(measurements: Sequence[Measurement], correction: Correction) -> list[Measurement]:
+    """Measurements whose clouds weigh as the correction says (`Capture.noise_factor`)."""
+    return [
+        replace(m, capture=replace(m.capture, noise_factor=corrected.noise_factor))
+        for m, corrected in zip(measurements, correction.captures, strict=True)
+    ]
 
 
 def _locate_targets(measurements: Sequence[Measurement], correction: Correction) -> list[TargetModelFit | None]:
-    # How certain the hand-eye is need not be waited for where there are none.
+    # How certain the hand-eye is need not be found here where there are none.
     return [
         None if m.capture.sightings is None else locate_targets(m, correction.model, correction.hand_eye.inflation)
         for m in measurements
     ]
 
 
-def _fitted_rig(correction: Correction, sessions: Sequence[FittedSession]) -> FittedRig:
-    weighed = [
-        replace(s, measurement=_with_noise_factor(s.measurement, own.noise_factor))
-        for s, own in zip(sessions, correction.captures, strict=True)
-    ]
-    return FittedRig(weighed, list(correction.captures), correction)
+def linearise(session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+    """Return the views' free-network poses under the model, from their overlaps and common targets.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    capture = corrected_capture(measurement, model)
+    return surface_model(measurement, model, capture, unconstrained_poses(capture, capture.poses(model.T_mount), gate))
 
 
-def _with_noise_factor(measurement: Measurement, noise_factor: float) -> Measurement:
-    """The measurement with clouds that weigh as they were found to (`Capture.noise_factor`)."""
-    return replace(measurement, capture=replace(measurement.capture, noise_factor=noise_factor))
+def finish(
+    session: SessionData,
+    fitted: FittedRig,
+    index: int,
+    coarse: StageResult,
+    recorder: Recorder,
+    *,
+    seconds: float,
+    method: str,
+    until_screened: Callable[[], None],
+) -> tuple[Fit, float]:
+    """Register session `index` of a rig under the common model by a method, and fuse it; return its noise floor too.
+
+    Raises:
+        InputError: a scan changed on disk since it was read.
+    """
+    clock = Clock()
+    correction, measurement = fitted.correction, fitted.sessions[index].measurement
+    assert correction is not None
+    model, capture, overlaps = correction.geometry, correction.captures[index], correction.overlaps[index]
+    scatter = correction.scatter[index]
+    poses_model = capture.poses(model.T_mount)
+    note = "" if correction.given else correct_note(coarse.rms, overlaps.gram.rms)
+    corrected = _overlap_stage("correct", overlaps, len(correction.history), seconds, note)
+    recorder.stage(corrected, poses_model)
+    registration = register(
+        capture,
+        poses_model,
+        scatter,
+        overlaps.gate,
+        recorder,
+        correction.unconstrained[index].poses,
+        method=METHODS[method],
+        before=overlaps,
+    )
+    note = register_note(registration, session, unseen_moves(registration, poses_model))
+    registered = _overlap_stage("register", registration.overlaps, len(registration.history), clock.lap(), note)
+    registered = replace(registered, method=method)
+    recorder.stage(registered, registration.poses)
+    if has_whole_clouds(session):
+        # To read every point again takes time and room: only for views that stay.
+        until_screened()
+        clock.lap()
+    fused, unsupported = fuse_every_point(RegisteredSession(session, measurement, model, capture, registration.poses))
+    several = int((fused.count > 1).sum())
+    last = StageResult("fuse", _fused_rms(fused.residual), several, 1, clock.lap(), support_note(unsupported))
+    recorder.stage(last, registration.poses)
+    floor = noise_floor(capture, registration.overlaps, session.scanner.noise)
+    fit = Fit(
+        stages=(coarse, corrected, registered, last),
+        poses_model=poses_model,
+        poses=registration.poses,
+        corrections=frames.log(registration.poses @ frames.inverse(poses_model)),
+        view_rms=per_view_rms(registration.overlaps, len(capture.scans)),
+        fused=fused,
+        unsupported=unsupported,
+        repeatability=scatter,
+        verdict=surface_sentence(corrected.rms, registered.rms, floor, scatter, session.length_unit, model.effects),
+        convergence={"correct": list(correction.history), "register": list(registration.history)},
+        # A search that nobody goes on from takes room.
+        overlaps=replace(overlaps, searched=None),
+        registered=replace(registration.overlaps, searched=None),
+    )
+    return fit, floor
+
+
+def _overlap_stage(name: str, overlaps: Overlaps, iterations: int, seconds: float, note: str) -> StageResult:
+    return StageResult(name, overlaps.gram.rms, int(overlaps.gram.count.sum()), iterations, seconds, note)
+
+
+def _fused_rms(residual: Array) -> float:
+    sample = take_mapped(residual, np.arange(0, len(residual), -(-len(residual) // _RMS_SAMPLES)))
+    distances = sample[np.isfinite(sample)]
+    if not len(distances):
+        return float("nan")
+    # As in the overlaps: what lies beyond 4 robust sigmas is an edge, not a distance of surfaces.
+    return float(np.sqrt(np.mean(distances[distances < RMS_GATE * MAD_TO_SIGMA * np.median(distances)] ** 2)))
+
+
+def per_view_rms(overlaps: Overlaps, views: int) -> Array:
+    """Return (V,) rms of the residuals that touch a view, inside the robust gate; NaN for a view without partners."""
+    square = np.zeros(views)
+    count = np.zeros(views)
+    for (v, w), s, n in zip(overlaps.gram.pairs, overlaps.gram.raw_square, overlaps.gram.count, strict=True):
+        square[[v, w]] += s
+        count[[v, w]] += n
+    return np.where(count > 0, np.sqrt(square / np.maximum(count, 1)), np.nan)
+
+
+def notes(session: SessionData, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
+    """Return what a user should know before trusting the result."""
+    assert fitted.correction is not None
+    targets, outliers = fitted.sessions[index].targets, fitted.sessions[index].outliers
+    of_targets = () if targets is None else mixed_notes(targets, outliers, session)
+    return (*warnings(start, fitted.correction.hand_eye), *of_targets)

@@ -7,38 +7,40 @@ import numpy as np
 
 from stitch.errors import NoResultError
 from stitch.fit.coarse import REUSED, STATED, CoarseHandEye
-from stitch.fit.register_and_fuse import FittedRig, InitialModel, finish_targets
-from stitch.fit.sentences import target_notes
-from stitch.fit.target_fit import TargetStart, evaluate_targets, fit_targets, fit_without_outliers
+from stitch.fit.fit import FitStart, FittedRig, fit_without_outliers
+from stitch.fit.sentences import target_notes, target_sentence
+from stitch.fit.target_fit import TargetSession, evaluate_targets, fit_targets
+from stitch.fusion.register import register_targets
 from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile, bind_to_session
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.hand_eye_fit import repeatability_from
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
-from stitch.observations.targets.rows import drawing_of, initial_landmarks, target_rows
+from stitch.observations.targets.rows import drawing_of, initial_landmarks
 from stitch.observations.targets.target_model import TargetModelFit, rms_of, target_model
 from stitch.recorder import Recorder
-from stitch.run_data import Fit, LedgerStep, StageResult
+from stitch.run_data import Fit, FusedCloud, StageResult
 from stitch.session.capture import Sightings
 from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData
+from stitch.system.threads import Clock
 
 
-def initial_hand_eyes(
+def start(
     sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile | None
 ) -> list[CoarseHandEye]:
-    """The hand-eye of each session to begin with: of a model, stated in session.toml, or in closed form.
+    """Return the hand-eye of each session to begin with: of a model, stated in session.toml, or in closed form.
 
     Raises:
         NoResultError: motions or targets that cannot show the hand-eye; without a model, no target that is seen twice.
     """
-    return [
-        _initial_hand_eye(session, measurement, file)
-        for session, measurement in zip(sessions, measurements, strict=True)
-    ]
+    return [_start_session(s, m, file) for s, m in zip(sessions, measurements, strict=True)]
 
 
-def _initial_hand_eye(session: SessionData, measurement: Measurement, file: ModelFile | None) -> CoarseHandEye:
+def _start_session(session: SessionData, measurement: Measurement, file: ModelFile | None) -> CoarseHandEye:
     if file is None and _sightings(measurement).view_counts.max() < 2:
         raise NoResultError(
             f"{session.path}: no target is seen in two views; nothing shows whether the poses agree; to fix: with the "
@@ -50,110 +52,114 @@ def _initial_hand_eye(session: SessionData, measurement: Measurement, file: Mode
     return CoarseHandEye(stated, float("nan"), REUSED if file else STATED, ())
 
 
-def initial_stage(measurement: Measurement, start: CoarseHandEye, seconds: float, recorder: Recorder) -> StageResult:
-    """How well the views agree on the targets under the coarse hand-eye."""
-    own = measurement.capture
-    rows = target_rows(own, start.T_mount, initial_landmarks(own, start.T_mount))
-    distances = rows.distances(rows.residual)
-    count = int(np.isfinite(distances).sum())
-    stage = StageResult("coarse", rms_of(distances), count, 1, seconds, start.source)
-    recorder.stage(stage, own.poses(start.T_mount))
-    return stage
+def _sightings(measurement: Measurement) -> Sightings:
+    assert measurement.capture.sightings is not None
+    return measurement.capture.sightings
 
 
 def fit(
-    sessions: Sequence[SessionData],
-    measurements: Sequence[Measurement],
-    starts: Sequence[CoarseHandEye],
-    initial_model: InitialModel | None,
-    recorder: Recorder,
+    sessions: Sequence[SessionData], measurements: Sequence[Measurement], start: FitStart, recorder: Recorder
 ) -> FittedRig:
-    """Hand-eyes and targets; then, with effects that all sessions share, all of them."""
-    first = _refit(sessions, measurements, [Model(own.T_mount) for own in starts], recorder)
-    if initial_model is None:
+    """Fit hand-eyes and targets; then, with effects that all sessions share, all of them.
+
+    Under a model of another run nothing is fitted but targets that it does not know.
+    """
+    if start.given is not None:
+        file = start.given
+
+        def evaluate(measurements: Sequence[Measurement], _: list[TargetModelFit] | None) -> list[TargetModelFit]:
+            return [evaluate_targets(m, bind_to_session(file, m)) for m in measurements]
+
+        return FittedRig(fit_without_outliers(measurements, evaluate, _targets_of)[1])
+    if start.model is not None:
+        return _fit_models(sessions, measurements, [start.model] * len(sessions), recorder)
+    first = _fit_models(sessions, measurements, [Model(hand_eye.T_mount) for hand_eye in start.hand_eyes], recorder)
+    if start.effects is None:
         return first
-    own = [session.measurement for session in first.sessions]
+    measurements = [session.measurement for session in first.sessions]
+    hand_eyes = [first.model_of(k).T_mount for k in range(len(sessions))]
     # An event or a time constant is one for all sessions: the first says where it begins.
-    model = initial_model(own[0], Model(first.model_of(0).T_mount), starts[0].gate)
-    return _refit(sessions, own, [replace(model, T_mount=first.model_of(k).T_mount) for k in range(len(own))], recorder)
+    model = start.effects(measurements[0], Model(hand_eyes[0]), start.hand_eyes[0].gate)
+    return _fit_models(sessions, measurements, [replace(model, T_mount=T) for T in hand_eyes], recorder)
 
 
-def refit(
-    sessions: Sequence[SessionData],
-    measurements: Sequence[Measurement],
-    model: Model,
-    gates: Sequence[float],
-    recorder: Recorder,
-) -> FittedRig:
-    """Hand-eye, targets and the effects of a model fitted anew from where it stands."""
-    return _refit(sessions, measurements, [model] * len(sessions), recorder)
-
-
-def _refit(
+def _fit_models(
     sessions: Sequence[SessionData], measurements: Sequence[Measurement], models: Sequence[Model], recorder: Recorder
 ) -> FittedRig:
     drawings = [drawing_of(s.nominal, _sightings(m)) for s, m in zip(sessions, measurements, strict=True)]
 
     def once(measurements: Sequence[Measurement], before: list[TargetModelFit] | None) -> list[TargetModelFit]:
-        at = models if before is None else [found.model for found in before]
-        every = zip(measurements, at, drawings, strict=True)
-        begun = [
-            TargetStart(m, own, initial_landmarks(corrected_capture(m, own), own.T_mount, drawn))
-            for m, own, drawn in every
+        begin = models if before is None else [targets.model for targets in before]
+        landmarks = [
+            initial_landmarks(corrected_capture(m, model), model.T_mount, drawing)
+            for m, model, drawing in zip(measurements, begin, drawings, strict=True)
         ]
-        return fit_targets(begun, recorder)
+        return fit_targets([TargetSession(*s) for s in zip(measurements, begin, landmarks, strict=True)], recorder)
 
-    return _fitted_rig(measurements, once)
+    return FittedRig(fit_without_outliers(measurements, once, _targets_of)[1])
 
 
-def apply(sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile) -> FittedRig:
-    """The sessions under a model of another run; nothing is fitted but targets that it does not know."""
-
-    def once(measurements: Sequence[Measurement], _: list[TargetModelFit] | None) -> list[TargetModelFit]:
-        return [evaluate_targets(m, bind_to_session(file, m)) for m in measurements]
-
-    return _fitted_rig(measurements, once)
+def _targets_of(measurements: Sequence[Measurement], targets: list[TargetModelFit]) -> list[TargetModelFit]:
+    return targets
 
 
 def linearise(session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
-    """Labelled points as they are."""
+    """Return the rows of the labelled points as they are."""
     return target_model(measurement, model, drawing_of(session.nominal, _sightings(measurement)))
-
-
-def begin_to_register(fitted: FittedRig, sessions: Sequence[SessionData], register: str) -> FittedRig:
-    """The same: `register` names a method of surfaces, which labelled points do not need."""
-    return fitted
 
 
 def finish(
     session: SessionData,
     fitted: FittedRig,
     index: int,
-    before: StageResult,
+    coarse: StageResult,
     recorder: Recorder,
+    *,
     seconds: float,
-) -> tuple[Fit, LedgerStep]:
-    """Register single views."""
-    found = fitted.sessions[index].targets
-    assert found is not None
-    return finish_targets(session, found, before, recorder, seconds)
+    method: str,
+    until_screened: Callable[[], None],
+) -> tuple[Fit, float]:
+    """Register single views by their labelled points, whatever the method; return the noise floor too.
+
+    There is no cloud to fuse.
+    """
+    clock = Clock()
+    targets = fitted.sessions[index].targets
+    assert targets is not None
+    rows = targets.rows
+    poses_model = rows.capture.poses(targets.model.T_mount)
+    count = int(np.isfinite(rows.distances(rows.residual)).sum())
+    poses, after = register_targets(rows, targets.variances, poses_model)
+    note = "3D distances of the targets from their fitted positions"
+    corrected = StageResult("correct", targets.rms, count, len(targets.history), seconds, note)
+    note = "each view moved by its most likely pose error"
+    registered = StageResult("register", rms_of(after), count, 1, clock.lap(), note)
+    recorder.stage(corrected, poses_model)
+    recorder.stage(registered, poses)
+    scatter = repeatability_from(targets.variances)
+    fit = Fit(
+        stages=(coarse, corrected, registered),
+        poses_model=poses_model,
+        poses=poses,
+        corrections=frames.log(poses @ frames.inverse(poses_model)),
+        view_rms=np.sqrt(targets.view_squares),
+        fused=_targets_as_cloud(targets),
+        repeatability=scatter,
+        verdict=target_sentence(targets, registered.rms, scatter, session.length_unit),
+        convergence={"correct": list(targets.history), "register": [registered.rms]},
+    )
+    return fit, targets.noise_floor
+
+
+def _targets_as_cloud(targets: TargetModelFit) -> FusedCloud:
+    """The targets in place of a fused cloud: position, rms distance of the views from it, number of views."""
+    positions = targets.landmarks.positions
+    count: Array = np.minimum(targets.rows.sightings.view_counts, 65535).astype(np.int32)
+    return FusedCloud(positions, np.zeros_like(positions), targets.target_rms, count)
 
 
 def notes(session: SessionData, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
-    """What a user should know before trusting the result."""
-    own = fitted.sessions[index]
-    assert own.targets is not None
-    return target_notes(own.targets, own.outliers, session)
-
-
-def _fitted_rig(
-    measurements: Sequence[Measurement],
-    once: Callable[[Sequence[Measurement], list[TargetModelFit] | None], list[TargetModelFit]],
-) -> FittedRig:
-    found, sessions = fit_without_outliers(measurements, once, lambda _, found: found)
-    return FittedRig(sessions, [own.rows.capture for own in found])
-
-
-def _sightings(measurement: Measurement) -> Sightings:
-    assert measurement.capture.sightings is not None
-    return measurement.capture.sightings
+    """Return what a user should know before trusting the result."""
+    targets = fitted.sessions[index].targets
+    assert targets is not None
+    return target_notes(targets, fitted.sessions[index].outliers, session)

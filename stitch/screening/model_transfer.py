@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stitch.errors import NoResultError
-from stitch.fit.register_and_fuse import FittedRig, per_view_rms
-from stitch.fit.target_fit import FittedSession
+from stitch.fit.fit import FittedRig, FittedSession
+from stitch.fit.surface_steps import per_view_rms
 from stitch.model.model_toml import ModelFile
 from stitch.numerics import frames
 from stitch.numerics.distributions import chi2_tail, f_tail

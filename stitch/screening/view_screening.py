@@ -8,7 +8,7 @@ import numpy as np
 
 from stitch.errors import NoResultError
 from stitch.fit.correct import Correction
-from stitch.fit.register_and_fuse import FittedRig
+from stitch.fit.fit import FittedRig
 from stitch.numerics.frames import Array
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.run_data import ExcludedView, ViewLinks
@@ -220,12 +220,10 @@ def fit_screened_views(
     for _ in range(_MAX_ROUNDS):
         with _naming_excluded_views(sessions, taken):
             fitted = fit(own, measured)
-            with _discarded_if_refused(fitted):
-                found = [_screen_fitted_session(session, fitted, i) for i, session in enumerate(own)]
+            found = [_screen_fitted_session(session, fitted, i) for i, session in enumerate(own)]
         taken = [replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, found, strict=True)]
         if keep or not any(a.left_out for a in found):
             break
-        fitted.discard()
         for session, a in zip(sessions, taken, strict=True):
             require_majority(session, a.left_out)
         measured = [m.without(a.indices(s)) for m, a, s in zip(measured, found, own, strict=True)]
@@ -238,15 +236,6 @@ def fit_screened_views(
         # The last round has left views out too: what is returned is the fit of those that are left.
         fitted = fit(own, measured)
     return ScreenedFit(own, measured, fitted, taken)
-
-
-@contextmanager
-def _discarded_if_refused(fitted: FittedRig) -> Iterator[None]:
-    try:
-        yield
-    except BaseException:
-        fitted.discard()
-        raise
 
 
 @contextmanager

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_cell
-from stitch.api.pipeline import change, diagnose, run, suggest
+from stitch.api.pipeline import change, diagnose, run
+from stitch.api.stepwise import suggest
 from stitch.diagnosis.stepwise_selection import find_effect_to_drop
 
 

@@ -10,9 +10,9 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch.api.pipeline import run
 from stitch.errors import InputError
-from stitch.fit import register_and_fuse
+from stitch.fit import surface_steps
 from stitch.fusion.fuse import RegisteredSession, fuse_every_point
-from stitch.recorder import IterationMemory, SilentRecorder
+from stitch.recorder import RecorderMemory, SilentRecorder
 from stitch.system.threads import begin
 
 
@@ -25,16 +25,16 @@ class _Told(SilentRecorder):
 
 
 def test_iterations_are_told_in_their_order_and_not_before():
-    memory, recorder = IterationMemory(), _Told()
+    memory, recorder = RecorderMemory(), _Told()
     for index in range(3):
         memory.iteration("register", index, np.eye(4)[None], 1.0, 2.0)
     assert recorder.told == []
-    memory.tell(recorder)
+    memory.replay(recorder)
     assert recorder.told == [("register", 0), ("register", 1), ("register", 2)]
 
 
 def test_a_stage_that_nobody_wants_ends_with_its_next_iteration():
-    memory = IterationMemory()
+    memory = RecorderMemory()
 
     def stage() -> None:
         for index in range(10**9):
@@ -58,7 +58,7 @@ def test_views_are_fused_while_they_are_screened_and_errors_are_told(monkeypatch
         threads.append(current_thread().name)
         return fuse_every_point(registered)
 
-    monkeypatch.setattr(register_and_fuse, "fuse_every_point", fused)
+    monkeypatch.setattr(surface_steps, "fuse_every_point", fused)
     found = run(session)
     own = RegisteredSession(session, found.measurement, found.model, found.measurement.capture, found.poses)
     assert threads == ["stitch-beside"]
@@ -67,6 +67,6 @@ def test_views_are_fused_while_they_are_screened_and_errors_are_told(monkeypatch
     def without_room(registered):
         raise InputError("no room")
 
-    monkeypatch.setattr(register_and_fuse, "fuse_every_point", without_room)
+    monkeypatch.setattr(surface_steps, "fuse_every_point", without_room)
     with pytest.raises(InputError, match="no room"):
         run(session)

@@ -12,7 +12,7 @@ from stitch.api.pipeline import run, run_rig
 from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
 from stitch.errors import InputError
-from stitch.fit.target_fit import TargetStart, _TargetProblem
+from stitch.fit.target_fit import LinearisedTargets, TargetSession
 from stitch.model.forward import corrected_capture
 from stitch.model.model import Model, term_of
 from stitch.numerics import frames
@@ -114,8 +114,8 @@ def test_a_parameter_that_goes_to_zero_is_made_up_for_in_the_same_step():
         term = term_of(found.measurement, EFFECTS["joint_offset"])
         model = Model(found.model.T_mount, (term.at(np.array([0, value, 0, 0, 0, 0])),))
         landmarks = initial_landmarks(corrected_capture(found.measurement, model), model.T_mount)
-        begun = TargetStart(found.measurement, model, landmarks)
-        step = _TargetProblem([begun]).linearise(model, None).solve(np.zeros(6, bool))
+        begun = TargetSession(found.measurement, model, landmarks)
+        step = LinearisedTargets([begun], None).solve(np.zeros(6, bool))
         assert not step.model.terms[0].values.any()
         ends.append(step.model.T_mount)
     moved_by_it = 1e-5 * 1000

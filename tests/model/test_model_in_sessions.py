@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.in_memory import session_of
-from stitch.api.pipeline import run_rig
+from stitch.api.pipeline import require_effects, run_rig
 from stitch.effects import EFFECTS
 from stitch.effects.contract import parameters_in
 from stitch.errors import InputError
-from stitch.fit.rig import require_effects
 from stitch.model.model import term_of
 from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.session.capture import prepare_capture

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import stitch.api.pipeline as stepwise
 import stitch.diagnosis.validation as validation
 import stitch.output.finding_screen as finding_screen
 import stitch.output.plain_finding as plain
 from bench.docs.page_blocks import refused
+from stitch.api import stepwise
 from stitch.cli.diagnose import show_budget
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine

@@ -10,8 +10,7 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.api.pipeline import change, run
 from stitch.errors import InputError, NoResultError
-from stitch.fit.register_and_fuse import FittedRig
-from stitch.fit.target_fit import FittedSession
+from stitch.fit.fit import FittedRig, FittedSession
 from stitch.model.model_toml import ModelFile
 from stitch.numerics import frames
 from stitch.output.result_document import result_document
@@ -160,6 +159,6 @@ def test_labelled_points_with_exchanged_coordinates_are_refused():
 def test_a_fit_that_says_nothing_about_the_poses_leaves_no_view_out():
     session, T_mount, _ = labelled_cell(0, views=12)
     measurement = measurement_of(session, prepare_capture(session))
-    fitted = FittedRig([FittedSession(measurement, None, ())], [measurement.capture])
+    fitted = FittedRig([FittedSession(measurement, None, ())])
     found = fit_screened_views([session], [measurement], lambda sessions, measurements: fitted)
     assert found.screenings == [ViewScreening()] and found.sessions == [session]

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from stitch.fit.results import linearise
+from stitch.fit.pipelines import linearise
 from stitch.model.forward import corrected_capture
 from stitch.numerics.distributions import f_tail
 from stitch.numerics.frames import Array, Indices, Mask

@@ -115,7 +115,8 @@ def robot(
     Examples:
       stitch calibrate robot reflector-session -o runs/arm
     """
-    from stitch.api.pipeline import run, suggest
+    from stitch.api.pipeline import run
+    from stitch.api.stepwise import suggest
     from stitch.cli.diagnose import write_diagnosis
     from stitch.output.json_file import to_json
     from stitch.output.run_folder import new_folder, write_with_page

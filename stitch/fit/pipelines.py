@@ -1,0 +1,103 @@
+"""How a run goes with what was observed: from clouds (`surface_steps.py`), or from labelled points (`target_steps.py`).
+
+A further kind of observation is one more module with the functions of `Pipeline`.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from stitch.fit import surface_steps, target_steps
+from stitch.fit.coarse import CoarseHandEye
+from stitch.fit.fit import FitStart, FittedRig
+from stitch.fit.sentences import coarse_note
+from stitch.model.model import Model
+from stitch.model.model_toml import ModelFile
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.targets.rows import initial_landmarks, target_rows
+from stitch.observations.targets.target_model import rms_of
+from stitch.recorder import Recorder
+from stitch.run_data import Fit, StageResult
+from stitch.session.measurement import Measurement
+from stitch.session.session import SessionData
+
+
+class Pipeline(Protocol):
+    """The steps of a run from one kind of observation."""
+
+    def start(
+        self, sessions: Sequence[SessionData], measurements: Sequence[Measurement], file: ModelFile | None
+    ) -> list[CoarseHandEye]:
+        """Return the hand-eye of every session to begin with: of a model's file, stated, or found."""
+        ...
+
+    def fit(
+        self, sessions: Sequence[SessionData], measurements: Sequence[Measurement], start: FitStart, recorder: Recorder
+    ) -> FittedRig:
+        """Return the sessions with their common model."""
+        ...
+
+    def linearise(self, session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+        """Return what was observed, as one linear model about a model."""
+        ...
+
+    def finish(
+        self,
+        session: SessionData,
+        fitted: FittedRig,
+        index: int,
+        coarse: StageResult,
+        recorder: Recorder,
+        *,
+        seconds: float,
+        method: str,
+        until_screened: Callable[[], None],
+    ) -> tuple[Fit, float]:
+        """Return one session with its single views registered, and fused, and its noise floor, length_unit.
+
+        It runs beside the screening of the views; the recorder ends it where views are left out.
+
+        Args:
+            coarse: the stage before the fit.
+            seconds: that the fit has taken.
+            method: by which surfaces are registered: dpwvm or gicp.
+            until_screened: returns when it is known that all views stay.
+        """
+        ...
+
+    def notes(self, session: SessionData, fitted: FittedRig, index: int, start: CoarseHandEye) -> tuple[str, ...]:
+        """Return what a user should know before trusting the result."""
+        ...
+
+
+def pipeline_for(session: SessionData) -> Pipeline:
+    """Return how a run goes with what was observed."""
+    return surface_steps if session.has_clouds else target_steps
+
+
+def linearise(session: SessionData, measurement: Measurement, model: Model, gate: float) -> LinearModel:
+    """Return what a session says about what a model lacks.
+
+    Args:
+        gate: largest distance between partners, length_unit; NaN without clouds.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    return pipeline_for(session).linearise(session, measurement, model, gate)
+
+
+def coarse_stage(session: SessionData, measurement: Measurement, start: CoarseHandEye, seconds: float) -> StageResult:
+    """Return how well the views of one session agree under the hand-eye to begin with.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    capture, note = measurement.capture, coarse_note(start)
+    if session.has_clouds:
+        g = start.overlaps(capture).gram
+        return StageResult("coarse", g.rms, int(g.count.sum()), len(start.candidates), seconds, note)
+    rows = target_rows(capture, start.T_mount, initial_landmarks(capture, start.T_mount))
+    distances = rows.distances(rows.residual)
+    return StageResult("coarse", rms_of(distances), int(np.isfinite(distances).sum()), 1, seconds, note)
