@@ -23,7 +23,7 @@ from unknown_worlds import MULTIPLES, PARTS
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
-from stitch.diagnosis.unnamed_time_laws import find_repeating_errors
+from stitch.diagnosis.unmodelled_time_effects import find_repeating_errors
 from stitch.diagnosis.verdict import Evidence
 from stitch.observations.linear_model import LinearModel
 from stitch.system.threads import library_threads_off

@@ -8,8 +8,8 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import NOT_REPEATING, BudgetLine
-from stitch.diagnosis.unnamed_joint_laws import JointCurve
-from stitch.diagnosis.unnamed_time_laws import ROTATION_PART, TRANSLATION_PART, TimeCurve
+from stitch.diagnosis.unmodelled_joint_effects import JointCurve
+from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_PART, TimeCurve
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, covariate_text, length_text
 from stitch.observations.pose_errors import time_in_steps

@@ -31,7 +31,7 @@ class Form:
     term: Term  # at zero, gridded parameters at their value
     keep: Mask  # (P,) parameters that are free in this form
     whole: Array  # (·, P) response of the observation to all; held once for all forms of a term
-    reduced: Array  # (n, P) the same in the channel
+    reduced: Array  # (n, P) the same in the reduced observations
     sizes: Array  # (p,) plausible sizes
 
     @property
@@ -41,7 +41,7 @@ class Form:
 
     @property
     def columns(self) -> Array:
-        """(n, p) of the free ones in the channel."""
+        """(n, p) of the free ones in the reduced observations."""
         return self.selected.columns
 
     @property
@@ -55,7 +55,7 @@ class Form:
         return [p for p, keep in zip(self.term.parameters, self.keep, strict=True) if keep]
 
     def at(self, values: Array) -> Term:
-        """The term with fitted values (p,) of the free parameters."""
+        """Return the term with fitted values (p,) of the free parameters."""
         filled = self.term.values
         filled[self.keep] = values
         return self.term.at(filled)
@@ -72,7 +72,7 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """Return the name of the effect."""
+        """The name of the effect."""
         return self.effect.name
 
     @property
@@ -87,62 +87,63 @@ class Candidate:
 
 
 def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Candidate], dict[str, tuple[str, ...]]]:
-    """Physical, user and (if asked for) empirical effects that are not in the model, and what unavailable ones lack."""
-    used = linear.model.effects
-    library = [e for e in EFFECTS.values() if e.name not in used and not stands_still(linear.measurement, e)]
-    missing = {e.name: lacks for e in library if (lacks := missing_need(linear.measurement, e))}
+    """Return physical, user and (if asked for) empirical effects that are not in the model, and what unavailable ones
+    lack."""
+    in_use = linear.model.effects
+    library = [e for e in EFFECTS.values() if e.name not in in_use and not stands_still(linear.measurement, e)]
+    missing = {e.name: needs for e in library if (needs := missing_need(linear.measurement, e))}
     effects = [e for e in library if e.name not in missing]
     shapes = empirical_effects(linear.measurement.views) if empirical else []
     effects += [e for e in shapes if not missing_need(linear.measurement, e)]
-    terms = [_grid_terms(linear, effect) for effect in effects]
-    responses = iter(linear.responses([term for own in terms for term in own]))
-    tried = [_build_candidate(linear, own, [next(responses) for _ in own]) for own in terms]
+    terms_of = [_grid_terms(linear, effect) for effect in effects]
+    responses = iter(linear.responses([term for terms in terms_of for term in terms]))
+    tried = [_build_candidate(linear, terms, [next(responses) for _ in terms]) for terms in terms_of]
     return [c for c in tried if c is not None], missing
 
 
 def candidate_of(linear: LinearModel, effect: Effect) -> Candidate | None:
-    """One effect as a candidate; None if it has no parameters here."""
+    """Return one effect as a candidate; None if it has no parameters here."""
     terms = _grid_terms(linear, effect)
     return _build_candidate(linear, terms, linear.responses(terms))
 
 
 def candidate_as_fitted(linear: LinearModel, term: Term) -> Candidate:
-    """An effect with those of its parameters that a fit left in use, as the one form it may have."""
-    zero, keep = term.at(np.where(term.gridded, term.values, 0.0)), ~term.gridded & (term.values != 0)
+    """Return an effect with those of its parameters that a fit left in use, as the one form it may have."""
+    zero = term.at(np.where(term.gridded, term.values, 0.0))
+    keep = ~term.gridded & (term.values != 0)
     response = linear.responses([zero])[0].columns
     form = Form(zero, keep, response, linear.reduce(response), term.typical[keep])
     return Candidate(term.effect, (form,), response, None)
 
 
+def free_masks(term: Term) -> list[Mask]:
+    """Return (P,) parameters that are free in each form of an effect: all together, then those that can be true alone.
+
+    Those of one joint, or all but an offset; links in single numbers too, and shapes over points in these.
+    """
+    effect, parameters = term.effect, term.parameters
+    if effect.tier == "empirical" and effect.place == "sensor":
+        groups = one_by_one(effect, parameters)
+    else:
+        groups = by_joint(effect, parameters) or without_offset(effect, parameters)
+        if groups and effect.place == "links" and len(effect.specs) > 1:
+            groups = groups + one_by_one(effect, parameters)
+    free = ~term.gridded
+    alone = [free & np.isin(np.arange(len(free)), group) for group in groups]
+    return [free, *(keep for keep in alone if (keep != free).any())]
+
+
 def _grid_terms(linear: LinearModel, effect: Effect) -> list[Term]:
-    """The effect at zero, once for every combination of its gridded parameters."""
+    """Return the effect at zero, once for every combination of its gridded parameters."""
     zero = Term(effect, parameters_in(linear.measurement, effect))
     return [zero.at(np.array(values)) for values in product(*(p.grid or (0.0,) for p in zero.parameters))]
 
 
 def _build_candidate(linear: LinearModel, terms: Sequence[Term], responses: Sequence[Response]) -> Candidate | None:
-    forms = [f for term, r in zip(terms, responses, strict=True) for f in _forms(linear, term, r.columns)]
+    forms = list[Form]()
+    for term, response in zip(terms, responses, strict=True):
+        reduced = linear.reduce(response.columns)
+        forms += [Form(term, keep, response.columns, reduced, term.typical[keep]) for keep in free_masks(term)]
     if not forms:
         return None
     return Candidate(terms[0].effect, tuple(forms), responses[0].columns, responses[0].points)
-
-
-def _forms(linear: LinearModel, term: Term, response: Array) -> list[Form]:
-    columns = linear.reduce(response)
-    return [Form(term, keep, response, columns, term.typical[keep]) for keep in free_masks(term)]
-
-
-def free_masks(term: Term) -> list[Mask]:
-    """(P,) parameters that are free in each form of an effect: all together, then those that can be true alone."""
-    free = ~term.gridded
-    alone = [free & np.isin(np.arange(len(free)), g) for g in _parameter_groups(term.effect, term.parameters)]
-    return [free, *(keep for keep in alone if (keep != free).any())]
-
-
-def _parameter_groups(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Parameters of one joint, or all but an offset; links in single numbers too, and shapes over points in these."""
-    if effect.tier == "empirical" and effect.place == "sensor":
-        return one_by_one(effect, parameters)
-    joints = by_joint(effect, parameters) or without_offset(effect, parameters)
-    single = effect.place == "links" and len(effect.specs) > 1
-    return joints + one_by_one(effect, parameters) if joints and single else joints

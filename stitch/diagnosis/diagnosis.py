@@ -9,9 +9,10 @@ from stitch.diagnosis.residual_structure import BudgetLine, Dependence
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.sensitivity import Alias
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unnamed_joint_laws import JointCurve
-from stitch.diagnosis.unnamed_time_laws import RepeatingError, TimeCurve, reportable
+from stitch.diagnosis.unmodelled_joint_effects import JointCurve
+from stitch.diagnosis.unmodelled_time_effects import RepeatingError, TimeCurve, reportable
 from stitch.diagnosis.validation import CrossValidation
+from stitch.diagnosis.verdict import Answer
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.scanner_errors import FieldError
@@ -39,7 +40,7 @@ class CandidateEffect:
 
     @property
     def name(self) -> str:
-        """Return the name of the effect."""
+        """The name of the effect."""
         return self.ranked.name
 
 
@@ -94,6 +95,7 @@ class Diagnosis:
     coincidence: str = ""  # of `Evidence`
     together: tuple[str, ...] = ()  # effects that are missing beside each other, the one that is named first
     tried: dict[str, str] = field(default_factory=dict)  # effects that were fitted in this run and dropped, and why
+    answers: tuple[Answer, ...] = ()  # of the questions that led to the verdict; the last that changed it decided
 
     @property
     def effects(self) -> tuple[str, ...]:

@@ -1,7 +1,17 @@
-"""Evidence for the verdict: effects that explain the views, and what speaks against naming them."""
+"""Evidence for a verdict, gathered by questions that are asked in order.
 
-from collections.abc import Mapping, Sequence
+`NAMING` asks which effects would explain the views and what explains them as well; `TESTS` hold what is named against
+views left out, halves of the views, the scanner's own errors and rivals that predict as well. Each question changes the
+evidence at most, and its answer is kept (`Evidence.answers`): the last one that changed what is named decided.
+
+A candidate is scored without its own share of the pose errors (`score`), while every other joint and link may err by as
+much as the views show. What two effects can both do no single one is wanted for, since the errors that remain do the
+other's part: then the smallest set is sought without which the views cannot do (`required_group`).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,13 +30,13 @@ from stitch.diagnosis.ranking import (
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import ScatterLimit, implausible, score
 from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
-from stitch.diagnosis.unnamed_time_laws import (
+from stitch.diagnosis.unmodelled_time_effects import (
     find_repeating_errors,
     least_log_bayes_factor,
-    unnamed_law_log_posterior,
+    unmodelled_log_posterior,
 )
-from stitch.diagnosis.validation import CrossValidation, Halves, cross_validate, validate_in_halves
-from stitch.diagnosis.verdict import Evidence, scanner_explains_it
+from stitch.diagnosis.validation import CrossValidation, cross_validate, validate_in_halves
+from stitch.diagnosis.verdict import Answer, Evidence, scanner_explains_it
 from stitch.model.forward import moves_points
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
@@ -35,34 +45,380 @@ from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.observations.surfaces.view_poses import noise_floor
 from stitch.session.measurement import Views
 
-# What remains between the views however each of them is moved: no error of poses, joints or mount leaves that.
-#
-# A seam or a ripple in the scanner's field, a corner that is off, a part that changes its shape: overlaps show it, and
-# the poses that fit best take only a share of it. Only beside the noise can it be seen that it is there.
+# Errors of one and two periods a turn have a name; those of three and four have not.
+_GEARS, _NAMELESS_ORDERS = ("gear_eccentricity", "gear_harmonic"), ("fourier_3", "fourier_4")
+# The effect of the direction from which a joint comes.
+_BY_DIRECTION = "backlash"
+# Share of a joint's moves on either side of a jump that go one way, and the moves there must be to tell.
+_ONE_WAY, _FEWEST_MOVES = 0.95, 3
 
 
-def overlap_misfit_beyond_noise(linear: LinearModel, stated: float | None = None) -> float:
-    """Rms (length_unit) of it beside the noise that the scans show, where it is more than that; else 0, and where no
-    overlap of surfaces was observed.
+class Reply(NamedTuple):
+    """An answer in words, what it changes in the evidence, and whether the next questions do not arise."""
 
-    The noise is the scatter about the surface within each scan (`noise_floor`), whatever a data sheet says.
+    text: str
+    changes: Mapping[str, Any] = {}
+    ends: bool = False
+
+
+# A question; None where it does not arise.
+Question = Callable[[LinearModel, Sequence[Candidate], Evidence], Reply | None]
+
+
+def gather_evidence(
+    linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit, overlap_misfit: float = 0.0
+) -> Evidence:
+    """Return all that the views say for and against every effect; the verdict follows from it.
 
     Args:
-        stated: noise of the scanner, for scans too small to show their own.
+        overlap_misfit: rms that no motion of the views removes (`overlap_misfit_beyond_noise`), length_unit.
+    """
+    proposed = propose_names(linear, candidates, limit)
+    evidence = ask(TESTS, linear, candidates, replace(proposed, proposed=proposed))
+    if overlap_misfit:
+        misfit = Reply("yes, beyond the noise", {"overlap_misfit": overlap_misfit})
+        evidence = _answered(evidence, overlap_misfit_beyond_noise, misfit)
+    return evidence
+
+
+def propose_names(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:
+    """Return the effects that would explain the views, and what explains them as well; nothing is left out yet."""
+    ranked, empirical = rank_all(linear, candidates)
+    evidence = Evidence(ranked, empirical, implausible_scatter=implausible(linear, limit))
+    return ask(NAMING, linear, candidates, evidence)
+
+
+def ask(
+    questions: Sequence[Question], linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
+) -> Evidence:
+    """Return the evidence after questions that were asked in order, with their answers."""
+    for question in questions:
+        reply = question(linear, candidates, evidence)
+        if reply is None:
+            continue
+        evidence = _answered(evidence, question, reply)
+        if reply.ends:
+            break
+    return evidence
+
+
+def _answered(evidence: Evidence, question: Callable[..., object], reply: Reply) -> Evidence:
+    """Return the evidence with what a reply changes, and with the answer; a docstring's first line is the question."""
+    after = replace(evidence, **reply.changes)
+    changed = after.verdict != evidence.verdict or [r.name for r in after.named] != [r.name for r in evidence.named]
+    sentence = (question.__doc__ or "").strip().splitlines()[0]
+    answer = Answer(question.__name__, sentence, reply.text, changed)
+    return replace(after, answers=(*evidence.answers, answer))
+
+
+def is_anything_certain(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+    """Is an effect certain by itself, or a shape without a cause?"""
+    certain = [r.name for r in evidence.ranked if is_certain(r)]
+    if _certain_shape(evidence) is None and not certain:
+        return Reply("no")
+    return Reply(", ".join(certain) or "a shape without a cause", {"alarm": True})
+
+
+def are_several_required(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+    """Are several effects required of which none is certain by itself?"""
+    if evidence.alarm:
+        return None
+    group = required_group(linear, candidates, len(evidence.ranked))
+    return Reply(_names(group) or "no", {"explanation": group}, ends=bool(group))
+
+
+def which_explains_most(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+    """Which effect explains most, where none that could be named is among the errors that remain?"""
+    if not evidence.alarm:
+        return None
+    contenders, base = rescore_contenders(linear, [r for r in evidence.ranked if is_contender(r)])
+    if not contenders:
+        return Reply("none that could be named", ends=True)
+    best = contenders[0]
+    unmodelled = unmodelled_log_posterior(base)
+    changes = {
+        "explanation": (best,),
+        "together": (best,),
+        "contenders": tuple(contenders),
+        "base": base,
+        "unmodelled_log_posterior": unmodelled,
+        "ranked": rescored_against(evidence.ranked, best, unmodelled),
+    }
+    return Reply(best.name, changes)
+
+
+def which_hold_together(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+    """Of many views: which effects are missing at once, each holding its place beside the others?"""
+    if not evidence.alarm or not regime_of(linear).many_views:
+        return None
+    best = evidence.explanation[0]
+    shape = _shape_beside_contenders(evidence)
+    selection = forward_selection(linear, candidates, best)
+    explained = max(selection.explained, best.log_posterior)
+    nothing = {"explanation": (), "together": (), **_refusals(selection.refused)}
+    if shape is not None and shape.log_posterior > explained + limits.ODDS:
+        return Reply("none: a shape without a cause explains more", nothing, ends=True)
+    if selection.refused and not selection.effects:
+        return Reply("none holds beyond the measured poses", nothing, ends=True)
+    effects, idle = list(selection.effects or (best,)), dict[str, str]()
+    if not regime_of(linear).prior:
+        effects, idle = keep_worth_adding(linear, effects, sum(not c.empirical for c in candidates))
+    refused = _refusals(selection.refused | idle)
+    if not effects:
+        return Reply("none helps on views left out", {**nothing, **refused, "alarm": False})
+    further = effects[1] if len(effects) > 1 else None
+    changes = {"explanation": tuple(effects[:1]), "further": further, "together": tuple(effects), **refused}
+    return Reply(_names(effects), changes)
+
+
+def do_poses_err_without_a_name(
+    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
+) -> Reply | None:
+    """Where no effect is wanted: do the poses err again in a way that has no name?"""
+    if evidence.alarm:
+        return None
+    errors = find_repeating_errors(linear)
+    text = "they " + " and ".join(error.words for error in errors) if errors else "no"
+    return Reply(text, {"repeating_errors": errors}, ends=True)
+
+
+def does_an_unmodelled_effect_explain_it(
+    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
+) -> Reply | None:
+    """Of few views: does something without a name explain them as well, alone and beside a second effect?
+
+    Two known effects at once may look like none of them: the best is tried with a second one.
+    """
+    if regime_of(linear).many_views:
+        return None
+    best = evidence.explanation[0]
+    shape = _shape_beside_contenders(evidence)
+    unmodelled = evidence.unmodelled_log_posterior
+    if not _beaten_by_unmodelled(best.log_posterior, shape, unmodelled):
+        return Reply("no")
+    second = find_second_effect(linear, candidates, best)
+    if second is not None:
+        prior = float(np.log(limits.PRIOR_PHYSICAL / len(evidence.ranked)))
+        of_both = best.log_posterior + (second.score.log_bayes_factor + prior)
+        if not _beaten_by_unmodelled(of_both, shape, unmodelled):
+            return Reply(f"not beside {second.name}", {"further": second, "together": (best, second)})
+    return Reply("yes", {"unmodelled_explains_it": True}, ends=True)
+
+
+def is_it_wanted_beside_smooth_errors(
+    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
+) -> Reply | None:
+    """Is it wanted beside the others and beside any trend without a name, of a joint or in time?"""
+    if regime_of(linear).prior:
+        return None  # the prior of pose errors has asked already
+    best, *others = evidence.together
+    if least_log_bayes_factor(conditioned_on_effects(linear, others), best.score) > limits.ODDS:
+        return Reply("yes")
+    note = f"{best.name}: an unnamed error, smooth in the joint angles or in time, explains these views as well"
+    return Reply("no", {"unmodelled_explains_it": True, "notes": (*evidence.notes, note)}, ends=True)
+
+
+def may_a_gear_be_of_another_order(
+    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
+) -> Reply | None:
+    """May an error of a gear, over so short a range, be one of an order without a name?"""
+    best, base = evidence.explanation[0], evidence.base
+    if best.name not in _GEARS or base is None:
+        return None
+    nameless = [r for r in evidence.empirical if r.name.startswith(_NAMELESS_ORDERS)]
+    if regime_of(base).prior:
+        nameless = [rescored_in(base, r) for r in nameless]
+    if any(r.log_posterior > best.log_posterior - limits.ODDS for r in nameless):
+        return Reply("yes", {"unmodelled_explains_it": True, "notes": ()}, ends=True)
+    return Reply("no")
+
+
+def which_come_near(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+    """Which other effects come within 20 to 1?"""
+    if evidence.further is not None:
+        return None  # each was asked beside the other
+    best = evidence.explanation[0]
+    likely = [r for r in evidence.contenders if r.log_posterior > best.log_posterior - limits.ODDS]
+    near = [r for r in likely if r.name != best.name and r.name not in evidence.refused]
+    return Reply(_names(near) or "none", {"explanation": (best, *near)})
+
+
+def are_two_missing(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+    """Of few views: are two missing, of which one alone took for itself what both do?"""
+    if len(evidence.explanation) == 1 or regime_of(linear).many_views:
+        return None
+    pair = find_missing_pair(linear, candidates, evidence.explanation[0])
+    return Reply("no") if pair is None else Reply(_names(pair), _naming(pair))
+
+
+NAMING: tuple[Question, ...] = (
+    is_anything_certain,
+    are_several_required,
+    which_explains_most,
+    which_hold_together,
+    do_poses_err_without_a_name,
+    does_an_unmodelled_effect_explain_it,
+    is_it_wanted_beside_smooth_errors,
+    may_a_gear_be_of_another_order,
+    which_come_near,
+    are_two_missing,
+)
+
+
+def does_it_hold_elsewhere(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+    """Does it hold on views left out and in halves of the views?
+
+    Every effect that may be named is asked beside all that it was named beside or, where pose errors have no prior,
+    alone, as it would be added next. A second effect takes the place of a first that does not hold, where the second
+    holds alone too and is certain there.
+    """
+    effects = _named_effects(evidence)
+    alone = {r.name: r for r in evidence.ranked}
+    asked = {r.name: (r if r.score.base_model else alone[r.name]).score for r in effects}
+    left_out = {name: cross_validate(linear, scored) for name, scored in asked.items()}
+    if evidence.verdict != "missing_effect":
+        return Reply("not asked of a group", {"left_out": left_out}) if effects else None
+    objections = list[str]()
+    for effect in effects:
+        objection = _objection(effect, left_out[effect.name])
+        if objection is None:
+            break
+        objections.append(objection)
+    else:
+        notes = (*evidence.notes, objections[0])
+        return Reply(objections[0], {"left_out": left_out, "refuted": True, "notes": notes})
+    if effect is effects[0]:
+        return Reply("yes", {"left_out": left_out})
+    second = alone[effect.name]
+    changes = {"left_out": left_out, "explanation": (second,), "further": None}
+    refuted = not is_certain(second)
+    if not refuted and (objection := _objection(second, cross_validate(linear, second.score))) is not None:
+        refuted = True
+        objections.append(objection)
+    return Reply("; ".join(objections), {**changes, "refuted": refuted, "notes": (*evidence.notes, *objections)})
+
+
+def does_the_scanner_explain_it(
+    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
+) -> Reply | None:
+    """Do the scans err smoothly: by more than every scanner, and by as many nats as what is named?"""
+    if evidence.verdict == "adequate":
+        error = find_scanner_error(linear)
+        return Reply("no" if error is None else "yes", {"scanner_error": error})
+    if evidence.verdict != "missing_effect":
+        return None
+    error = _scanner_error_in_place_of(linear, evidence)
+    if error is None:
+        return Reply("no")
+    less_clear = f"{evidence.named[0].name} explains less than the scanner's own error"
+    return Reply("yes", {"scanner_error": error, "notes": (less_clear, *evidence.notes)})
+
+
+def does_it_hold_with_a_second(
+    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
+) -> Reply | None:
+    """Of few views: does a name that fell hold beside a second effect?
+
+    What that one did made the first another in each half of the views, or looked like a smooth error of the scanner.
+    """
+    proposed = evidence.proposed
+    if proposed is None or proposed.verdict != "missing_effect" or evidence.named or regime_of(linear).many_views:
+        return None
+    pair = _pair_that_stands(linear, candidates, replace(evidence, explanation=proposed.explanation))
+    if pair is None:
+        return Reply("no")
+    back = {"notes": proposed.notes, "refuted": False, "scanner_error": None}
+    return Reply(f"yes, beside {pair[1].name}", {**_naming(pair), **back})
+
+
+def which_predict_as_well(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+    """Which contenders predict views left out as well as a single name, or better?
+
+    These views cannot tell it from those. One that predicts them clearly better and stands every other test takes the
+    place of the name: a Bayes factor charges for plausible sizes that may be wrong, as a user's are, and what was not
+    seen does not. What a second effect leaves on views left out may hide by how much the first predicts them better.
+    """
+    if evidence.verdict != "missing_effect" or evidence.second is not None:
+        return None
+    named = evidence.named[0]
+    rivals = {
+        r.name: r
+        for r in evidence.ranked[: limits.CROSS_VALIDATED_CANDIDATES]
+        if r.name != named.name and is_contender(r) and not any(r.name in note for note in evidence.notes)
+    }
+    of_rivals = {name: cross_validate(linear, r.score) for name, r in rivals.items()}
+    left_out = dict(evidence.left_out) | of_rivals
+    ahead = [name for name, validation in of_rivals.items() if validation.better_than(left_out[named.name])]
+    better = min(ahead, key=lambda name: of_rivals[name].heldout, default=named.name)
+    if better != named.name and _objection(rivals[better], of_rivals[better]) is None:
+        rivals, named = rivals | {named.name: named}, rivals[better]
+    as_good = [r for name, r in rivals.items() if r is not named and left_out[name].as_good_as(left_out[named.name])]
+    if as_good and not regime_of(linear).many_views:
+        pair = _pair_that_stands(linear, candidates, evidence)
+        if pair is not None:
+            return Reply(f"none beside {pair[1].name}", _naming(pair))
+    return Reply(_names(as_good) or "none", {"explanation": (named, *as_good), "left_out": left_out})
+
+
+def does_a_joint_turn_back(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+    """Does a joint turn back where a jump in time is named, so that this session cannot tell the two apart?
+
+    A path that was driven once shows both at the same view. A jump that is missing beside other effects is not added
+    with them.
+    """
+    if evidence.verdict != "missing_effect":
+        return None
+    views, named = linear.measurement.views, evidence.named[0]
+    coincidences = {r.name: _coincidence(views, r) for r in (named, *evidence.together)}
+    if not any(coincidences.values()):
+        return Reply("no")
+    rest = tuple(r for r in evidence.together if not coincidences[r.name])
+    notes = (*evidence.notes, *(text for name, text in coincidences.items() if text and name != named.name))
+    text = coincidences[named.name]
+    if not text:
+        further = evidence.further and next(iter(rest[1:]), None)
+        return Reply("not where the name jumps", {"together": rest, "further": further, "notes": notes})
+    rival = next((r for r in evidence.ranked if r.name == _BY_DIRECTION and r.score.observable), None)
+    if rival is None:
+        return Reply(text, {"unmodelled_explains_it": True, "notes": (text, *notes)})
+    changes = {"explanation": (named, rival), "further": None, "together": (), "notes": notes, "coincidence": text}
+    return Reply(text, changes)
+
+
+TESTS: tuple[Question, ...] = (
+    does_it_hold_elsewhere,
+    does_the_scanner_explain_it,
+    does_it_hold_with_a_second,
+    which_predict_as_well,
+    does_a_joint_turn_back,
+)
+
+
+def overlap_misfit_beyond_noise(linear: LinearModel, stated_noise: float | None = None) -> float:
+    """Do the overlaps keep a misfit however the views are moved?
+
+    A seam or a ripple in the scanner's field, a corner that is off, a part that changes its shape: overlaps show it,
+    and the poses that fit best take only a share of it.
+
+    Args:
+        stated_noise: of the scanner, for scans too small to show their own.
+
+    Returns:
+        Its rms (length_unit) beside the noise, where it is more than that; else 0, and where no overlap of surfaces was
+        observed. The noise is the scatter about the surface within each scan (`noise_floor`), whatever a data sheet
+        says.
     """
     surfaces = surfaces_of(linear)
     if surfaces is None:
         return 0.0
-    freed, noise = (
-        surfaces.unconstrained.overlaps,
-        noise_floor(surfaces.capture, surfaces.unconstrained.overlaps, stated),
-    )
-    left = float(max(freed.gram.rms**2 - noise**2, 0.0) ** 0.5)
-    return left if left > noise else 0.0
+    overlaps = surfaces.unconstrained.overlaps
+    noise = noise_floor(surfaces.capture, overlaps, stated_noise)
+    misfit = float(max(overlaps.gram.rms**2 - noise**2, 0.0) ** 0.5)
+    return misfit if misfit > noise else 0.0
 
 
 def find_scanner_error(linear: LinearModel, other_terms: Sequence[Term] = ()) -> FieldError | None:
-    """Smooth errors of the scans where they are larger than every scanner's; None where overlaps show no such.
+    """Return smooth errors of the scans where they are larger than every scanner's; None where overlaps show no such.
 
     It may be small beside the noise: many points average that, and not what is the same in every view.
 
@@ -72,15 +428,65 @@ def find_scanner_error(linear: LinearModel, other_terms: Sequence[Term] = ()) ->
     surfaces = surfaces_of(linear)
     if surfaces is None:
         return None
-    found = field_error(linear.measurement, linear.model, surfaces.unconstrained, limits.ALPHA_UNKNOWN, other_terms)
-    return found if found.unusual else None
+    error = field_error(linear.measurement, linear.model, surfaces.unconstrained, limits.ALPHA_UNKNOWN, other_terms)
+    return error if error.unusual else None
 
 
-# Two effects that are both missing: each of them is asked for beside the other.
+def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: int) -> tuple[Ranked, ...]:
+    """Return effects of which some are wanted though none is alone, likeliest first; () if the views do without any.
+
+    Args:
+        tests: candidates among which the best is chosen.
+    """
+    families = () if linear.pose_errors is None else tuple(linear.pose_errors.effects)
+    without_families = linear.restricted(linear.causes - set(families))
+    if not families or without_families.null.deviance < linear.null.deviance:
+        # No error of joints or links helps: none stands in for another.
+        return ()
+    known = {c.name: c for c in candidates if not c.empirical}
+    ranked = rank([score(without_families, c) for c in known.values()], tests)[0]
+    best = next((r for r in ranked if is_certain(r)), None)
+    if best is None:
+        return ()
+    asked = known[best.name]
+    removed = {best.name}
+    while not is_certain(rank_one(linear.restricted(linear.causes - removed), asked, tests)):
+        others = [name for name in families if name in known and name not in removed]
+        if not others:
+            return ()
+        bases = {name: linear.restricted(linear.causes - removed - {name}) for name in others}
+        removed.add(max(others, key=lambda name: score(bases[name], asked).log_bayes_factor))
+    base = linear.restricted(linear.causes - removed)
+    again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
+    if unmodelled_log_posterior(base) > again[0].log_posterior - limits.ODDS:
+        return ()
+    near = [r for r in again if is_contender(r) and r.log_posterior > again[0].log_posterior - limits.ODDS]
+    # One that is far ahead of the others is still not wanted beside them, all of them being a little wrong.
+    return tuple(near) if len(near) > 1 else again
+
+
+def rescore_contenders(linear: LinearModel, contenders: Sequence[Ranked]) -> tuple[list[Ranked], LinearModel]:
+    """Return contenders, likeliest first, where none of them is among the errors that remain; and the model in which
+    they are not: there their Bayes factors are over one and the same."""
+    base = linear.restricted(linear.causes - {r.name for r in contenders})
+    if len(contenders) < 2 or base is linear:
+        return list(contenders), base
+    return sorted((rescored_in(base, r) for r in contenders), key=lambda r: -r.log_posterior), base
+
+
+def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:
+    """Return a candidate scored in another model; it counts among as many as before."""
+    again = score(base, ranked.score.candidate)
+    return replace(
+        ranked,
+        score=again,
+        adjusted=min(1.0, again.p_value * ranked.tests),
+        log_posterior=ranked.log_posterior + again.log_bayes_factor - ranked.score.log_bayes_factor,
+    )
 
 
 def find_second_effect(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> Ranked | None:
-    """The effect that explains most beside the best one, if it is certain."""
+    """Return the effect that explains most beside the best one, if it is certain."""
     others = [c for c in candidates if c.name != best.name and not c.empirical]
     ranked, _ = rank_all(conditioned_on_effects(linear, [best]), others)
     return next((r for r in ranked if is_certain(r)), None)
@@ -89,7 +495,7 @@ def find_second_effect(linear: LinearModel, candidates: Sequence[Candidate], bes
 def find_missing_pair(
     linear: LinearModel, candidates: Sequence[Candidate], best: Ranked
 ) -> tuple[Ranked, Ranked] | None:
-    """Two effects where one alone took for itself what both do, each scored beside the other.
+    """Return two effects where one alone took for itself what both do, each scored beside the other.
 
     Each must be certain beside the other, and beside the second no other may come near the first.
     """
@@ -106,386 +512,112 @@ def find_missing_pair(
     return (first, again) if is_certain(again) else None
 
 
-def score_pair(linear: LinearModel, first: Ranked, second: Ranked, tests: int) -> tuple[Ranked, Ranked]:
-    """Two effects, each scored beside the other.
-
-    Args:
-        tests: candidates among which they were chosen.
-    """
-    of_first = rank_one(conditioned_on_effects(linear, [second]), first.score.candidate, tests)
-    return of_first, rank_one(conditioned_on_effects(linear, [first]), second.score.candidate, tests)
-
-
-# Which effects the data want beside everything else that an arm may do wrong.
-#
-# A candidate is scored without its own share of the pose errors (`score`), while every other joint and link may err
-# by as much as the views show. What two effects can both do no single one is wanted for, since the errors that remain
-# do the other's part: then the smallest set is sought without which the views cannot do.
-
-
-def rescore_contenders(linear: LinearModel, contenders: Sequence[Ranked]) -> tuple[list[Ranked], LinearModel]:
-    """Contenders, likeliest first, where none of them is among the errors that remain; and the model in which they
-    are not: there their Bayes factors are over one and the same."""
-    base = linear.restricted(linear.causes - {r.name for r in contenders})
-    if len(contenders) < 2 or base is linear:
-        return list(contenders), base
-    return sorted((rescored_in(base, r) for r in contenders), key=lambda r: -r.log_posterior), base
-
-
-def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:
-    """Score a candidate in another model; it counts among as many as before."""
-    own = score(base, ranked.score.candidate)
-    return replace(
-        ranked,
-        score=own,
-        adjusted=min(1.0, own.p_value * ranked.tests),
-        log_posterior=ranked.log_posterior + own.log_bayes_factor - ranked.score.log_bayes_factor,
+def pair_is_validated(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
+    """Return whether each of two effects holds on views left out beside the other, beside which it was scored."""
+    return not any(
+        _objection(one, cross_validate(conditioned_on_effects(linear, [other]), one.score))
+        for one, other in (pair, pair[::-1])
     )
 
 
-def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: int) -> tuple[Ranked, ...]:
-    """Effects of which some are wanted though none is alone, likeliest first; () if the views do without any.
-
-    Args:
-        tests: candidates among which the best is chosen.
-    """
-    families = () if linear.pose_errors is None else tuple(linear.pose_errors.effects)
-    if not families or linear.restricted(linear.causes - set(families)).null.deviance < linear.null.deviance:
-        # No error of joints or links helps: none stands in for another.
-        return ()
-    known = {c.name: c for c in candidates if not c.empirical}
-    ranked = rank([score(linear.restricted(linear.causes - set(families)), c) for c in known.values()], tests)[0]
-    best = next((r for r in ranked if is_certain(r)), None)
-    if best is None:
-        return ()
-    removed = {best.name}
-    while not is_certain(rank_one(linear.restricted(linear.causes - removed), known[best.name], tests)):
-        others = [name for name in families if name in known and name not in removed]
-        if not others:
-            return ()
-        removed.add(
-            max(
-                others,
-                key=lambda name: (
-                    score(linear.restricted(linear.causes - {*removed, name}), known[best.name]).log_bayes_factor
-                ),
-            )
-        )
-    base = linear.restricted(linear.causes - removed)
-    again = rank([score(base, c) for c in known.values() if c.name in removed], tests)[0]
-    if unnamed_law_log_posterior(base) > again[0].log_posterior - limits.ODDS:
-        return ()
-    near = [r for r in again if is_contender(r) and r.log_posterior > again[0].log_posterior - limits.ODDS]
-    # One that is far ahead of the others is still not wanted beside them, all of them being a little wrong.
-    return tuple(near) if len(near) > 1 else again
+def _certain_shape(evidence: Evidence) -> Ranked | None:
+    """Return the likeliest shape without a cause, where it is enough for an alarm."""
+    shape = next(iter(evidence.empirical), None)
+    if shape is None or shape.adjusted >= limits.ALPHA_UNKNOWN:
+        return None
+    return shape if shape.score.log_bayes_factor > limits.LOG_BAYES_FACTOR else None
 
 
-# Errors of one and two periods a turn have a name; those of three and four have not.
-_GEARS, _NAMELESS_ORDERS = ("gear_eccentricity", "gear_harmonic"), ("fourier_3", "fourier_4")
-_NOT_REQUIRED = "{}: an unnamed error, smooth in the joint angles or in time, explains these views as well"
-_LESS_CLEAR = "{} explains less than the scanner's own error"
+def _shape_beside_contenders(evidence: Evidence) -> Ranked | None:
+    """Return that shape where none of the contenders is among the errors that remain."""
+    shape, base = _certain_shape(evidence), evidence.base
+    return None if shape is None or base is None else rescored_in(base, shape)
 
 
-def gather_evidence(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:
-    """Gather all that the views say for and against every effect; the verdict follows from it (`verdict.decide`).
+def _beaten_by_unmodelled(known: float, shape: Ranked | None, unmodelled: float) -> bool:
+    """Return whether something without a name does what effects of the library do.
 
-    What remains between the overlaps is not asked here (`overlap_misfit_beyond_noise`).
-    """
-    evidence = select(linear, candidates, limit)
-    evidence = challenge(linear, candidates, replace(evidence, left_out=cross_validate_named(linear, evidence)))
-    equal = with_equal_rivals(linear, evidence)
-    if equal.verdict != evidence.verdict and not regime_of(linear).many_views:
-        equal = _with_validated_second(linear, candidates, evidence) or equal
-    return with_turning_joints(linear.measurement.views, equal)
-
-
-def select(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:
-    """Find the effects that would explain the views, and what explains them as well; nothing is left out yet."""
-    ranked, empirical = rank_all(linear, candidates)
-    shape = next(iter(empirical), None)
-    if shape is not None and not (
-        shape.adjusted < limits.ALPHA_UNKNOWN and shape.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
-    ):
-        shape = None
-    found = Evidence(ranked, empirical, implausible_scatter=implausible(linear, limit))
-    if shape is None and not any(is_certain(r) for r in ranked):
-        # No effect is certain by itself: several of which some are required, errors without a name, or nothing.
-        group = required_group(linear, candidates, len(ranked))
-        return (
-            replace(found, explanation=group)
-            if group
-            else replace(found, repeating_errors=find_repeating_errors(linear))
-        )
-    found = replace(found, alarm=True)
-    contenders, base = rescore_contenders(linear, [r for r in ranked if is_contender(r)])
-    if not contenders:
-        return found
-    best, second, refused = contenders[0], None, dict[str, str]()
-    others: Sequence[Ranked] = ()
-    shape, law = shape and rescored_in(base, shape), unnamed_law_log_posterior(base)
-    found = replace(found, ranked=rescored_against(ranked, best, law))
-    if regime_of(linear).many_views:
-        effects, refused, other = _select_jointly(linear, candidates, best, shape)
-        found = replace(found, notes=tuple(dict.fromkeys(refused.values())))  # what speaks against several is said once
-        if not effects:
-            return found if other else replace(found, alarm=False, repeating_errors=find_repeating_errors(linear))
-        best, *others = effects
-        second = others[0] if others else None
-    elif _beaten_by_unnamed(best, shape, law):
-        # Two known effects at once may look like none of them: try the best with a second one.
-        second = find_second_effect(linear, candidates, best)
-        if second is None or _beaten_by_unnamed(best, shape, law, second, len(ranked)):
-            return replace(found, explanation=(best,), unnamed_explains_it=True)
-        others = [second]
-    if not _required(linear, best, others):
-        notes = (*found.notes, _NOT_REQUIRED.format(best.name))
-        return replace(found, explanation=(best,), unnamed_explains_it=True, notes=notes)
-    if _gear_order_ambiguous(base, best, empirical):
-        return replace(found, explanation=(best,), unnamed_explains_it=True, notes=())
-    likely = (r for r in contenders if r.log_posterior > best.log_posterior - limits.ODDS)
-    near = (r for r in likely if r.name != best.name and r.name not in refused)
-    group = (best, *(() if second is not None else near))
-    if len(group) > 1 and not regime_of(linear).many_views:
-        two = find_missing_pair(linear, candidates, best)
-        if two is not None:
-            return replace(found, explanation=two[:1], further=two[1], together=two)
-    return replace(found, explanation=group, further=second, together=(best, *others))
-
-
-def _select_jointly(
-    linear: LinearModel, candidates: Sequence[Candidate], best: Ranked, empirical: Ranked | None
-) -> tuple[list[Ranked], dict[str, str], bool]:
-    """Select effects that are missing at once, the one to be named first; what is not among them, and
-    why; and whether there is something of another form."""
-    found = forward_selection(linear, candidates, best)
-    explained = max(found.explained, best.log_posterior)
-    if (empirical is not None and empirical.log_posterior > explained + limits.ODDS) or (
-        found.refused and not found.effects
-    ):
-        return [], found.refused, True
-    effects, idle = list(found.effects or (best,)), dict[str, str]()
-    if not regime_of(linear).prior:
-        effects, idle = keep_worth_adding(linear, effects, sum(not c.empirical for c in candidates))
-    return effects, found.refused | idle, False
-
-
-def _beaten_by_unnamed(
-    best: Ranked, empirical: Ranked | None, law: float, second: Ranked | None = None, tests: int = 1
-) -> bool:
-    """True where something without a name does what an effect of the library does, with a second one or alone.
-
-    A shape without a cause must be 20 to 1 likelier; that a joint or the flange follows no law that has a name must be
+    A shape without a cause must be 20 to 1 likelier; that a joint or the flange follows nothing that has a name must be
     20 to 1 less likely, as all others that might have the name.
 
     Args:
-        law: log posterior of that (`unnamed_law_log_posterior`).
-        tests: effects among which the second was chosen.
+        known: log posterior of the effects.
+        unmodelled: that of an unmodelled effect.
     """
-    known = best.log_posterior
-    if second is not None:
-        known += second.score.log_bayes_factor + float(np.log(limits.PRIOR_PHYSICAL / tests))
-    return (empirical is not None and empirical.log_posterior > known + limits.ODDS) or law > known - limits.ODDS
+    return (shape is not None and shape.log_posterior > known + limits.ODDS) or unmodelled > known - limits.ODDS
 
 
-def _required(linear: LinearModel, best: Ranked, others: Sequence[Ranked]) -> bool:
-    """True if an effect is 20 to 1 wanted beside others and any course without a name; a prior of pose errors has
-    asked already."""
-    return regime_of(linear).prior or (
-        least_log_bayes_factor(conditioned_on_effects(linear, others), best.score) > limits.ODDS
-    )
+def _refusals(refused: Mapping[str, str]) -> dict[str, Any]:
+    """Return the changes; what speaks against several effects is said once."""
+    return {"refused": refused, "notes": tuple(dict.fromkeys(refused.values()))}
 
 
-def _gear_order_ambiguous(base: LinearModel, best: Ranked, empirical: Sequence[Ranked]) -> bool:
-    """True for a gear error that over so short a range may be one of an order without a name."""
-    nameless = [r for r in empirical if r.name.startswith(_NAMELESS_ORDERS)] if best.name in _GEARS else []
-    if regime_of(base).prior:
-        nameless = [rescored_in(base, r) for r in nameless]
-    return any(r.log_posterior > best.log_posterior - limits.ODDS for r in nameless)
+def _naming(pair: tuple[Ranked, Ranked]) -> dict[str, Any]:
+    """Return the changes that name the first of two effects, which are missing both."""
+    return {"explanation": pair[:1], "further": pair[1], "together": pair}
 
 
-# A name, held against views left out, halves of the views and what the scanner itself may do wrong.
-
-
-def challenge(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Evidence:
-    """Add what speaks against the name: views left out, halves of the views, smooth errors of the scans.
-
-    Where a name does not stand, a second effect that is missing too may be why: what it does made the first another in
-    each half of the views, or looked like a smooth error of the scanner.
-    """
-    if evidence.verdict != "missing_effect":
-        return with_scanner_error(linear, evidence)
-    found = with_scanner_error(linear, _validated(linear, evidence))
-    if found.named or regime_of(linear).many_views:
-        return found
-    return _with_validated_second(linear, candidates, evidence) or found
-
-
-def _with_validated_second(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Evidence | None:
-    """Add a second effect to a name where both stand every test beside each other; None where no two do.
-
-    What a second one leaves on views left out may hide by how much the first predicts them better than its rivals.
-    """
-    two = find_missing_pair(linear, candidates, evidence.named[0])
-    if two is None or two[0].name != evidence.named[0].name or not pair_is_validated(linear, two):
-        return None
-    pair = with_scanner_error(linear, replace(evidence, explanation=two[:1], further=two[1], together=two))
-    return pair if pair.named else None
-
-
-def with_equal_rivals(linear: LinearModel, evidence: Evidence) -> Evidence:
-    """Add to a single name the contenders that predict views left out as well: these views cannot tell which it is.
-
-    One that predicts them clearly better and stands every other test takes the place of the name: a Bayes factor
-    charges for plausible sizes that may be wrong, as a user's are, and what was not seen does not.
-    """
-    if evidence.verdict != "missing_effect" or evidence.second is not None:
-        return evidence
-    named = evidence.named[0]
-    rivals = {
-        r.name: r
-        for r in evidence.ranked[: limits.CROSS_VALIDATED_CANDIDATES]
-        if r.name != named.name and is_contender(r) and not any(r.name in note for note in evidence.notes)
-    }
-    own = {name: cross_validate(linear, r.score) for name, r in rivals.items()}
-    left_out = dict(evidence.left_out) | own
-    ahead = (name for name, found in own.items() if found.better_than(left_out[named.name]))
-    better = min(ahead, key=lambda name: own[name].heldout, default=named.name)
-    if better != named.name and not _rejection_reason(
-        rivals[better], own[better], validate_in_halves(rivals[better].score)
-    ):
-        rivals, named = rivals | {named.name: named}, rivals[better]
-    as_good = [r for name, r in rivals.items() if r is not named and left_out[name].as_good_as(left_out[named.name])]
-    return replace(evidence, explanation=(named, *as_good), left_out=left_out)
-
-
-def cross_validate_named(linear: LinearModel, evidence: Evidence) -> dict[str, CrossValidation]:
-    """Cross-validate each effect that may be named, beside all that it was named beside, or, where pose
-    errors have no prior, alone, as it would be added next."""
-    alone = {r.name: r.score for r in evidence.ranked}
-    asked = {r.name: r.score if r.score.base_model else alone[r.name] for r in _named_effects(evidence)}
-    return {name: cross_validate(linear, score) for name, score in asked.items()}
-
-
-def with_scanner_error(linear: LinearModel, evidence: Evidence) -> Evidence:
-    """Add smooth errors of the scans: beside a model to which nothing is missing, or beside one name."""
-    if evidence.verdict == "adequate":
-        return replace(evidence, scanner_error=find_scanner_error(linear))
-    if evidence.verdict != "missing_effect":
-        return evidence
-    moving = [r.score.form.term for r in _named_effects(evidence) if moves_points([r.score.form.term])]
-    out = replace(evidence, scanner_error=find_scanner_error(linear, other_terms=moving))
-    if scanner_explains_it(out):
-        return replace(out, notes=(_LESS_CLEAR.format(evidence.named[0].name), *evidence.notes))
-    return replace(out, scanner_error=None)
-
-
-def _validated(linear: LinearModel, evidence: Evidence) -> Evidence:
-    """Keep what holds on views left out and in halves.
-
-    A second effect that is named without the first is asked alone, and is refuted where alone it is not certain.
-    """
-    halves = {r.name: validate_in_halves(r.score) for r in _named_effects(evidence)}
-    held = with_validation(evidence, evidence.left_out, halves)
-    if held.refuted or held.named[0] is evidence.named[0]:
-        return held
-    alone = next(r for r in evidence.ranked if r.name == held.named[0].name)
-    again = replace(held, explanation=(alone,))
-    if not is_certain(alone):
-        return replace(again, refuted=True)
-    return with_validation(again, cross_validate_named(linear, again), {alone.name: validate_in_halves(alone.score)})
-
-
-def with_validation(
-    evidence: Evidence, found: Mapping[str, CrossValidation], in_halves: Mapping[str, Halves | None]
-) -> Evidence:
-    """Add whether the name holds on views left out and in halves; a second effect takes its place where that holds."""
-    notes = list(evidence.notes)
-    for named in _named_effects(evidence):
-        refusal = _rejection_reason(named, found.get(named.name), in_halves.get(named.name))
-        if refusal is None:
-            if named is evidence.named[0]:
-                return evidence
-            return replace(evidence, explanation=(named,), further=None, notes=tuple(notes))
-        notes.append(refusal)
-    return replace(evidence, refuted=True, notes=tuple(notes[: len(evidence.notes) + 1]))
-
-
-def pair_is_validated(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
-    """True if each of two effects stands that test beside the other, beside which it was scored."""
-    asked = (pair, pair[::-1])
-    return not any(
-        _rejection_reason(
-            one, cross_validate(conditioned_on_effects(linear, [other]), one.score), validate_in_halves(one.score)
-        )
-        for one, other in asked
-    )
-
-
-def _rejection_reason(named: Ranked, left_out: CrossValidation | None, halves: Halves | None) -> str | None:
-    """Why an effect does not stand the test of views left out."""
-    if left_out is not None and left_out.steadiness < limits.MIN_STEADINESS:
-        return f"{named.name} rests on one view: without it {max(left_out.steadiness, 0):.0%} of the effect remain"
-    if left_out is not None and not left_out.helps:
-        share = f"{left_out.poses:.2f} ± {left_out.poses_sigma:.2f}"
-        return f"{named.name} does not help on views left out: it leaves a mean square pose error of {share} of now"
-    return None if halves is None else halves.rejection_reason(named.name)
+def _names(effects: Sequence[Ranked]) -> str:
+    return ", ".join(r.name for r in effects)
 
 
 def _named_effects(evidence: Evidence) -> list[Ranked]:
     return [r for r in (*evidence.named, evidence.second) if r is not None]
 
 
-# A jump in time that is a joint turning back as well: a path that was driven once shows both at the same view.
-
-# The effect of the direction from which a joint comes.
-_BY_DIRECTION = "backlash"
-# Share of a joint's moves on either side of a jump that go one way, and the moves there must be to tell.
-_ONE_WAY, _FEWEST_MOVES = 0.95, 3
-
-
-def joints_turning_at(views: Views, first: float) -> list[int]:
-    """Return the joints, counted from 1, that come from one side before a view and from the other side from there on.
-
-    Args:
-        first: number of the view, as events count it.
-    """
-    out, after = list[int](), views.number >= first
-    for joint, side in enumerate(views.approach.T, 1):
-        sides = [side[now & (side != 0)] for now in (~after, after)]
-        if min(map(len, sides)) < _FEWEST_MOVES:
-            continue
-        # 1 where all moves go one way, −1 where all go the other.
-        before, later = (2 * np.mean(own > 0) - 1 for own in sides)
-        if before * later < 0 and min(abs(before), abs(later)) >= 2 * _ONE_WAY - 1:
-            out.append(joint)
-    return out
+def _objection(effect: Ranked, left_out: CrossValidation) -> str | None:
+    """Return why an effect does not hold on views left out or in halves of the views; None where it does."""
+    if left_out.steadiness < limits.MIN_STEADINESS:
+        return f"{effect.name} rests on one view: without it {max(left_out.steadiness, 0):.0%} of the effect remain"
+    if not left_out.helps:
+        share = f"{left_out.poses:.2f} ± {left_out.poses_sigma:.2f}"
+        return f"{effect.name} does not help on views left out: it leaves a mean square pose error of {share} of now"
+    halves = validate_in_halves(effect.score)
+    return None if halves is None else halves.rejection_reason(effect.name)
 
 
-def with_turning_joints(views: Views, evidence: Evidence) -> Evidence:
-    """Add to a jump that is named the joints that turn back where it happens: this session cannot tell the two apart.
+def _scanner_error_in_place_of(linear: LinearModel, evidence: Evidence) -> FieldError | None:
+    """Return smooth errors of the scans that explain as much as what is named; None where they explain less."""
+    terms = [r.score.form.term for r in _named_effects(evidence)]
+    error = find_scanner_error(linear, other_terms=[term for term in terms if moves_points([term])])
+    return error if scanner_explains_it(replace(evidence, scanner_error=error)) else None
 
-    A jump that is missing beside other effects is not added with them.
-    """
-    if evidence.verdict != "missing_effect":
-        return evidence
-    named, found = evidence.named[0], {r.name: _coincidence(views, r) for r in (*evidence.named, *evidence.together)}
-    rest = tuple(r for r in evidence.together if not found[r.name])
-    notes = (*evidence.notes, *(text for name, text in found.items() if text and name != named.name))
-    if not found[named.name]:
-        return replace(evidence, together=rest, further=evidence.further and next(iter(rest[1:]), None), notes=notes)
-    rival = next((r for r in evidence.ranked if r.name == _BY_DIRECTION and r.score.observable), None)
-    if rival is None:
-        return replace(evidence, unnamed_explains_it=True, notes=(found[named.name], *notes))
-    return replace(
-        evidence, explanation=(named, rival), further=None, together=(), notes=notes, coincidence=found[named.name]
-    )
+
+def _pair_that_stands(
+    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
+) -> tuple[Ranked, Ranked] | None:
+    """Return the first of the explanation with a second effect, where both stand every test beside each other."""
+    named = evidence.explanation[0]
+    pair = find_missing_pair(linear, candidates, named)
+    if pair is None or pair[0].name != named.name or not pair_is_validated(linear, pair):
+        return None
+    both = replace(evidence, refuted=False, scanner_error=None, **_naming(pair))
+    return pair if _scanner_error_in_place_of(linear, both) is None else None
 
 
 def _coincidence(views: Views, ranked: Ranked) -> str:
     """Return what else begins where an effect jumps; empty where it does not, or nothing does."""
     event = next((p for p in ranked.score.form.term.parameters if p.discrete), None)
-    joints = joints_turning_at(views, event.value) if event is not None else []
+    joints = [] if event is None else _joints_turning_at(views, event.value)
     if event is None or not joints:
         return ""
     which = f"joint {joints[0]} comes" if len(joints) == 1 else f"joints {', '.join(map(str, joints))} come"
     return f"{ranked.name} begins at view {event.view}, and from there on {which} from the other side"
+
+
+def _joints_turning_at(views: Views, first: float) -> list[int]:
+    """Return the joints, counted from 1, that come from one side before a view and from the other side from there on.
+
+    Args:
+        first: number of the view, as events count it.
+    """
+    joints, after = list[int](), views.number >= first
+    for joint, approach in enumerate(views.approach.T, 1):
+        sides = [approach[part & (approach != 0)] for part in (~after, after)]
+        if min(map(len, sides)) < _FEWEST_MOVES:
+            continue
+        # 1 where all moves go one way, −1 where all go the other.
+        before, later = (2 * np.mean(side > 0) - 1 for side in sides)
+        if before * later < 0 and min(abs(before), abs(later)) >= 2 * _ONE_WAY - 1:
+            joints.append(joint)
+    return joints

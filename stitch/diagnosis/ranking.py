@@ -27,7 +27,7 @@ class Ranked:
 
     @property
     def name(self) -> str:
-        """Return the name of the effect."""
+        """The name of the effect."""
         return self.score.name
 
     @property
@@ -41,44 +41,14 @@ class Ranked:
         return self.log_posterior - float(np.log(limits.PRIOR_NOTHING))
 
 
-def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
-    """Physical and empirical candidates, best first; posterior shares among all and nothing.
-
-    Args:
-        tests: physical candidates among which these were chosen, scored here or not: all of them count in the
-            family-wise p-value and share the prior.
-    """
-    known = [s for s in scores if not s.candidate.empirical]
-    other = [s for s in scores if s.candidate.empirical and s.observable]
-    tests = max(tests, 1)
-    weights = [(s, limits.PRIOR_PHYSICAL / tests, tests) for s in known]
-    weights += [(s, limits.PRIOR_UNKNOWN / len(other), len(other)) for s in other]
-    logs = [s.log_bayes_factor + float(np.log(prior)) if s.observable else -np.inf for s, prior, _ in weights]
-    total = float(logsumexp([*logs, np.log(limits.PRIOR_NOTHING)]))
-    out = [
-        Ranked(s, min(1.0, s.p_value * family), log, float(np.exp(log - total)), family)
-        for (s, _, family), log in zip(weights, logs, strict=True)
-    ]
-    # Where there is nothing to tell them apart, by name, so that the order of a list decides nothing.
-    out.sort(key=lambda r: (not r.score.observable, -round(r.log_posterior, 6) if r.score.observable else 0.0, r.name))
-    return tuple(r for r in out if r.physical), tuple(r for r in out if not r.physical)
-
-
 def rank_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
-    """All candidates scored and ranked among each other; those that these views cannot show are no tests."""
+    """Return all candidates scored and ranked among each other; those that these views cannot show are no tests."""
     scores = list(parallel(partial(score, linear), candidates, "candidate effects"))
     return rank(scores, sum(s.observable for s in scores if not s.candidate.empirical))
 
 
-def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: float) -> tuple[Ranked, ...]:
-    """Return the ranking where something else has this log posterior beside `best`: all shares make room."""
-    here = next(r for r in ranked if r.name == best.name).posterior
-    room = 1 + here * float(np.exp(min(log_posterior - best.log_posterior, 700.0)))
-    return tuple(replace(r, posterior=r.posterior / room) for r in ranked)
-
-
 def rank_one(linear: LinearModel, candidate: Candidate, tests: int, start: Array | None = None) -> Ranked:
-    """One candidate that was chosen among so many.
+    """Return one candidate that was chosen among so many.
 
     Args:
         start: of `score`.
@@ -86,25 +56,58 @@ def rank_one(linear: LinearModel, candidate: Candidate, tests: int, start: Array
     return rank([score(linear, candidate, start)], tests)[0][0]
 
 
-def is_contender(r: Ranked) -> bool:
-    """Significant, more likely than nothing, and seen.
+def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
+    """Return physical and empirical candidates, best first; posterior shares among all and nothing.
+
+    Args:
+        tests: physical candidates among which these were chosen, scored here or not: all of them count in the
+            family-wise p-value and share the prior.
+    """
+    physical = [s for s in scores if not s.candidate.empirical]
+    empirical = [s for s in scores if s.candidate.empirical and s.observable]
+    tests = max(tests, 1)
+    weighted = [(s, limits.PRIOR_PHYSICAL / tests, tests) for s in physical]
+    weighted += [(s, limits.PRIOR_UNKNOWN / len(empirical), len(empirical)) for s in empirical]
+    logs = [s.log_bayes_factor + float(np.log(prior)) if s.observable else -np.inf for s, prior, _ in weighted]
+    total = float(logsumexp([*logs, np.log(limits.PRIOR_NOTHING)]))
+    ranked = [
+        Ranked(s, min(1.0, s.p_value * family), log, float(np.exp(log - total)), family)
+        for (s, _, family), log in zip(weighted, logs, strict=True)
+    ]
+    # Where there is nothing to tell them apart, by name, so that the order of a list decides nothing.
+    ranked.sort(
+        key=lambda r: (not r.score.observable, -round(r.log_posterior, 6) if r.score.observable else 0.0, r.name)
+    )
+    return tuple(r for r in ranked if r.physical), tuple(r for r in ranked if not r.physical)
+
+
+def rescored_against(ranked: Sequence[Ranked], best: Ranked, log_posterior: float) -> tuple[Ranked, ...]:
+    """Return the ranking where something else has this log posterior beside `best`: all shares make room."""
+    share = next(r for r in ranked if r.name == best.name).posterior
+    room = 1 + share * float(np.exp(min(log_posterior - best.log_posterior, 700.0)))
+    return tuple(replace(r, posterior=r.posterior / room) for r in ranked)
+
+
+def is_contender(ranked: Ranked) -> bool:
+    """Return whether it is significant, more likely than nothing, and seen.
 
     Both are asked for: a p-value forgets how little a small effect of many parameters explains, the Bayes factor
     does not know how many were tried.
     """
-    s = r.score
-    return r.physical and s.observable and r.adjusted < limits.ALPHA_NAME and s.log_bayes_factor > 0
+    scored = ranked.score
+    significant = ranked.physical and scored.observable and ranked.adjusted < limits.ALPHA_NAME
+    return significant and scored.log_bayes_factor > 0
 
 
-def is_certain(r: Ranked) -> bool:
-    """Enough for an alarm."""
-    return is_contender(r) and r.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
+def is_certain(ranked: Ranked) -> bool:
+    """Return whether it is enough for an alarm."""
+    return is_contender(ranked) and ranked.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
 
 
 def conditioned_without(
     linear: LinearModel, chosen: Sequence[Ranked], one: Ranked, start: Array | None = None
 ) -> LinearModel:
-    """The evidence beside all effects but one.
+    """Return the evidence beside all effects but one.
 
     Args:
         start: of `conditioned_on`.
@@ -113,7 +116,7 @@ def conditioned_without(
 
 
 def conditioned_on_effects(linear: LinearModel, chosen: Sequence[Ranked], start: Array | None = None) -> LinearModel:
-    """The evidence beside some effects.
+    """Return the evidence beside some effects.
 
     Args:
         start: of `conditioned_on`; None: as the last of the effects was found, beside the others.
@@ -121,6 +124,6 @@ def conditioned_on_effects(linear: LinearModel, chosen: Sequence[Ranked], start:
     if not chosen:
         return linear
     start = chosen[-1].score.variances if start is None else start
-    chosen = sorted(chosen, key=lambda r: r.name)
-    columns = [r.score.form.selected for r in chosen]
-    return linear.conditioned_on(columns, np.concatenate([r.score.sizes for r in chosen]), start)
+    by_name = sorted(chosen, key=lambda r: r.name)
+    columns = [r.score.form.selected for r in by_name]
+    return linear.conditioned_on(columns, np.concatenate([r.score.sizes for r in by_name]), start)

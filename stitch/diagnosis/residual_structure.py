@@ -1,16 +1,22 @@
-"""On what the unexplained part of the poses depends: every covariate, with the shape as binned means."""
+"""What a model leaves: on what it depends, from which sources it comes, what a candidate would leave of it.
+
+`dependences` says of every covariate how much of the views' unexplained scatter follows it, with the shape as binned
+means. `variance_budget` shares out what the poses leave by source: effects in use, what is named, an unmodelled trend,
+smooth errors, wandering, white scatter, noise. `predicted_distances` says correspondence by correspondence what a
+candidate effect would leave between the surfaces.
+"""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stitch.diagnosis.ranking import Ranked, rank_all
 from stitch.diagnosis.score import Score, score
+from stitch.diagnosis.smooth_processes import FittedProcess
 from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, DEPENDENCE_BINS, ODDS
-from stitch.diagnosis.unnamed_joint_laws import FittedProcess
-from stitch.diagnosis.unnamed_time_laws import RepeatingError
+from stitch.diagnosis.unmodelled_time_effects import RepeatingError
 from stitch.effects.empirical import FIELD
 from stitch.model.forward import moves_points, scan_correction
 from stitch.numerics import frames
@@ -19,83 +25,11 @@ from stitch.numerics.least_squares import column_space, project_out
 from stitch.numerics.reml import fit_variances
 from stitch.numerics.variance_posterior import mean_variances
 from stitch.observations.linear_model import WHITE_COMPONENTS, LinearModel
-from stitch.observations.pose_errors import DRIFT_MEMORY, JOINT_SCATTER, PoseErrors
-from stitch.observations.surfaces.matching import Match, signed_distances
+from stitch.observations.pose_errors import DRIFT_MEMORY, JOINT_SCATTER
+from stitch.observations.surfaces.matching import signed_distances
 from stitch.observations.surfaces.scanner_errors import field_scatter
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.session.measurement import Views
-
-# A scanner that errs by where in its field a point is seen, by no law of the library.
-#
-# Axes of unequal scale or not at right angles, a plane of focus that is bent to one side: the same in every view, so
-# that overlaps show it, and joints, mount or time only seem to have a part in it.
-
-
-def follows_field(empirical: Sequence[Ranked], unnamed: Sequence[RepeatingError]) -> bool:
-    """True if the field is the likeliest of all shapes without a cause, 20 to 1 over errors of poses that repeat.
-
-    Args:
-        empirical: best first.
-        unnamed: what poses do again without a name; both are over scatter and what an arm usually errs by.
-    """
-    best = next(iter(empirical), None)
-    if best is None or best.name != FIELD or best.adjusted >= ALPHA_UNKNOWN:
-        return False
-    others = [r.score.log_bayes_factor for r in empirical[1:2]] + [u.log_bayes_factor for u in unnamed]
-    return bool(best.score.log_bayes_factor > max([0.0, *others]) + ODDS)
-
-
-# What a candidate effect would leave between the surfaces, correspondence by correspondence.
-
-
-def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Array | None:
-    """(M,) signed distances of all correspondences under the model, and the best form of a candidate with it.
-
-    In the linear approximation, hand-eye and effects in use fitted anew beside the candidate, as `add` fits them: poses
-    scatter independently. Beside all that an arm may do the hand-eye may lie far off, and what the arm then does is in
-    no prediction. The candidate is scored anew for that: another of its forms may explain most where poses scatter
-    independently than beside all that an arm may do, and that one `add` reaches.
-
-    In the order of the matches to which the views were freed. None without clouds.
-    """
-    surfaces = surfaces_of(linear)
-    if surfaces is None:
-        return None
-    fitted = linear.restricted(())
-    if scored is not None and fitted is not linear:
-        scored = score(fitted, scored.candidate)
-    linear = fitted
-    freed = surfaces.unconstrained
-    poses = surfaces.capture.poses(linear.model.T_mount)
-    points = [scan.points for scan in surfaces.capture.scans]
-    twists = linear.design @ linear.baseline_trial.solve()
-    if scored is not None:
-        X, sums = np.hstack([linear.design, scored.form.response]), scored.candidate.points
-        found = linear.trial(X, None if sums is None else sums.select(scored.form.keep)).solve()
-        k = scored.form.response.shape[1]
-        term = scored.form.at(found[-k:])
-        if moves_points([term]):
-            # Such an effect changes the points, and the views only as hand-eye and the others follow.
-            twists = X[:, :-k] @ found[:-k]
-            measurement, every = linear.measurement, slice(None)
-            points = [p + scan_correction(measurement, [term], v, poses[v], every) for v, p in enumerate(points)]
-        else:
-            twists = X @ found
-    matches, centre = freed.overlaps.matches, freed.overlaps.gram.centre
-    return signed_distances(matches, poses, points) + _along_normals(matches, centre, twists.reshape(-1, 6))
-
-
-def _along_normals(matches: Sequence[Match], centre: Array, twists: Array) -> Array:
-    """(M,) B(δ_v − δ_w) of the normal equations: what twists (V, 6) about `centre` do to the distances.
-
-    Not by moving the views: where hand-eye and links can stand in for one another, both move far and their common
-    motion alone counts.
-    """
-    apart = [frames.plane_rows(m.middle - centre, m.normal) @ (twists[m.v] - twists[m.w]) for m in matches]
-    return np.concatenate(apart)
-
-
-# What the poses leave, by source: named effects, a course of time, smooth errors, wandering, white scatter, noise.
 
 # Sources that are new in every view, or no error of the poses.
 NOT_REPEATING = ("sensor noise", "white repeatability", "scanner field")
@@ -123,60 +57,81 @@ class BudgetLine:
 
 
 def variance_budget(
-    linear: LinearModel, named: Sequence[Score] = (), course: FittedProcess | None = None
+    linear: LinearModel, named: Sequence[Score] = (), trend: FittedProcess | None = None
 ) -> tuple[BudgetLine, ...]:
-    """Shares of what effects in use took away and of what remains, largest first; () where poses have no prior.
+    """Return shares of what effects in use took away and of what remains, largest first; () where poses have no prior.
 
     Args:
         named: candidates that are said to be missing: what they explain is theirs.
-        course: of the flange in time, where one is said to be there.
+        trend: of the flange in time, where one is said to be there.
     """
-    if (errors := linear.pose_errors) is None:
+    if linear.pose_errors is None:
         return ()
-    linear = _with_observed_field(linear)
+    surfaces = surfaces_of(linear)
+    if linear.mixed.fixed is not None and surfaces is not None:
+        # Smooth errors of the scanner as the overlaps show them; an alarm allows for larger ones.
+        field = linear.reduce(field_scatter(linear.measurement, surfaces.unconstrained, share=None))
+        linear = replace(linear, mixed=replace(linear.mixed, fixed=(field @ field.T)[None]))
     hand_eye = linear.reduce(linear.design[:, :6])
-    squares: dict[str, float] = {}
-    for term, response in zip(linear.model.terms, linear.responses(linear.model.terms), strict=True):
-        squares[term.name] = _unexplained_square(hand_eye, linear.reduce(response.columns) @ term.values)
-    for effect in named:
-        squares[effect.name] = _unexplained_square(hand_eye, effect.form.columns @ effect.values)
-    explained = [s.form.columns for s in named]
-    if course is not None:
-        squares["one course of time"] = _unexplained_square(hand_eye, course.numbers)
-        explained.append(course.columns)
-    for name, square in _remaining_squares(linear, errors, explained):
+    terms = linear.model.terms
+    explained = {
+        term.name: linear.reduce(response.columns) @ term.values
+        for term, response in zip(terms, linear.responses(terms), strict=True)
+    }
+    explained |= {scored.name: scored.form.columns @ scored.values for scored in named}
+    columns = [scored.form.columns for scored in named]
+    if trend is not None:
+        explained["one course of time"] = trend.numbers
+        columns.append(trend.columns)
+    # Of what no hand-eye explains.
+    squares = {name: float(np.sum(project_out(hand_eye, numbers[:, None]) ** 2)) for name, numbers in explained.items()}
+    for name, square in _remaining_squares(linear, columns):
         squares[name] = squares.get(name, 0.0) + square
-    total, unit, n = sum(squares.values()), linear.measurement.length_unit, linear.mixed.size
-    lines = [BudgetLine(s, x / max(total, 1e-300), float(np.sqrt(max(x, 0.0) / n)), unit) for s, x in squares.items()]
+    total = sum(squares.values())
+    unit, n = linear.measurement.length_unit, linear.mixed.size
+    lines = [
+        BudgetLine(source, square / max(total, 1e-300), float(np.sqrt(max(square, 0.0) / n)), unit)
+        for source, square in squares.items()
+    ]
     return tuple(sorted(lines, key=lambda line: -line.variance_share))
 
 
-def _with_observed_field(linear: LinearModel) -> LinearModel:
-    """Replace smooth errors of the scanner by those that the overlaps show; an alarm allows for larger ones."""
-    seen = surfaces_of(linear)
-    if linear.mixed.fixed is None or seen is None:
-        return linear
-    field = linear.reduce(field_scatter(linear.measurement, seen.unconstrained, share=None))
-    return replace(linear, mixed=replace(linear.mixed, fixed=(field @ field.T)[None]))
-
-
-def _remaining_squares(linear: LinearModel, errors: PoseErrors, named: Sequence[Array]) -> Iterator[tuple[str, float]]:
-    """Sums of squares that each component leaves beside the model and what is named."""
-    U = column_space(np.hstack([linear.reduce(linear.design), *named]))
+def _remaining_squares(linear: LinearModel, explained: Sequence[Array]) -> list[tuple[str, float]]:
+    """Return sums of squares that each component leaves beside the model and what columns explain."""
+    errors = linear.pose_errors
+    assert errors is not None
+    U = column_space(np.hstack([linear.reduce(linear.design), *explained]))
     mixed = replace(linear.mixed, A=U[None])
     sizes = mean_variances(mixed, fit_variances(mixed, both_starts=True))
     of_every_joint = {component for component, _ in errors.effects.values()}
-    called = _SOURCE_NAMES | {component: f"{component} of every joint" for component in of_every_joint}
-    for name, size, C in zip((*WHITE_COMPONENTS, *errors.names), sizes, mixed.components[:, 0], strict=True):
-        yield called.get(name, name), float(size * (np.trace(C) - np.sum(U * (C @ U))))
+    names = _SOURCE_NAMES | {component: f"{component} of every joint" for component in of_every_joint}
+    squares = [
+        (names.get(name, name), float(size * (np.trace(C) - np.sum(U * (C @ U)))))
+        for name, size, C in zip((*WHITE_COMPONENTS, *errors.names), sizes, mixed.components[:, 0], strict=True)
+    ]
     if linear.mixed.fixed is not None:
         C = linear.mixed.fixed[0]
-        yield "scanner field", float(np.trace(C) - np.sum(U * (C @ U)))
+        squares.append(("scanner field", float(np.trace(C) - np.sum(U * (C @ U)))))
+    return squares
 
 
-def _unexplained_square(base: Array, numbers: Array) -> float:
-    """Return the sum of squares of numbers (n,) that no hand-eye explains."""
-    return float(np.sum(project_out(base, numbers[:, None]) ** 2))
+def follows_field(empirical: Sequence[Ranked], repeating: Sequence[RepeatingError]) -> bool:
+    """Return whether the scanner's field is the likeliest of all shapes without a cause, 20 to 1 over errors of poses
+    that repeat.
+
+    A scanner whose axes are of unequal scale or not at right angles, or with a plane of focus that is bent to one side,
+    errs by where in its field a point is seen, by no law of the library: the same in every view, so that overlaps show
+    it, and joints, mount or time only seem to have a part in it.
+
+    Args:
+        empirical: best first.
+        repeating: what poses do again without a name; both are over scatter and what an arm usually errs by.
+    """
+    best = next(iter(empirical), None)
+    if best is None or best.name != FIELD or best.adjusted >= ALPHA_UNKNOWN:
+        return False
+    others = [r.score.log_bayes_factor for r in empirical[1:2]] + [error.log_bayes_factor for error in repeating]
+    return bool(best.score.log_bayes_factor > max([0.0, *others]) + ODDS)
 
 
 @dataclass(frozen=True)
@@ -195,7 +150,7 @@ class Dependence:
 
 
 def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Dependence]:
-    """The best empirical form of every covariate, clearest first.
+    """Return the best empirical form of every covariate, clearest first.
 
     Over scatter alone: what follows a covariate may also be an error of the poses that repeats; this says where it is.
     """
@@ -209,30 +164,31 @@ def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Depend
         if group not in best or r.score.log_bayes_factor > best[group].score.log_bayes_factor:
             best[group] = r
     found = [
-        _dependence(linear, r, course)
+        _dependence(linear, r, values)
         for name, r in best.items()
-        if (course := covariate_values(views, name)) is not None
+        if (values := covariate_values(views, name)) is not None
     ]
     return sorted(found, key=lambda d: (d.p_value, -d.score))
 
 
 def covariate_values(views: Views, name: str) -> Array | None:
-    """(V,) values of a covariate, a joint angle in degrees, the time, or the order of the views for an event."""
+    """Return (V,) values of a covariate, a joint angle in degrees, the time, or the order of the views for an event."""
     if name == "time_s":
         return views.time
     if name == "an event":
         return np.arange(views.count, dtype=float)
     if joint := re.fullmatch(r"j(\d+)_deg", name):
-        return np.asarray(np.degrees(views.joints[:, int(joint[1]) - 1]))
+        return np.degrees(views.joints[:, int(joint[1]) - 1])
     return views.covariates.get(name)
 
 
-def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependence:
+def _dependence(linear: LinearModel, ranked: Ranked, values: Array) -> Dependence:
+    """Return how the views' displacements follow values (V,) of a covariate."""
     scored = ranked.score
-    white = linear.residual(scored.form.columns)
-    basis, s, _ = np.linalg.svd(white, full_matrices=False)
+    basis, s, _ = np.linalg.svd(linear.residual(scored.form.columns), full_matrices=False)
     basis = basis[:, s > 1e-9 * max(float(s[0]), 1e-300)]
-    share = float(np.sum((basis.T @ linear.white_residual) ** 2) / max(float(np.sum(linear.white_residual**2)), 1e-300))
+    white = linear.white_residual
+    share = float(np.sum((basis.T @ white) ** 2) / max(float(np.sum(white**2)), 1e-300))
     displacement = linear.view_displacements()
     # The direction in which the displacements follow the fitted shape most.
     fitted = linear.observation.part_displacements(scored.form.columns @ scored.values)
@@ -241,8 +197,8 @@ def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependenc
     main = np.linalg.svd(displacement, full_matrices=False)[2][0]
     main *= 1.0 if (displacement @ main)[len(displacement) // 2 :].sum() >= 0 else -1.0
     direction *= 1.0 if direction @ main >= 0 else -1.0
-    y = displacement @ direction
-    centres, mean, sigma = bin_means(course, y)
+    moved = displacement @ direction
+    centres, mean, sigma = bin_means(values, moved)
     effect = scored.candidate.effect
     return Dependence(
         covariate=effect.group if effect.group != "an event" else "view order",
@@ -252,13 +208,13 @@ def _dependence(linear: LinearModel, ranked: Ranked, course: Array) -> Dependenc
         mean=mean,
         sigma=sigma,
         shape=effect.formula,
-        at=course,
-        moved=y,
+        at=values,
+        moved=moved,
     )
 
 
 def bin_means(x: Array, y: Array, bins: int = DEPENDENCE_BINS) -> tuple[Array, Array, Array]:
-    """Middle, mean and standard error of y in bins of x with equal counts; views are the samples."""
+    """Return middle, mean and standard error of y in bins of x with equal counts; views are the samples."""
     order = np.argsort(x, kind="stable")
     parts = [p for p in np.array_split(order, min(bins, max(len(x) // 2, 1))) if len(p)]
     spread = float(np.std(y, ddof=1)) if len(y) > 1 else 0.0
@@ -266,3 +222,42 @@ def bin_means(x: Array, y: Array, bins: int = DEPENDENCE_BINS) -> tuple[Array, A
     mean = np.array([y[p].mean() for p in parts])
     sigma = np.array([(np.std(y[p], ddof=1) if len(p) > 2 else spread) / np.sqrt(len(p)) for p in parts])
     return middle, mean, sigma
+
+
+def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Array | None:
+    """Return (M,) signed distances of all correspondences under the model, and the best form of a candidate with it.
+
+    In the linear approximation, hand-eye and effects in use fitted anew beside the candidate, as `add` fits them: poses
+    scatter independently. Beside all that an arm may do the hand-eye may lie far off, and what the arm then does is in
+    no prediction. The candidate is scored anew for that: another of its forms may explain most where poses scatter
+    independently than beside all that an arm may do, and that one `add` reaches.
+
+    In the order of the matches of the free network. None without clouds.
+    """
+    surfaces = surfaces_of(linear)
+    if surfaces is None:
+        return None
+    fitted = linear.restricted(())
+    if scored is not None and fitted is not linear:
+        scored = score(fitted, scored.candidate)
+    poses = surfaces.capture.poses(fitted.model.T_mount)
+    points = [scan.points for scan in surfaces.capture.scans]
+    twists = fitted.design @ fitted.baseline_trial.solve()
+    if scored is not None:
+        X, sums = np.hstack([fitted.design, scored.form.response]), scored.candidate.points
+        solution = fitted.trial(X, None if sums is None else sums.select(scored.form.keep)).solve()
+        k = scored.form.response.shape[1]
+        term = scored.form.at(solution[-k:])
+        if moves_points([term]):
+            # Such an effect changes the points, and the views only as hand-eye and the others follow.
+            twists = X[:, :-k] @ solution[:-k]
+            measurement, every = fitted.measurement, slice(None)
+            points = [p + scan_correction(measurement, [term], v, poses[v], every) for v, p in enumerate(points)]
+        else:
+            twists = X @ solution
+    overlaps = surfaces.unconstrained.overlaps
+    matches, centre, of_views = overlaps.matches, overlaps.gram.centre, twists.reshape(-1, 6)
+    # B(δ_v − δ_w) of the normal equations, not by moving the views: where hand-eye and links can stand in for one
+    # another, both move far and their common motion alone counts.
+    along = [frames.plane_rows(m.middle - centre, m.normal) @ (of_views[m.v] - of_views[m.w]) for m in matches]
+    return signed_distances(matches, poses, points) + np.concatenate(along)

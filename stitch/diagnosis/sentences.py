@@ -8,14 +8,18 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.residual_structure import NOT_REPEATING
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
-from stitch.diagnosis.unnamed_joint_laws import JointCurve
-from stitch.diagnosis.unnamed_time_laws import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
+from stitch.diagnosis.unmodelled_joint_effects import JointCurve
+from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
 from stitch.numerics.units import angle_text, duration_text, format_amount, length_text, rounded
 from stitch.observations.surfaces.scanner_errors import FieldError
 
 _SCALE = "range_scale"
 # Curves of joints that are told in words; the page draws one more.
 _MAX_CURVES = 2
+_CAUSES = (
+    "Possible causes: a part that bends, an arm still settling during the scan, a scanner that warms up or errs by "
+    "range or brightness."
+)
 
 
 def diagnosis_sentence(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] | None) -> str:
@@ -26,21 +30,22 @@ def diagnosis_sentence(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranke
     """
     match d.verdict:
         case "adequate":
-            found = _adequate(d, length_unit)
+            sentences = _adequate(d, length_unit)
         case "missing_effect":
-            found = _missing_effect(d, length_unit, pair)
+            sentences = _missing_effect(d, length_unit, pair)
         case "cannot_tell":
-            found = _ambiguous_group(d, length_unit)
+            sentences = _ambiguous_group(d, length_unit)
         case _:
-            found = _unknown_effect(d, length_unit)
-    return " ".join(sentence for sentence in found if sentence)
+            sentences = _unknown_effect(d, length_unit)
+    return " ".join(sentence for sentence in sentences if sentence)
 
 
 def _adequate(d: Diagnosis, length_unit: str) -> Iterator[str]:
     yield f"The model is adequate. {_residual_sentence(d, length_unit)}"
-    if _poses_scatter(d):
-        yield f"The robot's poses scatter by {_pose_scatter(d, length_unit)} (1 σ), which explains the rest."
-        limits = _scatter_limits(d, length_unit)
+    if _poses_show(d):
+        scatter = _scatter(d.translation, d.rotation, length_unit)
+        yield f"The robot's poses scatter by {scatter} (1 σ), which explains the rest."
+        limits = _scatter(d.scatter_limit.translation, d.scatter_limit.rotation, length_unit)
         if d.scatter_limit.stated:
             yield f"The stated repeatability allows {limits}."
         else:
@@ -48,13 +53,14 @@ def _adequate(d: Diagnosis, length_unit: str) -> Iterator[str]:
     if d.scanner_error is not None:
         calibration = "" if d.scanner_error.by_view else ", but a calibration may"
         yield f"{scanner_error_sentence(d.scanner_error, length_unit)} No pose corrects that{calibration}."
-    yield _rejected_effects(d)
+    yield from _not_named(d)
 
 
 def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] | None) -> Iterator[str]:
     candidate = next(c for c in d.candidates if c.name == d.effects[0])
     ranked = pair[0] if pair else candidate.ranked
-    yield f"{candidate.name} {_is_missing(d)} ({fitted_amounts(ranked)}; p = {ranked.adjusted:.1g})."
+    is_missing = "is missing" if d.certain else "may be missing"
+    yield f"{candidate.name} {is_missing} ({fitted_amounts(ranked)}; p = {ranked.adjusted:.1g})."
     yield from _why_not_the_likeliest(d)
     yield _odds_over_chance(d)
     yield _residual_sentence(d, length_unit)
@@ -67,12 +73,17 @@ def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] 
     if _SCALE in (candidate.name, pair[1].name if pair else ""):
         # Scans, hand-eye and ways of the arm, all longer by the same share, fit each other as before.
         yield "These views cannot tell it from arm lengths that are all off by the same share; a known length can."
-    yield _implausible_sizes(ranked)
+    scored = ranked.score
+    if scored.fitted:
+        large = [p.name for p, value in zip(scored.form.free, scored.values, strict=True) if abs(value) > p.limit]
+        verb = "is" if len(large) == 1 else "are"
+        yield f"{_listed(large, 'and')} {verb} larger than plausible: check session.toml." if large else ""
 
 
 def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
     """Say why another effect is named than the one that explains most alone, which stands first in the table."""
-    first, named = d.candidates[0], d.effects[0]
+    first = d.candidates[0]
+    named = d.effects[0]
     if first.name == named:
         return
     yield f"Alone, {first.name} would explain more (posterior {first.ranked.posterior:.2f})."
@@ -86,7 +97,8 @@ def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
 
 
 def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:
-    yield f"Something {_is_missing(d)}: {' or '.join(d.effects)}. These views cannot tell which."
+    is_missing = "is missing" if d.certain else "may be missing"
+    yield f"Something {is_missing}: {' or '.join(d.effects)}. These views cannot tell which."
     if d.coincidence:
         yield f"{d.coincidence}. To tell, drive a few of these poses again from the first side."
     yield _odds_over_chance(d)
@@ -101,7 +113,7 @@ def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
         yield "So the scanner or the part's shape is off, and not only the poses."
     if d.follows_field:
         yield from scanner_advice(d.scanner_error, length_unit)
-        yield _rejected_effects(d)
+        yield from _not_named(d)
         return
     if d.scanner_error is not None:
         yield scanner_error_sentence(d.scanner_error, length_unit)
@@ -111,7 +123,7 @@ def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
     if clear:
         yield f"What is left follows {_listed(clear, 'and')}."
     yield from _poses_of_unknown(d, length_unit)
-    yield _rejected_effects(d)
+    yield from _not_named(d)
     untested = [name for name, needs in d.missing.items() if "joints" in needs or "torque" in needs]
     if untested:
         yield f"Joint effects were not tested ({', '.join(untested)}): they need joint angles and the robot's geometry."
@@ -119,18 +131,19 @@ def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
 
 def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
     """Say what the poses do where nothing is named."""
-    scatter = _pose_scatter(d, length_unit)
-    if said := reportable(d.repeating_errors, d.implausible):
+    scatter = _scatter(d.translation, d.rotation, length_unit)
+    if errors := reportable(d.repeating_errors, d.implausible):
         size = np.sqrt(sum(line.sigma**2 for line in d.budget if line.source not in NOT_REPEATING))
         amount = f" ({length_text(float(size), length_unit, 2)})" if size > 0 else ""
-        yield f"The pose errors repeat{amount}: they {' and '.join(u.words for u in said)}."
+        yield f"The pose errors repeat{amount}: they {' and '.join(error.words for error in errors)}."
         yield f"Apart from that the poses scatter by {scatter}."
     elif not d.implausible:
-        yield f"The poses scatter by {scatter}." if _poses_scatter(d) else "The measured points do not show the poses."
+        yield f"The poses scatter by {scatter}." if _poses_show(d) else "The measured points do not show the poses."
     elif d.overlap_misfit:
         yield f"The poses scatter by {scatter}; how much of that is the robot's shows once the misfit is corrected."
     else:
-        limit = f"{'stated' if d.scatter_limit.stated else 'usual'}: up to {_scatter_limits(d, length_unit)}"
+        limits = _scatter(d.scatter_limit.translation, d.scatter_limit.rotation, length_unit)
+        limit = f"{'stated' if d.scatter_limit.stated else 'usual'}: up to {limits}"
         yield f"The robot's pose errors dominate: they scatter by {scatter} ({limit})."
         yield "Such errors repeat at the same poses, so a correction found on one object holds for another."
 
@@ -140,95 +153,64 @@ def _residual_sentence(d: Diagnosis, length_unit: str) -> str:
     return f"The residual is {now}; the sensor's noise alone would leave {floor}."
 
 
-def _is_missing(d: Diagnosis) -> str:
-    return "is missing" if d.certain else "may be missing"
-
-
 def _odds_over_chance(d: Diagnosis) -> str:
     """Say how much likelier than chance it is, where that is little."""
     return "" if d.certain else f"The odds that it is more than chance are {odds_text(d.log_odds_over_nothing)}."
 
 
-def _implausible_sizes(ranked: Ranked) -> str:
-    """Say which sizes are larger than plausible."""
-    s = ranked.score
-    large = [p.name for p, v in zip(s.form.free, s.values, strict=True) if abs(v) > p.limit] if s.fitted else []
-    if not large:
-        return ""
-    return f"{_listed(large, 'and')} {'is' if len(large) == 1 else 'are'} larger than plausible: check session.toml."
+def _scatter(translation: float, rotation: float, length_unit: str) -> str:
+    return f"{length_text(translation, length_unit)} and {angle_text(rotation)}"
 
 
-def _pose_scatter(d: Diagnosis, length_unit: str) -> str:
-    return f"{length_text(d.translation, length_unit)} and {angle_text(d.rotation)}"
-
-
-def _scatter_limits(d: Diagnosis, length_unit: str) -> str:
-    return f"{length_text(d.scatter_limit.translation, length_unit)} and {angle_text(d.scatter_limit.rotation)}"
-
-
-def _poses_scatter(d: Diagnosis) -> bool:
-    """True unless what was seen is the same wherever the poses are."""
+def _poses_show(d: Diagnosis) -> bool:
+    """Return True unless what was seen is the same wherever the poses are."""
     return d.rotation > 0 or d.translation > 0
 
 
-def _rejected_effects(d: Diagnosis) -> str:
-    """Effects that explain much and are not named, and why: an alarm that did not stand is no silence."""
-    return " ".join(f"Not named: {note}." for note in d.notes)
+def _not_named(d: Diagnosis) -> Iterator[str]:
+    """Say which effects explain much and are not named, and why: an alarm that did not stand is no silence."""
+    yield from (f"Not named: {note}." for note in d.notes)
 
 
 def _listed(names: Sequence[str], last: str) -> str:
-    """a, b and c."""
+    """Return a, b and c."""
     return f" {last} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
-# Smooth errors of the scans themselves: the same in every view, or every view's own.
-
-_CAUSES = (
-    "Possible causes: a part that bends, an arm still settling during the scan, a scanner that warms up or errs by "
-    "range or brightness."
-)
-
-
-def scanner_error_sentence(found: FieldError, length_unit: str) -> str:
-    """Return the clearer of the two kinds with its size; how much views err by themselves besides is uncertain."""
-    if found.by_view:
-        size = length_text(found.rms_by_view, length_unit, 2)
-        return f"Each scan has a smooth error of its own{_drift_clause(found)}: {size} rms."
-    size = length_text(found.rms, length_unit, 2)
+def scanner_error_sentence(error: FieldError, length_unit: str) -> str:
+    """Return what the scans err by: the clearer of the two kinds, the same in every view or every view's own, with its
+    size; how much views err by themselves besides is uncertain."""
+    drift = ", larger as the session goes on" if error.with_time else ""
+    if error.by_view:
+        return f"Each scan has a smooth error of its own{drift}: {length_text(error.rms_by_view, length_unit, 2)} rms."
+    size = length_text(error.rms, length_unit, 2)
     common = f"The scanner errs over its field, the same in every view: {size} rms."
-    return f"{common} In part each view errs by itself{_drift_clause(found)}." if found.rms_by_view else common
+    return f"{common} In part each view errs by itself{drift}." if error.rms_by_view else common
 
 
-def scanner_advice(found: FieldError | None, length_unit: str) -> Iterable[str]:
+def scanner_advice(error: FieldError | None, length_unit: str) -> Iterable[str]:
     """Return what the scans err by where nothing else is named, and what to do; None: only the poses show it."""
-    if found is not None and found.by_view:
+    if error is not None and error.by_view:
         return (
-            scanner_error_sentence(found, length_unit),
+            scanner_error_sentence(error, length_unit),
             _CAUSES,
             "Scan the first pose again at the end: what differs then comes from the part or from time.",
         )
     where = "What is left depends on where in the scanner's field a point is seen, the same in every view."
-    size = "" if found is None else scanner_error_sentence(found, length_unit)
+    size = "" if error is None else scanner_error_sentence(error, length_unit)
     return where, size, "Have the scanner calibrated, or describe its error by an effect of your own."
 
 
-def _drift_clause(found: FieldError) -> str:
-    return ", larger as the session goes on" if found.with_time else ""
-
-
-# Errors without a name: where in the range of a joint, when in the session.
-
-
-def curve_sentences(found: Diagnosis, length_unit: str) -> list[str]:
-    """Return a sentence for every course that is clear enough, of joints and in time."""
-    shown = found.curves[:_MAX_CURVES]
-    told = [joint_curve_sentence(curve) for curve in shown]
-    open_ones = {c.joint: c.may_follow for c in shown if len(c.may_follow) > 1}
-    told += [
+def curve_sentences(d: Diagnosis, length_unit: str) -> list[str]:
+    """Return a sentence for every trend without a name that is clear enough, of joints and in time."""
+    shown = d.curves[:_MAX_CURVES]
+    sentences = [joint_curve_sentence(curve) for curve in shown]
+    undecided = {curve.joint: curve.may_follow for curve in shown if len(curve.may_follow) > 1}
+    sentences += [
         f"These views do not tell whether joint {joint} follows {_listed(others, 'or')}."
-        for joint, others in open_ones.items()
+        for joint, others in undecided.items()
     ]
-    return told if found.time_curve is None else [*told, time_curve_sentence(found.time_curve, length_unit)]
+    return sentences if d.time_curve is None else [*sentences, time_curve_sentence(d.time_curve, length_unit)]
 
 
 def joint_curve_sentence(curve: JointCurve) -> str:
@@ -259,34 +241,36 @@ def _place_in_words(curve: JointCurve, k: int) -> str:
 
 def time_curve_sentence(curve: TimeCurve, length_unit: str) -> str:
     """Return how far a flange seems to be off in time, and what could name the cause."""
+
+    def when(k: int) -> str:
+        steps = curve.steps[k] - curve.steps[0]
+        return f"{duration_text(steps * curve.seconds)} into the session" if curve.seconds else f"at view {steps:.0f}"
+
     moved_at, moved, moved_sigma = curve.largest(TRANSLATION_PART)
     turned_at, turned, turned_sigma = curve.largest(ROTATION_PART)
     return (
         f"The flange seems off by up to {format_amount(moved, moved_sigma, length_unit)} "
-        f"{_time_in_words(curve, moved_at)}, and turned by up to {format_amount(turned, turned_sigma, 'rad')} "
-        f"{_time_in_words(curve, turned_at)}. If something in the cell varies like that (a temperature, a machine "
+        f"{when(moved_at)}, and turned by up to {format_amount(turned, turned_sigma, 'rad')} "
+        f"{when(turned_at)}. If something in the cell varies like that (a temperature, a machine "
         "nearby), add it to views.csv as a column."
     )
 
 
-def _time_in_words(curve: TimeCurve, k: int) -> str:
-    steps = curve.steps[k] - curve.steps[0]
-    return f"{duration_text(steps * curve.seconds)} into the session" if curve.seconds else f"at view {steps:.0f}"
-
-
 def odds_text(log_odds: float) -> str:
-    """3 to 1, or 1 to 3; nobody can vouch for more than a hundred."""
+    """Return 3 to 1, or 1 to 3; nobody can vouch for more than a hundred."""
     likelier = f"{np.exp(abs(log_odds)):.2g}" if abs(log_odds) < np.log(99.5) else "more than 100"
     return f"{likelier} to 1" if log_odds >= 0 else f"1 to {likelier}"
 
 
 def fitted_amounts(ranked: Ranked, at_most: int = 3) -> str:
-    """The clearest parameters: c2 = 0.44 ± 0.04 µrad/(N m)."""
-    s = ranked.score
-    if not s.fitted:
+    """Return the clearest parameters: c2 = 0.44 ± 0.04 µrad/(N m)."""
+    scored = ranked.score
+    if not scored.fitted:
         return "too small to be worth a fit"
-    order = np.argsort(-np.abs(s.values) / np.maximum(s.sigmas, 1e-300))[:at_most]
-    clearest = [(s.form.free[i], s.values[i], s.sigmas[i]) for i in sorted(order)]
-    fitted = [f"{p.name} = {format_amount(v, sigma, p.unit)}" for p, v, sigma in clearest]
-    tried = [f"{p.name} = {p.formatted}" for p in s.form.term.parameters if p.grid]
+    clearest = np.argsort(-np.abs(scored.values) / np.maximum(scored.sigmas, 1e-300))[:at_most]
+    tried = [f"{p.name} = {p.formatted}" for p in scored.form.term.parameters if p.grid]
+    fitted = []
+    for i in sorted(clearest):
+        parameter = scored.form.free[i]
+        fitted.append(f"{parameter.name} = {format_amount(scored.values[i], scored.sigmas[i], parameter.unit)}")
     return ", ".join(tried + fitted)

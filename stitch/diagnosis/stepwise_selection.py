@@ -1,27 +1,55 @@
-"""Effects that are missing at once: found one by one, each asked to hold its place beside all the others."""
+"""Effects that are missing at once: found one by one, each asked to hold its place beside all the others.
+
+Two effects may each leave nothing to the other among the measured poses. What an imitation gains is no measure then: it
+has the more parameters, gains more, and is far off where nothing was measured. Ends of joints' ranges that were left
+out tell the two apart as far as these poses can: an effect that errs at some end gives way to one that does the same
+and is likelier to hold beyond (`find_exchange`).
+
+An effect that was found first explains a part of what others do, and beside it these are not wanted: one by one nothing
+leads away from it. At fixed variances the evidence of any set is a determinant of sums that are made once, so that sets
+without it can be tried by the hundred (`exchanged_set`).
+"""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations, pairwise
 
+import numpy as np
+
+from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, candidate_as_fitted, candidates_of
-from stitch.diagnosis.exchanged_sets import exchanged_set, is_better_set
 from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, conditioned_without, is_certain, rank, rank_one
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import promising, score
-from stitch.diagnosis.thresholds import CANDIDATES_TRIED, MANY_POSES, MAX_JOINT_EFFECTS, NEAR_BEST_GAIN
-from stitch.diagnosis.validation import Extrapolation, cross_validate, extrapolate, untested_ends_reason
+from stitch.diagnosis.validation import (
+    Extrapolation,
+    cross_validate,
+    extrapolate,
+    group_share,
+    untested_ends_reason,
+)
 from stitch.fit.pipelines import linearise
 from stitch.model.model import Term
+from stitch.numerics.parameter_selection import (
+    PLAUSIBLE,
+    eliminate_backward,
+    log_evidence_at_scales,
+    log_mixture,
+    select_forward,
+)
+from stitch.numerics.reml import at_variances, fit_variances
 from stitch.observations.linear_model import LinearModel
 from stitch.run_data import RunData
 from stitch.system.threads import parallel
 
-# Whether the effects of a model still hold their place beside each other.
+# Effects that are taken out at once.
+_TAKEN_OUT = 2
 
 
 def find_effect_to_drop(state: RunData, names: Collection[str]) -> tuple[str, str] | None:
-    """The weakest effect of labelled points that does not hold its place beside all others, and why; None if all do.
+    """Return the weakest effect of labelled points that does not hold its place beside all others, and why; None if all
+    do.
 
     Effects are asked at once, of many poses one after the other. Scans, whose overlaps are found by all cores already,
     do not allow it.
@@ -30,9 +58,9 @@ def find_effect_to_drop(state: RunData, names: Collection[str]) -> tuple[str, st
         names: effects of the model that may go.
     """
     asked = [term for term in state.model.terms if term.name in names]
-    each = parallel if state.measurement.views.count < MANY_POSES else map
-    found = zip(asked, each(partial(_test_effect, state), asked), strict=True)
-    failing = [(factor, term.name, reason) for term, (factor, reason) in found if reason is not None]
+    each = parallel if state.measurement.views.count < limits.MANY_POSES else map
+    tested = zip(asked, each(partial(_test_effect, state), asked), strict=True)
+    failing = [(factor, term.name, reason) for term, (factor, reason) in tested if reason is not None]
     if not failing:
         return None
     _, name, reason = min(failing)
@@ -40,75 +68,17 @@ def find_effect_to_drop(state: RunData, names: Collection[str]) -> tuple[str, st
 
 
 def _test_effect(state: RunData, term: Term) -> tuple[float, str | None]:
-    """Log Bayes factor of an effect beside the others, and why it should go, if it should."""
+    """Return the log Bayes factor of an effect beside the others, and why it should go, if it should."""
     name = term.name
     linear = linearise(state.session, state.measurement, state.model.without(name), state.gate)
     candidate = candidate_as_fitted(linear, term)
     if not candidate.forms[0].keep.any():
         return 0.0, f"{name} is not seen beside the others"
-    own = rank_one(linear, candidate, tests=1)
-    factor = own.score.log_bayes_factor
-    if not is_certain(own):
+    ranked = rank_one(linear, candidate, tests=1)
+    factor = ranked.score.log_bayes_factor
+    if not is_certain(ranked):
         return factor, f"{name} explains too little beside the others"
-    return factor, cross_validate(linear, own.score).rejection_reason(name)
-
-
-# An effect that errs at some end gives way to one that does the same and is likelier to hold beyond.
-#
-# Two effects may each leave nothing to the other among the measured poses. What an imitation gains is no measure then:
-# it has the more parameters, gains more, and is far off where nothing was measured. Ends that were left out tell the
-# two apart as far as these poses can.
-
-
-@dataclass(frozen=True)
-class Exchange:
-    """One effect for another."""
-
-    name: str  # that gives way
-    rejection_reason: str
-    replacement: Ranked
-
-
-def find_exchange(
-    linear: LinearModel,
-    candidates: Sequence[Candidate],
-    chosen: Sequence[Ranked],
-    beyond: Mapping[str, Extrapolation | None],
-) -> Exchange | None:
-    """The first effect that has to give way; None if all may stay.
-
-    Args:
-        candidates: that may take a place.
-        chosen: effects beside each other.
-        beyond: what each of them does at the ends, beside the others.
-    """
-    for r in chosen:
-        found = beyond[r.name]
-        if found is None or not found.errs_somewhere:
-            continue
-        rest = conditioned_without(linear, chosen, r)
-        rivals = _better_extrapolating_effects(
-            rest, [c for c in candidates if c.name not in {own.name for own in chosen}], found
-        )
-        for rival in rivals:
-            beside = conditioned_on_effects(rest, [rival])
-            left = extrapolate(beside, rank_one(beside, r.score.candidate, len(candidates)).score)
-            if left is not None and not left.helps:
-                return Exchange(r.name, f"{left.rejection_reason(r.name)}; this beside {rival.name}", rival)
-    return None
-
-
-def _better_extrapolating_effects(
-    rest: LinearModel, candidates: Sequence[Candidate], found: Extrapolation
-) -> list[Ranked]:
-    """Effects that are likelier to hold at a further end than one that was found, the likeliest first."""
-    out = list[tuple[float, Ranked]]()
-    for candidate, _ in promising(rest, candidates, CANDIDATES_TRIED):
-        other = rank_one(rest, candidate, len(candidates))
-        own = extrapolate(rest, other.score) if is_certain(other) else None
-        if own is not None and own.helps and own.likely > found.likely:
-            out.append((own.likely, other))
-    return [other for _, other in sorted(out, key=lambda item: -item[0])]
+    return factor, cross_validate(linear, ranked.score).rejection_reason(name)
 
 
 @dataclass(frozen=True)
@@ -121,115 +91,96 @@ class ForwardSelection:
 
 
 def forward_selection(linear: LinearModel, candidates: Sequence[Candidate], best: Ranked) -> ForwardSelection:
-    """Effects that are missing at once.
+    """Return the effects that are missing at once.
 
     One effect alone may explain more than each of two that are there, because it imitates a part of both. So
     effects are added one by one as long as one can be named beside those before; then each must hold its
     place beside all the others. What was found first may still stand in the way of others that together do more: they
     take its place where they also predict views left out better (`exchanged_set`).
     """
-    every = [c for c in candidates if not c.empirical]
-    found = _stable_selection(linear, every, _add_effects(linear, every, [best]))
-    while (other := _better_selection(linear, every, found)) is not None:
-        found = other
-    return found
+    physical = [c for c in candidates if not c.empirical]
+    selection = _stable_selection(linear, physical, _add_effects(linear, physical, [best]))
+    while (better := _better_selection(linear, physical, selection)) is not None:
+        selection = better
+    return selection
 
 
 def find_better_effects(state: RunData, added: Collection[str]) -> list[str]:
-    """Effects that together do better than those that were added to a model, some of which they do without; else none.
+    """Return effects that together do better than those that were added to a model, some of which they do without; else
+    none.
 
     Args:
         added: effects of the model that may go.
     """
     terms = [term for term in state.model.terms if term.name not in added]
     linear = linearise(state.session, state.measurement, state.model.with_terms(terms), state.gate)
-    every = [c for c in candidates_of(linear, empirical=False)[0] if c.name not in state.tried]
-    chosen = tuple(rank_one(linear, c, len(every)) for c in every if c.name in added)
-    found = _better_selection(linear, every, ForwardSelection(chosen, 0.0, {}))
-    return [] if found is None else [r.name for r in found.effects]
+    candidates = [c for c in candidates_of(linear, empirical=False)[0] if c.name not in state.tried]
+    chosen = tuple(rank_one(linear, c, len(candidates)) for c in candidates if c.name in added)
+    better = _better_selection(linear, candidates, ForwardSelection(chosen, 0.0, {}))
+    return [] if better is None else [r.name for r in better.effects]
 
 
 def _better_selection(
-    linear: LinearModel, every: Sequence[Candidate], found: ForwardSelection
+    linear: LinearModel, candidates: Sequence[Candidate], selection: ForwardSelection
 ) -> ForwardSelection | None:
-    """Other effects that hold their place, and together do better; None where there are none.
+    """Return other effects that hold their place, and together do better; None where there are none.
 
     What was refused, as it errs beyond the measured poses, is not tried again.
     """
-    instead = exchanged_set(linear, [c for c in every if c.name not in found.refused], found.effects)
+    instead = exchanged_set(linear, [c for c in candidates if c.name not in selection.refused], selection.effects)
     if not instead:
         return None
-    other = _stable_selection(linear, every, [rank_one(linear, c, len(every)) for c in instead])
-    return other if is_better_set(linear, other.effects, found.effects) else None
+    other = _stable_selection(linear, candidates, [rank_one(linear, c, len(candidates)) for c in instead])
+    return other if is_better_set(linear, other.effects, selection.effects) else None
 
 
-def _stable_selection(linear: LinearModel, every: Sequence[Candidate], chosen: Sequence[Ranked]) -> ForwardSelection:
-    """Effects of those chosen that hold their place, with others that then can be named.
+def _stable_selection(
+    linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]
+) -> ForwardSelection:
+    """Return effects of those chosen that hold their place, with others that then can be named.
 
     Of those that err beyond the measured poses the one that errs most is left out, and the search goes on: what it
     imitated others may explain. At last one that errs at some end gives way to another that does the same and is
     likelier to hold beyond.
     """
-    candidates, gone, unseen, refused = list(every), set[str](), set[str](), dict[str, str]()
+    remaining = list(candidates)
+    exchanged = set[str]()
+    unseen = set[str]()
+    refused = dict[str, str]()
     explained = sum(r.log_posterior for r in chosen)
     while True:
-        chosen, beyond = _eliminate_backward(linear, chosen, len(candidates))
-        erring = {name: found for name, found in beyond.items() if found is not None and not found.helps}
+        chosen, beyond = _eliminate_backward(linear, chosen, len(remaining))
+        erring = {name: at_ends for name, at_ends in beyond.items() if at_ends is not None and not at_ends.helps}
+        replacement: Ranked | None = None
         if erring:
             name = max(erring, key=lambda name: erring[name].share)
-            refused[name], instead = erring[name].rejection_reason(name), list[Ranked]()
+            refused[name] = erring[name].rejection_reason(name)
             (unseen.add if erring[name].unseen else unseen.discard)(name)
-        elif (exchange := find_exchange(linear, [c for c in every if c.name not in gone], chosen, beyond)) is not None:
-            name, instead = exchange.name, [exchange.replacement]
-            refused.pop(exchange.replacement.name, None)  # it erred beside the one that gives way
-            refused[name] = exchange.rejection_reason
-            gone.add(name)
-            unseen -= {name, exchange.replacement.name}
         else:
-            if len(unseen) > 1:
-                refused |= dict.fromkeys(unseen, untested_ends_reason(sorted(unseen)))
-            likeliest_first = tuple(sorted(chosen, key=lambda r: -r.log_posterior))
-            return ForwardSelection(likeliest_first, explained, refused)
-        candidates = [c for c in candidates if c.name != name]
-        chosen = _add_effects(linear, candidates, [*(r for r in chosen if r.name != name), *instead])
-
-
-def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int) -> tuple[list[Ranked], dict[str, str]]:
-    """Effects beside each other that all help on views left out; and what is idle, the weakest first.
-
-    What would be dropped again as soon as it is in the model is neither named nor added: of hundreds of poses an effect
-    is seen that moves hardly anything, and that anything else may do as well.
-
-    Args:
-        tests: candidates among which they were chosen.
-    """
-    chosen, idle = list(chosen), dict[str, str]()
-    while True:
-        objections = (
-            (r, cross_validate(conditioned_without(linear, chosen, r), r.score).rejection_reason(r.name))
-            for r in reversed(chosen)
-        )
-        first = next(((r, why) for r, why in objections if why is not None), None)
-        if first is None:
-            return chosen, idle
-        gone, idle[first[0].name] = first
-        rest = [r for r in chosen if r.name != gone.name]
-        again = parallel(partial(_rank_given_others, linear, rest, tests), rest)
-        chosen = sorted(filter(is_certain, again), key=lambda r: -r.log_posterior)
-
-
-def _rank_given_others(linear: LinearModel, chosen: Sequence[Ranked], tests: int, r: Ranked) -> Ranked:
-    """One of the effects chosen, asked beside the others of them."""
-    return rank_one(conditioned_without(linear, chosen, r), r.score.candidate, tests, r.score.variances)
+            rivals = [c for c in candidates if c.name not in exchanged]
+            exchange = find_exchange(linear, rivals, chosen, beyond)
+            if exchange is None:
+                break
+            name, reason, replacement = exchange
+            refused.pop(replacement.name, None)  # it erred beside the one that gives way
+            refused[name] = reason
+            exchanged.add(name)
+            unseen -= {name, replacement.name}
+        remaining = [c for c in remaining if c.name != name]
+        kept = [r for r in chosen if r.name != name]
+        chosen = _add_effects(linear, remaining, kept if replacement is None else [*kept, replacement])
+    if len(unseen) > 1:
+        refused |= dict.fromkeys(unseen, untested_ends_reason(sorted(unseen)))
+    likeliest_first = tuple(sorted(chosen, key=lambda r: -r.log_posterior))
+    return ForwardSelection(likeliest_first, explained, refused)
 
 
 def _add_effects(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Ranked]:
-    """Further effects, one by one, as long as one can be named beside those before."""
+    """Return further effects, one by one, as long as one can be named beside those before."""
     chosen = list(chosen)
-    while len(chosen) < MAX_JOINT_EFFECTS:
-        following = _next_effect(
-            conditioned_on_effects(linear, chosen), [c for c in candidates if c.name not in {r.name for r in chosen}]
-        )
+    while len(chosen) < limits.MAX_JOINT_EFFECTS:
+        others = [c for c in candidates if c.name not in {r.name for r in chosen}]
+        following = _next_effect(conditioned_on_effects(linear, chosen), others)
         if following is None:
             break
         chosen.append(following)
@@ -237,13 +188,13 @@ def _add_effects(linear: LinearModel, candidates: Sequence[Candidate], chosen: S
 
 
 def _next_effect(base: LinearModel, others: Sequence[Candidate]) -> Ranked | None:
-    """The effect that explains most of what is left, if it can be named.
+    """Return the effect that explains most of what is left, if it can be named.
 
     What seems to gain less than half of the best is fitted only where nothing else can be named: beside that one it
     has its turn again.
     """
-    likely = promising(base, others, CANDIDATES_TRIED)
-    near = [c for c, gain in likely if gain >= NEAR_BEST_GAIN * likely[0][1]]
+    likely = promising(base, others, limits.CANDIDATES_TRIED)
+    near = [c for c, gain in likely if gain >= limits.NEAR_BEST_GAIN * likely[0][1]]
     for tried in (near, [c for c, _ in likely if c not in near]):
         # Preselected by what they gain: all that were looked at count as tests.
         ranked, _ = rank(list(parallel(partial(score, base), tried)), tests=len(others))
@@ -256,26 +207,156 @@ def _next_effect(base: LinearModel, others: Sequence[Candidate]) -> Ranked | Non
 def _eliminate_backward(
     linear: LinearModel, chosen: Sequence[Ranked], tests: int
 ) -> tuple[list[Ranked], dict[str, Extrapolation | None]]:
-    """The effects that can still be named beside all the others, and what each does beyond the measured poses."""
+    """Return the effects that can still be named beside all the others, and what each does beyond the measured
+    poses."""
+    start = conditioned_on_effects(linear, chosen).null.variances if not regime_of(linear).prior else None
 
-    near = conditioned_on_effects(linear, chosen).null.variances if not regime_of(linear).prior else None
-
-    def extrapolated(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
-        beside = conditioned_without(linear, among, r, near)
-        own = rank_one(beside, r.score.candidate, tests, near)
-        return own, extrapolate(beside, own.score) if is_certain(own) else None
+    def beside_others(r: Ranked, among: Sequence[Ranked] = chosen) -> tuple[Ranked, Extrapolation | None]:
+        beside = conditioned_without(linear, among, r, start)
+        again = rank_one(beside, r.score.candidate, tests, start)
+        return again, extrapolate(beside, again.score) if is_certain(again) else None
 
     # Mostly all hold their place: then none was asked beside one that goes, and the order is of no account.
-    kept, beyond, as_asked = list(chosen), dict[str, Extrapolation | None](), True
-    for r, at_once in zip(chosen, list(parallel(extrapolated, chosen)), strict=True):
-        own, found = at_once if as_asked else extrapolated(r, kept)
+    kept = list(chosen)
+    beyond = dict[str, Extrapolation | None]()
+    as_asked = True
+    for r, at_once in zip(chosen, list(parallel(beside_others, chosen)), strict=True):
+        again, at_ends = at_once if as_asked else beside_others(r, kept)
         others = [other for other in kept if other.name != r.name]
-        if not (is_certain(own) and own.score.form is r.score.form):
+        if not (is_certain(again) and again.score.form is r.score.form):
             beyond, as_asked = {}, False  # what was asked of the others was asked beside this one
-        kept = [*others, own] if is_certain(own) else others
-        if is_certain(own):
-            beyond[own.name] = found
+        kept = [*others, again] if is_certain(again) else others
+        if is_certain(again):
+            beyond[again.name] = at_ends
     for r in kept:
         if r.name not in beyond:
-            beyond[r.name] = extrapolate(conditioned_without(linear, kept, r, near), r.score)
+            beyond[r.name] = extrapolate(conditioned_without(linear, kept, r, start), r.score)
     return kept, {r.name: beyond[r.name] for r in kept}
+
+
+def find_exchange(
+    linear: LinearModel,
+    candidates: Sequence[Candidate],
+    chosen: Sequence[Ranked],
+    beyond: Mapping[str, Extrapolation | None],
+) -> tuple[str, str, Ranked] | None:
+    """Return the first effect that has to give way, why, and what takes its place; None if all may stay.
+
+    Args:
+        candidates: that may take a place.
+        chosen: effects beside each other.
+        beyond: what each of them does at the ends, beside the others.
+    """
+    names = {r.name for r in chosen}
+    for r in chosen:
+        at_ends = beyond[r.name]
+        if at_ends is None or not at_ends.errs_somewhere:
+            continue
+        rest = conditioned_without(linear, chosen, r)
+        for rival in _better_extrapolating_effects(rest, [c for c in candidates if c.name not in names], at_ends):
+            beside = conditioned_on_effects(rest, [rival])
+            left = extrapolate(beside, rank_one(beside, r.score.candidate, len(candidates)).score)
+            if left is not None and not left.helps:
+                return r.name, f"{left.rejection_reason(r.name)}; this beside {rival.name}", rival
+    return None
+
+
+def _better_extrapolating_effects(
+    rest: LinearModel, candidates: Sequence[Candidate], at_ends: Extrapolation
+) -> list[Ranked]:
+    """Return effects that are likelier to hold at a further end than one that was found, the likeliest first."""
+    better = list[tuple[float, Ranked]]()
+    for candidate, _ in promising(rest, candidates, limits.CANDIDATES_TRIED):
+        other = rank_one(rest, candidate, len(candidates))
+        its_ends = extrapolate(rest, other.score) if is_certain(other) else None
+        if its_ends is not None and its_ends.helps and its_ends.likely > at_ends.likely:
+            better.append((its_ends.likely, other))
+    return [other for _, other in sorted(better, key=lambda item: -item[0])]
+
+
+def exchanged_set(linear: LinearModel, candidates: Sequence[Candidate], chosen: Sequence[Ranked]) -> list[Candidate]:
+    """Return effects that together are 20 to 1 likelier than those chosen, some of which they do without; else none.
+
+    Args:
+        candidates: that may take a place; of those with a time constant or an event only the chosen count.
+    """
+    if not chosen:
+        return []
+    chosen_forms = {r.name: r.score.form for r in chosen}
+    free = [c for c in candidates if c.name in chosen_forms or not c.forms[0].term.gridded.any()]
+    # Sums of all candidates at once, at the scatter that is left beside the chosen effects.
+    scatter = conditioned_on_effects(linear, chosen).null.variances
+    at = replace(linear, null=at_variances(linear.mixed, scatter))
+    forms = [chosen_forms.get(c.name) or c.forms[0] for c in free]
+    white = [at.residual(form.columns) * form.sizes for form in forms]
+    ends = np.cumsum([0, *(columns.shape[1] for columns in white)])
+    places = [np.arange(begin, end) for begin, end in pairwise(ends)]
+    stacked = np.hstack(white)
+    information = stacked.T @ stacked
+    vector = stacked.T @ at.white_residual
+
+    def log_posterior(numbers: Sequence[int]) -> float:
+        """Return that of some of the free candidates together, not yet normalised."""
+        index = np.concatenate([np.zeros(0, np.int64), *(places[k] for k in numbers)])
+        evidence = log_evidence_at_scales(information[np.ix_(index, index)], vector[index], PLAUSIBLE)
+        return log_mixture(evidence, PLAUSIBLE) + len(numbers) * float(np.log(limits.PRIOR_PHYSICAL / len(free)))
+
+    now = [k for k, c in enumerate(free) if c.name in chosen_forms]
+    others = [k for k in range(len(free)) if k not in now]
+    best = list[int]()
+    least = log_posterior(now) + limits.ODDS
+    for taken in (out for count in range(1, _TAKEN_OUT + 1) for out in combinations(now, count)):
+        rest = [k for k in now if k not in taken]
+        numbers = select_forward(log_posterior, others, rest, limits.MAX_JOINT_EFFECTS)
+        numbers = eliminate_backward(log_posterior, numbers)
+        if (value := log_posterior(numbers)) > least:
+            best, least = numbers, value
+    return [free[k] for k in best]
+
+
+def is_better_set(linear: LinearModel, new: Sequence[Ranked], old: Sequence[Ranked]) -> bool:
+    """Return whether effects are 20 to 1 likelier than others, all variances fitted, and predict views left out
+    better."""
+    likelier = _log_posterior(linear, new) > _log_posterior(linear, old) + limits.ODDS
+    shares = [group_share(linear, [r.score for r in effects])[0] for effects in (new, old)]
+    return bool(likelier and shares[0] < shares[1])
+
+
+def _log_posterior(linear: LinearModel, chosen: Sequence[Ranked]) -> float:
+    """Return the log posterior of effects together, not yet normalised."""
+    if not chosen:
+        return 0.0
+    G = linear.in_blocks(np.hstack([r.score.form.columns for r in chosen]))
+    start = conditioned_on_effects(linear, chosen).null.variances
+    fit = fit_variances(linear.mixed, G, np.concatenate([r.score.sizes for r in chosen]), start)
+    prior = sum(float(np.log(limits.PRIOR_PHYSICAL / r.tests)) for r in chosen)
+    return 0.5 * (linear.null.deviance - fit.deviance) + prior
+
+
+def keep_worth_adding(linear: LinearModel, chosen: Sequence[Ranked], tests: int) -> tuple[list[Ranked], dict[str, str]]:
+    """Return effects beside each other that all help on views left out; and what is idle, the weakest first.
+
+    What would be dropped again as soon as it is in the model is neither named nor added: of hundreds of poses an effect
+    is seen that moves hardly anything, and that anything else may do as well.
+
+    Args:
+        tests: candidates among which they were chosen.
+    """
+
+    def beside(others: Sequence[Ranked], r: Ranked) -> Ranked:
+        without = conditioned_without(linear, others, r)
+        return rank_one(without, r.score.candidate, tests, r.score.variances)
+
+    chosen = list(chosen)
+    idle = dict[str, str]()
+    while True:
+        objections = (
+            (r, cross_validate(conditioned_without(linear, chosen, r), r.score).rejection_reason(r.name))
+            for r in reversed(chosen)
+        )
+        first = next(((r, reason) for r, reason in objections if reason is not None), None)
+        if first is None:
+            return chosen, idle
+        idle[first[0].name] = first[1]
+        rest = [r for r in chosen if r.name != first[0].name]
+        chosen = sorted(filter(is_certain, parallel(partial(beside, rest), rest)), key=lambda r: -r.log_posterior)

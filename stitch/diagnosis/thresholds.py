@@ -1,8 +1,11 @@
-"""Every threshold that decides what a diagnosis says: its meaning, its unit and where its value comes from."""
+"""Every threshold that decides what a diagnosis says: its meaning, its unit and where its value comes from.
+
+In this order: alarm and names; scores of candidates; views left out, halves of the views, ends of joint ranges;
+effects in a model, added, kept or dropped; what looks alike, and what separates it; unmodelled effects of joints; those
+in time; formulas (`stitch explain`).
+"""
 
 import numpy as np
-
-# Alarm and names.
 
 # Family-wise error over all candidates (5 %, custom), shared between names and the alarm without one.
 ALPHA = 0.05
@@ -21,15 +24,14 @@ UNDETECTABLE_SQUARE = 1e6
 # (ISO 9283, 0.02 to 0.1 mm); larger is something systematic.
 IMPLAUSIBLE = (2.5e-4, 0.12)
 
-# Scores of candidates.
-
 # A candidate is seen if one of its parameters, at its plausible size, is at least this many sigmas (custom).
 SEEN_SIGMAS = 0.5
 # A prior of this many plausible sizes is as good as none, and keeps the unseen finite.
 FREE_SIZES = 30.0
 # Forms so many nats behind the best one of their candidate add less than a per cent to it (e^-6 = 0.0025).
 NEGLIGIBLE_NATS = 6.0
-# Numbers in the channel beyond which variances are the same under both priors of sizes, and a fit takes half a second.
+# Numbers of reduced observations beyond which variances are the same under both priors of sizes, and a fit takes half
+# a second.
 LONG = 250
 # Nats: forms that lose so many under the null's variances do not gain under their own either; under several variances,
 # of which one is nearly that of the maximum, they gain half a nat at the most.
@@ -43,8 +45,6 @@ MANY_POSES = 1000
 MAX_JOINT_EFFECTS, CANDIDATES_TRIED = 6, 5
 # Share of the largest gain below which a candidate is fitted only where nothing else can be named (time).
 NEAR_BEST_GAIN = 0.5
-
-# Views left out, halves of the views, ends of joint ranges.
 
 # Smallest share of an effect that must remain when one view is left out.
 MIN_STEADINESS = 0.25
@@ -61,14 +61,10 @@ END_PRIOR_FREEDOM, END_PRIOR_SIZES = 4.0, 10.0
 # Candidates whose prediction on left-out views is computed; the others explain nothing.
 CROSS_VALIDATED_CANDIDATES = 8
 
-# Effects in a model: added, kept or dropped.
-
 # New matches alone change a held-out residual by a few per cent: it rises if it does by more, and falls if below.
 HELDOUT_RISE, HELDOUT_FALL = 1.05, 0.995
 # An effect so many sigmas from zero is there although no residual shows it; below the second it can be dropped.
 CLEAR_SIGMAS, FAINT_SIGMAS = 4.0, 2.0
-
-# What looks alike, and what separates it.
 
 # Effects whose patterns correlate more than this are aliases in these views; beyond the second they are listed as such.
 ALIAS_CORRELATION, LISTED_ALIAS_CORRELATION = 0.9, 0.7
@@ -79,20 +75,16 @@ WORTHWHILE_GAIN = 1e-3
 # p-value below which what is left is said to follow a covariate (custom), and bins that show the shape.
 CLEAR_DEPENDENCE, DEPENDENCE_BINS = 0.01, 5
 
-# Errors of joints without a name.
-
 # Columns of a process at the most, and the share of its largest variance that the last of them has at least.
 PROCESS_COLUMNS, PROCESS_LEAST_VARIANCE = 96, 1e-3
 # Views whose covariance is drawn apart; beyond so many the others follow these (time: cubic).
 PROCESS_KNOTS = 400
-# Laws whose size is sought with all variances, the likeliest (time).
-JOINT_LAWS_FITTED = 12
-# Multiples of the usual variance at which the search for a law's size begins.
-LAW_VARIANCES = (0.01, 1.0, 30.0)
-# Share of what a joint does by its law that a curve must carry to say where in the range it errs.
+# Unmodelled joint effects whose size is sought with all variances, the likeliest (time).
+JOINT_EFFECTS_FITTED = 12
+# Multiples of the usual variance at which the search for an unmodelled effect's size begins.
+UNMODELLED_VARIANCES = (0.01, 1.0, 30.0)
+# Share of what a joint does so that a curve must carry to say where in the range it errs.
 CURVE_LEAST_SHARE = 0.1
-
-# Errors in time without a name.
 
 # Whole swings that a session must have seen, and swings per step: faster ones look like slower ones (Nyquist: 0.5).
 LEAST_SWINGS, FASTEST_SWING = 2.0, 0.45
@@ -101,14 +93,12 @@ LEAST_SWINGS, FASTEST_SWING = 2.0, 0.45
 FREQUENCY_STEP, MOST_FREQUENCIES = 0.5, 150
 # Standard deviation of the shortest stretch in steps, and of the longest as a share of the session; views in each.
 SHORTEST_STRETCH, LONGEST_STRETCH, STRETCH_VIEWS = 1.5, 0.2, 2
-# Courses whose size is sought with all variances, the likeliest (time); without a prior of pose errors the second.
-TIME_LAWS_FITTED, COURSES_FITTED = 3, 2
+# Trends whose size is sought with all variances, the likeliest (time); without a prior of pose errors the second.
+TIME_EFFECTS_FITTED, TRENDS_FITTED = 3, 2
 # Multiples of its own size that a process may have beside an effect.
-COURSE_SIZES = (1.0, 0.3, 0.1, 0.01)
+TREND_SIZES = (1.0, 0.3, 0.1, 0.01)
 # Joints for which a second one is sought that theirs may follow (time).
 PAIRED_JOINTS = 2
-
-# Formulas (`stitch explain`).
 
 # p-value of "no such formula" in the half of the views that took no part in finding it: below, it holds (custom).
 CONFIRMED_FORMULA = 0.01

@@ -1,4 +1,17 @@
-"""What a candidate would leave, in the fit and on views left out, in the linear approximation."""
+"""What a candidate would leave on views that took no part in finding it, in the linear approximation.
+
+`cross_validate` leaves out folds of neighbours and single views. `extrapolate` leaves out ends of joints' ranges: a
+wrong effect may imitate among the measured poses what is not known, and err beyond them; left-out neighbours in time or
+pose lie among the others and do not show it. The ends judge together. Where more than one thing is missing, a right
+effect takes away what hid another at some end and makes that one a little worse; an imitation helps at many ends and is
+far off at others. So a further end must be likely to become better, the ends being samples of it.
+
+`validate_in_halves` finds an effect in one half of the views and judges it in the other. The views are halved in the
+order of time, by the region of their poses, and alternately. In each half the form of the effect is chosen anew and its
+sizes are fitted; the other half says how much likelier its numbers are with that effect than without (partial Bayes
+factor; Berger & Pericchi 1996, J. Am. Stat. Assoc. 91:109). What imitates something else has another size or sign in
+each half. The pose errors that remain with the effect stand beside it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,17 +28,161 @@ from stitch.numerics.least_squares import mean_square_share
 from stitch.numerics.parameter_selection import log_evidence
 from stitch.observations.linear_model import CoefficientPrior, LinearModel, LinearTrial
 
-# Whether a candidate helps where nothing was measured: at ends of joints' ranges that were left out.
-#
-# A wrong effect may imitate among the measured poses what is not known, and err beyond them; left-out neighbours in
-# time or pose lie among the others and do not show it. The ends judge together. Where more than one thing is missing, a
-# right effect takes away what hid another at some end and makes that one a little worse; an imitation helps at many
-# ends and is far off at others. So a further end must be likely to become better, the ends being samples of it.
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Mean square of what remains over that of the present model."""
+
+    inside: float  # fitted on all views
+    heldout: float  # each fold judged by a fit without it
+    poses: float  # the same for the free-network poses, in units of their scatter, without the sensor's noise
+    poses_sigma: float  # spread of `poses` over folds; each view is in two of them: some 0.6 standard errors
+    steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
+    heldout_sigma: float = 0.0  # standard error of `heldout`, folds as samples
+    # Per fold what it keeps with the candidate when it is left out, of its points and of its poses.
+    fold_squares: tuple[tuple[float, ...], ...] = ()
+
+    def as_good_as(self, other: "CrossValidation") -> bool:
+        """Return whether points and poses of views left out are predicted as well as by another candidate, within the
+        uncertainty of the ratio."""
+        return all(share <= 1 + sigma for share, sigma in self._shares_of(other))
+
+    def better_than(self, other: "CrossValidation") -> bool:
+        """Return whether another candidate predicts both points and poses of views left out worse, beyond the
+        uncertainty."""
+        return all(share < 1 - sigma for share, sigma in self._shares_of(other))
+
+    def _shares_of(self, other: "CrossValidation") -> list[tuple[float, float]]:
+        """Return what is left of what another candidate leaves, with its uncertainty: of points and of poses."""
+        pairs = zip(self.fold_squares, other.fold_squares, strict=True)
+        return [mean_square_share(np.array(squares), np.array(of_other)) for squares, of_other in pairs]
+
+    @property
+    def helps(self) -> bool:
+        """True if views left out are predicted better, by more than folds differ."""
+        return self.poses <= 1 - self.poses_sigma
+
+    def fit_rejection_reason(self, name: str, share: float, *, zero: bool) -> str | None:
+        """Say why an effect that was fitted does not stay, if it does not: what views left out say beyond uncertainty.
+
+        Where the error of their points does not tell, that of their poses does.
+
+        Args:
+            share: of the mean square error on views left out that the fit with the effect leaves.
+            zero: no parameter of the fitted effect differs from zero.
+        """
+        left = f"it leaves {share:.2f} ± {self.heldout_sigma:.2f} of the mean square error on views left out"
+        if share > 1 + self.heldout_sigma:
+            return f"with {name} the error on views left out rose: {left}"
+        if share >= 1 - self.heldout_sigma and (zero or not self.helps):
+            return f"{name} does not help on views left out beyond its uncertainty: {left}"
+        return None
+
+    def rejection_reason(self, name: str) -> str | None:
+        """Say why an effect should not be in a model of many poses, if it should not: these show even what hardly
+        helps."""
+        if self.helps and self.poses <= limits.MAX_REMAINING_SHARE:
+            return None
+        share = f"{self.poses:.3f} ± {self.poses_sigma:.3f}"
+        return f"{name} hardly helps on views left out: it leaves {share} of the mean square error"
+
+
+def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
+    """Return what the best form of a candidate leaves, added to the model in the linear approximation.
+
+    What would be left is told of the fit that `add` makes, in which poses scatter independently; whether views left out
+    are predicted, beside everything else that poses may err by.
+    """
+    fitted = linear.restricted(())
+    beside = scored.base_model or linear
+    trial, squares, scatter = _squares_by_fold(beside, scored)
+    whole, alone = trial, scatter
+    if beside is not fitted:
+        whole, squares, alone = _squares_by_fold(fitted, score(fitted, scored.candidate))
+    heldout, heldout_sigma = mean_square_share(*squares)
+    poses, poses_sigma = mean_square_share(*scatter)
+    present = fitted.baseline_trial
+    return CrossValidation(
+        inside=float(whole.squares(whole.solve()).sum() / present.squares(present.solve()).sum()),
+        heldout=heldout,
+        poses=poses,
+        poses_sigma=poses_sigma,
+        steadiness=_steadiness(beside, trial, scored.form.response),
+        heldout_sigma=heldout_sigma,
+        fold_squares=tuple(tuple(map(float, folds[0])) for folds in (squares, alone)),
+    )
+
+
+def group_helps(share: float, sigma: float) -> bool:
+    """Return whether a group leaves less on views left out, by more than folds differ."""
+    return share <= 1 - sigma
+
+
+def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, float]:
+    """Return the mean square error of left-out poses with effects that cannot be told apart, all of them together, over
+    that of the present model.
+
+    Returns:
+        The share, and its standard error with folds as samples. Effects of points count by what they do to poses.
+    """
+    a = linear.design.shape[1]
+    precision = np.concatenate([np.zeros(a), *(_precision_of_sizes(linear, scored)[a:] for scored in group)])
+    trial = linear.trial(np.hstack([linear.design, *(scored.form.response for scored in group)]))
+    priors = [CoefficientPrior(p, np.zeros(len(p))) for p in (precision, np.zeros(a))]
+    folds = linear.observation.folds()
+    scatter = [[trial.scatter(fold, x) for x in trial.solve_each(priors, fold)] for fold in folds]
+    return mean_square_share(*np.array(scatter).reshape(-1, 2).T)
+
+
+def _squares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, Array, Array]:
+    """Return the fit with a candidate; (2, G) squares of each fold that fits without it leave, with the candidate and
+    without; and (2, G) scatter of its poses.
+
+    Views that carry most of an effect leave little to predict it from where they are left out. So without them the
+    effect is believed to be as large as it was found with all views, of either sign, and no larger: what little is
+    left to see does not count for more than that.
+    """
+    points = scored.candidate.points
+    sums = None if points is None else points.select(scored.form.keep)
+    trial = linear.trial(np.hstack([linear.design, scored.form.response]), sums)
+    # Nothing is believed of the coefficients of the model as it is.
+    precisions = (_precision_of_sizes(linear, scored), np.zeros(linear.design.shape[1]))
+    priors = [CoefficientPrior(precision, np.zeros(len(precision))) for precision in precisions]
+    squares, scatter = [], []
+    for fold in linear.observation.folds():
+        affected = linear.observation.affected_squares(fold)
+        without = trial.solve_each(priors, fold)
+        squares.append([trial.squares(x, affected).sum() for x in without])
+        scatter.append([trial.scatter(fold, x) for x in without])
+    return trial, np.array(squares).reshape(-1, 2).T, np.array(scatter).reshape(-1, 2).T
+
+
+def _precision_of_sizes(linear: LinearModel, scored: Score) -> Array:
+    """Return (a + k,) of model and candidate in fits without some views: the candidate as large as it was found."""
+    size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
+    size = np.maximum(size, limits.NEGLIGIBLE_SIZE * scored.form.sizes)
+    return np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
+
+
+def _steadiness(linear: LinearModel, trial: LinearTrial, response: Array) -> float:
+    """Return the smallest share of an effect that remains without one view.
+
+    A combination of parameters that one view carries alone vanishes without it.
+    """
+    whole = trial.solve()
+    size = response.shape[1]
+    theta = whole[-size:]
+    if not theta.any():
+        return 0.0
+    white = linear.residual(linear.reduce(response))
+    along = white.T @ (white @ theta)
+    strength = max(float(along @ theta), 1e-300)
+    return min(float(along @ trial.solve(np.array([v]))[-size:]) / strength for v in trial.influential_views(whole))
 
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """What a candidate leaves at the ends, each predicted from all other views."""
+    """What a candidate leaves at the ends of joints' ranges, each predicted from all other views."""
 
     share: float  # mean square distance over that of the present model, all ends together
     sigma: float  # standard error of `share`, ends as samples
@@ -68,17 +225,18 @@ def untested_ends_reason(names: Sequence[str]) -> str:
 
 
 def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
-    """The best form of a candidate at the ends; None where the views are too few to leave one out."""
+    """Return the best form of a candidate at the ends; None where the views are too few to leave one out."""
     ends = linear.observation.joint_ends(linear.measurement.views.joints)
     if not ends:
         return None
-    a, trial = linear.design.shape[1], linear.trial(_model_and_candidate_columns(linear, scored))
+    a = linear.design.shape[1]
+    trial = linear.trial(np.hstack([linear.design, scored.form.response]))
     prior = _student_prior(linear, trial, np.append(linear.sizes, scored.sizes))
     priors = prior, CoefficientPrior(prior.precision[:a], prior.mean[:a])
     squares = [[trial.squares(x, end.views) for x in trial.solve_each(priors, end.views)] for end in ends]
     shares = [mean_square_share(with_it, without) for with_it, without in squares]
     worst = max(range(len(ends)), key=lambda k: (shares[k][0] - 1) / max(shares[k][1], 1e-300))
-    total = mean_square_share(*np.array([[own.sum() for own in row] for row in squares]).T)
+    total = mean_square_share(*np.array([[end.sum() for end in row] for row in squares]).T)
     logs = np.log([max(share, 1e-300) for share, _ in shares])
     spread = np.std(logs, ddof=1) * np.sqrt(1 + 1 / len(logs)) if len(logs) > 1 else 0.0
     likely = normal_tail(float(np.mean(logs) / max(spread, 1e-12)))
@@ -86,177 +244,17 @@ def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
 
 
 def _student_prior(linear: LinearModel, trial: LinearTrial, sizes: Array) -> CoefficientPrior:
-    """A prior of the parameters' plausible sizes with the tails of Student's t, for fits that lack an end.
+    """Return a prior of the parameters' plausible sizes with the tails of Student's t, for fits that lack an end.
 
     What the other views hardly see would otherwise be anything, and the end would judge that instead of the effect. The
     normal prior that stands for t with ν degrees of freedom at an estimate θ has the variance (ν·s² + θ²)/(ν + 1)
     (Lange, Little & Taylor 1989, J. Am. Stat. Assoc. 84:881).
     """
     middle = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
-    free = 1 / (limits.END_PRIOR_SIZES * sizes) ** 2
-    found = trial.solve_each([CoefficientPrior(free, middle)])[0] - middle
-    known = np.where(np.isfinite(sizes), found, 0.0)
-    return CoefficientPrior((limits.END_PRIOR_FREEDOM + 1) / (limits.END_PRIOR_FREEDOM * sizes**2 + known**2), middle)
-
-
-@dataclass(frozen=True)
-class CrossValidation:
-    """Mean square of what remains over that of the present model."""
-
-    inside: float  # fitted on all views
-    heldout: float  # each fold judged by a fit without it
-    poses: float  # the same for where the views were freed to, in units of their scatter, without the sensor's noise
-    poses_sigma: float  # spread of `poses` over folds; each view is in two of them: some 0.6 standard errors
-    steadiness: float  # smallest share of the amplitude that remains when one view is left out; < 0: sign changes
-    heldout_sigma: float = 0.0  # standard error of `heldout`, folds as samples
-    # Per fold what it keeps with the candidate when it is left out, of its points and of its poses.
-    fold_squares: tuple[tuple[float, ...], ...] = ()
-
-    def as_good_as(self, other: "CrossValidation") -> bool:
-        """True if points and poses of views left out are predicted as well as by another candidate, within the
-        uncertainty of the ratio."""
-        pairs = zip(self.fold_squares, other.fold_squares, strict=True)
-        shares = [mean_square_share(np.array(own), np.array(theirs)) for own, theirs in pairs]
-        return all(share <= 1 + sigma for share, sigma in shares)
-
-    def better_than(self, other: "CrossValidation") -> bool:
-        """True if another candidate predicts both points and poses of views left out worse, beyond the uncertainty."""
-        pairs = zip(self.fold_squares, other.fold_squares, strict=True)
-        shares = [mean_square_share(np.array(own), np.array(theirs)) for own, theirs in pairs]
-        return all(share < 1 - sigma for share, sigma in shares)
-
-    @property
-    def helps(self) -> bool:
-        """True if views left out are predicted better, by more than folds differ."""
-        return self.poses <= 1 - self.poses_sigma
-
-    def fit_rejection_reason(self, name: str, share: float, *, zero: bool) -> str | None:
-        """Say why an effect that was fitted does not stay, if it does not: what views left out say beyond uncertainty.
-
-        Where the error of their points does not tell, that of their poses does.
-
-        Args:
-            share: of the mean square error on views left out that the fit with the effect leaves.
-            zero: no parameter of the fitted effect differs from zero.
-        """
-        told = f"it leaves {share:.2f} ± {self.heldout_sigma:.2f} of the mean square error on views left out"
-        if share > 1 + self.heldout_sigma:
-            return f"with {name} the error on views left out rose: {told}"
-        if share >= 1 - self.heldout_sigma and (zero or not self.helps):
-            return f"{name} does not help on views left out beyond its uncertainty: {told}"
-        return None
-
-    def rejection_reason(self, name: str) -> str | None:
-        """Why an effect should not be in a model of many poses, if it should not: these show even what hardly helps."""
-        if self.helps and self.poses <= limits.MAX_REMAINING_SHARE:
-            return None
-        share = f"{self.poses:.3f} ± {self.poses_sigma:.3f}"
-        return f"{name} hardly helps on views left out: it leaves {share} of the mean square error"
-
-
-def cross_validate(linear: LinearModel, scored: Score) -> CrossValidation:
-    """Add the best form of a candidate to the model, in the linear approximation.
-
-    What would be left is told of the fit that `add` makes, in which poses scatter independently; whether views left out
-    are predicted, beside everything else that poses may err by.
-    """
-    fitted = linear.restricted(())
-    beside = scored.base_model or linear
-    trial, squares, scatter = _squares_by_fold(beside, scored)
-    whole, alone = trial, scatter
-    if beside is not fitted:
-        whole, squares, alone = _squares_by_fold(fitted, score(fitted, scored.candidate))
-    (heldout, heldout_sigma), (poses, poses_sigma) = mean_square_share(*squares), mean_square_share(*scatter)
-    present = fitted.baseline_trial
-    return CrossValidation(
-        inside=float(whole.squares(whole.solve()).sum() / present.squares(present.solve()).sum()),
-        heldout=heldout,
-        poses=poses,
-        poses_sigma=poses_sigma,
-        steadiness=_steadiness(beside, trial, _model_and_candidate_columns(beside, scored), trial.solve()),
-        heldout_sigma=heldout_sigma,
-        fold_squares=tuple(tuple(map(float, own[0])) for own in (squares, alone)),
-    )
-
-
-def _model_and_candidate_columns(linear: LinearModel, scored: Score) -> Array:
-    """(·, a + k) response to the model and the candidate."""
-    return np.hstack([linear.design, scored.form.response])
-
-
-def _squares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, Array, Array]:
-    """The fit with a candidate; (2, G) squares of each fold that fits without it leave, with the candidate and without;
-    and (2, G) scatter of its poses."""
-    X, points = _model_and_candidate_columns(linear, scored), scored.candidate.points
-    own = None if points is None else points.select(scored.form.keep)
-    trial, priors = linear.trial(X, own), (prior_of_sizes(linear, scored), _free_model(linear))
-    squares, scatter = [], []
-    for fold in linear.observation.folds():
-        touched, without = linear.observation.affected_squares(fold), trial.solve_each(priors, fold)
-        squares.append([trial.squares(x, touched).sum() for x in without])
-        scatter.append([trial.scatter(fold, x) for x in without])
-    return trial, np.array(squares).reshape(-1, 2).T, np.array(scatter).reshape(-1, 2).T
-
-
-def _free_model(linear: LinearModel) -> CoefficientPrior:
-    """Nothing believed of the coefficients of the model as it is."""
-    return CoefficientPrior(np.zeros(linear.design.shape[1]), np.zeros(linear.design.shape[1]))
-
-
-def prior_of_sizes(linear: LinearModel, scored: Score) -> CoefficientPrior:
-    """Prior for model and candidate in fits without some views.
-
-    Views that carry most of an effect leave little to predict it from where they are left out. So without them the
-    effect is believed to be as large as it was found with all views, of either sign, and no larger: what little is
-    left to see does not count for more than that.
-    """
-    size = np.hypot(scored.values, np.nan_to_num(scored.sigmas))
-    size = np.maximum(size, limits.NEGLIGIBLE_SIZE * scored.form.sizes)
-    precision = np.append(np.zeros(linear.design.shape[1]), 1 / size**2)
-    return CoefficientPrior(precision, np.zeros(len(precision)))
-
-
-def _steadiness(linear: LinearModel, trial: LinearTrial, X: Array, whole: Array) -> float:
-    """A combination of parameters that one view carries alone vanishes without it."""
-    size = X.shape[1] - linear.design.shape[1]
-    theta = whole[-size:]
-    if not theta.any():
-        return 0.0
-    white = linear.residual(linear.reduce(X[:, -size:]))
-    along = white.T @ (white @ theta)
-    strength = max(float(along @ theta), 1e-300)
-    return min(float(along @ trial.solve(np.array([v]))[-size:]) / strength for v in trial.influential_views(whole))
-
-
-# Whether effects that cannot be told apart predict views left out, all of them together.
-
-
-def group_helps(share: float, sigma: float) -> bool:
-    """True if a group leaves less on views left out, by more than folds differ."""
-    return share <= 1 - sigma
-
-
-def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, float]:
-    """Return the mean square error of left-out poses with the group over that of the present model.
-
-    Returns:
-        The share, and its standard error with folds as samples. Effects of points count by what they do to poses.
-    """
-    a = linear.design.shape[1]
-    precision = np.concatenate([np.zeros(a), *(prior_of_sizes(linear, own).precision[a:] for own in group)])
-    prior = CoefficientPrior(precision, np.zeros(len(precision)))
-    trial = linear.trial(np.hstack([linear.design, *(own.form.response for own in group)]))
-    priors, folds = (prior, _free_model(linear)), linear.observation.folds()
-    off = [[trial.scatter(fold, x) for x in trial.solve_each(priors, fold)] for fold in folds]
-    return mean_square_share(*np.array(off).reshape(-1, 2).T)
-
-
-# Whether an effect holds in halves of the views: found in one, judged in the other, which took no part in choosing it.
-#
-# The views are halved in the order of time, by the region of their poses, and alternately. In each half the form of the
-# effect is chosen anew and its sizes are fitted; the other half says how much likelier its numbers are with that effect
-# than without (partial Bayes factor; Berger & Pericchi 1996, J. Am. Stat. Assoc. 91:109). What imitates something else
-# has another size or sign in each half. The pose errors that remain with the effect stand beside it.
+    free = CoefficientPrior(1 / (limits.END_PRIOR_SIZES * sizes) ** 2, middle)
+    estimate = np.where(np.isfinite(sizes), trial.solve_each([free])[0] - middle, 0.0)
+    freedom = limits.END_PRIOR_FREEDOM
+    return CoefficientPrior((freedom + 1) / (freedom * sizes**2 + estimate**2), middle)
 
 
 @dataclass(frozen=True)
@@ -285,28 +283,35 @@ class _HalfEvidence:
     vector: Array  # (p,)
 
     def fitted(self, prior: Array) -> tuple[Array, Array]:
-        """Mean (p,) and precision (p, p) with a prior (p,) around zero."""
+        """Return mean (p,) and precision (p, p) with a prior (p,) around zero."""
         precision = self.information + np.diag(prior**-2)
-        return np.asarray(np.linalg.solve(precision, self.vector), float), precision
+        mean = np.asarray(np.linalg.solve(precision, self.vector), float)
+        return mean, precision
 
     def log_evidence(self, precision: Array, mean: Array | None = None) -> float:
-        """Log of the likelihood over that of no effect, averaged over a normal prior."""
+        """Return the log of the likelihood over that of no effect, averaged over a normal prior."""
         return float(log_evidence(self.information, self.vector, precision, mean))
 
 
 def validate_in_halves(scored: Score) -> Halves | None:
-    """The best form of a candidate, and all its forms, in halves of the views; None where pose errors have no prior."""
+    """Return the best form of a candidate, and all its forms, in halves of the views; None where pose errors have no
+    prior."""
     base = scored.base_model
     if base is None or base.observation.numbers_per_view is not None:
         return None
+    sizes = scored.form.sizes
     gains, p_values, shares = [], [], []
     ways = halves_of(base.observation.T_base_flange, base.observation.reach)
     for way in ways:
-        bases = [base.explained_without(other) for other in reversed(way)]
-        gains.append(sum(_predictive_factor(scored, base, *pair) for pair in (bases, bases[::-1])))
-        a, b = (_half_evidence(base, U, scored.form) for U in bases)
-        p_values.append(_size_consistency(a, b, scored.form.sizes))
-        shares.append(_least_confirmed_share(a, b, scored.form.sizes))
+        explained = [base.explained_without(other) for other in reversed(way)]
+        gains.append(sum(_predictive_factor(scored, base, *pair) for pair in (explained, explained[::-1])))
+        first, second = (_half_evidence(base, U, scored.form) for U in explained)
+        p_values.append(_size_consistency(first, second, sizes))
+        # The smaller share that a half finds of what both find together, along its direction.
+        information = first.information + second.information
+        both = _HalfEvidence(information, first.vector + second.vector).fitted(sizes)[0]
+        along = information @ both / max(float(both @ information @ both), 1e-300)
+        shares.append(min(float(along @ half.fitted(sizes)[0]) for half in (first, second)))
     return Halves(float(np.mean(gains)), min(1.0, len(ways) * min(p_values)), min(shares))
 
 
@@ -317,31 +322,23 @@ def _half_evidence(base: LinearModel, explained: Array, form: Form) -> _HalfEvid
 
 
 def _predictive_factor(scored: Score, base: LinearModel, chosen_in: Array, tested_in: Array) -> float:
-    """Log Bayes factor in one half of the form that the other half prefers, at the sizes found there; before any view
-    these are of the scale that all views together prefer."""
+    """Return the log Bayes factor in one half of the form that the other half prefers, at the sizes found there; before
+    any view these are of the scale that all views together prefer."""
     forms = scored.candidate.forms
-    seen, priors = (
-        [_half_evidence(base, chosen_in, form) for form in forms],
-        [scored.scale * form.sizes for form in forms],
-    )
-    best = max(range(len(forms)), key=lambda i: seen[i].log_evidence(np.diag(priors[i] ** -2)))
-    mean, precision = seen[best].fitted(priors[best])
+    evidence = [_half_evidence(base, chosen_in, form) for form in forms]
+    priors = [scored.scale * form.sizes for form in forms]
+    best = max(range(len(forms)), key=lambda i: evidence[i].log_evidence(np.diag(priors[i] ** -2)))
+    mean, precision = evidence[best].fitted(priors[best])
     return _half_evidence(base, tested_in, forms[best]).log_evidence(precision, mean)
 
 
-def _size_consistency(a: _HalfEvidence, b: _HalfEvidence, sizes: Array) -> float:
-    """p-value of a χ² test of the difference, over the combinations that both halves see."""
-    (mean_a, one), (mean_b, other) = (s.fitted(limits.FREE_SIZES * sizes) for s in (a, b))
-    d = (mean_a - mean_b) / sizes
-    covariance = sum(np.linalg.inv(p * np.outer(sizes, sizes)) for p in (one, other))
+def _size_consistency(first: _HalfEvidence, second: _HalfEvidence, sizes: Array) -> float:
+    """Return the p-value of a χ² test of the difference, over the combinations that both halves see."""
+    fits = [half.fitted(limits.FREE_SIZES * sizes) for half in (first, second)]
+    difference = (fits[0][0] - fits[1][0]) / sizes
+    covariance = sum(np.linalg.inv(precision * np.outer(sizes, sizes)) for _, precision in fits)
     values, vectors = np.linalg.eigh(covariance)
-    told = values < 0.5 * limits.FREE_SIZES**2
-    return chi2_tail(float(np.sum((vectors.T @ d)[told] ** 2 / values[told])), int(told.sum())) if told.any() else 1.0
-
-
-def _least_confirmed_share(a: _HalfEvidence, b: _HalfEvidence, sizes: Array) -> float:
-    """Return the smaller share that a half finds of what both find together, along its direction."""
-    told = a.information + b.information
-    both = _HalfEvidence(told, a.vector + b.vector).fitted(sizes)[0]
-    along = told @ both / max(float(both @ told @ both), 1e-300)
-    return min(float(along @ s.fitted(sizes)[0]) for s in (a, b))
+    seen = values < 0.5 * limits.FREE_SIZES**2
+    if not seen.any():
+        return 1.0
+    return chi2_tail(float(np.sum((vectors.T @ difference)[seen] ** 2 / values[seen])), int(seen.sum()))

@@ -9,11 +9,22 @@ import numpy as np
 from scipy.special import logsumexp
 
 from stitch.diagnosis.ranking import Ranked
-from stitch.diagnosis.unnamed_time_laws import RepeatingError
+from stitch.diagnosis.unmodelled_time_effects import RepeatingError
 from stitch.diagnosis.validation import CrossValidation
+from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.scanner_errors import FieldError
 
 Verdict = Literal["adequate", "missing_effect", "cannot_tell", "unknown_effect"]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one question of a diagnosis was answered."""
+
+    name: str  # of the question: `which_explains_most`
+    question: str  # as a sentence
+    text: str  # of the answer
+    changed: bool  # the verdict, or what is named: the last answer that did decided
 
 
 @dataclass(frozen=True)
@@ -28,7 +39,7 @@ class Evidence:
     explanation: tuple[Ranked, ...] = ()
     together: tuple[Ranked, ...] = ()  # effects that were selected beside each other, the first to be named first
     further: Ranked | None = None  # an effect that is missing too, beside the first of `explanation`
-    unnamed_explains_it: bool = False  # an error without a name explains these views as well as `explanation`
+    unmodelled_explains_it: bool = False  # an error without a name explains these views as well as `explanation`
     refuted: bool = False  # `explanation` fails on views left out, in halves of the views, or rests on one view
     # smooth errors of the scans, beside `explanation`; None: usual or not asked
     scanner_error: FieldError | None = None
@@ -39,11 +50,27 @@ class Evidence:
     overlap_misfit: float = 0.0  # rms that no motion of the views removes, where it exceeds the noise; length_unit
     notes: tuple[str, ...] = ()  # effects that explain much and are not named, and why
     coincidence: str = ""  # why a jump in time cannot be told from an error of a joint that turns back
+    answers: tuple[Answer, ...] = ()  # of the questions that led here, in the order they were asked
+    # What questions hand on to the next: effects that could be named, likeliest first,
+    contenders: tuple[Ranked, ...] = ()
+    # the model in which none of them is among the errors that remain,
+    base: LinearModel | None = None
+    # the log posterior there of an unmodelled effect, of a joint or in time,
+    unmodelled_log_posterior: float = -np.inf
+    # effects that explain much and do not hold beside the others, and why,
+    refused: Mapping[str, str] = field(default_factory=dict)
+    # and the evidence as it was before what it names was tested.
+    proposed: "Evidence | None" = None
 
     @cached_property
     def verdict(self) -> Verdict:
-        """The verdict that this evidence gives."""
-        return decide(self)
+        """The first row of the table in docs/diagnosis.md ("The verdict") whose condition holds."""
+        without_rival = not (self.unmodelled_explains_it or self.refuted or scanner_explains_it(self))
+        if self.explanation and without_rival:
+            return "missing_effect" if len(self.explanation) == 1 else "cannot_tell"
+        scanner_errs = self.scanner_error is not None and self.scanner_error.over_noise
+        unexplained = self.alarm or self.repeating_errors or self.implausible_scatter
+        return "unknown_effect" if unexplained or scanner_errs or self.overlap_misfit > 0 else "adequate"
 
     @property
     def named(self) -> tuple[Ranked, ...]:
@@ -62,26 +89,13 @@ class Evidence:
         return float(logsumexp(odds)) if odds else np.inf
 
 
-def decide(e: Evidence) -> Verdict:
-    """Return the verdict: the first row of the table in docs/diagnosis.md ("The verdict") whose condition holds."""
-    explained = bool(e.explanation) and not (e.unnamed_explains_it or e.refuted or scanner_explains_it(e))
-    scanner_errs = e.scanner_error is not None and e.scanner_error.over_noise
-    if explained and len(e.explanation) == 1:
-        return "missing_effect"
-    if explained:
-        return "cannot_tell"
-    if e.alarm or e.repeating_errors or e.implausible_scatter or scanner_errs or e.overlap_misfit > 0:
-        return "unknown_effect"
-    return "adequate"
-
-
-def scanner_explains_it(e: Evidence) -> bool:
-    """True where smooth errors of the scans gain at least as many nats as the effect that would be named.
+def scanner_explains_it(evidence: Evidence) -> bool:
+    """Return whether smooth errors of the scans gain at least as many nats as the effect that would be named.
 
     Poses found from scans that err are off too, and an effect that explains some of that is not thereby there.
     """
     return (
-        e.scanner_error is not None
-        and len(e.explanation) == 1
-        and e.scanner_error.gain >= e.explanation[0].score.log_bayes_factor
+        evidence.scanner_error is not None
+        and len(evidence.explanation) == 1
+        and evidence.scanner_error.gain >= evidence.explanation[0].score.log_bayes_factor
     )

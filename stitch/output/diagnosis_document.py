@@ -7,7 +7,7 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis, Finding
 from stitch.diagnosis.score import Score
-from stitch.diagnosis.unnamed_time_laws import TimeCurve
+from stitch.diagnosis.unmodelled_time_effects import TimeCurve
 from stitch.diagnosis.validation import CrossValidation
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.scanner_errors import FieldError

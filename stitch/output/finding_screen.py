@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
-from stitch.diagnosis.effect_course import (
-    EffectCourse,
-    course_in_model,
-    course_of_candidate,
-    course_of_curve,
-    course_of_dependence,
+from stitch.diagnosis.effect_trend import (
+    EffectTrend,
+    trend_in_model,
+    trend_of_candidate,
+    trend_of_curve,
+    trend_of_dependence,
 )
 from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.diagnosis.sentences import odds_text
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
-from stitch.diagnosis.unnamed_time_laws import reportable
+from stitch.diagnosis.unmodelled_time_effects import reportable
 from stitch.numerics.frames import Array
 from stitch.numerics.units import angle_text, length_text
 from stitch.observations.surfaces.surface_model import surfaces_of
@@ -52,7 +52,7 @@ def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the screen of a diagnosis; lengths in length_unit, angles in rad."""
     fields = candidate_fields(diagnosis)
     candidates = compared(diagnosis)
-    courses = {c.name: course_of_candidate(diagnosis.linear, c.ranked.score) for c in candidates}
+    courses = {c.name: trend_of_candidate(diagnosis.linear, c.ranked.score) for c in candidates}
     why = _why(diagnosis, courses)
     return {
         "headline": _headline(diagnosis, why),
@@ -106,20 +106,20 @@ def compared(diagnosis: Diagnosis) -> list[CandidateEffect]:
     return helping[:_BEST]
 
 
-def _why(diagnosis: Diagnosis, courses: dict[str, EffectCourse | None]) -> EffectCourse | None:
+def _why(diagnosis: Diagnosis, courses: dict[str, EffectTrend | None]) -> EffectTrend | None:
     """Return the course of what is named, of the last effect in a model that lacks nothing, or of what has no name."""
     linear = diagnosis.linear
     if diagnosis.verdict in _NAMING:
         return courses.get(diagnosis.effects[0])
     if diagnosis.verdict == "adequate":
-        return course_in_model(linear, linear.model.terms[-1]) if linear.model.terms else None
+        return trend_in_model(linear, linear.model.terms[-1]) if linear.model.terms else None
     if diagnosis.curves:
-        return course_of_curve(linear, diagnosis.curves[0])
-    return course_of_dependence(linear, diagnosis.depends_on[0]) if diagnosis.depends_on else None
+        return trend_of_curve(linear, diagnosis.curves[0])
+    return trend_of_dependence(linear, diagnosis.depends_on[0]) if diagnosis.depends_on else None
 
 
 def _candidate_row(
-    diagnosis: Diagnosis, candidate: CandidateEffect, field: DisagreementField | None, course: EffectCourse | None
+    diagnosis: Diagnosis, candidate: CandidateEffect, field: DisagreementField | None, course: EffectTrend | None
 ) -> dict[str, Any]:
     validation = candidate.cross_validation
     return {
@@ -141,7 +141,7 @@ def _on_part(field: DisagreementField | None) -> dict[str, Any]:
     return {"mean": field.mean_abs, "worst": worst, "field": values}
 
 
-def _course_row(course: EffectCourse | None) -> dict[str, Any] | None:
+def _course_row(course: EffectTrend | None) -> dict[str, Any] | None:
     if course is None:
         return None
     return {
@@ -162,7 +162,7 @@ def _rounded(values: Array) -> list[float]:
     return [float(f"{x:.4g}") for x in values]
 
 
-def _headline(diagnosis: Diagnosis, why: EffectCourse | None) -> str:
+def _headline(diagnosis: Diagnosis, why: EffectTrend | None) -> str:
     """Return what is missing, in one sentence."""
     match diagnosis.verdict:
         case "adequate":
@@ -185,7 +185,7 @@ def _headline(diagnosis: Diagnosis, why: EffectCourse | None) -> str:
     return f"{'' if diagnosis.certain else 'Perhaps: '}{causes[0]}."
 
 
-def _cause(candidate: CandidateEffect, course: EffectCourse | None) -> str:
+def _cause(candidate: CandidateEffect, course: EffectTrend | None) -> str:
     """Return the cause as a sentence without its full stop."""
     name = candidate.name
     term = candidate.ranked.score.form.at(candidate.ranked.score.values)
@@ -198,7 +198,7 @@ def _cause(candidate: CandidateEffect, course: EffectCourse | None) -> str:
     return description[:1].upper() + description[1:]
 
 
-def _proof(diagnosis: Diagnosis, why: EffectCourse | None) -> str:
+def _proof(diagnosis: Diagnosis, why: EffectTrend | None) -> str:
     """Return how large it is, and what it does to the error on views left out."""
     unit = diagnosis.linear.measurement.length_unit
     now = length_text(diagnosis.heldout_rms, unit, 2)
@@ -217,7 +217,7 @@ def _proof(diagnosis: Diagnosis, why: EffectCourse | None) -> str:
     )
 
 
-def _size(why: EffectCourse, unit: str) -> str:
+def _size(why: EffectTrend, unit: str) -> str:
     """Return how far off an effect puts things, as a sentence."""
     largest = float(np.abs(why.predicted).max())
     size = angle_text(largest, 2) if why.value_unit == "rad" else length_text(largest, unit, 2)

@@ -14,13 +14,12 @@ from data_synth.ordinary_arm import draw_arm, with_memory
 from stitch.diagnosis.residual_structure import variance_budget
 from stitch.diagnosis.sentences import curve_sentences, joint_curve_sentence
 from stitch.diagnosis.thresholds import ODDS
-from stitch.diagnosis.unnamed_joint_laws import (
+from stitch.diagnosis.unmodelled_joint_effects import (
     ANY_SIZE,
     joint_curves,
-    joint_laws,
-    laws_of_kinds,
+    joint_effects,
     log_posterior_of_any,
-    significant_laws,
+    significant_joint_effects,
 )
 from stitch.numerics import frames
 from stitch.observations.pose_errors import (
@@ -52,15 +51,15 @@ def test_a_joint_is_told_where_all_of_them_together_explain_no_more(cell):
     off = np.zeros_like(cell.measured.plan.joints)
     off[:, 4] = 3e-4 * np.sin(2 * cell.measured.plan.joints[:, 4])
     linear = with_joints_off(cell, off)
-    assert joint_laws(linear)[0].log_bayes_factor < ODDS
-    assert [law.joint for law in significant_laws(linear)] == [5]
+    assert joint_effects(linear)[0].log_bayes_factor < ODDS
+    assert [law.joint for law in significant_joint_effects(linear)] == [5]
 
 
 @pytest.mark.parametrize("size", [0.3, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_no_joint_is_told_where_all_are_off(cell, size):
     for seed in range(2):
         arm = draw_arm(cell.measured.plan.arm.joints, size, np.random.default_rng(seed))
-        assert not significant_laws(cell.seen(arm.flange(cell.measured.plan.arm, cell.measured.plan.joints)))
+        assert not significant_joint_effects(cell.seen(arm.flange(cell.measured.plan.arm, cell.measured.plan.joints)))
 
 
 def test_that_some_law_is_there_is_their_mean_over_a_twentieth():
@@ -73,7 +72,7 @@ def test_that_some_law_is_there_is_their_mean_over_a_twentieth():
 def test_no_joint_is_told_where_poses_wander(cell):
     for seed in range(2):
         wander = with_memory(14, 0.9, np.random.default_rng(seed)) * np.repeat([4e-5, 0.04], 3)
-        assert not significant_laws(cell.seen(cell.measured.T_base_flange @ frames.exp(wander)))
+        assert not significant_joint_effects(cell.seen(cell.measured.T_base_flange @ frames.exp(wander)))
 
 
 def test_the_course_along_the_move_is_the_true_one_within_its_sigma(cell):
@@ -82,7 +81,7 @@ def test_the_course_along_the_move_is_the_true_one_within_its_sigma(cell):
     move = np.diff(q, axis=0, prepend=q[:1])
     off = np.zeros_like(q)
     off[:, 4] = 4e-4 * np.tanh(4 * move[:, 4])
-    laws = significant_laws(with_joints_off(cell, off))
+    laws = significant_joint_effects(with_joints_off(cell, off))
     assert [(law.joint, law.follows) for law in laws] == [(5, TRAVEL)]
     course = joint_curves(laws)[0]
     true = 4e-4 * np.tanh(4 * np.radians(course.at)) - off[:, 4].mean()
@@ -97,7 +96,7 @@ def test_two_joints_that_drag_each_other_are_told_by_the_two_angles(cell):
     q = cell.measured.plan.joints
     off = np.zeros_like(q)
     off[:, 2] = 3e-4 * np.sin(q[:, 2]) * np.sin(2 * q[:, 4])
-    (law,) = significant_laws(with_joints_off(cell, off))
+    (law,) = significant_joint_effects(with_joints_off(cell, off))
     assert (law.joint, law.follows, law.errors.others[law.process]) == (3, TWO_ANGLES, 4)
     curves = joint_curves([law])
     assert {c.covariate for c in curves} <= {"j3_deg", "j5_deg"} and curves[0].covariate == "j5_deg"
@@ -114,9 +113,9 @@ def test_what_a_joint_does_by_two_angles_is_the_mean_over_its_partners(cell):
     for p in smooth.of_joint(3):
         own = replace(smooth, joints=(3,), columns=smooth.columns[:, [p]], kernel=smooth.kernel[[p]])
         errors = replace(linear.pose_errors, joint_processes={TWO_ANGLES: own})
-        (law,) = laws_of_kinds(replace(linear, pose_errors=errors), [TWO_ANGLES])
+        (law,) = joint_effects(replace(linear, pose_errors=errors), [TWO_ANGLES])
         factors.append(np.exp(law.log_bayes_factor))
-    whole = next(law for law in laws_of_kinds(linear, [TWO_ANGLES]) if law.joint == 4)
+    whole = next(law for law in joint_effects(linear, [TWO_ANGLES]) if law.joint == 4)
     assert len(factors) == 5 and np.exp(whole.log_bayes_factor) == pytest.approx(np.mean(factors))
     apart = 2 * np.sin(0.5 * np.abs(q[0] - q[5]))
     process = smooth.of_joint(3)[0]
@@ -130,7 +129,7 @@ def test_the_teeth_of_a_belt_are_told_as_waves_with_their_period(cell):
     tooth = np.radians(20.0)
     off = np.zeros_like(q)
     off[:, 4] = 6e-4 * (np.mod(q[:, 4] / tooth, 1.0) - 0.5)
-    laws = joint_laws(with_joints_off(cell, off).restricted(NOT_OF_ARM))
+    laws = joint_effects(with_joints_off(cell, off).restricted(NOT_OF_ARM))
     law = laws[0]
     assert (law.joint, law.follows) == (5, WAVES)
     # Half a wave more or less over the range looks alike.
@@ -146,7 +145,7 @@ def test_the_course_in_time_of_a_joint_that_warms_is_the_true_one_within_its_sig
     steps = np.arange(14.0)
     off = np.zeros_like(cell.measured.plan.joints)
     off[:, 4] = 8e-4 * (1 - np.exp(-steps / 4.0))
-    (law,) = significant_laws(with_joints_off(cell, off))
+    (law,) = significant_joint_effects(with_joints_off(cell, off))
     assert (law.joint, law.follows) == (5, TIME_ONLY)
     (course,) = joint_curves([law])
     assert course.covariate == "time_s"
@@ -164,7 +163,7 @@ def test_a_joint_that_swings_in_time_does_so_at_every_pose_and_its_share_is_no_s
     off = np.zeros_like(cell.measured.plan.joints)
     off[:, 4] = 5e-4 * np.sin(0.7 * np.arange(14.0))
     linear = with_joints_off(cell, off)
-    law = next(law for law in joint_laws(linear) if law.follows == TIME_ONLY)
+    law = next(law for law in joint_effects(linear) if law.follows == TIME_ONLY)
     (course,) = joint_curves([law])
     assert law.joint == 5 and course.covariate == "time_s" and course.share > 0.9
     assert np.ptp(course.error) == pytest.approx(np.ptp(off[:, 4]), rel=0.2)
@@ -179,8 +178,8 @@ def test_what_a_joint_may_follow_as_well_is_said(cell):
     off = np.zeros_like(cell.measured.plan.joints)
     off[:, 4] = 5e-4 * np.sin(0.5 * np.arange(14.0))
     linear = with_joints_off(cell, off)
-    factors = {law.follows: law.log_bayes_factor for law in joint_laws(linear) if law.joint == 5}
-    (law,) = significant_laws(linear)
+    factors = {law.follows: law.log_bayes_factor for law in joint_effects(linear) if law.joint == 5}
+    (law,) = significant_joint_effects(linear)
     assert (factors[WITH_TIME] > max(factors.values()) - ODDS) and law.may_follow == ("the joint angles", "time")
     found = SimpleNamespace(curves=joint_curves([law]), time_curve=None)
     assert "These views do not tell whether joint 5 follows the joint angles or time." in curve_sentences(found, "mm")
@@ -192,7 +191,7 @@ def test_the_course_under_load_of_a_spring_that_stiffens_is_the_true_one_within_
     yields = Polynomial.fit(load, (load / np.abs(load).max()) ** 3, 5)
     off = np.zeros_like(plan.joints)
     off[:, 1] = 1e-3 * yields(load)
-    laws = joint_laws(with_joints_off(cell, off).restricted(NOT_OF_ARM))
+    laws = joint_effects(with_joints_off(cell, off).restricted(NOT_OF_ARM))
     (course,) = joint_curves([next(law for law in laws if law.joint == 2 and law.follows == JOINT_LOAD)])
     assert course.covariate == "j2_torque_nm"
     true = 1e-3 * yields(course.at) - off[:, 1].mean()

@@ -16,7 +16,12 @@ USELESS = CrossValidation(inside=0.5, heldout=1.0, poses=1.0, poses_sigma=0.1, s
 
 def ranked(name, beside=None, adjusted=1e-6):
     of = SimpleNamespace(name=name, empirical=False)
-    seen = {"observable": True, "values": (), "form": SimpleNamespace(free=()), "log_bayes_factor": 12.0}
+    seen = {
+        "observable": True,
+        "values": (),
+        "form": SimpleNamespace(free=(), term=SimpleNamespace(name=name)),
+        "log_bayes_factor": 12.0,
+    }
     score = SimpleNamespace(name=name, base_model=beside, candidate=of, fitted=True, **seen)
     return Ranked(score, adjusted, log_posterior=9.0, posterior=0.9)
 
@@ -32,20 +37,26 @@ SMOOTH = SimpleNamespace(gain=50.0, over_noise=False)
 def without_halves(monkeypatch):
     monkeypatch.setattr(gathering, "validate_in_halves", lambda score: None)
     monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: HELPS)
+    monkeypatch.setattr(gathering, "regime_of", lambda linear: SimpleNamespace(many_views=True))
 
 
 def upheld(monkeypatch, evidence, *, together, refused):
-    """With what the views say of two effects together, and evidences that the scanner's own error outweighs."""
-
-    def with_scanner_error(linear, e):
-        return replace(e, scanner_error=SMOOTH) if replace(e, left_out={}) in refused else e
-
+    """With what the views say of two effects together, and names that the scanner's own error outweighs."""
     pair = together and (together.explanation[0], together.further)
     monkeypatch.setattr(gathering, "regime_of", lambda linear: SimpleNamespace(many_views=False))
     monkeypatch.setattr(gathering, "find_missing_pair", lambda *asked: pair)
     monkeypatch.setattr(gathering, "pair_is_validated", lambda *asked: True)
-    monkeypatch.setattr(gathering, "with_scanner_error", with_scanner_error)
-    return gathering.challenge(None, (), replace(evidence, left_out=gathering.cross_validate_named(None, evidence)))
+    monkeypatch.setattr(gathering, "moves_points", lambda terms: True)
+    outweighed = [[r.name for r in (e.explanation[0], e.further) if r is not None] for e in refused]
+    found = {tuple(names): SMOOTH for names in outweighed}
+    monkeypatch.setattr(
+        gathering, "find_scanner_error", lambda linear, other_terms=(): found.get(tuple(t.name for t in other_terms))
+    )
+    return gathering.ask(gathering.TESTS[:3], None, (), replace(evidence, proposed=evidence))
+
+
+def rivals_of(evidence):
+    return gathering.ask([gathering.which_predict_as_well], None, (), evidence)
 
 
 def test_what_looks_like_an_error_of_the_scanner_may_be_a_second_effect(monkeypatch):
@@ -94,11 +105,11 @@ def test_what_predicts_views_left_out_as_well_is_not_told_from_the_name(monkeypa
     rival = replace(HELPS, fold_squares=squares)
     monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: rival)
     named = {FIRST.name: replace(HELPS, fold_squares=((1.0,) * 4, (1.0,) * 4))}
-    found = gathering.with_equal_rivals(None, replace(ALONE, left_out=named, notes=notes))
+    found = rivals_of(replace(ALONE, left_out=named, notes=notes))
     assert found.verdict == ("cannot_tell" if rivals else "missing_effect")
     assert found.named == ((FIRST, SECOND) if rivals else (FIRST,))
     # Where both are missing, each was asked beside the other.
-    assert gathering.with_equal_rivals(None, replace(PAIR, left_out=named)).named == (FIRST,)
+    assert rivals_of(replace(PAIR, left_out=named)).named == (FIRST,)
 
 
 @pytest.mark.parametrize(
@@ -115,14 +126,13 @@ def test_what_predicts_views_left_out_clearly_better_is_named_though_another_is_
     rival = replace(HELPS, fold_squares=squares, steadiness=0.9 if stands else 0.1)
     monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: rival)
     left_out = {FIRST.name: replace(HELPS, fold_squares=((1.0,) * 4, (1.0,) * 4))}
-    assert gathering.with_equal_rivals(None, replace(ALONE, left_out=left_out)).named == named
+    assert rivals_of(replace(ALONE, left_out=left_out)).named == named
 
 
 @pytest.mark.parametrize(("together", "named"), [(PAIR, (FIRST,)), (None, (FIRST, SECOND))])
 def test_rivals_that_a_second_effect_makes_equal_do_not_take_the_name(monkeypatch, together, named):
-    upheld(monkeypatch, ALONE, together=together, refused=[])
-    monkeypatch.setattr(gathering, "select", lambda *asked: ALONE)
-    monkeypatch.setattr(gathering, "with_equal_rivals", lambda linear, e: replace(e, explanation=(FIRST, SECOND)))
-    monkeypatch.setattr(gathering, "with_turning_joints", lambda views, e: e)
-    linear = SimpleNamespace(measurement=SimpleNamespace(views=None))
-    assert gathering.gather_evidence(linear, (), None).named == named
+    alone = upheld(monkeypatch, ALONE, together=together, refused=[])
+    rival = replace(HELPS, fold_squares=(SAME, SAME))
+    monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: rival)
+    left_out = {FIRST.name: replace(HELPS, fold_squares=((1.0,) * 4, (1.0,) * 4))}
+    assert rivals_of(replace(alone, left_out=left_out)).named == named

@@ -5,7 +5,7 @@ import pytest
 
 from data_synth import kinematics
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.effect_course import EffectCourse, course_of_candidate
+from stitch.diagnosis.effect_trend import EffectTrend, trend_of_candidate
 from stitch.diagnosis.score import score
 from stitch.effects.contract import EFFECTS
 from stitch.numerics import frames
@@ -20,10 +20,10 @@ def cell() -> FreedBlade:
     return freed_blade(4, 14)
 
 
-def _course(linear: LinearModel, effect: str) -> EffectCourse:
+def _course(linear: LinearModel, effect: str) -> EffectTrend:
     candidate = candidate_of(linear, EFFECTS[effect])
     assert candidate is not None
-    course = course_of_candidate(linear, score(linear, candidate))
+    course = trend_of_candidate(linear, score(linear, candidate))
     assert course is not None
     return course
 

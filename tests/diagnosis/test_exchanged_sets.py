@@ -5,8 +5,8 @@ import pytest
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.exchanged_sets import exchanged_set, is_better_set
 from stitch.diagnosis.ranking import rank_one
+from stitch.diagnosis.stepwise_selection import exchanged_set, is_better_set
 from stitch.effects.contract import EFFECTS
 from stitch.model.model import Model
 from stitch.observations.targets.target_model import target_model

@@ -14,8 +14,12 @@ from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE
-from stitch.diagnosis.unnamed_joint_laws import joint_curves, joint_laws, laws_of_kinds, significant_laws
-from stitch.diagnosis.unnamed_time_laws import find_repeating_errors
+from stitch.diagnosis.unmodelled_joint_effects import (
+    joint_curves,
+    joint_effects,
+    significant_joint_effects,
+)
+from stitch.diagnosis.unmodelled_time_effects import find_repeating_errors
 from stitch.effects.contract import EFFECTS
 from stitch.numerics import frames
 from stitch.numerics.reml import MAY_BE_ABSENT, NOISE, log_prior
@@ -132,7 +136,7 @@ def test_what_a_joint_may_do_in_time_and_under_load_stands_against_every_name(ce
     warm = 1e-3 * (1 - np.exp(-np.arange(len(plan.joints)) / 4.0))
     linear = cell.seen(kinematics.flange(plan.arm, plan.joints + warm[:, None] * np.eye(6)[4]))
     base = linear.restricted(linear.causes - {"joint_offset"})
-    found = {kind: laws_of_kinds(base, (kind,)) for kind in (ALL_ANGLES, OWN_ANGLE, WITH_TIME, JOINT_LOAD)}
+    found = {kind: joint_effects(base, (kind,)) for kind in (ALL_ANGLES, OWN_ANGLE, WITH_TIME, JOINT_LOAD)}
     best = {kind: max(law.log_bayes_factor for law in laws) for kind, laws in found.items()}
     assert best[WITH_TIME] > max(own for kind, own in best.items() if kind != WITH_TIME)
 
@@ -142,7 +146,7 @@ def test_a_joint_law_is_at_least_as_likely_as_at_sizes_tried_by_hand(cell):
     measured = cell.measured
     off = 2 * UNNAMED["coupling"](measured.plan, np.random.default_rng(1))
     linear = cell.seen(kinematics.flange(measured.plan.arm, measured.plan.joints + off))
-    law, errors = joint_laws(linear)[0], linear.pose_errors
+    law, errors = joint_effects(linear)[0], linear.pose_errors
     free = null_space(linear.mixed.A[0].T).T
     R, usual = free @ linear.observation.reduced_poses.reduction, errors.scales[errors.names.index("smooth")]
     every = [free @ C @ free.T for C in linear.mixed.components[:, 0]]
@@ -178,7 +182,7 @@ def test_joints_that_scatter_are_scatter(cell):
     for _ in range(8):
         off = 3e-5 * rng.standard_normal(q.shape)
         found, linear = said_of(cell, kinematics.flange(arm, q + off))
-        assert found.verdict == "adequate" and not significant_laws(linear)
+        assert found.verdict == "adequate" and not significant_joint_effects(linear)
         shown = frames.log(frames.inverse(kinematics.flange(arm, q)) @ kinematics.flange(arm, q + off))
         sizes.append(np.sqrt(linear.flange_scatter(linear.null)) / shown.reshape(-1, 2, 3).std(axis=(0, 2)))
     # Beside them the flange scatters for itself: what is shown is more, not less.
@@ -188,7 +192,7 @@ def test_joints_that_scatter_are_scatter(cell):
 def test_no_joint_follows_a_law_where_nothing_is_wrong(cell):
     measured = cell.measured
     linear = cell.seen(measured.T_base_flange)
-    assert max(law.log_bayes_factor for law in joint_laws(linear)) < 1
+    assert max(law.log_bayes_factor for law in joint_effects(linear)) < 1
 
 
 def test_the_course_of_a_joint_law_is_the_true_one_within_its_sigma(cell):
@@ -197,7 +201,7 @@ def test_the_course_of_a_joint_law_is_the_true_one_within_its_sigma(cell):
     off = np.zeros_like(q)
     off[:, 2] = 4e-4 * np.sin(2 * q[:, 3])
     linear = cell.seen(kinematics.flange(measured.plan.arm, q + off))
-    course = joint_curves(significant_laws(linear))[0]
+    course = joint_curves(significant_joint_effects(linear))[0]
     true = 4e-4 * np.sin(2 * np.radians(course.at)) - off[:, 2].mean()
     assert (course.joint, course.covariate) == (3, "j4_deg") and course.share > 0.9
     assert np.all(np.abs(course.error - true) < 3 * course.sigma)
@@ -214,7 +218,7 @@ def test_the_course_of_a_wave_of_a_gear_is_the_true_one_within_its_sigma(cell):
     off = np.zeros_like(q)
     off[:, 4] = 4e-4 * np.sin(7 * q[:, 4])
     linear = cell.seen(kinematics.flange(measured.plan.arm, q + off))
-    (course,) = joint_curves(significant_laws(linear))
+    (course,) = joint_curves(significant_joint_effects(linear))
     true = 4e-4 * np.sin(7 * np.radians(course.at)) - off[:, 4].mean()
     assert (course.joint, course.covariate) == (5, "j5_deg")
     assert np.all(np.abs(course.error - true) < 4 * course.sigma)

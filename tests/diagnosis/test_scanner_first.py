@@ -18,9 +18,9 @@ def named(gain: float) -> Evidence:
     return Evidence((ranked,), (), alarm=True, explanation=(ranked,))
 
 
-def held(monkeypatch: pytest.MonkeyPatch, evidence: Evidence, shown: FieldError | None) -> Evidence:
+def beside_the_scanner(monkeypatch: pytest.MonkeyPatch, evidence: Evidence, shown: FieldError | None) -> Evidence:
     monkeypatch.setattr(gathering, "find_scanner_error", lambda linear, other_terms=(): shown)
-    return gathering.with_scanner_error(None, evidence)
+    return gathering.ask([gathering.does_the_scanner_explain_it], None, (), evidence)
 
 
 def error(gain: float, over_noise: bool = True) -> FieldError:
@@ -28,13 +28,13 @@ def error(gain: float, over_noise: bool = True) -> FieldError:
 
 
 def test_the_clearer_of_the_two_is_said(monkeypatch):
-    assert held(monkeypatch, named(80.0), error(20.0)).verdict == "missing_effect"
-    refused = held(monkeypatch, named(8.0), error(20.0))
+    assert beside_the_scanner(monkeypatch, named(80.0), error(20.0)).verdict == "missing_effect"
+    refused = beside_the_scanner(monkeypatch, named(8.0), error(20.0))
     assert refused.verdict == "unknown_effect" and not refused.named and "backlash" in refused.notes[0]
 
 
 def test_only_more_than_the_noise_is_not_adequate(monkeypatch):
     nothing = Evidence((), ())
-    assert held(monkeypatch, nothing, None).verdict == "adequate"
-    assert held(monkeypatch, nothing, error(8.0, over_noise=False)).verdict == "adequate"
-    assert held(monkeypatch, nothing, error(8.0)).verdict == "unknown_effect"
+    assert beside_the_scanner(monkeypatch, nothing, None).verdict == "adequate"
+    assert beside_the_scanner(monkeypatch, nothing, error(8.0, over_noise=False)).verdict == "adequate"
+    assert beside_the_scanner(monkeypatch, nothing, error(8.0)).verdict == "unknown_effect"

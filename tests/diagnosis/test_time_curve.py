@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stitch.diagnosis.sentences import time_curve_sentence
-from stitch.diagnosis.unnamed_time_laws import TimeCurve, significant_time_law, time_curve
+from stitch.diagnosis.unmodelled_time_effects import TimeCurve, significant_time_effect, time_curve
 from stitch.numerics import frames
 from tests.diagnosis.freed_blade import freed_blade
 
@@ -23,9 +23,9 @@ def shown(cell, course, direction):
     err, (·, 6)."""
     errors = course[:, None] * direction
     linear = cell.seen(cell.measured.T_base_flange @ frames.exp(errors))
-    law = significant_time_law(linear)
-    assert law is not None
-    curve = time_curve(law)
+    fitted = significant_time_effect(linear)
+    assert fitted is not None
+    curve = time_curve(fitted)
     at_views = slice(None, None, (len(curve.steps) - 1) // (VIEWS - 1))
     off = (curve.error[at_views] - errors) / np.maximum(curve.sigma[at_views], 1e-300)
     return curve, off[np.abs(course) > 0.2]

@@ -13,10 +13,10 @@ from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.thresholds import IMPLAUSIBLE, ODDS
-from stitch.diagnosis.unnamed_time_laws import (
+from stitch.diagnosis.unmodelled_time_effects import (
     find_repeating_errors,
-    likeliest_time_law,
-    significant_time_law,
+    likeliest_time_effect,
+    significant_time_effect,
     time_processes,
 )
 from stitch.effects.contract import EFFECTS
@@ -76,10 +76,10 @@ def test_a_long_stretch_is_told_in_place_of_what_wanders(cell):
     """What wanders can do what a long stretch does: beside it the stretch gains little, alone it explains more."""
     stretch = np.exp(-0.5 * ((np.arange(VIEWS) - 9) / 3.5) ** 2)
     linear = linear_of(cell, 1.5 * stretch[:, None] * DIRECTION)
-    assert likeliest_time_law(linear).log_bayes_factor < ODDS
-    law = significant_time_law(linear)
-    assert law.course.words.startswith("are off for a stretch")
-    assert not set(DRIFT_MEMORY) & set(law.base.pose_errors.names)
+    assert likeliest_time_effect(linear)[1] < ODDS
+    fitted = significant_time_effect(linear)
+    assert fitted.process.words.startswith("are off for a stretch")
+    assert not set(DRIFT_MEMORY) & set(fitted.base.pose_errors.names)
     found = verdict_of(linear)
     assert found.verdict == "unknown_effect" and find_repeating_errors(linear)[0].curve is not None
 
@@ -87,23 +87,24 @@ def test_a_long_stretch_is_told_in_place_of_what_wanders(cell):
 def test_no_course_is_told_where_poses_wander(cell):
     for seed in range(2):
         wander = with_memory(VIEWS, 0.9, np.random.default_rng(seed)) * np.repeat([4e-5, 0.04], 3)
-        assert significant_time_law(linear_of(cell, wander)) is None
+        assert significant_time_effect(linear_of(cell, wander)) is None
 
 
 def test_scatter_follows_no_course_of_time(cell):
     linear = linear_of(cell, np.zeros((VIEWS, 6)))
-    assert significant_time_law(linear) is None and verdict_of(linear).verdict == "adequate"
+    assert significant_time_effect(linear) is None and verdict_of(linear).verdict == "adequate"
 
 
 def test_a_swing_is_as_likely_as_another_search_over_all_sizes_finds(cell):
     """Against the density of what the hand-eye leaves, by scipy, and Powell's search over every size at once."""
     swing = np.sin(2 * np.pi * np.arange(VIEWS) / 6.0)
     linear = linear_of(cell, swing[:, None] * DIRECTION)
-    found, scales = likeliest_time_law(linear), linear.pose_errors.scales
+    fitted, factor = likeliest_time_effect(linear)
+    scales = linear.pose_errors.scales
     free = null_space(linear.mixed.A[0].T).T
     every = [free @ C @ free.T for C in linear.mixed.components[:, 0]]
     fixed = 0 if linear.mixed.fixed is None else free @ linear.mixed.fixed[0] @ free.T
-    columns = free @ found.fitted.columns
+    columns = free @ fitted.columns
 
     def likely(log_variances, size):
         covariance = np.tensordot(np.exp(log_variances), every, axes=1) + fixed + size**2 * columns @ columns.T
@@ -114,11 +115,11 @@ def test_a_swing_is_as_likely_as_another_search_over_all_sizes_finds(cell):
     begun = np.log([*SCATTER**2, 1.0, *(1e-2 * scales**2), 3.0])
     search = minimize(lambda x: -likely(x[:-1], np.exp(x[-1])), begun, method="Powell", options={"ftol": 1e-6})
     assert -search.fun - without > 10
-    assert found.fitted.log_bayes_factor == pytest.approx(-search.fun - without, abs=0.3)
+    assert fitted.log_bayes_factor == pytest.approx(-search.fun - without, abs=0.3)
     # Of all courses of all kinds it is one: their mean is no larger, and no less than its share.
-    courses = time_processes(linear)
-    share = 1 / (3 * sum(course.kind == found.course.kind for course in courses))
-    assert found.fitted.log_bayes_factor + np.log(share) <= found.log_bayes_factor < found.fitted.log_bayes_factor
+    processes = time_processes(linear)
+    share = 1 / (3 * sum(process.kind == fitted.process.kind for process in processes))
+    assert fitted.log_bayes_factor + np.log(share) <= factor < fitted.log_bayes_factor
 
 
 def test_a_break_of_weeks_leaves_few_courses_to_try(cell):
@@ -130,13 +131,13 @@ def test_a_break_of_weeks_leaves_few_courses_to_try(cell):
     courses = time_processes(later)
     stretches = [course for course in courses if course.words.startswith("are off")]
     assert len({course.frequency for course in courses}) < 300 and stretches
-    assert all(np.count_nonzero(course.process.shapes > 0.5) >= 2 for course in stretches)
+    assert all(np.count_nonzero(course.shapes > 0.5) >= 2 for course in stretches)
 
 
 def test_stretches_are_tried_all_over_a_session_without_breaks(cell):
     linear = linear_of(cell, np.zeros((VIEWS, 6)))
     views = linear.measurement.views
     even = replace(linear.measurement, views=replace(views, time=90.0 * np.arange(VIEWS)))
-    middles = [course.process.shapes[:, 0] for course in time_processes(replace(linear, measurement=even))]
+    middles = [course.shapes[:, 0] for course in time_processes(replace(linear, measurement=even))]
     width = [shape for shape in middles if np.isclose(shape.max(), 1, atol=0.1) and np.count_nonzero(shape > 0.5) < 5]
     assert len(width) == len(np.arange(1.5, 17 - 0.75, 1.5))

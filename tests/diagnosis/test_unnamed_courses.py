@@ -9,7 +9,7 @@ from data_synth.laws.unnamed import UNNAMED
 from data_synth.moment import Plan
 from data_synth.ordinary_arm import with_memory
 from stitch.api.pipeline import diagnose, run
-from stitch.diagnosis.unnamed_time_laws import least_log_bayes_factor, unnamed_courses
+from stitch.diagnosis.unmodelled_time_effects import least_log_bayes_factor, unmodelled_trends
 
 VIEWS, SEED = 120, 31
 
@@ -78,6 +78,6 @@ def test_an_effect_that_is_there_is_wanted_beside_them_one_that_is_not_is_idle()
     idle = next(c.ranked.score for c in found.candidates if c.name == "gear_harmonic")
     assert least_log_bayes_factor(beside, idle) < 3
     # The law that is there is seen: a process explains it, with less scatter than the views seemed to have.
-    likeliest = unnamed_courses(beside)[0]
+    likeliest = unmodelled_trends(beside)[0]
     assert 0.5 * (beside.null.deviance - likeliest.fit.deviance) > 20
     assert likeliest.fit.variances[0] < beside.null.variances[0]

@@ -21,7 +21,7 @@ REPEATS = (SimpleNamespace(words="wander"),)
         ("cannot_tell", {"alarm": True, "explanation": (ONE, OTHER)}),
         ("cannot_tell", {"explanation": (ONE, OTHER)}),
         ("unknown_effect", {"alarm": True}),
-        ("unknown_effect", {"alarm": True, "explanation": (ONE,), "unnamed_explains_it": True}),
+        ("unknown_effect", {"alarm": True, "explanation": (ONE,), "unmodelled_explains_it": True}),
         ("unknown_effect", {"alarm": True, "explanation": (ONE,), "refuted": True}),
         ("unknown_effect", {"alarm": True, "explanation": (ONE,), "scanner_error": LARGE}),
         ("unknown_effect", {"repeating_errors": REPEATS}),

@@ -10,7 +10,7 @@ from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine
-from stitch.diagnosis.unnamed_joint_laws import JointCurve
+from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap
 from viz.diagnosis_plots import budget_rows, diagnosis_plots
 

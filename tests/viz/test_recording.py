@@ -15,7 +15,7 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.write import write_session
 from stitch.api.pipeline import diagnose, run
-from stitch.diagnosis.unnamed_joint_laws import JointCurve
+from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.numerics.units import length_text
 from stitch.output.comparison.disagreement_field import model_history
 from stitch.output.result_document import result_document

@@ -18,7 +18,7 @@ from stitch.diagnosis.next_view import RIDGE
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import form_weights
 from stitch.diagnosis.sensitivity import detectable_sizes
-from stitch.diagnosis.unnamed_joint_laws import law_covariances, log_posterior_of_any
+from stitch.diagnosis.unmodelled_joint_effects import joint_effect_covariances, log_posterior_of_any
 from stitch.numerics.distributions import f_limit
 from stitch.numerics.frames import Array, Mask
 from stitch.numerics.parameter_selection import log_mean_exp
@@ -245,10 +245,10 @@ class ExpectedDiagnosis:
         return out
 
     def _ahead_of_laws(self, k: int, numbers: Array) -> Mask:
-        """(D,) whether a candidate is ahead of joints that follow by no law (`law_covariances`)."""
+        """(D,) whether a candidate is ahead of joints that follow by no law (`joint_effect_covariances`)."""
         own = self._test({self.candidates[k].name}, self.candidates[k])
         if k not in self._laws:
-            found, sizes = law_covariances(own.linear), np.sqrt(limits.LAW_VARIANCES)
+            found, sizes = joint_effect_covariances(own.linear), np.sqrt(limits.UNMODELLED_VARIANCES)
             self._laws[k] = [[covariance_tests(own.linear, C, sizes) for C in kind] for kind in found]
         kinds = self._laws[k]
         if not kinds:

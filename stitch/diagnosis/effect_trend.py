@@ -14,7 +14,7 @@ import numpy as np
 from stitch.diagnosis.candidates import Form, candidate_as_fitted
 from stitch.diagnosis.residual_structure import Dependence, predicted_distances
 from stitch.diagnosis.score import Score, score
-from stitch.diagnosis.unnamed_joint_laws import JointCurve
+from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.effects.contract import EFFECTS, Effect, parameters_in, twist
 from stitch.model.forward import moves_points, point_correction, scan_points
 from stitch.model.model import Term
@@ -34,7 +34,7 @@ _ASKED = 60_000
 
 
 @dataclass(frozen=True)
-class EffectCourse:
+class EffectTrend:
     """The course of one effect over what it lives on; lengths in length_unit, angles in rad."""
 
     follows: str  # what it lives on: view order, time_s, angle of joint 2, …
@@ -50,7 +50,7 @@ class EffectCourse:
     law: Array = field(default_factory=lambda: np.zeros((2, 0)))
 
 
-def course_of_candidate(linear: LinearModel, scored: Score) -> EffectCourse | None:
+def trend_of_candidate(linear: LinearModel, scored: Score) -> EffectTrend | None:
     """The course of a candidate's best form; None where nothing of it was fitted."""
     if not scored.fitted:
         return None
@@ -68,7 +68,7 @@ def course_of_candidate(linear: LinearModel, scored: Score) -> EffectCourse | No
     return _course_of_views(fitted, term, own.form, found[len(found) - len(own.values) :], X @ found)
 
 
-def course_in_model(linear: LinearModel, term: Term) -> EffectCourse | None:
+def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
     """The course of an effect that is in the model, as it was fitted; None for one that changes points."""
     if moves_points([term]) or not (~term.gridded & (term.values != 0)).any():
         return None
@@ -77,7 +77,7 @@ def course_in_model(linear: LinearModel, term: Term) -> EffectCourse | None:
     return _course_of_views(fitted, term, form, term.values[form.keep], fitted.design @ fitted.baseline_trial.solve())
 
 
-def course_of_curve(linear: LinearModel, curve: JointCurve) -> EffectCourse | None:
+def trend_of_curve(linear: LinearModel, curve: JointCurve) -> EffectTrend | None:
     """How far a joint is off along what its error follows without a name, beside its mean."""
     fitted, joint = linear.restricted(()), curve.joint - 1
     law = np.interp(curve.view_values, curve.at, curve.error)
@@ -91,13 +91,13 @@ def course_of_curve(linear: LinearModel, curve: JointCurve) -> EffectCourse | No
     return _along_motion(fitted, motion, X @ found, 1, (*axis, curve.view_values))
 
 
-def course_of_dependence(linear: LinearModel, found: Dependence) -> EffectCourse:
+def trend_of_dependence(linear: LinearModel, found: Dependence) -> EffectTrend:
     """Where the views lie off along what their displacement follows without a name, and its means in bins."""
     shown = _some(len(found.at))
     fitted = np.interp(found.at, found.bins, found.mean)
     sigma = float(np.std(found.moved - fitted, ddof=1)) if len(fitted) > 1 else 0.0
     dots = {"measured": found.moved, "sigma": np.full(len(fitted), sigma), "predicted": fitted}
-    return EffectCourse(
+    return EffectTrend(
         follows=found.covariate,
         unit="",
         of="the views",
@@ -129,7 +129,7 @@ class _Motion:
 
 def _course_of_views(
     linear: LinearModel, term: Term, form: Form, values: Array, explained: Array
-) -> EffectCourse | None:
+) -> EffectTrend | None:
     """The course of an effect of views.
 
     Args:
@@ -172,7 +172,7 @@ def _along_motion(
     axis: tuple[str, str, Array],
     *,
     from_first: bool = False,
-) -> EffectCourse | None:
+) -> EffectTrend | None:
     """Return every view along its unit motion: the line, and beside it what the model with the effect leaves.
 
     Args:
@@ -196,7 +196,7 @@ def _along_motion(
     sign = 1.0 if motion.joint is not None or line[np.argmax(np.abs(line))] >= 0 else -1.0
     shown = _some(len(line))
     values_of = {"measured": sign * (line + off / square), "sigma": scatter / np.sqrt(square), "predicted": sign * line}
-    return EffectCourse(
+    return EffectTrend(
         follows, unit, motion.of, motion.unit, at[shown], shown, **{name: x[shown] for name, x in values_of.items()}
     )
 
@@ -303,7 +303,7 @@ def _along_gravity(gravity: Array, motion: _Motion) -> tuple[str, str, Array]:
 # Effects that change points: along the rays of the scanner, or as the part's shape moves.
 
 
-def _course_of_points(linear: LinearModel, scored: Score, term: Term) -> EffectCourse | None:
+def _course_of_points(linear: LinearModel, scored: Score, term: Term) -> EffectTrend | None:
     """Means over bins of points, each the effect and what the model with it leaves along its motion."""
     observation, left = surfaces_of(linear), predicted_distances(linear, scored)
     if left is None or observation is None:
@@ -375,7 +375,7 @@ def _point_axis(name: str, views: Views) -> tuple[str, str | None]:
 
 def _binned(
     linear: LinearModel, term: Term, at: Array, size: Array, cosine: Array, rest: Array, view_of: Indices
-) -> EffectCourse | None:
+) -> EffectTrend | None:
     """A dot for each of equal counts of points; its sigma is the scatter of the views' own means about it."""
     edges = np.unique(np.quantile(at, np.linspace(0, 1, _BINS + 1)))
     if len(edges) < 3:
@@ -397,7 +397,7 @@ def _binned(
     length = linear.measurement.length_unit
     follows, unit = _point_axis(term.name, linear.measurement.views)
     of = "the part" if term.effect.place == "shape" else "the scanner"
-    return EffectCourse(
+    return EffectTrend(
         follows=follows,
         unit=length if unit is None else unit,
         of=of,

@@ -1,0 +1,182 @@
+"""Smooth processes by which a joint or the flange may err, and how large they are beside a model.
+
+A process is a few columns of unit coefficients: the leading eigenvectors of its covariance between views. Its size is
+sought at the null's variances first (`size_process`), then with all variances (`fit_process`).
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg.lapack import dpstrf
+
+from stitch.diagnosis import thresholds as limits
+from stitch.effects.contract import EFFECTS
+from stitch.model.forward import pose_derivatives
+from stitch.model.model import term_of
+from stitch.numerics.common_covariance import SelectedColumns
+from stitch.numerics.frames import Array, Indices
+from stitch.numerics.kernels import REACH, SHORT_REACH, ornstein_uhlenbeck, rbf_joints
+from stitch.numerics.reml import VarianceFit, fit_variances
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.pose_errors import DRIFT_MEMORY, flange_twists, time_in_steps
+
+# Below this share of the largest variance nothing is left of a covariance.
+_ROUNDING = 1e-8
+# Of so many processes the trends are kept: those of a session with six or seven joints. Of thousands of poses each
+# takes a megabyte or two.
+_KEPT = 40
+# Sizes that are tried, as multiples of the one at which the clearest column is as large as its own sigma.
+_SIZES = np.geomspace(0.1, 1e5, 49)
+
+
+@dataclass(frozen=True)
+class SmoothProcess:
+    """Motions of the views that follow trends with unit coefficients; far smaller than its columns."""
+
+    joint: int | None  # that errs, counted from 1; None: the flange
+    motions: Array  # (V, 6, p) twists
+    shapes: Array  # (V, R) trends
+    # Of a flange that errs by one shape in time:
+    kind: str = ""
+    words: str = ""  # what they do: "they …"
+    trend: Callable[[Array], Array] | None = None  # times (T,) in steps from view to view → shapes (T, R)
+    frequency: float | None = None  # 1/step, of a swing
+
+    def columns(self, linear: LinearModel) -> Array:
+        """(n, p·R) of the reduced observations: each motion in each trend."""
+        moved = self.motions[:, :, :, None] * self.shapes[:, None, None, :]
+        return linear.observation.from_twists(moved.reshape(6 * len(moved), -1))
+
+
+@dataclass(frozen=True)
+class FittedProcess:
+    """A process at its likeliest size, all variances fitted beside it."""
+
+    base: LinearModel  # without it
+    process: SmoothProcess
+    columns: Array  # (n, R) of the reduced observations, per unit of that size
+    size: float
+    fit: VarianceFit  # of the views with the process
+    log_bayes_factor: float  # over the model without it, less the number of processes that were tried
+
+    @property
+    def joint(self) -> int | None:
+        """The joint that follows it, counted from 1; None: the flange, in time."""
+        return self.process.joint
+
+    @property
+    def flange_scatter(self) -> Array:
+        """(2,) variances along an axis by which the flange turns and moves anew in every view, beside the process."""
+        return self.base.flange_scatter(self.fit)
+
+    @property
+    def numbers(self) -> Array:
+        """(n,) of the reduced observations that it explains."""
+        return self.columns @ self.fit.mean[-self.columns.shape[1] :]
+
+
+def joint_motions(linear: LinearModel) -> Array:
+    """Return (n, V, 6, 1) twists of the views by a radian of each joint."""
+    offset = term_of(linear.measurement, EFFECTS["joint_offset"])
+    return next(pose_derivatives(linear.measurement, linear.model, [offset], linear.observation.centre))[..., None]
+
+
+def single_joint_processes(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProcess]:
+    """Yield joint k, counted from 0, that follows all joints, its own angle closely, or its own and the one that it
+    comes from."""
+    views = linear.measurement.views
+    angle = views.joints[:, [k]]
+    before = views.previous[:, [k]]
+    for angles, reach in ((views.joints, REACH), (angle, SHORT_REACH), (np.hstack([angle, before]), REACH)):
+        yield SmoothProcess(k + 1, motions[k], _smooth_trends(angles, reach))
+
+
+def joint_pair_processes(linear: LinearModel, motions: Array, k: int) -> Iterator[SmoothProcess]:
+    """Yield joint k, counted from 0, that follows its own angle and that of one other."""
+    joints = linear.measurement.views.joints
+    for other in range(joints.shape[1]):
+        if other != k:
+            yield SmoothProcess(k + 1, motions[k], _smooth_trends(joints[:, [k, other]]))
+
+
+def wandering_flange(linear: LinearModel) -> SmoothProcess:
+    """Return a flange that wanders in time."""
+    measurement = linear.measurement
+    time = time_in_steps(measurement)
+    knots = _knots(len(time))
+    covariance = ornstein_uhlenbeck(time, DRIFT_MEMORY["slowly wandering"], time[knots])
+    carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
+    return SmoothProcess(None, carried, covariance @ leading_trends(covariance[knots], limits.PROCESS_COLUMNS // 6))
+
+
+def leading_trends(covariance: Array, most: int) -> Array:
+    """Return (K, R) of which the trends with unit coefficients of a process are made, by its covariance with the knots
+    (K, K)."""
+    # What is smooth is a product of few columns: theirs are its trends, found in a third of the time.
+    factor, order, rank, _ = dpstrf(covariance, lower=1, tol=_ROUNDING * covariance.diagonal().max())
+    root = np.zeros((len(covariance), rank))
+    root[order - 1] = np.tril(factor[:, :rank])
+    few = rank < len(covariance) / 2
+    values, vectors = np.linalg.eigh(root.T @ root if few else covariance)
+    values, vectors = values[::-1][:most], vectors[:, ::-1][:, :most]
+    keep = values > limits.PROCESS_LEAST_VARIANCE * values[0]
+    trends = vectors[:, keep] / np.sqrt(values[keep])
+    return root @ (trends / np.sqrt(values[keep])) if few else trends
+
+
+def size_process(linear: LinearModel, process: SmoothProcess) -> tuple[float, float]:
+    """Return the size that is likeliest at the null's variances, and its log Bayes factor there.
+
+    Over the eigenvalues k of the columns' information and the shares g of what was observed: log BF(s) =
+    ½ Σ g²/(k + 1/s²) − ½ Σ log(1 + s²k).
+    """
+    information, vector = next(linear.information([SelectedColumns(process.columns(linear))]))
+    k, vectors = np.linalg.eigh(information)
+    k, g = np.maximum(k, 0.0), vectors.T @ vector
+    if not k[-1] > 0:
+        return 1.0, -np.inf
+    sizes = _SIZES / np.sqrt(k[-1])
+    gains = g**2 / (k + 1 / sizes[:, None] ** 2) - np.log1p(sizes[:, None] ** 2 * k)
+    factors = 0.5 * gains.sum(axis=1)
+    return float(sizes[factors.argmax()]), float(factors.max())
+
+
+def fit_process(linear: LinearModel, process: SmoothProcess, first_size: float, tried: int) -> FittedProcess:
+    """Return the process with all variances fitted anew: what it explains is no scatter, and where the scatter is less
+    it is likelier of another size.
+
+    Args:
+        first_size: the likeliest at the null's variances (`size_process`).
+        tried: processes among which it was chosen.
+    """
+    columns = process.columns(linear)
+    G = linear.in_blocks(columns)
+    unit = np.ones(columns.shape[1])
+    first = fit_variances(linear.mixed, G, first_size * unit, start=linear.null.variances)
+    size, _ = size_process(replace(linear, null=first), process)
+    again = fit_variances(linear.mixed, G, size * unit, start=first.variances)
+    size, fit = (size, again) if again.deviance < first.deviance else (first_size, first)
+    gain = 0.5 * (linear.null.deviance - fit.deviance) - float(np.log(tried))
+    return FittedProcess(linear, process, columns, size, fit, gain)
+
+
+def _smooth_trends(angles: Array, reach: float = REACH) -> Array:
+    """Return (V, R) smooth trends over some angles (V, a), without what is alike in all views: that has a name."""
+    return _smooth_trends_of(np.ascontiguousarray(angles).tobytes(), len(angles), reach)
+
+
+@lru_cache(maxsize=_KEPT)
+def _smooth_trends_of(angles: bytes, views: int, reach: float) -> Array:
+    """Return (V, R) of the views whose angles these are: the same in every diagnosis of a session."""
+    every = np.frombuffer(angles).reshape(views, -1)
+    knots = _knots(views)
+    covariance = rbf_joints(every, every[knots], reach)
+    shapes = covariance @ leading_trends(covariance[knots], limits.PROCESS_COLUMNS)
+    return shapes - shapes.mean(axis=0)
+
+
+def _knots(views: int) -> Indices:
+    """Return the views whose covariance is drawn apart."""
+    return np.unique(np.linspace(0, views - 1, min(views, limits.PROCESS_KNOTS)).astype(np.int64))

@@ -1,0 +1,408 @@
+"""Unmodelled effects in time, and all errors of poses without a name that are held against names.
+
+A flange swings to and fro, or stands off for a stretch of views after which it comes back: a cabinet that cools in
+turns, air that is conditioned in turns, a draught, somebody who leans on the cell. Errors half a period apart are
+opposite, and a stretch of large errors lies amid small ones: no process that forgets and has one size throughout does
+that. Beside such a prior they count as white scatter, and a model that left 0.1 mrad of them was adequate; or an effect
+that goes with time got its name from a part of a swing.
+
+Where no prior of pose errors stands beside names (labelled points, and views by the hundred), whatever is smooth gets
+the name of what it resembles, unless something smooth is what the name is held against. So a name must be wanted beside
+single joints that follow the joint angles, or the angles that they come from, by no law, and beside a flange that
+wanders in time: smooth processes of few numbers each and of a size that the views tell (`unmodelled_trends`).
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from stitch.diagnosis import thresholds as limits
+from stitch.diagnosis.regime import regime_of
+from stitch.diagnosis.score import Score
+from stitch.diagnosis.smooth_processes import (
+    FittedProcess,
+    SmoothProcess,
+    fit_process,
+    joint_motions,
+    joint_pair_processes,
+    single_joint_processes,
+    size_process,
+    wandering_flange,
+)
+from stitch.diagnosis.unmodelled_joint_effects import (
+    ANY_SIZE,
+    JOINT_ANGLES,
+    JointEffect,
+    joint_effect_log_posterior,
+    significant_joint_effects,
+)
+from stitch.numerics.frames import Array
+from stitch.numerics.parameter_selection import log_mean_exp
+from stitch.numerics.reml import NOISE, at_variances, fit_variances
+from stitch.numerics.units import duration_text
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.pose_errors import (
+    DRIFT,
+    DRIFT_MEMORY,
+    JOINT_SCATTER,
+    STOP_COMPONENTS,
+    flange_twists,
+    time_in_steps,
+    usual_time_step,
+    usual_twist,
+)
+from stitch.system.threads import parallel
+
+# Of a Gaussian its full width at half maximum.
+_FULL_WIDTH = 2.355
+# Periods between those that are tried, where one of them is clear.
+_PERIOD_REFINEMENT = 17
+# Of a swing in which all that moves does so at once: one of these is within a sixteenth of a period of any phase.
+_PHASES = 8
+_SWING, _SWING_IN_PHASE, _STRETCH = "swing", "swing at once", "stretch"
+_PLACES = 6  # of a curve in time, from one view to the next
+ROTATION_PART, TRANSLATION_PART = slice(3), slice(3, 6)
+# Processes that stand for the same in words; what is in none of them is an arm's own, of every joint and link.
+_FOLLOW_JOINTS, _WANDER_IN_TIME = "follow the joints", "wander in time"
+
+# Times (T,) in steps from view to view → shapes (T, R) of a process.
+_Trend = Callable[[Array], Array]
+# Its kind, in words, and with its frequency if it is a swing.
+_DescribedTrend = tuple[str, str, _Trend, float | None]
+
+
+def time_processes(linear: LinearModel) -> list[SmoothProcess]:
+    """Return all motions of the flange by one shape in time that are tried, of any size and direction in its frame."""
+    time = time_in_steps(linear.measurement)
+    span = max(float(np.ptp(time)), 1.0)
+    apart = max(limits.FREQUENCY_STEP / span, limits.FASTEST_SWING / limits.MOST_FREQUENCIES)
+    frequencies = np.arange(limits.LEAST_SWINGS / span, limits.FASTEST_SWING, apart)
+    swings = list(_swings(linear, frequencies))
+    # With one phase for all motions, as where one temperature moves them: half as many numbers.
+    in_phase = [
+        (_SWING_IN_PHASE, words, partial(_wave_at_phase, waves, k * np.pi / _PHASES), frequency)
+        for _, words, waves, frequency in swings
+        for k in range(_PHASES)
+    ]
+    return _processes(linear, time, [*swings, *in_phase, *_stretches(linear, time)])
+
+
+def likeliest_time_effect(linear: LinearModel) -> tuple[FittedProcess, float] | None:
+    """Return the likeliest of them beside a model, and the log Bayes factor of all that were tried over all else.
+
+    Of each kind of trends one may be there, each kind and each of its trends as likely before: what counts is the mean
+    of their Bayes factors. All variances are sought anew for the likeliest few; for the others that is a bound. None
+    where poses have no prior of errors, or a session is too short for any.
+    """
+    processes = [] if linear.pose_errors is None else time_processes(linear)
+    if not processes:
+        return None
+    sized = [size_process(linear, process) for process in processes]
+    gains = np.array([gain for _, gain in sized])
+    likeliest = np.argsort(-gains)[: limits.TIME_EFFECTS_FITTED]
+    fits = {k: fit_process(linear, processes[k], sized[k][0], tried=1) for k in likeliest}
+    for k, fit in fits.items():
+        gains[k] = max(gains[k], fit.log_bayes_factor)
+    best = max(fits, key=lambda k: gains[k])
+    kinds = np.array([process.kind for process in processes])
+    together = log_mean_exp([float(log_mean_exp(gains[kinds == kind])) for kind in np.unique(kinds)])
+    return fits[best], float(together)
+
+
+def significant_time_effect(linear: LinearModel) -> FittedProcess | None:
+    """Return the likeliest with the log Bayes factor of all that were tried, where it is 20 to 1 likelier than none.
+
+    Beside all else that poses may do; or in place of what wanders: then no less likely than all that wanders, which can
+    do what a stretch does, so that beside it a stretch gains nothing. A swing comes with the likeliest of all periods
+    near its own. As with a joint's effect (`significant_joint_effects`) the odds are those of the likeliest sizes.
+    """
+    steady, wandering = linear, 0.0
+    likeliest = likeliest_time_effect(linear)
+    if likeliest is None or likeliest[1] <= limits.ODDS:
+        steady = linear.restricted(linear.causes - DRIFT)
+        likeliest = likeliest_time_effect(steady)
+        wandering = 0.5 * (steady.null.deviance - linear.null.deviance)
+        if likeliest is None or likeliest[1] <= max(limits.ODDS, wandering):
+            return None
+    fitted, factor = likeliest
+    if fitted.process.frequency is not None:
+        fitted = _with_refined_period(steady, fitted)
+    return replace(fitted, log_bayes_factor=factor - wandering)
+
+
+def unmodelled_log_posterior(base: LinearModel) -> float:
+    """Return the log posterior of the likelier unmodelled effect, of some joint or of the flange in time, as those of
+    effects (`Ranked`); −∞ where there is none."""
+    in_time = likeliest_time_effect(base)
+    of_flange = -np.inf if in_time is None else in_time[1] - ANY_SIZE + float(np.log(limits.PRIOR_UNKNOWN))
+    return max(joint_effect_log_posterior(base), of_flange)
+
+
+def _with_refined_period(base: LinearModel, swing: FittedProcess) -> FittedProcess:
+    """Return the likeliest of swings with periods between those that were tried, beside the fitted variances."""
+    frequency = swing.process.frequency
+    assert frequency is not None
+    time = time_in_steps(base.measurement)
+    reach = limits.FREQUENCY_STEP / max(float(np.ptp(time)), 1.0)
+    frequencies = frequency + np.linspace(-reach, reach, _PERIOD_REFINEMENT)
+    beside = replace(base, null=swing.fit)
+    near = [(p, *size_process(beside, p)) for p in _processes(base, time, _swings(base, frequencies))]
+    process, size, _ = max(near, key=lambda sized: sized[2])
+    return fit_process(base, process, size, tried=1)
+
+
+def _processes(linear: LinearModel, time: Array, trends: Iterable[_DescribedTrend]) -> list[SmoothProcess]:
+    carried = flange_twists([linear.measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
+    return [
+        SmoothProcess(None, carried, trend(time), kind, words, trend, frequency)
+        for kind, words, trend, frequency in trends
+    ]
+
+
+def _swings(linear: LinearModel, frequencies: Array) -> Iterator[_DescribedTrend]:
+    """Yield sines, of another phase in each motion, in words."""
+    for f in map(float, frequencies):
+        yield _SWING, f"swing to and fro about every {_duration_in_words(linear, 1 / f)}", partial(_waves, f), f
+
+
+def _waves(frequency: float, time: Array) -> Array:
+    """Return (T, 2) of which all sines of a frequency (1/step) are made."""
+    phase = 2 * np.pi * frequency * time
+    return np.stack([np.cos(phase), np.sin(phase)], axis=1)
+
+
+def _wave_at_phase(waves: _Trend, phase: float, time: Array) -> Array:
+    """Return (T, 1) the one of them with a phase."""
+    return waves(time) @ np.array([[np.cos(phase)], [np.sin(phase)]])
+
+
+def _stretches(linear: LinearModel, time: Array) -> Iterator[_DescribedTrend]:
+    """Yield bumps that begin and end within the session, in words."""
+    first = float(time.min())
+    last = float(time.max())
+    views = linear.measurement.views
+    width = limits.SHORTEST_STRETCH
+    while width <= limits.LONGEST_STRETCH * (last - first):
+        # A grid of this width within the session, where there are views: it may hold breaks of days.
+        steps = np.floor((time - first) / width)
+        middles = first + width * np.unique([steps, steps + 1])
+        for middle in middles[(middles > first) & (middles < last - width / 2)]:
+            distance = np.abs(time - middle) / width
+            if np.count_nonzero(distance < _FULL_WIDTH / 2) >= limits.STRETCH_VIEWS:
+                name = views.names[views.number[distance.argmin()]]
+                words = f"are off for a stretch of {_duration_in_words(linear, _FULL_WIDTH * width)} about view {name}"
+                yield _STRETCH, words, partial(_bump, middle, width), None
+        width *= 2
+
+
+def _bump(middle: float, width: float, time: Array) -> Array:
+    """Return (T, 1) of unit height, with its standard deviation `width`."""
+    return np.exp(-0.5 * ((time - middle) / width) ** 2)[:, None]
+
+
+def _duration_in_words(linear: LinearModel, steps: float) -> str:
+    """Return a time in steps from view to view, in words."""
+    step = usual_time_step(linear.measurement)
+    return f"{steps:.2g} views" + (f" ({duration_text(steps * step)})" if step > 0 else "")
+
+
+@dataclass(frozen=True)
+class TimeCurve:
+    """How far the flange turns and moves in time, in its own frame, beside where it stands otherwise.
+
+    Example:
+        >>> stitch.diagnose(run).time_curve is None  # of a flange that does not
+        True
+    """
+
+    steps: Array  # (G,) times in usual steps from one view to the next
+    seconds: float  # that a step takes; 0 where no time is stated
+    error: Array  # (G, 6) rotation (rad), then translation (length_unit)
+    sigma: Array  # (G, 6)
+
+    def largest(self, of: slice) -> tuple[int, float, float]:
+        """Return where rotation or translation is largest, how large it is there, and its sigma.
+
+        Example:
+            >>> from stitch.diagnosis.unmodelled_time_effects import TimeCurve
+            >>> curve = TimeCurve(np.arange(2.0), 60.0, np.eye(6)[:2] * 1e-3, np.full((2, 6), 1e-4))
+            >>> curve.largest(slice(0, 3))
+            (0, 0.001, 0.0001)
+        """
+        size = np.linalg.norm(self.error[:, of], axis=1)
+        k = int(size.argmax())
+        along = self.error[k, of] / max(float(size[k]), 1e-300)
+        return k, float(size[k]), float(np.linalg.norm(along * self.sigma[k, of]))
+
+
+def time_curve(fitted: FittedProcess) -> TimeCurve:
+    """Return what the flange does in time, and its sigma: a free fit at the fitted sizes of all other errors."""
+    linear = fitted.base
+    assert fitted.process.trend is not None
+    time = np.sort(time_in_steps(linear.measurement))
+    places = np.linspace(0, len(time) - 1, _PLACES * (len(time) - 1) + 1)
+    steps = np.interp(places, np.arange(len(time)), time)
+    shapes = fitted.process.trend(steps)
+    wide = np.full(fitted.columns.shape[1], limits.FREE_SIZES * fitted.size)
+    fit = at_variances(linear.mixed, fitted.fit.variances, linear.in_blocks(fitted.columns), wide)
+    # Of every motion of the flange one coefficient for each shape.
+    coefficients = fit.mean[-len(wide) :].reshape(6, -1)
+    covariance = fit.covariance[-len(wide) :, -len(wide) :].reshape(*coefficients.shape, *coefficients.shape)
+    variance = np.einsum("gr,prps,gs->gp", shapes, covariance, shapes)
+    unit = usual_twist(linear.measurement.length_unit)
+    # Where the flange carries the part, the views move the other way.
+    direction = -unit if linear.measurement.eye_to_hand else unit
+    return TimeCurve(
+        steps=steps,
+        seconds=usual_time_step(linear.measurement),
+        error=direction * (shapes @ coefficients.T),
+        sigma=unit * np.sqrt(np.maximum(variance, 0.0)),
+    )
+
+
+def unmodelled_trends(linear: LinearModel) -> tuple[FittedProcess, ...]:
+    """Return the likeliest smooth processes of a joint or of the flange beside a model; () where pose errors have a
+    prior."""
+    if regime_of(linear).prior:
+        return ()
+    flange = wandering_flange(linear)
+    sized = [(flange, *size_process(linear, flange))]
+    if linear.measurement.views.has("joints"):
+        motions = joint_motions(linear)
+
+        def sized_of_joint(
+            processes: Callable[[LinearModel, Array, int], Iterator[SmoothProcess]], k: int
+        ) -> list[tuple[SmoothProcess, float, float]]:
+            return [(process, *size_process(linear, process)) for process in processes(linear, motions, k)]
+
+        by_joint = list(parallel(partial(sized_of_joint, single_joint_processes), range(len(motions))))
+        clearest = sorted(range(len(by_joint)), key=lambda k: -max(gain for _, _, gain in by_joint[k]))
+        pairs = parallel(partial(sized_of_joint, joint_pair_processes), clearest[: limits.PAIRED_JOINTS])
+        sized += [process for of_joint in (*by_joint, *pairs) for process in of_joint]
+    likeliest = sorted(sized, key=lambda process: -process[2])[: limits.TRENDS_FITTED]
+    fitted = parallel(lambda process: fit_process(linear, process[0], process[1], len(sized)), likeliest)
+    return tuple(sorted(fitted, key=lambda process: -process.log_bayes_factor))
+
+
+def least_log_bayes_factor(linear: LinearModel, scored: Score) -> float:
+    """Return the log Bayes factor of an effect beside that trend which leaves least of it; ∞ where pose errors have a
+    prior."""
+
+    def factor_beside(trend: FittedProcess) -> float:
+        both = linear.in_blocks(np.hstack([trend.columns, scored.form.columns]))
+        size = np.full(trend.columns.shape[1], trend.size)
+        priors = [np.append(times * size, scored.sizes) for times in limits.TREND_SIZES]
+        start = trend.fit.variances
+        return 0.5 * (trend.fit.deviance - min(fit_variances(linear.mixed, both, p, start).deviance for p in priors))
+
+    return min(parallel(factor_beside, unmodelled_trends(linear)), default=np.inf)
+
+
+@dataclass(frozen=True)
+class RepeatingError:
+    """One kind of errors that repeat, beside all others."""
+
+    words: str  # "they …"
+    log_bayes_factor: float  # over the same errors without it
+    joints: bool  # follows the pose rather than time
+    of_one: bool = False  # one joint, or one trend in time, stands out
+    joint_effects: tuple[JointEffect, ...] = ()  # of single joints, where they are clear
+    curve: TimeCurve | None = None  # of the flange in time, where that is clear
+    process: FittedProcess | None = None  # and the rest beside it, where the null counts it as scatter
+
+
+def reportable(errors: tuple[RepeatingError, ...], implausible: bool) -> tuple[RepeatingError, ...]:
+    """Return those of them that are said: where poses scatter as no arm does, only beside one that stands out."""
+    return errors if not implausible or any(error.of_one for error in errors) else ()
+
+
+def find_repeating_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
+    """Return kinds of errors without which the views cannot do, clearest first; () where white scatter explains them.
+
+    Without a prior of pose errors the likeliest alone (`unmodelled_trends`).
+
+    Each is left out of the prior in turn, all other sizes fitted anew. A size that is not wanted goes to where its
+    prior piles up and costs nothing; one that is wanted pays for its prior's tail alone and not for its width, about
+    three nats (`reml`), which the odds of 20 to 1 stand for.
+    """
+    if linear.pose_errors is None:
+        return _trend_errors(linear)
+    single = _single_error(linear)
+    if 0.5 * (linear.restricted({JOINT_SCATTER}).null.deviance - linear.null.deviance) < limits.ODDS:
+        return () if single is None else (single,)
+    names = linear.pose_errors.names
+    of_arm = tuple(name for name, own in zip(names, linear.pose_errors.arm_components, strict=True) if own)
+    kinds = {
+        _FOLLOW_JOINTS: of_arm,
+        _WANDER_IN_TIME: tuple(DRIFT_MEMORY),
+        "are shared by the scans of a stop": STOP_COMPONENTS,
+    }
+    errors = [
+        RepeatingError(
+            words, 0.5 * (_deviance_without(linear, kind) - linear.null.deviance), joints=words == _FOLLOW_JOINTS
+        )
+        for words, kind in kinds.items()
+        if any(name in kind for name in names)
+    ]
+    wanted = sorted((e for e in errors if e.log_bayes_factor > limits.ODDS), key=lambda e: -e.log_bayes_factor)
+    if single is not None:
+        # What one joint does is part of what follows the joints, and as clear.
+        alike = [e.log_bayes_factor for e in errors if e.joints == single.joints]
+        single = replace(single, log_bayes_factor=max([single.log_bayes_factor, *alike]))
+        return (single, *(e for e in wanted if e.joints != single.joints))
+    # Where each can stand in for the other, the likelier alone is said to be there.
+    return tuple(wanted) or (max(errors, key=lambda e: e.log_bayes_factor),)
+
+
+def _single_error(linear: LinearModel) -> RepeatingError | None:
+    """Return the error of one joint or of the flange in time; in the words of both where 20 to 1 tells neither."""
+    errors = list[RepeatingError]()
+    effects = significant_joint_effects(linear)
+    if effects:
+        which = " or ".join(f"joint {joint}" for joint in sorted(effect.joint for effect in effects))
+        followed = dict.fromkeys(number for effect in effects for number in effect.may_follow)
+        # Of functions that nobody knows none is certain to be of the kind that explains most.
+        words = f"come from {which} above all, likeliest by {' or '.join(followed)}"
+        if JOINT_ANGLES in followed:
+            words = f"{_FOLLOW_JOINTS}, {which} above all"
+        factor = effects[0].log_bayes_factor
+        errors.append(RepeatingError(words, factor, joints=True, of_one=True, joint_effects=effects))
+    fitted = significant_time_effect(linear)
+    if fitted is not None:
+        words, factor = fitted.process.words, fitted.log_bayes_factor
+        curve = time_curve(fitted)
+        errors.append(RepeatingError(words, factor, joints=False, of_one=True, curve=curve, process=fitted))
+    errors.sort(key=lambda error: -error.log_bayes_factor)
+    if len(errors) == 2 and errors[0].log_bayes_factor - errors[1].log_bayes_factor < limits.ODDS:
+        return replace(errors[0], words=f"{errors[0].words}, or {errors[1].words}")
+    return errors[0] if errors else None
+
+
+def _trend_errors(linear: LinearModel) -> tuple[RepeatingError, ...]:
+    """Return the likeliest trend of poses that count as scattering independently, where it is 20 to 1 likelier than
+    scatter alone though it is the best of all.
+
+    Scatter of the joints counts here, as what repeats least resembles it. It does not where names are asked for: an arm
+    that errs by many small effects at once seems to scatter by its joints, and of two tracked arms of one series one
+    was then not what it was named for on the other's poses.
+    """
+    trends = unmodelled_trends(linear.restricted({JOINT_SCATTER}))
+    trend = next((trend for trend in trends if trend.log_bayes_factor > limits.ODDS), None)
+    if trend is None:
+        return ()
+    words = _WANDER_IN_TIME if trend.joint is None else f"{_FOLLOW_JOINTS}, joint {trend.joint} above all"
+    return (RepeatingError(words, trend.log_bayes_factor, trend.joint is not None, process=trend),)
+
+
+def _deviance_without(linear: LinearModel, kind: tuple[str, ...]) -> float:
+    """Return the deviance of the null without some components."""
+    assert linear.pose_errors is not None
+    assert linear.mixed.further is not None
+    keep = np.array([name not in kind for name in linear.pose_errors.names], bool)
+    components = np.append(np.ones(NOISE + 1, bool), keep)
+    further = linear.mixed.further.select(keep)
+    mixed = replace(linear.mixed, components=linear.mixed.components[components], further=further)
+    plain = np.append(linear.restricted(()).null.variances, 1e-2 * further.scales**2)
+    return min(fit_variances(mixed, start=start).deviance for start in (linear.null.variances[components], plain))
