@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
 
 from data_synth.csv_rows import POSE, pose_numbers, write_rows
+from stitch.system.ply_file import write_ply
 
 Array = NDArray[np.float64]
 
@@ -18,7 +18,7 @@ def write_scans(table: Path, clouds: list[Array], T_base_scanner: Array) -> None
         name = f"{table.stem}-{i + 1:02}.ply"
         vertex = np.empty(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4")])
         vertex["x"], vertex["y"], vertex["z"] = points.T
-        PlyData([PlyElement.describe(vertex, "vertex")]).write(str(table.parent / name))
+        write_ply(table.parent / name, {"vertex": vertex})
         rows.append([name, *pose_numbers(T, 7)])
     write_rows(table, f"file {POSE}", rows)
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import igl
 import numpy as np
-from plyfile import PlyData, PlyElement
 from pykdtree.kdtree import KDTree
 
 from stitch.errors import NoResultError
 from stitch.numerics.frames import Array, Indices
+from stitch.system.ply_file import write_ply
 from stitch.system.threads import parallel
 
 # A cell's edge is one spacing of the points: finer, and cells on the surface have no point beside them; coarser, and
@@ -46,8 +46,7 @@ def write_mesh(mesh: TriangleMesh, path: Path) -> None:
         vertices[axis] = column
     faces = np.empty(len(mesh.triangles), [("vertex_indices", "<i4", (3,))])
     faces["vertex_indices"] = mesh.triangles
-    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
-    PlyData(elements, byte_order="<").write(str(path))
+    write_ply(path, {"vertex": vertices, "face": faces})
 
 
 def mesh_of(points: Array, normals: Array, outside: float = 0.0) -> TriangleMesh:

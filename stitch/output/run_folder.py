@@ -16,7 +16,6 @@ from threading import Thread
 from typing import Any, TypeVar
 
 import numpy as np
-from plyfile import PlyData, PlyElement
 
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
@@ -30,6 +29,7 @@ from stitch.run_data import FusedCloud, RunData
 from stitch.session.reading.session_folder import measured_files
 from stitch.session.session import SessionData, View
 from stitch.system.files import claim_folder, rewrite_folder
+from stitch.system.ply_file import ply_header
 from stitch.system.threads import release_mapped
 
 # Recordings of a run, made by the packages that offer one.
@@ -57,9 +57,8 @@ def write_cloud(cloud: FusedCloud, path: Path) -> None:
     """
     names = ("x", "y", "z", "nx", "ny", "nz", "residual")
     layout = np.dtype([(name, "<f4") for name in names] + [("views", "<u2")])
-    header = PlyData([PlyElement.describe(np.empty(0, layout), "vertex")], byte_order="<").header
     with path.open("wb") as out:
-        out.write(header.replace("vertex 0", f"vertex {len(cloud.points)}").encode() + b"\n")
+        out.write(ply_header({"vertex": (layout, len(cloud.points))}))
         for start in range(0, len(cloud.points), _ROWS):
             part = slice(start, start + _ROWS)
             columns = np.column_stack([cloud.points[part], cloud.normals[part], cloud.residual[part]])

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import tomli_w
-from plyfile import PlyData, PlyElement
 
 from stitch.errors import InputError
 from stitch.numerics import frames
@@ -22,6 +21,7 @@ from stitch.numerics.frames import Array
 from stitch.session.reading.session_toml import SESSION_FORMAT
 from stitch.session.robot import Robot
 from stitch.session.session import Cloud, StatedRepeatability
+from stitch.system import ply_file
 
 TableColumns = Mapping[str, Sequence[object] | Array]  # a table by its header; text as it stands, floats with 12 digits
 
@@ -126,7 +126,7 @@ def write_ply(path: Path, cloud: Cloud, scalar: str = "<f4") -> None:
     vertex = np.empty(len(cloud.points), layout)
     for name, values in (columns | cloud.scalars).items():
         vertex[name] = values
-    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
+    ply_file.write_ply(path, {"vertex": vertex})
 
 
 def write_table(file: Path, columns: TableColumns) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-from plyfile import PlyData, PlyParseError
 
 from stitch.effects.user_file import load
 from stitch.errors import InputError
@@ -29,6 +28,7 @@ from stitch.session.measurement import measurement_of, with_part_origin
 from stitch.session.reading.scan_files import require_room
 from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, session_hash
 from stitch.session.reading.text_files import shortened
+from stitch.system.ply_file import vertex_columns
 from stitch.system.threads import library_threads_off
 
 
@@ -187,7 +187,7 @@ def diagnosed_state(run: RunData, folder: Path) -> str:
 def fused_cloud(path: Path) -> FusedCloud:
     """Return what stitched.ply holds; reference frame, length_unit."""
     require_room(path)
-    vertex = PlyData.read(str(path))["vertex"]
+    vertex = vertex_columns(path)
     columns = np.column_stack([vertex[name] for name in ("x", "y", "z", "nx", "ny", "nz", "residual")])
     columns = columns.astype(np.float64)
     # Earlier versions called it count.
@@ -206,7 +206,7 @@ def _read_fit(folder: Path, run: RunData) -> Fit:
         document = read_result(folder)
         _require_same(folder, document, model, run)
         return _restore_fit(folder, document, run)
-    except (LookupError, TypeError, ValueError, OSError, PlyParseError) as error:
+    except (LookupError, TypeError, ValueError, OSError) as error:
         reason = shortened(" ".join(str(error).split()))
         raise InputError(f"{folder}: its files are damaged ({reason}); to fix: run `stitch run` again") from None
 

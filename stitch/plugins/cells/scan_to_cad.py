@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -32,6 +31,7 @@ from stitch.plugins.cells.job_files import write_columns
 from stitch.plugins.cells.placed_scans import SOURCES, JoinedScans, PlacingErrors
 from stitch.session.reading.csv_files import is_number
 from stitch.session.scan import even_indices
+from stitch.system.ply_file import write_ply
 
 # Stock on a casting: how far the scan stands off the CAD, even or slowly varying. Positive is outside: stock on it.
 
@@ -591,7 +591,7 @@ def write_deviation_ply(file: Path, deviations: Deviations) -> None:
     pale = 235 * (1 - np.abs(share))
     vertex["red"], vertex["green"] = np.where(share > 0, 235, pale), pale
     vertex["blue"] = np.where(share < 0, 235, pale)
-    PlyData([PlyElement.describe(vertex, "vertex")]).write(str(file))
+    write_ply(file, {"vertex": vertex})
 
 
 def write_deviation_csv(file: Path, deviations: Deviations) -> None:

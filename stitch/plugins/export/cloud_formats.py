@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyParseError
 from pykdtree.kdtree import KDTree
 
 from stitch.errors import InputError
@@ -21,6 +20,7 @@ from stitch.output.cloud_colours import Colours, residual_colours
 from stitch.output.stored_run import fused_cloud
 from stitch.run_data import FusedCloud
 from stitch.session.reading.text_files import shortened
+from stitch.system import ply_file
 
 # LAS counts places in whole steps of 32 bits, which hold so many on either side of the middle.
 _LAS_STEPS = 1e9
@@ -49,7 +49,7 @@ def coloured_cloud(folder: Path) -> ColouredCloud:
         raise InputError(f"{file}: no stitched cloud there; to fix: name a run of a session with clouds")
     try:
         fused = fused_cloud(file)
-    except (LookupError, TypeError, ValueError, OSError, PlyParseError) as error:
+    except (LookupError, TypeError, ValueError, OSError) as error:
         raise InputError(f"{file}: damaged ({shortened(str(error))}); to fix: run `stitch run` again") from None
     if not len(fused.points):
         raise InputError(
@@ -77,7 +77,7 @@ def write_ply(cloud: ColouredCloud, path: Path) -> None:
     for name, column in zip(("red", "green", "blue"), cloud.colours.T, strict=True):
         vertex[name] = column
     vertex["views"] = fused.count
-    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
+    ply_file.write_ply(path, {"vertex": vertex})
 
 
 def write_pcd(cloud: ColouredCloud, path: Path) -> None:
@@ -133,11 +133,10 @@ def write_glb(cloud: ColouredCloud, path: Path) -> None:
     if cloud.mesh is None:
         shape: Any = trimesh.PointCloud(cloud.fused.points * metres, colors=cloud.colours)
     else:
-        mesh = PlyData.read(str(cloud.mesh))
-        vertices = np.column_stack([mesh["vertex"][axis] for axis in "xyz"]).astype(float)
-        _, nearest = KDTree(np.ascontiguousarray(cloud.fused.points)).query(vertices, k=1)
-        faces = np.vstack(mesh["face"]["vertex_indices"])
-        shape = trimesh.Trimesh(vertices * metres, faces, vertex_colors=cloud.colours[nearest], process=False)
+        shape = trimesh.load_mesh(cloud.mesh, process=False)
+        _, nearest = KDTree(np.ascontiguousarray(cloud.fused.points)).query(np.array(shape.vertices), k=1)
+        shape.visual = trimesh.visual.ColorVisuals(shape, vertex_colors=cloud.colours[nearest])
+        shape.apply_scale(metres)
     path.write_bytes(trimesh.Scene([shape]).export(file_type="glb"))
 
 

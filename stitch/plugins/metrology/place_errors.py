@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.lib import recfunctions
-from plyfile import PlyData, PlyElement
 
 from stitch.model.forward import PointSlopes
 from stitch.numerics import frames
@@ -15,6 +13,7 @@ from stitch.run_data import FusedCloud
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
 from stitch.system.files import whole_file
+from stitch.system.ply_file import vertex_columns, write_ply
 
 # What is seen at more than 60° errs most with incidence, and other views see it better.
 _LEAST_COSINE = 0.5
@@ -209,8 +208,9 @@ def _of_points(places: PlaceErrors, views: Mask, shares: Array, nearest: Indices
 
 def write_sigmas(path: Path, sigma: Array) -> None:
     """Write the points' sigma as a column of stitched.ply, whole or not at all."""
-    vertex = PlyData.read(str(path))["vertex"].data
-    kept = [name for name in vertex.dtype.names if name != "sigma"]
-    rows = recfunctions.append_fields(vertex[kept], "sigma", sigma.astype("<f4"), usemask=False)
+    columns = vertex_columns(path) | {"sigma": sigma.astype("<f4")}
+    rows = np.empty(len(sigma), [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
     with whole_file(path) as file:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(file))
+        write_ply(file, {"vertex": rows})

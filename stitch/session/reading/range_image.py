@@ -13,6 +13,7 @@ from stitch.session.reading.pcd_file import read_pcd
 from stitch.session.reading.scan_files import grid_shape, read_ply, read_zdf_image
 from stitch.session.reading.text_files import reason_of
 from stitch.session.session import RangeImage
+from stitch.system import ply_file
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _COLOUR = re.compile(r"colou?r|rgb|image|gr[ae]y|intensity|texture|left|2d", re.IGNORECASE)
@@ -77,15 +78,13 @@ def _read_pixels(path: Path) -> tuple[Array | None, NDArray[np.uint8] | None]:
 
 def _full_grid(path: Path, columns: dict[str, Array], shape: tuple[int, int]) -> dict[str, Array]:
     """The vertices on their grid, where the file lists the measured ones and says which pixel has which."""
-    from plyfile import PlyData
-
     if len(columns["x"]) == shape[0] * shape[1]:
         return columns
-    data = PlyData.read(str(path))
-    if "range_grid" not in data:
+    pixels = ply_file.read_ply(path).get("range_grid", {}).get("vertex_indices")
+    if not isinstance(pixels, ply_file.Lists):
         return columns
-    pixels = data["range_grid"].data["vertex_indices"]
-    index = np.array([pixel[0] if len(pixel) else -1 for pixel in pixels])
+    index = np.full(len(pixels.lengths), -1)
+    index[pixels.lengths > 0] = pixels.values[(np.cumsum(pixels.lengths) - pixels.lengths)[pixels.lengths > 0]]
     return {
         name: np.where(index >= 0, np.asarray(column, float)[index], np.nan if name in "xyz" else 0.0)
         for name, column in columns.items()

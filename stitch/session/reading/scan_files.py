@@ -5,18 +5,17 @@ scanner's own frame. Where a scan is stored pixel by pixel, a pixel that measure
 error.
 """
 
-import io
 import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.session.reading.csv_files import is_number
 from stitch.session.reading.depth_image import is_depth_image, read_depth_columns
 from stitch.session.reading.text_files import import_extra, require_file
+from stitch.system.ply_file import vertex_columns
 
 MESHES = (".stl", ".obj", ".off", ".glb", ".gltf")
 TEXTS = (".xyz", ".csv", ".txt", ".asc", ".pts")
@@ -30,26 +29,11 @@ _DECIMAL_COMMAS = re.compile(r"(?=.*,)(?:[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?(?:[ 
 
 def read_ply(path: Path) -> dict[str, Array]:
     """Return columns (N,) of the vertices of a PLY by name, as stored."""
-    from plyfile import PlyData
-
     require_room(path)
     with path.open("rb") as stream:
         if stream.read(3) != b"ply":
             raise InputError(f"{path}: is not a PLY file; export it again, or name it by its kind")
-    data: NDArray[np.void] = PlyData.read(_without_blank_lines(path))["vertex"].data
-    # List properties have no column of numbers.
-    return {name: data[name] for name in data.dtype.names or () if not data.dtype[name].hasobject}
-
-
-def _without_blank_lines(path: Path) -> Path | io.BytesIO:
-    """Return the file, or its bytes without the blank lines that some programs leave in the header."""
-    with path.open("rb") as stream:
-        header, end, _ = stream.read(_HEADER_BYTES).partition(b"end_header")
-        lines = header.splitlines(keepends=True)
-        if not end or all(line.strip() for line in lines):
-            return path
-        stream.seek(len(header))
-        return io.BytesIO(b"".join(line for line in lines if line.strip()) + stream.read())
+    return vertex_columns(path)
 
 
 def require_room(path: Path) -> None:
