@@ -1,19 +1,15 @@
-"""Base to base on the source's two experiments: writes the tables of docs/base-to-base.md.
+"""Base to base on the source's two experiments."""
 
-Run: python bench/base_to_base.py [--draws N]
-"""
-
-import argparse
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
+from bench.harness import Row, Table, markdown
 from stitch.numerics import frames
+from stitch.numerics.frames import Array
 from stitch.plugins.cells.stand import Stand, TouchedPoints, compare_distances, cylinder_points, fit_stand, project
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "base-to-base.md"
-BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
 TRUE = {1: [4.0, -1.0, 1.0], 2: [6.0, -4.0, 1.0]}
 JOINTS = {1: (0.6283, 0.4488), 2: (1.0472, 0.6283)}
 SLIDE = {1: 3.8822, 2: 5.9093}
@@ -36,7 +32,7 @@ LEVERS = np.array([[0.76, -0.51], [-0.80, -0.13]])
 
 
 def exact_stand(experiment: int, joints: tuple[float, float]) -> Stand:
-    """The true stand: T and joint angles exact, rod readings computed, so that nothing contradicts anything."""
+    """Return the true stand: T and joint angles exact, rod readings computed, so that nothing contradicts anything."""
     (p, r), t = joints, np.array(TRUE[experiment])
     P = cylinder_points(np.array([p, -p]), np.full(2, 1.45), np.full(2, 1.3))
     R = cylinder_points(np.array([-r, r]), np.full(2, 0.7), np.full(2, 0.3))
@@ -46,7 +42,8 @@ def exact_stand(experiment: int, joints: tuple[float, float]) -> Stand:
     return stand_of(P, R, SLIDE[experiment], np.arctan2(arm[:, 0], arm[:, 1]), np.linalg.norm(arm, axis=1))
 
 
-def stand_of(P: np.ndarray, R: np.ndarray, slide: float, angle: np.ndarray, length: np.ndarray) -> Stand:
+def stand_of(P: Array, R: Array, slide: float, angle: Array, length: Array) -> Stand:
+    """Return a stand of touched points P, R (2, 3) and the readings of its rod."""
     touched = np.tile(np.eye(3) * 1e-8, (2, 1, 1))
     return Stand(
         length_unit="m",
@@ -65,24 +62,24 @@ def stand_of(P: np.ndarray, R: np.ndarray, slide: float, angle: np.ndarray, leng
     )
 
 
-def noisy(stand: Stand, joints: tuple[float, float], lam: float, rng: np.random.Generator) -> Stand:
+def noisy(stand: Stand, joints: tuple[float, float], noise: float, rng: np.random.Generator) -> Stand:
     """The source's noise, formula 12, on every joint angle; angles of zero stay exact."""
 
     def u(t):
-        return t + lam * 1e-3 * t * (rng.random(np.shape(t)) - 0.5)
+        return t + noise * 1e-3 * t * (rng.random(np.shape(t)) - 0.5)
 
     p, r = joints
     q25 = u(np.full((2, 2), np.pi / 2)) - np.pi / 2
     dr, dz = LEVERS @ q25
     P = cylinder_points(u(np.array([p, -p])), 1.45 + dr, 1.3 + dz)
     R = cylinder_points(u(np.array([-r, r])), np.full(2, 0.7), np.full(2, 0.3))
-    spread = lam * 1e-3 / np.sqrt(12)
+    spread = noise * 1e-3 / np.sqrt(12)
     rail = replace(stand.rail, points=P, covariance=covariance(P, p * spread, spread * np.pi / 2))
     rod = replace(stand.rod, points=R, covariance=covariance(R, r * spread, 1e-6))
     return replace(stand, rail=rail, rod=rod)
 
 
-def covariance(points: np.ndarray, sigma_joint1: float, sigma_other: float) -> np.ndarray:
+def covariance(points: Array, sigma_joint1: float, sigma_other: float) -> Array:
     """(N, 3, 3): tangent by joint 1, radius and height by the other joints."""
     radius = np.hypot(points[:, 0], points[:, 1])
     radial = np.stack([points[:, 0] / radius, points[:, 1] / radius, 0 * radius], -1)
@@ -93,79 +90,81 @@ def covariance(points: np.ndarray, sigma_joint1: float, sigma_other: float) -> n
     return np.einsum("nij,nj,nkj->nik", axes, sigma**2, axes)
 
 
-def errors(T: np.ndarray, experiment: int) -> tuple[float, float]:
+def errors(T: Array, experiment: int) -> tuple[float, float]:
     """Rotation (rad) and translation (m) error against the truth, −90° about z."""
     truth = frames.exp(np.array([0, 0, -np.pi / 2, 0, 0, 0]))
     truth[:3, 3] = TRUE[experiment]
     return float(frames.angle_between(T, truth)), float(np.linalg.norm(T[:3, 3] - truth[:3, 3]))
 
 
-def draw(experiment: int, lam: float, draws: int) -> dict[str, np.ndarray]:
+def jobs(seeds: range) -> Iterator[Row]:
+    """The source's noise at both sizes; as many draws as there are seeds, from one generator."""
+    for experiment, noise in PUBLISHED:
+        yield {"experiment": experiment, "noise": noise, "draws": len(seeds)}
+
+
+def trial(job: Row) -> Row:
     """Errors (draws, 2) of both solutions under the source's noise."""
+    experiment, noise = job["experiment"], job["noise"]
     # Experiment 2's own joint angles contradict its rod; with those of experiment 1 everything closes.
-    stand, rng = exact_stand(experiment, JOINTS[1]), np.random.default_rng(int(1000 * lam) + experiment)
-    stands = [noisy(stand, JOINTS[1], lam, rng) for _ in range(draws)]
+    stand, rng = exact_stand(experiment, JOINTS[1]), np.random.default_rng(int(1000 * noise) + experiment)
+    stands = [noisy(stand, JOINTS[1], noise, rng) for _ in range(job["draws"])]
     return {
-        "projection": np.array([errors(project(s).T_base1_base2, experiment) for s in stands]),
-        "least squares": np.array([errors(fit_stand(s).T_base1_base2, experiment) for s in stands]),
+        "projection": [errors(project(s).T_base1_base2, experiment) for s in stands],
+        "least squares": [errors(fit_stand(s).T_base1_base2, experiment) for s in stands],
     }
 
 
-def tables(draws: int) -> str:
-    lines = [
-        f"Errors under the source's noise, {draws} draws; rotation in µrad / translation in µm.",
+def summary(rows: list[Row]) -> list[str]:
+    """Errors under noise; the source's noisy positions; the distance that rod and joints contradict."""
+    lines = []
+    for row in rows:
+        published = PUBLISHED[row["experiment"], row["noise"]]
+        for name in ("projection", "least squares"):
+            off = np.array(row[name])
+            low, median, high = 1e6 * np.quantile(off, [0.025, 0.5, 0.975], axis=0)
+            rms, asked = 1e6 * np.sqrt((off**2).mean(0)), 1e6 * np.array(published)
+            figures = [f"{a:.0f} / {b:.0f}" for a, b in (rms, median, asked)]
+            figures.insert(2, " / ".join(f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True)))
+            below = " / ".join(f"{share:.0%}" for share in (off <= published).mean(axis=0))
+            lines.append([row["experiment"], row["noise"], name, *figures, below])
+    head = "experiment | λ | solution | rms | median | 95 % of draws between | published, one draw | draws below that"
+    return [
+        f"Errors under the source's noise, {rows[0]['draws']} draws; rotation in µrad / translation in µm.",
         "",
-        "| experiment | λ | solution | rms | median | 95 % of draws between | published, one draw | draws below that |",
-        "|---|---|---|---|---|---|---|---|",
+        *markdown(head, lines),
+        "",
+        "The source's noisy positions of experiment 1 (table 3, rounded to 0.1 mm) and its rod readings:",
+        "",
+        *markdown("λ | solution | rotation / rad | translation / m | published", _table_3()),
+        "",
+        "Distance R1 to R2 with the rod readings and joint angles as printed:",
+        "",
+        *markdown(
+            "rod of | joints of | by rod / m | by joints / m | difference / m | translation found",
+            (_closing(rod, joints) for rod, joints in ((1, 1), (2, 2), (2, 1))),
+        ),
     ]
-    for (experiment, lam), published in PUBLISHED.items():
-        for name, found in draw(experiment, lam, draws).items():
-            low, median, high = 1e6 * np.quantile(found, [0.025, 0.5, 0.975], axis=0)
-            rms, asked = 1e6 * np.sqrt((found**2).mean(0)), 1e6 * np.array(published)
-            cells = [f"{a:.0f} / {b:.0f}" for a, b in (rms, median, asked)]
-            cells.insert(2, " / ".join(f"{a:.0f} to {b:.0f}" for a, b in zip(low, high, strict=True)))
-            cells.append(" / ".join(f"{share:.0%}" for share in (found <= published).mean(axis=0)))
-            lines.append(f"| {experiment} | {lam} | {name} | {' | '.join(cells)} |")
-    lines += ["", "The source's noisy positions of experiment 1 (table 3, rounded to 0.1 mm) and its rod readings:", ""]
-    lines += ["| λ | solution | rotation / rad | translation / m | published |", "|---|---|---|---|---|"]
-    for lam, points in TABLE_3.items():
-        P, R = np.array(points[:2]), np.array(points[2:])
-        stand = stand_of(P, R, SLIDE[1], np.array(ANGLE[1]), np.array(LENGTH[1]))
-        for name, T in (
-            ("projection", project(stand).T_base1_base2),
-            ("least squares", fit_stand(stand).T_base1_base2),
-        ):
-            rotation, translation = errors(T, 1)
-            p = PUBLISHED[1, lam]
-            lines.append(f"| {lam} | {name} | {rotation:.5f} | {translation:.5f} | {p[0]:.5f} / {p[1]:.5f} |")
-    lines += ["", "Distance R1 to R2 with the rod readings and joint angles as printed:", ""]
-    lines.append("| rod of | joints of | by rod / m | by joints / m | difference / m | translation found |")
-    lines.append("|---|---|---|---|---|---|")
-    for rod, joints in ((1, 1), (2, 2), (2, 1)):
-        lines.append(_closing(rod, joints))
-    return "\n".join(lines)
 
 
-def _closing(rod: int, joints: int) -> str:
+def _table_3() -> Iterator[list[object]]:
+    for noise, points in TABLE_3.items():
+        stand = stand_of(np.array(points[:2]), np.array(points[2:]), SLIDE[1], np.array(ANGLE[1]), np.array(LENGTH[1]))
+        published = "{:.5f} / {:.5f}".format(*PUBLISHED[1, noise])
+        for name, solution in (("projection", project(stand)), ("least squares", fit_stand(stand))):
+            rotation, translation = errors(solution.T_base1_base2, 1)
+            yield [noise, name, f"{rotation:.5f}", f"{translation:.5f}", published]
+
+
+def _closing(rod: int, joints: int) -> list[object]:
     p, r = JOINTS[joints]
     P = cylinder_points(np.array([p, -p]), np.full(2, 1.45), np.full(2, 1.3))
     R = cylinder_points(np.array([-r, r]), np.full(2, 0.7), np.full(2, 0.3))
     stand = stand_of(P, R, SLIDE[rod], np.array(ANGLE[rod]), np.array(LENGTH[rod]))
     c = compare_distances(stand)[0]
-    found = (
-        "refused" if abs(c.difference) > 1e-3 else np.array2string(fit_stand(stand).T_base1_base2[:3, 3], precision=4)
-    )
-    return f"| {rod} | {joints} | {c.by_stand:.4f} | {c.by_robot:.4f} | {c.difference:+.4f} | {found} |"
+    refused = abs(c.difference) > 1e-3
+    place = "refused" if refused else np.array2string(fit_stand(stand).T_base1_base2[:3, 3], precision=4)
+    return [rod, joints, f"{c.by_stand:.4f}", f"{c.by_robot:.4f}", f"{c.difference:+.4f}", place]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--draws", type=int, default=1000)
-    text = tables(parser.parse_args().draws)
-    page = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(page.split(BEGIN)[0] + BEGIN + "\n" + text + "\n" + END + page.split(END)[1], encoding="utf-8")
-    print(text)
-
-
-if __name__ == "__main__":
-    main()
+TABLE = Table(jobs, trial, summary, range(1000), page="base-to-base", block="tables")

@@ -1,16 +1,13 @@
-"""The tables of docs/results.md: real scans, and a synthetic blade of 18 views with 340,000 points.
+"""Real scans of one rig (folder `reghec` of the shared data), and a synthetic blade of 18 views with 340,000 points."""
 
-Usage: python bench/real_scans.py PATH_OF_REGHEC_SESSIONS
-"""
-
-import sys
-from contextlib import redirect_stdout
+import time
+from collections.abc import Iterator
 from dataclasses import replace
-from io import StringIO
-from pathlib import Path
+from functools import cache
 
 import numpy as np
 
+from bench.harness import SHARED_DATA, Row, Table, grouped, markdown
 from data_synth.fixtures.blade_cells import SCENE_OF_MOUNT, captured, disturbed
 from data_synth.scene import load_scene
 from data_synth.simulate import simulate
@@ -20,126 +17,166 @@ from stitch.fusion.register import register
 from stitch.numerics import frames
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import collect_overlaps
+from stitch.run_data import RunData
 from stitch.session.capture import part_size, prepare_capture
 from stitch.session.reading.session_folder import load_session
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "results.md"
-BEGIN, END = "<!-- scans: begin -->", "<!-- scans: end -->"
 IN_HAND = ("david", "cone", "sphere", "rubik")
 OBJECTS = (*IN_HAND, "gripperopen")
+MOUNTS = ("eye_to_hand", "eye_in_hand")
 
 
-def main(folder: Path) -> None:
-    """Print the page."""
-    print("Written by `python bench/real_scans.py PATH_OF_REGHEC_SESSIONS`; two cores.\n")
-    runs = {name: run(load_session(folder / name)) for name in OBJECTS}
-    print("## Real scans, no hand-eye given (RegHEC: 5 objects, 9 views each)\n")
-    print("| object | one hand-eye, rms (µm) | held-out (µm) | after register (µm) | sensor noise (µm) | seconds |")
-    print("|---|---:|---:|---:|---:|---:|")
-    for name, r in runs.items():
-        seconds = sum(s.seconds for s in r.stages)
-        print(
-            f"| {name} | {r.residual_rms * 1e3:.0f} | {r.heldout_rms * 1e3:.0f} | {r.stages[2].rms * 1e3:.0f} "
-            f"| {r.noise_floor * 1e3:.0f} | {seconds:.1f} |"
-        )
-    agreement(runs)
-    together(folder, runs)
-    repeated(folder, runs)
-    synthetic()
-    speed()
+def jobs(seeds: range) -> Iterator[Row]:
+    """Objects alone, together, in pairs and one after david; a blade for each seed and mount; speed."""
+    yield from ({"part": "objects", "object": name} for name in OBJECTS)
+    for i, name in enumerate(IN_HAND):
+        yield from ({"part": "pairs", "pair": [other, name]} for other in IN_HAND[:i])
+    yield {"part": "together"}
+    yield from ({"part": "repeated", "object": name} for name in IN_HAND[1:])
+    for mount in MOUNTS:
+        yield from ({"part": "blade", "mount": mount, "seed": seed} for seed in seeds)
+    yield {"part": "speed"}
 
 
-def agreement(runs) -> None:
-    """χ² of the differences of the hand-eyes of one rig."""
-    print("\n## The four eye-in-hand objects come from one rig: do their hand-eyes agree?\n")
-    print(
-        "Difference squared over the sum of covariances, 6 degrees of freedom; 17.3 is the 95 % limit for six pairs.\n"
-    )
-    print("| pair | χ² |\n|---|---:|")
-    for i, a in enumerate(IN_HAND):
-        for b in IN_HAND[:i]:
-            xi = frames.log(frames.inverse(runs[a].T_mount) @ runs[b].T_mount)
-            both = runs[a].mount_covariance + runs[b].mount_covariance
-            print(f"| {b}, {a} | {xi @ np.linalg.solve(both, xi):.1f} |")
+def trial(job: Row) -> Row:
+    """One row of a part."""
+    parts = {"objects": _object, "pairs": _pair, "together": _together}
+    return {**parts, "repeated": _repeated, "blade": _blade, "speed": _speed}[job["part"]](job)
 
 
-def together(folder: Path, runs) -> None:
+@cache
+def _run_of(name: str) -> RunData:
+    return run(load_session(SHARED_DATA / "reghec" / name))
+
+
+def _object(job: Row) -> Row:
+    """Rms of one hand-eye, held out, after register; noise, µm; seconds of all stages."""
+    state = _run_of(job["object"])
+    lengths = [1e3 * x for x in (state.residual_rms, state.heldout_rms, state.stages[2].rms, state.noise_floor)]
+    return {"lengths": lengths, "seconds": sum(stage.seconds for stage in state.stages)}
+
+
+def _pair(job: Row) -> Row:
+    """χ² of the difference of two hand-eyes of one rig."""
+    one, other = (_run_of(name) for name in job["pair"])
+    xi = frames.log(frames.inverse(other.T_mount) @ one.T_mount)
+    return {"chi2": float(xi @ np.linalg.solve(other.mount_covariance + one.mount_covariance, xi))}
+
+
+def _together(job: Row) -> Row:
     """All four sessions in one fit."""
-    joint = run_rig([load_session(folder / name) for name in IN_HAND])
-    sigma = np.sqrt(np.diag(joint[0].mount_covariance))
-    best = min(np.sqrt(np.trace(runs[n].mount_covariance[3:, 3:])) for n in IN_HAND)
-    print(
-        f"\nTogether: one hand-eye, translation sigma {np.linalg.norm(sigma[3:]):.2f} mm "
-        f"(best single object {best:.2f} mm); "
-        "after register "
-        + ", ".join(f"{n} {r.stages[2].rms * 1e3:.0f} µm" for n, r in zip(IN_HAND, joint, strict=True))
-        + "."
-    )
+    joint = run_rig([load_session(SHARED_DATA / "reghec" / name) for name in IN_HAND])
+    sigma = np.sqrt(np.diag(joint[0].mount_covariance))[3:]
+    best = min(np.sqrt(np.trace(_run_of(name).mount_covariance[3:, 3:])) for name in IN_HAND)
+    registered = {name: 1e3 * r.stages[2].rms for name, r in zip(IN_HAND, joint, strict=True)}
+    return {"sigma": float(np.linalg.norm(sigma)), "best": float(best), "registered": registered}
 
 
-def repeated(folder: Path, runs) -> None:
-    """Corrections of david's views before other objects."""
-    print("\n## Pose errors repeat: corrections learned on david, applied to the same poses before other objects\n")
-    print("| object | before (µm) | after (µm) |\n|---|---:|---:|")
-    david = runs["david"]
-    for name in ("cone", "sphere", "rubik"):
-        own = prepare_capture(load_session(folder / name))
-        model = own.poses(david.T_mount)
-        picked = [sample_points(scan, 3000) for scan in own.scans]
-        moved = frames.exp(david.corrections) @ model
-        before, after = (collect_overlaps(own, poses, 4.0, picked).gram.rms for poses in (model, moved))
-        print(f"| {name} | {before * 1e3:.0f} | {after * 1e3:.0f} |")
+def _repeated(job: Row) -> Row:
+    """Rms of an object before and after corrections of david's views, µm."""
+    david = _run_of("david")
+    capture = prepare_capture(load_session(SHARED_DATA / "reghec" / job["object"]))
+    model = capture.poses(david.T_mount)
+    samples = [sample_points(scan, 3000) for scan in capture.scans]
+    poses = (model, frames.exp(david.corrections) @ model)
+    before, after = (1e3 * float(collect_overlaps(capture, T, 4.0, samples).gram.rms) for T in poses)
+    return {"before": before, "after": after}
 
 
-def synthetic(seeds: int = 20) -> None:
-    """True error of the hand-eye at the part against its prediction."""
-    print(f"\n## Synthetic blade, 12 views, {seeds} seeds, start off by 5° and 30 mm\n")
-    print("Repeatability put in: 20 µm and 20 µrad. z: error over sigma, all six components.\n")
-    print("| mount | rms error at the part (µm) | predicted (µm) | ratio | rms z |\n|---|---:|---:|---:|---:|")
-    for mount in ("eye_to_hand", "eye_in_hand"):
-        rows = [_trial(mount, seed) for seed in range(seeds)]
-        error, predicted = (np.sqrt(np.mean([row[i] for row in rows])) * 1e3 for i in (0, 1))
-        z = np.sqrt(np.mean([row[2] for row in rows]))
-        print(f"| {mount} | {error:.1f} | {predicted:.1f} | {error / predicted:.2f} | {z:.2f} |")
-
-
-def _trial(mount: str, seed: int) -> tuple[float, float, float]:
-    """Squared error and predicted variance at the part, mean squared z."""
-    scene = load_scene(SCENE_OF_MOUNT[mount])
-    m = simulate(replace(scene, small=0.0), {}, seed, 12)
-    c = captured(m)
-    found = correct([c], disturbed(m.T_mount, 1000 + seed), 0.35 * part_size([c])).hand_eye
-    xi = frames.log(frames.inverse(m.T_mount) @ found.T_mount)
-    middle = np.mean([s.points.mean(axis=0) for s in c.scans], axis=0)
+def _blade(job: Row) -> Row:
+    """Squared error and predicted variance of the hand-eye at the part, mean squared z."""
+    scene = load_scene(SCENE_OF_MOUNT[job["mount"]])
+    measured = simulate(replace(scene, small=0.0), {}, job["seed"], 12)
+    capture = captured(measured)
+    start = disturbed(measured.T_mount, 1000 + job["seed"])
+    fit = correct([capture], start, 0.35 * part_size([capture])).hand_eye
+    xi = frames.log(frames.inverse(measured.T_mount) @ fit.T_mount)
+    middle = np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)
     J = np.hstack([-frames.skew(middle), np.eye(3)])
-    z = xi / np.sqrt(np.diag(found.covariance))
-    return float(np.sum((J @ xi) ** 2)), float(np.trace(J @ found.covariance @ J.T)), float(np.mean(z**2))
+    z = xi / np.sqrt(np.diag(fit.covariance))
+    return {
+        "error": float(np.sum((J @ xi) ** 2)),
+        "predicted": float(np.trace(J @ fit.covariance @ J.T)),
+        "z": float(np.mean(z**2)),
+    }
 
 
-def speed() -> None:
+def _speed(job: Row) -> Row:
     """Seconds of every stage with a coarse hand-eye given."""
-    import time
-
     scene = load_scene("blade")
-    m = simulate(replace(scene, scanner=replace(scene.scanner, columns=330, rows=330)), {}, 0)
+    measured = simulate(replace(scene, scanner=replace(scene.scanner, columns=330, rows=330)), {}, 0)
     marks = [time.perf_counter()]
-    c = captured(m)
+    capture = captured(measured)
     marks.append(time.perf_counter())
-    found = correct([c], m.T_mount @ frames.exp(np.array([0.02, -0.025, 0.015, 4, -5, 4.5])), 0.35 * part_size([c]))
+    start = measured.T_mount @ frames.exp(np.array([0.02, -0.025, 0.015, 4, -5, 4.5]))
+    fit = correct([capture], start, 0.35 * part_size([capture]))
     marks.append(time.perf_counter())
-    poses = c.poses(found.hand_eye.T_mount)
-    register(c, poses, found.hand_eye.repeatability[0], found.overlaps[0].gate, start=found.unconstrained[0].poses)
+    poses = capture.poses(fit.hand_eye.T_mount)
+    register(capture, poses, fit.hand_eye.repeatability[0], fit.overlaps[0].gate, start=fit.unconstrained[0].poses)
     marks.append(time.perf_counter())
-    prepare, corrected, registered = np.diff(marks)
-    points = sum(len(s.points) for s in c.scans)
-    print(f"\n## Speed: 18 views, {points:,} points\n")
-    print("| prepare (s) | correct (s) | register (s) | in all (s) |\n|---:|---:|---:|---:|")
-    print(f"| {prepare:.1f} | {corrected:.1f} | {registered:.1f} | {marks[-1] - marks[0]:.1f} |")
+    return {"seconds": np.diff(marks).tolist(), "points": sum(len(scan.points) for scan in capture.scans)}
 
 
-if __name__ == "__main__":
-    with redirect_stdout(StringIO()) as printed:
-        main(Path(sys.argv[1]))
-    page = PAGE.read_text(encoding="utf-8")
-    text = page.split(BEGIN)[0] + BEGIN + "\n" + printed.getvalue() + END + page.split(END)[1]
-    PAGE.write_text(text, encoding="utf-8")
+def summary(rows: list[Row]) -> list[str]:
+    """The tables of all parts that have rows."""
+    parts = grouped(rows, "part")
+    tables = {"objects": _objects_table, "pairs": _pairs_table, "together": _together_sentence}
+    tables |= {"repeated": _repeated_table, "blade": _blade_table, "speed": _speed_table}
+    told = "Written by `python bench/run.py real-scans --write`; two cores."
+    return [told, "", *(line for p, table in tables.items() if p in parts for line in [*table(parts[p]), ""])]
+
+
+def _objects_table(rows: list[Row]) -> list[str]:
+    lines = ([row["object"], *(f"{x:.0f}" for x in row["lengths"]), f"{row['seconds']:.1f}"] for row in rows)
+    head = "object | one hand-eye, rms (µm) | held-out (µm) | after register (µm) | sensor noise (µm) | seconds"
+    title = "## Real scans, no hand-eye given (RegHEC: 5 objects, 9 views each)"
+    return [title, "", *markdown(head, lines)]
+
+
+def _pairs_table(rows: list[Row]) -> list[str]:
+    return [
+        "## The four eye-in-hand objects come from one rig: do their hand-eyes agree?",
+        "",
+        "Difference squared over the sum of covariances, 6 degrees of freedom; 17.3 is the 95 % limit for six pairs.",
+        "",
+        *markdown("pair | χ²", ([", ".join(row["pair"]), f"{row['chi2']:.1f}"] for row in rows)),
+    ]
+
+
+def _together_sentence(rows: list[Row]) -> list[str]:
+    [row] = rows
+    registered = ", ".join(f"{name} {rms:.0f} µm" for name, rms in row["registered"].items())
+    return [
+        f"Together: one hand-eye, translation sigma {row['sigma']:.2f} mm (best single object {row['best']:.2f} mm); "
+        f"after register {registered}."
+    ]
+
+
+def _repeated_table(rows: list[Row]) -> list[str]:
+    lines = ([row["object"], f"{row['before']:.0f}", f"{row['after']:.0f}"] for row in rows)
+    title = "## Pose errors repeat: corrections learned on david, applied to the same poses before other objects"
+    return [title, "", *markdown("object | before (µm) | after (µm)", lines)]
+
+
+def _blade_table(rows: list[Row]) -> list[str]:
+    lines = []
+    for mount, group in grouped(rows, "mount").items():
+        error, predicted, z = (np.sqrt(np.mean([row[key] for row in group])) for key in ("error", "predicted", "z"))
+        lines.append([mount, f"{1e3 * error:.1f}", f"{1e3 * predicted:.1f}", f"{error / predicted:.2f}", f"{z:.2f}"])
+    return [
+        f"## Synthetic blade, 12 views, {len(group)} seeds, start off by 5° and 30 mm",
+        "",
+        "Repeatability put in: 20 µm and 20 µrad. z: error over sigma, all six components.",
+        "",
+        *markdown("mount | rms error at the part (µm) | predicted (µm) | ratio | rms z", lines),
+    ]
+
+
+def _speed_table(rows: list[Row]) -> list[str]:
+    [row] = rows
+    seconds = [f"{s:.1f}" for s in (*row["seconds"], sum(row["seconds"]))]
+    head = "prepare (s) | correct (s) | register (s) | in all (s)"
+    return [f"## Speed: 18 views, {row['points']:,} points", "", *markdown(head, [seconds])]
+
+
+TABLE = Table(jobs, trial, summary, range(20), page="results", block="scans", one_core=False)

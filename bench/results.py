@@ -1,12 +1,9 @@
 """The first tables of docs/results.md: every row of the five sources and of the main line, each run by its command.
 
-Run: python bench/results.py [--only 001 …]
-
-Commands of `stitch` run in an empty folder, on the simulator's cells and on examples/. Rows of many cells belong to
-the scripts that are named; their figures are read from the pages that these scripts write.
+Commands of `stitch` run in an empty folder, on the simulator's cells and on examples/. The rows stand in results.toml;
+figures of many cells are read from the pages into which other tables are written. `--only 001` makes one system alone.
 """
 
-import argparse
 import json
 import os
 import re
@@ -14,34 +11,44 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+import tomllib
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from bench.harness import DOCS, ROOT, Row, Table, grouped, markdown
 from stitch.numerics import frames
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "results.md"
-BEGIN, END = "<!-- systems: begin -->", "<!-- systems: end -->"
+ROWS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 class Room:
-    """An empty folder in which commands run once, with what they print as JSON and the truths beside the cells."""
+    """An empty folder in which commands run once, with what they print as JSON and the truths beside the cells.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    A function of a row's figure takes the room and the row's last command.
+    """
+
+    def __init__(self) -> None:
+        self.kept = tempfile.TemporaryDirectory()
+        self.folder = Path(self.kept.name)
         self.printed: dict[str, str] = {}
-        (folder / "examples").symlink_to(ROOT / "examples")
+        (self.folder / "examples").symlink_to(ROOT / "examples")
 
     def run(self, command: str) -> str:
         """What a command prints, standard output first."""
         if command not in self.printed:
             programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-            environment = {**os.environ, "PATH": programs, "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
+            paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+            environment = {
+                **os.environ,
+                "PATH": programs,
+                "PYTHONPATH": paths,
+                "OMP_NUM_THREADS": "1",
+                "COLUMNS": "200",
+            }
             call, here = shlex.split(command), ROOT if "pytest" in command else self.folder
             done = subprocess.run(call, cwd=here, env=environment, check=False, capture_output=True, text=True)
             self.printed[command] = done.stdout or done.stderr
@@ -54,413 +61,217 @@ class Room:
     def read(self, file: str) -> Any:
         return json.loads((self.folder / file).read_text(encoding="utf-8"))
 
-    @cached_property
-    def blade(self) -> dict[str, Any]:
-        return self.read("blade-run/result.json")
+    def blade_steps(self, command: str) -> str:
+        stages = self.read("blade-run/result.json")["stages"]
+        return ", ".join(f"{stage['name']} {1e3 * stage['rms']:.0f} µm" for stage in stages)
 
+    def blade_disagreement(self, command: str) -> str:
+        steps = self.read("blade-run/result.json")["disagreement"]["steps"]
+        return f"{1e3 * steps[-1]['mean']:.1f} µm between views on average over the part"
 
-@dataclass(frozen=True)
-class Row:
-    """One line of the table; the last command is the one whose figure is shown."""
+    def blade_hand_eye(self, command: str) -> str:
+        revealed = self.json(f"{command} --json")
+        before, after = (1e3 * revealed[f"hand_eye_error{name}_mm"] for name in ("_coarse", ""))
+        return f"{before:.0f} µm before, {after:.0f} µm after"
 
-    what: str
-    commands: tuple[str, ...]
-    published: str
-    reached: Callable[[Room], str]
+    def hidden_found(self, command: str) -> str:
+        revealed = self.json("stitch reveal hidden-run hidden.truth.json --json")
+        before, after = (
+            1e3 * self.read(f"{run}/result.json")["heldout_rms"] for run in ("hidden-before", "hidden-run")
+        )
+        named = ", ".join(revealed["in_the_model"] or revealed["named"])
+        return f"named {named}; held-out {before:.0f} → {after:.0f} µm"
 
+    def sphere_hand_eye(self, command: str) -> str:
+        angle, shift = off(self.read("line/hand-eye.json")["hand_eye"], self.read("line.truth.json")["hand_eye"])
+        return f"off by {shift:.3f} mm and {np.degrees(angle):.4f}°"
 
-def of_page(page: str, pattern: str) -> str:
-    """Figures of a page's table, by a pattern with one group."""
-    found = re.search(pattern, (ROOT / "docs" / page).read_text(encoding="utf-8"))
-    if found is None:
-        raise SystemExit(f"docs/{page}: no row {pattern}; run the script that writes it")
-    return found.group(1).strip()
+    def fitted_body(self, command: str) -> str:
+        return self._fitted("body")
+
+    def fitted_window(self, command: str) -> str:
+        return self._fitted("window")
+
+    def _fitted(self, part: str) -> str:
+        fit = self.read(f"line/found-{part}/fit.json")["parts"][0]
+        _, shift = off(fit["T_base_part"], self.read("line.truth.json")[f"T_cell_{part}"])
+        return f"rms {fit['rms']:.3f} mm; pose off by {shift:.3f} mm"
+
+    def program(self, command: str) -> str:
+        moved = [target["moved_mm"] for target in self.json(command)["targets"]]
+        return f"{len(moved)} targets moved by up to {max(moved):.2f} mm, to the found body"
+
+    def seam(self, command: str) -> str:
+        stations = self.json(command)
+        flush, gap = (np.array([s[key] for s in stations]) for key in ("flush", "gap"))
+        good = sum(s["verdict"] == "good" for s in stations)
+        sizes = f"flush {np.abs(flush).max():.2f}, gap {gap.min():.2f} to {gap.max():.2f} mm"
+        return f"{good} of {len(stations)} good; {sizes}"
+
+    def each_gap(self, command: str) -> str:
+        return ", ".join(f"D{s['station']} {s['gap']:.2f}" for s in self.json(command)) + " mm"
+
+    def base_of_experiment_1(self, command: str) -> str:
+        solved = self.json(f"{command} --json")
+        truth = frames.exp(np.array([0, 0, -np.pi / 2, 0, 0, 0]))
+        truth[:3, 3] = [4.0, -1.0, 1.0]
+        least_squares, projection = (
+            off(solved["T_base1_base2"], truth),
+            off(solved["projection"]["T_base1_base2"], truth),
+        )
+        return "least squares {:.5f} rad, {:.5f} m; projection {:.5f} rad, {:.5f} m".format(*least_squares, *projection)
+
+    base_by_flanges = base_of_experiment_1
+
+    def other_planes(self, command: str) -> str:
+        projection = self.json(f"{command} --json")["projection"]
+        _, (px, pz), (py, pz2) = projection["offsets"]
+        beta, alpha = projection["flange_beta_alpha"]
+        open_planes = sum("open" in plane for plane in projection["likewise"].values())
+        return (
+            f"px {px:.4f}, pz {pz:.4f}; py {py:.4f}, pz {pz2:.4f}; the cosine rules are 0/0 in {open_planes} of 2 "
+            f"planes; by the flanges β {beta:.5f}, α {alpha:.5f}"
+        )
+
+    def flange_of_p1(self, command: str) -> str:
+        alpha, _, gamma = self.json(f"{command} --json")["flange_rpy"]["P1"]
+        return f"P1 α {alpha:.4f}, γ {gamma:.4f}"
+
+    def base_of_experiment_2(self, command: str) -> str:
+        text = " ".join(self.run(command).split())
+        return f"refused: rod and joints differ by {re.search(r'difference of [+]?([-0-9.]+) m', text)[1]} m"
+
+    def panel_model(self, command: str) -> str:
+        robots = self.json(command)["robots"].values()
+        base, turn = (max(max(r[key]) for r in robots) for key in ("sigma_base", "sigma_base_deg"))
+        return f"bases within ± {base:.3f} mm, {turn:.4f}° (1 σ)"
+
+    def panel_leg(self, command: str) -> str:
+        hidden, legs = self.read("panel.truth.json")["hidden"], self.json(command)["leg_offsets"]
+        named = [f"{name}{leg['leg']} {leg['offset']:+.2f} mm" for name, leg in legs.items() if leg["found"]]
+        true = f"{hidden['robot']}{hidden['leg']} {hidden['offset']:+.2f} mm"
+        return f"hidden {true}; found {', '.join(named) or 'none'}"
+
+    def panel_shape(self, command: str) -> str:
+        largest = self.json(command)["corrections"]["largest_deviation"]
+        return f"{' → '.join(f'{size:.2f}' for size in largest)} mm in {len(largest) - 1} corrections"
+
+    def drill_errors(self, command: str) -> str:
+        truth, places, angles = self.read("drilling.truth.json")["holes"], [], []
+        for drive in self.json(command)["drives"]:
+            hole = truth[drive["hole"]]
+            places.append(np.linalg.norm(np.subtract(drive["position"], hole["position"])))
+            angles.append(np.degrees(np.arccos(np.clip(np.dot(drive["direction"], hole["direction"]), -1, 1))))
+        return f"position ≤ {max(places):.2f} mm, direction ≤ {max(angles):.2f}°"
+
+    def drill_before(self, command: str) -> str:
+        return _range([e for group in self.json(command)["groups"].values() for e in group["drive_errors"]], "mm")
+
+    def by_drawing_distance(self, command: str) -> str:
+        return self._trials(command, "drawing", "distance", "mm")
+
+    def by_drawing_in_plane(self, command: str) -> str:
+        return self._trials(command, "drawing", "in_plane", "mm")
+
+    def by_drawing_tilt(self, command: str) -> str:
+        return self._trials(command, "drawing", "tilt_deg", "°")
+
+    def levelled_in_plane(self, command: str) -> str:
+        return self._trials(command, "levelled", "in_plane", "mm")
+
+    def _trials(self, command: str, stage: str, what: str, unit: str) -> str:
+        return _range([t[what] for t in self.json(command)["trials"] if t["stage"] == stage], unit)
+
+    def pin(self, command: str) -> str:
+        trials = [t for t in self.json(command)["trials"] if t["pin_position"]]
+        position, tilt = np.max([(t["pin_position"], t["pin_tilt_deg"]) for t in trials], axis=0)
+        return f"≤ {position:.2f} mm, ≤ {tilt:.2f}°"
+
+    def plate(self, command: str) -> str:
+        plate = self.json(command)["plate"]
+        return (
+            f"h {plate['height']:.2f} mm, {plate['stated']:.2f} stated; parallel within {plate['parallelism']:.2f} mm"
+        )
+
+    def drill_camera(self, command: str) -> str:
+        truth = self.read("drilling.truth.json")["hidden"]
+        named = {t["effect"]: t["value"] for t in self.json(command)["camera_effects"] if t["accepted"]}
+        return "; ".join(f"{name} {named.get(name, 0):.3g}, hidden {size:.3g}" for name, size in truth.items())
+
+    def recording(self, command: str) -> str:
+        size = (self.folder / "blade-run/recording.rrd").stat().st_size / 1e6
+        return f"{size:.1f} MB; {self.run(command).strip().splitlines()[-1]}"
+
+    def batch(self, command: str) -> str:
+        self.run(command)
+        return f"{len(list(self.folder.glob('runs/*/result.json')))} of 2 sessions have a run"
+
+    def mesh_tests(self, command: str) -> str:
+        return re.search(r"[^\n]*(?:passed|skipped|failed)[^\n]*?(?= in|$)", self.run(command))[0]
 
 
 def off(T: Any, true: Any) -> tuple[float, float]:
-    """Angle (rad) and distance between two poses."""
+    """Return the angle (rad) and distance between two poses."""
     T, true = np.array(T), np.array(true)
     return float(frames.angle_between(T, true)), float(np.linalg.norm(T[:3, 3] - true[:3, 3]))
 
 
-# The main line and source 004: a blade on the flange before a fixed scanner.
-
-
-def blade_steps(room: Room) -> str:
-    coarse, correct, register, fuse = (1e3 * stage["rms"] for stage in room.blade["stages"])
-    return f"coarse {coarse:.0f} µm, correct {correct:.0f} µm, register {register:.0f} µm, fuse {fuse:.0f} µm"
-
-
-def blade_disagreement(room: Room) -> str:
-    return f"{1e3 * room.blade['disagreement']['steps'][-1]['mean']:.1f} µm between views on average over the part"
-
-
-def blade_hand_eye(room: Room) -> str:
-    told = room.json("stitch reveal blade-run blade.truth.json --json")
-    return f"{1e3 * told['hand_eye_error_coarse_mm']:.0f} µm before, {1e3 * told['hand_eye_error_mm']:.0f} µm after"
-
-
-def hidden_found(room: Room) -> str:
-    told = room.json("stitch reveal hidden-run hidden.truth.json --json")
-    before, after = (room.read(f"{run}/result.json") for run in ("hidden-before", "hidden-run"))
-    return (
-        f"named {', '.join(told['in_the_model'] or told['named'])}; held-out {1e3 * before['heldout_rms']:.0f} → "
-        f"{1e3 * after['heldout_rms']:.0f} µm"
-    )
-
-
-BLADE = ("stitch synth blade blade --seed 3", "stitch run blade -o blade-run")
-HIDDEN = (
-    "stitch synth blade hidden --seed 3 --views 12 --hide backlash=2",
-    "stitch run hidden -o hidden-before",
-    "stitch run hidden -o hidden-run",
-    "stitch add hidden-run --suggested",
-)
-LINE = (
-    "stitch synth window-sweeps line --seed 3",
-    "stitch calibrate sphere line/sphere -o line/hand-eye.json",
-    "stitch fit line/window.toml -o line/found-window",
-    "stitch fit line/body.toml -o line/found-body",
-    "stitch seam line/seam.toml --json",
-)
-DRILL = ("stitch synth drilling drilling --seed 3", "stitch drill drilling/job.toml --json")
-PANEL = ("stitch synth panel-robots panel --seed 3", "stitch panel panel/job.toml --json")
-MACHINES = "python -m data_synth.cells.panel_job panel moves/shape_move.csv"
-SHAPED = f"stitch panel panel/job.toml -o moves --json --drive '{MACHINES}'"
-PLACE = "stitch export line/found-body --program line/place.src -o line/there.src --frame 0,0,0,0,0,0 --json"
-
-
-# Source 003: window and body.
-
-
-def sphere_hand_eye(room: Room) -> str:
-    angle, shift = off(room.read("line/hand-eye.json")["hand_eye"], room.read("line.truth.json")["hand_eye"])
-    return f"off by {shift:.3f} mm and {np.degrees(angle):.4f}°"
-
-
-def fitted(part: str) -> Callable[[Room], str]:
-    def reached(room: Room) -> str:
-        found = room.read(f"line/found-{part}/fit.json")["parts"][0]
-        _, shift = off(found["T_base_part"], room.read("line.truth.json")[f"T_cell_{part}"])
-        return f"rms {found['rms']:.3f} mm; pose off by {shift:.3f} mm"
-
-    return reached
-
-
-def program(room: Room) -> str:
-    moved = [target["moved_mm"] for target in room.json(PLACE)["targets"]]
-    return f"{len(moved)} targets moved by up to {max(moved):.2f} mm, to the found body"
-
-
-def seam(room: Room) -> str:
-    stations = room.json(LINE[-1])
-    flush, gap = (np.array([s[key] for s in stations]) for key in ("flush", "gap"))
-    good = sum(s["verdict"] == "good" for s in stations)
-    return f"{good} of {len(stations)} good; flush {np.abs(flush).max():.2f}, gap {gap.min():.2f} to {gap.max():.2f} mm"
-
-
-def each_gap(room: Room) -> str:
-    return ", ".join(f"D{s['station']} {s['gap']:.2f}" for s in room.json(LINE[-1])) + " mm"
-
-
-# Source 001: base to base.
-
-
-def base_of_experiment_1(room: Room, job: str = "base_to_base") -> str:
-    found = room.json(f"stitch base examples/{job}.toml --json")
-    truth = frames.exp(np.array([0, 0, -np.pi / 2, 0, 0, 0]))
-    truth[:3, 3] = [4.0, -1.0, 1.0]
-    parts = []
-    for name, T in (("least squares", found["T_base1_base2"]), ("projection", found["projection"]["T_base1_base2"])):
-        angle, shift = off(T, truth)
-        parts.append(f"{name} {angle:.5f} rad, {shift:.5f} m")
-    return "; ".join(parts)
-
-
-def other_planes(room: Room) -> str:
-    found = room.json("stitch base examples/base_to_base_rpy.toml --json")["projection"]
-    _, (px, pz), (py, pz2) = found["offsets"]
-    beta, alpha = found["flange_beta_alpha"]
-    open_planes = sum("open" in plane for plane in found["likewise"].values())
-    return (
-        f"px {px:.4f}, pz {pz:.4f}; py {py:.4f}, pz {pz2:.4f}; the cosine rules are 0/0 in {open_planes} of 2 planes; "
-        f"by the flanges β {beta:.5f}, α {alpha:.5f}"
-    )
-
-
-def flange_of_p1(room: Room) -> str:
-    alpha, _, gamma = room.json("stitch base examples/base_to_base_joints.toml --json")["flange_rpy"]["P1"]
-    return f"P1 α {alpha:.4f}, γ {gamma:.4f}"
-
-
-def base_of_experiment_2(room: Room) -> str:
-    said = " ".join(room.run("stitch base examples/base_to_base_2.toml").split())
-    return f"refused: rod and joints differ by {re.search(r'difference of [+]?([-0-9.]+) m', said).group(1)} m"
-
-
-# Source 002: fuselage panel.
-
-
-def panel_model(room: Room) -> str:
-    robots = room.json(PANEL[-1])["robots"].values()
-    base, turn = (max(max(r[key]) for r in robots) for key in ("sigma_base", "sigma_base_deg"))
-    return f"bases within ± {base:.3f} mm, {turn:.4f}° (1 σ)"
-
-
-def panel_leg(room: Room) -> str:
-    hidden, legs = room.read("panel.truth.json")["hidden"], room.json(PANEL[-1])["leg_offsets"]
-    found = {f"{name}{leg['leg']}": leg["offset"] for name, leg in legs.items() if leg["found"]}
-    told = ", ".join(f"{name} {size:+.2f} mm" for name, size in found.items()) or "none"
-    return f"hidden {hidden['robot']}{hidden['leg']} {hidden['offset']:+.2f} mm; found {told}"
-
-
-def panel_shape(room: Room) -> str:
-    largest = room.json(SHAPED)["corrections"]["largest_deviation"]
-    return f"{' → '.join(f'{size:.2f}' for size in largest)} mm in {len(largest) - 1} corrections"
-
-
-# Source 000: drilling.
-
-
-def drill_errors(room: Room) -> str:
-    truth, found = room.read("drilling.truth.json")["holes"], room.json(DRILL[-1])
-    places, angles = [], []
-    for drive in found["drives"]:
-        hole = truth[drive["hole"]]
-        places.append(np.linalg.norm(np.subtract(drive["position"], hole["position"])))
-        angles.append(np.degrees(np.arccos(np.clip(np.dot(drive["direction"], hole["direction"]), -1, 1))))
-    return f"position ≤ {max(places):.2f} mm, direction ≤ {max(angles):.2f}°"
-
-
-def drill_before(room: Room) -> str:
-    errors = [e for group in room.json(DRILL[-1])["groups"].values() for e in group["drive_errors"]]
-    return f"{min(errors):.2f} to {max(errors):.2f} mm, mean {np.mean(errors):.2f}"
-
-
-def trials(stage: str, what: str, unit: str) -> Callable[[Room], str]:
-    def reached(room: Room) -> str:
-        values = [t[what] for t in room.json(DRILL[-1])["trials"] if t["stage"] == stage]
-        return f"{min(values):.2f} to {max(values):.2f} {unit}, mean {np.mean(values):.2f}"
-
-    return reached
-
-
-def pin(room: Room) -> str:
-    bounds = [(t["pin_position"], t["pin_tilt_deg"]) for t in room.json(DRILL[-1])["trials"] if t["pin_position"]]
-    position, tilt = np.max(bounds, axis=0)
-    return f"≤ {position:.2f} mm, ≤ {tilt:.2f}°"
-
-
-def plate(room: Room) -> str:
-    found = room.json(DRILL[-1])["plate"]
-    return f"h {found['height']:.2f} mm, {found['stated']:.2f} stated; parallel within {found['parallelism']:.2f} mm"
-
-
-def drill_camera(room: Room) -> str:
-    truth = room.read("drilling.truth.json")["hidden"]
-    named = {t["effect"]: t["value"] for t in room.json(DRILL[-1])["camera_effects"] if t["accepted"]}
-    return "; ".join(f"{name} {named.get(name, 0):.3g}, hidden {size:.3g}" for name, size in truth.items())
-
-
-# What the user named by name.
-
-
-def recording(room: Room) -> str:
-    told = room.run("rerun rrd verify blade-run/recording.rrd").strip().splitlines()[-1]
-    return f"{(room.folder / 'blade-run/recording.rrd').stat().st_size / 1e6:.1f} MB; {told}"
-
-
-def batch(room: Room) -> str:
-    room.run(BATCH)
-    runs = list(room.folder.glob("runs/*/result.json"))
-    return f"{len(runs)} of 2 sessions have a run"
-
-
-def mesh_tests(room: Room) -> str:
-    return re.search(r"[^\n]*(passed|skipped|failed)[^\n]* in", room.run(MESHES) + " in").group(0).removesuffix(" in")
-
-
-BATCH = "stitch batch blade hidden -o runs --json --no-recording"
-MESHES = "python -m pytest -n 0 -m '' tests/data_synth/test_real_meshes.py"
-
-SYSTEMS: dict[str, tuple[Row, ...]] = {
-    "Main line: scans, hand-eye, what is missing": (
-        Row("each stage's distance between surfaces", BLADE, "steps are visible with the coarse hand-eye", blade_steps),
-        Row("hand-eye, error at the part", (*BLADE, "stitch reveal blade-run blade.truth.json"), "–", blade_hand_eye),
-        Row("a hidden effect named and added", HIDDEN, "–", hidden_found),
-    ),
-    "004: blade stitched by hand-eye correction": (
-        Row("agreement of the stitched cloud", BLADE, "better than 100 µm", blade_disagreement),
-        Row(
-            "DPWVM against GICP, error of the view poses",
-            ("python bench/register_weights.py",),
-            "DPWVM named without a formula",
-            lambda _: of_page("register.md", r"\| DPWVM-style \|(?:[^|]*\|){5}([^|]*)\|") + " cell by cell",
-        ),
-        Row(
-            "the same with stock on one view",
-            ("python bench/register_weights.py",),
-            "–",
-            lambda _: (
-                of_page("register.md", r"\| DPWVM-style \|(?:[^|]*\|){4}([^|]*)\|")
-                + " µm, GICP "
-                + of_page("register.md", r"\| GICP inside Tukey \|(?:[^|]*\|){4}([^|]*)\|")
-                + " µm"
-            ),
-        ),
-    ),
-    "003: window and car body": (
-        Row("hand-eye from a sphere", LINE[:2], "X 926.866, Y 652.648, Z 934.441 mm; no truth", sphere_hand_eye),
-        Row("body onto its CAD", (*LINE[:2], LINE[3]), "fit error 1.052", fitted("body")),
-        Row("window onto its CAD", LINE[:3], "fit error 0.573", fitted("window")),
-        Row("path corrected for the found body, as the robot's program", (*LINE[:2], LINE[3], PLACE), "–", program),
-        Row("flush and gap at eight places", LINE, "flush 0 ± 1.5, gap 16 ± 2 mm", seam),
-        Row("table 1: gap width at D1 to D8", LINE, "figures lost; all within 16 ± 2 mm", each_gap),
-        Row(
-            "the whole line, 5 cells: window set against its design place",
-            ("python bench/window_line.py",),
-            "–",
-            lambda _: of_page("window.md", r"\| all together \|(?:[^|]*\|){3}([^|]*)\|") + " mm (rms, largest)",
-        ),
-    ),
-    "001: base to base": (
-        Row(
-            "experiment 1 as printed",
-            ("stitch base examples/base_to_base.toml",),
-            "0.00010 rad, 0.00014 m at λ = 0.1",
-            base_of_experiment_1,
-        ),
-        Row(
-            "the same by joint angles, 6R and SCARA",
-            ("stitch base examples/base_to_base_joints.toml",),
-            "table 3: P1 α −3.1415, γ 0.6283",
-            flange_of_p1,
-        ),
-        Row(
-            "experiment 2 as printed",
-            ("stitch base examples/base_to_base_2.toml",),
-            "0.00014 rad, 0.00014 m at λ = 0.1",
-            base_of_experiment_2,
-        ),
-        Row(
-            "experiment 1 with flange angles, table 3 at λ = 0.5",
-            ("stitch base examples/base_to_base_rpy.toml",),
-            "0.00017 rad, 0.00022 m",
-            lambda room: base_of_experiment_1(room, "base_to_base_rpy"),
-        ),
-        Row(
-            "table 4 at λ = 0.5: X-Z and Y-Z planes",
-            ("stitch base examples/base_to_base_rpy.toml",),
-            "px 4.0000, pz 1.0002, β 0.0001; py −1.0000, pz 1.0001, α 0.0001",
-            other_planes,
-        ),
-        *(
-            Row(
-                f"experiment {n}, λ = 0.5, 1000 draws, {what}: rms; 95 % between, µrad / µm",
-                ("python bench/base_to_base.py",),
-                f"{published}, one draw",
-                lambda _, n=n, what=what: (
-                    of_page("base-to-base.md", rf"\| {n} \| 0.5 \| {what} \|((?:[^|]*\|){{3}})")
-                    .replace("|", ";", 1)
-                    .split(";")[0]
-                    + "; "
-                    + of_page("base-to-base.md", rf"\| {n} \| 0.5 \| {what} \|(?:[^|]*\|){{2}}([^|]*)\|")
-                ),
-            )
-            for n, published in ((1, "170 / 220"), (2, "540 / 360"))
-            for what in ("projection", "least squares")
-        ),
-    ),
-    "002: fuselage panel": (
-        Row("global model of robots and tracker", PANEL, "–", panel_model),
-        Row("a leg that is too long or short", PANEL, "–", panel_leg),
-        Row(
-            "pose after one adjustment, 30 cells, largest: x, y, z / mm",
-            ("python bench/panel.py",),
-            "0.047, 0.069, 0.036 mm; 0.008°",
-            lambda _: of_page("panel.md", r"\| after, largest \|((?:[^|]*\|){3})").replace(" |", ",").strip(" ,|"),
-        ),
-        Row("shape, one command", (*PANEL[:1], SHAPED), "≤ 0.6 mm", panel_shape),
-        Row(
-            "shape, 10 cells, largest deviation after one correction",
-            ("python bench/panel.py",),
-            "≤ 0.6 mm",
-            lambda _: of_page("panel.md", r"the rest gives way \|[^|]*\|([^|]*)\|") + " mm",
-        ),
-    ),
-    "000: drilling on curved structures": (
-        Row("plate against the flange", DRILL, "h 186.61 mm, 186.60 measured; parallel within 0.11 mm", plate),
-        Row("reference holes by the drawing", DRILL, "–", drill_before),
-        Row("table 4: by the drawing, 3D", DRILL, "2.28 to 2.85 mm, mean 2.55", trials("drawing", "distance", "mm")),
-        Row("table 4: 2D", DRILL, "0.61 to 2.00 mm, mean 1.32", trials("drawing", "in_plane", "mm")),
-        Row("table 4: direction", DRILL, "2.09 to 3.93°, mean 3.30", trials("drawing", "tilt_deg", "°")),
-        Row("table 6: corrected and levelled, 2D", DRILL, "0.03 to 0.15 mm", trials("levelled", "in_plane", "mm")),
-        Row("table 7: a pin went in", DRILL, "≤ 0.30 mm, ≤ 0.21°", pin),
-        Row("drilled holes, after", DRILL, "position ≤ 0.30 mm, direction ≤ 0.21°", drill_errors),
-        Row("what the homography hides", DRILL, "lens distortion neglected", drill_camera),
-        Row(
-            "drilled holes after, 200 cells: largest position / mm",
-            ("python bench/drilling.py",),
-            "≤ 0.30 mm",
-            lambda _: of_page("drilling.md", r"\| after \| position 3D / mm \|(?:[^|]*\|){2}([^|]*)\|"),
-        ),
-    ),
-}
-
-
-SYSTEMS["Named programs and libraries"] = (
-    Row(
-        "KISS-ICP on a scanner that never stops: right motions",
-        ("python -m bench.odometry --write",),
-        "–",
-        lambda _: of_page("session.md", r"odometry from the stated hand-eye \|[^|]*\|([^|]*)\|"),
-    ),
-    Row(
-        "hand-eye from it, and from the whole run on the same scans, off by / mm",
-        ("python -m bench.odometry --write",),
-        "–",
-        lambda _: ", ".join(
-            of_page("session.md", rf"\| `{name} \|[^|]*\|[^|]*\|([^|]*)\|")
-            for name in ("moving-scan`, odometry from the stated hand-eye", "moving-scan`, the whole run")
-        ),
-    ),
-    Row("Rerun: every stage and iteration", (*BLADE, "rerun rrd verify blade-run/recording.rrd"), "–", recording),
-    Row("real meshes, watertight and broken, from scan to fit", (MESHES,), "–", mesh_tests),
-    Row("many sessions by one command", (BLADE[0], HIDDEN[0], BATCH), "–", batch),
-)
-
-
-def lines(room: Room, only: list[str]) -> dict[str, list[str]]:
-    """The tables, a block of rows for each system whose name begins with one of `only`."""
-    blocks = {}
-    for system, rows in SYSTEMS.items():
-        if only and not system.startswith(tuple(only)):
+def _range(values: list[float], unit: str) -> str:
+    return f"{min(values):.2f} to {max(values):.2f} {unit}, mean {np.mean(values):.2f}"
+
+
+def jobs(seeds: range) -> Iterator[Row]:
+    """Every row of every system, in one room."""
+    for system, rows in ROWS["systems"].items():
+        for what, words, published, figure in rows:
+            commands = [command for word in words for command in ROWS["groups"].get(word, [word])]
+            row = {"number": system.split(":")[0], "what": what, "commands": commands, "published": published}
+            yield {"system": system, **row, "figure": figure}
+
+
+def trial(job: Row) -> Row:
+    """Run the row's commands and read its figure."""
+    figure = job["figure"]
+    if isinstance(figure, list):
+        page, pattern, text = figure
+        match = re.search(pattern, (DOCS / page).read_text(encoding="utf-8"))
+        if match is None:
+            raise SystemExit(f"docs/{page}: no row {pattern}; write the table that has it first")
+        return {"reached": text.format(*(group.strip() for group in match.groups()))}
+    room = _room()
+    for command in job["commands"]:
+        if command.startswith("stitch"):
+            room.run(command)
+    return {"reached": getattr(room, figure)(job["commands"][-1])}
+
+
+@cache
+def _room() -> Room:
+    return Room()
+
+
+def summary(rows: list[Row]) -> list[str]:
+    """A table a system, with the commands that have to run before; of systems that were left out, what the page has."""
+    text = (DOCS / "results.md").read_text(encoding="utf-8")
+    text = text.split("<!-- systems: begin -->")[1].split("<!-- systems: end -->")[0]
+    kept = dict(re.findall(r"(?ms)^### ([^\n]*)\n(.*?)(?=^### |\Z)", text))
+    lines = []
+    for system in ROWS["systems"]:
+        group = grouped(rows, "system").get(system)
+        lines += [f"### {system}", ""]
+        if group is None:
+            lines += [*kept.get(system, "").strip().splitlines(), ""]
             continue
-        out = [f"### {system}", "", "| what | command | published | reached |", "|---|---|---|---|"]
-        for row in rows:
-            for command in row.commands:
-                if command.startswith("stitch"):
-                    room.run(command)
-            out.append(f"| {row.what} | `{row.commands[-1]}` | {row.published} | {row.reached(room)} |")
-        prepared = [c for row in rows for c in row.commands[:-1]]
-        if prepared:
-            out += ["", "Before these commands:", "", "```sh", *dict.fromkeys(prepared), "```"]
-        blocks[system] = [*out, ""]
-    return blocks
+        cells = []
+        for row in group:
+            last = row["commands"][-1]
+            shown = f"[{last}]({last})" if last.endswith(".md") else f"`{last}`"
+            cells.append([row["what"], shown, row["published"], row["reached"]])
+        lines += [*markdown("what | command | published | reached", cells), ""]
+        before = dict.fromkeys(command for row in group for command in row["commands"][:-1])
+        if before:
+            lines += ["Before these commands:", "", "```sh", *before, "```", ""]
+    return lines
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", default=[], help="how names of systems begin; the other tables stay")
-    with tempfile.TemporaryDirectory() as folder:
-        blocks = lines(Room(Path(folder)), parser.parse_args().only)
-    page = PAGE.read_text(encoding="utf-8")
-    head, tail = page.split(BEGIN)[0], page.split(END)[1]
-    told = re.split(r"^### ", page.split(BEGIN)[1].split(END)[0], flags=re.MULTILINE)[1:]
-    kept = {block.split("\n")[0]: [*f"### {block}".rstrip("\n").split("\n"), ""] for block in told}
-    table = [line for system in SYSTEMS for line in blocks.get(system, kept.get(system, []))]
-    PAGE.write_text("\n".join([head + BEGIN, "", *table]) + END + tail, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+TABLE = Table(jobs, trial, summary, range(1), page="results", block="systems", one_core=False)

@@ -1,33 +1,87 @@
-"""Run the commands that the pages show, and write what they print.
+"""Run the commands that the pages show, and write what they print: python -m bench.docs.page_examples [PAGE …]
+[--check].
 
-Run: python -m bench.docs.page_examples [PAGE …] [--check]
-
-Tests run them too and compare. What a page needs before its first command is made by `bench/docs/page_folders.py`.
+Tests run them too and compare. What must lie in the folder of a page before its first command runs stands in PREPARE,
+and what stands on it beside their output in AFTER, both by the page's name without `.md`.
 """
 
 import argparse
 import io
+import json
 import math
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import tempfile
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from itertools import zip_longest
 from pathlib import Path
 
-from bench.docs.page_blocks import PAGES, ROOT, commands, examples
-from bench.docs.page_folders import AFTER, PREPARE
+import numpy as np
+
+from bench.docs.page_blocks import PAGES, ROOT, blocks, commands, examples
+from data_synth import kinematics
+from data_synth.commands import synth
+from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
+from data_synth.fixtures.raw_folders import Convention, raw_folder
+from data_synth.fixtures.robot_programs import program
+from data_synth.fixtures.sphere_scans import sphere_cell, write_spheres
+from data_synth.fixtures.true_arm import true_flanges
+from data_synth.scene import load_scene
 from stitch.cli.main import main as stitch
 from stitch.effects.contract import EFFECTS
+from stitch.numerics.frames import Array
+from stitch.plugins.intake.controllers.program import read_program
 
 WIDTH = 110
+BASE, TOOL = "0,0,0,0,0,0", "0,0,150,0,0,0"
+PROGRAM = """DEF SCAN ( )
+;FOLD SPTP home
+PTP {A1 11.0,A2 -68.0,A3 108.0,A4 -17.0,A5 56.0,A6 -70.0}
+;ENDFOLD
+LIN {X 1250.0,Y 250.0,Z 870.0,A 70.0,B 15.0,C 175.0,S 2,T 35} C_DIS ; in
+LIN {X 1350.0,Y 250.0,Z 870.0,A 70.0,B 15.0,C 175.0,S 2,T 35} C_DIS ; along
+LIN {X 1450.0,Y 250.0,Z 870.0,A 70.0,B 15.0,C 175.0,S 2,T 35} C_DIS ; out
+END
+"""
 # Seconds are the machine's own.
 _SECONDS = re.compile(r"(│ +)(\d+\.\d\d)( │)$", re.MULTILINE)
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?(?:e-?\d+)?")
+
+
+def main() -> None:
+    """Write the examples into the pages; with --check, end with 1 where one differs and write nothing."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("pages", nargs="*", type=Path, help="all that have examples, unless named")
+    parser.add_argument("--check", action="store_true", help="write nothing, end with 1 where a page differs")
+    given = parser.parse_args()
+    stale = 0
+    for page in [p.resolve() for p in given.pages] or [p for p in PAGES if examples(p)]:
+        known = dict(EFFECTS)
+        with tempfile.TemporaryDirectory() as folder:
+            anew = rewritten(page, Path(folder))
+        # An effect that one page brings is not known to the next.
+        for name in set(EFFECTS) - set(known):
+            del EFFECTS[name]
+        same = anew == page.read_text(encoding="utf-8")
+        stale += not same
+        print(f"{page.relative_to(ROOT)}: {'as it was' if same else 'differs' if given.check else 'written'}")
+        if not given.check:
+            page.write_text(anew, encoding="utf-8")
+    raise SystemExit(int(given.check and stale > 0))
+
+
+def rewritten(page: Path, folder: Path) -> str:
+    """The page with its examples run anew in an empty folder."""
+    text = page.read_text(encoding="utf-8")
+    for shown, anew in zip(examples(page), printed(page, folder), strict=True):
+        text = text.replace(f"```console\n{shown}```", f"```console\n{anew}```")
+    return AFTER.get(page.stem, lambda text, _: text)(text, folder)
 
 
 def printed(page: Path, folder: Path) -> list[str]:
@@ -35,31 +89,6 @@ def printed(page: Path, folder: Path) -> list[str]:
     PREPARE.get(page.stem, lambda _: None)(folder)
     with chdir(folder), _narrow():
         return ["\n".join(f"$ {line}\n{_output(line)}" for line in commands(shown)) for shown in examples(page)]
-
-
-def differences(anew: str, shown: str) -> list[str]:
-    """Where two outputs differ by more than another processor would make of them: one in the last digit shown."""
-
-    def words(text: str) -> list[str]:
-        return _NUMBER.sub("#", re.sub(r"\s+", " ", re.sub("[─━]+", "─", text))).split(" ")
-
-    if words(anew) != words(shown):
-        changed = zip_longest(words(shown), words(anew), fillvalue="nothing")
-        return [f"{a!r} is now {b!r}" for a, b in changed if a != b][:5]
-    pairs = zip(_NUMBER.findall(shown), _NUMBER.findall(anew), strict=True)
-    return [f"{a} is now {b}" for a, b in pairs if not _alike(a, b)]
-
-
-def _alike(a: str, b: str) -> bool:
-    # Below the rounding of sums of ones, zeros differ from processor to processor.
-    step = max(1.01 * max(_last_digit(a), _last_digit(b)), 1e-14)
-    return math.isclose(float(a.replace(",", "")), float(b.replace(",", "")), rel_tol=0, abs_tol=step)
-
-
-def _last_digit(number: str) -> float:
-    """What one more in the last digit that is shown is worth."""
-    mantissa, _, power = number.partition("e")
-    return float(10.0 ** (int(power or 0) - len(mantissa.partition(".")[2])))
 
 
 def _output(line: str) -> str:
@@ -102,34 +131,155 @@ def _narrow() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def rewritten(page: Path, folder: Path) -> str:
-    """The page with its examples run anew in an empty folder."""
-    text = page.read_text(encoding="utf-8")
-    for shown, anew in zip(examples(page), printed(page, folder), strict=True):
-        text = text.replace(f"```console\n{shown}```", f"```console\n{anew}```")
-    return AFTER.get(page.stem, lambda text, _: text)(text, folder)
+def differences(anew: str, shown: str) -> list[str]:
+    """Where two outputs differ by more than another processor would make of them: one in the last digit shown."""
+
+    def words(text: str) -> list[str]:
+        return _NUMBER.sub("#", re.sub(r"\s+", " ", re.sub("[─━]+", "─", text))).split(" ")
+
+    if words(anew) != words(shown):
+        changed = zip_longest(words(shown), words(anew), fillvalue="nothing")
+        return [f"{a!r} is now {b!r}" for a, b in changed if a != b][:5]
+    pairs = zip(_NUMBER.findall(shown), _NUMBER.findall(anew), strict=True)
+    return [f"{a} is now {b}" for a, b in pairs if not _alike(a, b)]
 
 
-def main() -> None:
-    """Write the examples into the pages; with --check, end with 1 where one differs and write nothing."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("pages", nargs="*", type=Path, help="all that have examples, unless named")
-    parser.add_argument("--check", action="store_true", help="write nothing, end with 1 where a page differs")
-    given = parser.parse_args()
-    stale = 0
-    for page in [p.resolve() for p in given.pages] or [p for p in PAGES if examples(p)]:
-        known = dict(EFFECTS)
-        with tempfile.TemporaryDirectory() as folder:
-            anew = rewritten(page, Path(folder))
-        # An effect that one page brings is not known to the next.
-        for name in set(EFFECTS) - set(known):
-            del EFFECTS[name]
-        same = anew == page.read_text(encoding="utf-8")
-        stale += not same
-        print(f"{page.relative_to(ROOT)}: {'as it was' if same else 'differs' if given.check else 'written'}")
-        if not given.check:
-            page.write_text(anew, encoding="utf-8")
-    raise SystemExit(int(given.check and stale > 0))
+def _alike(a: str, b: str) -> bool:
+    # Below the rounding of sums of ones, zeros differ from processor to processor.
+    step = max(1.01 * max(_last_digit(a), _last_digit(b)), 1e-14)
+    return math.isclose(float(a.replace(",", "")), float(b.replace(",", "")), rel_tol=0, abs_tol=step)
+
+
+def _last_digit(number: str) -> float:
+    """What one more in the last digit that is shown is worth."""
+    mantissa, _, power = number.partition("e")
+    return float(10.0 ** (int(power or 0) - len(mantissa.partition(".")[2])))
+
+
+def write_cell(folder: Path) -> None:
+    """A run `found` of a cell, and a program `scan.src`, in `folder`."""
+    synth("blade", folder / "cell", hide=["joint_compliance=3"], views=10, seed=4)
+    with Path(os.devnull).open("w") as nowhere, redirect_stderr(nowhere):
+        try:
+            words = ["--effects", "joint_compliance", "--no-recording"]
+            stitch(["run", str(folder / "cell"), "-o", str(folder / "found"), *words])
+        except SystemExit as ended:
+            if ended.code:
+                raise RuntimeError("the run of the example failed") from None
+    (folder / "scan.src").write_text(PROGRAM, encoding="utf-8")
+
+
+def tool_errors(folder: Path, name: str) -> Array:
+    """(K,) mm from where the program `scan.src` meant the tool to where the true arm takes it for that of a name."""
+    arm, tool = load_scene("blade").arm, np.eye(4)
+    tool[2, 3] = float(TOOL.split(",")[2])
+    hidden = json.loads((folder / "cell.truth.json").read_text())["hidden"]["joint_compliance"]
+
+    def commanded(program: str) -> Array:
+        out: list[Array] = []
+        for point in read_program(folder / program, BASE, TOOL).points:
+            if point.T_frame_tool is None:
+                joints = point.joints
+            else:
+                joints = kinematics.inverse(arm, point.T_frame_tool @ np.linalg.inv(tool), out[-1])
+            assert joints is not None
+            out.append(joints)
+        return np.array(out)
+
+    meant = kinematics.flange(arm, commanded("scan.src")) @ tool
+    reached = true_flanges("joint_compliance", hidden, arm, commanded(name)) @ tool
+    return np.linalg.norm((reached - meant)[:, :3, 3], axis=1)
+
+
+def truth(folder: Path) -> str:
+    """One sentence."""
+    errors = [tool_errors(folder, name) for name in ("scan.src", "scan-compensated.src")]
+    missed, misses = (f"{e.min():.2f} to {e.max():.2f} mm" for e in errors)
+    return (
+        f"The cell is simulated, so its true arm can be asked: it missed the tool's poses by {missed}\n"
+        f"with `scan.src`, and misses them by {misses} with the copy."
+    )
+
+
+def moved_line(folder: Path) -> str:
+    """One of the program's targets, as the copy has it."""
+    copy = (folder / "scan-compensated.src").read_text(encoding="utf-8")
+    return next(line for line in copy.splitlines() if "; along" in line)
+
+
+def raw_scans(folder: Path) -> None:
+    """Scans of a blade whose scanner measures too long, and a robot's poses in degrees, in `folder`/scans."""
+    cell = folder / "cell"
+    synth("blade-table", cell, hide=["range_scale=3"], views=8, seed=3)
+    raw_folder(cell, folder / "scans", Convention("ZYX", degrees=True, angles_first=False), "robot_poses.txt")
+
+
+def small_session(folder: Path) -> None:
+    """A session of three views, in `folder`/blade-17."""
+    synth("blade", folder / "blade-17", views=3, seed=1)
+
+
+def planned_views(folder: Path) -> None:
+    """Eight poses of a scanner on an arm that nobody has scanned from yet, in `folder`/planned."""
+    planned = folder / "planned"
+    synth("blade-table", planned, views=8, seed=3)
+    shutil.rmtree(planned / "clouds")
+
+
+def own_effect(folder: Path) -> None:
+    """The effect of the page as `folder`/mine.py."""
+    page = ROOT / "docs" / "effects.md"
+    text = next(block.text for block in blocks(page) if block.language == "python")
+    (folder / "mine.py").write_text(text, encoding="utf-8")
+
+
+def calibrations(folder: Path) -> None:
+    """Scans of a sphere, a tracker's frames, a program of a FANUC: sphere, tracker, SCAN1.LS in `folder`."""
+    write_spheres(sphere_cell(3, pose_noise=0.03), folder / "sphere")
+    probe, *_ = labelled_cell(4, views=30, probe=True)
+    write_labelled(folder / "tracker", probe, "frames")
+    arm = load_scene("blade").arm
+    joints = np.radians([[10, -60, 110, 0, 40, 0], [20, -65, 105, 5, 45, 10]])
+    poses = [kinematics.flange(arm, q[None])[0] for q in joints]
+    (folder / "SCAN1.LS").write_text(program("fanuc", [], poses), encoding="utf-8")
+
+
+def tracked_arm(folder: Path) -> None:
+    """An arm with two joints a little off, tracker reflectors on its flange: arm and other-poses in `folder`."""
+    offset = np.array([0, 1e-3, -1.5e-3, 0, 0, 0])
+    for name, seed in (("arm", 2), ("other-poses", 3)):
+        session, *_ = labelled_cell(seed, views=40, offset=offset)
+        write_labelled(folder / name, session)
+
+
+def examples_folder(folder: Path) -> None:
+    """The project's `examples`, which the pages of the cells speak of."""
+    (folder / "examples").symlink_to(ROOT / "examples")
+
+
+PREPARE: dict[str, Callable[[Path], None]] = {
+    "back-into-the-cell": write_cell,
+    "base-to-base": examples_folder,
+    "calibrate": calibrations,
+    "drilling": examples_folder,
+    "effects": own_effect,
+    "own-data": raw_scans,
+    "panel": examples_folder,
+    "plan": planned_views,
+    "points": tracked_arm,
+    "session": small_session,
+    "window": examples_folder,
+}
+
+
+def compensated(text: str, folder: Path) -> str:
+    """The page of programs with the line that moved and what the true arm does."""
+    text = re.sub(r"(?m)^LIN .*; along$", moved_line(folder), text)
+    between = re.compile(r"(?<=<!-- truth: begin -->\n).*?(?=\n<!-- truth: end -->)", re.DOTALL)
+    return between.sub(truth(folder), text)
+
+
+AFTER: dict[str, Callable[[str, Path], str]] = {"back-into-the-cell": compensated}
 
 
 if __name__ == "__main__":

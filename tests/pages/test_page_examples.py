@@ -7,10 +7,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import stitch
-from bench.docs.compensated_cell import PROGRAM, moved_line, tool_errors
-from bench.docs.notebook_page import NOTEBOOK, NOTEBOOKS, cells, notebook_page, printed_in, run_cells
 from bench.docs.page_blocks import PAGES, blocks, examples
-from bench.docs.page_examples import differences, printed
+from bench.docs.page_examples import PROGRAM, differences, moved_line, printed, tool_errors
+from bench.docs.site_pages import NOTEBOOK, NOTEBOOKS, cells, notebook_page, printed_in, run_cells
 from stitch.effects import EFFECTS
 from tests.needs import needs_open3d
 
@@ -76,7 +75,7 @@ def test_the_notebook_prints_what_it_shows(file):
         needs_open3d()
     done = run_cells(file)
     for (text, _), cell in zip(done, code_of(file), strict=True):
-        assert not differences(text, printed_in(cell)), "to fix: python -m bench.docs.notebook_page"
+        assert not differences(text, printed_in(cell)), "to fix: python -m bench.docs.site_pages notebooks"
     values = [value for _, value in done if value is not None]
     if file == NOTEBOOK:
         assert any(isinstance(value, Figure) for value in values)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.drilling_loop import (
+from bench.drilling import (
     FlangeSensors,
     Rangers,
     align_tool_axis,
@@ -293,7 +293,7 @@ def experiment(seed):
 
 
 def test_drilling_experiment_reaches_the_published_errors():
-    """Twenty seeds: before 2.3 to 2.9 mm and 2 to 4°, after ≤ 0.30 mm and ≤ 0.21° (bench/drilling.py runs 200)."""
+    """Twenty seeds: before 2.3 to 2.9 mm and 2 to 4°, after ≤ 0.30 mm and ≤ 0.21° (`bench/run.py drilling` runs 200)."""
     before, after = (np.array(values) for values in zip(*(experiment(seed) for seed in range(20)), strict=True))
     assert before[..., 0].min() > 2.2 and before[..., 0].max() < 3.0
     assert before[..., 1].min() > 1.8 and before[..., 1].max() < 4.2

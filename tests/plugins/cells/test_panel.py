@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.panel_loops import PanelSetup, run_pose, run_shape
+from bench.panel import PanelSetup, run_pose, run_shape
 from data_synth.cells import hexapod, panel_job
 from data_synth.cells.panel import NAMES, PanelCell, Sizes
 from data_synth.shell import Laminate, Shell

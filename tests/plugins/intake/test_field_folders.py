@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.field_folders import kind_verdict
+from bench.intake import kind_verdict
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.field_folders import KINDS, Campaign
 from data_synth.write import write_session

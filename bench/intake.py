@@ -1,0 +1,388 @@
+"""Folders as people have them through `stitch init`: does it tell the right session?
+
+FIELD: one simulated campaign in the ways of writing of data_synth/fixtures/field_folders.py. CASES: the folders of the
+shared cases, each simulated after a thread of somebody who does this job; with `--set run=true`, `stitch run` has to
+find the true hand-eye within twice its U, and to say of what it cannot know that it is not known. DRAWN: for each seed
+sixty ways of writing another campaign (data_synth/fixtures/field_drawn.py). Where init refuses, what it asks for is
+done to the letter, and it is asked again. Right: the views meet under the true hand-eye (cases), or poses, mount and
+pairing are those of the campaign.
+
+CONVENTIONS: conventions scrambled on purpose, of the five objects of RegHEC, nine views each. Twelve orders of Euler
+angles × poses inverted or not, 24 tables an object; axes that turn along or stand still, degrees or radians, mm or m,
+angles or positions first are drawn for each. Right: order, direction, unit and mount as they were; wrong: told, but
+otherwise than they were.
+"""
+
+import io
+import json
+import re
+import shutil
+import time
+import tomllib
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from bench.harness import SHARED_CASES, SHARED_DATA, Row, Table, grouped, markdown, with_all
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.field_drawn import draw_kinds
+from data_synth.fixtures.field_folders import KINDS, Campaign, Kind, rescale
+from data_synth.fixtures.raw_folders import Convention, session_poses, table_of
+from data_synth.write import write_session
+from stitch.cli.main import main as stitch
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.output.urdf_file import to_urdf
+from stitch.plugins.intake.cloud_pairs import pairings
+from stitch.plugins.intake.convention_choice import choose_convention, choose_mounting
+from stitch.plugins.intake.first_session import capture_of
+from stitch.plugins.intake.raw_poses import RawPoses
+from stitch.plugins.intake.readings import StatedTable, all_readings, candidate_units
+from stitch.screening.conventions import register_scan_pairs
+from stitch.screening.hypotheses import ORDERS
+from stitch.session.reading.clouds import read_cloud
+from stitch.session.reading.session_folder import load_session
+from stitch.session.session import SessionData
+
+OBJECTS = dict.fromkeys(("david", "cone", "sphere", "rubik"), "eye_in_hand") | {"gripperopen": "eye_to_hand"}
+OUTCOMES = ("right", "cannot be told", "wrong")
+MILLIMETRES = {"mm": 1.0, "m": 1e3}
+# The hand-eye behind the cases; under it the views of a right session lie this near to each other, mm.
+T_CASES = frames.make(Rotation.from_rotvec([0.080, -0.120, 0.750]).as_matrix(), np.array([62.0, -38.0, 95.0]))
+MEET_MM, _NEIGHBOURS = 0.15, 8
+# Of positions as tables round them; of the distance of clouds from the scanner, as a share.
+NEAR_MM, SIZE = 0.05, 5e-3
+# Where the true hand-eye is another, a wrist that never turns leaves it open, or nothing of a run can be judged by it.
+TURNTABLE = "turntable_names_only"
+NO_HAND_EYE = ("gantry_constant_rotation", "line_profiles_xyz", "bag_without_tf_static", "quaternion_2_decimals")
+NO_TRUE_HAND_EYE = (TURNTABLE, "bag_without_tf_static", "crash-steps-6-views", "duplicated-points")
+_SEED = 11
+
+
+@dataclass
+class Outcome:
+    """How a command ended."""
+
+    code: int
+    seconds: float  # of the processor, which other work on the machine does not change
+    said: str
+
+    @property
+    def refusal(self) -> str:
+        """The sentence of a refusal."""
+        return self.said.strip().splitlines()[-1] if self.code else ""
+
+
+def command(*words: str) -> Outcome:
+    """Run a command as a person does who has no terminal."""
+    said = io.StringIO()
+    begin, code = time.process_time(), 0
+    with redirect_stderr(said), redirect_stdout(said):
+        try:
+            stitch(list(words))
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return Outcome(code, time.process_time() - begin, said.getvalue())
+
+
+def init(folder: Path, out: Path, *flags: str) -> Outcome:
+    """Run `stitch init` on a folder."""
+    shutil.rmtree(out, ignore_errors=True)
+    return command("init", str(folder), "--yes", "-o", str(out), *flags)
+
+
+def follow(refusal: str, folder: Path, campaign: Campaign | None = None) -> tuple[str, ...] | None:
+    """Do what a refusal asks for, and return the flags that it asks for; None where it asks for something else."""
+    if match := re.search(r'^stitch: (\S+): .*as "depth_scale": (\S+)$', refusal):
+        file = Path(match[1])
+        file.write_text(file.read_text().rstrip().rstrip("}") + f', "depth_scale": {match[2]}}}')
+        return ()
+    if "--ball RADIUS" in refusal:
+        return ("--ball", "30")
+    if match := re.search(r"multiply x, y, z of the clouds by (\S+),", refusal):
+        return rescale(float(match[1]))(folder)
+    if "put the URDF" in refusal and (away := list(folder.glob("*.urdf.gone"))):
+        away[0].rename(away[0].with_suffix(""))
+        return ()
+    if "--orientation" in refusal and campaign is not None:
+        return ("--orientation", ",".join(f"{x:.8f}" for x in campaign.R.as_quat()[0]))
+    match = re.search(r"state (--[a-z-]+) (\S+)$", refusal)
+    return (match[1], match[2]) if match else None
+
+
+def case_jobs(seeds: range, run: bool) -> Iterator[Row]:
+    """Every case that is a folder; with `run` those that are sessions too."""
+    for case in sorted(SHARED_CASES.iterdir()):
+        if run and (case / "session").is_dir():
+            yield {"name": case.name, "run": True, "session": True}
+        if (case / "in").is_dir():
+            yield {"name": case.name, "run": run, "session": False}
+
+
+def case_trial(job: Row) -> Row:
+    """What becomes of a copy of the folder, and of its run."""
+    name = job["name"]
+    with TemporaryDirectory() as scratch:
+        folder, out = Path(scratch) / name, Path(scratch) / f"{name}-session"
+        if job["session"]:
+            shutil.copytree(SHARED_CASES / name / "session", folder)
+            return {"verdict": run_verdict(name, folder), "asked": ""}
+        shutil.copytree(SHARED_CASES / name / "in", folder)
+        bag = next((f.parent for f in folder.rglob("metadata.yaml")), folder)
+        first = last = init(bag, out)
+        flags = follow(first.refusal, folder) if first.code else None
+        if flags is not None:
+            last = init(bag, out, *flags)
+        verdict = case_verdict(name, out) if not last.code else "refused"
+        if last.code and "pip install" in last.refusal:
+            verdict = "needs a package"
+        verdict += " once it is stated" if flags is not None else ""
+        verdict += f"; run: {run_verdict(name, out)}" if job["run"] and not last.code else ""
+        return {"verdict": verdict, "asked": first.refusal.partition("; to fix: ")[2]}
+
+
+def case_verdict(name: str, out: Path) -> str:
+    """Judge the session of a case."""
+    session = load_session(out)
+    if name == TURNTABLE:
+        return "right" if turns(session, [float(re.findall(r"\d+", v.name)[-1]) for v in session.views]) else "wrong"
+    if name in NO_HAND_EYE:
+        return "right" if session.mount == "eye_in_hand" else "wrong"
+    off = apart(session, T_CASES)
+    return "right" if off < MEET_MM else f"wrong ({off:.2f} mm)"
+
+
+def run_verdict(name: str, out: Path) -> str:
+    """Run the session of a case, and judge the hand-eye by the true one within twice its U."""
+    folder = out.with_name(f"{out.name}-run")
+    if name == "line_profiles_xyz":
+        done = command("calibrate", "sphere", str(out), "-o", str(folder), "--json")
+        if done.code:
+            return f"refused: {done.refusal}"
+        T = np.array(json.loads(done.said[done.said.index("{") : done.said.rindex("}") + 1])["hand_eye"])
+        return f"{np.linalg.norm(T[:3, 3] - T_CASES[:3, 3]):.3f} mm off"
+    done = command("run", str(out), "-o", str(folder), "--no-recording")
+    if done.code:
+        return f"run refused: {done.refusal}"
+    result = json.loads((folder / "result.json").read_text())
+    scale = np.repeat([1.0, MILLIMETRES[result["length_unit"]]], 3)
+    T = np.array(result["hand_eye"])
+    T[:3, 3] *= scale[3]
+    sigma = np.array([np.nan if x is None else x for x in result["hand_eye_sigma"]]) * scale
+    off = np.abs(frames.log((frames.inverse(T_CASES[None]) @ T)[0])) / (2 * sigma)
+    unknown, left = result["hand_eye_unknown"], len(result["left_out"])
+    known = off[:3] if {"x", "y", "z"} <= set(unknown) else off
+    words = f"; not known: {', '.join(unknown)}" if unknown else ""
+    words += f"; {left} left out" if left else ""
+    if name in NO_TRUE_HAND_EYE:
+        return f"{result['residual_rms'] * scale[3]:.3f} mm rms{words}"
+    return f"{'right' if (known < 2).all() else 'wrong'}, {known.max():.1f} U off{words}"
+
+
+def apart(session: SessionData, T_mount: Array) -> float:
+    """Return the median distance (mm) of points from planes through their neighbours in the next view."""
+    scale = MILLIMETRES[session.length_unit]
+    placed = []
+    for view in session.views:
+        T = np.array(view.T_base_flange)
+        T[:3, 3] *= scale
+        T = T if session.mount == "eye_in_hand" else frames.inverse(T[None])[0]
+        placed.append(frames.transform(T @ T_mount, view.cloud.points * scale))
+    off = []
+    for points, others in pairwise(placed):
+        near = others[cKDTree(others).query(points[::9], k=_NEIGHBOURS)[1]]
+        middle = near.mean(axis=1)
+        normal = np.linalg.svd(near - middle[:, None])[2][:, 2]
+        off.append(np.median(np.abs(np.einsum("ni,ni->n", points[::9] - middle, normal))))
+    return float(np.median(off))
+
+
+def turns(session: SessionData, degrees: Sequence[float]) -> bool:
+    """True if the poses turn the part about z by these angles, all in one sense."""
+    T = np.array([view.T_base_flange for view in session.views])
+    angles = np.degrees(np.unwrap(np.arctan2(T[:, 1, 0], T[:, 0, 0])))
+    wanted = np.array(degrees) - degrees[0]
+    off = min(np.abs((sign * (angles - angles[0]) - wanted + 180) % 360 - 180).max() for sign in (1, -1))
+    return session.mount == "eye_to_hand" and off < 0.01 and np.allclose(T[:, :3, 3], 0)
+
+
+def kind_jobs(seeds: range) -> Iterator[Row]:
+    """Every kind of folder."""
+    yield from ({"name": name, "seed": None} for name in KINDS)
+
+
+def drawn_jobs(seeds: range) -> Iterator[Row]:
+    """Sixty drawn kinds for each seed."""
+    for seed in seeds:
+        yield from ({"name": name, "seed": seed} for name in draw_kinds(seed))
+
+
+def kind_trial(job: Row) -> Row:
+    """What becomes of a folder of a kind, and once more after what a refusal asks for."""
+    name, seed = job["name"], job["seed"]
+    kind = KINDS[name] if seed is None else draw_kinds(seed)[name]
+    still = name == "xyz-alone" or (seed is not None and name.startswith("still"))
+    known = campaigns(_SEED if seed is None else seed)
+    campaign = known["turntable" if kind.turntable else "still" if still else "arm"]
+    with TemporaryDirectory() as scratch:
+        folder, out = Path(scratch) / name.replace(" ", "-"), Path(scratch) / f"{name}-session"
+        folder.mkdir()
+        kind.write(folder, campaign)
+        first = last = init(folder, out, *(kind.flags if seed is None else ()))
+        flags = None
+        if first.code and seed is not None:
+            flags = follow(first.refusal, folder, campaign)
+        elif first.code and kind.expected and kind.mend and re.search(kind.expected, first.refusal):
+            flags = kind.mend(folder)
+        if flags is not None:
+            last = init(folder, out, *flags)
+        if last.code:
+            right = kind.expected is not None and re.search(kind.expected, last.refusal)
+            verdict = f"{'rightly' if right else 'wrongly'} refused"
+        else:
+            verdict = kind_verdict(kind, campaign, out)
+            verdict = verdict if verdict == "right" or "NOT TOLD" not in last.said else f"guessed, said so: {verdict}"
+        asked = first.refusal.partition("; to fix: ")[2] or first.refusal
+        return {"verdict": verdict + (" once it is stated" if flags is not None else ""), "asked": asked}
+
+
+@cache
+def campaigns(seed: int) -> dict[str, Campaign]:
+    """Return the campaign with joints, one of a part on a turntable, and one of a wrist that never turns."""
+    measured = measured_blade(seed, views=10, mount="eye_in_hand", pixels=80, repeatability=(0.0, 0.0))
+    with TemporaryDirectory() as scratch:
+        write_session(Path(scratch) / "campaign", measured, "campaign")
+        session = load_session(Path(scratch) / "campaign")
+    T = np.array([view.T_base_flange for view in session.views])
+    clouds = tuple(view.cloud.points for view in session.views)
+    arm = Campaign(clouds, T, np.array([view.joints for view in session.views]), to_urdf(session.robot))
+    part = np.vstack([frames.transform(pose @ measured.T_mount, c) for pose, c in zip(T, clouds, strict=True)])
+    part -= part.mean(axis=0)
+    angles = np.radians(np.arange(0, 360, 24.0))
+    spun = frames.make(Rotation.from_rotvec(np.outer(angles, [0, 0, 1])).as_matrix(), np.zeros(3))
+    X = frames.make(Rotation.from_euler("xz", [-115, 90], degrees=True).as_matrix(), np.array([400.0, 0.0, 130.0]))
+    turned = []
+    for pose in spun:
+        points = frames.transform(pose, part)
+        front = np.abs(np.arctan2(points[:, 1], points[:, 0])) < 1.2
+        turned.append(frames.transform(frames.inverse(X[None])[0], points[front]))
+    still = np.tile(T[0], (len(T), 1, 1))
+    still[:, :3, 3] += np.random.default_rng(5).uniform(-25, 25, (len(T), 3))
+    first = frames.transform(T[0] @ measured.T_mount, clouds[0])
+    seen = [frames.transform(frames.inverse((pose @ measured.T_mount)[None])[0], first) for pose in still]
+    return {"arm": arm, "turntable": Campaign(tuple(turned), spun), "still": Campaign(tuple(seen), still)}
+
+
+def kind_verdict(kind: Kind, campaign: Campaign, out: Path) -> str:
+    """Judge the session of a kind."""
+    session = load_session(out)
+    scale = MILLIMETRES[session.length_unit]
+    if kind.turntable:
+        angles = np.degrees(np.unwrap(np.arctan2(campaign.T[:, 1, 0], campaign.T[:, 0, 0])))
+        return "right" if len(session.views) == len(campaign.T) and turns(session, angles.tolist()) else "wrong"
+    middles = np.array([np.median(cloud, axis=0) for cloud in campaign.clouds])
+    shown = np.array([np.median(view.cloud.points, axis=0) * scale for view in session.views])
+    which = np.linalg.norm(shown[:, None] - middles, axis=2).argmin(axis=1)
+    wanted = [i for i in range(len(middles)) if i not in (kind.views or ())]
+    T = np.array([view.T_base_flange for view in session.views])
+    T[:, :3, 3] *= scale
+    size = np.median(np.linalg.norm(shown, axis=1) / np.linalg.norm(middles[which], axis=1))
+    if abs(size - 1) > SIZE:
+        return f"wrong: clouds {size:.4g} times as large"
+    if session.mount != "eye_in_hand" or sorted(which.tolist()) != wanted:
+        return f"wrong: {session.mount}, views {sorted(which.tolist())}"
+    shift = np.abs(T[:, :3, 3] - campaign.T[which][:, :3, 3]).max()
+    turn = frames.angle_between(T, campaign.T[which]).max()
+    return "right" if shift < NEAR_MM and turn < kind.near else f"wrong by {shift:.3g} mm, {turn:.2g} rad"
+
+
+def folder_summary(rows: list[Row]) -> list[str]:
+    """What becomes of every folder, and how many are right."""
+    called = tomllib.loads(Path(__file__).with_name("field_cases.toml").read_text(encoding="utf-8"))
+    good = sum(row["verdict"].startswith(("right", "rightly")) for row in rows)
+    lines = [[called.get(r["name"], r["name"]), r["verdict"], re.sub(r"/\S+/", "", r["asked"])] for r in rows]
+    table = markdown("folder | what becomes of it | what a refusal asks for", lines)
+    return [*table, "", f"{good} of {len(rows)} right or rightly refused."]
+
+
+CASES = Table(case_jobs, case_trial, folder_summary, range(1), page="own-data", block="field", settings={"run": False})
+FIELD = Table(kind_jobs, kind_trial, folder_summary, range(1))
+DRAWN = Table(drawn_jobs, kind_trial, folder_summary, range(1))
+
+
+def convention_jobs(seeds: range, views: int) -> Iterator[Row]:
+    """24 tables of every object, of the first so many of its nine views."""
+    for number, name in enumerate(OBJECTS):
+        for table in range(2 * len(ORDERS)):
+            yield {"object": name, "seed": seeds[0] + number, "table": table, "views": views}
+
+
+def convention_trial(job: Row) -> Row:
+    """Whether the convention of a table is told right, and what was said."""
+    convention = conventions(job["seed"])[job["table"]]
+    capture, T_true, clouds, motions = _scans(job["object"], job["views"])
+    numbers = np.round(table_of(T_true, convention), 7)
+    raw = RawPoses("table", None, numbers, ((),) * len(numbers), "")
+    readings = all_readings(raw, None, StatedTable())
+    pairs, units = pairings(clouds, raw.labels), candidate_units(readings, StatedTable())
+    decided = choose_convention(capture, motions, readings, pairs, units)
+    settled = choose_mounting(decided, None, None)
+    best = decided.best.interpretation
+    words = f"{best.reading.words}, {best.length_unit}, {settled.mount}{', inverted' * settled.inverted}"
+    following = decided.runner_up.misfit if decided.runner_up else 0
+    words += f" ({decided.best.misfit:.2f} mm, next {following:.2f})"
+    outcome = "cannot be told"
+    if decided.determined and settled.guess.determined:
+        T = settled.flange(best.T)
+        turned = frames.angle_between(T, T_true).max() < 1e-5
+        moved = np.abs(T - T_true)[:, :3, 3].max() < 0.01
+        outcome = "right" if turned and moved and settled.mount == OBJECTS[job["object"]] else "wrong"
+    return {"outcome": outcome, "convention": str(convention), "said": words}
+
+
+@cache
+def _scans(name: str, views: int) -> tuple:
+    """The scans of an object, prepared once, its poses and files, and the motions between its scans: they are the same
+    under every table."""
+    folder = SHARED_DATA / "reghec" / name
+    T, names = session_poses(folder)
+    clouds = [folder / cloud for cloud in names[:views]]
+    capture = capture_of([read_cloud(cloud) for cloud in clouds], 1000.0)
+    return capture, T[:views], clouds, cache(lambda: register_scan_pairs(capture))
+
+
+def conventions(seed: int) -> list[Convention]:
+    """Return one table for each order and direction, the rest drawn."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for order in ORDERS:
+        for inverse in (False, True):
+            along, degrees, first = rng.integers(2, size=3).astype(bool)
+            unit = ("mm", "m")[rng.integers(2)]
+            order_told = order if along else order.lower()
+            out.append(Convention(order_told, bool(degrees), inverse=inverse, unit=unit, angles_first=bool(first)))
+    return out
+
+
+def convention_summary(rows: list[Row]) -> list[str]:
+    """A line an object."""
+    lines = []
+    for name, tables in with_all(grouped(rows, "object")).items():
+        counts = Counter(row["outcome"] for row in tables)
+        lines.append([name, *(f"{counts[o]} of {len(tables)}" for o in OUTCOMES)])
+    return markdown(" | ".join(["object", *OUTCOMES]), lines)
+
+
+CONVENTIONS = Table(
+    convention_jobs, convention_trial, convention_summary, range(1), page="conventions-told", block="scrambled",
+    settings={"views": 9},
+)  # fmt: skip

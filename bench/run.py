@@ -1,0 +1,96 @@
+"""One table of the benchmarks: python bench/run.py TABLE [options].
+
+Seeds are those of the page unless stated; of some tables they are used up (the pages say which): take new ones to judge
+a change. `--only WORD[,WORD…]` keeps the jobs that have one of the words among their values, and may be repeated.
+"""
+
+import argparse
+import importlib
+import json
+import sys
+from pathlib import Path
+
+sys.path[0] = str(Path(__file__).resolve().parents[1])
+
+from bench import harness  # noqa: E402
+
+# By name: the module of bench and the table in it.
+TABLES = {
+    "base-to-base": "base_to_base:TABLE",
+    "batch-speed": "watch:SPEED",
+    "batch-scheduler": "watch:SCHEDULER",
+    "blind": "blind:TABLE",
+    "conventions": "intake:CONVENTIONS",
+    "diagnose-time": "speed:DIAGNOSE",
+    "drilling": "drilling:TABLE",
+    "expected-chances": "metrology:CHANCES",
+    "faults": "faults:TABLE",
+    "features": "metrology:FEATURES",
+    "features-monte-carlo": "metrology:MONTE_CARLO",
+    "few-views": "hand_eye_sigmas:FEW_VIEWS",
+    "field-cases": "intake:CASES",
+    "field-drawn": "intake:DRAWN",
+    "field-kinds": "intake:FIELD",
+    "large": "speed:LARGE",
+    "mistakes": "integrity:MISTAKES",
+    "mistakes-in-many-views": "integrity:MANY",
+    "mistakes-in-measured-scans": "integrity:MEASURED",
+    "mount-droop": "foreign_laws:DROOP",
+    "mount-laws": "foreign_laws:MOUNT",
+    "no-mistake": "integrity:GOOD",
+    "ordinary-arms": "hand_eye_sigmas:ORDINARY_ARMS",
+    "panel": "panel:TABLE",
+    "peers": "speed:PEERS",
+    "points-names": "points:NAMES",
+    "points-suggested": "points:SUGGESTED",
+    "power-oracle": "unknown_laws:ORACLE",
+    "real-scans": "real_scans:TABLE",
+    "results": "results:TABLE",
+    "scanner-laws": "foreign_laws:SCANNER",
+    "unknown-laws": "unknown_laws:TABLE",
+    "watch": "watch:TABLE",
+    "window": "window:TABLE",
+    "window-line": "window:LINE",
+}
+
+
+def main() -> None:
+    """Run the jobs of a table, print its lines, and write them into its page."""
+    names = "tables: " + ", ".join(sorted(TABLES))
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, epilog=names, formatter_class=raw)
+    parser.add_argument("table", choices=TABLES, metavar="TABLE")
+    parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), help="END itself is left out")
+    parser.add_argument("--only", action="append", default=[], metavar="WORDS")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of the table")
+    parser.add_argument("--rows", type=Path, help="keeps a line for each trial; those that stand there are not run")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--write", action="store_true", help="put the lines into the page")
+    asked = parser.parse_args()
+    module, _, name = TABLES[asked.table].partition(":")
+    table = getattr(importlib.import_module(f"bench.{module}"), name)
+    settings = dict(table.settings)
+    for text in asked.set:
+        key, _, value = text.partition("=")
+        if key not in settings:
+            parser.error(f"no setting {key!r}; {asked.table} has {', '.join(settings) or 'none'}")
+        settings[key] = type(settings[key])(json.loads(value) if value[:1] in "[0123456789-tf" else value)
+    jobs = list(table.jobs(range(*asked.seeds) if asked.seeds else table.seeds, **settings))
+    for words in asked.only:
+        jobs = [job for job in jobs if set(words.split(",")) & _values(job)]
+    if not jobs:
+        parser.error("no job is left")
+    lines = table.summary(harness.run(table, jobs, asked.rows, asked.workers))
+    print("", *lines, sep="\n")
+    if asked.write and table.page:
+        harness.into_page(table.page, table.block, lines)
+
+
+def _values(job: harness.Row) -> set[str]:
+    """What a job has for values, those of its lists too, as words."""
+    values = [inner for value in job.values() for inner in (value if isinstance(value, list) else [value])]
+    return {str(value) for value in values}
+
+
+if __name__ == "__main__":
+    main()
