@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import stitch
+from bench import run as bench_run
 from bench.docs.page_blocks import ROOT, blocks
 from bench.docs.site_pages import pages
-from bench.run import TABLES
 from data_synth.fixtures.labelled_arm import DH_ROWS, labelled_cell
 from stitch.api.pipeline import diagnose, run
 from stitch.output.diagnosis_document import diagnosis_document
@@ -255,16 +255,16 @@ def found(module, name):
         return False
 
 
-@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("table", bench_run.TABLES)
 def test_a_table_of_the_benches_stands_in_its_module(table):
-    module, _, name = TABLES[table].partition(":")
+    module, _, name = bench_run.TABLES[table].partition(":")
     tree = ast.parse((ROOT / "bench" / f"{module}.py").read_text(encoding="utf-8"))
     assert name in {ast.unparse(node.targets[0]) for node in tree.body if isinstance(node, ast.Assign)}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_names_tables_of_the_benches_that_are_there(page):
-    assert set(re.findall(r"bench/run\.py\s+([a-z][\w-]*)", page.read_text(encoding="utf-8"))) <= set(TABLES)
+    assert set(re.findall(r"bench/run\.py\s+([a-z][\w-]*)", page.read_text(encoding="utf-8"))) <= set(bench_run.TABLES)
 
 
 BENCHES = "".join(file.read_text(encoding="utf-8") for file in sorted((ROOT / "bench").glob("*.py")))
