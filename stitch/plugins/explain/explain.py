@@ -1,108 +1,23 @@
 """From unknown to a formula: what a model lacks, as a sum of products of what the cell knows of its views."""
 
 import tempfile
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.score import Score, score
-from stitch.diagnosis.thresholds import FORMULA_LIMIT_SIZES, LARGEST_JOINT_ADDEND
+from stitch.diagnosis.thresholds import LARGEST_JOINT_ADDEND
 from stitch.diagnosis.validation import cross_validate, extrapolate
-from stitch.effects.contract import EFFECTS, TWIST
+from stitch.effects.contract import EFFECTS
 from stitch.effects.user_file import load
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.plugins.explain.dictionary import Dictionary, Ingredient, build_dictionary, coefficient, view_quantities
+from stitch.plugins.explain.dictionary import Dictionary, Ingredient, build_dictionary, coefficient
+from stitch.plugins.explain.formula_file import effect_source, formula_text
+from stitch.plugins.explain.quantities import view_quantities
 from stitch.plugins.explain.search import TestedSum, enough_views, fitted_sizes, search_sums
 from stitch.system.threads import library_threads_off
-
-# A formula as a Python file of effects that a person can read, doubt, edit and add.
-
-
-def formula_text(ingredients: Sequence[Ingredient], coefficients: Sequence[float]) -> str:
-    """The formula for people: what is displaced, and by what; joint by joint, or all axes of a body at once.
-
-    Args:
-        coefficients: in each ingredient's unit.
-    """
-    if any(i.place != "robot" for i in ingredients):
-        return "; ".join(map(_body_text, _by_quantity(ingredients, coefficients)))
-    own = list(zip(ingredients, coefficients, strict=True))
-    return "; ".join(
-        f"{what} = {what.replace('*', '')} "
-        + " ".join(f"{c:+.2g} {i.unit} · {i.quantity.text}" for i, c in own if i.what == what)
-        for what in dict.fromkeys(i.what for i in ingredients)
-    )
-
-
-def _by_quantity(ingredients: Sequence[Ingredient], sizes: Sequence[Any]) -> list[list[tuple[Ingredient, Any]]]:
-    """Ingredients with their sizes, those together that follow the same at one place."""
-    found = defaultdict[tuple[str, str], list[tuple[Ingredient, Any]]](list)
-    for i, size in zip(ingredients, sizes, strict=True):
-        found[i.place, i.quantity.text].append((i, size))
-    return list(found.values())
-
-
-def _body_text(addend: Sequence[tuple[Ingredient, float]]) -> str:
-    """part rx, ry, rz, tx, ty, tz = (+0.0003, +0.0001, 0) rad, (-0.1, 0, +0.02) mm · cos(2π t/0.2 h − 45°)"""
-    units = list(dict.fromkeys(i.unit for i, _ in addend))
-    sizes = [f"({', '.join(f'{c:+.2g}' for i, c in addend if i.unit == unit)}) {unit}" for unit in units]
-    axes = ", ".join(TWIST[i.index] for i, _ in addend)
-    first = addend[0][0]
-    return f"{first.place} {axes} = {', '.join(sizes)} · {first.quantity.text}"
-
-
-def effect_source(name: str, ingredients: Sequence[Ingredient], coefficients: Sequence[float], origin: str) -> str:
-    """The file; all ingredients stand at one place.
-
-    Args:
-        coefficients: in each ingredient's unit, as effects are written.
-        origin: where the formula comes from, for the first line of the file.
-    """
-    place = ingredients[0].place
-    count = len(ingredients)
-    letters = list("abcd"[:count]) if count <= 4 else [f"a{k + 1}" for k in range(count)]
-    specs = "".join(
-        f'    {a}=number("{i.unit}", typical={size:.2g}, limit={FORMULA_LIMIT_SIZES * size:.2g}),\n'
-        for a, i, size in zip(letters, ingredients, np.abs(coefficients), strict=True)
-    )
-    # What the code reads of the views, as the tuple that the library asks for.
-    names = ["joints"] if place == "robot" else []
-    names = list(dict.fromkeys([*names, *(need for i in ingredients for need in i.quantity.needs)]))
-    quoted = ", ".join(f'"{need}"' for need in names)
-    needs = f"({quoted},)" if len(names) == 1 else f"({quoted})"
-    head = (
-        f'"""{origin}"""\n\nimport numpy as np\n\nfrom stitch.effects import effect, number\n\n\n'
-        f'@effect(\n    "{place}",\n    needs={needs},\n{specs})\n'
-    )
-    body = _joint_code(ingredients, letters) if place == "robot" else _twist_code(ingredients, letters)
-    first = "joints, views" if place == "robot" else "views"
-    return head + "\n".join([f"def {name}({first}, {', '.join(letters)}):", *(f"    {line}" for line in body), ""])
-
-
-def _joint_code(ingredients: Sequence[Ingredient], letters: Sequence[str]) -> list[str]:
-    own = list(zip(letters, ingredients, strict=True))
-    told = "; ".join(f"{i.what} {a}·{i.quantity.text}" for a, i in own)
-    lines = [f"true[:, {i.index}] += {a} * {i.quantity.code}" for a, i in own]
-    return [f'"""{told}"""', "true = np.array(joints, float)", *lines, "return true"]
-
-
-def _twist_code(ingredients: Sequence[Ingredient], letters: Sequence[str]) -> list[str]:
-    addends = _by_quantity(ingredients, letters)
-    told = "; ".join(f"{own[0][0].place} ({', '.join(a for _, a in own)})·{own[0][0].quantity.text}" for own in addends)
-    lines = list[str]()
-    for own in addends:
-        axes, sizes = [i.index for i, _ in own], ", ".join(a for _, a in own)
-        lines += [f"course = {own[0][0].quantity.code}", f"twist[:, {axes}] += np.outer(course, [{sizes}])"]
-    return [f'"""{told}"""', "twist = np.zeros((views.count, 6))", *lines, "return twist"]
-
-
-# Sums that may hold, tried as an effect among all views.
 
 EFFECT_NAME = "explained"
 _TINY = 1e-12
@@ -137,48 +52,51 @@ def explain(linear: LinearModel, origin: str = "Found by `stitch explain`.") -> 
         origin: first line of the file of effects.
     """
     with library_threads_off():
-        terms, first = build_dictionary(linear, view_quantities(linear.measurement.views)), None
+        terms = build_dictionary(linear, view_quantities(linear.measurement.views))
+        first: Explanation | None = None
         if not enough_views(linear, terms):
             return Explanation(False, _TOO_FEW.format(linear.measurement.views.count))
-        for chosen in search_sums(linear, terms):
-            tried = _try_sum(linear, terms, chosen, origin)
-            if tried.found:
-                return tried
-            first = first or tried
+        for tested in search_sums(linear, terms):
+            explanation = _try_sum(linear, terms, tested, origin)
+            if explanation.found:
+                return explanation
+            first = first or explanation
             # What does not hold in the other views needs no further test.
-            if not chosen.holds:
+            if not tested.holds:
                 break
         return first or Explanation(False, "No joint angle, time or column of views.csv explains what is left.")
 
 
 def _try_sum(linear: LinearModel, terms: Dictionary, chosen: TestedSum, origin: str) -> Explanation:
-    """A sum that may hold, as an effect among all views."""
-    own, scaled = chosen.ingredients, fitted_sizes(linear, terms, chosen.ingredients)
-    values = _coefficients(linear, own, scaled)
-    text = formula_text(own, values)
+    """Try a sum that may hold as an effect among all views."""
+    ingredients = chosen.ingredients
+    scaled = fitted_sizes(linear, terms, ingredients)
+    values = _coefficients(linear, ingredients, scaled)
+    text = formula_text(ingredients, values)
     if not chosen.holds:
         failed = f"{text}, found in some of the views, fails in the others (p = {chosen.p_value:.2g})"
         return Explanation(False, f"No formula holds: {failed}.")
-    turns = [abs(v if i.quantity.bounded else x) for i, v, x in zip(own, values, scaled, strict=True)]
-    if own[0].place == "robot" and max(turns) > LARGEST_JOINT_ADDEND:
+    turns = [abs(v if i.quantity.bounded else x) for i, v, x in zip(ingredients, values, scaled, strict=True)]
+    if ingredients[0].place == "robot" and max(turns) > LARGEST_JOINT_ADDEND:
         return Explanation(
             False, f"{text} would turn a joint by more than any arm errs, {1e3 * LARGEST_JOINT_ADDEND:.0f} mrad."
         )
-    source = effect_source(EFFECT_NAME, own, values, f"{origin} {text}")
+    source = effect_source(EFFECT_NAME, ingredients, values, f"{origin} {text}")
     scored = _score_effect(linear, source)
-    left_out, beyond = cross_validate(linear, scored), extrapolate(linear, scored)
-    share = left_out.heldout
-    if not left_out.helps or share >= 1:
+    left_out = cross_validate(linear, scored)
+    if not left_out.helps or left_out.heldout >= 1:
         return Explanation(False, f"{text} explains the views, but not those left out with their neighbours.")
+    beyond = extrapolate(linear, scored)
     if beyond is not None and not beyond.helps:
         return Explanation(False, f"{beyond.rejection_reason(text)}.")
-    tested, other = text, chosen.instead_of
-    if other and not _are_same_sum(other, own):
+    tested = text
+    other = chosen.instead_of
+    if other and not _are_same_sum(other, ingredients):
         # The formula that stood the test is another, in whose place all views want this one.
         tested = formula_text(other, _coefficients(linear, other, fitted_sizes(linear, terms, other)))
     why = f"{text}: {_test_sentence(chosen.p_value, text, tested)}."
     return Explanation(
-        True, why, text, own[0].place, tested, heldout_share=share, p_value=chosen.p_value, source=source
+        True, why, text, ingredients[0].place, tested, left_out.heldout, p_value=chosen.p_value, source=source
     )
 
 
@@ -210,7 +128,7 @@ def _are_same_sum(some: Sequence[Ingredient], others: Sequence[Ingredient]) -> b
 
 
 def _score_effect(linear: LinearModel, source: str) -> Score:
-    """The effect of a file of effects against the model."""
+    """Score the effect of a file of effects against the model."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "found.py"
         file.write_text(source, encoding="utf-8")

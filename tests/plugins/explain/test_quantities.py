@@ -8,14 +8,9 @@ import pytest
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
 from stitch.api.pipeline import run
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.plugins.explain.dictionary import (
-    Quantity,
-    build_dictionary,
-    nonlinear_torque,
-    saw_of_joint,
-    view_quantities,
-)
+from stitch.plugins.explain.dictionary import build_dictionary
 from stitch.plugins.explain.explain import explain
+from stitch.plugins.explain.quantities import Quantity, nonlinear_torque, saw_of_joint, view_quantities
 from stitch.session.measurement import views_of
 
 TOOTH, HEIGHT = 0.33, 8e-4  # rad

@@ -8,8 +8,9 @@ import pytest
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.effects.contract import EFFECTS, missing_need
 from stitch.effects.user_file import load
-from stitch.plugins.explain.dictionary import Ingredient, coefficient, view_quantities
-from stitch.plugins.explain.explain import effect_source, formula_text
+from stitch.plugins.explain.dictionary import Ingredient, coefficient
+from stitch.plugins.explain.formula_file import effect_source, formula_text
+from stitch.plugins.explain.quantities import view_quantities
 from stitch.session.measurement import no_torques, views_of
 from tests.plugins.explain.test_explain import evidence
 
