@@ -31,7 +31,8 @@ from stitch.screening.deep_check import refuse_explained_mistake
 from stitch.screening.model_transfer import check_arm_transfer, check_model_transfer, find_disagreeing_sessions
 from stitch.screening.view_screening import ScreenedFit, ViewScreening, fit_screened_views, session_warnings
 from stitch.session.capture import Capture, part_size, prepare_capture
-from stitch.session.measurement import Measurement, measurement_of, session_notes, with_part_origin
+from stitch.session.measurement import Measurement, measurement_of, with_part_origin
+from stitch.session.notes import session_notes
 from stitch.session.session import SessionData
 from stitch.system.threads import Clock, begin, library_threads_off
 

@@ -25,7 +25,6 @@ from stitch.output.session_files import (
 )
 from stitch.output.urdf_file import to_urdf
 from stitch.screening.deep_check import refuse_whole
-from stitch.session.capture import MAX_POINTS
 from stitch.session.reading import session_folder
 from stitch.session.reading.arrays import cloud_of, per_view, poses_of, sighting_of
 from stitch.session.reading.scale_checks import check_scale
@@ -35,6 +34,7 @@ from stitch.session.reading.text_files import require_folder_name, require_name,
 from stitch.session.reading.views_table import require_agreement
 from stitch.session.robot import Robot, forward
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, StatedRepeatability, View
+from stitch.session.thinning import MAX_POINTS
 from stitch.system.threads import parallel
 
 # Names of views that can be those of files.

@@ -86,7 +86,7 @@ def session_summary(session: SessionData) -> dict[str, object]:
     """Return what a session holds, in plain numbers."""
     import numpy as np
 
-    from stitch.session.measurement import session_notes
+    from stitch.session.notes import session_notes
 
     clouds = [view.cloud.points for view in session.views if view.cloud is not None]
     sighted = [view.sighting.points for view in session.views if view.sighting is not None]

@@ -10,8 +10,9 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
 from stitch.observations.targets.rows import Landmarks, TargetRows, target_rows
 from stitch.session.capture import Sightings, build_capture
-from stitch.session.measurement import PAYLOAD, Measurement, Torques, Views, torques_of
+from stitch.session.measurement import Measurement, Views
 from stitch.session.robot import Robot, forward
+from stitch.session.torques import PAYLOAD, Torques, torques_of
 
 _SAMPLES = 6000
 _SPREAD = np.radians(40.0)  # about joint angles that were driven before

@@ -62,7 +62,7 @@ from stitch.observations.pose_errors import (
     time_in_steps,
     usual_time_step,
 )
-from stitch.session.measurement import STILL
+from stitch.session.torques import STILL
 
 # What not knowing its size costs an unmodelled effect, nats: as much as one with a name (`try_form`), so that neither
 # has an advantage.

@@ -37,7 +37,8 @@ from stitch.numerics.kernels import (
     two_joint_kernel,
 )
 from stitch.numerics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
-from stitch.session.measurement import STILL, Measurement, Torques
+from stitch.session.measurement import Measurement
+from stitch.session.torques import STILL, Torques
 
 # What every joint does anew in every view, and how much of it is usual, as a share of a plausible offset: as much as
 # the flange turns.

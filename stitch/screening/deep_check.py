@@ -38,11 +38,12 @@ from stitch.screening.scan_faults import find_occluder, find_static_background
 from stitch.screening.snooping import MisplacedView, Snooping, snoop_views
 from stitch.screening.target_checks import check_targets, target_problems
 from stitch.screening.view_model import UsualEffects
-from stitch.session.capture import Capture, part_size, sightings_of, thin_session
+from stitch.session.capture import Capture, part_size, sightings_of
 from stitch.session.measurement import measurement_of
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES
 from stitch.session.reading.intrinsics import find_intrinsics
 from stitch.session.session import SessionData
+from stitch.session.thinning import thin_session
 
 # No arm scatters by more.
 _ROTATION, _TRANSLATION_M = 0.010, 0.005

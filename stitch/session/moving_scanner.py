@@ -36,8 +36,8 @@ def stand_still(session: SessionData) -> SessionData:
                 f"{where}: scanner.moving, and the cloud of view {view.name} has no time of its points; to fix: write "
                 "the column time, s after time_s, or drop scanner.moving"
             )
-    path = _RobotPath(np.array(times, float), mount_poses(session))
-    T_mount = stream_hand_eye(session)
+    path = _RobotPath(np.array(times, float), _mount_poses(session))
+    T_mount = _stream_hand_eye(session)
     if T_mount is None:
         T_mount = session.scanner.T_mount
     if T_mount is None:
@@ -52,16 +52,17 @@ def stand_still(session: SessionData) -> SessionData:
     return replace(session, views=tuple(views))
 
 
-def mount_poses(session: SessionData) -> Array:
+def _mount_poses(session: SessionData) -> Array:
     """Return T_reference_mount (V, 4, 4): the flange in the base frame, or for a scanner that stands the inverse."""
     T = np.array([view.T_base_flange for view in session.views])
     return T if session.mount == "eye_in_hand" else frames.inverse(T)
 
 
-def stream_hand_eye(session: SessionData) -> Array | None:
+def _stream_hand_eye(session: SessionData) -> Array | None:
     """Return T_mount (4, 4) of A·X = X·B over the odometry of a stream; None where the scans are none."""
     clouds = [view.cloud for view in session.views if view.cloud is not None]
-    scans, T_reference_mount = [cloud.points for cloud in clouds], mount_poses(session)
+    scans = [cloud.points for cloud in clouds]
+    T_reference_mount = _mount_poses(session)
     if not is_stream(T_reference_mount, scans):
         return None
     times = [cloud.scalars["time"] for cloud in clouds] if session.scanner.moving else None
@@ -69,9 +70,9 @@ def stream_hand_eye(session: SessionData) -> Array | None:
     interval = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     starts = [None] if session.scanner.T_mount is None else [session.scanner.T_mount, None]
     for T_mount in starts:
-        found, _ = hand_eye_of_stream(T_reference_mount, scans, times, interval, T_mount)
-        if found is not None:
-            return found
+        hand_eye, _ = hand_eye_of_stream(T_reference_mount, scans, times, interval, T_mount)
+        if hand_eye is not None:
+            return hand_eye
     return None
 
 
@@ -84,14 +85,16 @@ class _RobotPath:
         from scipy.interpolate import CubicSpline
         from scipy.spatial.transform import Rotation, RotationSpline
 
-        self._place, self._by_vector = CubicSpline(times, T_reference_mount[:, :3, 3]), Rotation.from_rotvec
+        self._place = CubicSpline(times, T_reference_mount[:, :3, 3])
+        self._by_vector = Rotation.from_rotvec
         self._turn = RotationSpline(times, Rotation.from_matrix(T_reference_mount[:, :3, :3]))
 
     def at(self, times: Array) -> Array:
-        """(K, 4, 4) at times (K,), which may lie a little before the first view or after the last."""
+        """Return (K, 4, 4) at times (K,), which may lie a little before the first view or after the last."""
         within = np.clip(times, self.times[0], self.times[-1])
         T = np.tile(np.eye(4), (len(times), 1, 1))
-        rate, late = self._turn(within, 1), times - within
+        rate = self._turn(within, 1)
+        late = times - within
         T[:, :3, :3] = (self._turn(within) * self._by_vector(rate * late[:, None])).as_matrix()
         T[:, :3, 3] = self._place(within) + self._place(within, 1) * late[:, None]
         return T
@@ -102,4 +105,4 @@ def _seen_from_view(points: Array, times: Array, path: _RobotPath, of_view: floa
     moments, index = np.unique(times, return_inverse=True)
     T_reference_scanner = path.at(of_view + moments) @ T_mount
     T = (frames.inverse(path.at(np.array([of_view]))[0] @ T_mount) @ T_reference_scanner)[index]
-    return np.asarray(np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3])
+    return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]

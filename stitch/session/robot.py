@@ -3,6 +3,8 @@
 One joint is `before · Rz(q + theta) · after`: standard DH has before = 1 and after = Tz(d)Tx(a)Rx(α)
 (Denavit & Hartenberg 1955), modified DH before = Rx(α)Tx(a) and after = Tz(d) (Craig 1986), URDF
 before = origin with the joint axis turned to z and after = its inverse turn.
+
+Of an arm whose links are a little wrong (`Links`): where its flange truly is, and how that answers to every error.
 """
 
 from dataclasses import dataclass
@@ -12,6 +14,10 @@ import numpy as np
 
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
+
+# Columns of a frame.
+_X = 0
+_Z = 2
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,7 @@ class Robot:
 
 
 def elementary(axis: str, angle: Array | float = 0.0, shift: Array | float = 0.0) -> Array:
-    """Rotation about and shift along one coordinate axis; scalars or (n,) -> (..., 4, 4)."""
+    """Return rotation about and shift along one coordinate axis; scalars or (n,) -> (..., 4, 4)."""
     angle, shift = np.broadcast_arrays(np.asarray(angle, float), np.asarray(shift, float))
     i = "xyz".index(axis)
     j, k = (i + 1) % 3, (i + 2) % 3
@@ -74,7 +80,7 @@ def elementary(axis: str, angle: Array | float = 0.0, shift: Array | float = 0.0
 
 
 def link_frames(robot: Robot, joints: Array) -> Array:
-    """T_base_link (..., n+1, 4, 4) for joint angles (..., n) in rad; index 0 is the base itself."""
+    """Return T_base_link (..., n+1, 4, 4) for joint angles (..., n) in rad; index 0 is the base itself."""
     joints = np.asarray(joints, float)
     out = [np.broadcast_to(np.eye(4), (*joints.shape[:-1], 4, 4))]
     for i in range(robot.n_joints):
@@ -84,18 +90,18 @@ def link_frames(robot: Robot, joints: Array) -> Array:
 
 
 def forward(robot: Robot, joints: Array) -> Array:
-    """T_base_flange (..., 4, 4) for joint angles (..., n) in rad."""
-    return np.asarray(link_frames(robot, joints)[..., -1, :, :])
+    """Return T_base_flange (..., 4, 4) for joint angles (..., n) in rad."""
+    return link_frames(robot, joints)[..., -1, :, :]
 
 
 def joint_axes(robot: Robot, joints: Array) -> tuple[Array, Array]:
-    """A point on each joint axis and its direction, both (..., n, 3), in the base frame."""
+    """Return a point on each joint axis and its direction, both (..., n, 3), in the base frame."""
     axis_frame = link_frames(robot, joints)[..., :-1, :, :] @ robot.before
     return axis_frame[..., :3, 3], axis_frame[..., :3, 2]
 
 
 def jacobian(robot: Robot, joints: Array) -> Array:
-    """(..., 6, n): body twist of the flange, T·exp(J dq), rotation first (rad, length_unit per rad).
+    """Return (..., 6, n): body twist of the flange, T·exp(J dq), rotation first (rad, length_unit per rad).
 
     The columns are the joint screws seen from the flange (Lynch & Park, *Modern Robotics*, 5.1.2).
     """
@@ -108,26 +114,26 @@ def jacobian(robot: Robot, joints: Array) -> Array:
 
 
 def unit_torques(robot: Robot, joints: Array) -> Array:
-    """(..., n, n) N·m about joint i of 1 kg at the origin of link k's frame; 0 where joint i does not carry it."""
+    """Return (..., n, n) N·m about joint i of 1 kg at the origin of link k's frame; 0 where i does not carry it."""
     link = link_frames(robot, joints)
     point, axis = joint_axes(robot, joints)
     lever = link[..., None, 1:, :3, 3] - point[..., :, None, :]
     torque = np.einsum("...ij,...ikj->...ik", axis, np.cross(lever, robot.gravity))
-    n = robot.n_joints
-    return np.asarray(torque * robot.metres_per_unit * (np.arange(n)[None, :] >= np.arange(n)[:, None]))
+    number = np.arange(robot.n_joints)
+    return torque * robot.metres_per_unit * (number[None, :] >= number[:, None])
 
 
 def payload_torques(robot: Robot, joints: Array) -> Array:
-    """(..., n) N·m about +z of every joint of 1 kg at the payload's centre of mass: z_i · (c − o_i) × g."""
+    """Return (..., n) N·m about +z of every joint of 1 kg at the payload's centre of mass: z_i · (c − o_i) × g."""
     flange = link_frames(robot, joints)[..., -1, :, :]
     point, axis = joint_axes(robot, joints)
     centre = (flange[..., :3, :3] @ robot.payload_com[:, None])[..., 0] + flange[..., :3, 3]
     torque = np.einsum("...ij,...ij->...i", axis, np.cross(centre[..., None, :] - point, robot.gravity))
-    return np.asarray(torque * robot.metres_per_unit)
+    return torque * robot.metres_per_unit
 
 
 def gravity_torques(robot: Robot, joints: Array) -> Array:
-    """Torque of gravity about +z of every joint, N·m, (..., n): z_i · Σ (c − o_i) × m g over the links beyond.
+    """Return torques of gravity about +z of every joint, N·m, (..., n): z_i · Σ (c − o_i) × m g over the links beyond.
 
     Minus the slope of potential energy V = −Σ m g·c; the drive holds the opposite. Zeros without masses.
     """
@@ -142,12 +148,7 @@ def gravity_torques(robot: Robot, joints: Array) -> Array:
     moment = np.einsum("ik,k,...kj->...ij", beyond, mass, centres)
     moment -= (beyond @ mass)[:, None] * point
     torque = np.einsum("...ij,...ij->...i", axis, np.cross(moment, robot.gravity))
-    return np.asarray(torque * robot.metres_per_unit)
-
-
-# A serial robot whose links are a little wrong: where its flange truly is, and how that answers to every error.
-
-_X, _Z = 0, 2  # columns of a frame
+    return torque * robot.metres_per_unit
 
 
 @dataclass(frozen=True)
@@ -174,31 +175,34 @@ class FlangeSlopes:
     dalpha: Array  # (V, 6, n)
 
     def twists(self, joints: Array, links: Links) -> Array:
-        """(V, 6) of the flange for small changes of the joint angles (V, n) and of the links."""
+        """Return (V, 6) twists of the flange for small changes of the joint angles (V, n) and of the links."""
         rows = np.einsum("vki,i->vk", self.da, links.da) + np.einsum("vki,i->vk", self.dd, links.dd)
         rows += np.einsum("vki,i->vk", self.dalpha, links.dalpha)
-        return np.asarray(np.einsum("vki,vi->vk", self.joints, joints) + self.scale * links.scale[:, None] + rows)
+        return np.einsum("vki,vi->vk", self.joints, joints) + self.scale * links.scale[:, None] + rows
 
 
 def exact_links(count: int, joints: int) -> Links:
-    """Those of an arm without any error, for `count` views."""
+    """Return the links of an arm without any error, for `count` views."""
     return Links(np.ones(count), *np.zeros((3, joints)))
 
 
 def forward_with_errors(robot: Robot, joints: Array, links: Links) -> Array:
-    """T_base_flange (V, 4, 4) of an arm with such links, for joint angles (V, n) in rad."""
-    return np.asarray(_chain(robot, joints, links)[-1][2])
+    """Return T_base_flange (V, 4, 4) of an arm with such links, for joint angles (V, n) in rad."""
+    return _chain(robot, joints, links)[-1][2]
 
 
 def flange_slopes(robot: Robot, joints: Array, links: Links) -> FlangeSlopes:
-    """How the flange answers to small changes of joint angles (V, n) and links, about these.
+    """Return how the flange answers to small changes of joint angles (V, n) and links, about these.
 
     Each error is a screw in a frame of the chain, seen from the flange (Lynch & Park, *Modern Robotics*, 5.1.2).
     """
     chain = _chain(robot, joints, links)
-    T, modified = chain[-1][2], robot.convention == "modified"
-    still, slopes = np.zeros((len(joints), 3)), dict[str, list[Array]](joints=[], da=[], dd=[], dalpha=[])
-    scale, reach = np.zeros((len(joints), 6)), links.scale[:, None]
+    T = chain[-1][2]
+    modified = robot.convention == "modified"
+    still = np.zeros((len(joints), 3))
+    scale = np.zeros((len(joints), 6))
+    reach = links.scale[:, None]
+    slopes = dict[str, list[Array]](joints=[], da=[], dd=[], dalpha=[])
     for before, turned, after, moved in chain:
         row = before if modified else after  # the frame at whose x axis da and dalpha act
         slopes["joints"].append(_screw(T, turned, turned[..., :3, _Z], still))
@@ -207,40 +211,38 @@ def flange_slopes(robot: Robot, joints: Array, links: Links) -> FlangeSlopes:
         # d lies along the joint's own axis: ahead of `after`, or, modified, at its end.
         slopes["dd"].append(_screw(T, after, still, reach * (after if modified else turned)[..., :3, _Z]))
         scale += _screw(T, after, still, moved / reach)
-    stacked = {name: np.stack(own, axis=-1) for name, own in slopes.items()}
-    return FlangeSlopes(scale=scale, **stacked)
+    return FlangeSlopes(scale=scale, **{name: np.stack(by_joint, axis=-1) for name, by_joint in slopes.items()})
 
 
 def _chain(robot: Robot, joints: Array, links: Links) -> list[tuple[Array, Array, Array, Array]]:
-    """Per joint the frames T_base_· (V, 4, 4) before its turn, after it and at the link's end, and (V, 3) by how much
-    the link's lengths move that end."""
-    modified = robot.convention == "modified"
-    x_error, z_error = elementary("x", links.dalpha, links.da), elementary("z", 0, links.dd)
-    T, out = np.broadcast_to(np.eye(4), (len(joints), 4, 4)), []
+    """Return per joint the frames T_base_· (V, 4, 4) before its turn, after it and at the link's end, and (V, 3) by how
+    much the link's lengths move that end."""
+    x_error = elementary("x", links.dalpha, links.da)
+    z_error = elementary("z", 0, links.dd)
+    T = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
+    chain = []
     for i in range(robot.n_joints):
-        if modified:
-            own = robot.before[i] @ x_error[i], robot.after[i] @ z_error[i]
-        else:
-            own = robot.before[i], z_error[i] @ robot.after[i] @ x_error[i]
-        before, after = (_scaled(factor, links.scale) for factor in own)
-        first = T @ before
+        before, after = robot.before[i], z_error[i] @ robot.after[i] @ x_error[i]
+        if robot.convention == "modified":
+            before, after = robot.before[i] @ x_error[i], robot.after[i] @ z_error[i]
+        first = T @ _scaled(before, links.scale)
         turned = first @ elementary("z", joints[:, i] + robot.theta[i])
-        last = turned @ after
+        last = turned @ _scaled(after, links.scale)
         moved = first[:, :3, 3] - T[:, :3, 3] + last[:, :3, 3] - turned[:, :3, 3]
-        out.append((first, turned, last, moved))
+        chain.append((first, turned, last, moved))
         T = last
-    return out
+    return chain
 
 
 def _scaled(T: Array, scale: Array) -> Array:
-    """(V, 4, 4) of one transform, its lengths times `scale` (V,)."""
+    """Return (V, 4, 4) of one transform, its lengths times `scale` (V,)."""
     out = np.tile(T, (len(scale), 1, 1))
     out[:, :3, 3] *= scale[:, None]
     return out
 
 
 def _screw(T_base_flange: Array, at: Array, turn: Array, shift: Array) -> Array:
-    """(V, 6) body twist of the flange of a turn and a shift (V, 3) in the base's directions at the origin of `at`."""
+    """Return (V, 6) body twist of the flange of a turn and a shift (V, 3), in the base's directions, at `at`'s origin."""
     lever = T_base_flange[:, :3, 3] - at[:, :3, 3]
     back = frames.inverse(T_base_flange)
     moved = (turn, np.cross(turn, lever) + shift)

@@ -10,30 +10,6 @@ from pykdtree.kdtree import KDTree
 
 from stitch.numerics.frames import Array, Indices
 
-# The box around points, along the axes of their frame.
-
-
-def bounding_box(points: Array) -> Array:
-    """(2, 3) lowest and highest corner of points (N, 3)."""
-    # By columns: reductions over three numbers a point take ten times as long.
-    return np.array([[f(column) for column in points.T] for f in (np.min, np.max)])
-
-
-def centroid(points: Array) -> Array:
-    """(3,) mean of points (N, 3)."""
-    return np.array([column.mean() for column in points.T])
-
-
-def spread(points: Array) -> float:
-    """Rms distance of points (N, 3) from their centroid."""
-    return float(np.sqrt(sum(column.var() for column in points.T)))
-
-
-def box_corners(box: Array) -> Array:
-    """(8, 3) of a box (2, 3)."""
-    return np.array(np.meshgrid(*box.T)).reshape(3, 8).T
-
-
 # Neighbours of a point's local plane: enough to average the noise, few enough to follow a fillet. To the quadric of the
 # noise estimate, of six coefficients, they leave ten degrees of freedom, and stay within one curve of the surface where
 # a thin part is scanned in coarse steps.
@@ -49,6 +25,13 @@ _EDGE_OFFSET = 0.35
 _BENT = 2**0.5
 # Surface variation λ₀/(λ₀+λ₁+λ₂) of a crease (Pauly et al. 2002); a plane has 0.
 _CREASE_VARIATION = 0.05
+# Share of the largest eigenvalue's square by which a plane stands out from a line; below it digits are lost.
+_CLEARLY_PLANE = 1e-3
+# Weight of a quadric's terms being zero, as a share of their squares: what neighbours hardly show beside the rest stays
+# zero, as how a surface bends between two profiles, whatever the axes.
+_NOT_SHOWN = 0.01
+# Of the largest square, what rounding makes of none.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -86,14 +69,8 @@ class Scan:
         return float(np.median(each))
 
     def rays(self, points: Array) -> Array:
-        """(N, 3) unit vectors from the eye to points (N, 3), scanner frame."""
-        return rays_to(points, self.eye)
-
-
-def rays_to(points: Array, eye: Array) -> Array:
-    """(N, 3) unit vectors from an eye (3,) to points (N, 3)."""
-    away = points - eye
-    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300))
+        """Return (N, 3) unit vectors from the eye to points (N, 3), scanner frame."""
+        return _rays_to(points, self.eye)
 
 
 @dataclass(frozen=True)
@@ -106,15 +83,6 @@ class Neighbourhoods:
     spacing: float  # median distance to the nearest one, length_unit
 
 
-def find_neighbourhoods(points: Array, picked: Indices | None = None) -> Neighbourhoods:
-    """Neighbourhoods of all points of a scan, or of those that are picked."""
-    points = np.ascontiguousarray(points, float)
-    tree = KDTree(points, leafsize=16)
-    own = points if picked is None or len(picked) == len(points) else points[picked]
-    distance, index = tree.query(own, k=min(_NEIGHBOURS, len(points)))
-    return Neighbourhoods(tree, index, np.array(distance[:, -1]), float(np.median(distance[:, 1])))
-
-
 def prepare_scan(
     name: str,
     points: Array,
@@ -122,7 +90,9 @@ def prepare_scan(
     eye: Array | None = None,
     around: Neighbourhoods | None = None,
 ) -> Scan:
-    """KD-tree, normals (local plane of 16 neighbours, quadric where that bends), edges, spacing and noise of one scan.
+    """Return one scan with KD-tree, normals, edges, spacing and noise.
+
+    A normal is that of the local plane of 16 neighbours, or of a quadric where that bends.
 
     Args:
         picked: indices of the points that the scan keeps; normals, edges and noise are those of all points.
@@ -135,7 +105,7 @@ def prepare_scan(
     tree, index, radius = around.tree, around.index, around.radius
     centroid, normals, variation, left = fit_planes(points, index)
     eye = np.zeros(3) if eye is None else eye
-    rays = rays_to(own, eye)
+    rays = _rays_to(own, eye)
     usable = (np.abs(np.einsum("ij,ij->i", normals, rays)) > GRAZING_COSINE) & (variation < _CREASE_VARIATION)
     usable &= np.linalg.norm(centroid - own, axis=1) < _EDGE_OFFSET * radius
     # Across an edge no quadric fits: there the surface would count as noise.
@@ -167,8 +137,17 @@ def prepare_scan(
     )
 
 
+def find_neighbourhoods(points: Array, picked: Indices | None = None) -> Neighbourhoods:
+    """Return the neighbourhoods of all points of a scan, or of those that are picked."""
+    points = np.ascontiguousarray(points, float)
+    tree = KDTree(points, leafsize=16)
+    own = points if picked is None or len(picked) == len(points) else points[picked]
+    distance, index = tree.query(own, k=min(_NEIGHBOURS, len(points)))
+    return Neighbourhoods(tree, index, np.array(distance[:, -1]), float(np.median(distance[:, 1])))
+
+
 def subsample(scan: Scan, at_most: int) -> Scan:
-    """The scan with at most `at_most` of its points, evenly over the scan order, and a tree over those alone."""
+    """Return the scan with at most `at_most` of its points, evenly over the scan order, and a tree over those alone."""
     if len(scan.points) <= at_most:
         return scan
     picked = even_indices(len(scan.points), at_most)
@@ -187,8 +166,14 @@ def subsample(scan: Scan, at_most: int) -> Scan:
 
 
 def even_indices(count: int, at_most: int) -> Indices:
-    """(n,) at most `at_most` of `count` indices, evenly from the first to the last."""
+    """Return (n,) at most `at_most` of `count` indices, evenly from the first to the last."""
     return np.linspace(0, count - 1, min(count, at_most)).astype(np.int64)
+
+
+def _rays_to(points: Array, eye: Array) -> Array:
+    """Return (N, 3) unit vectors from an eye (3,) to points (N, 3)."""
+    away = points - eye
+    return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)
 
 
 def _estimate_spacing(points: Array, tree: Any) -> float:
@@ -197,8 +182,10 @@ def _estimate_spacing(points: Array, tree: Any) -> float:
 
 
 def fit_planes(points: Array, index: Indices) -> tuple[Array, Array, Array, Array]:
-    """Centroids (N, 3), unit normals (N, 3), surface variation (N,) and 1-sigma about the plane (N,) of neighbourhoods,
-    rows (N, k) of points.
+    """Fit planes to neighbourhoods, rows (N, k) of points.
+
+    Returns:
+        Centroids (N, 3), unit normals (N, 3), surface variation (N,) and 1-sigma about the plane (N,).
     """
     centroid, normals = np.empty((len(index), 3)), np.empty((len(index), 3))
     variation, left = np.empty(len(index)), np.empty(len(index))
@@ -219,12 +206,8 @@ def fit_planes(points: Array, index: Indices) -> tuple[Array, Array, Array, Arra
     return centroid, normals, variation, left
 
 
-# Share of the largest eigenvalue's square by which a plane stands out from a line; below it digits are lost.
-_CLEARLY_PLANE = 1e-3
-
-
 def _weakest_directions(C: Array) -> tuple[Array, Array]:
-    """Eigenvectors (N, 3) of the smallest eigenvalues of covariances (3, 3, N), and their share (N,) of the traces.
+    """Return eigenvectors (N, 3) of the smallest eigenvalues of covariances (3, 3, N), and their share (N,) of traces.
 
     The eigenvalues are the roots of a cubic, by its angle (Smith 1961); all rows of C − λ lie across the eigenvector.
     """
@@ -249,13 +232,8 @@ def _weakest_directions(C: Array) -> tuple[Array, Array]:
     return normals, smallest
 
 
-def _cross(a: Array, b: Array) -> Array:
-    """(3, N) vector products of vectors (3, N)."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-
-
 def _estimate_noise(points: Array, own: Array, normals: Array, index: Indices) -> float:
-    """1-sigma of the points across a local quadric: median over some of the neighbourhoods of `own`.
+    """Return 1-sigma of the points across a local quadric: median over some of the neighbourhoods of `own`.
 
     A plane would count curvature as noise. White noise only: an error that is smooth over the
     neighbourhood moves the quadric with it and is not seen.
@@ -272,7 +250,7 @@ def _estimate_noise(points: Array, own: Array, normals: Array, index: Indices) -
 
 
 def _bent_normals(points: Array, own: Array, normals: Array, index: Indices) -> Array:
-    """(N, 3) unit normals of local quadrics at points `own` (N, 3), from those of the local planes.
+    """Return (N, 3) unit normals of local quadrics at points `own` (N, 3), from those of the local planes.
 
     A scanner sees a bent surface in closer steps where it looks at it straight. The plane of a point's neighbours is
     that of a place nearer to there: normals at a slant lean towards the scanner, by some hundredths of a radian.
@@ -282,13 +260,6 @@ def _bent_normals(points: Array, own: Array, normals: Array, index: Indices) -> 
         at = slice(start, start + _IN_CACHE)
         out[at] = _fit_quadrics(points, own[at], normals[at], index[at])[1]
     return out
-
-
-# Weight of a quadric's terms being zero, as a share of their squares: what neighbours hardly show beside the rest stays
-# zero, as how a surface bends between two profiles, whatever the axes.
-_NOT_SHOWN = 0.01
-# Of the largest square, what rounding makes of none.
-_ROUNDING = 1e-12
 
 
 def _fit_quadrics(
@@ -319,24 +290,23 @@ def _fit_quadrics(
     solve = _solver(_normal_matrices(terms) + _NOT_SHOWN * whole)
     slope = np.zeros((2, x.shape[1]))
     for _ in range(2):
-        found = solve(np.einsum("ikn,kn->in", terms, rest))
-        rest -= np.einsum("ikn,in->kn", terms, found)
-        slope += found[:2]
+        coefficients = solve(np.einsum("ikn,kn->in", terms, rest))
+        rest -= np.einsum("ikn,in->kn", terms, coefficients)
+        slope += coefficients[:2]
     slope /= scale
     bent = n - slope[0] * a - slope[1] * b
 
     def numbers() -> Array:
-        left = np.stack(
-            [solve(_NOT_SHOWN * whole[:, j]) for j in range(len(terms))], axis=1
-        )  # by a round, of each term
+        # By a round, of each term.
+        left = np.stack([solve(_NOT_SHOWN * whole[:, j]) for j in range(len(terms))], axis=1)
         twice = np.einsum("ijn,jkn->ikn", left, left)
-        return np.asarray(1 + len(terms) - np.einsum("ijn,jin->n", twice, twice))
+        return 1 + len(terms) - np.einsum("ijn,jin->n", twice, twice)
 
     return rest, (bent / np.maximum(np.linalg.norm(bent, axis=0), 1e-300)).T, numbers
 
 
 def _normal_matrices(terms: Array) -> Array:
-    """(m, m, N) of terms (m, k, N)."""
+    """Return (m, m, N) of terms (m, k, N)."""
     out = np.empty((len(terms), *terms[:, 0].shape))
     for i, term in enumerate(terms):
         out[i, : i + 1] = out[: i + 1, i] = np.einsum("kn,jkn->jn", term, terms[: i + 1])
@@ -344,7 +314,7 @@ def _normal_matrices(terms: Array) -> Array:
 
 
 def _solver(A: Array) -> Callable[[Array], Array]:
-    """From right sides (m, N) to the solutions of N systems of small symmetric positive matrices A (m, m, N)."""
+    """Return what takes right sides (m, N) to solutions of N systems, A (m, m, N) symmetric, positive and small."""
     # All systems at once by Cholesky factors: a library's loop over them takes several times as long.
     m = len(A)
     L = np.zeros_like(A)
@@ -361,3 +331,29 @@ def _solver(A: Array) -> Callable[[Array], Array]:
         return out
 
     return solve
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return (3, N) vector products of vectors (3, N)."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def bounding_box(points: Array) -> Array:
+    """Return (2, 3) lowest and highest corner of points (N, 3)."""
+    # By columns: reductions over three numbers a point take ten times as long.
+    return np.array([[f(column) for column in points.T] for f in (np.min, np.max)])
+
+
+def centroid(points: Array) -> Array:
+    """Return (3,) mean of points (N, 3)."""
+    return np.array([column.mean() for column in points.T])
+
+
+def spread(points: Array) -> float:
+    """Return the rms distance of points (N, 3) from their centroid."""
+    return float(np.sqrt(sum(column.var() for column in points.T)))
+
+
+def box_corners(box: Array) -> Array:
+    """Return (8, 3) corners of a box (2, 3)."""
+    return np.array(np.meshgrid(*box.T)).reshape(3, 8).T

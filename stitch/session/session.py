@@ -1,4 +1,4 @@
-"""What was measured: a session, its views and its scanner."""
+"""What was measured: a session, its scanner and its views, each with a scan or with named points."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
@@ -13,7 +13,10 @@ from stitch.numerics.frames import Array
 from stitch.session.robot import Robot
 from stitch.session.scan import Scan, bounding_box
 
-# One scan as arrays.
+Mount = Literal["eye_to_hand", "eye_in_hand"]
+SensorKind = Literal["area", "line", "tracker", "probe", "camera"]
+# ISO 9283: RP = l̄ + 3·S_l; for isotropic scatter σ a coordinate l̄ = 2σ√(2/π) and S_l = σ√(3 − 8/π).
+_RP_OF_SIGMA = float(2 * np.sqrt(2 / np.pi) + 3 * np.sqrt(3 - 8 / np.pi))
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Cloud:
         return len(self.points) if self.whole is None else self.whole.count
 
     def within(self, box: Array) -> "Cloud":
-        """Its points inside a box (2, 3)."""
+        """Return the cloud of its points inside a box (2, 3)."""
         inside = ((self.points >= box[0]) & (self.points <= box[1])).all(axis=1)
         scalars = {name: column[inside] for name, column in self.scalars.items()}
         return Cloud(self.points[inside], None if self.normals is None else self.normals[inside], scalars)
@@ -49,7 +52,7 @@ class WholeCloud:
     scan: Scan  # the points that the cloud holds, with the surface of all of them
 
     def read(self) -> Cloud:
-        """Every point, in the order in which they were scanned.
+        """Return every point, in the order in which they were scanned.
 
         Raises:
             InputError: the file is not what it was.
@@ -60,7 +63,12 @@ class WholeCloud:
         return cloud
 
 
-# Points with names: as a sensor shows them in one view, and as a drawing states them.
+@dataclass(frozen=True)
+class RangeImage:
+    """One scan pixel by pixel, H rows and W columns; lengths in length_unit."""
+
+    points: Array  # (H, W, 3) scanner frame; NaN where nothing was measured
+    grey: NDArray[np.uint8]  # (H, W)
 
 
 @dataclass(frozen=True)
@@ -81,23 +89,6 @@ class NominalTargets:
     targets: tuple[str, ...]  # T
     points: Array  # (T, 3) length_unit
     sigma: Array  # (T,) of a coordinate; NaN where nobody states it
-
-
-# One scan pixel by pixel: where each pixel lies in space, and how bright it is.
-
-
-@dataclass(frozen=True)
-class RangeImage:
-    """An image of H rows and W columns; lengths in length_unit."""
-
-    points: Array  # (H, W, 3) scanner frame; NaN where nothing was measured
-    grey: NDArray[np.uint8]  # (H, W)
-
-
-Mount = Literal["eye_to_hand", "eye_in_hand"]
-SensorKind = Literal["area", "line", "tracker", "probe", "camera"]
-# ISO 9283: RP = l̄ + 3·S_l; for isotropic scatter σ a coordinate l̄ = 2σ√(2/π) and S_l = σ√(3 − 8/π).
-_RP_OF_SIGMA = float(2 * np.sqrt(2 / np.pi) + 3 * np.sqrt(3 - 8 / np.pi))
 
 
 @dataclass(frozen=True)
@@ -126,14 +117,14 @@ class Scanner:
     moving: bool = False  # points lie in the scanner's frame at their own time, not at that of the view
 
     def eye(self, points: Array) -> Array:
-        """(3,) from where it looks at points (N, 3), scanner frame: the origin, if that is not amid what it measures.
+        """Return (3,) from where it looks at points (N, 3), scanner frame: the origin, if not amid what it measures.
 
         A scanner with the origin of its frame in its measuring volume stands its working distance behind that.
         """
         if self.standoff is None or not len(points):
             return np.zeros(3)
         amid = np.median(np.linalg.norm(points, axis=1)) < self.standoff / 2
-        return np.asarray(-self.standoff * self.optical_axis if amid else np.zeros(3))
+        return -self.standoff * self.optical_axis if amid else np.zeros(3)
 
 
 @dataclass(frozen=True)

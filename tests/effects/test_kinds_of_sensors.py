@@ -9,7 +9,8 @@ from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.effects.contract import EFFECTS, missing_need, require_available
 from stitch.errors import InputError
 from stitch.session.capture import prepare_capture
-from stitch.session.measurement import measurement_of, sensor_kind, sensor_note
+from stitch.session.measurement import measurement_of, sensor_kind
+from stitch.session.notes import sensor_note
 from stitch.session.session import Sighting
 
 SENSOR = {name for name, e in EFFECTS.items() if e.place == "sensor" and e.tier == "physical"}

@@ -10,10 +10,11 @@ from stitch.errors import InputError
 from stitch.fusion.fuse import RegisteredSession, fuse, fuse_every_point
 from stitch.model.forward import corrected_capture
 from stitch.model.model import Model, term_of
-from stitch.session.capture import points_within, prepare_capture, thin_session
+from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.reading.session_folder import load_session
 from stitch.session.session import WholeCloud
+from stitch.session.thinning import points_within, thin_session
 
 
 def registered(session, measured, effect=None):

@@ -3,7 +3,8 @@
 from dataclasses import replace
 
 from data_synth.fixtures.labelled_arm import labelled_cell
-from stitch.session.measurement import gaps_note, views_of
+from stitch.session.measurement import views_of
+from stitch.session.notes import gaps_note
 
 
 def test_a_column_with_a_gap_is_told_and_not_used():

@@ -8,7 +8,9 @@ import pytest
 from data_synth.fixtures.labelled_arm import flange, labelled_cell
 from stitch.api.pipeline import run
 from stitch.cli.check import session_summary
-from stitch.session.measurement import payload_note, torques_of, views_of
+from stitch.session.measurement import views_of
+from stitch.session.notes import payload_note
+from stitch.session.torques import torques_of
 
 GRAVITY = 9.81
 COMPLIANCE = 4e-6  # rad/(N m)

@@ -12,10 +12,11 @@ from stitch.effects import EFFECTS
 from stitch.effects.contract import missing_need
 from stitch.errors import InputError
 from stitch.session import capture
-from stitch.session.capture import distinct_points, prepare_capture
+from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.scan import fit_planes, prepare_scan
 from stitch.session.session import Cloud, Scanner
+from stitch.session.thinning import distinct_points
 
 
 def test_normals_and_noise_of_a_sphere():

@@ -43,12 +43,13 @@ from stitch.plugins.intake.readings import (
 from stitch.plugins.intake.scan_targets import TargetSearch, find_folder_targets, target_motions
 from stitch.plugins.intake.stops import rows_with_scans
 from stitch.screening.conventions import RelativeScans, register_scan_pairs
-from stitch.session.capture import Capture, distinct_points, thin_session
+from stitch.session.capture import Capture
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES
 from stitch.session.reading.intrinsics import find_intrinsics
 from stitch.session.reading.scan_headers import poses_in_scans
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, Sighting, View
+from stitch.session.thinning import distinct_points, thin_session
 from stitch.system.process import steps
 
 # What a person states with flags, of a table of poses and of the folder it lies in; None where nothing is stated.

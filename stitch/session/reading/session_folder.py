@@ -16,7 +16,6 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
-from stitch.session.capture import MAX_POINTS, distinct_points, points_within, thin_cloud
 from stitch.session.moving_scanner import stand_still
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.scale_checks import check_scale, require_near
@@ -46,6 +45,7 @@ from stitch.session.session import (
     Sighting,
     View,
 )
+from stitch.session.thinning import MAX_POINTS, distinct_points, points_within, thin_cloud
 from stitch.system.threads import parallel
 
 _TABLES = ("session.toml", "views.csv", "points.csv", "frames.csv", "targets.csv")

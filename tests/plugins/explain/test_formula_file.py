@@ -11,7 +11,8 @@ from stitch.effects.user_file import load
 from stitch.plugins.explain.dictionary import Ingredient, coefficient
 from stitch.plugins.explain.formula_file import effect_source, formula_text
 from stitch.plugins.explain.quantities import view_quantities
-from stitch.session.measurement import no_torques, views_of
+from stitch.session.measurement import views_of
+from stitch.session.torques import no_torques
 from tests.plugins.explain.test_explain import evidence
 
 SHIFT = 8e-5  # m, where the payload is largest

@@ -23,8 +23,8 @@ from stitch.plugins.export.robot_program import compensate_targets, compensated_
 from stitch.plugins.intake.controllers.program import import_file, read_program
 from stitch.plugins.intake.controllers.taught_points import program_bytes
 from stitch.plugins.metrology.calibrate.arm_model import ArmModel
-from stitch.session.measurement import torques_of
 from stitch.session.reading.robot_description import robot_from_dh
+from stitch.session.torques import torques_of
 from tests.plugins.intake.controllers.program_samples import ABB, FANUC, KUKA_DAT, KUKA_SRC, UR
 
 ARM = ARMS["KUKA KR30-3"]

@@ -182,8 +182,8 @@ def test_labelled_points_of_a_view():
 
 
 def test_a_thinned_cloud_gives_all_of_its_points():
-    from stitch.session.capture import thin_cloud
     from stitch.session.session import Scanner
+    from stitch.session.thinning import thin_cloud
 
     dense = RNG.normal(size=(500, 3)) + np.array([0, 0, 500.0])
     thin = thin_cloud("v", Cloud(dense), 100, Scanner(None, None, None, np.array([0, 0, 1.0])))

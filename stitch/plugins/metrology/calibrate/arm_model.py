@@ -17,18 +17,11 @@ from stitch.output.urdf_file import to_urdf, xml_comment
 from stitch.plugins.metrology.calibrate.robot import CalibratedRobot, beyond_sentence, calibrated_robot
 from stitch.session import robot as kinematics
 from stitch.session.capture import build_capture
-from stitch.session.measurement import (
-    PAYLOAD,
-    Measurement,
-    Views,
-    gravity_of,
-    no_torques,
-    torques_of,
-    views_of,
-)
+from stitch.session.measurement import Measurement, Views, gravity_of, views_of
 from stitch.session.reading.session_folder import load_session
 from stitch.session.robot import Robot
 from stitch.session.session import SessionData
+from stitch.session.torques import PAYLOAD, no_torques, torques_of
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,108 @@
+"""Large scans made light: fewer points, each with the surface of all of them; the whole cloud stays where it is.
+
+Evidence about poses counts in views, and a view is asked a few thousand times (`overlaps.FINE_SAMPLES`). What remains
+must be dense enough that the nearest point lies on the same piece of surface; normals, edges and noise come from all
+points. Only what is fused is every point, and these are read once more when it is their turn.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics.frames import Indices
+from stitch.session.capture import Capture, prepare_capture
+from stitch.session.scan import (
+    bounding_box,
+    even_indices,
+    prepare_scan,
+    subsample,
+)
+from stitch.session.session import Cloud, Scanner, SessionData, View, WholeCloud
+from stitch.system.threads import parallel
+
+# Some ten points for every query: √10 spacings of the queries lie between a point and its partner at most. Hand-eye and
+# fused surface are then as near to the truth as with all points (docs/large-sessions.md).
+MAX_POINTS = 39_000
+# Four points for every query still lie within two of their spacings.
+_MIN_POINTS = 12_000
+# Measured: bytes that a point in memory takes until the run is written, as cloud and scan with its tree, and with its
+# share of the correspondences.
+_BYTES_PER_POINT = 220
+# What libraries and the slabs take in which everything is fused.
+_FIXED_BYTES = 1.2e9
+
+
+def points_within(memory: float, views: int) -> int:
+    """Return how many points of each view may stay in memory.
+
+    Args:
+        memory: bytes for the whole run.
+
+    Raises:
+        InputError: so many views need more.
+    """
+    room = int((memory - _FIXED_BYTES) / (views * _BYTES_PER_POINT))
+    if room < _MIN_POINTS:
+        least = np.ceil((_FIXED_BYTES + views * _BYTES_PER_POINT * _MIN_POINTS) / 1e8) / 10
+        raise InputError(
+            f"memory: {memory / 1e9:.3g} GB are too little for a run of {views} views; to fix: give {least:.1f} GB"
+        )
+    return min(room, MAX_POINTS)
+
+
+def thin_session(session: SessionData, at_most: int = MAX_POINTS) -> tuple[SessionData, Capture]:
+    """Return a session with at most `at_most` points a view, evenly over the scan order, and its capture."""
+
+    def of_view(view: View) -> View:
+        if view.cloud is None:
+            return view
+        return replace(view, cloud=thin_cloud(view.name, view.cloud, at_most, session.scanner))
+
+    session = replace(session, views=tuple(parallel(of_view, session.views)))
+    return session, prepare_capture(session)
+
+
+def thin_cloud(
+    name: str, cloud: Cloud, at_most: int, scanner: Scanner, reload: Callable[[], Cloud] | None = None
+) -> Cloud:
+    """Return a cloud with at most `at_most` of its points, and where the whole is.
+
+    Args:
+        name: of the view.
+        reload: reads the whole cloud again; None: it stays in memory.
+    """
+    picked = even_indices(len(cloud.points), at_most)
+    if len(picked) == len(cloud.points):
+        return cloud
+    if cloud.whole is not None:
+        return _take_points(cloud, picked, replace(cloud.whole, scan=subsample(cloud.whole.scan, at_most)))
+    scan = prepare_scan(name, cloud.points, picked, scanner.eye(cloud.points))
+    whole = WholeCloud(reload or (lambda: cloud), len(cloud.points), bounding_box(cloud.points), scan)
+    return _take_points(cloud, picked, whole)
+
+
+def _take_points(cloud: Cloud, index: Indices, whole: WholeCloud) -> Cloud:
+    """Return some of the points; those of the scan are the same, so that memory holds them once."""
+    normals = None if cloud.normals is None else cloud.normals[index]
+    scalars = {name: values[index] for name, values in cloud.scalars.items()}
+    return Cloud(whole.scan.points, normals, scalars, whole)
+
+
+def distinct_points(cloud: Cloud) -> Cloud:
+    """Return the cloud with every point once, in its order; the same object where none stands twice.
+
+    A copy says nothing more, and normals, noise and spacing would be taken from a point's own copies.
+    """
+    x, y, z = cloud.points.T
+    # Of different points hardly any two agree in one number, which sorts ten times as fast as three.
+    if len(np.unique(x + np.sqrt(2) * y + np.sqrt(3) * z)) == len(cloud.points):
+        return cloud
+    _, first = np.unique(cloud.points, axis=0, return_index=True)
+    if len(first) == len(cloud.points):
+        return cloud
+    first.sort()
+    normals = None if cloud.normals is None else cloud.normals[first]
+    scalars = {name: values[first] for name, values in cloud.scalars.items()}
+    return replace(cloud, points=cloud.points[first], normals=normals, scalars=scalars)
