@@ -242,7 +242,7 @@ def _scaled(T: Array, scale: Array) -> Array:
 
 
 def _screw(T_base_flange: Array, at: Array, turn: Array, shift: Array) -> Array:
-    """Return (V, 6) body twist of the flange of a turn and a shift (V, 3), in the base's directions, at `at`'s origin."""
+    """Return (V, 6) body twist of the flange of a turn and a shift (V, 3) in the base's directions, about `at`."""
     lever = T_base_flange[:, :3, 3] - at[:, :3, 3]
     back = frames.inverse(T_base_flange)
     moved = (turn, np.cross(turn, lever) + shift)
