@@ -53,7 +53,6 @@ _PLY = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float 
 _PCD = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA {1}\n"
 _HUGE = 10**12
 _HEADER = "Nr.;Datei;Lage X [mm];Lage Y [mm];Lage Z [mm];Drehung um Z [°];Drehung um Y [°];Drehung um X [°]"
-_TORQUES = [f"j{i}_torque_nm" for i in range(1, 7)]
 # Keys of result.json and values of another kind.
 _WRONG: dict[str, Any] = {"session": 5, "hand_eye": [[1, 2], [3]], "residual_rms": "x", "noise_floor": None}
 _WRONG |= {"effects": [1], "stages": {"a": 1}, "views": [5], "unobservable": [1], "repeatability": 7, "verdict": []}
@@ -67,7 +66,7 @@ def all_cases() -> Iterator[Case]:
     """Return every case."""
     listed = tomllib.loads(Path(__file__).with_name("faults.toml").read_text(encoding="utf-8"))["kind"]
     yield from chain.from_iterable(map(_listed, listed))
-    computed = (_tables, _cloud_headers, _points, _results, _loads, _disks, _terminals, _spreadsheets, _clocks, _others)
+    computed = (_tables, _cloud_headers, _points, _results, _disks, _terminals, _spreadsheets, _clocks, _others)
     yield from chain.from_iterable(source() for source in computed)
 
 
@@ -88,6 +87,8 @@ def _listed(kind: dict[str, Any]) -> Iterator[Case]:
             yield Case(name.replace("KEY", key.split(".")[0]), f"{key} = {value[:40]}", spoil, **more)
     for text in kind.get("cells", ()):
         yield Case(name, repr(text[:20]), _with_cell(kind["column"], _repeated(text)))
+    for case, rows in kind.get("loads", {}).items():
+        yield Case(name, case, _with_columns(kind["columns"], [row.split(",") for row in rows]), **more)
     changes: dict[str, Callable[[Path], object]] = {}
     for count, edits in ((0, kind.get("edits", {})), (1, kind.get("first", {}))):
         changes |= {case: _edited(kind, [_repeated(word) for word in edit], count) for case, edit in edits.items()}
@@ -332,33 +333,6 @@ def _with_result(change: Callable[[dict[str, Any]], Any], command: list[str]) ->
     )
 
 
-def _loads() -> Iterator[Case]:
-    """payload_kg and jN_torque_nm; an arm of five joints."""
-    for name, cells in {
-        "negative": ["-3"],
-        "negative once": ["5", "-3", "5"],
-        "a word once": ["5", "x", "5"],
-        "empty once": ["5", "", "5"],
-        "NaN": ["nan"],
-        "a megaton": ["1e9"],
-        "words": ["heavy"],
-    }.items():
-        yield Case("payload_kg", name, _with_columns(["payload_kg"], [[cell] for cell in cells]))
-    still = ["3"] * 6
-    for name, names, rows in (
-        ("of five joints", _TORQUES[:5], [still[:5]]),
-        ("of a joint that is not there", [*_TORQUES, "j7_torque_nm"], [[*still, "3"]]),
-        ("empty once", _TORQUES, [still, [*still[:5], ""], still]),
-        ("a word once", _TORQUES, [still, [*still[:5], "x"], still]),
-        ("1e25", _TORQUES, [["1e25"] * 6]),
-    ):
-        yield Case("torque columns", name, _with_columns(names, rows))
-    yield Case("loads that are right", "an empty column", _with_columns(["payload_kg"], [[""]]), fine=True)
-    right = _with_columns(_TORQUES, [still, ["4"] * 6])
-    yield Case("loads that are right", "torques of all joints", right, fine=True)
-    yield Case("arms of other runs", "five joints", _five_joints)
-
-
 def _with_columns(names: Sequence[str], rows: Sequence[Sequence[str]]) -> Spoil:
     """Columns more in views.csv of s, whose effect of the arm follows them; the last row goes on to the end."""
 
@@ -540,6 +514,7 @@ def _others() -> Iterator[Case]:
         make = lambda room: (room / "cell").mkdir()  # noqa: E731
         spoil = _changed("cell/history.sqlite", change, ["watch", "cell", "--add", "r"], make)
         yield Case("histories of cells", name, spoil)
+    yield Case("arms of other runs", "five joints", _five_joints)
     yield Case("stitch review", "port in use", _port_in_use)
     yield Case("command lines", "", lambda room: [])
     yield Case("links out of a run", "pictures", _pictures_elsewhere, writes=("r",))

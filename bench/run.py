@@ -18,7 +18,6 @@ from bench import harness  # noqa: E402
 TABLES = {
     "base-to-base": "base_to_base:TABLE",
     "batch-speed": "watch:SPEED",
-    "batch-scheduler": "watch:SCHEDULER",
     "blind": "blind:TABLE",
     "conventions": "intake:CONVENTIONS",
     "diagnose-time": "speed:DIAGNOSE",
@@ -44,7 +43,7 @@ TABLES = {
     "points-names": "points:NAMES",
     "points-suggested": "points:SUGGESTED",
     "power-oracle": "unknown_laws:ORACLE",
-    "real-scans": "real_scans:TABLE",
+    "real-scans": "hand_eye_sigmas:REAL_SCANS",
     "results": "results:TABLE",
     "scanner-laws": "foreign_laws:SCANNER",
     "unknown-laws": "unknown_laws:TABLE",

@@ -4,15 +4,12 @@ TABLE: A cell over days: false alarms, what is named and when, coverage, time an
 real arm is the UR10's series A: 11,911 poses with a tracker, their times and the temperature of the air. Every block is
 a session of its own, run with joint offsets and link geometry as effects, and appended to the history of a cell.
 
-SPEED, SCHEDULER: Many sessions: two workers against one, and what the scheduler holds of a day of a plant.
+SPEED: two workers against one on many small sessions.
 """
 
-import logging
 import os
 import re
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -20,13 +17,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import psutil
-from distributed import Client
-from distributed.utils import open_port
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from bench.harness import ROOT, SHARED_DATA, Row, Table, grouped, markdown, stitch_process
+from bench.harness import SHARED_DATA, Row, Table, grouped, markdown, stitch_process
 from data_synth.cell_history import HAND_EYE, CellHistory, CellPlan, cell_history
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.cell_records import records_of
@@ -37,7 +31,6 @@ from stitch.numerics.units import length_text
 from stitch.output.result_document import model_of
 from stitch.output.run_folder import write_with_page
 from stitch.plugins.watch import tracking
-from stitch.plugins.watch.batch.run_batch import BatchJob, SessionRow, rows_from
 from stitch.plugins.watch.history import HISTORY_FILE, open_history, read_record
 from stitch.plugins.watch.report import CellReport, cell_report, cell_trend
 from stitch.plugins.watch.update import DAY_SECONDS, RUN_LENGTH, append_runs, regressor_prior_sigmas, regressors
@@ -61,11 +54,6 @@ _MORE = 40
 SESSIONS = 64
 # By name: workers, and whether they share one core.
 WAYS = {"one worker, one core": (1, True), "one process, all cores": (1, False), "two workers": (2, False)}
-TASKS = (1_000, 10_000, 100_000)
-_SENTENCE = (
-    "One hand-eye leaves 41.9 µm rms where the sensor's own noise would leave 29.2 µm: the robot's poses scatter by "
-    "12.2 µm and 0.1 mrad; moving each view by its own correction leaves 40 µm."
-)
 
 
 def jobs(seeds: range, cells: int) -> Iterator[Row]:
@@ -368,74 +356,3 @@ SPEED = Table(
     speed_jobs, speed_trial, speed_summary, range(1), page="scale", block="speed", one_core=False,
     settings={"sessions": SESSIONS},
 )  # fmt: skip
-
-
-def nothing(job: BatchJob) -> SessionRow:
-    """Return a row as large as that of a session, at once."""
-    sizes = [41.9] * 4
-    run = (str(job.session), job.run.name, str(job.run))
-    return SessionRow(*run, False, None, False, _SENTENCE, 18, 0, *sizes, "v007", 42.2, 7.1)
-
-
-def scheduler_jobs(seeds: range) -> Iterator[Row]:
-    """So many tasks of the size of ours that do nothing."""
-    yield from ({"count": count} for count in TASKS)
-
-
-def scheduler_trial(job: Row) -> Row:
-    """Through a scheduler and two workers in processes of their own."""
-    port = open_port()
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    quiet = {"env": environment, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    dask, address = [sys.executable, "-m", "dask"], f"tcp://127.0.0.1:{port}"
-    with tempfile.TemporaryDirectory() as scratch:
-        place = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
-        served = subprocess.Popen([*dask, "scheduler", *place], **quiet)
-        options = ["--nworkers", "2", "--nthreads", "1", "--no-dashboard", "--local-directory", scratch]
-        working = subprocess.Popen([*dask, "worker", address, *options], **quiet)
-        try:
-            return _through(job["count"], address, psutil.Process(served.pid))
-        finally:
-            for process in (working, served):
-                process.terminate()
-                process.wait()
-
-
-def _through(count: int, address: str, served: psutil.Process) -> Row:
-    """Seconds, seconds of the scheduler's processor, and what it and this process hold more at most, MB."""
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    command = psutil.Process()
-    with Client(address, timeout=60) as client:
-        client.wait_for_workers(2, timeout=60)
-        jobs = [BatchJob(Path(f"/plant/cell-{i % 1000}/{i}"), Path(f"/plant/runs/{i}"), "f" * 32) for i in range(count)]
-        before = [process.memory_info().rss for process in (served, command)]
-        spent, begun = sum(served.cpu_times()[:2]), time.perf_counter()
-        most = list(before)
-        for done, _ in enumerate(rows_from(client, jobs, nothing)):
-            if done % 500 == 0:
-                most = [max(m, process.memory_info().rss) for m, process in zip(most, (served, command), strict=True)]
-        wall, cpu = time.perf_counter() - begun, sum(served.cpu_times()[:2]) - spent
-    more = [(m - b) / 1e6 for m, b in zip(most, before, strict=True)]
-    return {"seconds": wall, "cpu": cpu, "scheduler": more[0], "command": more[1]}
-
-
-def scheduler_summary(rows: list[Row]) -> list[str]:
-    """A row a size."""
-    lines = []
-    for row in rows:
-        count = row["count"]
-        memory = [f"{row[key]:.0f} ({1e3 * row[key] / count:.1f})" for key in ("scheduler", "command")]
-        rate = [f"{row['seconds']:.1f}", f"{count / row['seconds']:,.0f}", f"{1e3 * row['cpu'] / count:.2f}"]
-        lines.append([f"{count:,}", *rate, *memory])
-    head = "sessions | s | a second | scheduler: CPU ms each | MB more (kB each) | command: MB more (kB each)"
-    return [
-        "**Tasks that do nothing**, with arguments and results as of sessions, through a scheduler and two workers in "
-        "processes of their own",
-        "",
-        *markdown(head, lines),
-    ]
-
-
-SCHEDULER = Table(
-    scheduler_jobs, scheduler_trial, scheduler_summary, range(1), page="scale", block="scheduler", one_core=False
-)

@@ -7,14 +7,12 @@ session of one's own, without pictures.
 """
 
 import argparse
-import json
 import os
 import re
 import shutil
 import subprocess
 import tempfile
 import time
-import urllib.request
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -53,7 +51,6 @@ def main() -> None:
         with served(folder / "run") as (address, process):
             page = browser.new_page(viewport=WIDE)
             camera = Camera(page, keep=given.session is None)
-            choices(folder / "run", address, process)
             page.goto(address)
             story(camera, given.effect)
             print(memory(process))
@@ -207,20 +204,11 @@ def served(run: Path):
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
     try:
         address = process.stderr.readline().strip()
-        print(f"listens after {time.monotonic() - begun:.1f} s, {processor_seconds(process):.1f} s of one core")
+        print(f"listens after {time.monotonic() - begun:.1f} s")
         yield address, process
     finally:
         process.terminate()
         process.wait()
-
-
-def processor_seconds(process: subprocess.Popen[str]) -> float:
-    """What a process has used so far, where /proc tells: a busy machine does not count."""
-    try:
-        fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return float("nan")
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def memory(process: subprocess.Popen[str]) -> str:
@@ -231,17 +219,6 @@ def memory(process: subprocess.Popen[str]) -> str:
         return "memory unknown"
     sizes = {line.split(":")[0]: int(line.split()[1]) / 1e3 for line in status.splitlines() if line.startswith("Vm")}
     return f"{sizes['VmRSS']:.0f} MB, {sizes['VmHWM']:.0f} MB at most"
-
-
-def choices(run: Path, address: str, process: subprocess.Popen[str]) -> None:
-    """What the fields of everything, of a view and of a place cost the server."""
-    view = json.loads((run / "result.json").read_text(encoding="utf-8"))["views"][0]["view"]
-    for choice in ({}, {"views": [view]}, {"place": [0.0, 0.0, 0.0], "within": 50.0}):
-        before = processor_seconds(process)
-        asked = urllib.request.Request(f"{address}chosen", json.dumps(choice).encode(), method="POST")
-        told = json.load(urllib.request.urlopen(asked))["chosen"]
-        cost = processor_seconds(process) - before
-        print(f"choice {choice}: rms {told['rms'] or 0:.1f} µm, {cost:.2f} s of one core; {memory(process)}")
 
 
 if __name__ == "__main__":
