@@ -19,10 +19,35 @@ from stitch.errors import InputError
 from stitch.numerics.units import Amount, format_amount
 from stitch.session.measurement import Measurement
 
-# How the arguments of an effect's function become parameters: kinds, units, plausible sizes.
-
 # Stands for all views of the session in a grid.
 EVERY_VIEW = (-1.0,)
+# Places that are tried for an event among hundreds of views.
+_EVENT_PLACES = 50
+PLACES = {
+    "sensor": "(points (N, 3) at x*, view: ScanView, parameters) → points (N, 3) that the scanner reports",
+    "robot": "(joints (V, n) reported, views: Views, parameters) → true joints (V, n)",
+    "links": "(links: Links, views: Views, parameters) → Links",
+    "mount": "(views: Views, parameters) → twists (V, 6): the mount is M·exp(twist)",
+    "part": "(views: Views, parameters) → twists (V, 6): the part sits displaced by exp(twist), reference frame",
+    "shape": "(points (N, 3) of the part in the reference frame, view: ScanView, parameters) → displaced points",
+}
+TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
+# Units are written for millimetres; a session in metres has the same unit with m.
+_PER_MM = {"mm": 1.0, "m": 1e-3}
+# What a link and all that it carries may well weigh, kg, where nobody states it; and how much more than is
+# believable for a known mass the product of mass and compliance may be, for light and soft arms too.
+_LINK_MASS, _LINK_MASS_LIMIT = 10.0, 100.0
+_WHERE_FROM = {
+    "joints": "joint angles in views.csv and the robot's DH rows or URDF",
+    "torque": "joint angles and the robot's geometry",
+    "velocity": "columns j1_velocity_deg_s … in views.csv",
+    "time": "a column time_s in views.csv",
+    "intensity": "an intensity for every point",
+    "optics": "a sensor with optics that has all points ahead of it (kind area, line or camera under [scanner])",
+    "surfaces": "a sensor that scans surfaces (kind area or line under [scanner])",
+    "gravity_at_mount": "a scanner that the robot turns against gravity",
+    "gravity_at_part": "a part that the robot turns against gravity",
+}
 
 
 @dataclass(frozen=True)
@@ -41,40 +66,41 @@ class Spec:
 
 
 def number(unit: str, typical: float, limit: float, grid: Sequence[float] = ()) -> Spec:
-    """One number."""
+    """Return one number."""
     return Spec("number", unit, typical, limit, tuple(grid))
 
 
 def vector(unit: str, typical: float, limit: float) -> Spec:
-    """A vector (3,): cx, cy, cz for c."""
+    """Return a vector (3,): cx, cy, cz for c."""
     return Spec("vector", unit, typical, limit)
 
 
 def offset(unit: str, typical: float, limit: float, axes: Sequence[str] = "xyz") -> Spec:
-    """An array, a vector cx, cy, cz for c unless `axes` says otherwise; it may be zero where the effect's others are
-    not."""
+    """Return an array, a vector cx, cy, cz for c unless `axes` says otherwise; it may be zero where the effect's others
+    are not."""
     return Spec("offset", unit, typical, limit, axes=tuple(axes))
 
 
 def event() -> Spec:
-    """The view from which on something is different; every view that can show it is tried, of a hundred some fifty."""
+    """Return the view from which on something is different; every view that can show it is tried, of a hundred some
+    fifty."""
     return Spec("number", "view", 1.0, float("inf"), EVERY_VIEW)
 
 
 def per_joint(unit: str, typical: float, limit: float) -> Spec:
-    """An array (n,) with one number a joint: `c` becomes c1 … cn."""
+    """Return an array (n,) with one number a joint: `c` becomes c1 … cn."""
     return Spec("joint", unit, typical, limit)
 
 
 def per_torque(unit: str, typical: float, limit: float) -> Spec:
-    """One number for each gravity torque that `Views.sag` knows: c1 … cn with masses, c2_3 … without."""
+    """Return one number for each gravity torque that `Views.sag` knows: c1 … cn with masses, c2_3 … without."""
     return Spec("torque", unit, typical, limit)
 
 
 def twist(
     unit: str, rotation: float, translation: float, limit_rotation: float = 0.02, limit_translation: float = 10.0
 ) -> Spec:
-    """A twist (6,), rotation first, named rx … tz; `unit` follows rad and mm, such as "/h"."""
+    """Return a twist (6,), rotation first, named rx … tz; `unit` follows rad and mm, such as "/h"."""
     return Spec(
         "twist",
         f"rad{unit}",
@@ -84,22 +110,6 @@ def twist(
         typical_shift=translation,
         limit_shift=limit_translation,
     )
-
-
-PLACES = {
-    "sensor": "(points (N, 3) at x*, view: ScanView, parameters) → points (N, 3) that the scanner reports",
-    "robot": "(joints (V, n) reported, views: Views, parameters) → true joints (V, n)",
-    "links": "(links: Links, views: Views, parameters) → Links",
-    "mount": "(views: Views, parameters) → twists (V, 6): the mount is M·exp(twist)",
-    "part": "(views: Views, parameters) → twists (V, 6): the part sits displaced by exp(twist), reference frame",
-    "shape": "(points (N, 3) of the part in the reference frame, view: ScanView, parameters) → displaced points",
-}
-TWIST = ("rx", "ry", "rz", "tx", "ty", "tz")
-# Units are written for millimetres; a session in metres has the same unit with m.
-_PER_MM = {"mm": 1.0, "m": 1e-3}
-# What a link and all that it carries may well weigh, kg, where nobody states it; and how much more than is
-# believable for a known mass the product of mass and compliance may be, for light and soft arms too.
-_LINK_MASS, _LINK_MASS_LIMIT = 10.0, 100.0
 
 
 @dataclass(frozen=True)
@@ -125,10 +135,9 @@ class Parameter:
     @property
     def formatted(self) -> Amount:
         """As people read it; the view of an event by its name."""
-        name = self.view
-        return (
-            Amount(name, "–", "") if name else format_amount(self.value, self.sigma if self.fitted else None, self.unit)
-        )
+        if self.view:
+            return Amount(self.view, "–", "")
+        return format_amount(self.value, self.sigma if self.fitted else None, self.unit)
 
     @property
     def view(self) -> str:
@@ -175,7 +184,7 @@ class Effect:
         return (self.function.__doc__ or "").strip().splitlines()[0]
 
     def parameters(self, joints: int, torques: Sequence[str], length_unit: str) -> tuple[Parameter, ...]:
-        """All parameters for an arm of n joints at zero, in the session's unit."""
+        """Return all parameters for an arm of n joints at zero, in the session's unit."""
         named = [
             (key, spec, name)
             for key, spec in self.specs.items()
@@ -184,16 +193,16 @@ class Effect:
         return tuple(_parameter(key, spec, name, length_unit) for key, spec, name in named)
 
     def arguments(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
-        """Keyword arguments of the function: a number, or an array for an argument of several parameters."""
+        """Return keyword arguments of the function: a number, or an array for an argument of several parameters."""
         values: dict[str, list[float]] = {key: [] for key in self.specs}
         for p in parameters:
             values[p.argument].append(p.value)
         single = {key for key, spec in self.specs.items() if spec.kind == "number"}
-        return {key: float(own[0]) if key in single else np.array(own, float) for key, own in values.items()}
+        return {key: float(given[0]) if key in single else np.array(given, float) for key, given in values.items()}
 
 
 def _parameter_names(key: str, spec: Spec, joints: int, torques: Sequence[str]) -> Sequence[str]:
-    """Names of the parameters that an argument stands for."""
+    """Return the names of the parameters that an argument stands for."""
     match spec.kind:
         case "number":
             return [key]
@@ -208,7 +217,7 @@ def _parameter_names(key: str, spec: Spec, joints: int, torques: Sequence[str]) 
 
 
 def _parameter(key: str, spec: Spec, name: str, length_unit: str) -> Parameter:
-    """A parameter in the session's unit."""
+    """Return a parameter in the session's unit."""
     unit, typical, limit = spec.unit, spec.typical, spec.limit
     if spec.kind == "twist" and name.startswith("t"):
         unit, typical, limit = spec.unit_shift, spec.typical_shift, spec.limit_shift
@@ -248,58 +257,8 @@ def effect(
     return register
 
 
-# Which parameters of an effect belong together: those of one joint, one number of a link, or all of them.
-
-
-def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Indices of the parameters of each joint; empty for an effect without joints."""
-    if not any(spec.kind in ("joint", "torque") for spec in effect.specs.values()):
-        return []
-    letters = sorted(effect.specs, key=len, reverse=True)
-    joints: dict[str, list[int]] = {}
-    for i, parameter in enumerate(parameters):
-        letter = next(name for name in letters if parameter.name.startswith(name))
-        joints.setdefault(parameter.name[len(letter) :].split("_")[0], []).append(i)
-    return list(joints.values())
-
-
-def without_offset(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Indices of all parameters but an offset; empty for an effect without one."""
-    offsets = [f"{key}{axis}" for key, spec in effect.specs.items() if spec.kind == "offset" for axis in spec.axes]
-    return [[i for i, p in enumerate(parameters) if p.name not in offsets]] if offsets else []
-
-
-def one_by_one(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """The smallest parts that can be true without the others."""
-    if effect.place == "links" or effect.tier == "empirical":
-        # One row of a table seldom is wrong altogether, nor a scanner in every term of a polynomial.
-        return [[i] for i in range(len(parameters))]
-    return by_joint(effect, parameters) or [*without_offset(effect, parameters), list(range(len(parameters)))]
-
-
-# An effect in one session: its parameters there, and what it needs that the session may not have.
-
-_EVENT_PLACES = 50
-_WHERE_FROM = {
-    "joints": "joint angles in views.csv and the robot's DH rows or URDF",
-    "torque": "joint angles and the robot's geometry",
-    "velocity": "columns j1_velocity_deg_s … in views.csv",
-    "time": "a column time_s in views.csv",
-    "intensity": "an intensity for every point",
-    "optics": "a sensor with optics that has all points ahead of it (kind area, line or camera under [scanner])",
-    "surfaces": "a sensor that scans surfaces (kind area or line under [scanner])",
-    "gravity_at_mount": "a scanner that the robot turns against gravity",
-    "gravity_at_part": "a part that the robot turns against gravity",
-}
-
-
-def describe_need(need: str) -> str:
-    """What an effect needs, as somebody who writes a session knows it."""
-    return _WHERE_FROM.get(need, f"a column {need} in views.csv")
-
-
 def find_effect(name: str) -> Effect:
-    """An effect of the library or of a user's file.
+    """Return an effect of the library or of a user's file.
 
     Raises:
         InputError: no such effect.
@@ -310,25 +269,27 @@ def find_effect(name: str) -> Effect:
 
 
 def parameters_in(measurement: Measurement, effect: Effect) -> tuple[Parameter, ...]:
-    """The parameters of an effect in a session, at zero; where time stands in for a temperature, rates are per hour."""
+    """Return the parameters of an effect in a session, at zero; where time stands in for a temperature, rates are per
+    hour."""
     views = measurement.views
-    found = effect.parameters(views.joints.shape[1], views.torques.names, measurement.length_unit)
+    # An event can come before any view but the first two and the last: one view alone shows no event. Among hundreds of
+    # views its place matters less than the time to try them all.
+    places = range(2, views.count - 1)
+    events = tuple(float(v) for v in places[:: max(len(places) // _EVENT_PLACES, 1)])
     timed = bool(effect.prefers) and not any(views.has(name) for name in effect.prefers)
-    found = tuple(replace(p, unit=p.unit.replace("°C", "h")) for p in found) if timed else found
-    return tuple(replace(p, grid=_grid(p, views.count), names=views.names if p.discrete else ()) for p in found)
-
-
-def _grid(parameter: Parameter, views: int) -> tuple[float, ...]:
-    if parameter.grid != EVERY_VIEW:
-        return parameter.grid
-    # An event can come before any view but the first two and the last: one view alone shows no event.
-    places = range(2, views - 1)
-    # Among hundreds of views the place of an event matters less than the time to try them all.
-    return tuple(float(v) for v in places[:: max(len(places) // _EVENT_PLACES, 1)])
+    return tuple(
+        replace(
+            p,
+            unit=p.unit.replace("°C", "h") if timed else p.unit,
+            grid=events if p.grid == EVERY_VIEW else p.grid,
+            names=views.names if p.discrete else (),
+        )
+        for p in effect.parameters(views.joints.shape[1], views.torques.names, measurement.length_unit)
+    )
 
 
 def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
-    """What an effect needs and a session has not; time stands in for a covariate that the effect prefers."""
+    """Return what an effect needs and a session has not; time stands in for a covariate that the effect prefers."""
     views = measurement.views
     known_here = {
         "intensity": measurement.has_intensity,
@@ -342,7 +303,7 @@ def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
 
 
 def stands_still(measurement: Measurement, effect: Effect) -> bool:
-    """True for an effect of what hangs at the flange where that does not: of the part, or of the scanner."""
+    """Return whether an effect is one of what hangs at the flange where that does not: the part, or the scanner."""
     return ("gravity_at_mount" if measurement.eye_to_hand else "gravity_at_part") in effect.needs
 
 
@@ -359,3 +320,34 @@ def require_available(measurement: Measurement, effect: Effect) -> None:
             f"effect {effect.name} needs {words}, which session {measurement.capture.name} does not have"
             "; to fix: state it, or leave the effect out"
         )
+
+
+def describe_need(need: str) -> str:
+    """Return what an effect needs, as somebody who writes a session knows it."""
+    return _WHERE_FROM.get(need, f"a column {need} in views.csv")
+
+
+def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """Return indices of the parameters of each joint; empty for an effect without joints."""
+    if not any(spec.kind in ("joint", "torque") for spec in effect.specs.values()):
+        return []
+    letters = sorted(effect.specs, key=len, reverse=True)
+    joints: dict[str, list[int]] = {}
+    for i, parameter in enumerate(parameters):
+        letter = next(name for name in letters if parameter.name.startswith(name))
+        joints.setdefault(parameter.name[len(letter) :].split("_")[0], []).append(i)
+    return list(joints.values())
+
+
+def without_offset(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """Return indices of all parameters but an offset; empty for an effect without one."""
+    offsets = [f"{key}{axis}" for key, spec in effect.specs.items() if spec.kind == "offset" for axis in spec.axes]
+    return [[i for i, p in enumerate(parameters) if p.name not in offsets]] if offsets else []
+
+
+def one_by_one(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
+    """Return the smallest parts that can be true without the others."""
+    if effect.place == "links" or effect.tier == "empirical":
+        # One row of a table seldom is wrong altogether, nor a scanner in every term of a polynomial.
+        return [[i] for i in range(len(parameters))]
+    return by_joint(effect, parameters) or [*without_offset(effect, parameters), list(range(len(parameters)))]

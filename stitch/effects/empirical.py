@@ -25,18 +25,22 @@ _MONOMIALS = [factors for degree in (1, 2) for factors in combinations_with_repl
 
 
 def empirical_effects(views: Views) -> list[Effect]:
-    """Every empirical effect that these views can carry."""
-    out = []
+    """Return every empirical effect that these views can carry."""
+    effects = []
     for joint in range(views.joints.shape[1]):
         # A joint that hardly turns shows no period.
         if np.ptp(views.joints[:, joint]) > np.radians(15.0):
-            out += [_harmonic(joint, order) for order in _HARMONICS]
-    courses = {"time_s": views.time} if views.has("time") else {}
-    for name, course in (courses | views.covariates).items():
-        if np.ptp(course) > 0 and len(np.unique(course)) > 2:
-            out += [_bias(name, course, 1), _bias(name, course, 2), _mount(name, course, 1), _mount(name, course, 2)]
-    out.append(_field())
-    return [*out, _effect("an event", "knock_of_mount", "mount", _step, xi=twist("", 6e-4, 0.2), v=event())]
+            effects += [_harmonic(joint, order) for order in _HARMONICS]
+    covariates = ({"time_s": views.time} if views.has("time") else {}) | views.covariates
+    for name, values in covariates.items():
+        if np.ptp(values) > 0 and len(np.unique(values)) > 2:
+            x = 2 * (values - values.min()) / np.ptp(values) - 1
+            # Polynomials (V,) of the covariate over ±1.
+            polynomials = {1: x, 2: 1.5 * x**2 - 0.5}
+            effects += [_bias(name, order, shape) for order, shape in polynomials.items()]
+            effects += [_mount(name, order, shape) for order, shape in polynomials.items()]
+    effects.append(_field())
+    return [*effects, _effect("an event", "knock_of_mount", "mount", _step, xi=twist("", 6e-4, 0.2), v=event())]
 
 
 def _effect(
@@ -47,17 +51,35 @@ def _effect(
 
 def _harmonic(joint: int, order: int) -> Effect:
     def fourier(joints: Array, views: Views, A: float, B: float) -> Array:
-        out = joints.copy()
-        out[:, joint] += A * np.sin(order * views.joints[:, joint]) + B * np.cos(order * views.joints[:, joint])
-        return out
+        true = joints.copy()
+        true[:, joint] += A * np.sin(order * views.joints[:, joint]) + B * np.cos(order * views.joints[:, joint])
+        return true
 
     fourier.__doc__ = f"joint {joint + 1}: A sin {order}q + B cos {order}q"
-    name, size = f"fourier_{order}_of_j{joint + 1}", number("rad", 4e-4, 0.01)
+    name = f"fourier_{order}_of_j{joint + 1}"
+    size = number("rad", 4e-4, 0.01)
     return _effect(f"j{joint + 1}_deg", name, "robot", fourier, A=size, B=size)
 
 
+def _bias(name: str, order: int, shape: Array) -> Effect:
+    def bias(points: Array, view: ScanView, k: float) -> Array:
+        return points + view.along(points) * (k * shape[view.index])
+
+    bias.__doc__ = f"along the ray by k·P{order}({name})"
+    return _effect(name, f"bias_{order}_of_{name}", "sensor", bias, k=number("mm", 0.1, 5.0))
+
+
+def _mount(name: str, order: int, shape: Array) -> Effect:
+    def follow(views: Views, xi: Array) -> Array:
+        return np.outer(shape, xi)
+
+    follow.__doc__ = f"M·exp(ξ·P{order}({name}))"
+    return _effect(name, f"mount_{order}_of_{name}", "mount", follow, xi=twist("", 4e-4, 0.15))
+
+
 def _field() -> Effect:
-    """Points move in all three directions by a function of where they are seen; 0.1 mm at the edge is usual."""
+    """Return points that move in all three directions by a function of where they are seen; 0.1 mm at the edge is
+    usual."""
     terms = {f"c{axis}_{''.join(factors)}": (axis, factors) for axis in range(3) for factors in _MONOMIALS}
 
     def distort(points: Array, view: ScanView, **c: float) -> Array:
@@ -74,32 +96,6 @@ def _field() -> Effect:
     sizes = {name: 0.1 / prod(_REACH[factor] for factor in factors) for name, (_, factors) in terms.items()}
     specs = {name: number("mm", size, 50 * size) for name, size in sizes.items()}
     return _effect("the scanner's field", FIELD, "sensor", distort, ("optics",), **specs)
-
-
-def _standard(course: Array, order: int) -> Array:
-    """(V,) polynomial of the course over ±1."""
-    x = 2 * (course - course.min()) / np.ptp(course) - 1
-    return np.asarray(x if order == 1 else 1.5 * x**2 - 0.5)
-
-
-def _bias(name: str, course: Array, order: int) -> Effect:
-    shape = _standard(course, order)
-
-    def bias(points: Array, view: ScanView, k: float) -> Array:
-        return np.asarray(points + view.along(points) * (k * shape[view.index]))
-
-    bias.__doc__ = f"along the ray by k·P{order}({name})"
-    return _effect(name, f"bias_{order}_of_{name}", "sensor", bias, k=number("mm", 0.1, 5.0))
-
-
-def _mount(name: str, course: Array, order: int) -> Effect:
-    shape = _standard(course, order)
-
-    def follow(views: Views, xi: Array) -> Array:
-        return np.outer(shape, xi)
-
-    follow.__doc__ = f"M·exp(ξ·P{order}({name}))"
-    return _effect(name, f"mount_{order}_of_{name}", "mount", follow, xi=twist("", 4e-4, 0.15))
 
 
 def _step(views: Views, xi: Array, v: float) -> Array:

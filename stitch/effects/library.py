@@ -1,5 +1,9 @@
-"""The library of physical effects, in the order of the chain of frames: arm, mount, part, scanner; then what holds
-scanner or part against gravity.
+"""The library of physical effects, in the order of the chain of frames.
+
+First the arm: effects give the true joint angles q* and the true links. Then the scanner's mount, which truly is
+M·exp(twist), and the part, which creeps, slips, grows or sags in the reference frame. Then the scanner, which reports a
+point that is at x*; a tracker or its probe has none of these. Last what holds scanner or part and gives way under its
+weight, as it is turned against gravity.
 
 Candidates are tried and listed in this order.
 """
@@ -13,7 +17,10 @@ from stitch.numerics.frames import Array
 from stitch.session.measurement import ScanView, Views
 from stitch.session.robot import Links
 
-# Effects of the arm: the true joint angles q* and the true links.
+# A steel bracket of 30 N bends by 0.1 to 0.5 mrad and 0.02 to 0.1 mm; a sheet of metal is five times as soft.
+_SHIFT = number("mm", typical=0.05, limit=2.0)
+_TILT = vector("rad", typical=2e-4, limit=0.01)
+_UNEVEN = offset("rad", typical=1e-4, limit=0.01, axes=("xx", "yy", "xy", "xz", "yz"))
 
 
 @effect("robot", needs=("velocity",), dt=number("s", typical=2e-3, limit=0.5))
@@ -50,13 +57,13 @@ def joint_compliance(joints: Array, views: Views, c: Array) -> Array:
 @effect("robot", needs=("joints",), A=per_joint("rad", 4e-4, 0.01), B=per_joint("rad", 4e-4, 0.01))
 def gear_eccentricity(joints: Array, views: Views, A: Array, B: Array) -> Array:
     """q*_i = q_i + A_i sin q_i + B_i cos q_i"""
-    return np.asarray(joints + A * np.sin(views.joints) + B * np.cos(views.joints))
+    return joints + A * np.sin(views.joints) + B * np.cos(views.joints)
 
 
 @effect("robot", needs=("joints",), A=per_joint("rad", 4e-4, 0.01), B=per_joint("rad", 4e-4, 0.01))
 def gear_harmonic(joints: Array, views: Views, A: Array, B: Array) -> Array:
     """q*_i = q_i + A_i sin 2q_i + B_i cos 2q_i"""
-    return np.asarray(joints + A * np.sin(2 * views.joints) + B * np.cos(2 * views.joints))
+    return joints + A * np.sin(2 * views.joints) + B * np.cos(2 * views.joints)
 
 
 @effect("robot", needs=("joints",), b=per_joint("rad", 3e-4, 0.005))
@@ -78,11 +85,8 @@ def robot_thermal_growth(links: Links, views: Views, g: float) -> Links:
 
 
 def warmer(views: Views, covariate: str) -> Array:
-    """(V,) ΔT since the first view, or hours where nobody measured."""
+    """Return (V,) ΔT since the first view, or hours where nobody measured."""
     return views.since_first(covariate) if covariate in views.covariates else views.hours
-
-
-# Effects of the scanner's mount: the true one is M·exp(twist).
 
 
 @effect("mount", needs=("time",), xi=twist("/h", 1e-3, 0.4))
@@ -100,9 +104,6 @@ def mount_drift(views: Views, xi: Array) -> Array:
 def mount_warmup(views: Views, xi: Array, T_c: float) -> Array:
     """M·exp(ξ (1−e^(−(t−t₀)/T_c)))"""
     return np.outer(1 - np.exp(-views.time / max(T_c, 1.0)), xi)
-
-
-# Effects of the part: it creeps, slips, grows or sags in the reference frame.
 
 
 @effect("part", needs=("time",), xi=twist("/h", 1e-3, 0.4))
@@ -137,9 +138,6 @@ def part_sag(points: Array, view: ScanView, kappa: float) -> Array:
     return points + kappa * points[:, 2:] ** 2 * view.gravity
 
 
-# Effects of the scanner: where it reports a point that is at x*. A tracker or its probe has none of them.
-
-
 @effect("sensor", needs=("optics",), s=number("1", typical=1e-3, limit=0.02))
 def range_scale(points: Array, view: ScanView, s: float) -> Array:
     """x = (1+s) x*"""
@@ -151,7 +149,7 @@ def range_nonlinearity(points: Array, view: ScanView, k: float) -> Array:
     """x = x* + u·k·(r/r₀−1)², r₀ the standoff"""
     u = view.along(points)
     r = (view.away(points) * u).sum(axis=1)
-    return np.asarray(points + u * (k * (r / view.views.standoff - 1) ** 2)[:, None])
+    return points + u * (k * (r / view.views.standoff - 1) ** 2)[:, None]
 
 
 @effect("sensor", needs=("surfaces",), b=number("mm", typical=0.1, limit=1.0))
@@ -187,13 +185,6 @@ def scanner_thermal_scale(points: Array, view: ScanView, k: float) -> Array:
     return points * (1 + k * view.since_first("scanner_temperature_c"))
 
 
-# Effects of what holds scanner or part and gives way under its weight, as it is turned against gravity.
-
-# A steel bracket of 30 N bends by 0.1 to 0.5 mrad and 0.02 to 0.1 mm; a sheet of metal is five times as soft.
-_SHIFT, _TILT = number("mm", typical=0.05, limit=2.0), vector("rad", typical=2e-4, limit=0.01)
-_UNEVEN = offset("rad", typical=1e-4, limit=0.01, axes=("xx", "yy", "xy", "xz", "yz"))
-
-
 @effect("mount", needs=("gravity_at_mount",), s=_SHIFT, w=_TILT, a=_UNEVEN)
 def mount_droop(views: Views, s: float, w: Array, a: Array) -> Array:
     """M tilts by w×g + A·g and moves by s·(g_x, g_y, 0), g the direction of gravity less z, flange frame
@@ -210,7 +201,7 @@ def fixture_droop(views: Views, s: float, w: Array, a: Array) -> Array:
 
 
 def _droop(gravity: Array, s: float, w: Array, a: Array) -> Array:
-    """(V, 6) twists about the flange's origin by gravity (V, 3), both in its frame.
+    """Return (V, 6) twists about the flange's origin by gravity (V, 3), both in its frame.
 
     What an elastic fixture does under a weight is linear in the direction of gravity. Its rotation is K·(d×g), K
     symmetric and d the lever of the weight, which has no trace. Of its shift only what differs between directions is

@@ -1,4 +1,8 @@
-"""A user's own effects from a Python file, written in the form of the library's."""
+"""A user's own effects from a Python file, written in the form of the library's.
+
+What the file says of an effect and what its function returns is checked; whatever goes wrong in it is one line that
+names the file and the place.
+"""
 
 import importlib.util
 import inspect
@@ -8,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -19,12 +22,51 @@ from stitch.numerics.frames import Array
 from stitch.session.robot import Links
 from stitch.system.process import time_limit
 
-# Is what a user's file says of an effect, and what its function returns, what the chain can use?
-
 _KINDS = ("number", "vector", "offset", "joint", "torque", "twist")
+# Seconds for the file and for every call of an effect; a call on a million points takes less than one.
+_SECONDS = 5.0
+_LIMIT = "STITCH_EFFECT_SECONDS"
 
 
-def require_effect(effect: Effect, where: str) -> None:
+def load(path: Path) -> list[str]:
+    """Run the file; its effects join the registry.
+
+    The file is Python and is executed: load only files that you would run.
+
+    Returns:
+        Their names.
+
+    Raises:
+        InputError: no such file, no Python file, an error in it (with its line), or no effect in it. The registry is
+            then as it was.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; --effects-file names a Python file with @effect functions")
+    spec = importlib.util.spec_from_file_location(f"stitch_user_effects_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"{path}: not called a Python file; rename it {path.with_suffix('.py').name}")
+    before = dict(EFFECTS)
+    for name in [name for name, known in EFFECTS.items() if known.tier == "user"]:
+        del EFFECTS[name]
+    try:
+        with _name_errors(path, ""):
+            # As it stands: Python's own import would leave a cache beside the file, and may take one that is old.
+            exec(compile(path.read_bytes(), path, "exec"), vars(importlib.util.module_from_spec(spec)))
+        names = [name for name in EFFECTS if name not in before or EFFECTS[name] is not before[name]]
+        if not names:
+            raise InputError(f"{path}: no effect in it; decorate a function with @stitch.effects.effect(place, …)")
+        for name in names:
+            _require_effect(EFFECTS[name], f"{path}: effect {name}")
+    except InputError:
+        EFFECTS.clear()
+        EFFECTS.update(before)
+        raise
+    for name in names:
+        EFFECTS[name] = replace(EFFECTS[name], tier="user", function=_guard_function(EFFECTS[name], path))
+    return names
+
+
+def _require_effect(effect: Effect, where: str) -> None:
     """Refuse parameters without a plausible size, and a function that does not take them.
 
     Raises:
@@ -55,17 +97,26 @@ def require_effect(effect: Effect, where: str) -> None:
         raise InputError(f"{where}: its function has no argument {missing[0]!r}; to fix: name it as the parameter")
 
 
-def read_only_arguments(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
-    """The arguments, arrays among them read-only: an effect returns what changes and leaves what it is given."""
-    out = [value.view() if isinstance(value, np.ndarray) else value for value in arguments]
-    for value in out:
-        if isinstance(value, np.ndarray):
-            value.flags.writeable = False
-    return tuple(out)
+def _guard_function(effect: Effect, path: Path) -> Callable[..., Any]:
+    """Return the effect's function; what goes wrong in it names the file and the line, and so does a result that cannot
+    be."""
+
+    @wraps(effect.function)
+    def function(*arguments: Any, **parameters: Any) -> Any:
+        # An effect returns what changes and leaves what it is given.
+        views = [value.view() if isinstance(value, np.ndarray) else value for value in arguments]
+        for value in views:
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+        with _name_errors(path, f" effect {effect.name}:"):
+            result = effect.function(*views, **parameters)
+        return _require_result(effect, arguments, result, f"{path}: effect {effect.name}")
+
+    return function
 
 
-def require_result(effect: Effect, arguments: tuple[Any, ...], result: Any, where: str) -> Any:
-    """What an effect's function returned, as float arrays.
+def _require_result(effect: Effect, arguments: tuple[Any, ...], result: Any, where: str) -> Any:
+    """Return what an effect's function returned, as float arrays.
 
     Raises:
         InputError: another shape than the place asks for, or values that are no real numbers.
@@ -84,7 +135,7 @@ def require_result(effect: Effect, arguments: tuple[Any, ...], result: Any, wher
 
 
 def _require_numbers(result: Any, like: Array, where: str) -> Array:
-    """`result` as numbers of the shape of `like`; where `like` is not finite, it need not be."""
+    """Return `result` as numbers of the shape of `like`; where `like` is not finite, it need not be."""
     try:
         values = np.asarray(result)
     except ValueError:
@@ -108,65 +159,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float, np.number)) and not isinstance(value, (bool, np.complexfloating))
 
 
-# Seconds for the file and for every call of an effect; a call on a million points takes less than one.
-_SECONDS = 5.0
-_LIMIT = "STITCH_EFFECT_SECONDS"
-
-
-def load(path: Path) -> list[str]:
-    """Run the file; its effects join the registry. Returns their names.
-
-    The file is Python and is executed: load only files that you would run.
-
-    Raises:
-        InputError: no such file, no Python file, an error in it (with its line), or no effect in it. The registry is
-            then as it was.
-    """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; --effects-file names a Python file with @effect functions")
-    spec = importlib.util.spec_from_file_location(f"stitch_user_effects_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise InputError(f"{path}: not called a Python file; rename it {path.with_suffix('.py').name}")
-    before = dict(EFFECTS)
-    for name in [name for name, known in EFFECTS.items() if known.tier == "user"]:
-        del EFFECTS[name]
-    try:
-        with _name_errors(path, ""):
-            _execute(path, importlib.util.module_from_spec(spec))
-        names = [name for name in EFFECTS if name not in before or EFFECTS[name] is not before[name]]
-        if not names:
-            raise InputError(f"{path}: no effect in it; decorate a function with @stitch.effects.effect(place, …)")
-        for name in names:
-            require_effect(EFFECTS[name], f"{path}: effect {name}")
-    except InputError:
-        EFFECTS.clear()
-        EFFECTS.update(before)
-        raise
-    for name in names:
-        EFFECTS[name] = replace(EFFECTS[name], tier="user", function=_guard_function(EFFECTS[name], path))
-    return names
-
-
-def _execute(path: Path, module: ModuleType) -> None:
-    """Run the file as it stands; Python's own import would leave a cache beside it, and may take one that is old."""
-    exec(compile(path.read_bytes(), path, "exec"), vars(module))
-
-
-def _guard_function(effect: Effect, path: Path) -> Callable[..., Any]:
-    """The effect's function; what goes wrong in it names the file and the line, and so does a result that cannot be."""
-
-    @wraps(effect.function)
-    def function(*arguments: Any, **parameters: Any) -> Any:
-        with _name_errors(path, f" effect {effect.name}:"):
-            result = effect.function(*read_only_arguments(arguments), **parameters)
-        return require_result(effect, arguments, result, f"{path}: effect {effect.name}")
-
-    return function
-
-
 @contextmanager
 def _name_errors(path: Path, what: str) -> Iterator[None]:
-    """Errors, ends of the program and endless loops in a user's file as one line."""
+    """Raise errors, ends of the program and endless loops in a user's file as one line."""
     seconds = _seconds()
     late = (
         f"{path}:{what} does not end within {seconds:g} s; to fix: look for a loop in it, or allow more seconds in the "
@@ -176,8 +171,8 @@ def _name_errors(path: Path, what: str) -> Iterator[None]:
         with time_limit(seconds, late):
             yield
     except InputError as error:
-        told = str(error)
-        raise InputError(told if told.startswith(str(path)) else f"{path}:{what} {told}; to fix: correct it") from None
+        text = str(error)
+        raise InputError(text if text.startswith(str(path)) else f"{path}:{what} {text}; to fix: correct it") from None
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # whatever a user's file may raise, the end of the program too
@@ -196,11 +191,12 @@ def _seconds() -> float:
 
 
 def _error_line(error: BaseException, path: Path) -> str:
+    """Return the last line of the file that an error passed through."""
     if isinstance(error, SyntaxError):
         return "" if error.lineno is None else f" line {error.lineno}"
-    trace, found = error.__traceback__, ""
+    trace, line = error.__traceback__, ""
     while trace is not None:
         if os.path.abspath(trace.tb_frame.f_code.co_filename) == os.path.abspath(path):
-            found = f" line {trace.tb_lineno}"
+            line = f" line {trace.tb_lineno}"
         trace = trace.tb_next
-    return found
+    return line

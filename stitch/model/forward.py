@@ -1,4 +1,9 @@
-"""What a model does to poses and points, and both without it: as they truly were."""
+"""What a model does to poses and points, both without it as they truly were, and how they answer to its parameters.
+
+Poses and points answer to the parameters of terms by central differences about a model (`pose_derivatives`,
+`PointSlopes`). Differences of poses are taken of what an effect does to joints, links, mount and part alone; from there
+the chain of frames carries them.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +19,10 @@ from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement, ScanView
 from stitch.session.robot import FlangeSlopes, Links, exact_links, flange_slopes, forward, forward_with_errors
 
+# Step as a share of the plausible size: errors of third order stay far below the noise. A time constant is stepped
+# less, since the effect is not linear in it.
+STEP, _STEP_GRIDDED = 0.1, 0.005
+
 
 @dataclass(frozen=True)
 class ChainErrors:
@@ -26,14 +35,14 @@ class ChainErrors:
 
 
 def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErrors | None = None) -> ChainErrors:
-    """Collect what some effects do to the chain of frames, beside what others have done already."""
+    """Return what some effects do to the chain of frames, beside what others have done already."""
     views = measurement.views
     if base is None:
         right = exact_links(*views.joints.shape)
         base = ChainErrors(views.joints, right, np.zeros((views.count, 6)), np.zeros((views.count, 6)))
     joints, mount, part = base.joints, base.mount, base.part
     # A user's own effect may change the links that it is given in place.
-    links = Links(*(own.copy() for own in vars(base.links).values()))
+    links = Links(*(value.copy() for value in vars(base.links).values()))
     for term in terms:
         function, arguments = term.effect.function, term.arguments
         # The function adds to what it is given; what it reads of the pose are the reported angles.
@@ -49,7 +58,7 @@ def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErr
 
 
 def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[Array, Array]:
-    """(V, 4, 4) what stands left of the hand-eye and right of it under effects of robot, mount and part."""
+    """Return (V, 4, 4) what stands left of the hand-eye and right of it under effects of robot, mount and part."""
     errors = chain_errors(measurement, terms)
     T_base_flange = measurement.T_base_flange
     if measurement.robot is not None and any(moves_arm(term) for term in terms):
@@ -57,18 +66,18 @@ def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[A
         # A reported pose that differs from the nominal kinematics (a calibrated controller) keeps its difference.
         T_base_flange = T_base_flange @ frames.inverse(forward(measurement.robot, measurement.views.joints)) @ true
     left = frames.inverse(T_base_flange) if measurement.eye_to_hand else T_base_flange
-    return np.asarray(frames.exp(-errors.part) @ left), np.asarray(frames.exp(errors.mount))
+    return frames.exp(-errors.part) @ left, frames.exp(errors.mount)
 
 
 def moves_arm(term: Term) -> bool:
-    """True for an effect of joints or links."""
+    """Return whether it is an effect of joints or links."""
     return term.effect.place in ("robot", "links")
 
 
 def scan_correction(
     measurement: Measurement, terms: Sequence[Term], v: int, pose: Array, index: Indices | slice
 ) -> Array:
-    """(N, 3) what must be added to the scanned points of view v, scanner frame, to undo sensor and part effects.
+    """Return (N, 3) what must be added to the scanned points of view v, scanner frame, to undo sensor and part effects.
 
     Args:
         pose: (4, 4) T_reference_scanner of the view.
@@ -78,14 +87,14 @@ def scan_correction(
 
 
 def scan_points(measurement: Measurement, v: int, index: Indices | slice) -> tuple[Array, ScanView]:
-    """Some points (N, 3) of view v, scanner frame, and what effects may know of them."""
+    """Return some points (N, 3) of view v, scanner frame, and what effects may know of them."""
     view = measurement.scan_views[v]
     intensity = None if view.intensity is None else view.intensity[index]
     return measurement.capture.scans[v].points[index], replace(view, cosine=view.cosine[index], intensity=intensity)
 
 
 def point_correction(terms: Sequence[Term], points: Array, view: ScanView, pose: Array, steps: int = 2) -> Array:
-    """(N, 3) what must be added to measured points (N, 3) of one view to undo sensor and part effects.
+    """Return (N, 3) what must be added to measured points (N, 3) of one view to undo sensor and part effects.
 
     Args:
         steps: of fixed point. Corrections are thousandths of the range: the first leaves thousandths of them, which is
@@ -100,14 +109,14 @@ def point_correction(terms: Sequence[Term], points: Array, view: ScanView, pose:
         in_reference = frames.transform(pose, true)
         moved = term.effect.function(in_reference, view, **term.arguments) - in_reference
         true = true - frames.rotate(frames.inverse(pose), moved)
-    return np.asarray(true - points)
+    return true - points
 
 
 def target_correction(
     measurement: Measurement, terms: Sequence[Term], poses: Array, places: Array | None = None
 ) -> Array:
-    """(V, S, 3) what must be added to the labelled points of all views to undo sensor and part effects; zero in empty
-    slots.
+    """Return (V, S, 3) what must be added to the labelled points of all views to undo sensor and part effects; zero in
+    empty slots.
 
     Args:
         places: (V, S, 3) of the points, as `target_places` finds them under the same effects.
@@ -118,21 +127,24 @@ def target_correction(
         return np.zeros(sightings.points.shape)
     places = target_places(measurement, terms, poses) if places is None else places
     to_sensor = frames.inverse(poses)
-    views = zip(measurement.target_views, to_sensor, places, strict=True)
-    moved = [_displaced(terms, place, view, own) for view, own, place in views]
+    views = zip(measurement.target_views, places, to_sensor, strict=True)
+    moved = [_displaced(terms, of_view, view, T) for view, of_view, T in views]
     apart = frames.transform(to_sensor, places) - np.array(moved)
     return np.where((sightings.target >= 0)[..., None], apart, 0.0)
 
 
 def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array, steps: int = 2) -> Array:
-    """(V, S, 3) where the targets in the slots of all views lie, reference frame: the mean of the views that use each.
+    """Return (V, S, 3) where the targets in the slots of all views lie, reference frame: the mean of the views that use
+    each.
 
     An effect is evaluated there. At a point as it was measured it would hold the error of that point, times the effect,
     and explain the error by itself (errors in variables; Fuller 1987, Measurement Error Models).
     """
     s = measurement.capture.sightings
     assert s is not None
-    placed, used, blank = frames.transform(poses, s.points), s.used, s.target.max(axis=1) < 0
+    placed = frames.transform(poses, s.points)
+    used = s.used
+    blank = s.target.max(axis=1) < 0
     count = np.maximum(s.view_counts, 1)[:, None]
     # An empty slot borrows the first target of its view, a view without any the first of all: its own zero has no ray.
     first = np.maximum(s.target.max(axis=1), 0)
@@ -152,7 +164,8 @@ def target_places(measurement: Measurement, terms: Sequence[Term], poses: Array,
 
 
 def _displaced(terms: Sequence[Term], places: Array, view: ScanView, to_sensor: Array) -> Array:
-    """(N, 3) where the sensor of a view reports points that lie at places (N, 3) of the reference frame, its frame.
+    """Return (N, 3) where the sensor of a view reports points that lie at places (N, 3) of the reference frame, in its
+    frame.
 
     Args:
         to_sensor: (4, 4) T_scanner_reference of the view.
@@ -166,21 +179,22 @@ def _displaced(terms: Sequence[Term], places: Array, view: ScanView, to_sensor: 
 
 
 def moves_points(terms: Sequence[Term]) -> bool:
-    """True if an effect changes the points within a view, and not only where the view sits."""
+    """Return whether an effect changes the points within a view, and not only where the view sits."""
     return any(term.effect.place in ("sensor", "shape") for term in terms)
 
 
 def true_geometry(measurement: Measurement, model: Model) -> tuple[Array, list[Array]]:
-    """Poses (V, 4, 4) T_reference_scanner, and points (N, 3) of every scan, without the effects of a model."""
-    capture, points = _without_motion(measurement, model.terms), [scan.points for scan in measurement.capture.scans]
-    poses, every = capture.poses(model.T_mount), slice(None)
+    """Return poses (V, 4, 4) T_reference_scanner, and points (N, 3) of every scan, without the effects of a model."""
+    poses = _without_motion(measurement, model.terms).poses(model.T_mount)
+    points = [scan.points for scan in measurement.capture.scans]
+    every = slice(None)
     if moves_points(model.terms):
         points = [p + scan_correction(measurement, model.terms, v, poses[v], every) for v, p in enumerate(points)]
     return poses, points
 
 
 def corrected_capture(measurement: Measurement, model: Model) -> Capture:
-    """The capture as it would be without the effects of the model."""
+    """Return the capture as it would be without the effects of the model."""
     terms = model.terms
     capture = _without_motion(measurement, terms)
     if moves_points(terms):
@@ -196,44 +210,33 @@ def corrected_capture(measurement: Measurement, model: Model) -> Capture:
 
 
 def _without_motion(measurement: Measurement, terms: Sequence[Term]) -> Capture:
-    """The capture without effects of robot, mount and part; the points as they were scanned."""
+    """Return the capture without effects of robot, mount and part; the points as they were scanned."""
     left, right = perturbed_frames(measurement, terms)
     return replace(measurement.capture, T_reference_mount=left, T_behind_mount=right)
 
 
-# How poses answer to the parameters of a term, by central differences about a model.
-
-# Step as a share of the plausible size: errors of third order stay far below the noise. A time constant is stepped
-# less, since the effect is not linear in it.
-STEP, _STEP_GRIDDED = 0.1, 0.005
-
-
 def pose_derivatives(measurement: Measurement, model: Model, terms: Sequence[Term], centre: Array) -> Iterator[Array]:
-    """Per term (P, V, 6) left twists of the views about `centre`, reference frame, per unit of each parameter.
+    """Yield per term (P, V, 6) left twists of the views about `centre`, reference frame, per unit of each parameter.
 
-    About the model with the term in place of its own, or added at its values. Differences are taken of what an effect
-    does to joints, links, mount and part alone; from there the chain of frames carries them.
+    About the model with the term in place of its own, or added at its values; the view of an event moves nothing.
     """
-    chain, in_use = None, chain_errors(measurement, model.terms)
+    chain = None
+    in_use = chain_errors(measurement, model.terms)
     for term in terms:
         others = in_use
         if term.name in model.effects:
             others = chain_errors(measurement, model.without(term.name).terms)
         errors = chain_errors(measurement, [term], others)
         if chain is None or not chain.is_about(errors):
-            chain = _ChainJacobian(measurement, model.with_term(term), errors, centre)
-        yield _pose_derivatives(measurement, others, term, chain)
-
-
-def _pose_derivatives(measurement: Measurement, others: ChainErrors, term: Term, chain: "_ChainJacobian") -> Array:
-    """(P, V, 6) of every parameter beside what all other terms do; the view of an event moves nothing."""
-    out = np.zeros((len(term.parameters), measurement.views.count, 6))
-    sizes = [(_STEP_GRIDDED if p.grid else STEP) * p.typical for p in term.parameters]
-    stepped = [i for i, p in enumerate(term.parameters) if not p.discrete]
-    steps = [[chain_errors(measurement, [t], others) for t in step_parameter(term, i, sizes[i])] for i in stepped]
-    if steps:
-        out[stepped] = chain.twists(steps, moves_arm(term)) / (2 * np.array(sizes)[stepped, None, None])
-    return out
+            chain = _ChainJacobian(measurement, model.with_term(term), errors, frames.make(np.eye(3), -centre))
+        derivatives = np.zeros((len(term.parameters), measurement.views.count, 6))
+        sizes = [(_STEP_GRIDDED if p.grid else STEP) * p.typical for p in term.parameters]
+        fitted = [i for i, p in enumerate(term.parameters) if not p.discrete]
+        steps = [[chain_errors(measurement, [moved], others) for moved in _stepped(term, i, sizes[i])] for i in fitted]
+        if steps:
+            twists = chain.twists(steps, moves_arm(term))
+            derivatives[fitted] = twists / (2 * np.array(sizes)[fitted, None, None])
+        yield derivatives
 
 
 @dataclass(frozen=True)
@@ -243,21 +246,21 @@ class _ChainJacobian:
     measurement: Measurement
     about: Model
     errors: ChainErrors
-    centre: Array  # (3,)
+    to_centre: Array  # (4, 4)
 
     def is_about(self, errors: ChainErrors) -> bool:
-        own, other = ((e.joints, *vars(e.links).values(), e.mount, e.part) for e in (self.errors, errors))
-        # Errors of the same effects, summed in another order, are the same.
+        """Return whether errors are those of this model: of the same effects, summed in another order, they are."""
+        here, there = ((e.joints, *vars(e.links).values(), e.mount, e.part) for e in (self.errors, errors))
         return all(
-            np.array_equal(a, b) or np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in zip(own, other, strict=True)
+            np.array_equal(a, b) or np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in zip(here, there, strict=True)
         )
 
     def twists(self, steps: Sequence[Sequence[ChainErrors]], of_arm: bool) -> Array:
-        """(P, V, 6) left twists of the views between the two errors of each step, near these."""
+        """Return (P, V, 6) left twists of the views between the two errors of each step, near these."""
         if of_arm and self.measurement.robot is not None:
             moved = []
             for up, down in steps:
-                links = {name: own - getattr(down.links, name) for name, own in vars(up.links).items()}
+                links = {name: value - getattr(down.links, name) for name, value in vars(up.links).items()}
                 moved.append(self.flange.twists(up.joints - down.joints, Links(**links)))
             return _apply_matrices(self.of_flange, np.array(moved))
         mount = np.array([up.mount - down.mount for up, down in steps])
@@ -276,90 +279,72 @@ class _ChainJacobian:
         """(V, 6, 6) for body twists of the flange."""
         if self.measurement.eye_to_hand:
             # (T·exp ξ)⁻¹ = exp(−ξ)·T⁻¹: the flange's own side stands left.
-            return -frames.adjoint(self._to_centre @ frames.exp(-self.errors.part))
-        return frames.adjoint(self._to_centre @ self._left)
+            return -frames.adjoint(self.to_centre @ frames.exp(-self.errors.part))
+        return frames.adjoint(self._left)
 
     @cached_property
     def of_mount(self) -> Array:
         """(V, 6, 6) for changes of the twist of the mount: exp(m + δ) = exp(J δ)·exp(m)."""
-        carried = frames.adjoint(self._to_centre @ self._left @ self.about.T_mount)
-        return np.asarray(carried @ frames.left_jacobian(self.errors.mount))
+        return frames.adjoint(self._left @ self.about.T_mount) @ frames.left_jacobian(self.errors.mount)
 
     @cached_property
     def of_part(self) -> Array:
         """(V, 6, 6) for changes of the twist of the part."""
-        return -np.asarray(frames.adjoint(self._to_centre) @ frames.left_jacobian(-self.errors.part))
+        return -(frames.adjoint(self.to_centre) @ frames.left_jacobian(-self.errors.part))
 
     @cached_property
     def _left(self) -> Array:
-        """(V, 4, 4) what stands left of the hand-eye."""
-        return perturbed_frames(self.measurement, self.about.terms)[0]
-
-    @property
-    def _to_centre(self) -> Array:
-        return frames.make(np.eye(3), -self.centre)
+        """Return (V, 4, 4) what stands left of the hand-eye, about the centre."""
+        return self.to_centre @ perturbed_frames(self.measurement, self.about.terms)[0]
 
 
 def _apply_matrices(matrix: Array, vectors: Array) -> Array:
-    """(P, V, 6) of (V, 6, 6) and (P, V, 6)."""
-    return np.asarray((matrix @ vectors.transpose(1, 2, 0)).transpose(2, 0, 1))
-
-
-def step_parameter(term: Term, i: int, size: float) -> tuple[Term, Term]:
-    """The term with parameter i larger and smaller by a step."""
-
-    def moved(by: float) -> Term:
-        own = replace(term.parameters[i], value=float(term.parameters[i].value + by))
-        return replace(term, parameters=(*term.parameters[:i], own, *term.parameters[i + 1 :]))
-
-    return moved(size), moved(-size)
-
-
-# How points answer to the parameters of terms, by central differences about a model.
+    """Return (P, V, 6) of (V, 6, 6) and (P, V, 6)."""
+    return (matrix @ vectors.transpose(1, 2, 0)).transpose(2, 0, 1)
 
 
 @dataclass(frozen=True)
 class PointSlopes:
-    """What must be added to measured points, per unit of each of P parameters: scanner frame."""
+    """What must be added to measured points, per unit of each of the terms' P parameters: scanner frame.
+
+    About the model with each term in place of its own, or added at its values.
+    """
 
     measurement: Measurement
-    steps: tuple["_ParameterStep", ...]
-    about: tuple[Term, ...] = ()  # effects in use
-
-    @classmethod
-    def about_model(cls, measurement: Measurement, model: Model, terms: Sequence[Term]) -> "PointSlopes":
-        """About a model with each term in place of its own, or added at its values."""
-        steps = tuple(_parameter_step(model, term, i) for term in terms for i in range(len(term.parameters)))
-        return cls(measurement, steps, model.terms)
+    terms: Sequence[Term] = ()
+    model: Model | None = None  # None: without terms
 
     def at(self, v: int, pose: Array, index: Indices | slice) -> Array:
-        """(P, N, 3) for some points of view v, which stands at `pose` (4, 4) T_reference_scanner."""
+        """Return (P, N, 3) for some points of view v, which stands at `pose` (4, 4) T_reference_scanner."""
         points, view = scan_points(self.measurement, v, index)
         return self._differences(lambda terms: point_correction(terms, points, view, pose, steps=1))
 
     def at_targets(self, poses: Array) -> Array:
-        """(P, V, S, 3) for the labelled points of all views."""
-        places = target_places(self.measurement, self.about, poses)
+        """Return (P, V, S, 3) for the labelled points of all views."""
+        places = target_places(self.measurement, () if self.model is None else self.model.terms, poses)
         return self._differences(lambda terms: target_correction(self.measurement, terms, poses, places))
 
     def _differences(self, moved: Callable[[Sequence[Term]], Array]) -> Array:
-        if not self.steps:
+        if not self._steps:
             return moved(())[None][:0]
-        return np.array([(moved(s.up) - moved(s.down)) / s.width for s in self.steps])
+        return np.array([(moved(up) - moved(down)) / width for up, down, width in self._steps])
+
+    @cached_property
+    def _steps(self) -> list[tuple[tuple[Term, ...], tuple[Term, ...], float]]:
+        """The effects of the model with one parameter larger and smaller, and how far these are apart."""
+        steps = []
+        for term in self.terms:
+            assert self.model is not None
+            for i, parameter in enumerate(term.parameters):
+                # The view of an event is tried, never fitted: nothing answers to it.
+                size = 0.0 if parameter.discrete else STEP * parameter.typical
+                up, down = (self.model.with_term(moved).terms for moved in _stepped(term, i, size))
+                steps.append((up, down, 2 * size or 1.0))
+        return steps
 
 
-@dataclass(frozen=True)
-class _ParameterStep:
-    """The effects of a model with one parameter larger and smaller, and how far these are apart."""
-
-    up: tuple[Term, ...]
-    down: tuple[Term, ...]
-    width: float
-
-
-def _parameter_step(model: Model, term: Term, i: int) -> _ParameterStep:
-    parameter = term.parameters[i]
-    # The view of an event is tried, never fitted: nothing answers to it.
-    size = 0.0 if parameter.discrete else STEP * parameter.typical
-    up, down = (model.with_term(t).terms for t in step_parameter(term, i, size))
-    return _ParameterStep(up, down, 2 * size or 1.0)
+def _stepped(term: Term, i: int, size: float) -> tuple[Term, Term]:
+    """Return the term with parameter i larger and smaller by a step."""
+    step = np.zeros(len(term.parameters))
+    step[i] = size
+    return term.at(term.values + step), term.at(term.values - step)

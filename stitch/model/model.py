@@ -1,4 +1,10 @@
-"""The model of a cell in memory: hand-eye with covariance, effects in use, places of targets."""
+"""The model of a cell in memory: hand-eye with covariance, effects in use, places of targets.
+
+The covariance Σ of a hand-eye belongs to a right perturbation T·exp(ξ) in the scanner frame. Rotation vector and
+translation of T in the mount frame move by J·ξ with J = diag(J_r⁻¹, R), so that theirs is J·Σ·Jᵀ, to first order
+(`printed_covariance`). The parameters of all effects in use have a covariance of their own (`EffectsCovariance`):
+errors of one go with errors of another.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,7 +19,12 @@ from stitch.numerics.frames import Array, Mask
 from stitch.numerics.units import METRES, value_uncertainty_text
 from stitch.session.measurement import Measurement
 
-# An effect in use with its named parameters.
+# Expanded uncertainty U = k·σ, coverage about 95 % (JCGM 100:2008, GUM).
+COVERAGE_FACTOR = 2.0
+# A person may edit the sigmas of model.toml; then the matrix of the fit is no longer theirs.
+_SAME_SIGMA = 1e-6
+# Of a twist, for central differences: far above rounding, far below the bend of any angle.
+_STEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -71,55 +82,11 @@ class Term:
             >>> better.terms[0].at(np.zeros(1)).values
             array([0.])
         """
-        every = zip(self.parameters, values, strict=True)
-        own = [p if p.value == v else replace(p, value=float(v)) for p, v in every]
+        pairs = zip(self.parameters, values, strict=True)
+        parameters = [p if p.value == value else replace(p, value=float(value)) for p, value in pairs]
         if sigmas is not None:
-            own = [replace(p, sigma=float(s)) for p, s in zip(own, sigmas, strict=True)]
-        return replace(self, parameters=tuple(own))
-
-
-def term_of(measurement: Measurement, effect: Effect) -> Term:
-    """The effect at zero; parameters that are tried value by value in the middle of their grid."""
-    found = parameters_in(measurement, effect)
-    return Term(effect, tuple(replace(p, value=p.grid[len(p.grid) // 2] if p.grid else 0.0) for p in found))
-
-
-def stack_parameters(terms: Sequence[Term]) -> tuple[Parameter, ...]:
-    """All parameters of all terms in one row."""
-    return tuple(p for term in terms for p in term.parameters)
-
-
-def values_of(terms: Sequence[Term]) -> Array:
-    """(P,) values of all parameters of all terms, each in its unit."""
-    return np.array([p.value for p in stack_parameters(terms)], float)
-
-
-def sizes_of(terms: Sequence[Term]) -> Array:
-    """(P,) plausible sizes of the same."""
-    return np.array([p.typical for p in stack_parameters(terms)], float)
-
-
-def known_sigmas(terms: Sequence[Term], fitted: Mask, sigmas: Array) -> Array:
-    """(P,) sigmas: found for the `fitted`, as it came for what another run's arm brought, NaN for the rest."""
-    out = np.array([p.sigma if p.kept else np.nan for p in stack_parameters(terms)], float)
-    out[fitted] = sigmas
-    return out
-
-
-def with_parameter_values(terms: Sequence[Term], values: Array, sigmas: Array | None = None) -> tuple[Term, ...]:
-    """The terms with values (P,), and sigmas (P,), of all their parameters in one row."""
-    out, at = [], 0
-    for term in terms:
-        own = slice(at, at + len(term.parameters))
-        out.append(term.at(values[own], None if sigmas is None else sigmas[own]))
-        at = own.stop
-    return tuple(out)
-
-
-# How well the parameters of all effects in use are known together: errors of one go with errors of another.
-
-# A person may edit the sigmas of model.toml; then the matrix of the fit is no longer theirs.
-_SAME_SIGMA = 1e-6
+            parameters = [replace(p, sigma=float(sigma)) for p, sigma in zip(parameters, sigmas, strict=True)]
+        return replace(self, parameters=tuple(parameters))
 
 
 @dataclass(frozen=True)
@@ -130,7 +97,7 @@ class EffectsCovariance:
     matrix: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (K, K)
 
     def root(self, terms: Sequence[Term]) -> Array:
-        """(P, K) L with L·Lᵀ the covariance of all parameters of some terms, zero where nothing is known of one.
+        """Return (P, K) L with L·Lᵀ the covariance of all parameters of some terms, zero where nothing is known of one.
 
         Where the sigma of a parameter is another than the matrix has, its sigma counts, alone.
         """
@@ -146,127 +113,13 @@ class EffectsCovariance:
         alone = [i for i, (_, p) in enumerate(rows) if p.fitted and i not in together]
         out = np.zeros((len(rows), len(known) + len(alone)))
         if known:
-            own, theirs = (list(index) for index in zip(*known, strict=True))
-            size = sigma[theirs]
-            values, vectors = np.linalg.eigh(self.matrix[np.ix_(theirs, theirs)] / np.outer(size, size))
-            out[own, : len(known)] = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+            here, there = (list(index) for index in zip(*known, strict=True))
+            size = sigma[there]
+            values, vectors = np.linalg.eigh(self.matrix[np.ix_(there, there)] / np.outer(size, size))
+            out[here, : len(known)] = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
         for k, i in enumerate(alone, len(known)):
             out[i, k] = rows[i][1].sigma
         return out
-
-
-def kept_root(terms: Sequence[Term], covariance: EffectsCovariance) -> Array:
-    """(P, K) the same root for what another run's arm brought, zero rows for the rest."""
-    kept = np.array([p.kept for term in terms for p in term.parameters], bool)
-    root = covariance.root(terms)
-    root = root * kept[:, None]
-    return np.asarray(root[:, (root != 0).any(axis=0)])
-
-
-def covariance_of_fit(terms: Sequence[Term], fitted: Mask, matrix: Array, kept: Array) -> EffectsCovariance:
-    """Of the fitted parameters (K of P, bool) with their matrix (K, K), beside those kept, with their root (P, L)."""
-    names = [f"{term.name}.{p.name}" for term in terms for p in term.parameters]
-    whole = kept @ kept.T
-    whole[np.ix_(fitted, fitted)] += matrix
-    known = np.diag(whole) > 0
-    return EffectsCovariance(tuple(n for n, k in zip(names, known, strict=True) if k), whole[np.ix_(known, known)])
-
-
-# The uncertainty of a hand-eye in the frame in which it is printed.
-#
-# Its covariance Σ belongs to a right perturbation T·exp(ξ) in the scanner frame. Rotation vector and translation of T
-# in the mount frame move by J·ξ with J = diag(J_r⁻¹, R), so that theirs is J·Σ·Jᵀ (to first order).
-
-# Expanded uncertainty U = k·σ, coverage about 95 % (JCGM 100:2008, GUM).
-COVERAGE_FACTOR = 2.0
-# Of a twist, for central differences: far above rounding, far below the bend of any angle.
-_STEP = 1e-6
-
-
-def printed_covariance(T_mount: Array, covariance: Array) -> Array:
-    """(6, 6) of (rotation vector in rad, translation in length_unit), both in the mount frame.
-
-    Args:
-        T_mount: (4, 4) T_mount_scanner.
-        covariance: (6, 6) of the right perturbation, rotation first.
-    """
-    J = np.zeros((6, 6))
-    J[:3, :3] = frames.right_jacobian_inverse(Rotation.from_matrix(T_mount[:3, :3]).as_rotvec())
-    J[3:, 3:] = T_mount[:3, :3]
-    return J @ covariance @ J.T
-
-
-def numbers_covariance(numbers: Callable[[Array], Array], T_mount: Array, covariance: Array) -> Array:
-    """(n, n) of whatever numbers (n,) a controller writes of a hand-eye, to first order.
-
-    Args:
-        numbers: of a pose (4, 4); near T_mount they must not jump.
-        T_mount: (4, 4) T_mount_scanner.
-        covariance: (6, 6) of the right perturbation, rotation first.
-    """
-    steps = _STEP * np.eye(6)
-    J = [(numbers(T_mount @ frames.exp(e)) - numbers(T_mount @ frames.exp(-e))) / (2 * _STEP) for e in steps]
-    return np.asarray(np.transpose(J) @ covariance @ np.array(J))
-
-
-def expanded_uncertainty(T_mount: Array, covariance: Array) -> Array:
-    """(6,) U (k = 2) of rotation vector (rad) and translation (length_unit) in the mount frame."""
-    return COVERAGE_FACTOR * np.sqrt(np.diag(printed_covariance(T_mount, covariance)))
-
-
-def displacement(covariance: Array, middle: Array) -> float:
-    """U (k = 2) of a point (3,) of the scanner's frame under the hand-eye's covariance (6, 6), all directions."""
-    lever = np.hstack([-frames.skew(middle), np.eye(3)])
-    return float(COVERAGE_FACTOR * np.sqrt(np.trace(lever @ covariance @ lever.T)))
-
-
-def hand_eye_lines(
-    T_mount: Array,
-    covariance: Array,
-    mount: str,
-    length_unit: str,
-    *,
-    unknown: Sequence[str] = (),
-    stated: bool = False,
-) -> list[str]:
-    """Return text: position in mm and rotation vector in mrad with U (k = 2), in the frame that carries the scanner.
-
-    Args:
-        unknown: of x, y, z, rx, ry, rz: numbers that the views do not show.
-        stated: such a number is printed as session.toml states it, and else not at all.
-    """
-    frame = "base" if mount == "eye_to_hand" else "flange"
-    to_mm = METRES[length_unit] * 1e3
-    rotation = Rotation.from_matrix(T_mount[:3, :3]).as_rotvec() * 1e3
-    U = expanded_uncertainty(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
-
-    def number(name: str, value: float, u: float) -> str:
-        if name in unknown:
-            return f"{value:.5g} as stated" if stated else "not known"
-        return value_uncertainty_text(value, u)
-
-    position, turn = (
-        ", ".join(f"{axis} {number(kind + axis, x, u)}" for axis, x, u in zip("xyz", values, size, strict=True))
-        for kind, values, size in (("", T_mount[:3, 3] * to_mm, U[3:]), ("r", rotation, U[:3]))
-    )
-    return [
-        f"Hand-eye T_{frame}_scanner, in the frame of the {frame}, ± U (k = 2) for a complete model:",
-        f"  position {position} mm",
-        f"  rotation vector {turn} mrad",
-    ]
-
-
-def uncertainty_scope(verdict: str | None) -> str:
-    """Of which model U is: a sigma counts no effect that is missing.
-
-    Args:
-        verdict: of the diagnosis; None where there is none yet.
-    """
-    told = {
-        None: "; whether an effect is missing has not been asked",
-        "adequate": "; no effect is found missing",
-    }
-    return f"U of the hand-eye holds for a complete model{told.get(verdict, ', and this one seems to lack something')}."
 
 
 @dataclass(frozen=True)
@@ -329,3 +182,144 @@ class Model:
         effects = ", ".join(self.effects) or "no effects"
         position = ", ".join(f"{x:.4g}" for x in self.T_mount[:3, 3])
         return f"Model(hand-eye at ({position}), {effects}, {len(self.targets)} targets)"
+
+
+def term_of(measurement: Measurement, effect: Effect) -> Term:
+    """Return the effect at zero; parameters that are tried value by value in the middle of their grid."""
+    parameters = parameters_in(measurement, effect)
+    return Term(effect, tuple(replace(p, value=p.grid[len(p.grid) // 2] if p.grid else 0.0) for p in parameters))
+
+
+def stack_parameters(terms: Sequence[Term]) -> tuple[Parameter, ...]:
+    """Return all parameters of all terms in one row."""
+    return tuple(p for term in terms for p in term.parameters)
+
+
+def values_of(terms: Sequence[Term]) -> Array:
+    """Return (P,) values of all parameters of all terms, each in its unit."""
+    return np.array([p.value for p in stack_parameters(terms)], float)
+
+
+def sizes_of(terms: Sequence[Term]) -> Array:
+    """Return (P,) plausible sizes of the same."""
+    return np.array([p.typical for p in stack_parameters(terms)], float)
+
+
+def known_sigmas(terms: Sequence[Term], fitted: Mask, sigmas: Array) -> Array:
+    """Return (P,) sigmas: found for the `fitted`, as it came for what another run's arm brought, NaN for the rest."""
+    out = np.array([p.sigma if p.kept else np.nan for p in stack_parameters(terms)], float)
+    out[fitted] = sigmas
+    return out
+
+
+def with_parameter_values(terms: Sequence[Term], values: Array, sigmas: Array | None = None) -> tuple[Term, ...]:
+    """Return the terms with values (P,), and sigmas (P,), of all their parameters in one row."""
+    ends = np.cumsum([len(term.parameters) for term in terms])[:-1]
+    values_of_terms = np.split(values, ends)
+    sigmas_of_terms = [None] * len(terms) if sigmas is None else np.split(sigmas, ends)
+    return tuple(map(Term.at, terms, values_of_terms, sigmas_of_terms))
+
+
+def kept_root(terms: Sequence[Term], covariance: EffectsCovariance) -> Array:
+    """Return (P, K) the same root for what another run's arm brought, zero rows for the rest."""
+    kept = np.array([p.kept for term in terms for p in term.parameters], bool)
+    root = covariance.root(terms) * kept[:, None]
+    return root[:, (root != 0).any(axis=0)]
+
+
+def covariance_of_fit(terms: Sequence[Term], fitted: Mask, matrix: Array, kept: Array) -> EffectsCovariance:
+    """Return that of the fitted parameters (K of P, bool) with their matrix (K, K), beside those kept, with their root
+    (P, L)."""
+    names = [f"{term.name}.{p.name}" for term in terms for p in term.parameters]
+    whole = kept @ kept.T
+    whole[np.ix_(fitted, fitted)] += matrix
+    known = np.diag(whole) > 0
+    return EffectsCovariance(tuple(n for n, k in zip(names, known, strict=True) if k), whole[np.ix_(known, known)])
+
+
+def printed_covariance(T_mount: Array, covariance: Array) -> Array:
+    """Return (6, 6) of (rotation vector in rad, translation in length_unit), both in the mount frame.
+
+    Args:
+        T_mount: (4, 4) T_mount_scanner.
+        covariance: (6, 6) of the right perturbation, rotation first.
+    """
+    J = np.zeros((6, 6))
+    J[:3, :3] = frames.right_jacobian_inverse(Rotation.from_matrix(T_mount[:3, :3]).as_rotvec())
+    J[3:, 3:] = T_mount[:3, :3]
+    return J @ covariance @ J.T
+
+
+def numbers_covariance(numbers: Callable[[Array], Array], T_mount: Array, covariance: Array) -> Array:
+    """Return (n, n) of whatever numbers (n,) a controller writes of a hand-eye, to first order.
+
+    Args:
+        numbers: of a pose (4, 4); near T_mount they must not jump.
+        T_mount: (4, 4) T_mount_scanner.
+        covariance: (6, 6) of the right perturbation, rotation first.
+    """
+    steps = _STEP * np.eye(6)
+    J = [(numbers(T_mount @ frames.exp(e)) - numbers(T_mount @ frames.exp(-e))) / (2 * _STEP) for e in steps]
+    return np.transpose(J) @ covariance @ np.array(J)
+
+
+def expanded_uncertainty(T_mount: Array, covariance: Array) -> Array:
+    """Return (6,) U (k = 2) of rotation vector (rad) and translation (length_unit) in the mount frame."""
+    return COVERAGE_FACTOR * np.sqrt(np.diag(printed_covariance(T_mount, covariance)))
+
+
+def displacement(covariance: Array, middle: Array) -> float:
+    """Return U (k = 2) of a point (3,) of the scanner's frame under the hand-eye's covariance (6, 6), of all
+    directions."""
+    lever = np.hstack([-frames.skew(middle), np.eye(3)])
+    return float(COVERAGE_FACTOR * np.sqrt(np.trace(lever @ covariance @ lever.T)))
+
+
+def hand_eye_lines(
+    T_mount: Array,
+    covariance: Array,
+    mount: str,
+    length_unit: str,
+    *,
+    unknown: Sequence[str] = (),
+    stated: bool = False,
+) -> list[str]:
+    """Return text: position in mm and rotation vector in mrad with U (k = 2), in the frame that carries the scanner.
+
+    Args:
+        unknown: of x, y, z, rx, ry, rz: numbers that the views do not show.
+        stated: such a number is printed as session.toml states it, and else not at all.
+    """
+    frame = "base" if mount == "eye_to_hand" else "flange"
+    to_mm = METRES[length_unit] * 1e3
+    rotation = Rotation.from_matrix(T_mount[:3, :3]).as_rotvec() * 1e3
+    U = expanded_uncertainty(T_mount, covariance) * np.repeat([1e3, to_mm], 3)
+
+    def number(name: str, value: float, u: float) -> str:
+        if name in unknown:
+            return f"{value:.5g} as stated" if stated else "not known"
+        return value_uncertainty_text(value, u)
+
+    position, turn = (
+        ", ".join(f"{axis} {number(kind + axis, x, u)}" for axis, x, u in zip("xyz", values, size, strict=True))
+        for kind, values, size in (("", T_mount[:3, 3] * to_mm, U[3:]), ("r", rotation, U[:3]))
+    )
+    return [
+        f"Hand-eye T_{frame}_scanner, in the frame of the {frame}, ± U (k = 2) for a complete model:",
+        f"  position {position} mm",
+        f"  rotation vector {turn} mrad",
+    ]
+
+
+def uncertainty_scope(verdict: str | None) -> str:
+    """Return of which model U is: a sigma counts no effect that is missing.
+
+    Args:
+        verdict: of the diagnosis; None where there is none yet.
+    """
+    scopes = {
+        None: "; whether an effect is missing has not been asked",
+        "adequate": "; no effect is found missing",
+    }
+    scope = scopes.get(verdict, ", and this one seems to lack something")
+    return f"U of the hand-eye holds for a complete model{scope}."

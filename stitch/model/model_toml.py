@@ -1,4 +1,8 @@
-"""model.toml, the form of a model for people: read and written."""
+"""model.toml, the form of a model for people: read and written, and bound to a session.
+
+Between the file and a session stand units, parameters that mean the same, and sigmas. `keep_arm_effects` takes nothing
+but the arm of another run: its effects on joints and links as they are, under another mount, tool or day.
+"""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,6 +20,7 @@ from stitch.session.measurement import Measurement
 from stitch.session.reading.text_files import optional_text, read_toml, table_choice
 
 FORMAT = "stitch-model/1"
+ARM_PLACES = ("robot", "links")  # where the effects of an arm stand in the chain
 _HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps scanner
 # coordinates into the {carrier} frame. sigma and covariance belong to a right perturbation
 # T·exp(ξ), ξ = (rotation in rad, translation in {unit}), in the scanner frame.
@@ -68,6 +73,17 @@ def write_model(model: ModelFile, path: Path) -> None:
     path.write_text(header + tomli_w.dumps(document), encoding="utf-8")
 
 
+def _parameter_table(p: Parameter) -> dict[str, Any]:
+    """Return the table of a parameter: TOML has a nan, but who reads it expects a word."""
+    known = {"sigma": p.sigma} if p.fitted else {"observable": False}
+    return {"value": p.value, **known, "unit": p.unit, **({"kept": True} if p.kept else {})}
+
+
+def _target_table(target: Target) -> dict[str, Any]:
+    table = {"position": target.position.tolist(), "sigma": target.sigma.tolist()}
+    return table if target.orientation is None else table | {"orientation": target.orientation.tolist()}
+
+
 def read_model(path: Path | str) -> ModelFile:
     """Read `model.toml`, or that of a run folder.
 
@@ -107,11 +123,6 @@ def read_model(path: Path | str) -> ModelFile:
     )
 
 
-def _target_table(target: Target) -> dict[str, Any]:
-    table = {"position": target.position.tolist(), "sigma": target.sigma.tolist()}
-    return table if target.orientation is None else table | {"orientation": target.orientation.tolist()}
-
-
 def _targets(path: Path, table: Any) -> dict[str, Target]:
     out = {}
     try:
@@ -125,12 +136,6 @@ def _targets(path: Path, table: Any) -> dict[str, Target]:
             f"{path}: targets must be tables such as [targets.ball1] with position, sigma; to fix: three numbers each"
         ) from None
     return out
-
-
-def _parameter_table(p: Parameter) -> dict[str, Any]:
-    """TOML has a nan, but who reads it expects a word."""
-    known = {"sigma": p.sigma} if p.fitted else {"observable": False}
-    return {"value": p.value, **known, "unit": p.unit, **({"kept": True} if p.kept else {})}
 
 
 def _effects(path: Path, table: Any) -> dict[str, dict[str, Parameter]]:
@@ -165,46 +170,38 @@ def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:
     return matrix
 
 
-# The arm of another run: its effects on joints and links as they are, under another mount, tool or day.
-
-ARM_PLACES = ("robot", "links")  # where the effects of an arm stand in the chain
-
-
 def keep_arm_effects(file: ModelFile) -> ModelFile:
-    """The model with nothing but the effects of its arm, all of them kept.
+    """Return the model with nothing but the effects of its arm, all of them kept.
 
     Raises:
         InputError: an effect that is not known, or none of the arm.
     """
-    found = arm_model(file)
-    if found is None:
+    arm = arm_model(file)
+    if arm is None:
         used = ", ".join(file.effects) or "none"
         raise InputError(
             f"--arm: the model has no effect of joints or links (its effects: {used}); to fix: name the run of a "
             "session that showed them, after `stitch add`"
         )
-    return found
+    return arm
 
 
 def arm_model(file: ModelFile) -> ModelFile | None:
-    """The same; None without an effect of the arm.
+    """Return the same; None without an effect of the arm.
 
     Raises:
         InputError: an effect that is not known.
     """
     effects = {
-        name: {key: replace(p, kept=True) for key, p in own.items()}
-        for name, own in file.effects.items()
+        name: {key: replace(p, kept=True) for key, p in parameters.items()}
+        for name, parameters in file.effects.items()
         if find_effect(name).place in ARM_PLACES
     }
     return replace(file, effects=effects, targets={}) if effects else None
 
 
-# Between model.toml and a session: units, parameters that mean the same, sigmas.
-
-
 def bind_to_session(file: ModelFile, measurement: Measurement) -> Model:
-    """The model of a file in a session; a parameter that the file does not name is held at zero.
+    """Return the model of a file in a session; a parameter that the file does not name is held at zero.
 
     Raises:
         InputError: an effect that is not known or that the session cannot have, or a parameter that it does not have
@@ -214,10 +211,11 @@ def bind_to_session(file: ModelFile, measurement: Measurement) -> Model:
     for name, stated in file.effects.items():
         effect = find_effect(name)
         require_available(measurement, effect)
-        own = parameters_in(measurement, effect)
-        _require_same(measurement, effect, stated, {p.name: p.unit for p in own})
+        parameters = parameters_in(measurement, effect)
+        _require_same(measurement, effect, stated, {p.name: p.unit for p in parameters})
         filled = [
-            replace(p, value=s.value, sigma=s.sigma, kept=s.kept) if (s := stated.get(p.name)) else p for p in own
+            replace(p, value=s.value, sigma=s.sigma, kept=s.kept) if (s := stated.get(p.name)) else p
+            for p in parameters
         ]
         terms.append(Term(effect, tuple(filled)))
     return Model(file.T_mount, tuple(terms), file.covariance, file.targets, file.effects_covariance)
@@ -244,28 +242,26 @@ def _require_same(
 
 
 def convert_unit(file: ModelFile, length_unit: str) -> ModelFile:
-    """The model with lengths in another unit."""
+    """Return the model with lengths in another unit."""
     if file.length_unit == length_unit:
         return file
     factor = METRES[file.length_unit] / METRES[length_unit]
     scale = np.array([1.0] * 3 + [factor] * 3)
-    moved = []
-    for T in (file.T_mount, file.T_mount_coarse):
-        T = T.copy()
+    hand_eyes = [file.T_mount.copy(), file.T_mount_coarse.copy()]
+    for T in hand_eyes:
         T[:3, 3] *= factor
-        moved.append(T)
     known = file.effects_covariance
-    units = {f"{name}.{key}": p.unit for name, own in file.effects.items() for key, p in own.items()}
+    units = {f"{name}.{key}": p.unit for name, parameters in file.effects.items() for key, p in parameters.items()}
     factors = np.array([factor ** _power(units.get(name, ""), file.length_unit) for name in known.names])
     return replace(
         file,
         length_unit=length_unit,
-        T_mount=moved[0],
-        T_mount_coarse=moved[1],
+        T_mount=hand_eyes[0],
+        T_mount_coarse=hand_eyes[1],
         covariance=file.covariance * np.outer(scale, scale),
         effects={
-            name: {key: _rescaled(p, file.length_unit, length_unit, factor) for key, p in own.items()}
-            for name, own in file.effects.items()
+            name: {key: _rescaled(p, file.length_unit, length_unit, factor) for key, p in parameters.items()}
+            for name, parameters in file.effects.items()
         },
         effects_covariance=replace(known, matrix=known.matrix * np.outer(factors, factors)),
         targets={
@@ -281,6 +277,6 @@ def _rescaled(p: Parameter, old: str, new: str, factor: float) -> Parameter:
 
 
 def _power(unit: str, length: str) -> int:
-    """A unit counts lengths where `length` stands alone in it: mm, mm/h, 1/mm, but not rad/(N m)."""
+    """Return the power of lengths in a unit, where `length` stands alone in it: mm, mm/h, 1/mm, but not rad/(N m)."""
     above, _, below = unit.partition("/")
     return (above.strip() == length) - (below.strip() == length)

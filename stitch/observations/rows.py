@@ -86,7 +86,7 @@ class Rows:
                 moved = next(of_views)
                 out.append(self.from_twists(moved.reshape(len(moved), -1).T))
                 continue
-            slopes = PointSlopes.about_model(measurement, model, [term]).at_targets(poses)
+            slopes = PointSlopes(measurement, [term], model).at_targets(poses)
             own = np.zeros((*self.residual.shape, len(slopes)))
             own[: len(poses)] = np.moveaxis(self.point_rows(frames.rotate(poses, slopes)), 0, -1)
             own[: len(poses)][~self.used] = 0.0

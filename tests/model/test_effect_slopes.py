@@ -67,7 +67,7 @@ def test_point_slopes_are_minus_what_nature_does(still_cells, name):
     pose = measured.T_reference_scanner[2]
     index = np.arange(0, 200, 7)
     zero = Term(effect, parameters_in(measurement, effect))
-    slopes = PointSlopes.about_model(measurement, Model(np.eye(4)), [zero]).at(2, pose, index)
+    slopes = PointSlopes(measurement, [zero], Model(np.eye(4))).at(2, pose, index)
     view = measurement.scan_views[2]
     view = replace(view, cosine=view.cosine[index], intensity=view.intensity[index])
     points = measurement.capture.scans[2].points[index]

@@ -80,7 +80,7 @@ def test_slopes_of_shifts_are_linear_in_small_steps():
     poses = measurement.capture.poses(T_mount)
     moved = target_correction(measurement, [term.at([1e-6])], poses)
     np.testing.assert_allclose(
-        moved, 1e-6 * PointSlopes.about_model(measurement, Model(T_mount), [term]).at_targets(poses)[0], rtol=1e-3
+        moved, 1e-6 * PointSlopes(measurement, [term], Model(T_mount)).at_targets(poses)[0], rtol=1e-3
     )
 
 

@@ -186,7 +186,7 @@ def _point_effect_sums(
 ) -> PointGram:
     """Sums over the correspondences for all parameters of point effects."""
 
-    slopes = PointSlopes.about_model(measurement, model, terms)
+    slopes = PointSlopes(measurement, terms, model)
 
     def of_points(v: int, index: Indices) -> Array:
         return slopes.at(v, unconstrained.poses[v], index)

@@ -77,7 +77,7 @@ def place_errors(run: RunData) -> PlaceErrors:
             poses=run.poses,
             centre=chain.freed.overlaps.gram.centre,
             sources=tuple(_sources(run, chain)),
-            slopes=PointSlopes.about_model(run.measurement, run.model, terms) if terms else None,
+            slopes=PointSlopes(run.measurement, terms, run.model) if terms else None,
             half=half_field(run.measurement),
         )
 
