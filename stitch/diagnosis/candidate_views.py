@@ -22,33 +22,33 @@ _LIMIT = np.radians(170.0)  # of joints whose limits nobody stated, unless they 
 _MARGIN, _TURNED = 0.15, np.cos(np.radians(50.0))
 
 
-def nearby(seen: Array, chosen: Array | None = None) -> Array:
-    """(K, n) joint angles near those that were driven (V, n), or closer to chosen ones (C, n), within the limits that
-    were kept."""
+def nearby(driven: Array, chosen: Array | None = None) -> Array:
+    """Return (K, n) joint angles near those that were driven (V, n), or closer to chosen ones (C, n), within the limits
+    that were kept."""
     rng = np.random.default_rng(0)
-    about, spread = (seen, _SPREAD) if chosen is None else (chosen, _CLOSER)
-    joints = about[rng.integers(0, len(about), _SAMPLES)] + rng.uniform(-spread, spread, (_SAMPLES, seen.shape[1]))
-    limit = np.maximum(_LIMIT, np.abs(seen).max(axis=0))
-    return np.asarray(joints[(np.abs(joints) < limit).all(axis=1)])
+    about, spread = (driven, _SPREAD) if chosen is None else (chosen, _CLOSER)
+    joints = about[rng.integers(0, len(about), _SAMPLES)] + rng.uniform(-spread, spread, (_SAMPLES, driven.shape[1]))
+    limit = np.maximum(_LIMIT, np.abs(driven).max(axis=0))
+    return joints[(np.abs(joints) < limit).all(axis=1)]
 
 
 def reachable(
-    seen: Array,
+    driven: Array,
     poses_of: Callable[[Array], Array],
     seen_from: Array,
     centre: Array,
     chosen: Array | None = None,
 ) -> Array:
-    """(K, n) joint angles in which the scanner sees the part about as it has before.
+    """Return (K, n) joint angles in which the scanner sees the part about as it has before.
 
     Args:
-        seen: (V, n) joint angles that were driven.
+        driven: (V, n) joint angles.
         poses_of: T_reference_scanner (K, 4, 4) at joint angles (K, n).
         seen_from: the same (V, 4, 4) of the views that there are.
         centre: (3,) of what they see, reference frame.
         chosen: (C, n) joint angles to stay close to.
     """
-    joints = nearby(seen, chosen)
+    joints = nearby(driven, chosen)
     poses = poses_of(joints)
     there = frames.transform(frames.inverse(poses), centre[None])[:, 0]
     before = frames.transform(frames.inverse(seen_from), centre[None])[:, 0]
@@ -56,13 +56,15 @@ def reachable(
     inside = ((there > before.min(axis=0) - margin) & (there < before.max(axis=0) + margin)).all(axis=1)
     # A view direction far from all others would share no surface with them.
     inside &= (poses[:, :3, 2] @ seen_from[:, :3, 2].T).max(axis=1) > _TURNED
-    return np.asarray(joints[inside])
+    return joints[inside]
 
 
 def candidate_measurement(measurement: Measurement, joints: Array) -> Measurement:
-    """The measurement with views that nobody has taken yet, right after the last one, each approached from there."""
+    """Return the measurement with views that nobody has taken yet, right after the last one, each approached from
+    there."""
     assert measurement.robot is not None
-    views, count = measurement.views, len(joints)
+    views = measurement.views
+    count = len(joints)
     last = np.repeat(views.joints[-1:], count, axis=0)
     torques = _torques_at(measurement.robot, views, joints)
     pause = float(np.median(np.diff(views.time))) if views.has("time") and views.count > 1 else 0.0
@@ -86,7 +88,8 @@ def candidate_measurement(measurement: Measurement, joints: Array) -> Measuremen
 
 
 def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:
-    """At joint angles (K, n), with the last view's payload; measured ones as at the nearest pose of all views."""
+    """Return those at joint angles (K, n), with the last view's payload; measured ones as at the nearest pose of all
+    views."""
     if views.torques.measured:
         near = np.linalg.norm(joints[:, None] - views.joints[None], axis=2).argmin(axis=1)
         return replace(views.torques, values=views.torques.values[near])
@@ -97,7 +100,7 @@ def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:
 def candidate_rows(
     measurement: Measurement, seen: TargetRows, landmarks: Landmarks, variances: Array, terms: Sequence[Term]
 ) -> tuple[TargetRows, list[Array], Array]:
-    """Rows of K views in which every target would be seen, how they answer to `terms`, and their covariance.
+    """Return rows of K views in which every target would be seen, how they answer to `terms`, and their covariance.
 
     Args:
         measurement: of the candidate views.
@@ -118,8 +121,9 @@ def candidate_rows(
 
 
 def _all_seen(measurement: Measurement, seen: TargetRows, landmarks: Landmarks, known: Indices) -> Measurement:
-    """The measurement with sightings of all known targets, as good as those that were seen."""
-    before, K = seen.sightings, len(measurement.T_base_flange)
+    """Return the measurement with sightings of all known targets, as good as those that were seen."""
+    before = seen.sightings
+    K = len(measurement.T_base_flange)
     bare = build_capture("candidates", (), measurement.T_base_flange, measurement.mount)
     back = frames.inverse(bare.poses(seen.T_mount))
     points = frames.transform(back, landmarks.positions[known])

@@ -130,8 +130,9 @@ class Diagnosis:
 
     @property
     def time_curve(self) -> TimeCurve | None:
-        """Return the motion of the flange in time, where it is reported."""
-        return next((u.curve for u in reportable(self.repeating_errors, self.implausible) if u.curve is not None), None)
+        """The motion of the flange in time, where it is reported."""
+        reported = reportable(self.repeating_errors, self.implausible)
+        return next((error.curve for error in reported if error.curve is not None), None)
 
     def __repr__(self) -> str:
         return f"Diagnosis({self.verdict}: {self.sentence})"

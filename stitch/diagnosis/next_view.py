@@ -5,10 +5,9 @@ of the scatter. A further view adds six rows to both patterns; among poses that 
 the scanner would see the part as it has before, the one that adds most to the two that stay most alike is proposed.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,6 @@ from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import SurfaceObservation
 from stitch.observations.targets.target_model import TargetObservation
 from stitch.session.capture import build_capture
-from stitch.session.measurement import Measurement
 from stitch.session.robot import forward
 from stitch.system.threads import library_threads_off
 
@@ -60,61 +58,59 @@ ARTEFACTS = {
 }
 
 
-def propose_measurements(found: Diagnosis) -> tuple[Proposal, ...]:
+def propose_measurements(diagnosis: Diagnosis) -> tuple[Proposal, ...]:
     """Return what would tell the named group apart; without a group, the clearest candidate from what resembles it."""
     with library_threads_off():
-        linear, group = found.linear, _effects_to_separate(found)
-        names = tuple(score.name for score in group)
+        linear = diagnosis.linear
+        group = _effects_to_separate(diagnosis)
+        names = tuple(scored.name for scored in group)
         artefacts = tuple(Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS)
         can_move = linear.measurement.robot is not None and linear.measurement.views.joints.shape[1] > 0
         best = _best_pose(linear, group) if can_move else None
         if best is None:
             return artefacts
         joints, count, separated = best
-        told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(joints))
+        angles = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(joints))
         times = "a view" if count == 1 else f"{count} views"
-        pose = Proposal(f"take {times} near {told}", separated, [round(float(x), 2) for x in joints], count)
+        pose = Proposal(f"take {times} near {angles}", separated, [round(float(x), 2) for x in joints], count)
         return (pose, *artefacts)
 
 
-def _effects_to_separate(found: Diagnosis) -> list[Score]:
-    """The group that was named, or the best candidate and its nearest alias; else nothing."""
-    if len(found.named) > 1:
-        return [r.score for r in found.named]
-    seen = [c.ranked for c in found.candidates if c.ranked.score.observable and c.ranked.score.fitted][:_LIKELIEST]
-    if found.verdict == "adequate" or len(seen) < 2:
+def _effects_to_separate(diagnosis: Diagnosis) -> list[Score]:
+    """Return the group that was named, or the best candidate and its nearest alias; else nothing."""
+    if len(diagnosis.named) > 1:
+        return [r.score for r in diagnosis.named]
+    fitted = [c.ranked for c in diagnosis.candidates if c.ranked.score.observable and c.ranked.score.fitted]
+    likeliest = fitted[:_LIKELIEST]
+    if diagnosis.verdict == "adequate" or len(likeliest) < 2:
         return []
-    first = found.named[0] if found.named else seen[0]
-    others = [r.score for r in seen if r.name != first.name]
-    row = alias_matrix(found.linear, [first.score, *others])[0, 1:]
+    first = diagnosis.named[0] if diagnosis.named else likeliest[0]
+    others = [r.score for r in likeliest if r.name != first.name]
+    row = alias_matrix(diagnosis.linear, [first.score, *others])[0, 1:]
     return [first.score, others[int(row.argmax())]] if row.max() > ALIAS_CORRELATION else []
 
 
 def _best_pose(linear: LinearModel, group: Sequence[Score]) -> tuple[Array, int, tuple[str, ...]] | None:
-    """Joint angles (n,) in degrees where the two that stay most alike gain most, the number of such views, and what
-    they separate; None if poses cannot separate anything.
+    """Return joint angles (n,) in degrees where the two that stay most alike gain most, the number of such views, and
+    what they separate; None if poses cannot separate anything.
     """
-    pairs = [(gains, (a.name, b.name)) for a, b in combinations(group, 2) if (gains := _gains(linear, a, b))]
-    pairs = [(gains, names) for gains, names in pairs if gains.of_views.max() > WORTHWHILE_GAIN * SEPARATION_LAMBDA]
-    if not pairs:
+    joints, separable = None, []
+    for a, b in combinations(group, 2):
+        gains = _gains(linear, a, b)
+        if gains is not None and gains[2].max() > WORTHWHILE_GAIN * SEPARATION_LAMBDA:
+            joints, known, of_views = gains  # the joints are the same for every two candidate effects
+            separable.append((known, of_views, (a.name, b.name)))
+    if joints is None:
         return None
-    k = int(np.min([gains.of_views for gains, _ in pairs], axis=0).argmax())
-    counts = [np.ceil(max(SEPARATION_LAMBDA - g.known, 0.0) / max(g.of_views[k], 1e-12)) for g, _ in pairs]
-    separated = dict.fromkeys(score.name for score in group if any(score.name in names for _, names in pairs))
-    return np.degrees(pairs[0][0].joints[k]), int(np.clip(max(counts), 1, 99)), tuple(separated)
+    k = int(np.min([of_views for _, of_views, _ in separable], axis=0).argmax())
+    counts = [np.ceil(max(SEPARATION_LAMBDA - known, 0.0) / max(gains[k], 1e-12)) for known, gains, _ in separable]
+    separated = dict.fromkeys(scored.name for scored in group if any(scored.name in names for *_, names in separable))
+    return np.degrees(joints[k]), int(np.clip(max(counts), 1, 99)), tuple(separated)
 
 
-@dataclass(frozen=True)
-class _Gains:
-    """How much apart two candidate effects are, and how much each of K views would add to it."""
-
-    known: float
-    joints: Array  # (K, n) rad, the same for every two candidate effects
-    of_views: Array  # (K,)
-
-
-def _gains(linear: LinearModel, a: Score, b: Score) -> _Gains | None:
-    """None if poses cannot show the effects."""
+def _gains(linear: LinearModel, a: Score, b: Score) -> tuple[Array, float, Array] | None:
+    """Return joints (K, n) of candidate views, how much apart two candidate effects are, and how much each view would
+    add to that (K,); None if poses cannot show the effects."""
     views = candidate_views(linear, a, b)
     if views is None or not len(views.joints):
         return None
@@ -123,15 +119,18 @@ def _gains(linear: LinearModel, a: Score, b: Score) -> _Gains | None:
     known = np.column_stack([linear.white_design, linear.whiten(b.form.columns) * b.form.sizes, pattern])
     further = np.concatenate([views.design, views.b * b.form.sizes, (views.a @ a.values)[..., None]], axis=2)
     white = np.linalg.solve(views.half, further)
-    present, q = known.T @ known, known.shape[1]
-    rival, own = slice(linear.white_design.shape[1], q - 1), slice(q - 1, q)
-    apart = float(separations(present, own, rival)[0])
-    each = separations(present + white.transpose(0, 2, 1) @ white, own, rival)[:, 0]
-    return _Gains(apart, views.joints, each - apart)
+    present = known.T @ known
+    q = known.shape[1]
+    of_b = slice(linear.white_design.shape[1], q - 1)
+    of_a = slice(q - 1, q)
+    apart = float(separations(present, of_a, of_b)[0])
+    with_each = separations(present + white.transpose(0, 2, 1) @ white, of_a, of_b)[:, 0]
+    return views.joints, apart, with_each - apart
 
 
 def separations(normal: Array, own: slice, rival: slice) -> Array:
-    """(..., p) squared length of what every column of a pattern keeps when a rival's imitate it, all else being free.
+    """Return (..., p) squared length of what every column of a pattern keeps when a rival's imitate it, all else being
+    free.
 
     Args:
         normal: (..., q, q) normal matrix; columns at plausible sizes.
@@ -151,12 +150,9 @@ def separations(normal: Array, own: slice, rival: slice) -> Array:
     return np.maximum(left, 0.0)
 
 
-# How candidate views would answer to a model and to two effects.
-
-
 @dataclass(frozen=True)
 class CandidateViews:
-    """K views with m numbers each, before whitening."""
+    """How K views that could be taken would answer to a model and to two effects, m numbers each, before whitening."""
 
     joints: Array  # (K, n) rad
     design: Array  # (K, m, a) per column of the model
@@ -165,58 +161,59 @@ class CandidateViews:
     half: Array  # (K, m, m) Cholesky factors of the scatter of one view
 
 
-def _of_surfaces(linear: LinearModel, seen: SurfaceObservation, a: Score, b: Score) -> CandidateViews | None:
-    """Poses in which the scanner would see the part about as it has before; None if poses cannot show the effects."""
-    zero = [s.form.at(np.zeros(len(s.values))) for s in (a, b)]
-    T_mount, centre = linear.model.T_mount, seen.unconstrained.overlaps.gram.centre
+def candidate_views(linear: LinearModel, a: Score, b: Score) -> CandidateViews | None:
+    """Return further views of a session for two effects; None if no pose can show them, and for an observation of which
+    nobody says how it would look in a further view."""
+    match linear.observation:
+        case SurfaceObservation() as surfaces:
+            return _of_surfaces(linear, surfaces, a, b)
+        case TargetObservation() as targets:
+            return _of_targets(linear, targets, a, b)
+    return None
+
+
+def _of_surfaces(linear: LinearModel, surfaces: SurfaceObservation, a: Score, b: Score) -> CandidateViews | None:
+    """Return poses in which the scanner would see the part about as it has before; None if poses cannot show the
+    effects."""
+    zero = [scored.form.at(np.zeros(len(scored.values))) for scored in (a, b)]
+    T_mount = linear.model.T_mount
+    centre = surfaces.unconstrained.overlaps.gram.centre
 
     def poses_of(joints: Array) -> Array:
         assert linear.measurement.robot is not None
         T = forward(linear.measurement.robot, joints)
         return build_capture("candidates", (), T, linear.measurement.mount).poses(T_mount)
 
-    joints = reachable(linear.measurement.views.joints, poses_of, seen.capture.poses(T_mount), centre)[:_TRIED]
+    driven = linear.measurement.views.joints
+    joints = reachable(driven, poses_of, surfaces.capture.poses(T_mount), centre)[:_TRIED]
     if moves_points(zero) or not len(joints):
         return None
-    measurement, bare = candidate_measurement(linear.measurement, joints), Model(T_mount)
-    to_centre = frames.make(np.eye(3), -centre)
-    own = frames.adjoint(to_centre @ (perturbed_frames(measurement, ())[0] @ bare.T_mount))
-    extra = np.zeros((len(joints), 6, linear.white_design.shape[1] - 6))
-    found = pose_derivatives(measurement, bare, zero, centre)
-    of_a, of_b = (c[s.form.keep].transpose(1, 2, 0) for c, s in zip(found, (a, b), strict=True))
-    half = _view_scatter(linear, measurement, to_centre)
-    return CandidateViews(joints, np.concatenate([own, extra], axis=2), of_a, of_b, half)
-
-
-def _of_targets(linear: LinearModel, seen: TargetObservation, a: Score, b: Score) -> CandidateViews:
-    """Poses near those driven, in which all targets are seen."""
-    joints = nearby(linear.measurement.views.joints)[:_TRIED]
     measurement = candidate_measurement(linear.measurement, joints)
-    zero = [s.form.at(np.zeros(len(s.values))) for s in (a, b)]
-    flange_and_noise = np.append(linear.flange_scatter(linear.null), linear.null.variances[NOISE])
-    rows, columns, covariance = candidate_rows(measurement, seen.rows, seen.landmarks, flange_and_noise, zero)
-    extra = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - rows.landmarks.shape[2]))
-    design = np.concatenate([rows.hand_eye, rows.landmarks, extra], axis=2)
-    of_a, of_b = (c[..., s.form.keep] for c, s in zip(columns, (a, b), strict=True))
-    return CandidateViews(joints, design, of_a, of_b, np.asarray(np.linalg.cholesky(covariance), float))
-
-
-# What was observed, and how it would look in a further view; nothing is proposed for what is not in here.
-_VIEWS_BY_OBSERVATION: dict[type, Callable[[LinearModel, Any, Score, Score], CandidateViews | None]] = {
-    SurfaceObservation: _of_surfaces,
-    TargetObservation: _of_targets,
-}
-
-
-def candidate_views(linear: LinearModel, a: Score, b: Score) -> CandidateViews | None:
-    """Further views of a session for two effects; None if no pose can show them."""
-    of = _VIEWS_BY_OBSERVATION.get(type(linear.observation))
-    return None if of is None else of(linear, linear.observation, a, b)
-
-
-def _view_scatter(linear: LinearModel, measurement: Measurement, to_centre: Array) -> Array:
-    """(K, 6, 6) Cholesky factors of the pose scatter of one view about the centre."""
+    bare = Model(T_mount)
+    to_centre = frames.make(np.eye(3), -centre)
+    hand_eye = frames.adjoint(to_centre @ (perturbed_frames(measurement, ())[0] @ bare.T_mount))
+    extra = np.zeros((len(joints), 6, linear.white_design.shape[1] - 6))
+    derivatives = pose_derivatives(measurement, bare, zero, centre)
+    of_a, of_b = (
+        twists[scored.form.keep].transpose(1, 2, 0) for twists, scored in zip(derivatives, (a, b), strict=True)
+    )
+    # The pose scatter of one view about the centre.
     T = measurement.T_base_flange
     carried = frames.adjoint(to_centre @ (np.broadcast_to(np.eye(4), T.shape) if measurement.eye_to_hand else T))
     variances = np.repeat(np.maximum(linear.flange_scatter(linear.null), 1e-300), 3)
-    return np.asarray(np.linalg.cholesky(carried * variances @ carried.transpose(0, 2, 1)))
+    half = np.linalg.cholesky(carried * variances @ carried.transpose(0, 2, 1))
+    return CandidateViews(joints, np.concatenate([hand_eye, extra], axis=2), of_a, of_b, half)
+
+
+def _of_targets(linear: LinearModel, targets: TargetObservation, a: Score, b: Score) -> CandidateViews:
+    """Return poses near those driven, in which all targets are seen."""
+    joints = nearby(linear.measurement.views.joints)[:_TRIED]
+    measurement = candidate_measurement(linear.measurement, joints)
+    zero = [scored.form.at(np.zeros(len(scored.values))) for scored in (a, b)]
+    flange_and_noise = np.append(linear.flange_scatter(linear.null), linear.null.variances[NOISE])
+    rows, columns, covariance = candidate_rows(measurement, targets.rows, targets.landmarks, flange_and_noise, zero)
+    extra = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - rows.landmarks.shape[2]))
+    design = np.concatenate([rows.hand_eye, rows.landmarks, extra], axis=2)
+    of_a, of_b = (c[..., scored.form.keep] for c, scored in zip(columns, (a, b), strict=True))
+    half = np.asarray(np.linalg.cholesky(covariance), float)
+    return CandidateViews(joints, design, of_a, of_b, half)

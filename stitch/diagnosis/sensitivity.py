@@ -1,10 +1,13 @@
-"""The smallest size of an effect that these views would show: both tests in use pass with 80 % probability.
+"""What these views can show of an effect: what could do the same, the smallest size that shows, what it does unseen.
 
-An effect of true parameters θ shifts the squared length of its whitened columns' projection by λ = θᵀIθ. The
-scatter is known to ν degrees of freedom only, and takes its share of what the effect does: the test statistic q
-is non-central F, and the log evidence ½ ν log(1 + q/ν) in place of ½ q. For one parameter, known scatter and the
-p-value alone this is |θ| = (z_{1−α/2K} + z_{power})/√I.
-"""
+Candidates are aliases where what they do correlates, hand-eye and model projected out (`alias_matrix`). An effect that
+is too small to be seen would push the hand-eye by what its sigma does not hold (`omitted_effect_bias`).
+
+The smallest size that shows is the one at which both tests in use pass with 80 % probability. An effect of true
+parameters θ shifts the squared length of its whitened columns' projection by λ = θᵀIθ. The scatter is known to ν
+degrees of freedom only, and takes its share of what the effect does: the test statistic q is non-central F, and the log
+evidence ½ ν log(1 + q/ν) in place of ½ q. For one parameter, known scatter and the p-value alone this is |θ| =
+(z_{1−α/2K} + z_{power})/√I."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,8 +24,6 @@ from stitch.numerics.distributions import f_limit, noncentral_f_tail
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 
-# Which candidates are aliases in these views: correlation of what they do, hand-eye and model projected out.
-
 
 @dataclass(frozen=True)
 class Alias:
@@ -33,34 +34,34 @@ class Alias:
 
 
 def effect_pattern(linear: LinearModel, scored: Score) -> Array:
-    """(n,) what the fitted candidate does to the views, in units of their scatter."""
+    """Return (n,) what the fitted candidate does to the views, in units of their scatter."""
     white = linear.residual(scored.form.columns)
     if np.any(scored.values):
-        return np.asarray(white @ scored.values)
+        return white @ scored.values
     # Nothing fitted: the most visible combination of plausible size.
     U, s, _ = np.linalg.svd(white * scored.form.sizes, full_matrices=False)
-    return np.asarray(U[:, 0] * s[0])
+    return U[:, 0] * s[0]
 
 
 def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
-    """(K, K): how much of the fitted pattern of row k the effect of the column can imitate, 0 … 1.
+    """Return (K, K): how much of the fitted pattern of row k the effect of the column can imitate, 0 … 1.
 
     The other effect may use all its parameters, but none beyond ten times its plausible size.
     """
     patterns = [effect_pattern(linear, s) for s in scores]
     whites = [linear.residual(s.candidate.forms[0].columns) for s in scores]
-    out = np.eye(len(scores))
-    for i, y in enumerate(patterns):
+    matrix = np.eye(len(scores))
+    for i, pattern in enumerate(patterns):
         for j, (white, scored) in enumerate(zip(whites, scores, strict=True)):
             if i != j:
-                out[i, j] = imitated_share(y, white * scored.candidate.forms[0].sizes)
-    return out
+                matrix[i, j] = imitated_share(pattern, white * scored.candidate.forms[0].sizes)
+    return matrix
 
 
 def aliases_of(
     k: int, matrix: Array, scores: Sequence[Score], least: float = limits.LISTED_ALIAS_CORRELATION
 ) -> list[Alias]:
-    """The most similar effects of candidate k."""
+    """Return the most similar effects of candidate k."""
     order = np.argsort(-matrix[k])
     return [Alias(scores[j].name, float(matrix[k, j])) for j in order if j != k and matrix[k, j] > least][:5]
 
@@ -77,35 +78,33 @@ def imitated_share(y: Array, X: Array) -> float:
     return float(np.clip(fitted / alike @ (y / length), 0.0, 1.0)) if alike > 0 else 0.0
 
 
-# How far an effect that is too small to be seen would push the hand-eye: what its sigma does not hold.
-
-
 def hand_eye_response(linear: LinearModel) -> Array:
-    """(3, n) how whitened numbers (n,) displace the middle of the scanner's field through the fitted hand-eye."""
+    """Return (3, n) how whitened numbers (n,) displace the middle of the scanner's field through the fitted
+    hand-eye."""
     middle = np.mean([points.mean(axis=0) for points in linear.measurement.capture.point_sets], axis=0)
     lever = np.hstack([-frames.skew(middle), np.eye(3)])
     length = np.linalg.norm(linear.white_design, axis=0)
     scale = np.where(length > 0, length, 1.0)
-    return np.asarray(lever @ (np.linalg.pinv(linear.white_design / scale, rcond=1e-10) / scale[:, None])[:6])
+    return lever @ (np.linalg.pinv(linear.white_design / scale, rcond=1e-10) / scale[:, None])[:6]
 
 
 def omitted_effect_bias(
-    linear: LinearModel, push: Array, candidate: Candidate, detectable: dict[str, float]
+    linear: LinearModel, response: Array, candidate: Candidate, detectable: dict[str, float]
 ) -> float | None:
-    """Largest displacement (length_unit) of the middle of the scanner's field by the error of the hand-eye.
+    """Return the largest displacement (length_unit) of the middle of the scanner's field by the error of the hand-eye.
 
     Each parameter in turn is there unseen, at its smallest detectable size or, where that is larger, at its plausible
     one; the hand-eye takes up of it what generalised least squares gives it. None if these views show no parameter.
 
     Args:
-        push: of the same linear model (`hand_eye_response`).
+        response: of the same linear model (`hand_eye_response`).
     """
-    found = []
+    displacements = []
     for form in candidate.forms:
-        for p, moved in zip(form.free, (push @ linear.whiten(form.columns)).T, strict=True):
+        for p, moved in zip(form.free, (response @ linear.whiten(form.columns)).T, strict=True):
             if np.isfinite(detectable.get(p.name, np.inf)):
-                found.append(min(detectable[p.name], p.typical) * float(np.linalg.norm(moved)))
-    return max(found, default=None)
+                displacements.append(min(detectable[p.name], p.typical) * float(np.linalg.norm(moved)))
+    return max(displacements, default=None)
 
 
 def least_noncentrality(
@@ -115,7 +114,7 @@ def least_noncentrality(
     degrees_of_freedom: float,
     scales: Mapping[float, float],
 ) -> float:
-    """θᵀIθ that a form needs to be detected.
+    """Return θᵀIθ that a form needs to be detected.
 
     Args:
         white: (n, p) whitened columns at their plausible sizes.
@@ -129,8 +128,11 @@ def least_noncentrality(
     if rank == 0:
         return float("inf")
     by_p = rank * f_limit(limits.ALPHA_NAME * weight / max(tests, 1), rank, max(degrees_of_freedom, 1.0))
-    factor, told = limits.LOG_BAYES_FACTOR - float(np.log(weight)), information.clip(0)
-    by_factor = [_squares_for(factor - float(np.log(y)), s**2 * told, degrees_of_freedom) for s, y in scales.items()]
+    factor = limits.LOG_BAYES_FACTOR - float(np.log(weight))
+    by_factor = [
+        _squares_for(factor - float(np.log(share)), scale**2 * information.clip(0), degrees_of_freedom)
+        for scale, share in scales.items()
+    ]
     needed = max(by_p, min(by_factor))
     if needed > limits.UNDETECTABLE_SQUARE:
         return float("inf")
@@ -146,7 +148,8 @@ def least_noncentrality(
 
 
 def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -> float:
-    """Squared length of the projection at which a form gains that log Bayes factor beside what it could have been.
+    """Return the squared length of the projection at which a form gains that log Bayes factor beside what it could have
+    been.
 
     Args:
         information: (p,) of its parameters per unit of their prior; where it is little, the prior keeps back a share.
@@ -157,16 +160,17 @@ def _squares_for(factor: float, information: Array, degrees_of_freedom: float) -
 
 
 def detectable_sizes(linear: LinearModel, candidate: Candidate, tests: int) -> dict[str, float]:
-    """Smallest detectable size of every free parameter of a candidate among so many, where it alone is not zero, by the
-    form that shows it best."""
+    """Return the smallest detectable size of every free parameter of a candidate among so many, where it alone is not
+    zero, by the form that shows it best."""
     linear = linear.restricted(linear.causes - {candidate.name})
-    found: dict[str, dict[tuple[str, ...], list[float]]] = {}
+    sizes: dict[str, dict[tuple[str, ...], list[float]]] = {}
     for form, weight in zip(candidate.forms, form_weights(candidate), strict=True):
-        white, names = linear.residual(form.columns), tuple(p.name for p in form.free)
+        white = linear.residual(form.columns)
+        names = tuple(p.name for p in form.free)
         known = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
         least = least_noncentrality(white * form.sizes, float(weight), tests, known, regime_of(linear).scales)
         for name, length in zip(names, np.linalg.norm(white, axis=0), strict=True):
             size = float(np.sqrt(least) / length) if length > 0 else float("inf")
-            found.setdefault(name, {}).setdefault(names, []).append(size)
+            sizes.setdefault(name, {}).setdefault(names, []).append(size)
     # Forms of the same parameters differ in when something happened: any of them could be true.
-    return {name: min(float(np.median(own)) for own in by_form.values()) for name, by_form in found.items()}
+    return {name: min(float(np.median(of_form)) for of_form in forms.values()) for name, forms in sizes.items()}

@@ -35,7 +35,7 @@ def test_the_next_view_serves_the_two_that_stay_most_alike(monkeypatch):
             self.name = name
 
     def of_two(evidence, a, b):
-        return next_view._Gains(0.4, np.radians([[10.0], [20.0], [30.0]]), np.array(gains[a.name + b.name], float))
+        return np.radians([[10.0], [20.0], [30.0]]), 0.4, np.array(gains[a.name + b.name], float)
 
     monkeypatch.setattr(next_view, "_gains", of_two)
     joints, count, separated = next_view._best_pose(None, [CandidateEffect(name) for name in "abc"])
