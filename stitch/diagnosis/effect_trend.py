@@ -1,4 +1,4 @@
-"""How far every view lies off along what an effect does, over what the effect lives on: the law, to the eye.
+"""How far every view lies off along what an effect does, over what the effect lives on: the effect, to the eye.
 
 A view's value is its displacement at the part along its unit motion: that of one joint where an effect is in a joint,
 that of the mount or the part along the fitted twist, else the direction in which the effect displaces the views most.
@@ -8,6 +8,7 @@ off the line are what the effect does not explain. Effects of points are read al
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -22,20 +23,32 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.units import covariate_text
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.surface_model import surfaces_of
+from stitch.observations.surfaces.surface_model import SurfaceObservation, surfaces_of
 from stitch.session.measurement import ScanView, Views
 
-# Dots along one course: more cannot be told apart.
+# Dots along one trend: more cannot be told apart.
 _MOST = 300
 # Bins of the points of effects of the scanner and of the part's shape.
 _BINS = 16
-# Correspondences that are asked for one course.
+# Correspondences that are asked for one trend.
 _ASKED = 60_000
+_TEMPERATURES = {"part_growth": "part_temperature_c", "scanner_thermal_scale": "scanner_temperature_c"}
+# What effects of points live on, with its unit, None for the session's; all others the angle in the field.
+_POINT_AXES = {
+    "range_scale": ("distance from the scanner", None),
+    "range_nonlinearity": ("distance from the scanner", None),
+    "incidence_bias": ("angle of incidence", "°"),
+    "intensity_bias": ("intensity, in standard deviations", ""),
+    "part_sag": ("height above the clamp", None),
+}
+
+# What an effect lives on, its unit, and where the views stand along it (V,).
+_Axis = tuple[str, str, Array]
 
 
 @dataclass(frozen=True)
 class EffectTrend:
-    """The course of one effect over what it lives on; lengths in length_unit, angles in rad."""
+    """The trend of one effect over what it lives on; lengths in length_unit, angles in rad."""
 
     follows: str  # what it lives on: view order, time_s, angle of joint 2, …
     unit: str  # of `at`: "", s, °, N m, °C, length_unit
@@ -46,74 +59,80 @@ class EffectTrend:
     measured: Array  # (D,)
     sigma: Array  # (D,) standard deviation of a dot, by the scatter about the line
     predicted: Array  # (D,)
-    # The law between the dots, (2, G): places and values; empty where the dots alone are known.
+    # The effect between the dots, (2, G): places and values; empty where the dots alone are known.
     law: Array = field(default_factory=lambda: np.zeros((2, 0)))
+
+    def only(self, dots: Indices) -> "EffectTrend":
+        """Return the trend with some of its dots."""
+        numbers = {name: getattr(self, name)[dots] for name in ("at", "views", "measured", "sigma", "predicted")}
+        return replace(self, **numbers)
 
 
 def trend_of_candidate(linear: LinearModel, scored: Score) -> EffectTrend | None:
-    """The course of a candidate's best form; None where nothing of it was fitted."""
+    """Return the trend of a candidate's best form; None where nothing of it was fitted."""
     if not scored.fitted:
         return None
     fitted = linear.restricted(())
     # As the field of the part predicts it: beside scatter alone, hand-eye and effects in use fitted anew.
-    own = scored if fitted is linear else score(fitted, scored.candidate)
-    if not own.fitted:
-        return None
-    X = np.hstack([fitted.design, own.form.response])
-    sums = own.candidate.points
-    found = fitted.trial(X, None if sums is None else sums.select(own.form.keep)).solve()
-    term = own.form.at(found[len(found) - own.form.response.shape[1] :])
+    if fitted is not linear:
+        scored = score(fitted, scored.candidate)
+        if not scored.fitted:
+            return None
+    form = scored.form
+    points = scored.candidate.points
+    X = np.hstack([fitted.design, form.response])
+    solution = fitted.trial(X, None if points is None else points.select(form.keep)).solve()
+    values = solution[len(solution) - len(scored.values) :]
+    term = form.at(values)
     if moves_points([term]):
-        return _course_of_points(fitted, own, term)
-    return _course_of_views(fitted, term, own.form, found[len(found) - len(own.values) :], X @ found)
+        return _trend_of_points(fitted, scored, term)
+    return _trend_of_views(fitted, term, form, values, X @ solution)
 
 
 def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
-    """The course of an effect that is in the model, as it was fitted; None for one that changes points."""
+    """Return the trend of an effect that is in the model, as it was fitted; None for one that changes points."""
     if moves_points([term]) or not (~term.gridded & (term.values != 0)).any():
         return None
     fitted = linear.restricted(())
     form = candidate_as_fitted(fitted, term).forms[0]
-    return _course_of_views(fitted, term, form, term.values[form.keep], fitted.design @ fitted.baseline_trial.solve())
+    return _trend_of_views(fitted, term, form, term.values[form.keep], fitted.design @ fitted.baseline_trial.solve())
 
 
 def trend_of_curve(linear: LinearModel, curve: JointCurve) -> EffectTrend | None:
-    """How far a joint is off along what its error follows without a name, beside its mean."""
-    fitted, joint = linear.restricted(()), curve.joint - 1
-    law = np.interp(curve.view_values, curve.at, curve.error)
+    """Return how far a joint is off along what its error follows without a name, beside its mean."""
+    fitted = linear.restricted(())
+    joint = curve.joint - 1
+    error = np.interp(curve.view_values, curve.at, curve.error)
     turned = _joint_columns(fitted)[:, joint : joint + 1]
-    response = turned * _of_rows(fitted, law[:, None], len(turned))
-    X = np.hstack([fitted.design, response])
-    found = fitted.trial(X).solve()
+    X = np.hstack([fitted.design, turned * _of_rows(fitted, error[:, None], len(turned))])
+    solution = fitted.trial(X).solve()
     columns = _displacements(fitted, turned)[..., 0]
-    motion = _Motion(f"joint {curve.joint}", "rad", columns, found[-1] * law[:, None] * columns, joint)
-    axis = (covariate_text(curve.covariate), "") if curve.covariate != "time_s" else ("time", "s")
-    return _along_motion(fitted, motion, X @ found, 1, (*axis, curve.view_values))
+    motion = _Motion(f"joint {curve.joint}", "rad", columns, solution[-1] * error[:, None] * columns, joint)
+    name, unit = (covariate_text(curve.covariate), "") if curve.covariate != "time_s" else ("time", "s")
+    return _along_motion(fitted, motion, X @ solution, 1, (name, unit, curve.view_values))
 
 
-def trend_of_dependence(linear: LinearModel, found: Dependence) -> EffectTrend:
-    """Where the views lie off along what their displacement follows without a name, and its means in bins."""
-    shown = _some(len(found.at))
-    fitted = np.interp(found.at, found.bins, found.mean)
-    sigma = float(np.std(found.moved - fitted, ddof=1)) if len(fitted) > 1 else 0.0
-    dots = {"measured": found.moved, "sigma": np.full(len(fitted), sigma), "predicted": fitted}
-    return EffectTrend(
-        follows=found.covariate,
+def trend_of_dependence(linear: LinearModel, dependence: Dependence) -> EffectTrend:
+    """Return where the views lie off along what their displacement follows without a name, and its means in bins."""
+    predicted = np.interp(dependence.at, dependence.bins, dependence.mean)
+    sigma = float(np.std(dependence.moved - predicted, ddof=1)) if len(predicted) > 1 else 0.0
+    trend = EffectTrend(
+        follows=dependence.covariate,
         unit="",
         of="the views",
         value_unit=linear.measurement.length_unit,
-        at=found.at[shown],
-        views=shown,
-        **{name: x[shown] for name, x in dots.items()},
+        at=dependence.at,
+        views=np.arange(len(predicted)),
+        measured=dependence.moved,
+        sigma=np.full(len(predicted), sigma),
+        predicted=predicted,
     )
+    return trend.only(_shown(len(predicted)))
 
 
-def _some(views: int) -> Indices:
+def _shown(views: int) -> Indices:
     """Return the numbers of the views that are shown."""
     return np.unique(np.linspace(0, views - 1, min(views, _MOST)).astype(np.int64))
-
-
-# Effects that move views.
 
 
 @dataclass(frozen=True)
@@ -124,13 +143,16 @@ class _Motion:
     unit: str
     columns: Array  # (V, k) displacements
     response: Array  # (V, k) displacements by the effect
-    joint: int | None = None
+    joint: int | None = None  # counted from 0
+
+    @property
+    def line(self) -> Array:
+        """(V,) displacement by the effect along that of a unit, times the latter."""
+        return np.sum(self.columns * self.response, axis=1)
 
 
-def _course_of_views(
-    linear: LinearModel, term: Term, form: Form, values: Array, explained: Array
-) -> EffectTrend | None:
-    """The course of an effect of views.
+def _trend_of_views(linear: LinearModel, term: Term, form: Form, values: Array, explained: Array) -> EffectTrend | None:
+    """Return the trend of an effect of views.
 
     Args:
         values: (p,) of the form's free parameters.
@@ -138,47 +160,38 @@ def _course_of_views(
     """
     motion = _motion(linear, term, form, values)
     views = linear.measurement.views
-    axis = _lives_on(views, term, motion)
     # Where the part sat at first is nobody's error.
-    course = _along_motion(linear, motion, explained, len(values), axis, from_first=term.effect.place == "part")
-    if course is None or motion.joint is None or not course.follows.startswith("angle"):
-        return course
-    return replace(course, law=_over_a_turn(views, form.at(values), motion.joint))
+    from_first = term.effect.place == "part"
+    trend = _along_motion(linear, motion, explained, len(values), _axis(views, term, motion), from_first=from_first)
+    if trend is None or motion.joint is None or not trend.follows.startswith("angle"):
+        return trend
+    return replace(trend, law=_over_a_turn(views, form.at(values), motion.joint))
 
 
 def _over_a_turn(views: Views, fitted: Term, joint: int) -> Array:
-    """Return the law of a joint over its whole turn (2, G), ° and rad: over the angles seen alone, a gear that runs
-    out of true looks like a slope. Empty where the law takes more than this joint's angle, or does not vary.
+    """Return what an effect does to a joint over its whole turn (2, G), ° and rad: over the angles seen alone, a gear
+    that runs out of true looks like a slope. Empty where it takes more than this joint's angle, or does not vary.
     """
     turn = np.radians(np.linspace(-180, 180, 121))
     asked = np.concatenate([turn, views.joints[:, joint]])
     others_still = np.tile(views.joints[0], (len(asked), 1))
     others_still[:, joint] = asked
-    law = _joint_laws(replace(views.only([0] * len(asked)), joints=others_still), fitted)[:, joint]
-    over_turn, seen = law[: len(turn)], law[len(turn) :]
-    alone = np.allclose(seen, _joint_laws(views, fitted)[:, joint], rtol=1e-6, atol=1e-12)
-    return (
-        np.stack([np.degrees(turn), over_turn])
-        if alone and np.ptp(over_turn) > 1e-6 * np.abs(over_turn).max()
-        else np.zeros((2, 0))
-    )
+    errors = _joint_errors(replace(views.only([0] * len(asked)), joints=others_still), fitted)[:, joint]
+    over_turn, in_views = errors[: len(turn)], errors[len(turn) :]
+    alone = np.allclose(in_views, _joint_errors(views, fitted)[:, joint], rtol=1e-6, atol=1e-12)
+    if alone and np.ptp(over_turn) > 1e-6 * np.abs(over_turn).max():
+        return np.stack([np.degrees(turn), over_turn])
+    return np.zeros((2, 0))
 
 
 def _along_motion(
-    linear: LinearModel,
-    motion: _Motion,
-    explained: Array,
-    free: int,
-    axis: tuple[str, str, Array],
-    *,
-    from_first: bool = False,
+    linear: LinearModel, motion: _Motion, explained: Array, free: int, axis: _Axis, *, from_first: bool = False
 ) -> EffectTrend | None:
     """Return every view along its unit motion: the line, and beside it what the model with the effect leaves.
 
     Args:
         explained: response of the whole model with the effect.
         free: number of fitted parameters of the effect.
-        axis: what the effect lives on, its unit, and where the views stand along it (V,).
         from_first: count from where the first view is.
     """
     square = np.sum(motion.columns**2, axis=1)
@@ -187,146 +200,182 @@ def _along_motion(
     # Where a unit moves a view by next to nothing, the view says nothing of it.
     square = np.maximum(square, 1e-2 * np.median(square))
     left = linear.mixed.z.ravel() - linear.reduce(explained[:, None])[:, 0]
-    line = np.sum(motion.columns * motion.response, axis=1) / square
+    line = motion.line / square
     off = np.sum(motion.columns * _displacements(linear, linear.observation.expand(left[:, None]))[..., 0], axis=1)
     scatter = float(np.sqrt(np.mean(off**2 / square) * len(line) / max(len(line) - free, 1)))
     follows, unit, at = axis
     if from_first:
         line = line - line[np.argmin(at)]
     sign = 1.0 if motion.joint is not None or line[np.argmax(np.abs(line))] >= 0 else -1.0
-    shown = _some(len(line))
-    values_of = {"measured": sign * (line + off / square), "sigma": scatter / np.sqrt(square), "predicted": sign * line}
-    return EffectTrend(
-        follows, unit, motion.of, motion.unit, at[shown], shown, **{name: x[shown] for name, x in values_of.items()}
+    trend = EffectTrend(
+        follows,
+        unit,
+        motion.of,
+        motion.unit,
+        at,
+        np.arange(len(line)),
+        measured=sign * (line + off / square),
+        sigma=scatter / np.sqrt(square),
+        predicted=sign * line,
     )
+    return trend.only(_shown(len(line)))
 
 
 def _motion(linear: LinearModel, term: Term, form: Form, values: Array) -> _Motion:
-    """What an effect moves, by its place in the chain of frames."""
+    """Return what an effect moves, by its place in the chain of frames."""
     response = _displacements(linear, form.response @ values[:, None])[..., 0]
-    unit, fitted = linear.measurement.length_unit, form.at(values)
+    unit = linear.measurement.length_unit
+    fitted = form.at(values)
     if term.effect.place == "robot":
         turned = _joint_columns(linear)
-        law = _joint_laws(linear.measurement.views, fitted)
-        seen = linear.reduce(turned * _of_rows(linear, law, len(turned)))
-        joint = int(np.argmax(np.sum(seen**2, axis=0)))
+        errors = _joint_errors(linear.measurement.views, fitted)
+        reduced = linear.reduce(turned * _of_rows(linear, errors, len(turned)))
+        joint = int(np.argmax(np.sum(reduced**2, axis=0)))
         columns = _displacements(linear, turned[:, joint : joint + 1])[..., 0]
-        return _Motion(f"joint {joint + 1}", "rad", columns, law[:, joint : joint + 1] * columns, joint)
+        return _Motion(f"joint {joint + 1}", "rad", columns, errors[:, joint : joint + 1] * columns, joint)
     if term.effect.place == "mount":
-        constant = Effect("constant", "mount", {"xi": twist("", 1e-3, 1.0)}, _constant, (), (), "empirical")
-        own = Term(constant, parameters_in(linear.measurement, constant))
+        specs = {"xi": twist("", 1e-3, 1.0)}
+        constant = Effect(
+            "constant", "mount", specs, lambda views, xi: np.tile(xi, (views.count, 1)), (), (), "empirical"
+        )
         twists = fitted.effect.function(linear.measurement.views, **fitted.arguments)
         along = (twists - twists.mean(axis=0))[np.argmax(np.sum(response**2, axis=1))]
-        columns = _displacements(linear, linear.responses([own])[0].columns @ along[:, None])[..., 0]
-        return _Motion("the scanner's mount", unit, _unit_rows(columns), response)
+        at_constant = linear.responses([Term(constant, parameters_in(linear.measurement, constant))])[0].columns
+        columns = _displacements(linear, at_constant @ along[:, None])[..., 0]
+        # Rows of a mean length of one.
+        columns = columns / max(float(np.mean(np.linalg.norm(columns, axis=1))), 1e-300)
+        return _Motion("the scanner's mount", unit, columns, response)
     direction = np.linalg.svd(response - response.mean(axis=0), full_matrices=False)[2][0]
     of = "the part" if term.effect.place == "part" else "the arm"
     return _Motion(of, unit, np.tile(direction, (len(response), 1)), response)
 
 
 def _joint_columns(linear: LinearModel) -> Array:
-    """(·, n) response to a turn of each joint."""
-    of_joints = Term(EFFECTS["joint_offset"], parameters_in(linear.measurement, EFFECTS["joint_offset"]))
-    return linear.responses([of_joints])[0].columns
+    """Return (·, n) response to a turn of each joint."""
+    offset = EFFECTS["joint_offset"]
+    return linear.responses([Term(offset, parameters_in(linear.measurement, offset))])[0].columns
+
+
+def _joint_errors(views: Views, fitted: Term) -> Array:
+    """Return (V, n) rad by which an effect turns the joints."""
+    errors: Array = fitted.effect.function(views.joints, views, **fitted.arguments) - views.joints
+    return errors
 
 
 def _of_rows(linear: LinearModel, values: Array, count: int) -> Array:
-    """(count, P) values of the views (V, P) for every row of a response; zero for rows of no view."""
-    each = len(linear.mixed.z[0]) if surfaces_of(linear) is None else 6
-    own = np.repeat(values, each, axis=0)
-    return np.vstack([own, np.zeros((count - len(own), values.shape[1]))])
-
-
-def _constant(views: Views, xi: Array) -> Array:
-    """M·exp(ξ)"""
-    return np.tile(xi, (views.count, 1))
-
-
-def _joint_laws(views: Views, fitted: Term) -> Array:
-    """(V, n) rad by which an effect turns the joints."""
-    return np.asarray(fitted.effect.function(views.joints, views, **fitted.arguments)) - views.joints
-
-
-def _unit_rows(columns: Array) -> Array:
-    """Rows of a mean length of one."""
-    return columns / max(float(np.mean(np.linalg.norm(columns, axis=1))), 1e-300)
+    """Return (count, P) values of the views (V, P) for every row of a response; zero for rows of no view."""
+    rows = np.repeat(values, len(linear.mixed.z[0]) if surfaces_of(linear) is None else 6, axis=0)
+    return np.vstack([rows, np.zeros((count - len(rows), values.shape[1]))])
 
 
 def _displacements(linear: LinearModel, response: Array) -> Array:
-    """(V, k, P) displacements at the part of responses (·, P); of surfaces a turn counts by what it does at the rim."""
-    observation, surfaces = linear.observation, surfaces_of(linear)
+    """Return (V, k, P) displacements at the part of responses (·, P); of surfaces a turn counts by what it does at the
+    rim."""
+    observation = linear.observation
+    surfaces = surfaces_of(linear)
     if surfaces is None:
-        return np.stack([observation.part_displacements(own) for own in observation.reduce(response).T], axis=2)
-    out = response.reshape(linear.measurement.views.count, 6, -1).copy()
-    out[:, :3] *= surfaces.reach
-    return np.asarray(out)
+        columns = observation.reduce(response).T
+        return np.stack([observation.part_displacements(column) for column in columns], axis=2)
+    twists = response.reshape(linear.measurement.views.count, 6, -1).copy()
+    twists[:, :3] *= surfaces.reach
+    return twists
 
 
-def _lives_on(views: Views, term: Term, motion: _Motion) -> tuple[str, str, Array]:
-    """What an effect lives on, its unit, and where the views stand along it."""
-    name, joint = term.name, motion.joint
-    covariate = next((n for n in (*term.effect.prefers, *term.effect.needs) if n in views.covariates), None)
-    if joint is not None:
-        number = joint + 1
-        if "torque" in term.effect.needs:
-            own = [k for k, bent in enumerate(views.torques.joint) if bent == joint]
-            if own:
-                size = max(own, key=lambda k: abs(term.values[k]) * float(np.ptp(views.torques.values[:, k])))
-                return f"torque on joint {number}", "N m", views.torques.values[:, size]
-        if name == "backlash":
-            return f"last move of joint {number}: −1 down, +1 up", "", views.approach[:, joint]
-        if name == "settling":
-            moved = np.degrees(views.joints - views.previous)
-            return f"last move of joint {number}", "°", moved[:, joint]
-        if "velocity" in term.effect.needs and views.velocity is not None:
-            return f"speed of joint {number}", "°/s", np.degrees(views.velocity[:, joint])
-        return f"angle of joint {number}", "°", np.degrees(views.joints[:, joint])
+def _axis(views: Views, term: Term, motion: _Motion) -> _Axis:
+    """Return what an effect of views lives on, its unit, and where the views stand along it."""
+    effect = term.effect
+    if motion.joint is not None:
+        return _joint_axis(views, term, motion.joint)
     for weight in ("gravity_at_mount", "gravity_at_part"):
-        if weight in term.effect.needs:
-            return _along_gravity(getattr(views, weight), motion)
+        if weight in effect.needs:
+            # What gives way under its weight lives on the pull of gravity along the direction that moves it most.
+            gravity = getattr(views, weight)
+            line = motion.line / np.maximum(np.sum(motion.columns**2, axis=1), 1e-300)
+            slope = np.linalg.lstsq(np.column_stack([gravity, np.ones(len(line))]), line, rcond=1e-6)[0][:3]
+            pull = gravity @ slope / max(float(np.linalg.norm(slope)), 1e-300)
+            return "pull of gravity where it gives way most", "g", pull
+    covariate = next((name for name in (*effect.prefers, *effect.needs) if name in views.covariates), None)
     if covariate is not None:
         return covariate, "", views.covariates[covariate]
-    if any(p.discrete for p in term.parameters) or not views.has("time"):
-        return "view order", "", np.arange(views.count, dtype=float)
-    if "time" in (*term.effect.needs, *term.effect.prefers) or term.effect.prefers:
+    is_event = any(p.discrete for p in term.parameters)
+    if views.has("time") and not is_event and ("time" in effect.needs or effect.prefers):
         return "time", "s", views.time
     return "view order", "", np.arange(views.count, dtype=float)
 
 
-def _along_gravity(gravity: Array, motion: _Motion) -> tuple[str, str, Array]:
-    """What gives way under its weight lives on the pull of gravity (V, 3) along the direction that moves it most."""
-    line = np.sum(motion.columns * motion.response, axis=1) / np.maximum(np.sum(motion.columns**2, axis=1), 1e-300)
-    slope = np.linalg.lstsq(np.column_stack([gravity, np.ones(len(line))]), line, rcond=1e-6)[0][:3]
-    return "pull of gravity where it gives way most", "g", gravity @ slope / max(float(np.linalg.norm(slope)), 1e-300)
+def _joint_axis(views: Views, term: Term, joint: int) -> _Axis:
+    """Return what an effect of a joint, counted from 0, lives on."""
+    number = joint + 1
+    bending = [k for k, bent in enumerate(views.torques.joint) if bent == joint]
+    if "torque" in term.effect.needs and bending:
+        torques = views.torques.values
+        largest = max(bending, key=lambda k: abs(term.values[k]) * float(np.ptp(torques[:, k])))
+        return f"torque on joint {number}", "N m", torques[:, largest]
+    if term.name == "backlash":
+        return f"last move of joint {number}: −1 down, +1 up", "", views.approach[:, joint]
+    if term.name == "settling":
+        return f"last move of joint {number}", "°", np.degrees(views.joints - views.previous)[:, joint]
+    if "velocity" in term.effect.needs and views.velocity is not None:
+        return f"speed of joint {number}", "°/s", np.degrees(views.velocity[:, joint])
+    return f"angle of joint {number}", "°", np.degrees(views.joints[:, joint])
 
 
-# Effects that change points: along the rays of the scanner, or as the part's shape moves.
-
-
-def _course_of_points(linear: LinearModel, scored: Score, term: Term) -> EffectTrend | None:
-    """Means over bins of points, each the effect and what the model with it leaves along its motion."""
-    observation, left = surfaces_of(linear), predicted_distances(linear, scored)
-    if left is None or observation is None:
+def _trend_of_points(linear: LinearModel, scored: Score, term: Term) -> EffectTrend | None:
+    """Return means over bins of points, each the effect and what the model with it leaves along its motion."""
+    surfaces = surfaces_of(linear)
+    distances = predicted_distances(linear, scored)
+    if distances is None or surfaces is None:
         return None
-    poses = observation.capture.poses(linear.model.T_mount)
-    matches, rows = observation.unconstrained.overlaps.matches, list[tuple[Array, Array, Array, Array, Array]]()
-    total = sum(len(m.residual) for m in matches)
+    rows = _points_of_matches(linear, surfaces, term, distances)
+    dots = _binned(*rows)
+    if dots is None:
+        return None
+    at, measured, sigma, predicted = dots
+    views = linear.measurement.views
+    length = linear.measurement.length_unit
+    temperature = _TEMPERATURES.get(term.name)
+    unit: str | None
+    if temperature is not None:
+        follows, unit = (temperature, "°C") if temperature in views.covariates else ("time", "s")
+    else:
+        follows, unit = _POINT_AXES.get(term.name, ("angle from the middle of the field", "°"))
+    return EffectTrend(
+        follows=follows,
+        unit=length if unit is None else unit,
+        of="the part" if term.effect.place == "shape" else "the scanner",
+        value_unit=length,
+        at=at,
+        views=np.zeros(0, np.int64),
+        measured=measured,
+        sigma=sigma,
+        predicted=predicted,
+    )
+
+
+def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: Term, distances: Array) -> list[Any]:
+    """Return of points (N,) of some correspondences: where each stands along what the effect lives on, how far the
+    effect moves it, the cosine of that motion to the normal, the distance that is left, and its view."""
+    poses = surfaces.capture.poses(linear.model.T_mount)
+    matches = surfaces.unconstrained.overlaps.matches
+    every = max(sum(len(m.residual) for m in matches) // _ASKED, 1)
+    rows = list[tuple[Array, ...]]()
     start = 0
     for m in matches:
-        some = np.arange(0, len(m.residual), max(total // _ASKED, 1))
-        own, start = left[start + some], start + len(m.residual)
+        some = np.arange(0, len(m.residual), every)
+        left = distances[start + some]
+        start += len(m.residual)
         for v, index, sign in ((m.v, m.index_v[some], 1.0), (m.w, m.index_w[some], -1.0)):
             points, view = scan_points(linear.measurement, v, index)
             size, direction = _sizes(term, points, view, poses[v])
             facing = np.einsum("ni,ni->n", frames.rotate(poses[v], direction), m.normal[some])
-            at = _place_of(term.name, points, view, poses[v])
-            rows.append((at, size, sign * facing, own, np.full(len(some), v)))
-    at, size, cosine, rest, view_of = (np.concatenate(x) for x in zip(*rows, strict=True))
-    return _binned(linear, term, at, size, cosine, rest, view_of)
+            place = _place_of(term.name, points, view, poses[v])
+            rows.append((place, size, sign * facing, left, np.full(len(some), v)))
+    return [np.concatenate(column) for column in zip(*rows, strict=True)]
 
 
 def _sizes(term: Term, points: Array, view: ScanView, pose: Array) -> tuple[Array, Array]:
-    """(N,) how far an effect moves points, and (N, 3) where to, scanner frame: along the rays where it does so."""
+    """Return (N,) how far an effect moves points, and (N, 3) where to, scanner frame: along the rays where it does
+    so."""
     moved = -point_correction([term], points, view, pose)
     rays = view.along(points)
     along = np.einsum("ni,ni->n", moved, rays)
@@ -337,10 +386,10 @@ def _sizes(term: Term, points: Array, view: ScanView, pose: Array) -> tuple[Arra
 
 
 def _place_of(name: str, points: Array, view: ScanView, pose: Array) -> Array:
-    """(N,) where points stand along what an effect of points lives on."""
+    """Return (N,) where points stand along what an effect of points lives on."""
     match name:
         case "range_scale" | "range_nonlinearity":
-            return np.asarray(np.linalg.norm(view.away(points), axis=1))
+            return np.linalg.norm(view.away(points), axis=1)
         case "incidence_bias":
             return np.degrees(np.arccos(np.clip(view.cosine, 0, 1)))
         case "intensity_bias":
@@ -354,57 +403,24 @@ def _place_of(name: str, points: Array, view: ScanView, pose: Array) -> Array:
     return np.degrees(np.arctan(np.sqrt(view.rho2(points))))
 
 
-_TEMPERATURES = {"part_growth": "part_temperature_c", "scanner_thermal_scale": "scanner_temperature_c"}
-# What effects of points live on, with its unit, None for the session's; all others the angle in the field.
-_POINT_AXES = {
-    "range_scale": ("distance from the scanner", None),
-    "range_nonlinearity": ("distance from the scanner", None),
-    "incidence_bias": ("angle of incidence", "°"),
-    "intensity_bias": ("intensity, in standard deviations", ""),
-    "part_sag": ("height above the clamp", None),
-}
-
-
-def _point_axis(name: str, views: Views) -> tuple[str, str | None]:
-    """What an effect of points lives on, and its unit."""
-    temperature = _TEMPERATURES.get(name)
-    if temperature is not None:
-        return (temperature, "°C") if temperature in views.covariates else ("time", "s")
-    return _POINT_AXES.get(name, ("angle from the middle of the field", "°"))
-
-
-def _binned(
-    linear: LinearModel, term: Term, at: Array, size: Array, cosine: Array, rest: Array, view_of: Indices
-) -> EffectTrend | None:
-    """A dot for each of equal counts of points; its sigma is the scatter of the views' own means about it."""
+def _binned(at: Array, size: Array, cosine: Array, left: Array, view_of: Indices) -> Array | None:
+    """Return (4, D) place, measured value, sigma and prediction of a dot for each of equal counts of points; its sigma
+    is the scatter of the views' own means about it."""
     edges = np.unique(np.quantile(at, np.linspace(0, 1, _BINS + 1)))
     if len(edges) < 3:
         return None
     dots = []
     for low, high in pairwise(edges):
-        here = (at >= low) & (at <= high)
-        weight = np.sum(cosine[here] ** 2)
+        inside = (at >= low) & (at <= high)
+        weight = np.sum(cosine[inside] ** 2)
         if weight <= 0:
             continue
-        off = float(np.sum(cosine[here] * rest[here]) / weight)
-        views = view_of[here]
-        top, below = (np.bincount(views, x[here]) for x in (cosine * rest, cosine**2))
+        off = float(np.sum(cosine[inside] * left[inside]) / weight)
+        of_views = view_of[inside]
+        top = np.bincount(of_views, (cosine * left)[inside])
+        below = np.bincount(of_views, (cosine**2)[inside])
         known = below > 0
         spread = np.sqrt(np.sum((top[known] - off * below[known]) ** 2)) / weight
-        law = float(size[here].mean())
-        dots.append((float(at[here].mean()), law + off, float(spread), law))
-    place, measured, sigma, predicted = np.array(dots).T
-    length = linear.measurement.length_unit
-    follows, unit = _point_axis(term.name, linear.measurement.views)
-    of = "the part" if term.effect.place == "shape" else "the scanner"
-    return EffectTrend(
-        follows=follows,
-        unit=length if unit is None else unit,
-        of=of,
-        value_unit=length,
-        at=place,
-        views=np.zeros(0, np.int64),
-        measured=measured,
-        sigma=sigma,
-        predicted=predicted,
-    )
+        predicted = float(size[inside].mean())
+        dots.append((float(at[inside].mean()), predicted + off, float(spread), predicted))
+    return np.array(dots).T

@@ -35,7 +35,7 @@ from stitch.diagnosis.unmodelled_time_effects import (
     least_log_bayes_factor,
     unmodelled_log_posterior,
 )
-from stitch.diagnosis.validation import CrossValidation, cross_validate, validate_in_halves
+from stitch.diagnosis.validation import CrossValidation, cross_validate, objection_in_halves
 from stitch.diagnosis.verdict import Answer, Evidence, scanner_explains_it
 from stitch.model.forward import moves_points
 from stitch.model.model import Term
@@ -572,8 +572,7 @@ def _objection(effect: Ranked, left_out: CrossValidation) -> str | None:
     if not left_out.helps:
         share = f"{left_out.poses:.2f} ± {left_out.poses_sigma:.2f}"
         return f"{effect.name} does not help on views left out: it leaves a mean square pose error of {share} of now"
-    halves = validate_in_halves(effect.score)
-    return None if halves is None else halves.rejection_reason(effect.name)
+    return objection_in_halves(effect.score)
 
 
 def _scanner_error_in_place_of(linear: LinearModel, evidence: Evidence) -> FieldError | None:

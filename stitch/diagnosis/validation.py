@@ -6,7 +6,7 @@ pose lie among the others and do not show it. The ends judge together. Where mor
 effect takes away what hid another at some end and makes that one a little worse; an imitation helps at many ends and is
 far off at others. So a further end must be likely to become better, the ends being samples of it.
 
-`validate_in_halves` finds an effect in one half of the views and judges it in the other. The views are halved in the
+`objection_in_halves` finds an effect in one half of the views and judges it in the other. The views are halved in the
 order of time, by the region of their poses, and alternately. In each half the form of the effect is chosen anew and its
 sizes are fitted; the other half says how much likelier its numbers are with that effect than without (partial Bayes
 factor; Berger & Pericchi 1996, J. Am. Stat. Assoc. 91:109). What imitates something else has another size or sign in
@@ -258,24 +258,6 @@ def _student_prior(linear: LinearModel, trial: LinearTrial, sizes: Array) -> Coe
 
 
 @dataclass(frozen=True)
-class Halves:
-    """What the halves say of an effect that all views together suggest."""
-
-    log_bayes_factor: float  # of what each half predicts of the other, mean over the ways to halve
-    p_value: float  # that the sizes in both halves are one and the same, Bonferroni over the ways to halve
-    share: float  # smallest share of the effect of all views that a half finds; < 0: the sign changes
-
-    def rejection_reason(self, name: str) -> str | None:
-        """Say what speaks against an effect that explains much, if anything does."""
-        if self.log_bayes_factor <= 0:
-            return f"{name}, found in one half of the views, does not help in the other"
-        # A clear effect whose form is not quite right differs a little, beyond chance: it is there all the same.
-        if self.p_value < limits.HALVES_P_VALUE and self.share < limits.MIN_STEADINESS:
-            return f"{name} has another size or sign in each half of the views (p = {self.p_value:.1g})"
-        return None
-
-
-@dataclass(frozen=True)
 class _HalfEvidence:
     """What some views say of the parameters (p,) of a form: log likelihood vᵀθ − ½ θᵀIθ."""
 
@@ -293,9 +275,9 @@ class _HalfEvidence:
         return float(log_evidence(self.information, self.vector, precision, mean))
 
 
-def validate_in_halves(scored: Score) -> Halves | None:
-    """Return the best form of a candidate, and all its forms, in halves of the views; None where pose errors have no
-    prior."""
+def objection_in_halves(scored: Score) -> str | None:
+    """Say what halves of the views speak against the best form of a candidate that explains much; None where nothing,
+    and where pose errors have no prior."""
     base = scored.base_model
     if base is None or base.observation.numbers_per_view is not None:
         return None
@@ -312,7 +294,14 @@ def validate_in_halves(scored: Score) -> Halves | None:
         both = _HalfEvidence(information, first.vector + second.vector).fitted(sizes)[0]
         along = information @ both / max(float(both @ information @ both), 1e-300)
         shares.append(min(float(along @ half.fitted(sizes)[0]) for half in (first, second)))
-    return Halves(float(np.mean(gains)), min(1.0, len(ways) * min(p_values)), min(shares))
+    if np.mean(gains) <= 0:
+        return f"{scored.name}, found in one half of the views, does not help in the other"
+    # Bonferroni over the ways to halve. A clear effect whose form is not quite right differs a little, beyond chance:
+    # it is there all the same.
+    p_value = min(1.0, len(ways) * min(p_values))
+    if p_value < limits.HALVES_P_VALUE and min(shares) < limits.MIN_STEADINESS:
+        return f"{scored.name} has another size or sign in each half of the views (p = {p_value:.1g})"
+    return None
 
 
 def _half_evidence(base: LinearModel, explained: Array, form: Form) -> _HalfEvidence:

@@ -35,7 +35,7 @@ SMOOTH = SimpleNamespace(gain=50.0, over_noise=False)
 
 @pytest.fixture(autouse=True)
 def without_halves(monkeypatch):
-    monkeypatch.setattr(gathering, "validate_in_halves", lambda score: None)
+    monkeypatch.setattr(gathering, "objection_in_halves", lambda score: None)
     monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: HELPS)
     monkeypatch.setattr(gathering, "regime_of", lambda linear: SimpleNamespace(many_views=True))
 

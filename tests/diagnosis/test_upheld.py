@@ -19,7 +19,7 @@ def held(monkeypatch, left_out: CrossValidation) -> tuple[str, tuple[str, ...]]:
     score = SimpleNamespace(name="backlash", base_model=None)
     named = Ranked(score, adjusted=1e-3, log_posterior=5.0, posterior=0.99)
     evidence = Evidence((named,), (), alarm=True, explanation=(named,))
-    monkeypatch.setattr(gathering, "validate_in_halves", lambda score: None)
+    monkeypatch.setattr(gathering, "objection_in_halves", lambda score: None)
     monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: left_out)
     upheld = gathering.ask([gathering.does_it_hold_elsewhere], None, (), evidence)
     return upheld.verdict, upheld.notes
