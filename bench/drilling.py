@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bench.harness import Row, Table, markdown
+from bench.harness import Parts, Row, Table, markdown
 from data_synth.cells.drilling import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.cells.drilling_image import render_plate
 from stitch.errors import NoResultError
@@ -129,9 +129,9 @@ class ServoResult:
 
 def measure_hole(sensors: FlangeSensors, ranges: Array, uv: Array) -> HoleSight:
     """One measurement in the flange frame, from the rangers' readings and an image point (2,)."""
-    seen = fit_ranged_plane(sensors.rangers, ranges)
+    plane = fit_ranged_plane(sensors.rangers, ranges)
     xy = to_plane(sensors.H, np.asarray(uv)[None])[0]
-    return HoleSight(seen.normal, seen.tilt, np.append(xy, seen.height - sensors.height))
+    return HoleSight(plane.normal, plane.tilt, np.append(xy, plane.height - sensors.height))
 
 
 def align_tool_axis(T_base_tool: Array, normal: Array) -> Array:
@@ -205,13 +205,13 @@ def run_group(
         for name in references
     }
     actual = np.array([placed[name].hole for name in references])
-    found = compensate_group(np.array([nominal[name][0] for name in references]), actual)
-    positions, directions = found.apply(*(np.array([nominal[name][i] for name in targets]) for i in (0, 1)))
+    compensation = compensate_group(np.array([nominal[name][0] for name in references]), actual)
+    positions, directions = compensation.apply(*(np.array([nominal[name][i] for name in targets]) for i in (0, 1)))
     drives = {
         name: turn_upright(lambda T, name=name: measure(name, T), sensors, drive_pose(p, v))  # type: ignore[misc]
         for name, p, v in zip(targets, positions, directions, strict=True)
     }
-    return HoleGroup(placed, found, drives)
+    return HoleGroup(placed, compensation, drives)
 
 
 def turn_upright(measure: Callable[[Array], tuple[Array, Array]], sensors: FlangeSensors, T_base_tool: Array) -> Array:
@@ -227,11 +227,6 @@ def jobs(seeds: range) -> Iterator[Row]:
     for k1, plate in HIDDEN:
         yield from ({"part": "hidden", "k1": k1, "plate": plate, "seed": seed} for seed in seeds)
     yield from ({"part": "images", "seed": seed} for seed in seeds[:IMAGES])
-
-
-def trial(job: Row) -> Row:
-    """One cell of a part."""
-    return {"experiment": _experiment, "hidden": _hidden, "images": _images}[job["part"]](job)
 
 
 def _experiment(job: Row) -> Row:
@@ -271,13 +266,6 @@ def _images(job: Row) -> Row:
     truth = cell.image(np.column_stack([NINE, np.full(9, HEIGHT)]))
     errors = np.linalg.norm(to_plane(fit_homography(NINE, holes), truth) - NINE, axis=1)
     return {"off": errors.tolist(), "left_out": np.linalg.norm(leave_one_out(NINE, holes), axis=1).tolist()}
-
-
-def summary(rows: list[Row]) -> list[str]:
-    """The tables of all parts that have rows."""
-    parts = {part: [row for row in rows if row["part"] == part] for part in ("experiment", "hidden", "images")}
-    tables = {"experiment": _experiment_table, "hidden": _hidden_table, "images": _images_sentence}
-    return [line for part, table in tables.items() if parts[part] for line in [*table(parts[part]), ""]]
 
 
 def _experiment_table(rows: list[Row]) -> list[str]:
@@ -330,4 +318,11 @@ def _images_sentence(rows: list[Row]) -> list[str]:
     ]
 
 
-TABLE = Table(jobs, trial, summary, range(200), page="drilling", block="tables")
+PARTS = Parts(
+    {
+        "experiment": (_experiment, _experiment_table),
+        "hidden": (_hidden, _hidden_table),
+        "images": (_images, _images_sentence),
+    }
+)
+TABLE = Table(jobs, PARTS.trial, PARTS.summary, range(200), page="drilling", block="tables")

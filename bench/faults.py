@@ -588,8 +588,8 @@ def summary(rows: list[Row]) -> list[str]:
             f"`{command}` killed {len(group)} times: {left['old']} times the old run, {left['new']} times the new one, "
             f"{left['neither']} times neither; {failed} times the next command fails."
         )
-    told = f"Measured on {date.today()} by `python bench/run.py faults`:"
-    return [told, "", *markdown(" | ".join(["kind", "cases", *FAULTS]), lines), "", *wrong, *sentences]
+    title = f"Measured on {date.today()} by `python bench/run.py faults`:"
+    return [title, "", *markdown(" | ".join(["kind", "cases", *FAULTS]), lines), "", *wrong, *sentences]
 
 
 TABLE = Table(jobs, trial, summary, range(1), page="limits", block="measured", settings={"kills": 50})

@@ -166,8 +166,8 @@ def droop_summary(rows: list[Row]) -> list[str]:
     lines = []
     for amplitude, group in grouped(rows, "amplitude").items():
         kinds = Counter(row["kind"] for row in group)
-        told = ", ".join(f"{kind} {count}" for kind, count in kinds.items())
-        lines.append([f"{amplitude:g}", len(group), told, share(row["sigmas"] <= 3 for row in group)])
+        named = ", ".join(f"{kind} {count}" for kind, count in kinds.items())
+        lines.append([f"{amplitude:g}", len(group), named, share(row["sigmas"] <= 3 for row in group)])
     return markdown("amplitude | cells | named | hand-eye within 3 sigma", lines)
 
 

@@ -21,7 +21,7 @@ from functools import cache, partial
 import numpy as np
 
 from bench.drawn_cells import GATE, SCATTER, Cell, cell_of, shown
-from bench.harness import SHARED_DATA, Row, Table, grouped, markdown
+from bench.harness import SHARED_DATA, Parts, Row, Table, grouped, markdown
 from bench.small_cells import SCENES, scene_of
 from data_synth import kinematics
 from data_synth.fixtures.blade_cells import SCENE_OF_MOUNT, captured, disturbed
@@ -185,12 +185,6 @@ def scan_jobs(seeds: range) -> Iterator[Row]:
         yield from ({"part": "blade", "mount": mount, "seed": seed} for seed in seeds)
 
 
-def scan_trial(job: Row) -> Row:
-    """One row of a part."""
-    parts = {"objects": _object, "pairs": _pair, "together": _together}
-    return {**parts, "repeated": _repeated, "blade": _blade}[job["part"]](job)
-
-
 @cache
 def _run_of(name: str) -> RunData:
     return run(load_session(SHARED_DATA / "reghec" / name))
@@ -248,15 +242,6 @@ def _blade(job: Row) -> Row:
     }
 
 
-def scan_summary(rows: list[Row]) -> list[str]:
-    """The tables of all parts that have rows."""
-    parts = grouped(rows, "part")
-    tables = {"objects": _objects_table, "pairs": _pairs_table, "together": _together_sentence}
-    tables |= {"repeated": _repeated_table, "blade": _blade_table}
-    told = "Written by `python bench/run.py real-scans --write`; two cores."
-    return [told, "", *(line for p, table in tables.items() if p in parts for line in [*table(parts[p]), ""])]
-
-
 def _objects_table(rows: list[Row]) -> list[str]:
     lines = ([row["object"], *(f"{x:.0f}" for x in row["lengths"]), f"{row['seconds']:.1f}"] for row in rows)
     head = "object | one hand-eye, rms (µm) | held-out (µm) | after register (µm) | sensor noise (µm) | seconds"
@@ -303,4 +288,13 @@ def _blade_table(rows: list[Row]) -> list[str]:
     ]
 
 
-REAL_SCANS = Table(scan_jobs, scan_trial, scan_summary, range(20), page="results", block="scans", one_core=False)
+PARTS = Parts(
+    {
+        "objects": (_object, _objects_table),
+        "pairs": (_pair, _pairs_table),
+        "together": (_together, _together_sentence),
+        "repeated": (_repeated, _repeated_table),
+        "blade": (_blade, _blade_table),
+    }
+)
+REAL_SCANS = Table(scan_jobs, PARTS.trial, PARTS.summary, range(20), page="results", block="scans", one_core=False)

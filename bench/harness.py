@@ -46,6 +46,22 @@ class Table:
     one_core: bool = True  # False where the trials measure what all cores do
 
 
+@dataclass(frozen=True)
+class Parts:
+    """Trial and summary of a table whose jobs name the part that they belong to."""
+
+    parts: dict[str, tuple[Callable[[Row], Row], Callable[[list[Row]], list[str]]]]  # trial and table of each
+
+    def trial(self, job: Row) -> Row:
+        """Run the trial of the job's part."""
+        return self.parts[job["part"]][0](job)
+
+    def summary(self, rows: list[Row]) -> list[str]:
+        """Return the tables of all parts that have rows."""
+        groups = grouped(rows, "part")
+        return [line for part in self.parts if part in groups for line in [*self.parts[part][1](groups[part]), ""]]
+
+
 def run(table: Table, jobs: Sequence[Row], rows: Path | None = None, workers: int = 1) -> list[Row]:
     """Return a row for each job, in their order; those that stand in the file `rows` are not run again."""
     names = [json.dumps(job, sort_keys=True) for job in jobs]

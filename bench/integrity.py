@@ -341,9 +341,9 @@ def judged(good: SessionData, mistake: Mistake) -> Row:
 def mistake_summary(rows: list[Row]) -> list[str]:
     """A line a mistake."""
     cases = {case: group for case, group in grouped(rows, "case").items() if case != "nothing"}
-    told = [row for row in rows if row["case"] not in ("nothing", _BELOW)]
+    large_enough = [row for row in rows if row["case"] not in ("nothing", _BELOW)]
     lines = []
-    for case, group in {**cases, "all but those too small to be told": told}.items():
+    for case, group in {**cases, "all but those too small to be told": large_enough}.items():
         counts = [sum(bool(row[what]) for row in group) for what in ("silent", "culprit", "named")]
         lines.append([case, len(group), *counts])
     return markdown("mistake | cells | silent | culprit among those named | kind of mistake named", lines)

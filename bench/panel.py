@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from bench.harness import Row, Table, grouped, markdown
+from bench.harness import Parts, Row, Table, grouped, markdown
 from data_synth.cells import hexapod, panel_job
 from data_synth.cells.panel import NAMES, PanelCell, Sizes
 from stitch.errors import NoResultError
@@ -88,8 +88,8 @@ class ShapeRun:
 
 def measure_pose(cell: PanelMachines, setup: PanelSetup, targets: Array) -> RigidFit:
     """The panel's pose from its targets (K, 3), panel frame."""
-    seen = cell.track(targets)
-    return rigid_fit(targets, seen, setup.tracker.sigma(seen))
+    places = cell.track(targets)
+    return rigid_fit(targets, places, setup.tracker.sigma(places))
 
 
 def run_pose(cell: PanelMachines, setup: PanelSetup, targets: Array, T_base_flange: Array) -> Array:
@@ -120,8 +120,8 @@ def run_shape(
     forces: list[Array] = []
     T_target_world = frames.inverse(setup.T_world_target)
     for _ in range(_MOST_CORRECTIONS + 1):
-        seen = frames.transform(T_target_world, cell.track(control.nominal))
-        step = shape_step(seen, control, T_base_flange, contact, axes=axes)
+        places = frames.transform(T_target_world, cell.track(control.nominal))
+        step = shape_step(places, control, T_base_flange, contact, axes=axes)
         deviations.append(largest_deviations(step.deviations, control))
         forces.append(cell.forces())
         if deviations[-1].max() <= tolerance:
@@ -204,11 +204,6 @@ def jobs(seeds: range) -> Iterator[Row]:
             yield from ({"part": "drift", "leg": leg, "motion": motion, "seed": seed} for seed in range(DRIFT_CELLS))
 
 
-def trial(job: Row) -> Row:
-    """One cell of a part."""
-    return {"pose": _pose, "shape": _shape, "leg": _leg, "drift": _drift}[job["part"]](job)
-
-
 def _pose(job: Row) -> Row:
     """True errors of the panel's pose before and after one adjustment, and the largest change of force."""
     r = ready(job["seed"], sizes=Sizes(joint=job["joint"])) if job["joint"] else ready(job["seed"])
@@ -272,13 +267,6 @@ def _drift(job: Row) -> Row:
         change.append(frames.log(frames.inverse(relative[0]) @ relative[1]).tolist())
         r.cell.drive(r.T_base_flange)
     return {"change": change, "expected": [float(expected.position.max()), float(np.degrees(expected.angle.max()))]}
-
-
-def summary(rows: list[Row]) -> list[str]:
-    """The tables of all parts that have rows."""
-    parts = grouped(rows, "part")
-    tables = {"pose": _pose_table, "shape": _shape_table, "leg": _leg_table, "drift": _drift_table}
-    return [line for part, table in tables.items() if part in parts for line in [*table(parts[part]), ""]]
 
 
 def _pose_table(rows: list[Row]) -> list[str]:
@@ -357,4 +345,12 @@ def _drift_table(rows: list[Row]) -> list[str]:
     ]
 
 
-TABLE = Table(jobs, trial, summary, range(30), page="panel", block="tables")
+PARTS = Parts(
+    {
+        "pose": (_pose, _pose_table),
+        "shape": (_shape, _shape_table),
+        "leg": (_leg, _leg_table),
+        "drift": (_drift, _drift_table),
+    }
+)
+TABLE = Table(jobs, PARTS.trial, PARTS.summary, range(30), page="panel", block="tables")

@@ -86,13 +86,7 @@ class Room:
         angle, shift = off(self.read("line/hand-eye.json")["hand_eye"], self.read("line.truth.json")["hand_eye"])
         return f"off by {shift:.3f} mm and {np.degrees(angle):.4f}°"
 
-    def fitted_body(self, command: str) -> str:
-        return self._fitted("body")
-
-    def fitted_window(self, command: str) -> str:
-        return self._fitted("window")
-
-    def _fitted(self, part: str) -> str:
+    def fitted(self, command: str, part: str) -> str:
         fit = self.read(f"line/found-{part}/fit.json")["parts"][0]
         _, shift = off(fit["T_base_part"], self.read("line.truth.json")[f"T_cell_{part}"])
         return f"rms {fit['rms']:.3f} mm; pose off by {shift:.3f} mm"
@@ -120,8 +114,6 @@ class Room:
             off(solved["projection"]["T_base1_base2"], truth),
         )
         return "least squares {:.5f} rad, {:.5f} m; projection {:.5f} rad, {:.5f} m".format(*least_squares, *projection)
-
-    base_by_flanges = base_of_experiment_1
 
     def other_planes(self, command: str) -> str:
         projection = self.json(f"{command} --json")["projection"]
@@ -167,19 +159,7 @@ class Room:
     def drill_before(self, command: str) -> str:
         return _range([e for group in self.json(command)["groups"].values() for e in group["drive_errors"]], "mm")
 
-    def by_drawing_distance(self, command: str) -> str:
-        return self._trials(command, "drawing", "distance", "mm")
-
-    def by_drawing_in_plane(self, command: str) -> str:
-        return self._trials(command, "drawing", "in_plane", "mm")
-
-    def by_drawing_tilt(self, command: str) -> str:
-        return self._trials(command, "drawing", "tilt_deg", "°")
-
-    def levelled_in_plane(self, command: str) -> str:
-        return self._trials(command, "levelled", "in_plane", "mm")
-
-    def _trials(self, command: str, stage: str, what: str, unit: str) -> str:
+    def trials(self, command: str, stage: str, what: str, unit: str) -> str:
         return _range([t[what] for t in self.json(command)["trials"] if t["stage"] == stage], unit)
 
     def pin(self, command: str) -> str:
@@ -232,7 +212,7 @@ def jobs(seeds: range) -> Iterator[Row]:
 def trial(job: Row) -> Row:
     """Run the row's commands and read its figure."""
     figure = job["figure"]
-    if isinstance(figure, list):
+    if figure[0].endswith(".md"):
         page, pattern, text = figure
         match = re.search(pattern, (DOCS / page).read_text(encoding="utf-8"))
         if match is None:
@@ -242,7 +222,7 @@ def trial(job: Row) -> Row:
     for command in job["commands"]:
         if command.startswith("stitch"):
             room.run(command)
-    return {"reached": getattr(room, figure)(job["commands"][-1])}
+    return {"reached": getattr(room, figure[0])(job["commands"][-1], *figure[1:])}
 
 
 @cache

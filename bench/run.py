@@ -76,7 +76,7 @@ def main() -> None:
         settings[key] = type(settings[key])(json.loads(value) if value[:1] in "[0123456789-tf" else value)
     jobs = list(table.jobs(range(*asked.seeds) if asked.seeds else table.seeds, **settings))
     for words in asked.only:
-        jobs = [job for job in jobs if set(words.split(",")) & _values(job)]
+        jobs = [job for job in jobs if {words, *words.split(",")} & _values(job)]
     if not jobs:
         parser.error("no job is left")
     lines = table.summary(harness.run(table, jobs, asked.rows, asked.workers))

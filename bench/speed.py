@@ -212,8 +212,8 @@ def diagnose_trial(job: Row) -> Row:
         write_session(session, measured, "blade")
         commands = {"run": ["run", session, "-o", run], "diagnose": ["diagnose", run], "compare": ["compare", run]}
         costs = {name: stitch_process(*words) for name, words in commands.items()}
-        seen = float(np.mean([len(cloud.points) for cloud in measured.clouds]))
-        return {"views": len(measured.clouds), "mean": seen, "costs": costs, "sums": _sums(run, job["correspondences"])}
+        mean = float(np.mean([len(cloud.points) for cloud in measured.clouds]))
+        return {"views": len(measured.clouds), "mean": mean, "costs": costs, "sums": _sums(run, job["correspondences"])}
 
 
 def _sums(run: Path, correspondences: int) -> Row:

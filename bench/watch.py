@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-from bench.harness import SHARED_DATA, Row, Table, grouped, markdown, stitch_process
+from bench.harness import SHARED_DATA, Parts, Row, Table, grouped, markdown, stitch_process
 from data_synth.cell_history import HAND_EYE, CellHistory, CellPlan, cell_history
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.cell_records import records_of
@@ -66,11 +66,6 @@ def jobs(seeds: range, cells: int) -> Iterator[Row]:
     yield {"part": "real"}
 
 
-def trial(job: Row) -> Row:
-    """One cell, or hall of cells, of a part."""
-    return {"silence": _silence, "months": _month, "size": _size, "real": _real}[job["part"]](job)
-
-
 def _silence(job: Row) -> Row:
     """False alarms where nothing happens but a thermal cycle and noise."""
     return {"alarms": _alarms(job["hall"], job["thermal"], job["cells"])}
@@ -81,18 +76,19 @@ def _alarms(hall: int, thermal: float, cells_of_hall: int) -> int:
     plan = CellPlan(knock_day=None, growth=0.0, thermal=thermal)
     cells = [cell_history(10_000 * hall + k, plan, hall=hall) for k in range(cells_of_hall)]
     times, air = cells[0].time, cells[0].air_temperature_c
-    found, sigma = np.hstack([c.found for c in cells]), np.concatenate([c.sigma for c in cells])
+    values = np.hstack([c.found for c in cells])
+    sigma = np.concatenate([c.sigma for c in cells])
     covariates = regressors(times, (air - air[0])[:, None], _CHANNELS)
     still = (tracking.MEMBERS[tracking.STILL], tracking.MEMBERS[tracking.STEADY])
     bank = tracking.with_parameters(
-        tracking.empty_bank(covariates.shape[1], still), found[0], sigma, regressor_prior_sigmas(_CHANNELS), still
+        tracking.empty_bank(covariates.shape[1], still), values[0], sigma, regressor_prior_sigmas(_CHANNELS), still
     )
-    charts, limit, alarms = tracking.empty_charts(found.shape[1]), tracking.chart_limits(RUN_LENGTH, _PARAMETERS), 0
-    sloped = np.zeros(found.shape[1], bool)
+    charts, limit, alarms = tracking.empty_charts(values.shape[1]), tracking.chart_limits(RUN_LENGTH, _PARAMETERS), 0
+    sloped = np.zeros(values.shape[1], bool)
     days = np.diff(times, prepend=times[0]) / DAY_SECONDS
     for k in range(len(times)):
         bank, innovations = tracking.updated_bank(
-            tracking.predicted_bank(bank, days[k]), found[k], sigma, covariates[k]
+            tracking.predicted_bank(bank, days[k]), values[k], sigma, covariates[k]
         )
         charts = tracking.updated_charts(charts, innovations)
         odds = tracking.slope_odds(bank, 0, 1) / tracking.odds_limit(_PARAMETERS)
@@ -233,20 +229,13 @@ def _later(session: SessionData, times: np.ndarray) -> list[list[str]]:
 def joints_off(session: SessionData, times: np.ndarray, low: float, high: float) -> float:
     """Median distance in the space of the joints, degrees, to the nearest other pose of the first two hours."""
     joints = np.degrees(np.array([view.joints for view in session.views]))
-    early, own = (joints[(times >= a * HOUR) & (times < b * HOUR)] for a, b in ((0, 2), (low, high)))
+    early, later = (joints[(times >= a * HOUR) & (times < b * HOUR)] for a, b in ((0, 2), (low, high)))
     nearest = 2 if low == 0 else 1
-    return float(np.median(cKDTree(early).query(own, k=[nearest])[0]))
+    return float(np.median(cKDTree(early).query(later, k=[nearest])[0]))
 
 
 def _some(index: np.ndarray) -> np.ndarray:
     return index[np.unique(np.linspace(0, len(index) - 1, 2 * POSES).astype(int))]
-
-
-def summary(rows: list[Row]) -> list[str]:
-    """The tables of all parts that have rows."""
-    parts = grouped(rows, "part")
-    tables = {"silence": _silence_table, "months": _months_table, "size": _size_table, "real": _real_tables}
-    return [line for part, table in tables.items() if part in parts for line in [*table(parts[part]), ""]]
 
 
 def _silence_table(rows: list[Row]) -> list[str]:
@@ -256,9 +245,9 @@ def _silence_table(rows: list[Row]) -> list[str]:
         low, high = chi2.ppf([0.025, 0.975], [2 * alarms or 1, 2 * alarms + 2]) / 2 / months * 100
         interval = f"{low if alarms else 0:.2f} to {high:.2f}"
         lines.append([f"{thermal:g}", f"{months:,}", alarms, f"{100 * alarms / months:.2f}", interval])
-    told = "**Nothing happens**: false alarms in months of 600 sessions; the limits are for one in 200"
+    title = "**Nothing happens**: false alarms in months of 600 sessions; the limits are for one in 200"
     head = "thermal cycle, sigmas | cell-months | false alarms | in 100 cell-months | 95 % interval"
-    return [told, "", *markdown(head, lines)]
+    return [title, "", *markdown(head, lines)]
 
 
 def _months_table(rows: list[Row]) -> list[str]:
@@ -279,8 +268,8 @@ def _months_table(rows: list[Row]) -> list[str]:
         )
     head = "growth from | onset of the knock off by (worst) | knock seen with session (median, worst)"
     head += " | growth seen after days (median, worst) | named a drift | other names | coverage of 95 %"
-    told = f"**A month** of 20 sessions a day, knock on day 17, {len(cells)} cells each"
-    return [told, "", *markdown(f"{head} | without the common part", lines)]
+    title = f"**A month** of 20 sessions a day, knock on day 17, {len(cells)} cells each"
+    return [title, "", *markdown(f"{head} | without the common part", lines)]
 
 
 def _size_table(rows: list[Row]) -> list[str]:
@@ -289,9 +278,9 @@ def _size_table(rows: list[Row]) -> list[str]:
         more = f"{np.median(row['costs']):.0f}, {max(row['costs']):.0f}"
         rest = [f"{row['reported']:.2f}", f"{row['page']:.2f}", f"{row['size']:.1f}"]
         lines.append([f"{row['sessions']:,}", more, *rest])
-    told = "**Growing histories** of 12 parameters, one processor"
+    title = "**Growing histories** of 12 parameters, one processor"
     head = "sessions | one more, ms (median, most) | report, s | page with drawings, s | file, MB"
-    return [told, "", *markdown(head, lines)]
+    return [title, "", *markdown(head, lines)]
 
 
 def _real_tables(rows: list[Row]) -> list[str]:
@@ -310,7 +299,17 @@ def _real_tables(rows: list[Row]) -> list[str]:
     ]
 
 
-TABLE = Table(jobs, trial, summary, range(HALLS), page="watch", block="tables", settings={"cells": CELLS_OF_HALL})
+PARTS = Parts(
+    {
+        "silence": (_silence, _silence_table),
+        "months": (_month, _months_table),
+        "size": (_size, _size_table),
+        "real": (_real, _real_tables),
+    }
+)
+TABLE = Table(
+    jobs, PARTS.trial, PARTS.summary, range(HALLS), page="watch", block="tables", settings={"cells": CELLS_OF_HALL}
+)
 
 
 def speed_jobs(seeds: range, sessions: int) -> Iterator[Row]:

@@ -18,7 +18,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from bench.harness import Row, Table, grouped, markdown
+from bench.harness import Parts, Row, Table, grouped, markdown
 from data_synth.cells import window_scans, window_views
 from data_synth.cells.window_line import EXACT, Errors, WindowLine
 from data_synth.cells.window_line_job import write_line, write_seam
@@ -65,11 +65,6 @@ def jobs(seeds: range) -> Iterator[Row]:
     for case in CASES:
         yield from ({"part": "fit", "case": case, "seed": seed} for seed in seeds)
     yield from ({"part": "seam", "seed": seed} for seed in seeds)
-
-
-def trial(job: Row) -> Row:
-    """One turn of the part."""
-    return _fit(job) if job["part"] == "fit" else _seam(job)
 
 
 def _fit(job: Row) -> Row:
@@ -146,13 +141,6 @@ def _seam(job: Row) -> Row:
     }
 
 
-def summary(rows: list[Row]) -> list[str]:
-    """The tables of both parts that have rows."""
-    parts = grouped(rows, "part")
-    tables = {"fit": _fit_table, "seam": _seam_table}
-    return [line for part, table in tables.items() if part in parts for line in [*table(parts[part]), ""]]
-
-
 def _fit_table(rows: list[Row]) -> list[str]:
     lines = []
     for case, group in grouped(rows, "case").items():
@@ -161,8 +149,8 @@ def _fit_table(rows: list[Row]) -> list[str]:
         lines.append([case, f"{start:.2f}", f"{end:.4f}", f"{rms:.3f}", f"{share:.0%}"])
     lines.append(["published: body / window", "", "", "1.052 / 0.573", ""])
     head = "part | start / mm | after the fit, largest / mm | rms of distances / mm | share that counts"
-    told = f"Furthest that the pose's error moves any point of the part, {len(group)} turns of it; noise {NOISE} mm."
-    return [told, "", *markdown(head, lines)]
+    title = f"Furthest that the pose's error moves any point of the part, {len(group)} turns of it; noise {NOISE} mm."
+    return [title, "", *markdown(head, lines)]
 
 
 def _seam_table(rows: list[Row]) -> list[str]:
@@ -192,7 +180,8 @@ def _seam_table(rows: list[Row]) -> list[str]:
     ]
 
 
-TABLE = Table(jobs, trial, summary, range(3), page="window", block="tables")
+PARTS = Parts({"fit": (_fit, _fit_table), "seam": (_seam, _seam_table)})
+TABLE = Table(jobs, PARTS.trial, PARTS.summary, range(3), page="window", block="tables")
 
 
 def line_jobs(seeds: range, keep: str) -> Iterator[Row]:

@@ -102,8 +102,8 @@ def _source_page(path: Path) -> str:
 
 
 def _first_line(file: Path) -> str:
-    found = re.match(r'"""(.*?)(?:"""|\n)', file.read_text(encoding="utf-8")) if file.is_file() else None
-    return found[1].replace("|", "\\|") if found else ""
+    match = re.match(r'"""(.*?)(?:"""|\n)', file.read_text(encoding="utf-8")) if file.is_file() else None
+    return match[1].replace("|", "\\|") if match else ""
 
 
 def _all_sources(linked: list[str]) -> str:
@@ -148,8 +148,8 @@ Made from the library: `stitch effects` lists the same. What the places mean and
 def python_page() -> str:
     """What `import stitch` offers."""
     names = "\n\n".join(f"::: {module}.{name}" for name, module in MODULES.items())
-    told = "Made from the docstrings of what `import stitch` offers; frames and units: [glossary](glossary.md)."
-    return f"# Every name of Python\n\n{told} How they work together: [python](python.md).\n\n{names}\n"
+    text = "Made from the docstrings of what `import stitch` offers; frames and units: [glossary](glossary.md)."
+    return f"# Every name of Python\n\n{text} How they work together: [python](python.md).\n\n{names}\n"
 
 
 def _sizes(effect: stitch.effects.contract.Effect) -> str:
