@@ -129,7 +129,7 @@ def group_share(linear: LinearModel, group: Sequence[Score]) -> tuple[float, flo
     precision = np.concatenate([np.zeros(a), *(_precision_of_sizes(linear, scored)[a:] for scored in group)])
     trial = linear.trial(np.hstack([linear.design, *(scored.form.response for scored in group)]))
     priors = [CoefficientPrior(p, np.zeros(len(p))) for p in (precision, np.zeros(a))]
-    folds = linear.observation.folds()
+    folds = linear.observation.folds
     scatter = [[trial.scatter(fold, x) for x in trial.solve_each(priors, fold)] for fold in folds]
     return mean_square_share(*np.array(scatter).reshape(-1, 2).T)
 
@@ -149,7 +149,7 @@ def _squares_by_fold(linear: LinearModel, scored: Score) -> tuple[LinearTrial, A
     precisions = (_precision_of_sizes(linear, scored), np.zeros(linear.design.shape[1]))
     priors = [CoefficientPrior(precision, np.zeros(len(precision))) for precision in precisions]
     squares, scatter = [], []
-    for fold in linear.observation.folds():
+    for fold in linear.observation.folds:
         affected = linear.observation.affected_squares(fold)
         without = trial.solve_each(priors, fold)
         squares.append([trial.squares(x, affected).sum() for x in without])

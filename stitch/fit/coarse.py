@@ -2,7 +2,7 @@
 
 Candidates come from two independent ideas: (1) the centroids of the clouds as crude labelled points
 of one fixed target, minimised from many starting rotations (`centroid_hand_eyes`); (2) relative scan motions
-against the robot's (AX = XB, five solvers; `motion_candidates`): neighbouring views are registered by features (FPFH,
+against the robot's (AX = XB, two solvers; `motion_candidates`): neighbouring views are registered by features (FPFH,
 RANSAC; Rusu et al. 2009), a stream of scans in small steps by KISS-ICP's odometry (Vizzo et al. 2023). Every candidate
 is then closed in on the scans at low resolution, and the consistency of the whole set decides: the truncated mean
 square distance between all views that ought to meet. Objects without features (sphere, cone, plane) pass the same way.

@@ -2,9 +2,9 @@
 
     z = A·α + noise,   cov(noise) = Σ_i λ_i C_i
 
-z are the numbers that were seen (channel), A what hand-eye, landmarks and effects in use do to them. An observation
-says how its own coordinates (responses: twists of the views, or rows of targets) become numbers of the channel, how
-a model with further columns is tried, and which views may be left out. A further kind is a subclass of `Rows`
+z are the numbers that were seen (reduced observations), A what hand-eye, landmarks and effects in use do to them. An
+observation says how its own coordinates (responses: twists of the views, or rows of targets) are reduced to them, how a
+model with further columns is tried, and which views may be left out. A further kind is a subclass of `Rows`
 (`rows.py`) where every view has numbers of its own; nothing of diagnosis changes.
 """
 
@@ -274,12 +274,9 @@ class Observation(ABC):
     def affected_squares(self, views: Indices) -> Mask:
         """(units,) which squares of a trial some views have a part in."""
 
+    @cached_property
     def folds(self) -> list[Indices]:
         """Groups of views to leave out."""
-        return self._folds
-
-    @cached_property
-    def _folds(self) -> list[Indices]:
         return grouped_folds(self.T_base_flange, self.reach)
 
     def joint_ends(self, joints: Array) -> list[JointEnd]:
@@ -344,16 +341,17 @@ class LinearModel(ErrorModel):
         """Per set of columns (n, P) of the channel what the views tell of their coefficients θ beside the model: (P, P)
         and (P,) of the log likelihood vᵀθ − ½ θᵀIθ."""
         kept = self.mixed.common is not None and self.mixed.sums.are_kept
-        if kept and all(own.keep is not None for own in columns):
+        if kept and all(selected.keep is not None for selected in columns):
             yield from map(self._own_information.of, columns)
             return
         for start in range(0, len(columns), _SETS_AT_ONCE):
-            portion = [own.columns for own in columns[start : start + _SETS_AT_ONCE]]
+            portion = [selected.columns for selected in columns[start : start + _SETS_AT_ONCE]]
             white = self.whiten(np.hstack(portion))
-            explained, vector = self._explained.T @ white, white.T @ self.white_residual
-            ends = np.cumsum([0, *(own.shape[1] for own in portion)])
-            for own in map(slice, ends[:-1], ends[1:]):
-                yield white[:, own].T @ white[:, own] - explained[:, own].T @ explained[:, own], vector[own]
+            explained = self._explained.T @ white
+            vector = white.T @ self.white_residual
+            ends = np.cumsum([0, *(X.shape[1] for X in portion)])
+            for at in map(slice, ends[:-1], ends[1:]):
+                yield white[:, at].T @ white[:, at] - explained[:, at].T @ explained[:, at], vector[at]
 
     @cached_property
     def _own_information(self) -> ModelInformation:

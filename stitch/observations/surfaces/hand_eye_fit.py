@@ -1,9 +1,14 @@
-"""The hand-eye and the effects in use from freed views: generalised least squares, covariance, held-out error.
+"""The hand-eye and the effects in use from free-network views: generalised least squares, covariance, held-out error.
 
 No number of points averages out the error of a pose: views are the samples, and they weigh by the scatter that they
-show, so that what remains is as small as it can be. What an arm does wrong it does again: no number of views averages
-that out. `pose_errors.py` says how poses may err, the views say how much, and that is what the covariance of hand-eye
-and effects counts. Errors of the scanner that repeat in every view come on top.
+show, so that what remains is as small as it can be. The per-view twists δ̂ (`view_poses.py`) are reduced to the
+directions that the overlaps can see, z, with covariance σ_r² T_r + σ_t² T_t + c σ² H⁺: rotation and translation scatter
+of the flange, and a factor on the noise within overlaps, whose errors are correlated; restricted maximum likelihood
+tells the three (Patterson & Thompson 1971, Harville 1977).
+
+What an arm does wrong it does again: no number of views averages that out. `pose_errors.py` says how poses may err, the
+views say how much, and that is what the covariance of hand-eye and effects counts. Errors of the scanner that repeat in
+every view come on top.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,30 +38,14 @@ from stitch.observations.surfaces.normal_equations import Gram, pair_squares
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.session.capture import Capture
 
-# How far the robot's poses scatter: restricted maximum likelihood on per-view pose estimates.
-#
-# The points of one view share that view's pose error, so evidence counts in views. The per-view
-# twists δ̂ (`view_poses.py`) are reduced to the directions the overlaps can see, z, with covariance
-# σ_r² T_r + σ_t² T_t + c σ² H⁺ (rotation and translation scatter of the flange, and a factor on the
-# noise within overlaps, whose errors are correlated). Patterson & Thompson (1971), Harville (1977).
-
+# Errors of the scanner that all views repeat, by their name among the sources of the hand-eye's variance.
+SCANNER_FIELD, SCANNER_SCALE = "scanner field", "scanner scale"
+# White scatter of more numbers is known well enough to take its maximum.
+_PLUG_IN = 300
 # Combinations of hand-eye and effects weaker than this share of the strongest are unobservable.
 _OBSERVABLE_SHARE = 1e-6
 # Precision along what the motions do not show, over that of the weak prior: it stays where it is.
 _HELD = 1e12
-
-
-@dataclass(frozen=True)
-class ReducedPoses:
-    """What overlaps and common targets say about the poses of the views, reduced to n visible directions."""
-
-    reduction: Array  # (n, 6V) from twists of the views to visible directions
-    expansion: Array  # (6V, n) back to the shortest twists, a radian as long as what it moves at the part
-    z: Array  # (n,) observed twists, reduction @ twists
-    hand_eye: Array  # (n, 6) response to the hand-eye's ξ
-    rotation: Array  # (n, n) covariance of a unit rotation scatter of the flange
-    translation: Array  # (n, n) the same for translation
-    noise: Array  # (n, n) covariance of the sensor noise within overlaps
 
 
 @dataclass(frozen=True)
@@ -73,92 +62,22 @@ class Repeatability:
     noise_factor: float
 
 
-def hand_eye_jacobian(hand_eye_frames: Array, centre: Array) -> Array:
-    """(6V, 6): left twists of the views about `centre` for a right perturbation of the hand-eye."""
-    return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ hand_eye_frames)))
+@dataclass(frozen=True)
+class ReducedPoses:
+    """What overlaps and common targets say about the poses of the views, reduced to n visible directions."""
 
-
-def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_flange: Array) -> ReducedPoses:
-    """Reduce per-view twists to the directions that the overlaps see.
-
-    Args:
-        g: normal equations about the part's centre, at the freed poses.
-        twists: (V, 6) about that centre, from the model's poses to the freed ones.
-        hand_eye_frames: (V, 4, 4) whose adjoint carries a perturbation of the hand-eye into the reference frame.
-        T_reference_flange: (V, 4, 4) carries a twist of the flange into the reference frame: identity
-            for eye_to_hand, T_base_flange for eye_in_hand.
-    """
-    seen = g.visible
-    left = seen.vectors.T / seen.scale
-    to_centre = frames.make(np.eye(3), -g.centre)
-    response = left @ hand_eye_jacobian(hand_eye_frames, g.centre)
-    carried = frames.adjoint(to_centre @ T_reference_flange)
-    # Covariances of the visible directions for independent unit turns and shifts of every view's flange.
-    blocks = left.reshape(len(left), -1, 6).transpose(1, 0, 2) @ carried
-    rotation, translation = summed_squares(blocks[..., :3]), summed_squares(blocks[..., 3:])
-    expansion = seen.scale[:, None] * seen.vectors
-    z, noise = left @ twists.reshape(-1), np.diag(g.variance / seen.values)
-    return ReducedPoses(left, expansion, z, response, rotation, translation, noise)
-
-
-def hand_eye_mixed_model(channel: ReducedPoses, further: Array | None = None) -> MixedModel:
-    """The channel as one block; the hand-eye, and `further` columns (n, K), are the free mean."""
-    mean = channel.hand_eye if further is None else np.column_stack([channel.hand_eye, further])
-    components = np.array([channel.rotation, channel.translation, channel.noise])[:, None]
-    return MixedModel(channel.z[None], mean_basis(mean)[None], components)
-
-
-def mean_basis(columns: Array) -> Array:
-    """(n, r) orthonormal basis of the mean's columns (n, K), less what the views cannot tell apart."""
-    return column_space(columns, _OBSERVABLE_SHARE)
-
-
-def estimate_repeatability(channel: ReducedPoses, further: Array | None = None) -> Repeatability:
-    """REML of (σ_r, σ_t, c); the hand-eye, and `further` columns (n, K), are the unknown mean."""
-    return repeatability_from(fit_variances(hand_eye_mixed_model(channel, further), both_starts=True).variances)
-
-
-def repeatability_from(variances: Array) -> Repeatability:
-    """Standard deviations (rad, length_unit) and noise factor from the three variances (3,)."""
-    return Repeatability(float(np.sqrt(variances[0])), float(np.sqrt(variances[1])), float(variances[2]))
-
-
-def pose_covariance(channel: ReducedPoses, scatter: Repeatability) -> Array:
-    """(n, n) covariance of the channel's z."""
-    return (
-        scatter.rotation**2 * channel.rotation
-        + scatter.translation**2 * channel.translation
-        + scatter.noise_factor * channel.noise
-    )
-
-
-def whiten_captures(
-    sessions: Sequence[tuple[Capture, UnconstrainedPoses, Array]], T_mount: Array, values: Array, free: Mask
-) -> WhitenedData:
-    """All captures of a rig in units of their pose scatter, stacked.
-
-    Args:
-        sessions: per capture its freed views and the twists (6V, P) of the effects.
-        values: (P,) of the effects at which the views were freed; z is what was seen without them.
-        free: (P,) effects that explain scatter.
-    """
-    out = []
-    for capture, f, extra in sessions:
-        channel = reduce_poses(f.overlaps.gram, f.twists, capture.hand_eye_frames(T_mount), capture.T_reference_flange)
-        further = channel.reduction @ extra
-        half = np.linalg.cholesky(pose_covariance(channel, estimate_repeatability(channel, further[:, free])))
-        stack = np.column_stack([channel.hand_eye, further, channel.z + further @ values])
-        out.append(np.linalg.solve(half, stack))
-    everything = np.concatenate(out)
-    return WhitenedData(everything[:, :6], everything[:, 6:-1], everything[:, -1])
-
-
-# What one capture says about hand-eye and effects: its pairs, its freed views, and both without some views.
+    reduction: Array  # (n, 6V) from twists of the views to visible directions
+    expansion: Array  # (6V, n) back to the shortest twists, a radian as long as what it moves at the part
+    z: Array  # (n,) observed twists, reduction @ twists
+    hand_eye: Array  # (n, 6) response to the hand-eye's ξ
+    rotation: Array  # (n, n) covariance of a unit rotation scatter of the flange
+    translation: Array  # (n, n) the same for translation
+    noise: Array  # (n, n) covariance of the sensor noise within overlaps
 
 
 @dataclass(frozen=True)
 class CaptureEvidence:
-    """One capture's pairs and freed views."""
+    """What one capture says about hand-eye and effects: its pairs and its free-network views."""
 
     capture: Capture
     gram: Gram
@@ -168,19 +87,16 @@ class CaptureEvidence:
 
     @cached_property
     def reduced_poses(self) -> ReducedPoses:
-        """The visible directions of the freed views."""
+        """The visible directions of the views."""
         return reduce_poses(self.gram, self.twists, self.hand_eye_frames, self.capture.T_reference_flange)
 
     @property
     def effect_columns(self) -> Array | None:
-        """(n, P) the effects' columns in the channel; None without effects."""
+        """(n, P) the effects' columns; None without effects."""
         return self.reduced_poses.reduction @ self.effect_twists if self.effect_twists.shape[1] else None
 
-    def folds(self) -> list[Indices]:
-        """Groups of views to leave out."""
-        return grouped_folds(self.capture.T_base_flange, max(self.gram.lever, 1e-9))
-
     def without(self, views: Indices) -> "CaptureEvidence":
+        """Return the same without some views."""
         g = self.gram
         keep = np.asarray(~np.isin(g.pairs, views).any(axis=1))
         number = np.cumsum(~np.isin(np.arange(g.views), views)) - 1
@@ -189,59 +105,54 @@ class CaptureEvidence:
             gram=replace(g.only(keep), views=g.views - len(views), pairs=number[g.pairs[keep]]),
             twists=np.delete(self.twists, views, 0),
             hand_eye_frames=np.delete(self.hand_eye_frames, views, 0),
-            effect_twists=self.drop_views(self.effect_twists, views),
+            effect_twists=np.delete(self.effect_twists, (6 * views[:, None] + np.arange(6)).ravel(), axis=0),
         )
 
     def squares(self, views: Indices, corrections: Sequence[Array]) -> Array:
-        """Σ w e² of the pairs of some views with the robot's poses and each correction (6 + P,)."""
+        """Return Σ w e² of the pairs of some views with the robot's poses and each correction (6 + P,)."""
         touched = np.isin(self.gram.pairs, views).any(axis=1)
         J = np.column_stack([hand_eye_jacobian(self.hand_eye_frames, self.gram.centre), self.effect_twists])
         moved = [(J @ x).reshape(-1, 6) - self.twists for x in corrections]
         return np.array([pair_squares(self.gram, m)[touched].sum() for m in moved])
 
-    @staticmethod
-    def drop_views(rows: Array, views: Indices) -> Array:
-        """Rows (6V, ·) of twists without those of some views."""
-        return np.delete(rows, (6 * views[:, None] + np.arange(6)).ravel(), axis=0)
-
-
-# The freed views of all sessions of a rig as one mixed model: hand-eye and effects beside errors of the poses.
-
 
 @dataclass(frozen=True)
 class RigModel:
-    """N visible directions of all sessions; 6 + P unknowns."""
+    """The views of all sessions of a rig: N visible directions, 6 + P unknowns."""
 
     parts: Sequence[CaptureEvidence]
-    z: Array  # (N,)
-    columns: Array  # (N, 6 + P) of hand-eye and effects
+
+    @cached_property
+    def z(self) -> Array:
+        """(N,) what was seen."""
+        return np.concatenate([e.reduced_poses.z for e in self.parts])
+
+    @cached_property
+    def columns(self) -> Array:
+        """(N, 6 + P) of hand-eye and effects."""
+        reduced = [(e.reduced_poses, e.effect_twists) for e in self.parts]
+        return np.concatenate([np.column_stack([r.hand_eye, r.reduction @ twists]) for r, twists in reduced])
 
     def fit_gls(self, scatter: Sequence[Repeatability], prior: Array) -> GeneralisedFit:
-        """Generalised least squares under the scatter of every session alone, with a prior (6 + P, 6 + P)."""
+        """Return generalised least squares under every session's scatter alone, with a prior (6 + P, 6 + P)."""
         noise = [pose_covariance(e.reduced_poses, s) for e, s in zip(self.parts, scatter, strict=True)]
         return generalised_fit(block_diag(*noise), self.columns, prior)
 
     def mixed(self, errors: PoseErrors) -> MixedModel:
-        """All sessions as one block: what the arm does wrong it does wrong in all of them."""
-        channels = [e.reduced_poses for e in self.parts]
-        own = zip(*((c.rotation, c.translation, c.noise) for c in channels), strict=True)
-        R = block_diag(*(c.reduction for c in channels))
-        components = np.array([*(block_diag(*c) for c in own), *(R @ C @ R.T for C in errors.components)])
-        mean = mean_basis(self.columns)
-        return MixedModel(self.z[None], mean[None], components[:, None], further=errors.prior)
+        """Return all sessions as one block: what the arm does wrong it does wrong in all of them."""
+        reduced = [e.reduced_poses for e in self.parts]
+        white = (
+            block_diag(*(r.rotation for r in reduced)),
+            block_diag(*(r.translation for r in reduced)),
+            block_diag(*(r.noise for r in reduced)),
+        )
+        R = block_diag(*(r.reduction for r in reduced))
+        components = np.array([*white, *(R @ C @ R.T for C in errors.components)])
+        return MixedModel(self.z[None], mean_basis(self.columns)[None], components[:, None], further=errors.prior)
 
     def reduce(self, twists: Sequence[Array]) -> Array:
-        """(N, K) visible directions of twists (6V, K) of every session."""
+        """Return the visible directions (N, K) of twists (6V, K) of every session."""
         return np.concatenate([e.reduced_poses.reduction @ t for e, t in zip(self.parts, twists, strict=True)])
-
-
-def stack_captures(parts: Sequence[CaptureEvidence]) -> RigModel:
-    """All sessions stacked."""
-    columns = [np.column_stack([e.reduced_poses.hand_eye, e.reduced_poses.reduction @ e.effect_twists]) for e in parts]
-    return RigModel(parts, np.concatenate([e.reduced_poses.z for e in parts]), np.concatenate(columns))
-
-
-# The linear problem of hand-eye and effects over freed views, and its answer without the statistics.
 
 
 @dataclass(frozen=True)
@@ -257,7 +168,6 @@ class FittedEffects:
 class HandEyeSolution:
     """The linear problem of hand-eye and effects, and its answer x (6 + P,)."""
 
-    parts: list[CaptureEvidence]
     rig: RigModel
     scatter: tuple[Repeatability, ...]
     prior: Array  # (6 + P, 6 + P) precision
@@ -267,82 +177,6 @@ class HandEyeSolution:
     values: Array  # (P,) of the effects at which it was made
     hidden: Array  # (6, m) twists of the hand-eye that the motions do not show, one sigma of the weak prior each
     T_mount: Array  # (4, 4) where it leads
-
-
-def solve_hand_eye(
-    captures: Sequence[Capture],
-    unconstrained: Sequence[UnconstrainedPoses],
-    T_mount: Array,
-    columns: FittedEffects | None = None,
-) -> HandEyeSolution:
-    """Views weigh by the scatter that they show; arguments as of `fit_hand_eye`."""
-    columns = columns or FittedEffects(
-        tuple(np.zeros((6 * len(f.poses), 0)) for f in unconstrained), np.zeros(0), np.zeros(0)
-    )
-    parts = [
-        CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), extra)
-        for c, f, extra in zip(captures, unconstrained, columns.twists, strict=True)
-    ]
-    rig, scatter = (
-        stack_captures(parts),
-        tuple(estimate_repeatability(e.reduced_poses, e.effect_columns) for e in parts),
-    )
-    prior = weak_prior(captures, unconstrained, T_mount, columns.prior)
-    hidden = _hidden_twists(captures, T_mount, prior)
-    held = prior.copy()
-    held[:6, :6] += _HELD * prior[:6, :6] @ hidden @ hidden.T @ prior[:6, :6]
-    pull = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
-    weighed = rig.fit_gls(scatter, held)
-    x = weighed.solve(rig.z, pull)
-    return HandEyeSolution(
-        parts=parts,
-        rig=rig,
-        scatter=scatter,
-        prior=held,
-        prior_vector=pull,
-        gls=weighed,
-        x=x,
-        values=columns.values,
-        hidden=hidden,
-        T_mount=T_mount @ frames.exp(x[:6]),
-    )
-
-
-def _hidden_twists(captures: Sequence[Capture], T_mount: Array, prior: Array) -> Array:
-    """Return twists (6, m) of the hand-eye, one sigma of the prior each, across those that the motions show."""
-    sigma = np.diag(prior)[:6] ** -0.5
-    visible = visible_twists(captures, T_mount, seen_part(captures)) / sigma[:, None]
-    return sigma[:, None] * null_space(visible.T, rcond=1e-9)
-
-
-def step_hand_eye(
-    captures: Sequence[Capture], unconstrained: Sequence[UnconstrainedPoses], T_mount: Array
-) -> tuple[Array, tuple[Repeatability, ...]]:
-    """T_mount (4, 4) as `fit_hand_eye` finds it, without its statistics, and how the poses scatter per capture."""
-    found = solve_hand_eye(captures, unconstrained, T_mount)
-    return found.T_mount, found.scatter
-
-
-def weak_prior(
-    captures: Sequence[Capture], unconstrained: Sequence[UnconstrainedPoses], T_mount: Array, effects: Array
-) -> Array:
-    """Precision of one radian and one working distance: keeps the unseen finite, moves nothing else.
-
-    Args:
-        effects: (P,) standard deviations of the prior of effects fitted with the hand-eye.
-    """
-    ranges = [
-        np.linalg.norm(frames.transform(frames.inverse(c.poses(T_mount)), f.overlaps.gram.centre[None]), axis=-1)
-        for c, f in zip(captures, unconstrained, strict=True)
-    ]
-    distance = float(np.median(np.concatenate(ranges)))
-    return np.diag(np.concatenate([[1.0] * 3, [distance**-2.0] * 3, effects**-2.0]))
-
-
-# Errors of the scanner that all views repeat, by their name among the sources of the hand-eye's variance.
-SCANNER_FIELD, SCANNER_SCALE = "scanner field", "scanner scale"
-# White scatter of more numbers is known well enough to take its maximum.
-_PLUG_IN = 300
 
 
 @dataclass(frozen=True)
@@ -378,7 +212,7 @@ def fit_hand_eye(
     errors: PoseErrors | None = None,
     solved: HandEyeSolution | None = None,
 ) -> HandEyeFit:
-    """Generalised least squares over the pose channels of all captures; covariance under all errors of the poses.
+    """Return generalised least squares over the reduced poses of all captures, covariance under all their errors.
 
     Args:
         unconstrained: per capture the views moved by the overlaps alone, from the poses under `T_mount`.
@@ -388,97 +222,239 @@ def fit_hand_eye(
             errors that all views and captures have in common; they widen the covariance and change nothing else.
         errors: how the poses may err beside white scatter; None: they do not. What joints do anew is not counted: on
             average the scatter of the flange that views show holds it already.
-        solved: what `solve_hand_eye` finds of the same, if it is at hand.
+        solved: what `solve_hand_eye` returns of the same, if it is at hand.
     """
-    found = solved or solve_hand_eye(captures, unconstrained, T_mount, columns)
+    solution = solved or solve_hand_eye(captures, unconstrained, T_mount, columns)
     errors = errors or white_scatter_only(sum(len(f.poses) for f in unconstrained))
-    sources = _variance_sources(found, errors.restricted(errors.causes - {JOINT_SCATTER}), scanner_errors or {})
+    repeating = errors.restricted(errors.causes - {JOINT_SCATTER})
+    sources = _variance_sources(solution, repeating, scanner_errors or {})
     covariance = np.sum(list(sources.values()), axis=0)
-    log_ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(found.gls.covariance)[1]
+    log_ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(solution.gls.covariance)[1]
     # Held where they are, the hidden directions are no better known than before.
-    sources["unseen"][:6, :6] += found.hidden @ found.hidden.T
-    covariance[:6, :6] += found.hidden @ found.hidden.T
+    sources["unseen"][:6, :6] += solution.hidden @ solution.hidden.T
+    covariance[:6, :6] += solution.hidden @ solution.hidden.T
     return HandEyeFit(
-        T_mount=found.T_mount,
+        T_mount=solution.T_mount,
         covariance=covariance[:6, :6],
         inflation=float(max(1.0, np.exp(log_ratio / len(covariance)))),
-        repeatability=found.scatter,
-        heldout_ratio=_heldout_ratio(found.parts, found.scatter, (found.prior, found.prior_vector), found.x),
-        degrees=len(found.rig.z) - mean_basis(found.rig.columns).shape[1],
+        repeatability=solution.scatter,
+        heldout_ratio=_heldout_ratio(solution),
+        degrees=len(solution.rig.z) - mean_basis(solution.rig.columns).shape[1],
         rotation_shares=_source_shares(sources, slice(0, 3)),
         position_shares=_source_shares(sources, slice(3, 6)),
-        values=found.values + found.x[6:],
+        values=solution.values + solution.x[6:],
         values_covariance=covariance[6:, 6:],
     )
 
 
 def _variance_sources(
-    found: HandEyeSolution, errors: PoseErrors, scanner_errors: Mapping[str, Sequence[Array]]
+    solution: HandEyeSolution, errors: PoseErrors, scanner_errors: Mapping[str, Sequence[Array]]
 ) -> dict[str, Array]:
-    """What each source does to the covariance (6 + P, 6 + P)."""
-    rig, weighed = found.rig, found.gls
+    """Return what each source does to the covariance (6 + P, 6 + P)."""
+    rig, gls = solution.rig, solution.gls
     mixed = rig.mixed(errors)
-    sizes = fit_variances(mixed, both_starts=True)
-    mean = sizes.variances if not errors.names and mixed.size > _PLUG_IN else mean_variances(mixed, sizes)
-    names = (*WHITE_COMPONENTS, *errors.names)
-    components = zip(names, mean, mixed.components[:, 0], strict=True)
-    sources = {name: size * weighed.gain @ C @ weighed.gain.T for name, size, C in components}
+    fit = fit_variances(mixed, both_starts=True)
+    mean = fit.variances if not errors.names and mixed.size > _PLUG_IN else mean_variances(mixed, fit)
+    components = zip((*WHITE_COMPONENTS, *errors.names), mean, mixed.components[:, 0], strict=True)
+    sources = {name: variance * gls.gain @ C @ gls.gain.T for name, variance, C in components}
     for name, twists in scanner_errors.items():
-        errors_seen = rig.reduce(twists)
-        repeated = weighed.gain @ errors_seen
+        columns = rig.reduce(twists)
+        repeated = gls.gain @ columns
         if name == SCANNER_SCALE:
             scatter = np.einsum("c,cij->ij", mean, mixed.components[:, 0])
-            repeated = repeated @ _posterior_root(rig, scatter, errors_seen)
+            repeated = repeated @ _posterior_root(rig, scatter, columns)
         sources[name] = repeated @ repeated.T
     # The rest is what the prior leaves where nothing is seen.
-    sources["unseen"] = weighed.covariance @ found.prior @ weighed.covariance
+    sources["unseen"] = gls.covariance @ solution.prior @ gls.covariance
     return sources
 
 
 def _posterior_root(rig: RigModel, scatter: Array, errors: Array) -> Array:
-    """(K, K) square root of what the views leave of errors (N, K) of unit size: their variance with their mean squared.
+    """Return the square root (K, K) of what the views leave of errors (N, K) of unit size: variance with squared mean.
 
     Long ways of the flange show how long the scanner's millimetre is, short ones do not.
     """
     white = np.linalg.solve(np.linalg.cholesky(scatter), np.column_stack([rig.columns, errors, rig.z]))
     free = project_out(white[:, : rig.columns.shape[1]], white[:, rig.columns.shape[1] :])
-    own, seen = free[:, :-1], free[:, -1]
-    variance = np.linalg.inv(np.eye(errors.shape[1]) + own.T @ own)
-    likeliest = variance @ (own.T @ seen)
+    columns, seen = free[:, :-1], free[:, -1]
+    variance = np.linalg.inv(np.eye(errors.shape[1]) + columns.T @ columns)
+    likeliest = variance @ (columns.T @ seen)
     return np.linalg.cholesky(variance + np.outer(likeliest, likeliest)).astype(float)
 
 
 def _source_shares(sources: dict[str, Array], axes: slice) -> dict[str, float]:
-    """Of every source in the variance of some axes of the hand-eye together."""
-    own = {name: float(np.trace(matrix[axes, axes])) for name, matrix in sources.items()}
-    return {name: square / max(sum(own.values()), 1e-300) for name, square in own.items()}
+    """Return the share of every source in the variance of some axes of the hand-eye together."""
+    squares = {name: float(np.trace(matrix[axes, axes])) for name, matrix in sources.items()}
+    return {name: square / max(sum(squares.values()), 1e-300) for name, square in squares.items()}
+
+
+def _heldout_ratio(solution: HandEyeSolution) -> float:
+    """Return the rms of views left out in groups over that of the same pairs under the estimates of all views."""
+    parts = list(zip(solution.rig.parts, solution.scatter, strict=True))
+    outside = np.zeros(2)
+    for k, (e, scatter) in enumerate(parts):
+        for fold in grouped_folds(e.capture.T_base_flange, max(e.gram.lever, 1e-9)):
+            fewer = e.without(fold)
+            rest = parts[:k] + parts[k + 1 :]
+            rest += [(fewer, scatter)] if len(fewer.gram.pairs) else []
+            if rest:
+                rig = RigModel([part for part, _ in rest])
+                gls = rig.fit_gls([of_part for _, of_part in rest], solution.prior)
+                outside += e.squares(fold, (gls.solve(rig.z, solution.prior_vector), solution.x))
+    return float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")
+
+
+def solve_hand_eye(
+    captures: Sequence[Capture],
+    unconstrained: Sequence[UnconstrainedPoses],
+    T_mount: Array,
+    columns: FittedEffects | None = None,
+) -> HandEyeSolution:
+    """Return the answer in which views weigh by the scatter that they show; arguments as of `fit_hand_eye`."""
+    if columns is None:
+        columns = FittedEffects(tuple(np.zeros((6 * len(f.poses), 0)) for f in unconstrained), np.zeros(0), np.zeros(0))
+    parts = [
+        CaptureEvidence(c, f.overlaps.gram, f.twists, c.hand_eye_frames(T_mount), twists)
+        for c, f, twists in zip(captures, unconstrained, columns.twists, strict=True)
+    ]
+    rig = RigModel(parts)
+    scatter = tuple(estimate_repeatability(e.reduced_poses, e.effect_columns) for e in parts)
+    prior = weak_prior(captures, unconstrained, T_mount, columns.prior)
+    # Twists of the hand-eye, one sigma of the prior each, across those that the motions show.
+    sigma = np.diag(prior)[:6] ** -0.5
+    visible = visible_twists(captures, T_mount, seen_part(captures)) / sigma[:, None]
+    hidden = sigma[:, None] * null_space(visible.T, rcond=1e-9)
+    held = prior.copy()
+    held[:6, :6] += _HELD * prior[:6, :6] @ hidden @ hidden.T @ prior[:6, :6]
+    prior_vector = np.concatenate([np.zeros(6), -columns.values * columns.prior**-2.0])
+    gls = rig.fit_gls(scatter, held)
+    x = gls.solve(rig.z, prior_vector)
+    return HandEyeSolution(
+        rig=rig,
+        scatter=scatter,
+        prior=held,
+        prior_vector=prior_vector,
+        gls=gls,
+        x=x,
+        values=columns.values,
+        hidden=hidden,
+        T_mount=T_mount @ frames.exp(x[:6]),
+    )
+
+
+def step_hand_eye(
+    captures: Sequence[Capture], unconstrained: Sequence[UnconstrainedPoses], T_mount: Array
+) -> tuple[Array, tuple[Repeatability, ...]]:
+    """Return T_mount (4, 4) as `fit_hand_eye` finds it, without statistics, and how the poses scatter per capture."""
+    solution = solve_hand_eye(captures, unconstrained, T_mount)
+    return solution.T_mount, solution.scatter
+
+
+def weak_prior(
+    captures: Sequence[Capture], unconstrained: Sequence[UnconstrainedPoses], T_mount: Array, effects: Array
+) -> Array:
+    """Return a precision (6 + P, 6 + P): one radian and one working distance keep the unseen finite, move nothing else.
+
+    Args:
+        effects: (P,) standard deviations of the prior of effects fitted with the hand-eye.
+    """
+    ranges = [
+        np.linalg.norm(frames.transform(frames.inverse(c.poses(T_mount)), f.overlaps.gram.centre[None]), axis=-1)
+        for c, f in zip(captures, unconstrained, strict=True)
+    ]
+    distance = float(np.median(np.concatenate(ranges)))
+    return np.diag(np.concatenate([[1.0] * 3, [distance**-2.0] * 3, effects**-2.0]))
+
+
+def hand_eye_jacobian(hand_eye_frames: Array, centre: Array) -> Array:
+    """Return left twists (6V, 6) of the views about `centre` for a right perturbation of the hand-eye."""
+    return np.concatenate(list(frames.adjoint(frames.make(np.eye(3), -centre) @ hand_eye_frames)))
+
+
+def reduce_poses(g: Gram, twists: Array, hand_eye_frames: Array, T_reference_flange: Array) -> ReducedPoses:
+    """Return per-view twists reduced to the directions that the overlaps see.
+
+    Args:
+        g: normal equations about the part's centre, at the free-network poses.
+        twists: (V, 6) about that centre, from the model's poses to those.
+        hand_eye_frames: (V, 4, 4) whose adjoint carries a perturbation of the hand-eye into the reference frame.
+        T_reference_flange: (V, 4, 4) carries a twist of the flange into the reference frame: identity
+            for eye_to_hand, T_base_flange for eye_in_hand.
+    """
+    seen = g.visible
+    left = seen.vectors.T / seen.scale
+    to_centre = frames.make(np.eye(3), -g.centre)
+    response = left @ hand_eye_jacobian(hand_eye_frames, g.centre)
+    carried = frames.adjoint(to_centre @ T_reference_flange)
+    # Covariances of the visible directions for independent unit turns and shifts of every view's flange.
+    blocks = left.reshape(len(left), -1, 6).transpose(1, 0, 2) @ carried
+    return ReducedPoses(
+        reduction=left,
+        expansion=seen.scale[:, None] * seen.vectors,
+        z=left @ twists.reshape(-1),
+        hand_eye=response,
+        rotation=summed_squares(blocks[..., :3]),
+        translation=summed_squares(blocks[..., 3:]),
+        noise=np.diag(g.variance / seen.values),
+    )
+
+
+def hand_eye_mixed_model(reduced: ReducedPoses, further: Array | None = None) -> MixedModel:
+    """Return the reduced poses as one block; the hand-eye, and `further` columns (n, K), are the free mean."""
+    mean = reduced.hand_eye if further is None else np.column_stack([reduced.hand_eye, further])
+    components = np.array([reduced.rotation, reduced.translation, reduced.noise])[:, None]
+    return MixedModel(reduced.z[None], mean_basis(mean)[None], components)
+
+
+def mean_basis(columns: Array) -> Array:
+    """Return an orthonormal basis (n, r) of the mean's columns (n, K), less what the views cannot tell apart."""
+    return column_space(columns, _OBSERVABLE_SHARE)
+
+
+def estimate_repeatability(reduced: ReducedPoses, further: Array | None = None) -> Repeatability:
+    """Return REML of (σ_r, σ_t, c); the hand-eye, and `further` columns (n, K), are the unknown mean."""
+    return repeatability_from(fit_variances(hand_eye_mixed_model(reduced, further), both_starts=True).variances)
+
+
+def repeatability_from(variances: Array) -> Repeatability:
+    """Return standard deviations (rad, length_unit) and noise factor from the three variances (3,)."""
+    return Repeatability(float(np.sqrt(variances[0])), float(np.sqrt(variances[1])), float(variances[2]))
+
+
+def pose_covariance(reduced: ReducedPoses, scatter: Repeatability) -> Array:
+    """Return the covariance (n, n) of the reduced poses' z."""
+    return (
+        scatter.rotation**2 * reduced.rotation
+        + scatter.translation**2 * reduced.translation
+        + scatter.noise_factor * reduced.noise
+    )
+
+
+def whiten_captures(
+    sessions: Sequence[tuple[Capture, UnconstrainedPoses, Array]], T_mount: Array, values: Array, free: Mask
+) -> WhitenedData:
+    """Return all captures of a rig in units of their pose scatter, stacked.
+
+    Args:
+        sessions: per capture its free-network views and the twists (6V, P) of the effects.
+        values: (P,) of the effects at which the views were freed; z is what was seen without them.
+        free: (P,) effects that explain scatter.
+    """
+    stacked = []
+    for capture, views, twists in sessions:
+        hand_eye_frames = capture.hand_eye_frames(T_mount)
+        reduced = reduce_poses(views.overlaps.gram, views.twists, hand_eye_frames, capture.T_reference_flange)
+        further = reduced.reduction @ twists
+        half = np.linalg.cholesky(pose_covariance(reduced, estimate_repeatability(reduced, further[:, free])))
+        columns = np.column_stack([reduced.hand_eye, further, reduced.z + further @ values])
+        stacked.append(np.linalg.solve(half, columns))
+    white = np.concatenate(stacked)
+    return WhitenedData(white[:, :6], white[:, 6:-1], white[:, -1])
 
 
 def capture_repeatability(capture: Capture, unconstrained: UnconstrainedPoses, T_mount: Array) -> Repeatability:
-    """The repeatability of one capture's poses, whatever its hand-eye, linearised at T_mount (4, 4)."""
-    nothing = np.zeros((6 * len(capture.scans), 0))
-    own = CaptureEvidence(
-        capture, unconstrained.overlaps.gram, unconstrained.twists, capture.hand_eye_frames(T_mount), nothing
+    """Return the repeatability of one capture's poses, whatever its hand-eye, linearised at T_mount (4, 4)."""
+    gram, twists = unconstrained.overlaps.gram, unconstrained.twists
+    return estimate_repeatability(
+        reduce_poses(gram, twists, capture.hand_eye_frames(T_mount), capture.T_reference_flange)
     )
-    return estimate_repeatability(own.reduced_poses)
-
-
-def _heldout_ratio(
-    parts: Sequence[CaptureEvidence], scatter: Sequence[Repeatability], prior: tuple[Array, Array], x: Array
-) -> float:
-    """Rms of views left out in groups over that of the same pairs under the estimates x (6 + P,) of all views.
-
-    Args:
-        prior: precision (6 + P, 6 + P), and that times its middle (6 + P,).
-    """
-    outside = np.zeros(2)
-    for k, e in enumerate(parts):
-        for fold in e.folds():
-            fewer = e.without(fold)
-            rest = [(o, s) for i, (o, s) in enumerate(zip(parts, scatter, strict=True)) if i != k]
-            rest += [(fewer, scatter[k])] if len(fewer.gram.pairs) else []
-            if rest:
-                rig = stack_captures([o for o, _ in rest])
-                left_out = rig.fit_gls([s for _, s in rest], prior[0]).solve(rig.z, prior[1])
-                outside += e.squares(fold, (left_out, x))
-    return float(np.sqrt(outside[0] / outside[1])) if outside[1] > 0 else float("nan")

@@ -1,4 +1,9 @@
-"""Correspondences between views: KD-tree search in both directions, gated by distance and normal."""
+"""Correspondences between views: KD-tree search in both directions, gated by distance and normal.
+
+First which views overlap at all (`overlapping_pairs`), then what the sampled points of every view find in the others
+(`match_pairs`). An iteration goes on from the search before: a point whose partner was clearly the nearest keeps it
+while the views move little.
+"""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -13,130 +18,71 @@ from stitch.numerics.frames import Array, Indices
 from stitch.session.scan import Scan, box_corners, even_indices
 from stitch.system.threads import parallel
 
-# Sampled points of all views, placed in the reference frame once, and their search for nearest points of a view.
-
+# Two patches whose normals differ by more than 45° are not the same surface.
+_NORMAL_COSINE = np.cos(np.radians(45.0))
+# Queries that decide whether two views overlap, and the share that must find a partner.
+_PROBES = 250
+MINIMUM_OVERLAP = 0.04
+# Views in which one point of another view is asked for.
+_MOST_PARTNERS = 20
 # A search goes on so much farther than the gate: what comes nearer with little motion is known already.
 _REACH = 1.1
 # Of so large a share of the queries that may have another partner, all are asked: then it costs no more.
 _MOST_OPEN = 0.5
-# Two patches whose normals differ by more than 45° are not the same surface.
-_NORMAL_COSINE = np.cos(np.radians(45.0))
 # Some of a view's sampled points.
 QueryPart = tuple[int, slice]
 
 
-@dataclass(frozen=True)
-class Nearest:
-    """What N points found in one view."""
-
-    partner: NDArray[np.int32]  # (N,) usable point of the view; -1 where none lies within reach
-    lead: Array  # (N,) float32: with less than half of it as motion no other point comes nearer within the gate
-
-
-@dataclass(frozen=True)
-class NeighbourQueries:
-    """V views under one set of poses, and n points of each that look for partners."""
-
-    scans: Sequence[Scan]
-    poses: Array  # (V, 4, 4) T_reference_scanner
-    index: Sequence[Indices]  # per view (n,)
-    points: list[Array]  # per view (n, 3), reference frame
-    normals: list[Array]  # per view (n, 3), reference frame
-
-    def gather(self, parts: Sequence[QueryPart]) -> tuple[Indices, Array, Array]:
-        """Index, point and normal of some points of several views, one view after the other."""
-        points, normals = (np.concatenate([own[v][at] for v, at in parts]) for own in (self.points, self.normals))
-        return np.concatenate([self.index[v][at] for v, at in parts]), points, normals
-
-    def counts(self, parts: Sequence[QueryPart]) -> list[int]:
-        """How many points each part holds."""
-        return [len(range(*at.indices(len(self.index[v])))) for v, at in parts]
-
-    def nearest(self, w: int, points: Array, gate: float) -> Nearest:
-        """What points (N, 3) of the reference frame find in view w, and how certain it is after motion."""
-        tree, reach, query = self.scans[w].tree, _REACH * gate, self._seen_from(w, points)
-        distance, index = tree.query(query, k=min(2, tree.n), distance_upper_bound=reach)
-        first, second = distance.reshape(len(query), -1).T[[0, -1]]
-        # What is beyond the gate anyway has to come all the way back.
-        lead = np.maximum(np.minimum(second, reach) - first, 2 * (first - gate))
-        return Nearest(self._usable(w, index.reshape(len(query), -1)[:, 0]), lead.astype(np.float32))
-
-    def partners(self, w: int, points: Array, gate: float) -> NDArray[np.int32]:
-        """(N,) usable points of view w that are nearest to points (N, 3) of the reference frame, -1 for none."""
-        return self._usable(w, self.scans[w].tree.query(self._seen_from(w, points), distance_upper_bound=gate)[1])
-
-    def _usable(self, w: int, index: NDArray[np.uint32]) -> NDArray[np.int32]:
-        # Where none is found its number is one beyond the last.
-        return np.where(np.append(self.scans[w].usable, False)[index], index.astype(np.int32), np.int32(-1))
-
-    def search(self, w: int, points: Array, normals: Array, gate: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Of N points each (N,): distance (inf where none), and whether the partner may be used.
-
-        Args:
-            w: the view in which partners are sought.
-            points, normals: (N, 3) reference frame.
-            gate: farthest partner, length_unit.
-        """
-        scan = self.scans[w]
-        distance, index = scan.tree.query(self._seen_from(w, points), distance_upper_bound=gate)
-        partner = self._usable(w, index)
-        accept = partner >= 0
-        near = np.flatnonzero(accept)
-        facing = frames.rotate(frames.inverse(self.poses[w]), normals[near])
-        accept[near] = np.einsum("ij,ij->i", facing, scan.normals[partner[near]]) > _NORMAL_COSINE
-        return distance, accept
-
-    def _seen_from(self, w: int, points: Array) -> Array:
-        # The trees stay in their scanner's frame; the queries travel.
-        return np.ascontiguousarray(frames.transform(frames.inverse(self.poses[w]), points))
+def sample_points(scan: Scan, count: int) -> Indices:
+    """Return indices (n,) of at most `count` usable points, evenly over the scan order; the same every time."""
+    usable: Indices = np.flatnonzero(scan.usable).astype(np.int64)
+    if len(usable) <= count:
+        return usable
+    picked: Indices = usable[even_indices(len(usable), count)]
+    return picked
 
 
-def neighbour_queries(scans: Sequence[Scan], poses: Array, samples: Sequence[Indices]) -> NeighbourQueries:
-    """Sampled points of every view under T_reference_scanner (V, 4, 4)."""
-    every = list(zip(scans, poses, samples, strict=True))
-    points = [frames.transform(T, scan.points.take(index, axis=0)) for scan, T, index in every]
-    normals = [frames.rotate(T, scan.normals.take(index, axis=0)) for scan, T, index in every]
-    return NeighbourQueries(scans, poses, samples, points, normals)
+def near_pairs(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
+    """Return the pairs (v < w) whose bounding boxes come within `gate`: no others can have partners."""
+    placed = [frames.transform(T, box_corners(scan.box)) for scan, T in zip(scans, poses, strict=True)]
+    low, high = np.min(placed, axis=1), np.max(placed, axis=1)
+    apart = (low[:, None] - high[None] > gate).any(axis=2)
+    v, w = np.nonzero(np.triu(~(apart | apart.T), 1))
+    return list(zip(v.tolist(), w.tolist(), strict=True))
 
 
-# Views in which one point of another view is asked for.
-_MOST_PARTNERS = 20
+def overlapping_pairs(
+    scans: Sequence[Scan], poses: Array, gate: float, at_most: int = _PROBES
+) -> list[tuple[int, int]]:
+    """Return the pairs (v < w) of which at least 4 % of the probed points meet.
 
+    Args:
+        poses: T_reference_scanner, (V, 4, 4).
+        at_most: points of a view that are probed; more than 250 tell nothing new.
+    """
+    queries = neighbour_queries(scans, poses, [sample_points(scan, min(at_most, _PROBES)) for scan in scans])
 
-@dataclass(frozen=True)
-class Searched:
-    """What the points of all views found in the others, so that after little motion few have to look again."""
+    def meeting(asked: tuple[int, list[int]]) -> list[int]:
+        """Return, of the views that ask one view, those of which enough points find a partner."""
+        w, views = asked
+        parts = [(v, slice(None)) for v in views if len(queries.index[v])]
+        if not parts:
+            return []
+        _, points, normals = queries.gather(parts)
+        accepted = np.split(queries.search(w, points, normals, gate)[1], np.cumsum(queries.counts(parts))[:-1])
+        return [v for (v, _), of_view in zip(parts, accepted, strict=True) if np.mean(of_view) >= MINIMUM_OVERLAP]
 
-    scans: Sequence[Scan]
-    poses: Array  # (V, 4, 4) T_reference_scanner
-    index: Sequence[Indices]  # per view the points that look
-    parts: list[list[QueryPart]]  # per view those that ask it
-    gate: float  # largest distance between partners, length_unit
-    nearest: list[Nearest]  # per view asked
+    def met(pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
+        """Return those of pairs (asking, asked) that meet."""
+        asking = defaultdict[int, list[int]](list)
+        for v, w in pairs:
+            asking[w].append(v)
+        return {(v, w) for w, views in zip(asking, parallel(meeting, asking.items()), strict=True) for v in views}
 
-    def still_open(self, every: NeighbourQueries, parts: list[list[QueryPart]], gate: float) -> list[Indices] | None:
-        """Per view asked, the queries for which under new poses another point may be nearest; None: ask all anew.
-
-        Distances change by no more than the motion of the point that asks, seen from the view that is asked.
-        """
-        if gate > self.gate or parts != self.parts or len(every.scans) != len(self.scans):
-            return None
-        same = (a.tree is b.tree for a, b in zip(self.scans, every.scans, strict=True))
-        alike = (np.array_equal(a, b) for a, b in zip(self.index, every.index, strict=True))
-        if not (all(same) and all(alike)):
-            return None
-        corners = np.array([box_corners(scan.box) for scan in every.scans])
-        out, total = list[Indices](), 0
-        for w, (own, near) in enumerate(zip(parts, self.nearest, strict=True)):
-            v = [v for v, _ in own]
-            # A point between the corners moves no more than one of them.
-            was, now = (frames.transform(frames.inverse(T[w]) @ T[v], corners[v]) for T in (self.poses, every.poses))
-            moved = np.linalg.norm(now - was, axis=2).max(axis=1)
-            if gate + moved.max(initial=0.0) > _REACH * self.gate:
-                return None
-            out.append(np.flatnonzero(near.lead < np.repeat(2 * moved, every.counts(own))))
-            total += len(near.lead)
-        return out if sum(map(len, out)) < _MOST_OPEN * total else None
+    near = near_pairs(scans, poses, gate)
+    meet = met(near)
+    meet |= {(v, w) for w, v in met([(w, v) for v, w in near if (v, w) not in meet])}
+    return [pair for pair in near if pair in meet]
 
 
 @dataclass(frozen=True)
@@ -153,7 +99,7 @@ class Match:
     index_w: Indices  # (M,) point of view w
 
     def subset(self, at: slice) -> "Match":
-        """Some of them."""
+        """Return some of them."""
         return Match(self.v, self.w, *(value[at] for value in self.columns))
 
     @property
@@ -162,17 +108,53 @@ class Match:
         return list(vars(self).values())[2:]
 
     def swapped(self) -> "Match":
-        """The same as the other view sees it."""
+        """Return the same as the other view sees it."""
         return replace(self, v=self.w, w=self.v, residual=-self.residual, index_v=self.index_w, index_w=self.index_v)
 
 
-def sample_points(scan: Scan, count: int) -> Indices:
-    """(n,) indices of at most `count` usable points, evenly over the scan order; the same every time."""
-    usable: Indices = np.flatnonzero(scan.usable).astype(np.int64)
-    if len(usable) <= count:
-        return usable
-    picked: Indices = usable[even_indices(len(usable), count)]
-    return picked
+@dataclass(frozen=True)
+class Nearest:
+    """What N points found in one view."""
+
+    partner: NDArray[np.int32]  # (N,) usable point of the view; -1 where none lies within reach
+    lead: Array  # (N,) float32: with less than half of it as motion no other point comes nearer within the gate
+
+
+@dataclass(frozen=True)
+class Searched:
+    """What the points of all views found in the others, so that after little motion few have to look again."""
+
+    queries: "NeighbourQueries"
+    parts: list[list[QueryPart]]  # per view those that ask it
+    gate: float  # largest distance between partners, length_unit
+    nearest: list[Nearest]  # per view asked
+
+    def still_open(
+        self, queries: "NeighbourQueries", parts: list[list[QueryPart]], gate: float
+    ) -> list[Indices] | None:
+        """Return per view asked the queries that under new poses may have another partner; None: ask all anew.
+
+        Distances change by no more than the motion of the point that asks, seen from the view that is asked.
+        """
+        before = self.queries
+        if gate > self.gate or parts != self.parts or len(queries.scans) != len(before.scans):
+            return None
+        same_scans = all(a.tree is b.tree for a, b in zip(before.scans, queries.scans, strict=True))
+        if not (same_scans and all(map(np.array_equal, before.index, queries.index))):
+            return None
+        corners = np.array([box_corners(scan.box) for scan in queries.scans])
+        out, total = list[Indices](), 0
+        for w, (asking, nearest) in enumerate(zip(parts, self.nearest, strict=True)):
+            v = [view for view, _ in asking]
+            # A point between the corners moves no more than one of them.
+            was = frames.transform(frames.inverse(before.poses[w]) @ before.poses[v], corners[v])
+            now = frames.transform(frames.inverse(queries.poses[w]) @ queries.poses[v], corners[v])
+            moved = np.linalg.norm(now - was, axis=2).max(axis=1)
+            if gate + moved.max(initial=0.0) > _REACH * self.gate:
+                return None
+            out.append(np.flatnonzero(nearest.lead < np.repeat(2 * moved, queries.counts(asking))))
+            total += len(nearest.lead)
+        return out if sum(map(len, out)) < _MOST_OPEN * total else None
 
 
 def match_pairs(
@@ -183,7 +165,7 @@ def match_pairs(
     samples: Sequence[Indices],
     before: Searched | None = None,
 ) -> tuple[list[Match], Searched]:
-    """Correspondences of `pairs`, each sampled point with its nearest point of the other, and what was searched.
+    """Return the correspondences of `pairs`, each sampled point with its nearest point of the other, and the search.
 
     Where a view overlaps with more than 20 others, its points take turns: each is asked for in 20 of them. What a point
     says of its own view it says to the first few already, so that many views cost what they are and not their square.
@@ -191,136 +173,165 @@ def match_pairs(
     Args:
         poses: T_reference_scanner, (V, 4, 4).
         gate: largest distance between partners, length_unit.
-        samples: per view the indices that search (see `sample`).
+        samples: per view the indices that search (see `sample_points`).
         before: a search under other poses; what cannot have changed since then is not looked for again.
     """
     turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
     parts = [list[QueryPart]() for _ in scans]
     for v, w in pairs:
-        for a, b in ((v, w), (w, v)):
-            parts[b].append((a, slice(b % turns[a], None, turns[a])))
-    every = neighbour_queries(scans, poses, samples)
-    again = None if before is None else before.still_open(every, parts, gate)
+        for asking, asked in ((v, w), (w, v)):
+            parts[asked].append((asking, slice(asked % turns[asking], None, turns[asking])))
+    queries = neighbour_queries(scans, poses, samples)
+    again = None if before is None else before.still_open(queries, parts, gate)
 
     def search_view(w: int) -> tuple[Nearest, dict[int, Match]]:
-        """What is nearest in one view, and by view that asks what of it lies within the gate."""
+        """Return what is nearest in one view, and by view that asks what of it lies within the gate."""
         if not parts[w]:
             return Nearest(np.zeros(0, np.int32), np.zeros(0, np.float32)), {}
-        index, p, n = every.gather(parts[w])
+        index, points, normals = queries.gather(parts[w])
         if before is None or again is None:
-            near = every.nearest(w, p, gate)
-            return near, _partners_by_view(every, w, parts[w], gate, near.partner, (index, p, n))
-        partner = before.nearest[w].partner.copy()
-        partner[again[w]] = every.partners(w, p.take(again[w], axis=0), gate)
-        return before.nearest[w], _partners_by_view(every, w, parts[w], gate, partner, (index, p, n))
+            nearest = queries.nearest(w, points, gate)
+            partner = nearest.partner
+        else:
+            nearest = before.nearest[w]
+            partner = nearest.partner.copy()
+            partner[again[w]] = queries.partners(w, points.take(again[w], axis=0), gate)
+        return nearest, _partners_by_view(queries, w, parts[w], gate, partner, (index, points, normals))
 
     nearest, answers = zip(*parallel(search_view, range(len(scans))), strict=True)
     matches = []
     for v, w in pairs:
-        found = [of for of in (answers[w].pop(v), answers[v].pop(w).swapped()) if len(of.residual)]
-        if found:
-            columns = zip(*(of.columns for of in found), strict=True)
-            matches.append(Match(v, w, *(np.concatenate(own) for own in columns)))
+        both = [match for match in (answers[w].pop(v), answers[v].pop(w).swapped()) if len(match.residual)]
+        if both:
+            columns = zip(*(match.columns for match in both), strict=True)
+            matches.append(Match(v, w, *(np.concatenate(column) for column in columns)))
     if before is None or again is None:
-        before = Searched(scans, np.array(poses), samples, parts, gate, list(nearest))
+        lean = replace(queries, poses=np.array(poses), points=[], normals=[])
+        before = Searched(lean, parts, gate, list(nearest))
     return matches, before
 
 
+def _partners_by_view(
+    queries: "NeighbourQueries",
+    w: int,
+    parts: Sequence[QueryPart],
+    gate: float,
+    nearest: NDArray[np.int32],
+    asking: tuple[Indices, Array, Array],
+) -> dict[int, Match]:
+    """Return per view v that asks what its points found in view w within the gate: all that ask one view at once.
+
+    Args:
+        nearest: (N,) points of view w, -1 where there is none.
+        asking: index, point and normal of all that ask, in the order of `parts`.
+    """
+    scan, T = queries.scans[w], queries.poses[w]
+    some = np.flatnonzero(nearest >= 0)
+    index, partner = asking[0][some], nearest[some].astype(np.int64)
+    # Rows of three by `take`: an index in brackets takes four times as long.
+    p, n = asking[1].take(some, axis=0), asking[2].take(some, axis=0)
+    q = frames.transform(T, scan.points.take(partner, axis=0))
+    m = frames.rotate(T, scan.normals.take(partner, axis=0))
+    apart, cosine = p - q, np.einsum("ij,ij->i", n, m)
+    normal = n + m
+    normal /= np.sqrt(np.einsum("ij,ij->i", normal, normal))[:, None]
+    middle, residual = (p + q) / 2, np.einsum("ij,ij->i", apart, normal)
+    keep = np.flatnonzero((np.einsum("ij,ij->i", apart, apart) < gate**2) & (cosine > _NORMAL_COSINE))
+    bounds = np.searchsorted(some[keep], np.append(0, np.cumsum(queries.counts(parts))))
+    matches = {}
+    for (v, _), start, end in zip(parts, bounds[:-1], bounds[1:], strict=True):
+        at = keep[start:end]
+        i, j = index[at], partner[at]
+        matches[v] = Match(
+            v,
+            w,
+            middle.take(at, axis=0),
+            normal.take(at, axis=0),
+            residual[at],
+            weight=scan.confidence[j] * queries.scans[v].confidence[i],
+            index_v=i,
+            index_w=j,
+        )
+    return matches
+
+
+@dataclass(frozen=True)
+class NeighbourQueries:
+    """V views under one set of poses, and n points of each that look for partners."""
+
+    scans: Sequence[Scan]
+    poses: Array  # (V, 4, 4) T_reference_scanner
+    index: Sequence[Indices]  # per view (n,)
+    points: list[Array]  # per view (n, 3), reference frame
+    normals: list[Array]  # per view (n, 3), reference frame
+
+    def gather(self, parts: Sequence[QueryPart]) -> tuple[Indices, Array, Array]:
+        """Return index, point and normal of some points of several views, one view after the other."""
+        index = np.concatenate([self.index[v][at] for v, at in parts])
+        points = np.concatenate([self.points[v][at] for v, at in parts])
+        return index, points, np.concatenate([self.normals[v][at] for v, at in parts])
+
+    def counts(self, parts: Sequence[QueryPart]) -> list[int]:
+        """Return how many points each part holds."""
+        return [len(range(*at.indices(len(self.index[v])))) for v, at in parts]
+
+    def nearest(self, w: int, points: Array, gate: float) -> Nearest:
+        """Return what points (N, 3) of the reference frame find in view w, and how certain it is after motion."""
+        tree, reach = self.scans[w].tree, _REACH * gate
+        distance, index = tree.query(self._seen_from(w, points), k=min(2, tree.n), distance_upper_bound=reach)
+        first, second = distance.reshape(len(points), -1).T[[0, -1]]
+        # What is beyond the gate anyway has to come all the way back.
+        lead = np.maximum(np.minimum(second, reach) - first, 2 * (first - gate))
+        return Nearest(self._usable(w, index.reshape(len(points), -1)[:, 0]), lead.astype(np.float32))
+
+    def partners(self, w: int, points: Array, gate: float) -> NDArray[np.int32]:
+        """Return the usable points (N,) of view w nearest to points (N, 3) of the reference frame, -1 for none."""
+        return self._usable(w, self.scans[w].tree.query(self._seen_from(w, points), distance_upper_bound=gate)[1])
+
+    def search(self, w: int, points: Array, normals: Array, gate: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Return of N points each (N,): distance (inf where none), and whether the partner may be used.
+
+        Args:
+            w: the view in which partners are sought.
+            points, normals: (N, 3) reference frame.
+            gate: farthest partner, length_unit.
+        """
+        scan = self.scans[w]
+        distance, index = scan.tree.query(self._seen_from(w, points), distance_upper_bound=gate)
+        partner = self._usable(w, index)
+        accept = partner >= 0
+        near = np.flatnonzero(accept)
+        facing = frames.rotate(frames.inverse(self.poses[w]), normals[near])
+        accept[near] = np.einsum("ij,ij->i", facing, scan.normals[partner[near]]) > _NORMAL_COSINE
+        return distance, accept
+
+    def _usable(self, w: int, index: NDArray[np.uint32]) -> NDArray[np.int32]:
+        # Where none is found its number is one beyond the last.
+        return np.where(np.append(self.scans[w].usable, False)[index], index.astype(np.int32), np.int32(-1))
+
+    def _seen_from(self, w: int, points: Array) -> Array:
+        # The trees stay in their scanner's frame; the queries travel.
+        return np.ascontiguousarray(frames.transform(frames.inverse(self.poses[w]), points))
+
+
+def neighbour_queries(scans: Sequence[Scan], poses: Array, samples: Sequence[Indices]) -> NeighbourQueries:
+    """Return sampled points of every view under T_reference_scanner (V, 4, 4)."""
+    placed = list(zip(scans, poses, samples, strict=True))
+    points = [frames.transform(T, scan.points.take(index, axis=0)) for scan, T, index in placed]
+    normals = [frames.rotate(T, scan.normals.take(index, axis=0)) for scan, T, index in placed]
+    return NeighbourQueries(scans, poses, samples, points, normals)
+
+
 def signed_distances(matches: Sequence[Match], poses: Array, points: Sequence[Array]) -> Array:
-    """(M,) signed distances of all correspondences, v less w along their normals, with the views elsewhere.
+    """Return signed distances (M,) of all correspondences, v less w along their normals, with the views elsewhere.
 
     Args:
         poses: T_reference_scanner, (V, 4, 4).
         points: (N, 3) of every scan, scanner frame.
     """
-    placed = [frames.transform(T, own) for T, own in zip(poses, points, strict=True)]
-
-    def along(m: Match) -> Array:
+    placed = [frames.transform(T, in_scanner) for T, in_scanner in zip(poses, points, strict=True)]
+    distances = []
+    for m in matches:
         apart = placed[m.v].take(m.index_v, axis=0) - placed[m.w].take(m.index_w, axis=0)
-        return np.einsum("ij,ij->i", apart, m.normal)
-
-    return np.concatenate([along(m) for m in matches])
-
-
-def _partners_by_view(
-    every: NeighbourQueries,
-    w: int,
-    parts: Sequence[QueryPart],
-    gate: float,
-    nearest: NDArray[np.int32],
-    queries: tuple[Indices, Array, Array],
-) -> dict[int, Match]:
-    """Per view v that asks, what its points found in view w within the gate: all that ask one view at once.
-
-    Args:
-        nearest: (N,) points of view w, -1 where there is none.
-        queries: index, point and normal of all that ask, in the order of `parts`.
-    """
-    scan, T, some = every.scans[w], every.poses[w], np.flatnonzero(nearest >= 0)
-    index, partner = queries[0][some], nearest[some].astype(np.int64)
-    # Rows of three by `take`: an index in brackets takes four times as long.
-    p, n = (own.take(some, axis=0) for own in queries[1:])
-    q = frames.transform(T, scan.points.take(partner, axis=0))
-    other = frames.rotate(T, scan.normals.take(partner, axis=0))
-    apart, normal, cosine = p - q, n + other, np.einsum("ij,ij->i", n, other)
-    normal /= np.sqrt(np.einsum("ij,ij->i", normal, normal))[:, None]
-    middle, residual = (p + q) / 2, np.einsum("ij,ij->i", apart, normal)
-    keep = np.flatnonzero((np.einsum("ij,ij->i", apart, apart) < gate**2) & (cosine > _NORMAL_COSINE))
-    bounds = np.searchsorted(some[keep], np.append(0, np.cumsum(every.counts(parts))))
-    found = {}
-    for (v, _), start, end in zip(parts, bounds[:-1], bounds[1:], strict=True):
-        at = keep[start:end]
-        i, j = index[at], partner[at]
-        m, n, r = middle.take(at, axis=0), normal.take(at, axis=0), residual[at]
-        weight = scan.confidence[j] * every.scans[v].confidence[i]
-        found[v] = Match(v, w, m, n, r, weight=weight, index_v=i, index_w=j)
-    return found
-
-
-# Which views overlap.
-
-# Queries that decide whether two views overlap, and the share that must find a partner.
-_PROBES = 250
-MINIMUM_OVERLAP = 0.04
-
-
-def overlapping_pairs(
-    scans: Sequence[Scan], poses: Array, gate: float, at_most: int = _PROBES
-) -> list[tuple[int, int]]:
-    """Pairs (v < w) of which at least 4 % of the probed points meet; poses T_reference_scanner.
-
-    Args:
-        at_most: points of a view that are probed; more than 250 tell nothing new.
-    """
-    every = neighbour_queries(scans, poses, [sample_points(scan, min(at_most, _PROBES)) for scan in scans])
-
-    def meeting(of_view: tuple[int, list[int]]) -> list[int]:
-        """Of the views that ask one view, those of which enough points find a partner."""
-        w, views = of_view
-        parts = [(v, slice(None)) for v in views if len(every.index[v])]
-        if not parts:
-            return []
-        _, points, normals = every.gather(parts)
-        agree = np.split(every.search(w, points, normals, gate)[1], np.cumsum(every.counts(parts))[:-1])
-        return [v for (v, _), own in zip(parts, agree, strict=True) if np.mean(own) >= MINIMUM_OVERLAP]
-
-    def met(pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
-        """Of pairs (asking, asked) those that meet."""
-        asked = defaultdict[int, list[int]](list)
-        for v, w in pairs:
-            asked[w].append(v)
-        return {(v, w) for w, views in zip(asked, parallel(meeting, asked.items()), strict=True) for v in views}
-
-    near = near_pairs(scans, poses, gate)
-    found = met(near)
-    found |= {(v, w) for w, v in met([(w, v) for v, w in near if (v, w) not in found])}
-    return [pair for pair in near if pair in found]
-
-
-def near_pairs(scans: Sequence[Scan], poses: Array, gate: float) -> list[tuple[int, int]]:
-    """Pairs (v < w) whose bounding boxes come within `gate`: no others can have partners."""
-    placed = [frames.transform(T, box_corners(scan.box)) for scan, T in zip(scans, poses, strict=True)]
-    low, high = np.min(placed, axis=1), np.max(placed, axis=1)
-    apart = (low[:, None] - high[None] > gate).any(axis=2)
-    v, w = np.nonzero(np.triu(~(apart | apart.T), 1))
-    return list(zip(v.tolist(), w.tolist(), strict=True))
+        distances.append(np.einsum("ij,ij->i", apart, m.normal))
+    return np.concatenate(distances)

@@ -6,6 +6,16 @@ frame. Taking one midpoint for both sides keeps the common motion of all views e
 correction of the hand-eye ξ (right perturbation, scanner frame) moves view v by Ad(T_v) ξ, so the
 hand-eye fit, the per-view fit and their statistics all read the same 6x6 Gram matrices: memory is
 O(pairs), never O(points x parameters).
+
+Labelled points are pairs of views too, beside those of overlapping surfaces. A target seen by several views with
+weights w = 1/σ² has its place eliminated (Schur complement). What is left is
+
+    Σ_v w_v |x_v − x̄|² = Σ_{v<w} (w_v w_w / Σw) |x_v − x_w|²,
+
+so every two views that see it form a pair with e = (x_v − x_w) + L(δ_v − δ_w), a 3-vector, and L = [−[x̄ − c]×, 1]
+at the mean x̄ for all of them: the common motion of all views stays exactly free, as between surfaces. Their sums
+follow those of the surfaces in one Gram. Without one of n views the pairs that remain keep their weights, a share 1/n
+below those of a new elimination: as little as surfaces change theirs.
 """
 
 from collections.abc import Iterable, Sequence
@@ -24,11 +34,19 @@ from stitch.observations.surfaces.matching import Match, Searched, match_pairs, 
 from stitch.session.capture import Capture, Sightings
 from stitch.session.scan import Scan, centroid
 
+# Queries per view for the final normal equations and statistics.
+FINE_SAMPLES = 3000
+# Queries of all views together where they answer one question, a hand-eye or a scale.
+_TOTAL_SAMPLES = 20_000
+# Partners lie within the neighbour spacing plus 4 sigma of the surface distance.
+_GATE_SPACINGS = 1.5
+_GATE_SIGMAS = 4.0
+# Which pairs overlap is not asked again before a view has moved, or the gate opened, by so much of the gate. The pairs
+# of a gate hold those of a smaller one: asked again where they may be too many.
+_SAME_PAIRS = 0.3
+_SMALLER_GATE = 0.1
 # Residuals beyond 4 robust sigmas are not surface distances; for normal errors that cuts 0.006 %.
 RMS_GATE = 4.0
-_PAIR_FIELDS = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_square", "labelled")
-
-
 # Directions of H weaker than this share of the strongest (as displacements) carry no evidence: what
 # little they have comes from the noise of the normals. Gap seen on real parts: 3e-4 (noise on a
 # sphere and a cone) against 5e-3 (their weakest true directions). Labelled points have no such bias: what they
@@ -36,6 +54,110 @@ _PAIR_FIELDS = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_s
 NEAR_NULL = 1e-3
 _NULL = 1e-5
 _ROUNDING = 1e-12
+_PAIR_FIELDS = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_square", "labelled")
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """Correspondences of all overlapping pairs, and common targets, with the normal equations of both.
+
+    Example:
+        >>> len(run.overlaps.pairs), run.overlaps.gate > 0  # length_unit
+        (10, True)
+    """
+
+    pairs: list[tuple[int, int]]
+    matches: list[Match]
+    gram: "Gram"
+    gate: float
+    targets: "TargetPairs | None" = None
+    probed: tuple[Array, float] | None = None  # poses (V, 4, 4) and gate under which the pairs were found
+    searched: Searched | None = None  # where an iteration may go on from it
+
+
+def collect_overlaps(
+    capture: Capture,
+    poses: Array,
+    gate: float,
+    samples: Sequence[Indices],
+    before: Overlaps | None = None,
+) -> Overlaps:
+    """Return all overlapping pairs matched within `gate`, with their normal equations.
+
+    Args:
+        poses: T_reference_scanner, (V, 4, 4).
+        before: of an iteration before; its pairs and its search serve again where little has moved since then.
+
+    Raises:
+        NoResultError: no two views overlap.
+    """
+    if before is not None and before.probed is not None and _pairs_still_valid(before, poses, gate):
+        pairs = before.pairs
+        probed, searched = before.probed, before.searched
+    else:
+        pairs = overlapping_pairs(capture.scans, poses, gate, at_most=max(map(len, samples)))
+        probed, searched = (np.array(poses), gate), None
+    matches, searched = match_pairs(capture.scans, poses, pairs, gate, samples, searched)
+    if not matches:
+        raise NoResultError(
+            f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "
+            "and scanner.pose, or leave scanner.pose out to have it searched"
+        )
+    surfaces = sum_matches(matches, len(capture.scans))
+    targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
+    g = append_targets(surfaces, targets, capture.noise_factor)
+    return Overlaps(pairs, matches, g, gate, targets, probed, searched)
+
+
+def _pairs_still_valid(before: Overlaps, poses: Array, gate: float) -> bool:
+    """Return whether no view has moved, and the gate has not opened, by enough to make other pairs overlap."""
+    assert before.probed is not None
+    T, probed_gate = before.probed
+    if gate < _SMALLER_GATE * probed_gate:
+        return False
+    to_centre = frames.make(np.eye(3), -before.gram.centre)
+    twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ T))
+    moved = np.linalg.norm(twists[:, 3:], axis=1) + before.gram.lever * np.linalg.norm(twists[:, :3], axis=1)
+    return bool(max(moved.max(), gate - probed_gate) < _SAME_PAIRS * min(gate, probed_gate))
+
+
+def carry_overlaps(capture: Capture, before: Overlaps, start: Array, poses: Array) -> Overlaps:
+    """Return the same correspondences after views have moved by so little that their partners stay: e + B(δ_v − δ_w).
+
+    Args:
+        start: (V, 4, 4) T_reference_scanner under which they were matched.
+        poses: (V, 4, 4) where the views are now.
+    """
+    centre = before.gram.centre
+    to_centre = frames.make(np.eye(3), -centre)
+    twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ start))
+    matches = []
+    for m in before.matches:
+        change = frames.plane_rows(m.middle - centre, m.normal) @ (twists[m.v] - twists[m.w])
+        matches.append(replace(m, residual=m.residual + change))
+    targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
+    g = append_targets(sum_matches(matches, len(capture.scans)), targets, capture.noise_factor)
+    return replace(before, matches=matches, gram=g, targets=targets)
+
+
+def common_samples(scans: Sequence[Scan], most: int) -> list[Indices]:
+    """Return per view the points that ask where all views say one thing: of many views each needs fewer.
+
+    Args:
+        most: of one view.
+    """
+    return [sample_points(scan, min(most, _TOTAL_SAMPLES // len(scans))) for scan in scans]
+
+
+def next_gate(overlaps: Overlaps, capture: Capture) -> float:
+    """Return the distance that partners may have, from the spacing and the residuals' robust sigma."""
+    return _GATE_SPACINGS * capture.spacing + _GATE_SIGMAS * overlaps.gram.scale
+
+
+def pooled_rms(overlaps: Sequence[Overlaps]) -> float:
+    """Return the root mean square over the correspondences of all captures, inside the robust gate."""
+    square = sum(o.gram.raw_square.sum() for o in overlaps)
+    return float(np.sqrt(square / max(sum(o.gram.count.sum() for o in overlaps), 1)))
 
 
 @dataclass(frozen=True)
@@ -86,7 +208,8 @@ class Gram:
         scale = np.tile(1 / self.displacement_factors, self.views)
         values, vectors = np.linalg.eigh(assemble(self, ~self.labelled)[0] * scale[:, None] * scale)
         keep = values > NEAR_NULL * values[-1]
-        values, seen = values[keep], vectors[:, keep]
+        values = values[keep]
+        seen = vectors[:, keep]
         if not self.labelled.any():
             return VisibleDirections(values, seen, scale, seen)
         targets = assemble(self, self.labelled)[0] * scale[:, None] * scale
@@ -97,23 +220,8 @@ class Gram:
         return VisibleDirections(values[held], basis @ within[:, held], scale, seen)
 
     def only(self, keep: Mask) -> "Gram":
-        """The sums of some pairs (P,)."""
+        """Return the sums of some pairs (P,)."""
         return replace(self, **{name: getattr(self, name)[keep] for name in _PAIR_FIELDS})
-
-    def append(self, **sums: Any) -> "Gram":
-        """The sums, and after them those of further pairs of labelled points (P', ...) that have no surface."""
-        count = len(sums["pairs"])
-        nothing = np.zeros(count)
-        everything: dict[str, Any] = sums | {
-            "weight": nothing,
-            "count": nothing.astype(int),
-            "raw_square": nothing,
-            "labelled": nothing == 0,
-        }
-        joined: dict[str, Any] = {
-            name: np.concatenate([getattr(self, name), everything[name]]) for name in _PAIR_FIELDS
-        }
-        return replace(self, **joined)
 
     @property
     def variance(self) -> float:
@@ -122,7 +230,7 @@ class Gram:
 
 
 def _target_only_directions(H: Array, vectors: Array) -> Array:
-    """(6V, k) orthonormal: what targets see of the directions in which surfaces, `vectors` (6V, n), see nothing.
+    """Return (6V, k), orthonormal: what targets see where surfaces, `vectors` (6V, n), see nothing.
 
     A ball's centre sees its own surface turn no more than the two centres lie apart, which is noise.
     """
@@ -134,51 +242,49 @@ def _target_only_directions(H: Array, vectors: Array) -> Array:
 
 
 def robust_scale(matches: Iterable[Match]) -> float:
-    """Robust sigma of the residuals of all pairs: they are symmetric about zero, so no centring."""
+    """Return the robust sigma of the residuals of all pairs: they are symmetric about zero, so no centring."""
     residuals = [m.residual for m in matches]
     return mad_sigma(np.concatenate(residuals)) if residuals else float("nan")
+
+
+def sum_matches(matches: Sequence[Match], views: int) -> Gram:
+    """Return the sums over pairs about the middle of their correspondences, at their own robust scale."""
+    centre = np.mean([centroid(m.middle) for m in matches], axis=0)
+    return gram(matches, views, centre, robust_scale(matches))
 
 
 def gram(
     matches: Sequence[Match], views: int, centre: Array, scale: float, weights: Sequence[Array] | None = None
 ) -> Gram:
-    """Accumulate the pairs; Tukey weights at `scale` unless `weights` gives them per match, (M,) each.
+    """Return the sums over pairs; Tukey weights at `scale` unless `weights` gives them per match, (M,) each.
 
     Args:
         centre: (3,) about which twists of the views count, reference frame.
     """
-    rows = [_pair_sums(m, centre, scale, None if weights is None else weights[i]) for i, m in enumerate(matches)]
+    rows = []
+    for i, m in enumerate(matches):
+        e = m.residual
+        weight = m.weight * tukey(e, scale) if weights is None else weights[i]
+        B = frames.plane_rows(m.middle - centre, m.normal)
+        weighted = B * weight[:, None]
+        inside = np.abs(e) < RMS_GATE * scale
+        rows.append(
+            {
+                "matrix": weighted.T @ B,
+                "vector": weighted.T @ e,
+                "square": float(weight @ e**2),
+                "weight": float(weight.sum()),
+                "count": int(inside.sum()),
+                "raw_square": float((e[inside] ** 2).sum()),
+            }
+        )
     sums = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     pairs = np.array([(m.v, m.w) for m in matches])
     return Gram(views=views, pairs=pairs, scale=scale, centre=centre, labelled=np.zeros(len(pairs), bool), **sums)
 
 
-def sum_matches(matches: Sequence[Match], views: int) -> Gram:
-    """Accumulate the pairs about the middle of their correspondences, at their own robust scale."""
-    centre = np.mean([centroid(m.middle) for m in matches], axis=0)
-    return gram(matches, views, centre, robust_scale(matches))
-
-
-def _pair_sums(m: Match, centre: Array, scale: float, weight: Array | None) -> dict[str, Any]:
-    """The sums over one pair, by their names in `Gram`."""
-    e = m.residual
-    if weight is None:
-        weight = m.weight * tukey(e, scale)
-    B = frames.plane_rows(m.middle - centre, m.normal)
-    weighted = B * weight[:, None]
-    inside = np.abs(e) < RMS_GATE * scale
-    return {
-        "matrix": weighted.T @ B,
-        "vector": weighted.T @ e,
-        "square": float(weight @ e**2),
-        "weight": float(weight.sum()),
-        "count": int(inside.sum()),
-        "raw_square": float((e[inside] ** 2).sum()),
-    }
-
-
 def assemble(g: Gram, keep: Array | Mask | None = None) -> tuple[Array, Array]:
-    """H (6V, 6V) and b (6V,) of all pairs: the cost is ½ δᵀHδ + bᵀδ; `keep` masks pairs."""
+    """Return H (6V, 6V) and b (6V,) of all pairs: the cost is ½ δᵀHδ + bᵀδ; `keep` masks pairs."""
     H = np.zeros((g.views, 6, g.views, 6))
     b = np.zeros((g.views, 6))
     for i, (v, w) in enumerate(g.pairs):
@@ -195,23 +301,11 @@ def assemble(g: Gram, keep: Array | Mask | None = None) -> tuple[Array, Array]:
 
 
 def pair_squares(g: Gram, twists: Array) -> Array:
-    """Σ w e² of every pair (P,) after the views moved by `twists` (V, 6), without new matches."""
+    """Return Σ w e² of every pair (P,) after the views moved by `twists` (V, 6), without new matches."""
     difference = twists[g.pairs[:, 0]] - twists[g.pairs[:, 1]]
     linear = np.einsum("pi,pi->p", g.vector, difference)
     quadratic = np.einsum("pi,pij,pj->p", difference, g.matrix, difference)
     return g.square + 2 * linear + quadratic
-
-
-# Labelled points as pairs of views, beside the pairs of overlapping surfaces.
-#
-# A target seen by several views with weights w = 1/σ² has its place eliminated (Schur complement). What is left is
-#
-#     Σ_v w_v |x_v − x̄|² = Σ_{v<w} (w_v w_w / Σw) |x_v − x_w|²,
-#
-# so every two views that see it form a pair with e = (x_v − x_w) + L(δ_v − δ_w), a 3-vector, and L = [−[x̄ − c]×, 1]
-# at the mean x̄ for all of them: the common motion of all views stays exactly free, as between surfaces. Their sums
-# follow those of the surfaces in one Gram. Without one of n views the pairs that remain keep their weights, a share 1/n
-# below those of a new elimination: as little as surfaces change theirs.
 
 
 @dataclass(frozen=True)
@@ -225,39 +319,35 @@ class TargetPairs:
     information: Array  # (N,) w_v w_w / Σw, 1/length²
 
     def lever(self, centre: Array) -> Array:
-        """(N, 3, 6) what a left twist of a view about `centre` does to the target."""
+        """Return (N, 3, 6), what a left twist of a view about `centre` does to the target."""
         turn = -frames.skew(self.place - centre)
         return np.concatenate([turn, np.broadcast_to(np.eye(3), turn.shape)], axis=2)
 
 
 def target_pairs(sightings: Sightings, poses: Array) -> TargetPairs | None:
-    """All pairs of views that see a common target; None without any.
+    """Return all pairs of views that see a common target; None without any.
 
     Args:
         poses: T_reference_scanner (V, 4, 4).
     """
-    views, slots = list[Indices](), list[Indices]()
-    place, apart, information = list[Array](), list[Array](), list[Array]()
+    parts = []
     placed = frames.transform(poses, sightings.points)
     for k in range(len(sightings.targets)):
         seen = np.argwhere(sightings.used & (sightings.target == k)).astype(np.int64)
         if len(seen) < 2:
             continue
-        x, w = placed[seen[:, 0], seen[:, 1]], sightings.sigma[seen[:, 0], seen[:, 1]] ** -2.0
+        x = placed[seen[:, 0], seen[:, 1]]
+        w = sightings.sigma[seen[:, 0], seen[:, 1]] ** -2.0
         a, b = np.array(list(combinations(range(len(seen)), 2))).T
-        views.append(np.stack([seen[a, 0], seen[b, 0]], axis=1))
-        slots.append(np.stack([seen[a, 1], seen[b, 1]], axis=1))
-        place.append(np.broadcast_to(w @ x / w.sum(), (len(a), 3)))
-        apart.append(x[a] - x[b])
-        information.append(w[a] * w[b] / w.sum())
-    if not views:
-        return None
-    of_pairs = [np.concatenate(parts) for parts in (place, apart, information)]
-    return TargetPairs(np.concatenate(views), np.concatenate(slots), *of_pairs)
+        views = np.stack([seen[a, 0], seen[b, 0]], axis=1)
+        slots = np.stack([seen[a, 1], seen[b, 1]], axis=1)
+        place = np.broadcast_to(w @ x / w.sum(), (len(a), 3))
+        parts.append((views, slots, place, x[a] - x[b], w[a] * w[b] / w.sum()))
+    return TargetPairs(*(np.concatenate(column) for column in zip(*parts, strict=True))) if parts else None
 
 
 def append_targets(g: Gram, targets: TargetPairs | None, noise_factor: float) -> Gram:
-    """The sums of the surfaces, followed by those of the labelled points in the same unit of variance.
+    """Return the sums of the surfaces, followed by those of the labelled points in the same unit of variance.
 
     Args:
         noise_factor: what a distance between surfaces varies by is `noise_factor` times `g.variance`: its
@@ -269,133 +359,24 @@ def append_targets(g: Gram, targets: TargetPairs | None, noise_factor: float) ->
     weight = g.variance * noise_factor * targets.information
     weighted = lever * weight[:, None, None]
     pairs, matrix = sum_by_pair(targets, np.einsum("nia,nib->nab", weighted, lever))
-    vector = sum_by_pair(targets, np.einsum("nia,ni->na", weighted, targets.difference))[1]
-    square = sum_by_pair(targets, weight * np.einsum("ni,ni->n", targets.difference, targets.difference))[1]
-    return g.append(pairs=pairs, matrix=matrix, vector=vector, square=square)
+    nothing = np.zeros(len(pairs))
+    sums: dict[str, Any] = {
+        "pairs": pairs,
+        "matrix": matrix,
+        "vector": sum_by_pair(targets, np.einsum("nia,ni->na", weighted, targets.difference))[1],
+        "square": sum_by_pair(targets, weight * np.einsum("ni,ni->n", targets.difference, targets.difference))[1],
+        "weight": nothing,
+        "count": nothing.astype(int),
+        "raw_square": nothing,
+        "labelled": nothing == 0,
+    }
+    joined: dict[str, Any] = {name: np.concatenate([getattr(g, name), sums[name]]) for name in _PAIR_FIELDS}
+    return replace(g, **joined)
 
 
 def sum_by_pair(targets: TargetPairs, rows: Array) -> tuple[Indices, Array]:
-    """Pairs of views (P, 2), and rows (N, ...) summed over all targets that the two have in common, (P, ...)."""
+    """Return pairs of views (P, 2), and rows (N, ...) summed over all targets that the two have in common, (P, ...)."""
     pairs, number = np.unique(targets.views, axis=0, return_inverse=True)
     out = np.zeros((len(pairs), *rows.shape[1:]))
     np.add.at(out, number.reshape(-1), rows)
     return pairs, out
-
-
-# Everything two views of one capture have in common, under one set of poses.
-
-# Queries per view for the final normal equations and statistics.
-FINE_SAMPLES = 3000
-# Queries of all views together where they answer one question, a hand-eye or a scale.
-_TOTAL_SAMPLES = 20_000
-# Partners lie within the neighbour spacing plus 4 sigma of the surface distance.
-_GATE_SPACINGS = 1.5
-_GATE_SIGMAS = 4.0
-# Which pairs overlap is not asked again before a view has moved, or the gate opened, by so much of the gate. The pairs
-# of a gate hold those of a smaller one: asked again where they may be too many.
-_SAME_PAIRS = 0.3
-_SMALLER_GATE = 0.1
-
-
-@dataclass(frozen=True)
-class Overlaps:
-    """Correspondences of all overlapping pairs, and common targets, with the normal equations of both.
-
-    Example:
-        >>> len(run.overlaps.pairs), run.overlaps.gate > 0  # length_unit
-        (10, True)
-    """
-
-    pairs: list[tuple[int, int]]
-    matches: list[Match]
-    gram: Gram
-    gate: float
-    targets: TargetPairs | None = None
-    probed: tuple[Array, float] | None = None  # poses (V, 4, 4) and gate under which the pairs were found
-    searched: Searched | None = None  # where an iteration may go on from it
-
-
-def collect_overlaps(
-    capture: Capture,
-    poses: Array,
-    gate: float,
-    samples: Sequence[Indices],
-    before: Overlaps | None = None,
-) -> Overlaps:
-    """Match all overlapping pairs within `gate` and accumulate their normal equations.
-
-    Args:
-        poses: T_reference_scanner, (V, 4, 4).
-        before: of an iteration before; its pairs and its search serve again where little has moved since then.
-
-    Raises:
-        NoResultError: no two views overlap.
-    """
-    if before is not None and before.probed is not None and _pairs_still_valid(before, poses, gate):
-        pairs, probed, searched = before.pairs, before.probed, before.searched
-    else:
-        pairs = overlapping_pairs(capture.scans, poses, gate, at_most=max(map(len, samples)))
-        probed, searched = (np.array(poses), gate), None
-    matches, searched = match_pairs(capture.scans, poses, pairs, gate, samples, searched)
-    if not matches:
-        raise NoResultError(
-            f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "
-            "and scanner.pose, or leave scanner.pose out to have it searched"
-        )
-    surfaces = sum_matches(matches, len(capture.scans))
-    targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
-    g = append_targets(surfaces, targets, capture.noise_factor)
-    return Overlaps(pairs, matches, g, gate, targets, probed, searched)
-
-
-def carry_overlaps(capture: Capture, before: Overlaps, start: Array, poses: Array) -> Overlaps:
-    """The same correspondences after views have moved by so little that their partners stay: e + B(δ_v − δ_w).
-
-    Args:
-        start: (V, 4, 4) T_reference_scanner under which they were matched.
-        poses: (V, 4, 4) where the views are now.
-    """
-    centre = before.gram.centre
-    to_centre = frames.make(np.eye(3), -centre)
-    twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ start))
-
-    def moved(m: Match) -> Match:
-        change = frames.plane_rows(m.middle - centre, m.normal) @ (twists[m.v] - twists[m.w])
-        return replace(m, residual=m.residual + change)
-
-    matches = [moved(m) for m in before.matches]
-    targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
-    g = append_targets(sum_matches(matches, len(capture.scans)), targets, capture.noise_factor)
-    return replace(before, matches=matches, gram=g, targets=targets)
-
-
-def _pairs_still_valid(before: Overlaps, poses: Array, gate: float) -> bool:
-    """Whether no view has moved, and the gate has not opened, by enough to make other pairs overlap."""
-    assert before.probed is not None
-    T, probed_gate = before.probed
-    if gate < _SMALLER_GATE * probed_gate:
-        return False
-    to_centre = frames.make(np.eye(3), -before.gram.centre)
-    twists = frames.log(to_centre @ poses @ frames.inverse(to_centre @ T))
-    moved = np.linalg.norm(twists[:, 3:], axis=1) + before.gram.lever * np.linalg.norm(twists[:, :3], axis=1)
-    return bool(max(moved.max(), gate - probed_gate) < _SAME_PAIRS * min(gate, probed_gate))
-
-
-def common_samples(scans: Sequence[Scan], most: int) -> list[Indices]:
-    """Per view the points that ask where all views say one thing: of many views each needs fewer.
-
-    Args:
-        most: of one view.
-    """
-    return [sample_points(scan, min(most, _TOTAL_SAMPLES // len(scans))) for scan in scans]
-
-
-def next_gate(overlaps: Overlaps, capture: Capture) -> float:
-    """The distance that partners may have, from the spacing and the residuals' robust sigma."""
-    return _GATE_SPACINGS * capture.spacing + _GATE_SIGMAS * overlaps.gram.scale
-
-
-def pooled_rms(overlaps: Sequence[Overlaps]) -> float:
-    """Root mean square over the correspondences of all captures, inside the robust gate."""
-    square = sum(o.gram.raw_square.sum() for o in overlaps)
-    return float(np.sqrt(square / max(sum(o.gram.count.sum() for o in overlaps), 1)))

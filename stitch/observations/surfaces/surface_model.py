@@ -1,4 +1,4 @@
-"""The linear model of overlapping surfaces: views freed by their overlaps, read through the visible directions."""
+"""The linear model of overlapping surfaces: free-network views, read through the visible directions."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -31,12 +31,16 @@ from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
 
-# A model of the views' twists tried on sums over pairs: no new matches.
+# Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
+_UNSEEN = 0.25
 
 
 @dataclass(frozen=True)
 class SurfaceTrial:
-    """Columns X (6V, k) of twists; `points` are the sums of the last ones if these change the points themselves."""
+    """Columns X (6V, k) of twists tried on sums over pairs, without new matches.
+
+    `points` are the sums of the last columns if these change the points themselves.
+    """
 
     linear: LinearModel
     unconstrained: UnconstrainedPoses
@@ -44,18 +48,18 @@ class SurfaceTrial:
     points: PointSums | None = None
 
     def solve(self, left_out: Indices | None = None) -> Array:
-        """Coefficients (k,) by generalised least squares without some views."""
+        """Return coefficients (k,) by generalised least squares without some views."""
         return self._solve(self._white(self.X), self.linear.white_z, left_out)
 
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
-        """The same under each prior; zero beyond the coefficients that it is of."""
-        every, found = self._white(self.X), []
+        """Return the same under each prior; zero beyond the coefficients that it is of."""
+        white, solutions = self._white(self.X), []
         for prior in priors:
             half, k = np.sqrt(prior.precision), len(prior.precision)
             z = np.append(self.linear.white_z, half * prior.mean)
-            own = self._solve(np.vstack([every[:, :k], np.diag(half)]), z, left_out)
-            found.append(np.pad(own, (0, every.shape[1] - k)))
-        return found
+            solution = self._solve(np.vstack([white[:, :k], np.diag(half)]), z, left_out)
+            solutions.append(np.pad(solution, (0, white.shape[1] - k)))
+        return solutions
 
     def _solve(self, white: Array, z: Array, left_out: Indices | None) -> Array:
         k = white.shape[1]
@@ -66,51 +70,42 @@ class SurfaceTrial:
         return fit_columns(white, z)[:k]
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
-        """(pairs,) Σ w e² after the model moved, of all pairs or of some."""
-        every = self._squares_of_pairs(coefficients)
-        return every if units is None else every[units]
-
-    def _squares_of_pairs(self, coefficients: Array) -> Array:
-        """Point effects change e itself and do not move the views."""
+        """Return Σ w e² (pairs,) after the model moved, of all pairs or of some."""
         g, points = self.unconstrained.overlaps.gram, self.points
-        if not isinstance(points, PointGram):
-            return pair_squares(g, self._moved(self.X, coefficients))
-        k = points.residual.shape[1]
-        theta, rest = coefficients[-k:], coefficients[:-k]
-        moved = self._moved(self.X[:, :-k], rest)
-        difference = moved[g.pairs[:, 0]] - moved[g.pairs[:, 1]]
-        cross = np.einsum("pi,pik,k->p", difference, points.vector, theta)
-        quadratic = np.einsum("k,pkl,l->p", theta, points.square, theta)
-        return pair_squares(g, moved) + 2 * points.residual @ theta + 2 * cross + quadratic
+        of_points = points.residual.shape[1] if isinstance(points, PointGram) else 0
+        of_views = self.X.shape[1] - of_points
+        moved = (self.X[:, :of_views] @ coefficients[:of_views]).reshape(-1, 6) - self.unconstrained.twists
+        squares = pair_squares(g, moved)
+        if isinstance(points, PointGram):
+            # Point effects change e itself and do not move the views.
+            theta = coefficients[of_views:]
+            difference = moved[g.pairs[:, 0]] - moved[g.pairs[:, 1]]
+            cross = np.einsum("pi,pik,k->p", difference, points.vector, theta)
+            quadratic = np.einsum("k,pkl,l->p", theta, points.square, theta)
+            squares = squares + 2 * points.residual @ theta + 2 * cross + quadratic
+        return squares if units is None else squares[units]
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
-        """In the directions of the whitened channel that the left-out views alone move."""
-        own = column_space(self._white(self._twists_of(left_out)))
+        """Return the sum of squares in the whitened directions that the left-out views alone move."""
+        directions = column_space(self._white(self._twists_of(left_out)))
         rest = self.linear.white_z - self._white((self.X @ coefficients)[:, None])[:, 0]
-        return float(np.sum((own.T @ rest) ** 2))
+        return float(np.sum((directions.T @ rest) ** 2))
 
     def influential_views(self, coefficients: Array) -> Indices:
-        """(V,) all views."""
+        """Return all views (V,)."""
         return np.arange(self.unconstrained.overlaps.gram.views, dtype=np.int64)
 
     def _white(self, response: Array) -> Array:
         return self.linear.whiten(self.linear.reduce(response))
 
     def _twists_of(self, views: Indices) -> Array:
-        """(6V, 6k) unit twists of some views."""
+        """Return unit twists (6V, 6k) of some views."""
         return np.eye(len(self.X))[:, (6 * np.asarray(views)[:, None] + np.arange(6)).ravel()]
-
-    def _moved(self, X: Array, coefficients: Array) -> Array:
-        return (X @ coefficients).reshape(-1, 6) - self.unconstrained.twists
-
-
-# Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
-_UNSEEN = 0.25
 
 
 @dataclass(frozen=True)
 class SurfaceObservation(Observation):
-    """V freed views; a response counts twists (6V, P), the channel their n visible directions."""
+    """V free-network views; a response counts twists (6V, P), reduced to their n visible directions."""
 
     capture: Capture  # without the effects in use
     unconstrained: UnconstrainedPoses
@@ -153,8 +148,8 @@ class SurfaceObservation(Observation):
 
     def affected_squares(self, views: Indices) -> Mask:
         """(pairs,) with one of the views."""
-        touched: Mask = np.isin(self.unconstrained.overlaps.gram.pairs, views)
-        return touched.any(axis=1)
+        mask: Mask = np.asarray(np.isin(self.unconstrained.overlaps.gram.pairs, views).any(axis=1))
+        return mask
 
     def part_displacements(self, numbers: Array) -> Array:
         """(V, 3) translations of the twists that make numbers (n,) of the channel, less the common motion."""
@@ -174,7 +169,7 @@ def surface_model(
     unconstrained: UnconstrainedPoses,
     variances: Callable[[Sequence[str]], Array] | None = None,
 ) -> LinearModel:
-    """Reduce freed views to a linear model.
+    """Return the linear model of free-network views.
 
     Args:
         capture: without the effects of the model.
@@ -183,38 +178,33 @@ def surface_model(
             views tell.
     """
     g, frames_of_mount = unconstrained.overlaps.gram, capture.hand_eye_frames(model.T_mount)
-    channel = reduce_poses(g, unconstrained.twists, frames_of_mount, capture.T_reference_flange)
-    extra = view_columns(measurement, model, unconstrained)
-    sizes = sizes_of(model.terms)
-    field = channel.reduction @ field_scatter(measurement, unconstrained)
-    alone = replace(hand_eye_mixed_model(channel), fixed=(field @ field.T)[None])
-    half = np.linalg.cholesky(alone.covariance(_null_fit(alone, (), variances).variances)[0])
-    white = (np.asarray(np.linalg.solve(half, c), float) for c in (channel.hand_eye, channel.reduction @ extra))
-    own, further = white
-    seen = independent(own, further, sizes, _UNSEEN)
-    mixed = replace(hand_eye_mixed_model(channel, channel.reduction @ extra[:, seen]), fixed=alone.fixed)
-    design = np.hstack([hand_eye_jacobian(frames_of_mount, g.centre), extra[:, seen]])
+    reduced = reduce_poses(g, unconstrained.twists, frames_of_mount, capture.T_reference_flange)
+
+    def fit_null(mixed: MixedModel, names: Sequence[str] = ()) -> VarianceFit:
+        return fit_variances(mixed, both_starts=True) if variances is None else at_variances(mixed, variances(names))
+
+    twists = view_columns(measurement, model, unconstrained)
+    sizes, values = sizes_of(model.terms), values_of(model.terms)
+    field = reduced.reduction @ field_scatter(measurement, unconstrained)
+    alone = replace(hand_eye_mixed_model(reduced), fixed=(field @ field.T)[None])
+    half = np.linalg.cholesky(alone.covariance(fit_null(alone).variances)[0])
+    base = np.linalg.solve(half, reduced.hand_eye).astype(float)
+    further = np.linalg.solve(half, reduced.reduction @ twists).astype(float)
+    seen = independent(base, further, sizes, _UNSEEN)
+    mixed = replace(hand_eye_mixed_model(reduced, reduced.reduction @ twists[:, seen]), fixed=alone.fixed)
     errors = None
     if measurement.views.count < MANY_VIEWS:
-        errors = prior_pose_errors([measurement], model, [g.centre]).project(channel.reduction)
+        errors = prior_pose_errors([measurement], model, [g.centre]).project(reduced.reduction)
         mixed = with_pose_errors(mixed, errors)
-    null = _null_fit(mixed, () if errors is None else errors.names, variances)
-    values = values_of(model.terms)
     return LinearModel(
         measurement,
         model,
-        SurfaceObservation(capture, unconstrained, channel),
-        design,
+        SurfaceObservation(capture, unconstrained, reduced),
+        design=np.hstack([hand_eye_jacobian(frames_of_mount, g.centre), twists[:, seen]]),
         sizes=np.append(np.full(6, np.inf), sizes[seen]),
         values=np.append(np.zeros(6), values[seen]),
         mixed=mixed,
-        null=null,
+        null=fit_null(mixed, () if errors is None else errors.names),
         pose_errors=errors,
         flange_per_joint=np.zeros(2) if errors is None else errors.flange_per_joint,
     )
-
-
-def _null_fit(
-    mixed: MixedModel, names: Sequence[str], variances: Callable[[Sequence[str]], Array] | None
-) -> VarianceFit:
-    return fit_variances(mixed, both_starts=True) if variances is None else at_variances(mixed, variances(names))

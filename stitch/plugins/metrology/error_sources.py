@@ -122,11 +122,11 @@ def error_chain(run: RunData) -> ErrorChain:
     of_points = np.array([moves_points([term]) for term in model.terms for _ in term.parameters], bool)
     effects = FittedEffects((columns[:, fitted],), values_of(model.terms)[fitted], WEAK * sizes_of(model.terms)[fitted])
     found = solve_hand_eye([own], [freed], model.T_mount, effects)
-    answer = np.asarray(found.gls.gain @ found.parts[0].reduced_poses.reduction)
+    answer = np.asarray(found.gls.gain @ found.rig.parts[0].reduced_poses.reduction)
     follow = _follow_overlaps(run, own, found, freed.overlaps.gram.centre)
     g = freed.overlaps.gram
     of_views = np.column_stack(
-        [hand_eye_jacobian(found.parts[0].hand_eye_frames, g.centre), columns[:, fitted] * ~of_points[fitted]]
+        [hand_eye_jacobian(found.rig.parts[0].hand_eye_frames, g.centre), columns[:, fitted] * ~of_points[fitted]]
     )
     by_points = np.column_stack([np.zeros((len(columns), 6)), columns[:, fitted] * of_points[fitted]])
     return ErrorChain(
