@@ -13,7 +13,7 @@ from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, covariate_text, length_text
 from stitch.observations.pose_errors import time_in_steps
-from stitch.observations.surfaces.scanner_errors import FieldMap
+from stitch.observations.surfaces.field_error import FieldMap
 from stitch.output.comparison.residual_tables import ResidualTable, ResidualTables
 from stitch.output.plain_finding import OTHER_SOURCES, largest_error_sources, share_text
 from viz import captions

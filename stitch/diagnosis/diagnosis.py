@@ -15,7 +15,7 @@ from stitch.diagnosis.validation import CrossValidation
 from stitch.diagnosis.verdict import Answer
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from stitch.diagnosis.verdict import Answer, Evidence, scanner_explains_it
 from stitch.model.forward import moves_points
 from stitch.model.model import Term
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.scanner_errors import FieldError, field_error
+from stitch.observations.surfaces.field_error import FieldError, field_error
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.observations.surfaces.view_poses import noise_floor
 from stitch.session.measurement import Views

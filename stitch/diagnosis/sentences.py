@@ -11,7 +11,7 @@ from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
 from stitch.numerics.units import angle_text, duration_text, format_amount, length_text, rounded
-from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 
 _SCALE = "range_scale"
 # Curves of joints that are told in words; the page draws one more.

@@ -12,7 +12,7 @@ from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.unmodelled_time_effects import RepeatingError
 from stitch.diagnosis.validation import CrossValidation
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 
 Verdict = Literal["adequate", "missing_effect", "cannot_tell", "unknown_effect"]
 

@@ -10,7 +10,7 @@ from stitch.diagnosis.score import Score
 from stitch.diagnosis.unmodelled_time_effects import TimeCurve
 from stitch.diagnosis.validation import CrossValidation
 from stitch.numerics.frames import Array
-from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 from stitch.output.finding_screen import finding_screen
 from stitch.output.plain_finding import plain_finding, suggested_command
 from stitch.output.result_document import parameter_row

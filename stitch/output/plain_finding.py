@@ -13,7 +13,7 @@ from stitch.diagnosis.sentences import odds_text
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, HELDOUT_FALL, MAX_REMAINING_SHARE
 from stitch.diagnosis.validation import CrossValidation, group_helps, group_share
 from stitch.numerics.units import length_text
-from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 from stitch.output.plain_words import REMEDIES, effect_in_words, plain_covariate
 from stitch.run_data import doubt_headline, effect_cure
 

@@ -7,7 +7,7 @@ import pytest
 from stitch.diagnosis import evidence as gathering
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.verdict import Evidence
-from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 
 
 def named(gain: float) -> Evidence:

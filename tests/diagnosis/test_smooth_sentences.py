@@ -1,7 +1,7 @@
 """What is said of scans that err smoothly: the clearer of the two kinds, with its size."""
 
 from stitch.diagnosis.sentences import scanner_advice, scanner_error_sentence
-from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 
 SAME = FieldError(0.02, 0.0, 9.0, over_noise=False)
 BOTH = FieldError(0.02, 0.01, 9.0, over_noise=True, with_time=True)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from stitch.diagnosis.verdict import Evidence
-from stitch.observations.surfaces.scanner_errors import FieldError
+from stitch.observations.surfaces.field_error import FieldError
 
 ONE, OTHER = (SimpleNamespace(name=n, score=SimpleNamespace(log_bayes_factor=8.0)) for n in ("backlash", "settling"))
 LARGE, SMALL = (FieldError(0.02, 0.0, gain, over_noise) for gain, over_noise in ((20.0, True), (5.0, False)))

@@ -15,13 +15,13 @@ from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.effects.contract import EFFECTS
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.surfaces.field_error import field_error
 from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import gram
 from stitch.observations.surfaces.scanner_errors import (
     COARSE,
     PER_VIEW,
     SmoothErrorLikelihood,
-    field_error,
     part_of_view,
     sum_smooth_errors,
     view_error_likelihood,

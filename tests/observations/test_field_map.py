@@ -11,7 +11,7 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import clean, simulated
 from stitch.api import pipeline
 from stitch.diagnosis.diagnose import linear_model_of
-from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap, field_error, robust_pass_share
+from stitch.observations.surfaces.field_error import FieldError, FieldMap, field_error, robust_pass_share
 
 # mm along the ray at places (N,) of the field, −1 … 1 both ways.
 Law = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -12,7 +12,8 @@ from data_synth.scene import load_scene
 from stitch.api import pipeline
 from stitch.diagnosis.diagnose import linear_model_of
 from stitch.numerics import frames
-from stitch.observations.surfaces.scanner_errors import field_error, field_scatter
+from stitch.observations.surfaces.field_error import field_error
+from stitch.observations.surfaces.scanner_errors import field_scatter
 
 SEEDS = 2
 

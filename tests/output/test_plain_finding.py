@@ -15,7 +15,7 @@ from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.validation import CrossValidation
 from stitch.effects import EFFECTS
-from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap
+from stitch.observations.surfaces.field_error import FieldError, FieldMap
 from stitch.output.diagnosis_document import _field_map
 from stitch.output.plain_finding import largest_error_sources, plain_finding, remedy_at_machine, suggested_command
 from stitch.output.plain_words import effect_in_words

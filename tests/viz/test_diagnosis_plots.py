@@ -11,7 +11,7 @@ from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
-from stitch.observations.surfaces.scanner_errors import FieldError, FieldMap
+from stitch.observations.surfaces.field_error import FieldError, FieldMap
 from viz.diagnosis_plots import budget_rows, diagnosis_plots
 
 LINES = (

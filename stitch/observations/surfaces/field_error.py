@@ -1,0 +1,274 @@
+"""Smooth errors of a scanner larger than every scanner has, as the overlaps show them, and a map of them.
+
+The same in every view, or not: two questions, each held against what every scanner has (`scanner_errors.py`).
+
+Overlaps show differences between views alone. On a part that is nearly flat, moving the views does what a constant or
+a slope over the field does, and what a bowl does: seen from two places, its two images differ by a slope, however the
+scanner is rolled. The map has none of them. Errors across the ray, or along the range, are no map over the field:
+where they are most of what is shown, there is none.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from stitch.model.forward import PointSlopes
+from stitch.model.model import Model, Term
+from stitch.numerics.distributions import chi2_tail, tukey
+from stitch.numerics.frames import Array, Mask
+from stitch.numerics.least_squares import project_out
+from stitch.observations.surfaces.effect_columns import PointGram, apparent_twists
+from stitch.observations.surfaces.normal_equations import Overlaps
+from stitch.observations.surfaces.scanner_errors import (
+    ALARM_SHARE,
+    COARSE,
+    FINE,
+    PER_VIEW,
+    SHARE_BOUNDS,
+    SHARED,
+    SmoothErrorLikelihood,
+    half_field,
+    legendre_products,
+    shared_error_likelihood,
+    sum_smooth_errors,
+    view_error_likelihood,
+)
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
+from stitch.session.measurement import Measurement
+
+# Places along either way across the field.
+_GRID_PLACES = 25
+# A place is drawn where the scans have at least this share of the points that it would have if all were spread evenly.
+_MIN_POINT_DENSITY = 0.05
+# Of what smooth errors leave in the overlaps, squared: the share that those along the ray over the field have to
+# explain. Axes askew or of another scale leave less than 0.2 to them, laws along the ray more than 0.8.
+_MIN_FIELD_SHARE = 0.7
+# Maps of simulated scanners were off by 1.2 to 2.2 times what chance alone makes of them: normals are measured too, and
+# a scanner's law is no polynomial.
+_SIGMA_FACTOR = 2.0
+_PERMUTATIONS = 999
+
+
+@dataclass(frozen=True)
+class FieldMap:
+    """Error along the ray over the scanner's field, length_unit; positive where points are seen too far away."""
+
+    x: Array  # (X,) x/|z| in the scanner's frame
+    y: Array  # (Y,) y/|z|
+    error: Array  # (Y, X) NaN where too few points were seen
+    sigma: Array  # (Y, X) its standard uncertainty
+
+    @property
+    def rms(self) -> float:
+        """Of the error, over what was seen of the field."""
+        return float(np.sqrt(np.nanmean(self.error**2)))
+
+    @property
+    def uncertainty(self) -> float:
+        """Rms of the standard uncertainty over the same."""
+        return float(np.sqrt(np.nanmean(self.sigma**2)))
+
+
+@dataclass(frozen=True)
+class FieldError:
+    """Errors along the ray that are smooth over the scanner's field; rms in length_unit, 0 where not unusual."""
+
+    rms: float  # of what is the same in every view
+    rms_by_view: float  # of what every view has for itself
+    gain: float  # nats by which the clearer of both is likelier than the largest that every scanner has
+    over_noise: bool  # one of the two is more systematic than random
+    by_view: bool = False  # the second is the clearer
+    with_time: bool = False  # it follows the session
+    map: FieldMap | None = field(default=None, compare=False, repr=False)  # where the first is the clearer
+
+    @property
+    def unusual(self) -> bool:
+        """Larger than every scanner's."""
+        return self.rms > 0 or self.rms_by_view > 0
+
+
+def field_error(
+    measurement: Measurement,
+    model: Model,
+    unconstrained: UnconstrainedPoses,
+    alpha: float,
+    nuisance_effects: Sequence[Term] = (),
+) -> FieldError:
+    """Return what the overlaps show of it; what it exceeds at the level `alpha`.
+
+    Args:
+        nuisance_effects: effects of points that may have any size there.
+    """
+    sums, noise = sum_smooth_errors(
+        measurement, unconstrained, PointSlopes.about_model(measurement, model, nuisance_effects), per_view=True
+    )
+    if not np.isfinite(noise):
+        return FieldError(0.0, 0.0, 0.0, over_noise=False)
+    nuisance = sum(len(term.parameters) for term in nuisance_effects)
+    each = view_error_likelihood(sums, unconstrained, noise, nuisance)
+    # Two questions, each at half of the level.
+    changing = _cause_size(each, PER_VIEW, alpha / 2)
+    # What all views have in common comes first: large errors of that kind move points to other partners, which looks
+    # like errors of single views.
+    alone = changing.share > 0 and changing.gain > _shared_error_gain(each)
+    if alone:
+        same = _cause_size(each, SHARED, alpha / 2)
+    else:
+        # Without the finer ones: what is known of it where no view has errors for itself.
+        together = sums.merge_sides(per_view=COARSE)
+        column = np.arange(together.residual.shape[1])
+        coarse = together.select((column <= COARSE) | (column >= len(column) - nuisance))
+        twists = apparent_twists(coarse, unconstrained)
+        likelihood = shared_error_likelihood(coarse, twists, unconstrained, noise, nuisance)
+        same = _cause_size(likelihood, SHARED, alpha / 2)
+    by_view = alone or (changing.share > 0 and not same.share)
+    return FieldError(
+        noise * same.share,
+        noise * changing.share,
+        max(same.gain, changing.gain),
+        same.over_noise or changing.over_noise,
+        by_view,
+        changing.share > 0 and _follows_time(each.estimate(PER_VIEW, changing.shares), alpha),
+        field_map(measurement, sums, unconstrained, noise, nuisance) if same.share and not by_view else None,
+    )
+
+
+@dataclass(frozen=True)
+class _CauseSize:
+    """Of errors of one cause, in units of the noise."""
+
+    share: float  # 0 where not unusual
+    shares: Array  # (C,) the likeliest of all causes
+    gain: float
+    over_noise: bool
+
+
+def _cause_size(likelihood: SmoothErrorLikelihood, cause: int, alpha: float) -> _CauseSize:
+    """Return the likeliest size of errors of one cause beside the others, if it is unusual."""
+
+    def clear(gain: float) -> bool:
+        # On the boundary of what is allowed: half of the χ² of one degree of freedom (Self & Liang 1987).
+        return 0.5 * chi2_tail(2 * gain, 1) < alpha
+
+    shares, free = likelihood.ml_shares(_share_limits(likelihood, {}))
+
+    def nats(share: float) -> float:
+        return 0.5 * (likelihood.ml_shares(_share_limits(likelihood, {cause: share}))[1] - free)
+
+    gain = nats(ALARM_SHARE)
+    if not clear(gain):
+        return _CauseSize(0.0, shares, gain, over_noise=False)
+    return _CauseSize(float(shares[cause]), shares, gain, clear(nats(1.0)))
+
+
+def _shared_error_gain(likelihood: SmoothErrorLikelihood) -> float:
+    """Return the nats that errors of all views gain over usual ones where those of single views are usual."""
+    usual = {PER_VIEW: ALARM_SHARE}
+    deviances = [
+        likelihood.ml_shares(_share_limits(likelihood, limits))[1] for limits in (usual | {SHARED: ALARM_SHARE}, usual)
+    ]
+    return 0.5 * (deviances[0] - deviances[1])
+
+
+def _share_limits(likelihood: SmoothErrorLikelihood, limits: dict[int, float]) -> list[float]:
+    """Return the largest share of each cause."""
+    return [limits.get(cause, SHARE_BOUNDS[1]) for cause in range(len(likelihood.design))]
+
+
+def _follows_time(errors: Array, alpha: float) -> bool:
+    """Return whether errors of the views, part after part, follow their order more than other orders would have it."""
+    parts = len(errors) // COARSE
+    errors = errors.reshape(parts, -1)
+    order = np.arange(parts) - (parts - 1) / 2
+    generator = np.random.default_rng(parts)
+    others = np.array([generator.permutation(order) for _ in range(_PERMUTATIONS)])
+    trend = np.linalg.norm(order @ errors)
+    return bool((1 + np.sum(np.linalg.norm(others @ errors, axis=1) >= trend)) / (1 + _PERMUTATIONS) < alpha)
+
+
+def field_map(
+    measurement: Measurement, sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int = 0
+) -> FieldMap | None:
+    """Return the likeliest error, as far as the overlaps tell it; None where it is not most of what they show.
+
+    Args:
+        sums: of `sum_smooth_errors` with errors of every view.
+        noise: of the scanner, length_unit.
+        nuisance: so many of the last parameters may have any size.
+    """
+    likelihood = _coarse_fine_likelihood(sums, unconstrained, noise, nuisance)
+    # Coarse and finer errors as one cause of unit size beside incidence.
+    shares = likelihood.ml_shares([SHARE_BOUNDS[1]] * len(likelihood.design))[0]
+    coarse, fine, incidence = (share * columns for share, columns in zip(shares, likelihood.design, strict=True))
+    sizes = np.repeat(shares[:2], [coarse.shape[1], fine.shape[1]])
+    likelihood = replace(likelihood, design=(np.hstack([coarse, fine]), incidence))
+    values = likelihood.estimate(0, np.ones(2))
+    if _field_share(likelihood, values) < _MIN_FIELD_SHARE:
+        return None
+    half = half_field(measurement)
+    scans = measurement.capture.scans
+    # 1 where the scanner looks along its z, −1 where against it.
+    forward = float(np.sign(np.median([np.median(scan.points[:, 2] - scan.eye[2]) for scan in scans])))
+    x, y = (np.linspace(-h, h, _GRID_PLACES) for h in half)
+    seen = _observed_places(measurement, x, y, forward)
+    a, b = (way[seen] for way in np.meshgrid(x, y))
+    rays = np.stack([a, b, np.ones_like(a)], axis=1)
+    # Coarse ones stand for what undoes the error, finer ones for the error itself.
+    signs = np.where(np.arange(FINE) < COARSE, -1.0, 1.0)
+    size = signs * sizes[:FINE] * noise / robust_pass_share(unconstrained.overlaps)
+    shapes = np.array(legendre_products(rays * [forward, forward, 1.0], half)).T * size
+    shapes = project_out(np.column_stack([rays, a**2 + b**2]), shapes)
+    covariance = likelihood.posterior_covariance(0, np.ones(2))[:FINE, :FINE]
+    error, sigma = (np.full(seen.shape, np.nan) for _ in range(2))
+    error[seen] = shapes @ values[:FINE]
+    sigma[seen] = _SIGMA_FACTOR * np.sqrt(np.sum((shapes @ covariance) * shapes, axis=1))
+    return FieldMap(x, y, error, sigma)
+
+
+def _coarse_fine_likelihood(
+    sums: PointGram, unconstrained: UnconstrainedPoses, noise: float, nuisance: int
+) -> SmoothErrorLikelihood:
+    """Return what the overlaps show of errors that all views share: coarse over the field, finer, over incidence."""
+    together = sums.merge_sides(per_view=COARSE)
+    column = np.arange(together.residual.shape[1])
+    # The one over incidence stands after the coarse ones; it is to come last.
+    order: Any = np.concatenate(
+        [np.delete(column[: len(column) - nuisance], COARSE), [COARSE], column[len(column) - nuisance :]]
+    )
+    shared = together.select(order)
+    twists = apparent_twists(shared, unconstrained)
+    likelihood = shared_error_likelihood(shared, twists, unconstrained, noise, nuisance)
+    over_field, incidence = likelihood.design
+    return replace(likelihood, design=(over_field[:, :COARSE], over_field[:, COARSE:], incidence))
+
+
+def _field_share(likelihood: SmoothErrorLikelihood, values: Array) -> float:
+    """Return how much of what the errors (K,) leave, squared, those along the ray over the field explain."""
+    whole = likelihood.design[0] @ values
+    rest = whole - likelihood.design[0][:, :FINE] @ values[:FINE]
+    squares = [float(np.sum(left**2 / likelihood.scatter)) for left in (rest, whole)]
+    return 1 - squares[0] / squares[1] if squares[1] > 0 else 0.0
+
+
+def robust_pass_share(overlaps: Overlaps) -> float:
+    """Return how much of a small error robust weights let through, as a share of what fixed weights would.
+
+    They fall as the error grows: Σ dψ/de over Σ ψ/e of Tukey's ψ (Huber & Ronchetti 2009, 7.6), 0.83 for normal noise.
+    """
+    root = np.sqrt(np.concatenate([tukey(m.residual, overlaps.gram.scale) for m in overlaps.matches]))
+    weight = np.concatenate([m.weight for m in overlaps.matches])
+    # With u = e/(c·sigma): the root is 1 − u², and dψ/de = (1 − u²)(1 − 5u²).
+    return float(np.sum(weight * root * (5 * root - 4)) / np.sum(weight * root**2))
+
+
+def _observed_places(measurement: Measurement, x: Array, y: Array, forward: float) -> Mask:
+    """Return (Y, X): True at places about which the scans have points."""
+    edges = [np.append(at, at[-1] + at[1] - at[0]) - (at[1] - at[0]) / 2 for at in (y, x)]
+    counts = np.zeros((len(y), len(x)))
+    for scan in measurement.capture.scans:
+        away = scan.points - scan.eye
+        slopes = forward * away[:, :2] / away[:, 2:]
+        counts += np.histogram2d(slopes[:, 1], slopes[:, 0], bins=edges)[0]
+    return counts > _MIN_POINT_DENSITY * counts.mean()
