@@ -1,14 +1,18 @@
 """Which parameters of an effect are fitted, and how large those left out may be."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binomtest, multivariate_normal
+from scipy.stats import binomtest, multivariate_normal, norm
 
 from stitch.numerics.least_squares import independent
 from stitch.numerics.parameter_selection import (
+    ANY_SIZE,
+    PLAUSIBLE,
     WhitenedData,
     log_evidence_at_scales,
+    log_mixture,
     omitted_rms,
     select_supported,
 )
@@ -122,3 +126,21 @@ def test_what_stays_at_zero_may_be_as_large_as_it_is_on_the_average():
         WhitenedData(own, np.tile(further, 2), z), np.full(2, 0.3), np.array([True, False]), np.arange(2)
     )
     np.testing.assert_allclose(same, [0.0, 0.3 * np.sqrt(0.5)], rtol=1e-6)
+
+
+@pytest.mark.parametrize("scales", [PLAUSIBLE, ANY_SIZE])
+def test_shares_add_up_to_all(scales):
+    assert sum(scales.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("scales", [PLAUSIBLE, ANY_SIZE])
+@pytest.mark.parametrize("seen", [0.0, 2.0, 66.0])
+def test_the_evidence_is_that_of_the_mixture(scales, seen):
+    """One number with sigma 1 of an amplitude that is usually of size 1; one of 66 is seen as well as it is."""
+    logs = np.array([norm.logpdf(seen, scale=np.hypot(1.0, scale)) for scale in scales])
+    mixture = sum(share * norm.pdf(seen, scale=np.hypot(1.0, scale)) for scale, share in scales.items())
+    assert log_mixture(logs, scales) == pytest.approx(np.log(mixture))
+    if seen > 60:
+        # Under a normal prior of plausible size what is 66 sizes large explains a thousand nats less than it is.
+        lost = norm.logpdf(seen, scale=seen) - log_mixture(logs, scales)
+        assert lost < 10 < norm.logpdf(seen, scale=seen) - norm.logpdf(seen, scale=np.hypot(1.0, 1.0)) - 500
