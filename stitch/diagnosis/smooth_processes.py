@@ -106,7 +106,7 @@ def wandering_flange(linear: LinearModel) -> SmoothProcess:
     measurement = linear.measurement
     time = time_in_steps(measurement)
     knots = _knots(len(time))
-    covariance = ornstein_uhlenbeck(time, DRIFT_MEMORY["slowly wandering"], time[knots])
+    covariance = exponential_kernel(time, time[knots], DRIFT_MEMORY["slowly wandering"])
     carried = flange_twists([measurement], [linear.observation.centre]).reshape(len(time), 6, 6)
     return SmoothProcess(None, carried, covariance @ leading_trends(covariance[knots], limits.PROCESS_COLUMNS // 6))
 

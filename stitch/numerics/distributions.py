@@ -1,14 +1,13 @@
-"""Tails of distributions, and where they begin: `scipy.stats` has them too, and takes a second to load.
+"""Robust scale and weights of residuals; tails of distributions, and where they begin.
 
-All are upper tails: P(X > x), and the x beyond which the share p lies.
+All are upper tails: P(X > x), and the x beyond which the share p lies. `scipy.stats` has them too, and takes a second
+to load.
 """
 
 import numpy as np
 from scipy import special
 
 from stitch.numerics.frames import Array
-
-# Robust scale and weights of residuals.
 
 MAD_TO_SIGMA = 1.4826
 # Tukey's biweight at 4.685 σ keeps 95 % efficiency for normal errors (Holland & Welsch 1977).
@@ -22,7 +21,8 @@ def mad_sigma(e: Array) -> float:
 
 def nan_median(values: Array) -> Array:
     """(n,) medians over the first axis of values (m, n) without their NaN; NaN where there is nothing else."""
-    known, ordered, column = np.isfinite(values).sum(axis=0), np.sort(values, axis=0), np.arange(values.shape[1])
+    known = np.isfinite(values).sum(axis=0)
+    ordered, column = np.sort(values, axis=0), np.arange(values.shape[1])
     low, high = np.maximum(known - 1, 0) // 2, np.minimum(known // 2, len(values) - 1)
     return (ordered[low, column] + ordered[high, column]) / 2
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pykdtree.kdtree import KDTree
 
 from stitch.numerics import frames
@@ -59,7 +58,7 @@ def voxel_downsample(points: Array, normals: Array, size: float) -> tuple[Array,
     count = np.bincount(voxel)
 
     def mean(values: Array) -> Array:
-        return np.stack([_sums(voxel, column, len(count)) for column in values.T], axis=1) / count[:, None]
+        return np.stack([np.bincount(voxel, column, len(count)) for column in values.T], axis=1) / count[:, None]
 
     return mean(points), _unit(mean(normals))
 
@@ -74,7 +73,8 @@ def compute_fpfh(points: Array, normals: Array, radius: float) -> FeaturedSurfac
     other = index[own, column].astype(int)
     simple = _angle_histograms(points, normals, own, other)
     weight = 1 / distance[own, column] ** 2
-    around = np.stack([_sums(own, weight * share[other], len(points)) for share in simple.T], axis=1)
+    sums = [np.bincount(own, weight * share[other], len(points)) for share in simple.T]
+    around: Array = np.stack(sums, axis=1).astype(float)
     return FeaturedSurface(points, normals, _normalised(simple) + _normalised(around), tree)
 
 
@@ -91,7 +91,9 @@ def register_ransac(source: FeaturedSurface, target: FeaturedSurface, reach: flo
     own, other = _partners(source.histograms, target.histograms)
     a, b = source.points[own], target.points[other]
     triples = np.random.default_rng(seed).integers(len(a), size=(draws, _MIN_SAMPLE))
-    triples = triples[_same_shape(a[triples], b[triples])]
+    # Only where the edges have the same length in both.
+    edges = [np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2) for p in (a[triples], b[triples])]
+    triples = triples[(np.minimum(*edges) > _EDGE_RATIO * np.maximum(*edges)).all(axis=1)]
     T = align_points(a[triples], b[triples])
     moved = a[triples] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
     T = T[np.linalg.norm(moved - b[triples], axis=2).max(axis=1, initial=0.0) < reach]
@@ -148,22 +150,12 @@ def _unit(vectors: Array) -> Array:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
-def _sums(group: Indices, values: Array, groups: int) -> Array:
-    return np.asarray(np.bincount(group, values, groups), float)
-
-
 def _partners(a: Array, b: Array) -> tuple[Indices, Indices]:
     """Indices of histograms that are each other's nearest; where those are too few, of every one and its nearest."""
     forth, back = (KDTree(y).query(x, k=1)[1].astype(int) for x, y in ((a, b), (b, a)))
     own = np.arange(len(a))
     mutual = back[forth] == own
     return (own[mutual], forth[mutual]) if mutual.sum() >= 3 * _MIN_SAMPLE else (own, forth)
-
-
-def _same_shape(a: Array, b: Array) -> NDArray[np.bool_]:
-    """Whether the edges of triples a and b (K, 3, 3) have the same length."""
-    edges = [np.linalg.norm(triples - np.roll(triples, 1, axis=1), axis=2) for triples in (a, b)]
-    return (np.minimum(*edges) > _EDGE_RATIO * np.maximum(*edges)).all(axis=1)
 
 
 def _msac_costs(T: Array, a: Array, b: Array, reach: float) -> Array:

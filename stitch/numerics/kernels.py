@@ -60,8 +60,11 @@ def direction_kernel(joint: Array, travel: Array) -> Array:
 
 
 def exponential_kernel(some: Array, others: Array, reach: float) -> Array:
-    """(S, O) of a continuous function of one number, (S,) and (O,), alike as far as `reach`."""
-    return ornstein_uhlenbeck(some, reach, others)
+    """Return (S, O) of a continuous function of one number, (S,) and (O,), alike as far as `reach`.
+
+    It is the process that forgets (Ornstein–Uhlenbeck); of time in steps from view to view the reach is its memory.
+    """
+    return np.exp(-np.abs(some[:, None] - others[None, :]) / reach)
 
 
 def load_kernel(torques: Array) -> Array:
@@ -74,16 +77,6 @@ def load_kernel(torques: Array) -> Array:
 def direction_reach(joint: Array) -> float:
     """How far a move may differ and still do nearly the same, rad: the range of the joint (V,) rad."""
     return max(float(np.ptp(joint)), 1e-9)
-
-
-def ornstein_uhlenbeck(time: Array, memory: float, others: Array | None = None) -> Array:
-    """(V, V) of a process that forgets (Ornstein–Uhlenbeck), or (V, O) with other times (O,).
-
-    Args:
-        time: (V,) and memory in steps from view to view.
-    """
-    apart = time[:, None] - (time if others is None else others)[None, :]
-    return np.exp(-np.abs(apart) / memory)
 
 
 def same_stop(T_base_flange: Array) -> Mask:

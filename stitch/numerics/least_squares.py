@@ -11,34 +11,18 @@ from scipy.special import ndtri
 
 from stitch.numerics.frames import Array, Indices, Mask
 
-# Anderson acceleration with a memory of one step (Anderson 1965; for ICP: Pavlov et al. 2018).
-#
-# Partners follow a view that moves, so that every step of point-to-plane matching leaves the same share of the way
-# undone. Two steps tell that share, and the next one makes up for it.
-
-# Against steps that hardly shrink: at most twice as far, or half as far where they turn back.
-_FARTHEST, _NEAREST = 1.0, -0.5
-
-
-def anderson_step(step: Array, last_step: Array, last_taken: Array) -> Array:
-    """(N,) the step to take, from what two iterations in turn ask for.
-
-    Args:
-        step: (N,) what the present iteration asks for, all components in one unit.
-        last_step: (N,) what the iteration before asked for.
-        last_taken: (N,) the step that was taken then.
-    """
-    change = step - last_step
-    square = float(change @ change)
-    share = 0.0 if square == 0 else float(np.clip(-(change @ step) / square, _NEAREST, _FARTHEST))
-    return step + share * (last_taken + change)
-
-
 # Where every column of a unit diagonal has more than this share of its root beside those before it, a Cholesky factor
 # is as good as eigenvectors, and takes a tenth of the time.
 CLEARLY_KNOWN = 1e-3
 # Above this one it solves as well as they do.
 _SOLVABLE = 1e-6
+# Of so many rows singular values take ten times as long as eigenvalues of the columns' products. These, their squares,
+# tell as well which combinations say something, unless one lies between.
+_MANY_ROWS, _SAYS_SOMETHING, _SAYS_NOTHING = 1_000, 1e-8, 1e-12
+# Fewer estimates say nothing about their spread.
+_FEWEST = 4
+# Acceleration against steps that hardly shrink: at most twice as far, or half as far where they turn back.
+_FARTHEST, _NEAREST = 1.0, -0.5
 
 
 def equilibrated(matrix: Array) -> tuple[Array, Array]:
@@ -46,33 +30,6 @@ def equilibrated(matrix: Array) -> tuple[Array, Array]:
     these; unknowns count in rad, mm and per hour."""
     unit = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
     return matrix * unit[..., :, None] * unit[..., None, :], unit
-
-
-# How much more leaving out samples moves estimates than their covariance says (Efron & Stein 1981).
-
-# Fewer estimates say nothing about their spread.
-_FEWEST = 4
-
-
-def grouped_inflation(left_out: Array, covariance: Array) -> float:
-    """Factor on the covariance, at least 1: the jackknife's over the model's, mean over all directions.
-
-    Args:
-        left_out: (G, K) estimates with one group of samples left out.
-        covariance: (K, K) of the estimates.
-    """
-    count = len(left_out)
-    if count < _FEWEST:
-        return 1.0
-    scaled, unit = equilibrated(covariance)
-    centred = (left_out - left_out.mean(axis=0)) * unit
-    values, vectors = np.linalg.eigh(scaled)
-    keep = values > 1e-9
-    squares = (count - 1) / count * ((centred @ vectors[:, keep]) ** 2).sum(axis=0) / values[keep]
-    return float(max(1.0, squares.mean()))
-
-
-# A covariance in blocks: its inverse, its factor and its determinant.
 
 
 @dataclass(frozen=True)
@@ -121,9 +78,6 @@ def _invert_blocks(V: Array) -> InverseCovariance:
     return InverseCovariance(half.transpose(0, 2, 1) @ half, half, 2 * float(np.log(np.einsum("iib->ib", L)).sum()))
 
 
-# Least squares over blocks: estimates, their covariance, and the same without some views.
-
-
 @dataclass(frozen=True)
 class BlockLeastSquares:
     """z = X·x + noise in B blocks of m, with a weak prior; the noise's covariance is known.
@@ -152,7 +106,8 @@ class BlockLeastSquares:
     @cached_property
     def _sums(self) -> Array:
         """(k + 1, k + 1) of all blocks."""
-        return _summed(self._rows)
+        rows = self._rows.reshape(-1, self._rows.shape[2])
+        return rows.T @ rows
 
     @property
     def information(self) -> Array:
@@ -168,19 +123,23 @@ class BlockLeastSquares:
         return self.solve_each([(self.precision, self.prior_vector)], left_out)[0]
 
     def solve_each(self, priors: Sequence[tuple[Array, Array]], left_out: Array | Indices | None = None) -> list[Array]:
-        """The same under each of some priors; one of fewer than k columns is of the first ones, the others left out."""
-        sums = self._sums if left_out is None else self._sums - _summed(self._rows[np.asarray(left_out, np.int64)])
-        return [self._solve(sums, *prior) for prior in priors]
-
-    def _solve(self, sums: Array, precision: Array, prior_vector: Array) -> Array:
-        k = len(precision)
-        prior, vector = np.diag(precision), sums[:k, -1] + prior_vector
-        unit = equilibrated(self._sums[:k, :k] + prior)[1]
-        scaled = (sums[:k, :k] + prior) * np.outer(unit, unit)
-        root, failed = dpotrf(scaled, lower=1, clean=0)
-        if not failed and np.diag(root).min() > _SOLVABLE:
-            return dpotrs(root, vector * unit, lower=1)[0] * unit
-        return _pseudo_inverse(scaled, unit) @ vector
+        """Return the same under each prior; one of fewer than k columns is of the first ones, the others left out."""
+        sums = self._sums
+        if left_out is not None:
+            rows = self._rows[np.asarray(left_out, np.int64)].reshape(-1, len(sums))
+            sums = sums - rows.T @ rows
+        solutions = list[Array]()
+        for precision, prior_vector in priors:
+            k = len(precision)
+            prior, vector = np.diag(precision), sums[:k, -1] + prior_vector
+            unit = equilibrated(self._sums[:k, :k] + prior)[1]
+            scaled = (sums[:k, :k] + prior) * np.outer(unit, unit)
+            root, failed = dpotrf(scaled, lower=1, clean=0)
+            if not failed and np.diag(root).min() > _SOLVABLE:
+                solutions.append(dpotrs(root, vector * unit, lower=1)[0] * unit)
+            else:
+                solutions.append(_pseudo_inverse(scaled, unit) @ vector)
+        return solutions
 
     def estimates_covariance(self) -> Array:
         """(k, k) of the estimates under the blocks' full covariance."""
@@ -202,12 +161,6 @@ class BlockLeastSquares:
     def inflation(self, groups: Sequence[Indices], covariance: Array) -> float:
         """How much more leaving out groups of views moves the estimates than `covariance` says, at least 1."""
         return grouped_inflation(np.array([self.solve(group) for group in groups]), covariance)
-
-
-def _summed(X: Array) -> Array:
-    """(k, k) Σ_b XᵀX of (B, m, k)."""
-    flat = X.reshape(-1, X.shape[2])
-    return flat.T @ flat
 
 
 def _pseudo_inverse(scaled: Array, unit: Array) -> Array:
@@ -235,12 +188,7 @@ def generalised_fit(noise: Array, columns: Array, precision: Array) -> Generalis
     weighted = cho_solve(cho_factor(noise, lower=True), columns)
     scaled, unit = equilibrated(columns.T @ weighted + precision)
     covariance = np.linalg.inv(scaled) * np.outer(unit, unit)
-    return GeneralisedFit(np.asarray(covariance @ weighted.T), np.asarray(covariance))
-
-
-# Of so many rows singular values take ten times as long as eigenvalues of the columns' products. These, their squares,
-# tell as well which combinations say something, unless one lies between.
-_MANY_ROWS, _SAYS_SOMETHING, _SAYS_NOTHING = 1_000, 1e-8, 1e-12
+    return GeneralisedFit(covariance @ weighted.T, covariance)
 
 
 def column_space(columns: Array, relative: float = 1e-9) -> Array:
@@ -279,9 +227,6 @@ def summed_squares(blocks: Array) -> Array:
     return wide @ wide.T
 
 
-# Which parameters the views can know: absolute first, then beside the hand-eye and each other.
-
-
 def independent(base: Array, further: Array, sizes: Array, threshold: float) -> Mask:
     """(P,) bool: columns that stand out by at least `threshold` sigmas at their size, beside those chosen before.
 
@@ -309,9 +254,6 @@ def project_out(base: Array, columns: Array) -> Array:
     return columns - U @ (U.T @ columns)
 
 
-# What one of two models leaves of the mean square error that the other leaves.
-
-
 def mean_square_share(with_it: Array, without: Array) -> tuple[float, float]:
     """What one model leaves over what another leaves, mean squares, and the standard error of that.
 
@@ -335,3 +277,40 @@ def significantly_smaller(squares: Array, others: Array, chance: float) -> bool:
     seen = np.isfinite(squares) & np.isfinite(others)
     share, sigma = mean_square_share(squares[seen], others[seen])
     return bool(share < 1 - ndtri(1 - chance) * sigma)
+
+
+def grouped_inflation(left_out: Array, covariance: Array) -> float:
+    """Return a factor on the covariance, at least 1: the jackknife's over the model's, mean over all directions.
+
+    How much more leaving out samples moves estimates than their covariance says (Efron & Stein 1981).
+
+    Args:
+        left_out: (G, K) estimates with one group of samples left out.
+        covariance: (K, K) of the estimates.
+    """
+    count = len(left_out)
+    if count < _FEWEST:
+        return 1.0
+    scaled, unit = equilibrated(covariance)
+    centred = (left_out - left_out.mean(axis=0)) * unit
+    values, vectors = np.linalg.eigh(scaled)
+    keep = values > 1e-9
+    squares = (count - 1) / count * ((centred @ vectors[:, keep]) ** 2).sum(axis=0) / values[keep]
+    return float(max(1.0, squares.mean()))
+
+
+def anderson_step(step: Array, last_step: Array, last_taken: Array) -> Array:
+    """Return the step (N,) to take, from what two iterations in turn ask for: Anderson acceleration, memory one step.
+
+    Partners follow a view that moves, so that every step of point-to-plane matching leaves the same share of the way
+    undone. Two steps tell that share, and the next one makes up for it (Anderson 1965; for ICP: Pavlov et al. 2018).
+
+    Args:
+        step: (N,) what the present iteration asks for, all components in one unit.
+        last_step: (N,) what the iteration before asked for.
+        last_taken: (N,) the step that was taken then.
+    """
+    change = step - last_step
+    square = float(change @ change)
+    share = 0.0 if square == 0 else float(np.clip(-(change @ step) / square, _NEAREST, _FARTHEST))
+    return step + share * (last_taken + change)

@@ -84,9 +84,9 @@ def scan_odometry(
             odometry.last_delta = frames.make(predicted[v - 1, :3, :3], scale * predicted[v - 1, :3, 3])
         odometry.register_frame(np.ascontiguousarray(scale * points), np.zeros(0) if times is None else times[v])
         poses.append(odometry.last_pose.copy())
-    found = np.array(poses)
-    found[:, :3, 3] /= scale
-    return found
+    T_first_scanner = np.array(poses)
+    T_first_scanner[:, :3, 3] /= scale
+    return T_first_scanner
 
 
 def hand_eye_of_stream(
@@ -127,26 +127,17 @@ class _ToTheTimeOfTheScan:
     Its own takes a scan to last until the next one, and brings it to its last point.
     """
 
-    def __init__(self, own: Any, interval: float) -> None:
-        self._own, self._interval = own, interval
+    def __init__(self, preprocessor: Any, interval: float) -> None:
+        self._preprocessor = preprocessor
+        self._interval = interval
 
     def preprocess(self, points: Array, times: Array, T_last_now: Array) -> Array:
         """Return points (N, 3) as seen from where the scanner was at time 0."""
         if not len(times):
-            return self._own.preprocess(points, times, T_last_now)
+            return self._preprocessor.preprocess(points, times, T_last_now)
         velocity = frames.log(T_last_now) / self._interval
-        at_end = self._own.preprocess(points, times, frames.exp(np.ptp(times) * velocity))
+        at_end = self._preprocessor.preprocess(points, times, frames.exp(np.ptp(times) * velocity))
         return frames.transform(frames.exp(times.max() * velocity), at_end)
-
-
-def turned_pairs(T_reference_mount: Array) -> list[tuple[int, int]]:
-    """Return pairs of views between which the robot turned enough to show a hand-eye."""
-    V = len(T_reference_mount)
-    strides = sorted({max(1, round(share * V)) for share in _STRIDES})
-    v: Indices = np.concatenate([np.arange(V - stride) for stride in strides])
-    w: Indices = np.concatenate([np.arange(stride, V) for stride in strides])
-    turned = frames.angle_between(T_reference_mount[v], T_reference_mount[w]) > _TURNED
-    return list(zip(v[turned].tolist(), w[turned].tolist(), strict=True))
 
 
 def motions_of_stream(T_reference_mount: Array, odometry: Array) -> tuple[Array, Array]:
@@ -155,7 +146,12 @@ def motions_of_stream(T_reference_mount: Array, odometry: Array) -> tuple[Array,
     Both turn by the same angle, whatever the hand-eye is (Chen 1991). A step that went wrong spoils every motion across
     it: the half whose angles agree best is kept.
     """
-    pairs = turned_pairs(T_reference_mount)
+    V = len(T_reference_mount)
+    strides = sorted({max(1, round(share * V)) for share in _STRIDES})
+    v: Indices = np.concatenate([np.arange(V - stride) for stride in strides])
+    w: Indices = np.concatenate([np.arange(stride, V) for stride in strides])
+    turned = frames.angle_between(T_reference_mount[v], T_reference_mount[w]) > _TURNED
+    pairs = list(zip(v[turned].tolist(), w[turned].tolist(), strict=True))
     A, B = motions_between(T_reference_mount, pairs), motions_between(odometry, pairs)
     apart = angle_differences(A, B)
     kept = np.sort(np.argsort(apart, kind="stable")[: -(-len(pairs) // 2)])

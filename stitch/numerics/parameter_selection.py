@@ -16,17 +16,22 @@ from scipy.special import expit, logit, logsumexp
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.least_squares import equilibrated, project_out
 
-# How large an amplitude may be over its plausible size: scales of a normal prior, and the share of belief in each.
-#
-# A mixture of normal distributions has tails that one of them has not (West 1987, Biometrika 74:646): a table of
-# lengths in which a digit is wrong, or a joint mounted a tooth off, is no reason to believe in nothing at all.
-
+# How large an amplitude may be over its plausible size: scales of a normal prior, and the share of belief in each. A
+# mixture of normal distributions has tails that one of them has not (West 1987, Biometrika 74:646): a table of lengths
+# in which a digit is wrong, or a joint mounted a tooth off, is no reason to believe in nothing at all.
 # What is grossly wrong: one effect of a hundred.
 GROSS, _GROSS_SHARE = 30.0, 0.01
 # Of plausible size, or grossly wrong.
 PLAUSIBLE = {1.0: 1 - _GROSS_SHARE, GROSS: _GROSS_SHARE}
 # Of any size: what plausible sizes are is a guess.
 ANY_SIZE = dict.fromkeys((1.0, 3.0, 0.3, 0.1), (1 - _GROSS_SHARE) / 4) | {GROSS: _GROSS_SHARE}
+# Log Bayes factor that a group must add: 12 to 1, as a name must in the diagnosis.
+_LOG_BAYES_FACTOR = 2.5
+# A parameter that these views know worse than this many times its plausible size stays at zero: it would
+# only borrow from the hand-eye.
+UNSEEN = 4.0
+# A parameter of an effect of which nobody knows more is there or not.
+_EVEN_ODDS = 0.5
 
 
 def log_evidence(information: Array, vector: Array, precision: Array | None = None, mean: Array | None = None) -> Array:
@@ -64,21 +69,9 @@ def log_mixture(logs: Array, scales: dict[float, float]) -> float:
     return float(np.logaddexp.reduce(logs + np.log(list(scales.values()))))
 
 
-# The mean of Bayes factors of which one is meant, each as likely before.
-
-
 def log_mean_exp(logs: Sequence[float] | Array) -> Array:
-    """(…) log of the mean over n factors, from their logs (n, …)."""
+    """Return the log (…) of the mean over n factors, from their logs (n, …): Bayes factors of which one is meant."""
     return logsumexp(logs, axis=0) - np.log(len(logs))
-
-
-# Log Bayes factor that a group must add: 12 to 1, as a name must in the diagnosis.
-_LOG_BAYES_FACTOR = 2.5
-# A parameter that these views know worse than this many times its plausible size stays at zero: it would
-# only borrow from the hand-eye.
-UNSEEN = 4.0
-# A parameter of an effect of which nobody knows more is there or not.
-_EVEN_ODDS = 0.5
 
 
 @dataclass(frozen=True)
@@ -106,8 +99,8 @@ def select_supported(
 
     @cache
     def gain_of(*index: int) -> float:
-        told, b = M[np.ix_(index, index)], v[list(index)]
-        return log_mixture(log_evidence_at_scales(told, b, PLAUSIBLE), PLAUSIBLE)
+        information, vector = M[np.ix_(index, index)], v[list(index)]
+        return log_mixture(log_evidence_at_scales(information, vector, PLAUSIBLE), PLAUSIBLE)
 
     def gain(chosen: Sequence[int]) -> float:
         return gain_of(*sorted({i for k in chosen for i in groups[k]}))
@@ -119,8 +112,8 @@ def select_supported(
     seen = np.linalg.norm(G, axis=0) >= 1 / UNSEEN
     for effect in dict.fromkeys(effects):
         if not any(effects[k] == effect for k in chosen):
-            own_groups = [k for k in every if effects[k] == effect]
-            chosen.append(max(own_groups, key=lambda k: (seen[groups[k]].any(), gain([*chosen, k]))))
+            of_effect = [k for k in every if effects[k] == effect]
+            chosen.append(max(of_effect, key=lambda k: (seen[groups[k]].any(), gain([*chosen, k]))))
     out = np.zeros(len(sizes), bool)
     out[[i for k in chosen for i in groups[k]]] = True
     return out
@@ -141,13 +134,14 @@ def omitted_rms(whitened: WhitenedData, sizes: Array, fitted: Mask, effects: Ind
         fitted: (P,) bool.
         effects: (P,) index of the effect that each belongs to.
     """
-    told, pull = _marginal_information(whitened, sizes, fitted)
-    seen, gain, square = told / (1 + told), *_inclusion_odds(told, pull)
+    information, pull = _marginal_information(whitened, sizes, fitted)
+    seen = information / (1 + information)
+    gain, square = _inclusion_odds(information, pull)
     others = np.equal.outer(effects, effects) & ~np.eye(len(sizes), dtype=bool)
     there = seen * expit(gain)
     share = (_EVEN_ODDS + others @ there) / (1 + others @ seen)
     scale = np.sqrt((1 + others @ (there * square)) / (1 + others @ there))
-    gain, square = _inclusion_odds(scale**2 * told, scale * pull)
+    gain, square = _inclusion_odds(scale**2 * information, scale * pull)
     rms = sizes * scale * np.sqrt(expit(logit(share) + gain) * square)
     return np.where(fitted, 0.0, rms)
 
@@ -162,18 +156,18 @@ def _marginal_information(whitened: WhitenedData, sizes: Array, fitted: Mask) ->
     """(P,) what the views know of every parameter beside all others that are fitted, per plausible size: information,
     and that times the likeliest value."""
 
-    def conditioned_on(others: Mask, own: Mask) -> tuple[Array, Array]:
+    def conditioned_on(others: Mask, asked: Mask) -> tuple[Array, Array]:
         base = np.hstack([whitened.base, whitened.further[:, others]])
-        G = project_out(base, whitened.further[:, own] * sizes[own])
+        G = project_out(base, whitened.further[:, asked] * sizes[asked])
         y = project_out(base, whitened.z[:, None])[:, 0]
         return np.einsum("np,np->p", G, G), G.T @ y
 
-    told, pull = np.zeros(len(sizes)), np.zeros(len(sizes))
-    told[~fitted], pull[~fitted] = conditioned_on(fitted, ~fitted)
+    information, pull = np.zeros(len(sizes)), np.zeros(len(sizes))
+    information[~fitted], pull[~fitted] = conditioned_on(fitted, ~fitted)
     for p in np.flatnonzero(fitted):
         only = np.arange(len(sizes)) == p
-        told[only], pull[only] = conditioned_on(fitted & ~only, only)
-    return told, pull
+        information[only], pull[only] = conditioned_on(fitted & ~only, only)
+    return information, pull
 
 
 def select_forward(

@@ -40,13 +40,13 @@ def covariate_unit(name: str) -> str:
 def covariate_text(name: str) -> str:
     """Return a covariate with its unit in brackets: j2_deg → j2 (°)."""
     ending = next((ending for ending in _ENDINGS if name.endswith(ending)), "")
-    told = name.removesuffix(ending).replace("_", " ")
-    return f"{told} ({_ENDINGS[ending]})" if ending else told
+    words = name.removesuffix(ending).replace("_", " ")
+    return f"{words} ({_ENDINGS[ending]})" if ending else words
 
 
 def duration_text(seconds: float) -> str:
     """Seconds, minutes or hours, whichever leaves a number below a hundred or so."""
-    size, unit = next((own for own in ((1, "s"), (60, "min")) if seconds < 120 * own[0]), (3600, "h"))
+    size, unit = next((scale for scale in ((1, "s"), (60, "min")) if seconds < 120 * scale[0]), (3600, "h"))
     return f"{_plain_decimal(seconds / size, 2)} {unit}"
 
 
@@ -54,8 +54,8 @@ def value_uncertainty_text(value: float, U: float) -> str:
     """A value with two digits of its expanded uncertainty: 1451.82 ± 0.14."""
     if not np.isfinite(U) or U <= 0:
         return f"{_plain_decimal(value, 6)} ± –"
-    told = uncertainty_text(U)
-    return f"{value:.{len(told.partition('.')[2])}f} ± {told}"
+    text = uncertainty_text(U)
+    return f"{value:.{len(text.partition('.')[2])}f} ± {text}"
 
 
 def uncertainty_text(U: float) -> str:
@@ -114,10 +114,10 @@ def format_amount(value: float, sigma: float | None, unit: str) -> Amount:
     Args:
         unit: that of value and sigma, with angles in rad.
     """
-    factor, told = display_unit(unit)
+    factor, shown_unit = display_unit(unit)
     known = sigma is not None and np.isfinite(sigma) and sigma > 0
     size = factor * sigma if sigma is not None and known else np.nan
-    return Amount(rounded(factor * value, size), _significant_digits(size, 1) if known else "–", told)
+    return Amount(rounded(factor * value, size), _significant_digits(size, 1) if known else "–", shown_unit)
 
 
 def _significant_digits(value: float, digits: int) -> str:

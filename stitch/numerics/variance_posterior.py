@@ -10,6 +10,11 @@ How good an arm is, is one more thing that nobody knows before: one factor on th
 with them (global and local scales; Carvalho, Polson & Scott 2010, Biometrika 97:465). An arm that shows no error of one
 kind is then believed to have less of the others. Few views hardly say how good it is: there the factor is what data
 sheets say of arms.
+
+How well the scatter is known in a direction are Satterthwaite's degrees of freedom: the variance s of a combination of
+what was seen is Σ λ_i s_i over the components of `reml.py`, whose estimates have the information ½ tr(P C_i P C_j).
+An estimate of s of relative variance 2/ν is worth a χ² of ν degrees of freedom (Satterthwaite 1946; Kenward & Roger
+1997, Biometrics 53:983).
 """
 
 from collections.abc import Sequence
@@ -32,14 +37,26 @@ from stitch.numerics.reml import (
     whitener,
 )
 
-# How well the scatter is known in a direction: Satterthwaite's degrees of freedom.
-#
-# The variance s of a combination of what was seen is Σ λ_i s_i over the components of `reml.py`, whose
-# REML estimates have the information ½ tr(P C_i P C_j). An estimate of s of relative variance 2/ν is worth a
-# χ² of ν degrees of freedom (Satterthwaite 1946; Kenward & Roger 1997, Biometrics 53:983).
-
 # More is as good as knowing it.
 _MANY = 1e4
+# Rounds over all variances that count, and those before them.
+_ROUNDS, _BURNT = 32, 6
+# Among so many numbers the variances are known better, and a round takes longer: fewer do. Among as many as the second
+# number the maximum alone must do.
+_AMONG, _FEWEST, _NO_ROUNDS = 300, 4, 1_200
+# The grid in log variances: below and above a variance that is usual, and its steps as a share of how
+# well n numbers know a log variance, √(2/n), at most so long.
+_BELOW, _ABOVE, _SHARE, _LONGEST = np.log(1e-4), np.log(1e8), 1.5, 0.25
+# Factors on all usual sizes of an arm, from a hundredth to thirty, and the middle one: half of all arms are worse.
+# Sizes of factor one put the flange of an arm of 1 to 2 m off by 0.2 to 0.3 mm rms. Data sheets and tests state 0.2 to
+# 0.5 mm for calibrated arms of that reach, and 0.5 to 2 mm for others. The factor is half-Cauchy about the middle
+# (Gelman 2006), so that the views decide where they can.
+_FACTORS = np.exp(np.arange(np.log(0.01), np.log(30.0), 0.25))
+_MIDDLE_FACTOR = 3.0
+_LOG_FACTOR_DENSITY = np.log(_FACTORS / _MIDDLE_FACTOR) - np.log1p((_FACTORS / _MIDDLE_FACTOR) ** 2)
+_USUAL = int(np.abs(np.log(_FACTORS / _MIDDLE_FACTOR)).argmin())
+# Directions of a component with less than this share of its largest variance are rounding.
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -77,26 +94,6 @@ def satterthwaite(mixed: MixedModel, null: VarianceFit) -> Satterthwaite:
     return Satterthwaite(white, np.linalg.pinv(information, rcond=1e-9, hermitian=True))
 
 
-# Rounds over all variances that count, and those before them.
-_ROUNDS, _BURNT = 32, 6
-# Among so many numbers the variances are known better, and a round takes longer: fewer do. Among as many as the second
-# number the maximum alone must do.
-_AMONG, _FEWEST, _NO_ROUNDS = 300, 4, 1_200
-# The grid in log variances: below and above a variance that is usual, and its steps as a share of how
-# well n numbers know a log variance, √(2/n), at most so long.
-_BELOW, _ABOVE, _SHARE, _LONGEST = np.log(1e-4), np.log(1e8), 1.5, 0.25
-# Factors on all usual sizes of an arm, from a hundredth to thirty, and the middle one: half of all arms are worse.
-# Sizes of factor one put the flange of an arm of 1 to 2 m off by 0.2 to 0.3 mm rms. Data sheets and tests state 0.2 to
-# 0.5 mm for calibrated arms of that reach, and 0.5 to 2 mm for others. The factor is half-Cauchy about the middle
-# (Gelman 2006), so that the views decide where they can.
-_FACTORS = np.exp(np.arange(np.log(0.01), np.log(30.0), 0.25))
-_MIDDLE_FACTOR = 3.0
-_LOG_FACTOR_DENSITY = np.log(_FACTORS / _MIDDLE_FACTOR) - np.log1p((_FACTORS / _MIDDLE_FACTOR) ** 2)
-_USUAL = int(np.abs(np.log(_FACTORS / _MIDDLE_FACTOR)).argmin())
-# Directions of a component with less than this share of its largest variance are rounding.
-_ROUNDING = 1e-12
-
-
 @dataclass(frozen=True)
 class _MeanFreeData:
     """Numbers without their mean: n of them, the components of their covariance and square roots of these."""
@@ -106,20 +103,6 @@ class _MeanFreeData:
     roots: list[Array]  # per component (n, rank)
     fixed: Array  # (n, n)
 
-    def whitened(self, variances: Array, i: int) -> tuple[Array, Array]:
-        """The square root of component i and the numbers, L⁻¹ times both, with L Lᵀ the covariance.
-
-        Raises:
-            LinAlgError: the covariance is not positive.
-        """
-        covariance = self.fixed + np.tensordot(variances, self.components, axes=1)
-        # What surrounds these routines in scipy takes longer than they do.
-        half, failed = dpotrf(covariance, lower=1, clean=0, overwrite_a=1)
-        if failed:
-            raise np.linalg.LinAlgError("covariance is not positive")
-        both = dtrtrs(half, np.column_stack([self.roots[i], self.z]), lower=1)[0]
-        return both[:, :-1], both[:, -1]
-
 
 def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
     """(c,) posterior means of the variances, begun at their maximum.
@@ -128,49 +111,45 @@ def mean_variances(mixed: MixedModel, fit: VarianceFit) -> Array:
     """
     if mixed.size >= _NO_ROUNDS:
         return fit.variances
-    seen, rng = _remove_mean(mixed), np.random.default_rng(0)
-    if not len(seen.z):
+    data, rng = _remove_mean(mixed), np.random.default_rng(0)
+    if not len(data.z):
         return fit.variances
+    shared = np.zeros(len(mixed.components), bool)
+    if mixed.further is not None:
+        shared[NOISE + 1 :] = mixed.further.common_factor
     grids = _grids(mixed, fit.variances)
-    densities = _densities(mixed, grids)
-    kin = [i for i in np.flatnonzero(_common_factor_mask(mixed)) if seen.roots[i].shape[1]]
-    here, total, at, factor = np.array(fit.variances), np.zeros(len(grids)), np.zeros(len(grids), int), _USUAL
+    densities = _densities(mixed, grids, shared)
+    kin = [i for i in np.flatnonzero(shared) if data.roots[i].shape[1]]
+    here = np.array(fit.variances)
+    total, at, factor = np.zeros(len(grids)), np.zeros(len(grids), int), _USUAL
     rounds = int(np.clip(_ROUNDS * (_AMONG / mixed.size) ** 3, _FEWEST, _ROUNDS))
     burnt = -(-_BURNT * rounds // _ROUNDS)
     for turn in range(burnt + rounds):
         for i, grid in enumerate(grids):
-            if seen.roots[i].shape[1]:
-                weights = _grid_weights(seen, here, i, grid, densities[i][factor if i in kin else 0])
+            if data.roots[i].shape[1]:
+                weights = _grid_weights(data, here, i, grid, densities[i][factor if i in kin else 0])
                 at[i] = rng.choice(len(grid), p=weights)
                 here[i] = grid[at[i]]
                 total[i] += (turn >= burnt) * float(weights @ grid)
         if kin:
-            factor = _draw_factor(rng, [densities[i][:, at[i]] for i in kin])
+            # Drawn where the components stand.
+            logs = _LOG_FACTOR_DENSITY + np.sum([densities[i][:, at[i]] for i in kin], axis=0)
+            weights = np.exp(logs - logs.max())
+            factor = int(rng.choice(len(_FACTORS), p=weights / weights.sum()))
     return total / rounds
 
 
-def _common_factor_mask(mixed: MixedModel) -> Mask:
-    """(c,) components that share a factor on their usual sizes."""
-    shared = np.zeros(len(mixed.components), bool)
-    if mixed.further is not None:
-        shared[NOISE + 1 :] = mixed.further.common_factor
-    return shared
+def _densities(mixed: MixedModel, grids: Sequence[Array], shared: Mask) -> list[Array]:
+    """Return per component (1, g) what is believed of its variance, or (F, g) at every factor on what is usual.
 
-
-def _densities(mixed: MixedModel, grids: Sequence[Array]) -> list[Array]:
-    """Per component (1, g) what is believed of its variance, or (F, g) at every factor on what is usual."""
+    Args:
+        shared: (c,) components that share a factor on their usual sizes.
+    """
     out = []
-    for i, (grid, shared) in enumerate(zip(grids, _common_factor_mask(mixed), strict=True)):
-        priors = [mixed.further.scaled(f) for f in _FACTORS] if shared and mixed.further else [mixed.further]
+    for i, (grid, has_factor) in enumerate(zip(grids, shared, strict=True)):
+        priors = [mixed.further.scaled(f) for f in _FACTORS] if has_factor and mixed.further else [mixed.further]
         out.append(np.array([log_density(i, np.log(grid), prior) for prior in priors]))
     return out
-
-
-def _draw_factor(rng: np.random.Generator, densities: Sequence[Array]) -> int:
-    """Index of a factor drawn where the components stand, from densities (F,) of each there."""
-    logs = _LOG_FACTOR_DENSITY + np.sum(densities, axis=0)
-    weights = np.exp(logs - logs.max())
-    return int(rng.choice(len(_FACTORS), p=weights / weights.sum()))
 
 
 def _remove_mean(mixed: MixedModel) -> _MeanFreeData:
@@ -202,8 +181,17 @@ def _grid_weights(data: _MeanFreeData, current: Array, i: int, grid: Array, dens
     """(g,) probabilities of the values of variance i while the others stand.
 
     V(λ) = V + (λ − λ_i) C = L (1 + (λ − λ_i) M) Lᵀ with M = L⁻¹ C L⁻ᵀ: one decomposition for the whole grid.
+
+    Raises:
+        LinAlgError: the covariance is not positive.
     """
-    root, z = data.whitened(current, i)
+    covariance = data.fixed + np.tensordot(current, data.components, axes=1)
+    # What surrounds these routines in scipy takes longer than they do.
+    half, failed = dpotrf(covariance, lower=1, clean=0, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError("covariance is not positive")
+    white = dtrtrs(half, np.column_stack([data.roots[i], data.z]), lower=1)[0]
+    root, z = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(root.T @ root)
     values = np.maximum(values, 1e-300)
     along = vectors.T @ (root.T @ z)

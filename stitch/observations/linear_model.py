@@ -10,7 +10,7 @@ model with further columns is tried, and which views may be left out. A further 
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol, Self
 
@@ -51,18 +51,139 @@ _SETS_AT_ONCE = 16
 _SINGLE_START_SIZE = 250
 
 
-@dataclass(frozen=True, kw_only=True)
-class ErrorModel:
-    """What was seen of one session in the channel, under errors whose sizes the numbers tell."""
+class PointSums(Protocol):
+    """Sums of what the parameters of an effect do to the points themselves."""
 
+    def select(self, keep: slice | Mask) -> "PointSums":
+        """The sums of some of the parameters."""
+        ...
+
+
+@dataclass(frozen=True)
+class CoefficientPrior:
+    """What is believed of k coefficients before anything is seen."""
+
+    precision: Array  # (k,) 0 where nothing is believed
+    mean: Array  # (k,)
+
+
+@dataclass(frozen=True)
+class Response:
+    """Columns of P parameters in the coordinates of an observation: twists of the views, or rows of targets."""
+
+    columns: Array  # (·, P) per unit of each parameter
+    points: PointSums | None = None  # of an effect that changes the points, where the columns do not say it all
+
+
+class LinearTrial(Protocol):
+    """A model with some columns, in the linear approximation."""
+
+    def solve(self, left_out: Indices | None = None) -> Array:
+        """(k,) coefficients by least squares, without some views."""
+        ...
+
+    def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
+        """The same under each prior; one of fewer coefficients is of the first ones, and the others are zero."""
+        ...
+
+    def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
+        """(units,) sums of squares of what remains, in the terms of residual_rms; of all units or of some."""
+        ...
+
+    def scatter(self, left_out: Indices, coefficients: Array) -> float:
+        """Sum of squares by which left-out views lie off, in units of their scatter."""
+        ...
+
+    def influential_views(self, coefficients: Array) -> Indices:
+        """(n,) views of which one alone could carry the coefficients (k,)."""
+        ...
+
+
+class Observation(ABC):
+    """What was observed of one session under its model: of numbers that a response counts as they are.
+
+    One whose responses count something else overrides `reduce` and `expand`; what its views share, `numbers_per_view`.
+    """
+
+    centre: Array  # (3,) about which twists of the views count, reference frame
+
+    @property
+    @abstractmethod
+    def T_base_flange(self) -> Array:
+        """(V, 4, 4) of the views, in the order of time."""
+
+    @property
+    @abstractmethod
+    def reach(self) -> float:
+        """Length that makes a radian of orientation comparable with a distance."""
+
+    @property
+    def numbers_per_view(self) -> int | None:
+        """Numbers that belong to one view, block after block; None where views share them."""
+        return None
+
+    @abstractmethod
+    def from_twists(self, moved: Array) -> Array:
+        """(n, P) numbers of the reduced observations of left twists (6V, P) of the views."""
+
+    @abstractmethod
+    def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
+        """Per term how the observation answers to its parameters."""
+
+    def reduce(self, response: Array) -> Array:
+        """(n, P) numbers of the reduced observations of a response (·, P)."""
+        return response
+
+    def expand(self, columns: Array) -> Array:
+        """(·, P) a response that has these numbers (n, P) of the reduced observations."""
+        return columns
+
+    @abstractmethod
+    def trial(self, linear: "LinearModel", response: Array, points: PointSums | None = None) -> LinearTrial:
+        """A model with the columns of a response (·, k); `points` belong to its last ones."""
+
+    @abstractmethod
+    def affected_squares(self, views: Indices) -> Mask:
+        """(units,) which squares of a trial some views have a part in."""
+
+    @cached_property
+    def folds(self) -> list[Indices]:
+        """Groups of views to leave out."""
+        return grouped_folds(self.T_base_flange, self.reach)
+
+    def joint_ends(self, joints: Array) -> list[JointEnd]:
+        """Ends of joints' ranges that may be left out; none where a square of a trial is no view's own."""
+        return []
+
+    @abstractmethod
+    def part_displacements(self, numbers: Array) -> Array:
+        """(V, 3) what reduced observations (n,) displace at the part, reference frame, without a common motion."""
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """One session under its model: what was seen beside hand-eye, landmarks and effects in use, reduced.
+
+    How large the errors of what was seen are, the numbers tell.
+    """
+
+    measurement: Measurement
+    model: Model
+    observation: Observation
+    design: Array  # (·, a) response to hand-eye, landmarks and effects in use
+    _: KW_ONLY
+    sizes: Array  # (a,) plausible ones of the effects' parameters; infinite for the rest
+    values: Array  # (a,) at which the parameters of effects in use stand; 0 for the rest
     mixed: MixedModel  # what was seen, its mean's columns, and the components of the covariance
     null: VarianceFit  # fitted without further columns
-    pose_errors: PoseErrors | None = None  # how poses may err beside white scatter, in the channel (c, n, n)
+    pose_errors: PoseErrors | None = (
+        None  # how poses may err beside white scatter, among the reduced observations (c, n, n)
+    )
     # (B, m, n) plausible offsets of the joints, each block a view, where the covariance counts no scatter of theirs.
     offsets: Array | None = None
     # (2,) variances, rad² and length_unit², by which a unit of joint scatter turns and moves the flange along an axis.
     flange_per_joint: Array = field(default_factory=lambda: np.zeros(2))
-    full_model: "ErrorModel | None" = None  # the one that this was taken from, where some pose errors are left out
+    full_model: "LinearModel | None" = None  # the one that this was taken from, where some pose errors are left out
 
     @cached_property
     def satterthwaite(self) -> Satterthwaite:
@@ -94,7 +215,7 @@ class ErrorModel:
 
     @cached_property
     def covariance(self) -> Array:
-        """(B, m, m) of the channel under the null."""
+        """(B, m, m) of the reduced observations under the null."""
         return self.mixed.covariance(self.null.variances)
 
     @cached_property
@@ -169,142 +290,12 @@ class ErrorModel:
             starts.append(np.append(fitted[: NOISE + 1], [by_name[name] for name in self.pose_errors.names]))
         return tuple(replace(self, null=at_variances(self.mixed, variances)) for variances in starts)
 
-
-def with_pose_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
-    """Return the mixed model of one block with scatter, noise, and what the poses err beside."""
-    components = np.concatenate([mixed.components[: NOISE + 1], errors.components[:, None]])
-    return replace(mixed, components=components, further=errors.prior, common=None)
-
-
-class PointSums(Protocol):
-    """Sums of what the parameters of an effect do to the points themselves."""
-
-    def select(self, keep: slice | Mask) -> "PointSums":
-        """The sums of some of the parameters."""
-        ...
-
-
-@dataclass(frozen=True)
-class CoefficientPrior:
-    """What is believed of k coefficients before anything is seen."""
-
-    precision: Array  # (k,) 0 where nothing is believed
-    mean: Array  # (k,)
-
-
-@dataclass(frozen=True)
-class Response:
-    """Columns of P parameters in the coordinates of an observation: twists of the views, or rows of targets."""
-
-    columns: Array  # (·, P) per unit of each parameter
-    points: PointSums | None = None  # of an effect that changes the points, where the columns do not say it all
-
-
-class LinearTrial(Protocol):
-    """A model with some columns, in the linear approximation."""
-
-    def solve(self, left_out: Indices | None = None) -> Array:
-        """(k,) coefficients by least squares, without some views."""
-        ...
-
-    def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
-        """The same under each prior; one of fewer coefficients is of the first ones, and the others are zero."""
-        ...
-
-    def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
-        """(units,) sums of squares of what remains, in the terms of residual_rms; of all units or of some."""
-        ...
-
-    def scatter(self, left_out: Indices, coefficients: Array) -> float:
-        """Sum of squares by which left-out views lie off, in units of their scatter."""
-        ...
-
-    def influential_views(self, coefficients: Array) -> Indices:
-        """(n,) views of which one alone could carry the coefficients (k,)."""
-        ...
-
-
-class Observation(ABC):
-    """What was observed of one session under its model: of numbers that a response counts as they are.
-
-    One whose responses count something else overrides `reduce` and `expand`; what its views share, `numbers_per_view`.
-    """
-
-    @property
-    @abstractmethod
-    def T_base_flange(self) -> Array:
-        """(V, 4, 4) of the views, in the order of time."""
-
-    @property
-    @abstractmethod
-    def centre(self) -> Array:
-        """(3,) about which twists of the views count, reference frame."""
-
-    @property
-    @abstractmethod
-    def reach(self) -> float:
-        """Length that makes a radian of orientation comparable with a distance."""
-
-    @property
-    def numbers_per_view(self) -> int | None:
-        """Numbers of the channel that belong to one view, block after block; None where views share them."""
-        return None
-
-    @abstractmethod
-    def from_twists(self, moved: Array) -> Array:
-        """(n, P) numbers of the channel of left twists (6V, P) of the views."""
-
-    @abstractmethod
-    def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
-        """Per term how the observation answers to its parameters."""
-
-    def reduce(self, response: Array) -> Array:
-        """(n, P) numbers of the channel of a response (·, P)."""
-        return response
-
-    def expand(self, columns: Array) -> Array:
-        """(·, P) a response that has these numbers (n, P) of the channel."""
-        return columns
-
-    @abstractmethod
-    def trial(self, linear: "LinearModel", response: Array, points: PointSums | None = None) -> LinearTrial:
-        """A model with the columns of a response (·, k); `points` belong to its last ones."""
-
-    @abstractmethod
-    def affected_squares(self, views: Indices) -> Mask:
-        """(units,) which squares of a trial some views have a part in."""
-
-    @cached_property
-    def folds(self) -> list[Indices]:
-        """Groups of views to leave out."""
-        return grouped_folds(self.T_base_flange, self.reach)
-
-    def joint_ends(self, joints: Array) -> list[JointEnd]:
-        """Ends of joints' ranges that may be left out; none where a square of a trial is no view's own."""
-        return []
-
-    @abstractmethod
-    def part_displacements(self, numbers: Array) -> Array:
-        """(V, 3) what numbers (n,) of the channel displace at the part, reference frame, without a common motion."""
-
-
-@dataclass(frozen=True)
-class LinearModel(ErrorModel):
-    """One session under its model: what was seen beside hand-eye, landmarks and effects in use, in the channel."""
-
-    measurement: Measurement
-    model: Model
-    observation: Observation
-    design: Array  # (·, a) response to hand-eye, landmarks and effects in use
-    sizes: Array  # (a,) plausible ones of the effects' parameters; infinite for the rest
-    values: Array  # (a,) at which the parameters of effects in use stand; 0 for the rest
-
     def responses(self, terms: Sequence[Term]) -> list[Response]:
         """Per term how the observation answers to its parameters."""
         return self.observation.responses(self.measurement, self.model, terms)
 
     def reduce(self, response: Array) -> Array:
-        """(n, P) numbers of the channel of a response (·, P)."""
+        """(n, P) numbers of the reduced observations of a response (·, P)."""
         return self.observation.reduce(response)
 
     @cached_property
@@ -333,13 +324,15 @@ class LinearModel(ErrorModel):
         return column_space(np.hstack([self.white_design, self.whiten(self.observation.from_twists(twists))]))
 
     def residual(self, columns: Array) -> Array:
-        """(n, P) whitened columns of the channel, what the model explains projected out."""
+        """(n, P) whitened columns of the reduced observations, what the model explains projected out."""
         white = self.whiten(columns)
         return white - self._explained @ (self._explained.T @ white)
 
     def information(self, columns: Sequence[SelectedColumns]) -> Iterator[tuple[Array, Array]]:
-        """Per set of columns (n, P) of the channel what the views tell of their coefficients θ beside the model: (P, P)
-        and (P,) of the log likelihood vᵀθ − ½ θᵀIθ."""
+        """Yield per set of columns (n, P) what the views tell of their coefficients θ beside the model.
+
+        It is I (P, P) and v (P,) of the log likelihood vᵀθ − ½ θᵀIθ.
+        """
         kept = self.mixed.common is not None and self.mixed.sums.are_kept
         if kept and all(selected.keep is not None for selected in columns):
             yield from map(self._own_information.of, columns)
@@ -414,3 +407,9 @@ class LinearModel(ErrorModel):
 
     def __repr__(self) -> str:
         return f"LinearModel({self.mixed.size} numbers of {self.measurement.views.count} views, {self.model!r})"
+
+
+def with_pose_errors(mixed: MixedModel, errors: PoseErrors) -> MixedModel:
+    """Return the mixed model of one block with scatter, noise, and what the poses err beside."""
+    components = np.concatenate([mixed.components[: NOISE + 1], errors.components[:, None]])
+    return replace(mixed, components=components, further=errors.prior, common=None)

@@ -13,6 +13,7 @@ the views' poses are a sum of processes, each with a covariance of known shape a
 White scatter of the flange in every scan, and the sensor's noise, come with the observation.
 """
 
+from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations
@@ -27,8 +28,8 @@ from stitch.numerics.frames import Array, Mask
 from stitch.numerics.kernels import (
     SmoothErrors,
     direction_kernel,
+    exponential_kernel,
     load_kernel,
-    ornstein_uhlenbeck,
     periodic_kernel,
     process_covariance,
     rbf_joints,
@@ -38,7 +39,7 @@ from stitch.numerics.kernels import (
 )
 from stitch.numerics.reml import ALWAYS_PRESENT, MAY_BE_ABSENT, FurtherPrior
 from stitch.session.measurement import Measurement
-from stitch.session.torques import STILL, Torques
+from stitch.session.torques import STILL
 
 # What every joint does anew in every view, and how much of it is usual, as a share of a plausible offset: as much as
 # the flange turns.
@@ -64,7 +65,7 @@ _MOST_VIEWS = 150
 # A diagnosis scores every candidate beside all errors that poses may have, which takes a minute for so many views. From
 # there on poses count as scattering independently, and effects are sought several at once (`diagnosis/regime.py`).
 MANY_VIEWS = 100
-_CONSTANT_EFFECTS = ("joint_offset", "link_geometry")
+_CONSTANT_EFFECTS = (_OFFSET, "link_geometry")
 # Causes by what they are: what wanders in time, what the scans of a stop share, and all that is none of the arm's.
 DRIFT, STOP = frozenset(DRIFT_MEMORY), frozenset(STOP_COMPONENTS)
 NOT_OF_ARM = DRIFT | STOP | {JOINT_SCATTER}
@@ -80,7 +81,7 @@ _MIN_WAVES, _WAVE_STEP, _SHORTEST_PERIOD, _MAX_WAVES = 2.0, 0.5, float(np.radian
 
 
 def arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
-    """What the library knows of every joint and link, as far as all sessions can have it."""
+    """Return what the library knows of every joint and link, as far as all sessions can have it."""
     possible = [
         e
         for e in EFFECTS.values()
@@ -90,20 +91,12 @@ def arm_effects(measurements: Sequence[Measurement]) -> list[Effect]:
     return [e for e in per_joint if not any(missing_need(m, e) for m in measurements)]
 
 
-def group_by_family(effects: Sequence[Effect]) -> dict[str, list[Effect]]:
-    """Effects of one cause share a size."""
-    out: dict[str, list[Effect]] = {}
-    for e in effects:
-        out.setdefault(EFFECT_FAMILY.get(e.name, e.name), []).append(e)
-    return out
-
-
 def effect_twists(measurement: Measurement, model: Model, centre: Array, effects: Sequence[Effect]) -> Array:
     """(6V, P) twists of the views for plausible sizes of all parameters of some effects."""
     in_use: dict[str, Term] = {term.name: term for term in model.terms}
     terms = [in_use.get(effect.name) or term_of(measurement, effect) for effect in effects]
-    found = zip(terms, pose_derivatives(measurement, model, terms, centre), strict=True)
-    return np.hstack([moved.reshape(len(moved), -1).T * term.typical for term, moved in found])
+    derivatives = pose_derivatives(measurement, model, terms, centre)
+    return np.hstack([d.reshape(len(d), -1).T * term.typical for term, d in zip(terms, derivatives, strict=True)])
 
 
 def joint_offset_twists(measurement: Measurement, model: Model, centre: Array) -> Array | None:
@@ -125,20 +118,24 @@ def flange_twists(measurements: Sequence[Measurement], centres: Sequence[Array])
         centres: per session the point (3,) about which twists count, reference frame.
     """
     unit = usual_twist(measurements[0].length_unit)
-    own = [
+    carried = [
         frames.adjoint(frames.make(np.eye(3), -centre) @ m.capture.T_reference_flange)
         for m, centre in zip(measurements, centres, strict=True)
     ]
-    return np.concatenate(own).reshape(-1, 6) * unit
+    return np.concatenate(carried).reshape(-1, 6) * unit
 
 
 def mean_square_per_axis(columns: Array, measurements: Sequence[Measurement], centres: Sequence[Array]) -> Array:
-    """(2,) mean squares, rad² and length_unit², along an axis of the flange of what columns (6V, n) of twists of the
-    views, of unit variance each, turn and move it by."""
+    """Return mean squares (2,), rad² and length_unit², along an axis of the flange of what columns turn and move it by.
+
+    Args:
+        columns: (6V, n) twists of the views, of unit variance each.
+        centres: per session the point (3,) about which they count, reference frame.
+    """
     flange = flange_twists(measurements, centres).reshape(-1, 6, 6)
     unit = usual_twist(measurements[0].length_unit)
-    own = unit[:, None] * np.linalg.solve(flange, columns.reshape(len(flange), 6, -1))
-    squares = (own**2).sum(axis=2).mean(axis=0)
+    twists = unit[:, None] * np.linalg.solve(flange, columns.reshape(len(flange), 6, -1))
+    squares = (twists**2).sum(axis=2).mean(axis=0)
     return squares.reshape(2, 3).mean(axis=1)
 
 
@@ -151,7 +148,8 @@ def drift_kernel(measurements: Sequence[Measurement], memory: float) -> Array:
     counts = [m.views.count for m in measurements]
     out, at = np.zeros((sum(counts), sum(counts))), 0
     for m, count in zip(measurements, counts, strict=True):
-        out[at : at + count, at : at + count] = ornstein_uhlenbeck(time_in_steps(m), memory)
+        time = time_in_steps(m)
+        out[at : at + count, at : at + count] = exponential_kernel(time, time, memory)
         at += count
     return out
 
@@ -171,7 +169,9 @@ def usual_time_step(measurement: Measurement) -> float:
 def joint_processes(
     measurements: Sequence[Measurement], joints: Array, offsets: Array, joint_kernel: Array
 ) -> dict[str, SmoothErrors]:
-    """Of every joint, by what it follows, for the sessions of a rig.
+    """Return what every joint may do by no law that anybody wrote down, by what it follows, for the sessions of a rig.
+
+    None of these processes is among the components of the prior of pose errors.
 
     Args:
         joints: (V, n) rad of all views.
@@ -180,101 +180,63 @@ def joint_processes(
     """
     came = joints - np.concatenate([m.views.previous for m in measurements])
     slowly = drift_kernel(measurements, DRIFT_MEMORY["slowly wandering"])
-    each = tuple(range(joints.shape[1]))
+    every = tuple(range(joints.shape[1]))
     kinds = {ALL_ANGLES: joint_kernel, WITH_TIME: (1 + joint_kernel) / 2 * slowly, TIME_ONLY: slowly}
-    found = {kind: SmoothErrors(offsets, own, each) for kind, own in kinds.items()}
-    found |= (
-        _own_angle_processes(joints, came, offsets)
-        | _angle_pair_processes(joints, offsets)
-        | _periodic_processes(joints, offsets)
-    )
-    return found | _load_processes([m.views.torques for m in measurements], offsets)
-
-
-def _moving_joints(joints: Array) -> Mask:
-    """(n,) joints that do not stand still in all views (V, n), rad."""
-    return np.ptp(joints, axis=0) > _STATIONARY_RANGE
-
-
-def _own_angle_processes(joints: Array, travel: Array, offsets: Array) -> dict[str, SmoothErrors]:
-    """What each joint does that follows its own angle closely, or the way it came, by these kinds of law; {} where none
-    turns.
-
-    Args:
-        joints: (V, n) rad.
-        travel: (V, n) rad from the view before.
-        offsets: (6V, n) twists of the views per unit of each joint.
-    """
-    own = tuple(map(int, np.flatnonzero(_moving_joints(joints))))
-    if not own:
-        return {}
-    closely = np.array([short_range_kernel(joints[:, k], joints[:, k]) for k in own])
-    in_way = np.array([direction_kernel(joints[:, k], travel[:, k]) for k in own])
-    kinds = {OWN_ANGLE: closely, TRAVEL: in_way}
-    return {kind: SmoothErrors(offsets[:, own], alike, own) for kind, alike in kinds.items()}
-
-
-def _angle_pair_processes(joints: Array, offsets: Array) -> dict[str, SmoothErrors]:
-    """What each joint does that follows its own angle and one other's alone, as joints do that drag each other: of the
-    many numbers that a function of all angles may have in few views it has a few. By that kind of law; {} where no
-    two are known of which one turns.
-
-    Args:
-        joints: (V, n) rad.
-        offsets: (6V, n) twists of the views per unit of each joint.
-    """
-    turns = _moving_joints(joints)
-    pairs = [two for two in permutations(range(joints.shape[1]), 2) if turns[[*two]].any()]
-    if not pairs:
-        return {}
-    own, others = (tuple(of) for of in zip(*pairs, strict=True))
-    alike = np.array([two_joint_kernel(*joints.T[[*two]]) for two in pairs])
-    return {TWO_ANGLES: SmoothErrors(offsets[:, own], alike, own, others)}
+    processes = {kind: SmoothErrors(offsets, kernel, every) for kind, kernel in kinds.items()}
+    moving = tuple(map(int, np.flatnonzero(np.ptp(joints, axis=0) > _STATIONARY_RANGE)))
+    if moving:
+        closely = np.array([short_range_kernel(joints[:, k], joints[:, k]) for k in moving])
+        in_way = np.array([direction_kernel(joints[:, k], came[:, k]) for k in moving])
+        processes[OWN_ANGLE] = SmoothErrors(offsets[:, moving], closely, moving)
+        processes[TRAVEL] = SmoothErrors(offsets[:, moving], in_way, moving)
+    # As joints do that drag each other: of the many numbers that a function of all angles may have in few views, that
+    # of its own angle and one other's has a few.
+    pairs = [two for two in permutations(every, 2) if set(two) & set(moving)]
+    if pairs:
+        first, second = (tuple(column) for column in zip(*pairs, strict=True))
+        kernels = np.array([two_joint_kernel(*joints.T[[*two]]) for two in pairs])
+        processes[TWO_ANGLES] = SmoothErrors(offsets[:, first], kernels, first, second)
+    return processes | _periodic_processes(joints, offsets) | _load_processes(measurements, offsets)
 
 
 def _periodic_processes(joints: Array, offsets: Array) -> dict[str, SmoothErrors]:
-    """What each joint does again and again as it turns, as teeth of a gear or of a belt do, by that kind of law; {}
-    where none turns.
+    """Return what each joint does again and again as it turns, as teeth of a gear or of a belt do; {} if none turns.
 
     Args:
         joints: (V, n) rad.
         offsets: (6V, n) twists of the views per unit of each joint.
     """
-    found = [
-        (k, period)
-        for k, own in enumerate(np.ptp(joints, axis=0))
-        if own > _STATIONARY_RANGE
-        for period in _candidate_periods(own)
+    waves = [
+        (k, turned / count)
+        for k, turned in enumerate(np.ptp(joints, axis=0))
+        if turned > _STATIONARY_RANGE
+        for count in np.arange(_MIN_WAVES, min(_MAX_WAVES, turned / _SHORTEST_PERIOD), _WAVE_STEP)
     ]
-    if not found:
+    if not waves:
         return {}
-    own, periods = (tuple(of) for of in zip(*found, strict=True))
-    alike = np.array([periodic_kernel(joints[:, k], joints[:, k], period) for k, period in found])
-    return {WAVES: SmoothErrors(offsets[:, own], alike, own, periods=periods)}
+    of_joint, periods = (tuple(column) for column in zip(*waves, strict=True))
+    kernels = np.array([periodic_kernel(joints[:, k], joints[:, k], period) for k, period in waves])
+    return {WAVES: SmoothErrors(offsets[:, of_joint], kernels, of_joint, periods=periods)}
 
 
-def _candidate_periods(turned: float) -> list[float]:
-    """Of waves along a joint that turned so far in all, rad."""
-    most = min(_MAX_WAVES, turned / _SHORTEST_PERIOD)
-    return [turned / waves for waves in np.arange(_MIN_WAVES, most, _WAVE_STEP)]
-
-
-def _load_processes(torques: Sequence[Torques], offsets: Array) -> dict[str, SmoothErrors]:
-    """What each joint that is bent does under its load, by that kind of law; {} where not the same is known of all.
+def _load_processes(measurements: Sequence[Measurement], offsets: Array) -> dict[str, SmoothErrors]:
+    """Return what each joint that is bent does under its load; {} where not the same is known of all sessions.
 
     Args:
         offsets: (6V, n) twists of the views per unit of each joint.
     """
+    torques = [m.views.torques for m in measurements]
     first = torques[0]
-    if any((own.names, own.measured) != (first.names, first.measured) for own in torques):
+    if any((of_session.names, of_session.measured) != (first.names, first.measured) for of_session in torques):
         return {}
-    values, joint = np.concatenate([own.values for own in torques]), np.array(first.joint)
+    values = np.concatenate([of_session.values for of_session in torques])
+    joint = np.array(first.joint)
     changes = np.ptp(values, axis=0) > STILL
     bent = tuple(int(k) for k in np.unique(joint[changes]))
     if not bent:
         return {}
-    alike = np.array([load_kernel(values[:, changes & (joint == k)]) for k in bent])
-    return {JOINT_LOAD: SmoothErrors(offsets[:, bent], alike, bent)}
+    kernels = np.array([load_kernel(values[:, changes & (joint == k)]) for k in bent])
+    return {JOINT_LOAD: SmoothErrors(offsets[:, bent], kernels, bent)}
 
 
 def usual_sizes() -> dict[str, float]:
@@ -364,32 +326,37 @@ def prior_pose_errors(measurements: Sequence[Measurement], model: Model, centres
     """
     if sum(m.views.count for m in measurements) > _MOST_VIEWS:
         return white_scatter_only(sum(m.views.count for m in measurements))
-    found, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
-    of_one_joint, by_joints = dict[str, SmoothErrors](), np.zeros(2)
+    # Covariance and usual σ of each component; per effect its component and its columns.
+    parts, members = dict[str, tuple[Array, float]](), dict[str, tuple[str, Array]]()
+    processes, by_joints = dict[str, SmoothErrors](), np.zeros(2)
     sessions = list(zip(measurements, centres, strict=True))
     if all(m.views.has("joints") for m in measurements):
         joints = np.concatenate([m.views.joints for m in measurements])
-        for name, effects in group_by_family(arm_effects(measurements)).items():
-            own = [np.concatenate([effect_twists(m, model, centre, [e]) for m, centre in sessions]) for e in effects]
-            members |= {e.name: (name, columns) for e, columns in zip(effects, own, strict=True)}
-            found[name] = (np.sum([columns @ columns.T for columns in own], axis=0), _ARM_SCALE)
+        # Effects of one cause share a size.
+        families = defaultdict[str, list[Array]](list)
+        for e in arm_effects(measurements):
+            columns = np.concatenate([effect_twists(m, model, centre, [e]) for m, centre in sessions])
+            family = EFFECT_FAMILY.get(e.name, e.name)
+            families[family].append(columns)
+            members[e.name] = (family, columns)
+        parts |= {name: (np.sum([X @ X.T for X in family], axis=0), _ARM_SCALE) for name, family in families.items()}
         constant = [EFFECTS[name] for name in _CONSTANT_EFFECTS if name in EFFECTS]
         links = np.concatenate([effect_twists(m, model, centre, constant) for m, centre in sessions])
         alike = rbf_joints(joints)
-        found["smooth"] = (process_covariance(links, alike), SMOOTH_SCALE)
-        if constant[0].name == _CONSTANT_EFFECTS[0]:
+        parts["smooth"] = (process_covariance(links, alike), SMOOTH_SCALE)
+        if constant[0].name == _OFFSET:
             offsets = links[:, : joints.shape[1]]
-            found[JOINT_SCATTER] = (process_covariance(offsets, np.eye(len(joints))), USUAL_JOINT_SCATTER)
+            parts[JOINT_SCATTER] = (process_covariance(offsets, np.eye(len(joints))), USUAL_JOINT_SCATTER)
             by_joints = mean_square_per_axis(offsets, measurements, centres)
-            of_one_joint = joint_processes(measurements, joints, offsets, alike)
+            processes = joint_processes(measurements, joints, offsets, alike)
     flange = flange_twists(measurements, centres)
     for name, memory in DRIFT_MEMORY.items():
-        found[name] = (process_covariance(flange, drift_kernel(measurements, memory)), 1.0)
+        parts[name] = (process_covariance(flange, drift_kernel(measurements, memory)), 1.0)
     same = same_stop(np.concatenate([m.T_base_flange for m in measurements]))
     if same.sum() > len(same):
-        halves = dict(zip(STOP_COMPONENTS, (flange[:, :3], flange[:, 3:]), strict=True))
-        found |= {name: (process_covariance(half, same.astype(float)), 1.0) for name, half in halves.items()}
-    components = np.array([c for c, _ in found.values()])
-    scales = np.array([s for _, s in found.values()])
+        for name, half in zip(STOP_COMPONENTS, (flange[:, :3], flange[:, 3:]), strict=True):
+            parts[name] = (process_covariance(half, same.astype(float)), 1.0)
+    components = np.array([covariance for covariance, _ in parts.values()])
+    scales = np.array([scale for _, scale in parts.values()])
     rotation, translation = usual_twist(measurements[0].length_unit)[[0, 3]].tolist()
-    return PoseErrors(tuple(found), components, scales, members, of_one_joint, by_joints, (rotation, translation))
+    return PoseErrors(tuple(parts), components, scales, members, processes, by_joints, (rotation, translation))

@@ -26,9 +26,12 @@ from stitch.observations.pose_errors import joint_offset_twists, mean_square_per
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
 
+# Views of largest influence on the estimates: if one alone carries them, it is among these.
+_CARRIERS = 20
+
 
 @dataclass(frozen=True, kw_only=True)
-class Rows:
+class Rows(Observation):
     """V views, B ≥ V blocks of m rows, those beyond V of no view; U unknowns beside the hand-eye."""
 
     capture: Capture  # without the effects in use
@@ -62,8 +65,13 @@ class Rows:
     def hand_eye(self) -> Array:
         """(B, m, 6) rows per right perturbation of the hand-eye."""
         to_centre = frames.make(np.eye(3), -self.centre)
-        own = self.lever @ frames.adjoint(to_centre @ self.capture.hand_eye_frames(self.T_mount))
-        return np.concatenate([own, np.zeros((len(self.residual) - len(own), *own.shape[1:]))])
+        of_views = self.lever @ frames.adjoint(to_centre @ self.capture.hand_eye_frames(self.T_mount))
+        return np.concatenate([of_views, np.zeros((len(self.residual) - len(of_views), *of_views.shape[1:]))])
+
+    @property
+    def T_base_flange(self) -> Array:
+        """(V, 4, 4) of the views, in the order of time."""
+        return self.capture.T_base_flange
 
     @property
     def reach(self) -> float:
@@ -71,32 +79,64 @@ class Rows:
         away = np.linalg.norm(self.centre - self.capture.T_reference_flange[:, :3, 3], axis=1)
         return float(max(np.median(away), 1e-9))
 
+    @property
+    def numbers_per_view(self) -> int:
+        """Those of a view's block."""
+        return int(self.residual.shape[1])
+
     def from_twists(self, moved: Array) -> Array:
-        """(B, m, P) of left twists (6V, P) of the views about the centre."""
+        """Return rows (B·m, P) of left twists (6V, P) of the views about the centre."""
         out = np.zeros((*self.residual.shape, moved.shape[1]))
         out[: len(self.lever)] = self.lever @ moved.reshape(-1, 6, moved.shape[1])
-        return out
+        return out.reshape(self.residual.size, moved.shape[1])
+
+    def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
+        """Return rows (B·m, P) of each term."""
+        columns = self.effect_columns(measurement, model, terms)
+        return [Response(c.reshape(self.residual.size, c.shape[2])) for c in columns]
+
+    def trial(self, linear: LinearModel, response: Array, points: PointSums | None = None) -> "RowTrial":
+        """Return a model with the columns of rows (B·m, k)."""
+        return RowTrial(self, linear.covariance, linear.in_blocks(response))
+
+    def affected_squares(self, views: Indices) -> Mask:
+        """Return the views themselves, (V,) bool."""
+        mask: Mask = np.asarray(np.isin(np.arange(len(self.lever)), views))
+        return mask
+
+    def joint_ends(self, joints: Array) -> list[JointEnd]:
+        """Return both ends of every joint's range, of the views that show anything."""
+        return joint_ends(joints, np.flatnonzero(self.used.any(axis=1)))
+
+    def part_displacements(self, numbers: Array) -> Array:
+        """Return the motion (V, 3) of a view that makes its rows by shifts alone; zero for one that shows nothing."""
+        V = len(self.lever)
+        shifts = self.lever[..., 3:] * self.distances_used[..., None]
+        left = numbers.reshape(self.residual.shape)[:V, :, None]
+        return (np.linalg.pinv(shifts) @ left)[..., 0]
 
     def effect_columns(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Array]:
         """Per term (B, m, P) how the rows answer to its parameters, at `model`."""
         of_views = pose_derivatives(measurement, model, [t for t in terms if not moves_points([t])], self.centre)
-        poses, out = self.capture.poses(self.T_mount), []
+        poses = self.capture.poses(self.T_mount)
+        out = []
         for term in terms:
             if not moves_points([term]):
                 moved = next(of_views)
-                out.append(self.from_twists(moved.reshape(len(moved), -1).T))
+                rows = self.from_twists(moved.reshape(len(moved), -1).T)
+                out.append(rows.reshape(*self.residual.shape, rows.shape[1]))
                 continue
-            slopes = PointSlopes(measurement, [term], model).at_targets(poses)
-            own = np.zeros((*self.residual.shape, len(slopes)))
-            own[: len(poses)] = np.moveaxis(self.point_rows(frames.rotate(poses, slopes)), 0, -1)
-            own[: len(poses)][~self.used] = 0.0
-            out.append(own)
+            slopes = PointSlopes.about_model(measurement, model, [term]).at_targets(poses)
+            rows = np.zeros((*self.residual.shape, len(slopes)))
+            rows[: len(poses)] = np.moveaxis(self.point_rows(frames.rotate(poses, slopes)), 0, -1)
+            rows[: len(poses)][~self.used] = 0.0
+            out.append(rows)
         return out
 
     def columns_in_use(self, measurement: Measurement, model: Model) -> Array:
         """(B, m, P) how the rows answer to all parameters of the effects in use."""
-        found = self.effect_columns(measurement, model, model.terms)
-        return np.concatenate([np.zeros((*self.residual.shape, 0)), *found], axis=2)
+        columns = self.effect_columns(measurement, model, model.terms)
+        return np.concatenate([np.zeros((*self.residual.shape, 0)), *columns], axis=2)
 
     def mixed_model(self, A: Array) -> MixedModel:
         """Rows as blocks for the variance components; `A` (B, m, a) are the columns of the free mean."""
@@ -124,8 +164,42 @@ class Rows:
         return common_covariance(self._scattered, self.noise, self.fixed)
 
 
-# Views of largest influence on the estimates: if one alone carries them, it is among these.
-_CARRIERS = 20
+def row_model(measurement: Measurement, model: Model, rows: Rows) -> LinearModel:
+    """Return the linear model of what a session shows in rows: hand-eye, landmarks and effects in use are free.
+
+    Args:
+        measurement: with the sightings that count.
+    """
+    base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
+    extra = rows.columns_in_use(measurement, model)
+    sizes, values = sizes_of(model.terms), values_of(model.terms)
+    # Parameters that the fit left at zero are not in the model.
+    used = np.array([p.value != 0 and not p.discrete for p in stack_parameters(model.terms)], bool)
+    whole = rows.mixed_model(np.concatenate([base, extra[..., used]], axis=2))
+    null = fit_variances(whole, both_starts=True)
+    half = whitener(whole, null.variances)
+    n = rows.residual.size
+    white_base = (half @ base).reshape(n, base.shape[2])
+    white_extra = (half @ extra).reshape(n, extra.shape[2])
+    seen = used & independent(white_base, white_extra * used, sizes, 1 / UNSEEN)
+    A = np.concatenate([base, extra[..., seen]], axis=2)
+    mixed = rows.mixed_model(A)
+    if (seen != used).any():
+        null = fit_variances(mixed, both_starts=True)
+    offsets = joint_offset_twists(measurement, model, rows.centre)
+    per_joint = np.zeros(2) if offsets is None else mean_square_per_axis(offsets, [measurement], [rows.centre])
+    return LinearModel(
+        measurement,
+        model,
+        rows,
+        A.reshape(n, -1),
+        sizes=np.append(np.full(base.shape[2], np.inf), sizes[seen]),
+        values=np.append(np.zeros(base.shape[2]), values[seen]),
+        mixed=mixed,
+        null=null,
+        offsets=None if offsets is None else rows.from_twists(offsets).reshape(*rows.residual.shape, -1),
+        flange_per_joint=per_joint,
+    )
 
 
 @dataclass(frozen=True)
@@ -147,9 +221,8 @@ class RowTrial:
 
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
         """Coefficients (k,) under each prior, without some views; zero beyond those that it is of."""
-        found = self.blocks.solve_each([(own.precision, own.precision * own.mean) for own in priors], left_out)
-        nothing = np.zeros(self.X.shape[2])
-        return [np.concatenate([x, nothing[len(x) :]]) for x in found]
+        solutions = self.blocks.solve_each([(p.precision, p.precision * p.mean) for p in priors], left_out)
+        return [np.pad(x, (0, self.X.shape[2] - len(x))) for x in solutions]
 
     def squares(self, coefficients: Array, units: Indices | Mask | None = None) -> Array:
         """(V,) sums of the squares of a view's distances, of all views or of some."""
@@ -158,9 +231,9 @@ class RowTrial:
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
         """Of the left-out views' distances, in units of the sensor's noise: each is seen as it is."""
-        own = self.rows.distances_used[left_out]
+        used = self.rows.distances_used[left_out]
         rest = self._rest(coefficients, left_out)
-        return float(np.sum(rest[own] ** 2 / self.rows.noise[left_out][own]))
+        return float(np.sum(rest[used] ** 2 / self.rows.noise[left_out][used]))
 
     def influential_views(self, coefficients: Array) -> Indices:
         """(n,) the views without which the coefficients would move most, to first order."""
@@ -172,95 +245,3 @@ class RowTrial:
     def _rest(self, coefficients: Array, views: Indices | Mask) -> Array:
         V = len(self.rows.lever)
         return self.rows.residual[:V][views] + self.X[:V][views] @ coefficients
-
-
-@dataclass(frozen=True)
-class RowObservation(Observation):
-    """A response counts rows: n = B·m of them, those of absent points at zero."""
-
-    rows: Rows
-
-    @property
-    def T_base_flange(self) -> Array:
-        """(V, 4, 4) of the views, in the order of time."""
-        return self.rows.capture.T_base_flange
-
-    @property
-    def centre(self) -> Array:
-        """(3,) about which twists of the views count, reference frame."""
-        return self.rows.centre
-
-    @property
-    def reach(self) -> float:
-        """Length that makes a radian of orientation comparable with a distance."""
-        return self.rows.reach
-
-    @property
-    def numbers_per_view(self) -> int:
-        """Those of a view's block."""
-        return int(self.rows.residual.shape[1])
-
-    def from_twists(self, moved: Array) -> Array:
-        """(n, P) rows of left twists (6V, P) of the views."""
-        return self.rows.from_twists(moved).reshape(self.rows.residual.size, -1)
-
-    def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
-        """Rows (n, P) of each term."""
-        found = self.rows.effect_columns(measurement, model, terms)
-        return [Response(c.reshape(self.rows.residual.size, c.shape[2])) for c in found]
-
-    def trial(self, linear: LinearModel, response: Array, points: PointSums | None = None) -> RowTrial:
-        """A model with the columns of rows (n, k)."""
-        return RowTrial(self.rows, linear.covariance, linear.in_blocks(response))
-
-    def affected_squares(self, views: Indices) -> Mask:
-        """(V,) the views themselves."""
-        return np.isin(np.arange(len(self.rows.lever)), views)
-
-    def joint_ends(self, joints: Array) -> list[JointEnd]:
-        """Both ends of every joint's range, of the views that show anything."""
-        return joint_ends(joints, np.flatnonzero(self.rows.used.any(axis=1)))
-
-    def part_displacements(self, numbers: Array) -> Array:
-        """(V, 3) motion of a view that makes its rows by shifts alone; zero for one that shows nothing."""
-        V = len(self.rows.lever)
-        shifts = self.rows.lever[..., 3:] * self.rows.distances_used[..., None]
-        left = numbers.reshape(self.rows.residual.shape)[:V, :, None]
-        return (np.linalg.pinv(shifts) @ left)[..., 0]
-
-
-def row_model(measurement: Measurement, model: Model, observation: RowObservation) -> LinearModel:
-    """Linearise what a session shows in rows about its model: hand-eye, landmarks and effects in use are free.
-
-    Args:
-        measurement: with the sightings that count.
-    """
-    rows = observation.rows
-    base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
-    extra = rows.columns_in_use(measurement, model)
-    sizes, values = sizes_of(model.terms), values_of(model.terms)
-    # Parameters that the fit left at zero are not in the model.
-    used = np.array([p.value != 0 and not p.discrete for p in stack_parameters(model.terms)], bool)
-    whole = rows.mixed_model(np.concatenate([base, extra[..., used]], axis=2))
-    null = fit_variances(whole, both_starts=True)
-    half, n = whitener(whole, null.variances), rows.residual.size
-    own_columns, further = ((half @ c).reshape(n, c.shape[2]) for c in (base, extra))
-    seen = used & independent(own_columns, further * used, sizes, 1 / UNSEEN)
-    A = np.concatenate([base, extra[..., seen]], axis=2)
-    mixed = rows.mixed_model(A)
-    if (seen != used).any():
-        null = fit_variances(mixed, both_starts=True)
-    offsets = joint_offset_twists(measurement, model, rows.centre)
-    per_joint = np.zeros(2) if offsets is None else mean_square_per_axis(offsets, [measurement], [rows.centre])
-    return LinearModel(
-        measurement,
-        model,
-        observation,
-        A.reshape(n, -1),
-        sizes=np.append(np.full(base.shape[2], np.inf), sizes[seen]),
-        values=np.append(np.zeros(base.shape[2]), values[seen]),
-        mixed=mixed,
-        null=null,
-        offsets=None if offsets is None else rows.from_twists(offsets),
-        flange_per_joint=per_joint,
-    )

@@ -8,7 +8,7 @@ from scipy import stats
 
 from stitch.numerics import distributions
 from stitch.numerics.folds import grouped_folds, halves_of, joint_ends
-from stitch.numerics.kernels import direction_kernel, load_kernel, ornstein_uhlenbeck, process_covariance, rbf_joints
+from stitch.numerics.kernels import direction_kernel, exponential_kernel, load_kernel, process_covariance, rbf_joints
 from stitch.numerics.least_squares import anderson_step
 
 
@@ -111,7 +111,7 @@ JOINTS = np.random.default_rng(0).uniform(-np.pi, np.pi, (25, 6))
 
 def test_covariances_have_no_negative_direction():
     in_time, in_way = (
-        ornstein_uhlenbeck(np.cumsum(JOINTS[:, 0] ** 2), 2.0),
+        exponential_kernel(np.cumsum(JOINTS[:, 0] ** 2), np.cumsum(JOINTS[:, 0] ** 2), 2.0),
         direction_kernel(JOINTS[:, 0], JOINTS[:, 1]),
     )
     for alike in (rbf_joints(JOINTS), in_time, in_way, load_kernel(40 * JOINTS[:, :2])):
@@ -131,7 +131,7 @@ def test_what_one_joint_moves_far_stays_half_alike_and_near_views_are_alike():
 
 
 def test_time_forgets():
-    alike = ornstein_uhlenbeck(np.array([0.0, 1.0, 500.0]), 20.0)
+    alike = exponential_kernel(*[np.array([0.0, 1.0, 500.0])] * 2, 20.0)
     assert alike[0, 1] == pytest.approx(np.exp(-1 / 20))
     assert alike[0, 2] < 1e-10
 
@@ -153,7 +153,7 @@ def test_load_counts_in_its_own_range():
 def test_spread_is_the_covariance_of_drawn_processes():
     """10,000 draws of two processes through their columns; each number within five of its standard errors."""
     rng = np.random.default_rng(1)
-    alike, columns, draws = ornstein_uhlenbeck(np.arange(4.0), 5.0), rng.normal(size=(24, 2)), 10_000
+    alike, columns, draws = exponential_kernel(np.arange(4.0), np.arange(4.0), 5.0), rng.normal(size=(24, 2)), 10_000
     half = np.linalg.cholesky(alike)
     drawn = np.zeros((draws, 24))
     for p in range(2):

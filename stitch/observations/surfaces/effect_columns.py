@@ -1,4 +1,9 @@
-"""What changes of the points themselves do to the sums over pairs, streamed: memory never grows with the points."""
+"""How the views answer to parameters of effects: left twists of every view, as the overlaps would see them.
+
+Effects of robot, mount and part move views as a whole. Effects of points change what the overlaps measure; what they
+look like to the poses is H⁺BᵀWg, with g the change of the distance e per unit. Their sums over pairs are streamed:
+memory never grows with the points.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -43,6 +48,46 @@ class PointGram:
         return PointGram(self.vector @ A, self.residual @ A, A.T @ self.square @ A)
 
 
+def view_responses(
+    measurement: Measurement, model: Model, terms: Sequence[Term], unconstrained: UnconstrainedPoses
+) -> list[Response]:
+    """Return per term the twists (6V, P) of the views, and the sums over pairs of those that change the points."""
+    of_points = [term for term in terms if moves_points([term])]
+    of_views = [term for term in terms if not moves_points([term])]
+    sums = None
+    if of_points:
+        slopes = PointSlopes.about_model(measurement, model, of_points)
+        sums = stream_point_sums(
+            unconstrained,
+            measurement.capture.noise_factor,
+            lambda v, index: slopes.at(v, unconstrained.poses[v], index),
+            lambda: slopes.at_targets(unconstrained.poses),
+        )
+    twists = apparent_twists(sums, unconstrained) if sums else None
+    derivatives = pose_derivatives(measurement, model, of_views, unconstrained.overlaps.gram.centre)
+    responses, at = [], 0
+    for term in terms:
+        if sums is not None and twists is not None and moves_points([term]):
+            columns = slice(at, at + len(term.parameters))
+            responses.append(Response(twists[:, columns], sums.select(columns)))
+            at = columns.stop
+        else:
+            moved = next(derivatives)
+            responses.append(Response(moved.reshape(len(moved), -1).T, None))
+    return responses
+
+
+def view_columns(measurement: Measurement, model: Model, unconstrained: UnconstrainedPoses) -> Array:
+    """Return twists (6V, P) of the views for all parameters of the effects in use."""
+    columns = [r.columns for r in view_responses(measurement, model, model.terms, unconstrained)]
+    return np.hstack([np.zeros((6 * len(unconstrained.poses), 0)), *columns])
+
+
+def apparent_twists(points: PointGram, unconstrained: UnconstrainedPoses) -> Array:
+    """Return H⁺BᵀWg (6V, K): what point effects do to poses that overlaps and targets alone determine."""
+    return solve_views(unconstrained.overlaps.gram, points.vector)
+
+
 def stream_point_sums(
     unconstrained: UnconstrainedPoses,
     noise_factor: float,
@@ -50,7 +95,7 @@ def stream_point_sums(
     of_targets: Callable[[], Array],
     per_view: int = 0,
 ) -> PointGram:
-    """Stream the pairs once, a block of rows at a time.
+    """Return the sums of all pairs, streamed once, a block of rows at a time.
 
     Args:
         noise_factor: of the capture, by which labelled points count beside the surfaces.
@@ -63,35 +108,29 @@ def stream_point_sums(
 
     def slopes(v: int, index: Indices, normal: Array) -> Array:
         """(N, K) how far points of view v move along normals (N, 3) of the reference frame, per unit."""
-        own = frames.rotate(frames.inverse(unconstrained.poses[v]), normal)
-        return np.einsum("kni,ni->nk", of_points(v, index), own)
-
-    def of_block(block: Sequence[tuple[int, Match]]) -> list[tuple[Array, Array, Array]]:
-        out, end = [], 0
-        changes = _split_by_view(_distance_changes([m for _, m in block], slopes), per_view)
-        for _, m in block:
-            start, end = end, end + len(m.residual)
-            change, weight = changes[start:end], m.weight * tukey(m.residual, g.scale)
-            weighted = change * weight[:, None]
-            B = frames.plane_rows(m.middle - g.centre, m.normal)
-            out.append((B.T @ weighted, weighted.T @ m.residual, weighted.T @ change))
-        return out
+        in_scanner = frames.rotate(frames.inverse(unconstrained.poses[v]), normal)
+        return np.einsum("kni,ni->nk", of_points(v, index), in_scanner)
 
     sums = dict[int, tuple[Array, ...]]()
     for block in _match_blocks(unconstrained.overlaps.matches):
-        for (pair, _), more in zip(block, of_block(block), strict=True):
+        changes = _split_by_view(_distance_changes([m for _, m in block], slopes), per_view)
+        end = 0
+        for pair, m in block:
+            start, end = end, end + len(m.residual)
+            change = changes[start:end]
+            weighted = change * (m.weight * tukey(m.residual, g.scale))[:, None]
+            B = frames.plane_rows(m.middle - g.centre, m.normal)
+            more = (B.T @ weighted, weighted.T @ m.residual, weighted.T @ change)
             sums[pair] = tuple(map(np.add, sums[pair], more)) if pair in sums else more
-    every = [
-        *(sums[pair] for pair in sorted(sums)),
-        *_target_pair_sums(unconstrained, noise_factor, of_targets, per_view),
-    ]
-    return PointGram(*(np.array([s[i] for s in every]) for i in range(3)))
+    rows = [sums[pair] for pair in sorted(sums)]
+    rows += _target_pair_sums(unconstrained, noise_factor, of_targets, per_view)
+    return PointGram(*(np.array([row[i] for row in rows]) for i in range(3)))
 
 
 def _split_by_view(changes: Array, per_view: int) -> Array:
     """(…, K + apart) of changes (…, 2, K) that the two views of a pair cause."""
-    own = [changes[..., side, :per_view] for side in range(2)] if per_view else []
-    return np.concatenate([*own, changes[..., per_view:].sum(axis=-2)], axis=-1)
+    sides = [changes[..., side, :per_view] for side in range(2)] if per_view else []
+    return np.concatenate([*sides, changes[..., per_view:].sum(axis=-2)], axis=-1)
 
 
 def _match_blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]:
@@ -112,17 +151,22 @@ def _match_blocks(matches: Sequence[Match]) -> Iterator[list[tuple[int, Match]]]
 def _distance_changes(matches: Sequence[Match], slopes: Callable[[int, Indices, Array], Array]) -> Array:
     """(N, 2, K) how the distances of all N correspondences of some pairs change by either view; each is asked once."""
     ends = np.cumsum([len(m.residual) for m in matches])
-    rows = [np.arange(end - len(m.residual), end) for m, end in zip(matches, ends, strict=True)]
     normal = np.concatenate([m.normal for m in matches])
-    sides = [(m.v, m.index_v, own, 0) for m, own in zip(matches, rows, strict=True)]
-    sides += [(m.w, m.index_w, own, 1) for m, own in zip(matches, rows, strict=True)]
+    # Per side of a pair the view, its points, the rows of the pair, and whether it is the second view.
+    sides = list[tuple[int, Indices, Indices, int]]()
+    for second in range(2):
+        for m, end in zip(matches, ends, strict=True):
+            rows = np.arange(end - len(m.residual), end)
+            sides.append((m.w, m.index_w, rows, 1) if second else (m.v, m.index_v, rows, 0))
     out = np.zeros((len(normal), 2, 0))
     for view in sorted({side[0] for side in sides}):
-        index, at = (np.concatenate([side[i] for side in sides if side[0] == view]) for i in (1, 2))
-        second = np.concatenate([np.full(len(side[2]), side[3]) for side in sides if side[0] == view])
+        of_view = [side for side in sides if side[0] == view]
+        index = np.concatenate([side[1] for side in of_view])
+        at = np.concatenate([side[2] for side in of_view])
+        is_second = np.concatenate([np.full(len(side[2]), side[3]) for side in of_view])
         moved = slopes(view, index, normal.take(at, axis=0))
         out = out if out.shape[2] else np.zeros((len(normal), 2, moved.shape[1]))
-        out[at, second] = np.where(second[:, None] == 1, -moved, moved)
+        out[at, is_second] = np.where(is_second[:, None] == 1, -moved, moved)
     return out
 
 
@@ -141,57 +185,3 @@ def _target_pair_sums(
     residual = sum_by_pair(targets, np.einsum("ni,nik->nk", targets.difference, weighted))[1]
     square = sum_by_pair(targets, np.einsum("nik,nil->nkl", change, weighted))[1]
     return list(zip(vector, residual, square, strict=True))
-
-
-def apparent_twists(points: PointGram, unconstrained: UnconstrainedPoses) -> Array:
-    """(6V, K) H⁺BᵀWg: what point effects do to poses that overlaps and targets alone determine."""
-    return solve_views(unconstrained.overlaps.gram, points.vector)
-
-
-# How the views answer to parameters of effects: left twists of every view, as the overlaps would see them.
-#
-# Effects of robot, mount and part move views as a whole. Effects of points change what the overlaps
-# measure; what they look like to the poses is H⁺BᵀWg, with g the change of the distance e per unit.
-
-
-def view_responses(
-    measurement: Measurement, model: Model, terms: Sequence[Term], unconstrained: UnconstrainedPoses
-) -> list[Response]:
-    """Per term the twists (6V, P) of the views, and the sums over pairs of those that change the points."""
-    of_points = [term for term in terms if moves_points([term])]
-    sums = _point_effect_sums(measurement, model, of_points, unconstrained) if of_points else None
-    seen = apparent_twists(sums, unconstrained) if sums else None
-    of_views = [term for term in terms if not moves_points([term])]
-    moved = pose_derivatives(measurement, model, of_views, unconstrained.overlaps.gram.centre)
-    out, at = [], 0
-    for term in terms:
-        if sums is not None and seen is not None and moves_points([term]):
-            own = slice(at, at + len(term.parameters))
-            out.append(Response(seen[:, own], sums.select(own)))
-            at = own.stop
-        else:
-            found = next(moved)
-            out.append(Response(np.asarray(found.reshape(len(found), -1).T), None))
-    return out
-
-
-def view_columns(measurement: Measurement, model: Model, unconstrained: UnconstrainedPoses) -> Array:
-    """(6V, P) twists of the views for all parameters of the effects in use."""
-    found = [r.columns for r in view_responses(measurement, model, model.terms, unconstrained)]
-    return np.hstack([np.zeros((6 * len(unconstrained.poses), 0)), *found])
-
-
-def _point_effect_sums(
-    measurement: Measurement, model: Model, terms: Sequence[Term], unconstrained: UnconstrainedPoses
-) -> PointGram:
-    """Sums over the correspondences for all parameters of point effects."""
-
-    slopes = PointSlopes(measurement, terms, model)
-
-    def of_points(v: int, index: Indices) -> Array:
-        return slopes.at(v, unconstrained.poses[v], index)
-
-    def of_targets() -> Array:
-        return slopes.at_targets(unconstrained.poses)
-
-    return stream_point_sums(unconstrained, measurement.capture.noise_factor, of_points, of_targets)

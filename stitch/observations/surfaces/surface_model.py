@@ -110,11 +110,7 @@ class SurfaceObservation(Observation):
     capture: Capture  # without the effects in use
     unconstrained: UnconstrainedPoses
     reduced_poses: ReducedPoses
-
-    @property
-    def centre(self) -> Array:
-        """(3,) of the overlaps, reference frame."""
-        return self.unconstrained.overlaps.gram.centre
+    centre: Array  # (3,) of the overlaps, reference frame
 
     @property
     def T_base_flange(self) -> Array:
@@ -199,7 +195,7 @@ def surface_model(
     return LinearModel(
         measurement,
         model,
-        SurfaceObservation(capture, unconstrained, reduced),
+        SurfaceObservation(capture, unconstrained, reduced, g.centre),
         design=np.hstack([hand_eye_jacobian(frames_of_mount, g.centre), twists[:, seen]]),
         sizes=np.append(np.full(6, np.inf), sizes[seen]),
         values=np.append(np.zeros(6), values[seen]),

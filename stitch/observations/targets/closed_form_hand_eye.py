@@ -9,7 +9,7 @@ import numpy as np
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
-from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.frames import Array, Indices
 from stitch.numerics.hand_eye import shah
 from stitch.session.capture import Capture
 
@@ -19,7 +19,7 @@ _DEGENERATE = 1e-6
 
 
 def closed_form_hand_eye(capture: Capture) -> Array:
-    """T_mount_sensor (4, 4) of a capture with sightings.
+    """Return T_mount_sensor (4, 4) of a capture with sightings.
 
     Raises:
         NoResultError: motions or targets that cannot show the hand-eye.
@@ -27,18 +27,22 @@ def closed_form_hand_eye(capture: Capture) -> Array:
     s = capture.sightings
     assert s is not None
     if s.rotation is not None:
-        return _from_probe(capture, s.points[:, 0], s.rotation, np.asarray(s.used.any(axis=1)))
+        # T_mount·T_sensor_probe = T_reference_mount⁻¹·T_reference_probe is A·X = Z·B for A = T_reference_mount⁻¹.
+        used = s.used.any(axis=1)
+        A = frames.inverse(capture.T_reference_mount[used])
+        return shah(A, frames.make(s.rotation[used], s.points[used, 0]))[1]
     v, slot = np.nonzero(s.used)
-    L, p, target = capture.T_reference_mount[v], s.points[v, slot], s.target[v, slot]
-    scale = float(np.linalg.norm(p - p.mean(axis=0), axis=1).mean()) or 1.0
+    L = capture.T_reference_mount[v]
+    p, target = s.points[v, slot], s.target[v, slot]
     offset = p.mean(axis=0)
+    scale = float(np.linalg.norm(p - offset, axis=1).mean()) or 1.0
     R = _solve_rotation_translation(L, (p - offset) / scale, target, len(s.targets), None)
     t = _solve_rotation_translation(L, p - offset, target, len(s.targets), R)[:, 0]
     return frames.make(R, t - R @ offset)
 
 
 def _solve_rotation_translation(L: Array, p: Array, target: Indices, targets: int, R: Array | None) -> Array:
-    """The rotation (3, 3) from all unknowns, or the translation (3, 1) with the rotation known.
+    """Return the rotation (3, 3) from all unknowns, or the translation (3, 1) with the rotation known.
 
     Args:
         L: (N, 4, 4) what stands left of the hand-eye, per sighting.
@@ -75,9 +79,3 @@ def _solve_rotation_translation(L: Array, p: Array, target: Indices, targets: in
     if R is None:
         return frames.nearest_rotation(x[:9].reshape(3, 3))
     return x[:3, None]
-
-
-def _from_probe(capture: Capture, points: Array, rotation: Array, used: Mask) -> Array:
-    """T_mount·T_sensor_probe = T_reference_mount⁻¹·T_reference_probe is A·X = Z·B for A = T_reference_mount⁻¹."""
-    A = frames.inverse(capture.T_reference_mount[used])
-    return shah(A, frames.make(rotation[used], points[used]))[1]

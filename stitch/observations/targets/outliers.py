@@ -3,6 +3,10 @@
 A view whose targets do not fit each other, wherever the arm stood, has a wrong one: that which the others and the
 scatter of the poses foretell least. A view whose targets agree but lie far off has a wrong pose. Both are measured
 by what is usual in these data (median), so that outliers do not hide behind the scatter they cause.
+
+A view whose targets bear each other's names is told by the distances between them, wherever the arm stood. One wrong
+name shows as an outlier. Where all names of a view are mixed up, what is left of it agrees with nothing, and beside
+clouds it holds the scan in a wrong place, so that the scan is blamed.
 """
 
 from collections import defaultdict
@@ -27,6 +31,10 @@ from stitch.session.capture import Sightings
 LIMIT_TARGET, LIMIT_VIEW = 6.0, 10.0
 # A view that may stand anywhere: its pose scatters by this many times what the poses do.
 _ANYWHERE = 1e3
+# Targets of a view whose distances tell names apart, and views that say how far two targets lie apart.
+_MIN_TARGETS, _MIN_VIEWS = 3, 3
+# Other names must leave so much less than those that are stated, and be found within so many trials.
+_CLEARER, _TRIALS = 0.2, 100_000
 
 
 @dataclass(frozen=True)
@@ -53,8 +61,9 @@ def find_outliers(rows: TargetRows, variances: Array) -> list[Outlier]:
     sightings = rows.capture.sightings
     assert sightings is not None
     V, S = sightings.used.shape
-    mixed, left = rows.mixed_model(rows.hand_eye), rows.residual[:V]
-    P = np.asarray(np.linalg.inv(mixed.covariance(variances)[:V]), float)
+    mixed = rows.mixed_model(rows.hand_eye)
+    left = rows.residual[:V]
+    P = np.linalg.inv(mixed.covariance(variances)[:V]).astype(float)
     free = np.linalg.inv(mixed.covariance(variances * [_ANYWHERE**2, _ANYWHERE**2, 1.0])[:V])
     seen = sightings.used.any(axis=1)
     slots, apart = _slot_deviations(P, left, S)
@@ -83,29 +92,18 @@ def _slot_deviations(P: Array, left: Array, slots: int) -> tuple[Array, Array]:
     """
     V = len(P)
     pushed = np.einsum("vij,vj->vi", P, left)[:, : 3 * slots].reshape(V, slots, 3)
-    own = P[:, : 3 * slots, : 3 * slots].reshape(V, slots, 3, slots, 3)
-    own = np.moveaxis(own[:, np.arange(slots), :, np.arange(slots)], 0, 1)  # (V, S, 3, 3)
-    apart = np.einsum("vsij,vsj->vsi", np.linalg.inv(own), pushed)
+    blocks = P[:, : 3 * slots, : 3 * slots].reshape(V, slots, 3, slots, 3)
+    blocks = np.moveaxis(blocks[:, np.arange(slots), :, np.arange(slots)], 0, 1)  # (V, S, 3, 3)
+    apart = np.einsum("vsij,vsj->vsi", np.linalg.inv(blocks), pushed)
     return np.sqrt(np.maximum(np.einsum("vsi,vsi->vs", pushed, apart), 0.0)), np.linalg.norm(apart, axis=2)
 
 
-def mask_outliers(used: Mask, found: Sequence[Outlier], targets: tuple[str, ...], target: Indices) -> Mask:
-    """(V, S) bool: what is in use without the outliers."""
+def mask_outliers(used: Mask, outliers: Sequence[Outlier], targets: tuple[str, ...], target: Indices) -> Mask:
+    """Return what is in use without the outliers, (V, S) bool."""
     used = used.copy()
-    for o in found:
+    for o in outliers:
         used[o.view] &= False if o.target is None else target[o.view] != targets.index(o.target)
     return used
-
-
-# Views whose targets bear each other's names: the distances between them tell it, wherever the arm stood.
-#
-# One wrong name shows as an outlier. Where all names of a view are mixed up, what is left of it agrees with nothing,
-# and beside clouds it holds the scan in a wrong place, so that the scan is blamed.
-
-# Targets of a view whose distances tell names apart, and views that say how far two targets lie apart.
-_MIN_TARGETS, _MIN_VIEWS = 3, 3
-# Other names must leave so much less than those that are stated, and be found within so many trials.
-_CLEARER, _TRIALS = 0.2, 100_000
 
 
 @dataclass(frozen=True)
@@ -124,10 +122,9 @@ class MislabelledView:
 
     def message(self, view: str) -> str:
         """What happened and what to do, with the name of the view."""
-        told = [f"{stated} is {right}" for stated, right in self.names]
-        named = "; ".join(told[:COMPARED_TARGETS]) + (
-            f" … and {len(told) - COMPARED_TARGETS} more" if len(told) > COMPARED_TARGETS else ""
-        )
+        named = "; ".join(f"{stated} is {right}" for stated, right in self.names[:COMPARED_TARGETS])
+        if len(self.names) > COMPARED_TARGETS:
+            named += f" … and {len(self.names) - COMPARED_TARGETS} more"
         which = f" ({named})" if named else ""
         return (
             f"The targets of view {view} bear each other's names{which}, as the distances between them say: its "
@@ -136,68 +133,64 @@ class MislabelledView:
 
 
 def find_mislabelled(sightings: Sightings) -> tuple[MislabelledView, ...]:
-    """Views whose names are mixed up; of many targets each view is asked about some, all over its list."""
+    """Return the views whose names are mixed up; of many targets each view is asked about some, all over its list."""
     places = target_positions(sightings)
-    worst, usually = _distance_deviations(places, [_compared_targets(place) for place in places])
+    worst, usually = _distance_deviations(places)
     scatter = max(distance_sigma(sightings), MAD_TO_SIGMA * usually)
-    doubted = np.flatnonzero(worst > LIMIT_TARGET * scatter)
-    usual = _usual_distances(places) if len(doubted) else np.empty((0, 0))
-    found = []
-    for v in doubted:
-        stated = np.flatnonzero(np.isfinite(places[v, :, 0]))
+    suspects = np.flatnonzero(worst > LIMIT_TARGET * scatter)
+    # Distances (K, K) between targets as most views have them, NaN where few do.
+    usual = np.empty((places.shape[1],) * 2 if len(suspects) else (0, 0))
+    for k, row in enumerate(usual):
+        apart = np.linalg.norm(places - places[:, k : k + 1], axis=2)
+        row[:] = np.where(np.isfinite(apart).sum(axis=0) < _MIN_VIEWS, np.nan, nan_median(apart))
+    mislabelled = []
+    for v in suspects:
+        shown = np.flatnonzero(np.isfinite(places[v, :, 0]))
         within = min(LIMIT_TARGET * scatter, _CLEARER * worst[v])
-        fits = list(_consistent_labels(target_distances(places[v : v + 1, stated])[0], usual, within))
+        fits = list(_consistent_labels(target_distances(places[v : v + 1, shown])[0], usual, within))
         if fits:
-            names = [sightings.targets[k] for k in stated]
+            stated = [sightings.targets[k] for k in shown]
             right = [sightings.targets[k] for k in fits[0]]
-            mixed = tuple((a, b) for a, b in zip(names, right, strict=True) if a != b)
-            found.append(MislabelledView(int(v), mixed if len(fits) == 1 else (), worst[v], worst[v] / scatter))
-    return tuple(found)
+            names = tuple((a, b) for a, b in zip(stated, right, strict=True) if a != b)
+            mislabelled.append(MislabelledView(int(v), names if len(fits) == 1 else (), worst[v], worst[v] / scatter))
+    return tuple(mislabelled)
 
 
 def drop_mislabelled(sightings: Sightings | None) -> Sightings | None:
-    """The sightings without those of views whose names are mixed up."""
+    """Return the sightings without those of views whose names are mixed up."""
     if sightings is None:
         return None
     mixed_up = [m.outlier for m in find_mislabelled(sightings)]
     return replace(sightings, used=mask_outliers(sightings.used, mixed_up, sightings.targets, sightings.target))
 
 
-def _compared_targets(place: Array) -> Indices:
-    """Of the targets (K, 3) that a view shows as many as are compared pair by pair."""
-    shown = np.flatnonzero(np.isfinite(place[:, 0]))
-    return shown[np.linspace(0, len(shown) - 1, min(len(shown), COMPARED_TARGETS)).astype(int)]
+def _distance_deviations(places: Array) -> tuple[Array, float]:
+    """Return by how much a distance of each view (V,) is off what it usually is, at the most, and the median of all.
 
-
-def _distance_deviations(places: Array, compared: Sequence[Indices]) -> tuple[Array, float]:
-    """(V,) by how much a distance of each view is off what it usually is, at the most, and the median of all."""
-    worst, off = np.zeros(len(compared)), [np.zeros(0)]
+    Args:
+        places: (V, K, 3) of the targets, NaN where a view does not show one; of many that it shows some are compared.
+    """
+    worst, off = np.zeros(len(places)), [np.zeros(0)]
     alike = defaultdict[tuple[int, ...], list[int]](list)
-    for v, shown in enumerate(compared):
-        alike[tuple(shown)].append(v)
+    for v, place in enumerate(places):
+        shown = np.flatnonzero(np.isfinite(place[:, 0]))
+        some = np.linspace(0, len(shown) - 1, min(len(shown), COMPARED_TARGETS)).astype(int)
+        alike[tuple(shown[some])].append(v)
     for targets, views in alike.items():
         if len(targets) >= _MIN_TARGETS:
             apart = target_distances(places[:, list(targets)])[:, *np.triu_indices(len(targets), 1)]
             few = np.isfinite(apart).sum(axis=0) < _MIN_VIEWS
-            own = np.where(few, np.nan, np.abs(apart[views] - nan_median(apart)))
-            worst[views] = np.nanmax(own, axis=1, initial=0.0)
-            off.append(own.ravel())
+            deviations = np.where(few, np.nan, np.abs(apart[views] - nan_median(apart)))
+            worst[views] = np.nanmax(deviations, axis=1, initial=0.0)
+            off.append(deviations.ravel())
     every = np.concatenate(off)
     return worst, float(np.nanmedian(every)) if np.isfinite(every).any() else 0.0
 
 
-def _usual_distances(places: Array) -> Array:
-    """(K, K) distances between targets as most views have them, NaN where few do."""
-    out = np.empty((places.shape[1],) * 2)
-    for k, row in enumerate(out):
-        apart = np.linalg.norm(places - places[:, k : k + 1], axis=2)
-        row[:] = np.where(np.isfinite(apart).sum(axis=0) < _MIN_VIEWS, np.nan, nan_median(apart))
-    return out
-
-
-def _consistent_labels(own: Array, usual: Array, within: float) -> Iterator[list[int]]:
-    """At most two ways to name n targets, (n, n) apart, so that all distances are the usual ones (K, K)."""
-    named, trials, given = list[int](), 0, 0
+def _consistent_labels(distances: Array, usual: Array, within: float) -> Iterator[list[int]]:
+    """Yield at most two ways to name n targets, (n, n) apart, so that all distances are the usual ones (K, K)."""
+    named = list[int]()
+    trials = given = 0
     choices: list[Iterator[int]] = [iter(range(len(usual)))]
     while choices and trials < _TRIALS and given < 2:
         k = next(choices[-1], None)
@@ -205,18 +198,18 @@ def _consistent_labels(own: Array, usual: Array, within: float) -> Iterator[list
         if k is None:
             choices.pop()
             named = named[:-1]
-        elif len(named) + 1 == len(own):
+        elif len(named) + 1 == len(distances):
             given += 1
             yield [*named, k]
         else:
             named.append(k)
-            choices.append(iter(_consistent_targets(own[len(named), : len(named)], usual, named, within)))
+            choices.append(iter(_consistent_targets(distances[len(named), : len(named)], usual, named, within)))
 
 
-def _consistent_targets(own: Array, usual: Array, named: list[int], within: float) -> list[int]:
-    """Names that are left for a target, (d,) apart from d that have theirs: what few views say of some may be open."""
+def _consistent_targets(distances: Array, usual: Array, named: list[int], within: float) -> list[int]:
+    """Return the names left for a target, (d,) apart from d that have theirs: what few views say may be open."""
     held = named[:COMPARED_TARGETS]
-    off = np.abs(usual[:, held] - own[: len(held)])
+    off = np.abs(usual[:, held] - distances[: len(held)])
     known = np.isfinite(off)
     fits = (~known | (off < within)).all(axis=1) & (known.sum(axis=1) >= min(len(held), _MIN_TARGETS))
     fits[named] = False

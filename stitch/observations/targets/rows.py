@@ -20,8 +20,6 @@ from stitch.observations.rows import Rows
 from stitch.session.capture import Capture, Sightings
 from stitch.session.session import NominalTargets
 
-# Distances between the targets of one view: what they are wherever the arm stood, whatever the hand-eye is.
-
 # More targets hold each other, so that a wrong one pulls little; to compare all their pairs takes minutes.
 COMPARED_TARGETS = 24
 
@@ -42,9 +40,6 @@ def target_distances(places: Array) -> Array:
 def distance_sigma(sightings: Sightings) -> float:
     """What the noise of two coordinates leaves of a distance, length_unit."""
     return float(np.sqrt(2) * np.median(sightings.sigma[sightings.used]))
-
-
-# What the views see: positions of targets, the orientation of a probe, the place of a drawing; all unknown.
 
 
 @dataclass(frozen=True)
@@ -72,38 +67,38 @@ class Landmarks:
 
     def updated(self, by: Array) -> "Landmarks":
         """After a step of all unknowns: shifts, a left rotation vector, a left twist of the drawing."""
-        split = self.positions.size
-        orientation, T, at = self.orientation, self.T_reference_part, split
+        at = self.positions.size
+        positions = self.positions + by[:at].reshape(-1, 3)
+        orientation, T = self.orientation, self.T_reference_part
         if orientation is not None:
             orientation = Rotation.from_rotvec(by[at : at + 3]).as_matrix() @ orientation
             at += 3
         if T is not None:
             T = frames.exp(by[at : at + 6]) @ T
-        return replace(
-            self, positions=self.positions + by[:split].reshape(-1, 3), orientation=orientation, T_reference_part=T
-        )
+        return replace(self, positions=positions, orientation=orientation, T_reference_part=T)
 
 
 def drawing_of(nominal: NominalTargets | None, sightings: Sightings) -> Drawing | None:
-    """The drawing of the targets seen; where it states no sigma, a target is as good as one sighting of it."""
+    """Return the drawing of the targets seen; where it states no sigma, a target is as good as one sighting of it."""
     if nominal is None:
         return None
-    names, usual = sightings.targets, float(np.median(sightings.sigma[sightings.used]))
+    names = sightings.targets
+    usual = float(np.median(sightings.sigma[sightings.used]))
     pairs = [(names.index(name), i) for i, name in enumerate(nominal.targets) if name in names]
     target, rows = (np.array(column) for column in zip(*pairs, strict=True))
     sigma = nominal.sigma[rows]
     return Drawing(target, nominal.points[rows], np.where(np.isnan(sigma), usual, sigma))
 
 
-def initial_landmarks(own: Capture, T_mount: Array, drawing: Drawing | None = None) -> Landmarks:
-    """Landmarks in the middle (median) of where the views put them under a hand-eye; NaN for one that nobody sees.
+def initial_landmarks(capture: Capture, T_mount: Array, drawing: Drawing | None = None) -> Landmarks:
+    """Return landmarks in the middle (median) of where the views put them under a hand-eye; NaN for one not seen.
 
     Args:
-        own: without the effects in use.
+        capture: without the effects in use.
     """
-    s = own.sightings
+    s = capture.sightings
     assert s is not None
-    poses = own.poses(T_mount)
+    poses = capture.poses(T_mount)
     placed = frames.transform(poses, s.points)
     positions = np.full((len(s.targets), 3), np.nan)
     for k in range(len(s.targets)):
@@ -130,6 +125,7 @@ class TargetRows(Rows):
 
     variance: Array  # (B, m) that is known: 1 in absent rows, that of the drawing in its own
     positions: int  # the first 3S rows of a view are coordinates
+    places: Landmarks  # about which the rows are linearised
 
     @property
     def fixed(self) -> Array:
@@ -160,15 +156,15 @@ class TargetRows(Rows):
         return np.where(self.used[:, : self.positions : 3], d, np.nan)
 
 
-def target_rows(own: Capture, T_mount: Array, landmarks: Landmarks) -> TargetRows:
-    """Linearise labelled points about hand-eye and landmarks.
+def target_rows(capture: Capture, T_mount: Array, landmarks: Landmarks) -> TargetRows:
+    """Return labelled points linearised about hand-eye and landmarks.
 
     Args:
-        own: without the effects in use.
+        capture: without the effects in use.
     """
-    s = own.sightings
+    s = capture.sightings
     assert s is not None
-    poses = own.poses(T_mount)
+    poses = capture.poses(T_mount)
     centre = np.asarray(frames.transform(poses, s.points)[s.used].mean(axis=0))
     parts = [_coordinate_rows(s, poses, centre, landmarks)]
     if s.rotation is not None:
@@ -179,7 +175,7 @@ def target_rows(own: Capture, T_mount: Array, landmarks: Landmarks) -> TargetRow
     of_drawing, moved_in_drawing, known = _drawing_rows(landmarks, left.shape[1])
     nothing = np.zeros_like(of_drawing)
     return TargetRows(
-        capture=own,
+        capture=capture,
         T_mount=T_mount,
         centre=centre,
         residual=np.concatenate([left, of_drawing]),
@@ -188,6 +184,7 @@ def target_rows(own: Capture, T_mount: Array, landmarks: Landmarks) -> TargetRow
         noise=np.concatenate([noise, nothing]),
         variance=np.concatenate([absent.astype(float), known]),
         positions=3 * s.used.shape[1],
+        places=landmarks,
     )
 
 
@@ -213,7 +210,8 @@ def _coordinate_rows(
 def _orientation_rows(s: Sightings, poses: Array, landmarks: Landmarks) -> tuple[Array, Array, Array, Array]:
     """The same of the three rows (rad) of a probe's turn; zeros where nobody knows how it is held."""
     V, at = len(poses), landmarks.positions.size
-    left, noise, lever, columns = (np.zeros((V, 3, *more)) for more in ((), (), (6,), (landmarks.size,)))
+    left, noise = np.zeros((V, 3)), np.zeros((V, 3))
+    lever, columns = np.zeros((V, 3, 6)), np.zeros((V, 3, landmarks.size))
     if s.rotation is None or s.sigma_rotation is None or landmarks.orientation is None:
         return left, noise, lever, columns
     left = Rotation.from_matrix(poses[:, :3, :3] @ s.rotation @ landmarks.orientation.T).as_rotvec()
@@ -239,25 +237,22 @@ def _drawing_rows(landmarks: Landmarks, m: int) -> tuple[Array, Array, Array]:
     return left, columns, fixed
 
 
-# Where the targets lie, and how well that is known, under a hand-eye that is given.
-
-
-def fit_landmarks(own: Capture, T_mount: Array) -> tuple[Landmarks, BlockLeastSquares, Array]:
-    """The landmarks by least squares under a hand-eye, the blocks of that fit, and the scatter.
+def fit_landmarks(capture: Capture, T_mount: Array) -> tuple[Landmarks, BlockLeastSquares, Array]:
+    """Return the landmarks by least squares under a hand-eye, the blocks of that fit, and the scatter.
 
     Args:
-        own: without the effects in use.
+        capture: without the effects in use.
 
     Returns:
         The scatter as variances (3,) of rotation, of translation, and the factor on the sensor's noise.
     """
-    landmarks = initial_landmarks(own, T_mount)
-    rows = target_rows(own, T_mount, landmarks)
+    landmarks = initial_landmarks(capture, T_mount)
+    rows = target_rows(capture, T_mount, landmarks)
     mixed = rows.mixed_model(rows.landmarks)
     variances = fit_variances(mixed, both_starts=True).variances
-    assert own.sightings is not None
+    assert capture.sightings is not None
     # One working distance for what nobody sees.
-    distance = float(np.median(np.linalg.norm(np.concatenate(own.sightings.points_by_view()), axis=1)))
+    distance = float(np.median(np.linalg.norm(np.concatenate(capture.sightings.points_by_view()), axis=1)))
     precision = np.full(landmarks.size, distance**-2.0)
     blocks = BlockLeastSquares(
         mixed.z, rows.landmarks, mixed.covariance(variances), precision, np.zeros(landmarks.size)

@@ -8,11 +8,9 @@ from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
-from stitch.observations.rows import RowObservation, row_model
+from stitch.observations.rows import row_model
 from stitch.observations.targets.rows import Drawing, Landmarks, TargetRows, initial_landmarks, target_rows
 from stitch.session.measurement import Measurement
-
-# What the labelled points of one session say under a fitted model.
 
 
 @dataclass(frozen=True)
@@ -91,20 +89,12 @@ def rms_of(distances: Array) -> float:
     return float(np.sqrt(np.nanmean(distances**2)))
 
 
-@dataclass(frozen=True)
-class TargetObservation(RowObservation):
-    """Labelled points in rows, with the places of their targets."""
-
-    rows: TargetRows
-    landmarks: Landmarks
-
-
 def target_model(measurement: Measurement, model: Model, drawing: Drawing | None) -> LinearModel:
-    """Linearise the labelled points of a session about its model.
+    """Return the linear model of a session's labelled points.
 
     Args:
         measurement: with the sightings that count.
     """
-    own = corrected_capture(measurement, model)
-    landmarks = initial_landmarks(own, model.T_mount, drawing)
-    return row_model(measurement, model, TargetObservation(target_rows(own, model.T_mount, landmarks), landmarks))
+    capture = corrected_capture(measurement, model)
+    landmarks = initial_landmarks(capture, model.T_mount, drawing)
+    return row_model(measurement, model, target_rows(capture, model.T_mount, landmarks))

@@ -91,8 +91,8 @@ def test_columns_are_what_the_displacement_does():
     terms = build_dictionary(linear, view_quantities(linear.measurement.views))
     own = next(i for i in terms.ingredients if i.what == "q*3" and i.quantity.text == "sin q3·sin 2q2")
     column, scale = terms.columns([own])[:, 0], np.abs(own.quantity.values).max()
-    rows = linear.observation.rows.residual.ravel()
-    moved = evidence(4, coupling, views=20).observation.rows.residual.ravel()
+    rows = linear.observation.residual.ravel()
+    moved = evidence(4, coupling, views=20).observation.residual.ravel()
     # The fit of each session takes what hand-eye and targets can of it; what remains must be the column's remainder.
     free = linear.design
     left = moved - rows - column * scale * -SIZE
