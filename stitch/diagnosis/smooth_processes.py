@@ -17,7 +17,7 @@ from stitch.model.forward import pose_derivatives
 from stitch.model.model import term_of
 from stitch.numerics.common_covariance import SelectedColumns
 from stitch.numerics.frames import Array, Indices
-from stitch.numerics.kernels import REACH, SHORT_REACH, ornstein_uhlenbeck, rbf_joints
+from stitch.numerics.kernels import REACH, SHORT_REACH, exponential_kernel, rbf_joints
 from stitch.numerics.reml import VarianceFit, fit_variances
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import DRIFT_MEMORY, flange_twists, time_in_steps
