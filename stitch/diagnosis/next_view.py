@@ -24,7 +24,7 @@ from stitch.numerics.least_squares import equilibrated
 from stitch.numerics.reml import NOISE
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.surface_model import SurfaceObservation
-from stitch.observations.targets.target_model import TargetObservation
+from stitch.observations.targets.rows import TargetRows
 from stitch.session.capture import build_capture
 from stitch.session.robot import forward
 from stitch.system.threads import library_threads_off
@@ -167,7 +167,7 @@ def candidate_views(linear: LinearModel, a: Score, b: Score) -> CandidateViews |
     match linear.observation:
         case SurfaceObservation() as surfaces:
             return _of_surfaces(linear, surfaces, a, b)
-        case TargetObservation() as targets:
+        case TargetRows() as targets:
             return _of_targets(linear, targets, a, b)
     return None
 
@@ -205,13 +205,13 @@ def _of_surfaces(linear: LinearModel, surfaces: SurfaceObservation, a: Score, b:
     return CandidateViews(joints, np.concatenate([hand_eye, extra], axis=2), of_a, of_b, half)
 
 
-def _of_targets(linear: LinearModel, targets: TargetObservation, a: Score, b: Score) -> CandidateViews:
+def _of_targets(linear: LinearModel, targets: TargetRows, a: Score, b: Score) -> CandidateViews:
     """Return poses near those driven, in which all targets are seen."""
     joints = nearby(linear.measurement.views.joints)[:_TRIED]
     measurement = candidate_measurement(linear.measurement, joints)
     zero = [scored.form.at(np.zeros(len(scored.values))) for scored in (a, b)]
     flange_and_noise = np.append(linear.flange_scatter(linear.null), linear.null.variances[NOISE])
-    rows, columns, covariance = candidate_rows(measurement, targets.rows, targets.landmarks, flange_and_noise, zero)
+    rows, columns, covariance = candidate_rows(measurement, targets, targets.places, flange_and_noise, zero)
     extra = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - rows.landmarks.shape[2]))
     design = np.concatenate([rows.hand_eye, rows.landmarks, extra], axis=2)
     of_a, of_b = (c[..., scored.form.keep] for c, scored in zip(columns, (a, b), strict=True))

@@ -126,7 +126,7 @@ class Rows(Observation):
                 rows = self.from_twists(moved.reshape(len(moved), -1).T)
                 out.append(rows.reshape(*self.residual.shape, rows.shape[1]))
                 continue
-            slopes = PointSlopes.about_model(measurement, model, [term]).at_targets(poses)
+            slopes = PointSlopes(measurement, [term], model).at_targets(poses)
             rows = np.zeros((*self.residual.shape, len(slopes)))
             rows[: len(poses)] = np.moveaxis(self.point_rows(frames.rotate(poses, slopes)), 0, -1)
             rows[: len(poses)][~self.used] = 0.0

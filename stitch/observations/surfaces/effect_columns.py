@@ -56,7 +56,7 @@ def view_responses(
     of_views = [term for term in terms if not moves_points([term])]
     sums = None
     if of_points:
-        slopes = PointSlopes.about_model(measurement, model, of_points)
+        slopes = PointSlopes(measurement, of_points, model)
         sums = stream_point_sums(
             unconstrained,
             measurement.capture.noise_factor,

@@ -102,7 +102,7 @@ def field_error(
         nuisance_effects: effects of points that may have any size there.
     """
     sums, noise = sum_smooth_errors(
-        measurement, unconstrained, PointSlopes.about_model(measurement, model, nuisance_effects), per_view=True
+        measurement, unconstrained, PointSlopes(measurement, nuisance_effects, model), per_view=True
     )
     if not np.isfinite(noise):
         return FieldError(0.0, 0.0, 0.0, over_noise=False)
