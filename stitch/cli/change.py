@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stitch.cli.options import EffectsFile, Json, Trust
-from stitch.cli.progress import recorder_for, show_activity
+from stitch.cli.progress import opened_run, recorder_for, show_activity
 from stitch.cli.terminal import emit, in_full, say, show_next
 from stitch.errors import InputError
 from stitch.system.process import end_at_once
@@ -44,7 +44,10 @@ def add(
     if bool(effects) + suggested + group != 1:
         raise InputError("add what? to fix: name the effects, or let --suggested or --group choose; one of the three")
     if effects:
-        add_effects(run, effects, effects_file, trust=trust, recording=recording, as_json=as_json)
+        from stitch.api.stepwise import effects_with
+
+        with opened_run(run, effects_file, trust, "reading the run") as state:
+            _refit_run(run, state, effects_with(state, effects, run), recording, as_json)
     else:
         limit = at_most if suggested else None
         _add_diagnosed(run, limit, effects_file, trust=trust, recording=recording, as_json=as_json)
@@ -65,47 +68,16 @@ def drop(
     Examples:
       stitch drop runs/blade-17 backlash
     """
-    drop_effects(run, effects, effects_file, trust=trust, recording=recording, as_json=as_json)
-    end_at_once()
-
-
-def add_effects(
-    run: Path, effects: list[str], effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
-) -> None:
-    """Add effects by their names.
-
-    Raises:
-        InputError, NoResultError: as `stitch add` ends.
-    """
-    from stitch.api.stepwise import effects_with
-    from stitch.output import run_folder
-    from stitch.output.stored_run import load_run
-
-    with run_folder.lock_run_folder(run):
-        state = load_run(run, effects_file, trust=trust)
-        _refit_run(run, state, effects_with(state, effects, run), recording, as_json)
-
-
-def drop_effects(
-    run: Path, effects: list[str], effects_file: Path | None, *, trust: bool, recording: bool, as_json: bool
-) -> None:
-    """Take effects out by their names.
-
-    Raises:
-        InputError, NoResultError: as `stitch drop` ends.
-    """
     from stitch.api.stepwise import effects_without
-    from stitch.output import run_folder
-    from stitch.output.stored_run import load_run
 
-    with run_folder.lock_run_folder(run):
-        state = load_run(run, effects_file, trust=trust)
+    with opened_run(run, effects_file, trust, "reading the run") as state:
         _refit_run(run, state, effects_without(state, effects, run), recording, as_json)
+    end_at_once()
 
 
 def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, as_json: bool) -> None:
     """Give the run folder the model with these effects, and show it; what was fitted before is not fitted anew."""
-    from stitch.api.pipeline import change
+    from stitch.api.stepwise import change
     from stitch.output import run_folder
     from stitch.output.stored_run import load_run
 
@@ -131,22 +103,21 @@ def _add_diagnosed(
     from stitch.output import run_folder
     from stitch.output.diagnosis_document import named_before
     from stitch.output.plain_finding import plain_finding, suggested_command
-    from stitch.output.stored_run import load_run, standing_diagnosis
+    from stitch.output.stored_run import standing_diagnosis
     from stitch.recorder import RunMemory
 
     memory = RunMemory()
-    with run_folder.lock_run_folder(run):
+    with opened_run(run, effects_file, trust, "diagnosing") as state:
         with show_activity("diagnosing"):
-            state = load_run(run, effects_file, trust=trust)
-            told = {} if at_most is None else standing_diagnosis(run, state)
-            if told.get("verdict", "missing_effect") != "missing_effect" and "next_command" in told:
-                _show_nothing_missing(told, run, as_json)
+            standing = {} if at_most is None else standing_diagnosis(run, state)
+            if standing.get("verdict", "missing_effect") != "missing_effect" and "next_command" in standing:
+                _show_nothing_missing(standing, run, as_json)
                 return
             run_folder.preload_entry_points("stitch.reports", *(["stitch.recorders"] if recording else []))
             if at_most is None:
-                result, lines, found = suggest_group(state, memory)
+                result, lines, diagnosis = suggest_group(state, memory)
             else:
-                result, lines, found = suggest(state, at_most, named_before(told, state.tried), memory)
+                result, lines, diagnosis = suggest(state, at_most, named_before(standing, state.tried), memory)
         for line in lines if in_full() else ():
             say(line)
         if result is None:
@@ -160,21 +131,22 @@ def _add_diagnosed(
                 run_folder.write_with_page(result, scratch)
             if as_json:
                 _show_changed(result, run, as_json)
-        write_diagnosis(found, result or state, run)
+        write_diagnosis(diagnosis, result or state, run)
     if not in_full():
-        say(plain_finding(found, state.session.length_unit))
+        say(plain_finding(diagnosis, state.session.length_unit))
     if not as_json:
-        show_next(suggested_command(found, shlex.quote(str(run))))
+        show_next(suggested_command(diagnosis, shlex.quote(str(run))))
 
 
-def _show_nothing_missing(told: dict[str, Any], run: Path, as_json: bool) -> None:
+def _show_nothing_missing(standing: dict[str, Any], run: Path, as_json: bool) -> None:
     """Print what a standing diagnosis says, which names nothing to be added."""
-    notes = (f"{note}." for note in told["notes"] if note not in told["sentence"])
-    for line in (told["plain"], *((told["sentence"], *notes) if in_full() else ())):
+    from stitch.output.diagnosis_document import finding_lines
+
+    for line in finding_lines(standing)[: None if in_full() else 1]:
         say(line)
     _show_unchanged(run, as_json)
     if not as_json:
-        show_next(told["next_command"].replace("RUN", shlex.quote(str(run))))
+        show_next(standing["next_command"].replace("RUN", shlex.quote(str(run))))
 
 
 def _show_unchanged(run: Path, as_json: bool) -> None:
@@ -208,28 +180,29 @@ def remarks(result: RunData) -> list[str]:
     """Return whether the effects earned their place, and whether they are of a believable size."""
     from stitch.diagnosis.thresholds import FAINT_SIGMAS, HELDOUT_FALL, HELDOUT_RISE
 
-    out, earned = [], set[str]()
+    lines: list[str] = []
+    earned: list[str] = []
     if len(result.ledger) > 1:
-        before, after = result.ledger[-2], result.ledger[-1]
+        before, after = result.ledger[-2:]
         grown = sorted(set(after.effects) - set(before.effects))
         if after.heldout_rms < HELDOUT_FALL * before.heldout_rms:
-            earned = set(grown)
+            earned = grown
         elif grown:
             clear = max(term.sigmas_from_zero for term in result.terms if term.name in grown)
             rose = after.heldout_rms > HELDOUT_RISE * before.heldout_rms
-            out.append(_unseen_in_residuals(", ".join(grown), clear, "rose" if rose else "did not fall"))
+            lines.append(_unseen_in_residuals(", ".join(grown), clear, "rose" if rose else "did not fall"))
     for term in result.terms:
         wild = [p.name for p in term.parameters if not p.grid and abs(p.value) > p.limit]
         if wild:
-            out.append(f"{term.name}: {', '.join(wild)} is larger than anybody would believe.")
+            lines.append(f"{term.name}: {', '.join(wild)} is larger than anybody would believe.")
         if term.sigmas_from_zero < FAINT_SIGMAS:
-            out.append(
+            lines.append(
                 f"{term.name}: views left out are predicted better with it, though none of its parameters differs from "
                 "zero by two sigmas."
                 if term.name in earned
                 else f"{term.name}: no parameter differs from zero by two sigmas; it can be dropped."
             )
-    return out
+    return lines
 
 
 def _unseen_in_residuals(names: str, clear: float, residual: str) -> str:

@@ -41,18 +41,19 @@ def _check_readable(sessions: list[Path], as_json: bool) -> None:
     """Say what sessions hold; exit code 2 where one cannot be read."""
     from stitch.session.reading.session_folder import load_session
 
-    facts, errors = [], []
+    summaries: list[dict[str, Any]] = []
+    errors: list[str] = []
     for path in sessions:
         try:
-            facts.append(session_summary(load_session(path)))
+            summaries.append(session_summary(load_session(path)))
         except InputError as error:
             errors.append(str(error))
     if as_json:
-        emit(json.dumps({"sessions": facts, "errors": errors}, indent=1))
+        emit(json.dumps({"sessions": summaries, "errors": errors}, indent=1))
     else:
-        for fact in facts:
-            say(f"{fact['session']}: readable", bold=True)
-            show_block(_summary_rows(fact))
+        for summary in summaries:
+            say(f"{summary['session']}: readable", bold=True)
+            show_block(_summary_rows(summary))
     for line in errors:
         say(f"stitch: {line}")
     if errors:
@@ -66,23 +67,23 @@ def _check_deeply(sessions: list[Path], as_json: bool) -> None:
     from stitch.session.reading.session_folder import load_session
 
     with show_activity("trying the usual mistakes"):
-        loaded = {str(path): load_session(path) for path in sessions}
-        found = {path: deep_check(session) for path, session in loaded.items()}
-    documents = [
-        {"session": path, "ok": not problems, "problems": [p.as_dict() for p in problems]}
-        for path, problems in found.items()
-    ]
+        loaded = [(str(path), load_session(path)) for path in sessions]
+        checked = [(path, session.names, deep_check(session)) for path, session in loaded]
     if as_json:
+        documents = [
+            {"session": path, "ok": not problems, "problems": [p.as_dict() for p in problems]}
+            for path, _, problems in checked
+        ]
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
-        for path, problems in found.items():
-            for line in [p.line(loaded[path].names) for p in problems] or ["nothing wrong was found"]:
+        for path, names, problems in checked:
+            for line in [p.line(names) for p in problems] or ["nothing wrong was found"]:
                 say(f"{path}: {line}", hang=2)
-    if any(p.certain for problems in found.values() for p in problems):
+    if any(p.certain for _, _, problems in checked for p in problems):
         raise typer.Exit(2)
 
 
-def session_summary(session: SessionData) -> dict[str, object]:
+def session_summary(session: SessionData) -> dict[str, Any]:
     """Return what a session holds, in plain numbers."""
     import numpy as np
 

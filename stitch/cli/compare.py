@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
-from stitch.cli.progress import show_activity
-from stitch.cli.terminal import emit, say, show_block, show_files, show_next, show_table
+from stitch.cli.progress import opened_run, show_activity
+from stitch.cli.terminal import emit, say, show_block, show_columns, show_files, show_next
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
     from stitch.output.comparison.displaced_views import FollowedCovariate
-    from stitch.output.comparison.open3d_witness import Witness
     from stitch.output.comparison.residual_tables import ResidualTable, ResidualTables
     from stitch.run_data import RunData
 
 _SCOPE = "This look shows what the error follows, one covariate at a time. The cause is for stitch diagnose to name."
 _WORST_ROWS = 5
 _LISTED_TABLES = 4
-
 _WITNESSES = ("open3d",)
 _With = Annotated[
     str | None,
@@ -53,54 +52,43 @@ def compare_run(
         return
     from stitch.output.comparison.residual_tables import comparison_document
     from stitch.output.json_file import to_json
-    from stitch.output.run_folder import lock_run_folder
-    from stitch.output.stored_run import load_run
 
-    with lock_run_folder(run), show_activity("comparing: reading the scans"):
-        state = load_run(run, effects_file, trust=trust)
-        found = write_comparison(state, run)
+    with opened_run(run, effects_file, trust, "comparing: reading the scans") as state:
+        comparison = write_comparison(state, run)
     if as_json:
-        emit(to_json(comparison_document(found)))
+        emit(to_json(comparison_document(comparison)))
     else:
-        show_comparison(found, state, run)
+        show_comparison(comparison, state, run)
 
 
 def _compare_with(program: str, run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
     """Let another program register the scans of a run, write witness.json with a picture, and print what differs."""
+    from stitch.numerics.units import angle_text, length_text
     from stitch.output.comparison.open3d_witness import open3d_witness
     from stitch.output.json_file import to_json, write_json
-    from stitch.output.run_folder import call_entry_points, lock_run_folder
-    from stitch.output.stored_run import load_run
+    from stitch.output.run_folder import call_entry_points
     from stitch.system.open3d_library import import_open3d
 
     if program not in _WITNESSES:
         raise InputError(f"--with {program}: to fix: {' or '.join(_WITNESSES)}")
     import_open3d(f"--with {program}")
-    with lock_run_folder(run), show_activity("comparing: reading the scans"):
-        state = load_run(run, effects_file, trust=trust)
+    with opened_run(run, effects_file, trust, "comparing: reading the scans") as state:
         with show_activity("comparing: Open3D registers the scans"):
             witness = open3d_witness(state)
         write_json(witness.document(), run / "witness.json")
         call_entry_points("stitch.witness_pictures", witness, state, run)
     if as_json:
         emit(to_json(witness.document()))
-    else:
-        _show_witness(witness, state.session.length_unit, run)
-
-
-def _show_witness(witness: Witness, length_unit: str, run: Path) -> None:
-    from stitch.numerics.units import angle_text, length_text
-
-    for sentence in witness.sentences(length_unit):
+        return
+    unit = state.session.length_unit
+    for sentence in witness.sentences(unit):
         say(sentence)
-    show_table(
-        "Open3D's pose of each view beside this run's",
-        ("view", "shift", "turn"),
-        [
-            (name, length_text(float(shift), length_unit), angle_text(float(turn)))
-            for name, shift, turn in zip(witness.views, witness.shift, witness.turn, strict=True)
-        ],
+    columns = (
+        ("view", lambda v: witness.views[v]),
+        ("shift", lambda v: length_text(float(witness.shift[v]), unit)),
+        ("turn", lambda v: angle_text(float(witness.turn[v]))),
     )
+    show_columns("Open3D's pose of each view beside this run's", columns, range(len(witness.views)))
     show_files(run, ("witness.json", "witness.png"))
 
 
@@ -111,11 +99,11 @@ def write_comparison(state: RunData, run: Path) -> ResidualTables:
     from stitch.output.run_folder import call_entry_points
 
     with show_activity("comparing: residuals by view, joint, time and place"):
-        found = compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
+        comparison = compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
     with show_activity("comparing: drawing pictures and page"):
-        write_json(comparison_document(found), run / "compare.json")
-        call_entry_points("stitch.comparison_reports", found, state, run)
-    return found
+        write_json(comparison_document(comparison), run / "compare.json")
+        call_entry_points("stitch.comparison_reports", comparison, state, run)
+    return comparison
 
 
 def show_comparison(comparison: ResidualTables, state: RunData, run: Path) -> None:
@@ -134,42 +122,44 @@ def show_comparison(comparison: ResidualTables, state: RunData, run: Path) -> No
     if rest := [_group_chance(comparison, group) for group in comparison.groups[_LISTED_TABLES:]]:
         say(f"Less clear (p = 1 where none is given): {'; '.join(rest)}.")
     show_files(run, ("compare.json",))
-    review = (run / "diagnosis.json").exists()
-    show_next(f"Next: stitch {'review' if review else 'diagnose'} {shlex.quote(str(run))}")
+    command = "review" if (run / "diagnosis.json").exists() else "diagnose"
+    show_next(f"Next: stitch {command} {shlex.quote(str(run))}")
 
 
 def _show_followed(followed: Sequence[FollowedCovariate], to_um: float) -> None:
-    """Print what whole views follow, and their course along the clearest covariate."""
+    """Print what whole views follow, and their trend along the clearest covariate."""
     from stitch.output.comparison.displaced_views import also_clear, equally_clear
 
     if not followed:
         return
     first = followed[0]
-    if not first.clear:
+    equal = equally_clear(followed)
+    if first.clear:
+        say(f"Whole views follow {' or '.join(map(_followed_text, equal))}.", bold=True)
+    else:
         say(f"Whole views follow nothing known of them (clearest: {_followed_text(first)}).", bold=True)
-        say(_SCOPE)
-        return
-    same, beside = equally_clear(followed), also_clear(followed)
-    say(f"Whole views follow {' or '.join(map(_followed_text, same))}.", bold=True)
     say(_SCOPE)
+    if not first.clear:
+        return
+    beside = also_clear(followed)
     if beside:
-        say(f"Beside that they follow {', '.join(f'{o.covariate} (p = {o.p_beside:.1g})' for o in beside)}.")
-    if idle := [own.covariate for own in followed if own.clear and own not in (*same, *beside)]:
+        say(f"Beside that they follow {', '.join(f'{x.covariate} (p = {x.p_beside:.1g})' for x in beside)}.")
+    if idle := [x.covariate for x in followed if x.clear and x not in (*equal, *beside)]:
         say(f"Alike, but not needed beside it: {', '.join(idle)}.")
     axis = ", ".join(f"{x:+.2f}" for x in first.direction)
     unit = f" ({first.unit})" if first.unit else ""
-    course = zip(first.at, first.mean, first.sigma, strict=True)
-    show_table(
-        f"Displacement at the part along ({axis}), by {first.covariate}{unit}",
-        (first.covariate, "mean (µm)", "± 1 σ"),
-        [(f"{at:.4g}", f"{mean * to_um:+.1f}", f"{sigma * to_um:.1f}") for at, mean, sigma in course],
-        words=(),
+    columns = (
+        (first.covariate, lambda i: f"{first.at[i]:.4g}"),
+        ("mean (µm)", lambda i: f"{first.mean[i] * to_um:+.1f}"),
+        ("± 1 σ", lambda i: f"{first.sigma[i] * to_um:.1f}"),
     )
+    title = f"Displacement at the part along ({axis}), by {first.covariate}{unit}"
+    show_columns(title, columns, range(len(first.at)), words=())
 
 
-def _followed_text(own: FollowedCovariate) -> str:
-    """Return a covariate with the shape of its course and the chance of it: time (a line, p = 3e-07)."""
-    return f"{own.covariate} ({own.shape}, p = {own.p_value:.1g})"
+def _followed_text(x: FollowedCovariate) -> str:
+    """Return a covariate with the shape of its trend and the chance of it: time (a line, p = 3e-07)."""
+    return f"{x.covariate} ({x.shape}, p = {x.p_value:.1g})"
 
 
 def _significance_sentence(comparison: ResidualTables) -> str:
@@ -209,19 +199,17 @@ def _group_names(group: Sequence[ResidualTable]) -> str:
 
 def _worst_rows(table: ResidualTable, state: RunData, to_um: float) -> str:
     """Return the worst rows of a table with their rms; of places, in which unit and frame they are written."""
-    import numpy as np
-
     from stitch.output.comparison.residual_tables import PLACE
 
-    told = ", ".join(
+    worst = ", ".join(
         f"{table.label[i]} {table.rms[i] * to_um:.1f}"
-        + (f" ± {table.rms_sigma[i] * to_um:.1f}" if np.isfinite(table.rms_sigma[i]) else "")
+        + (f" ± {table.rms_sigma[i] * to_um:.1f}" if isfinite(table.rms_sigma[i]) else "")
         for i in table.worst(_WORST_ROWS)
     )
     if table.name != PLACE:
-        return f"{told} µm rms"
+        return f"{worst} µm rms"
     frame = "base" if state.session.mount == "eye_in_hand" else "flange"
-    return f"{told} µm rms; (x, y, z) in {state.session.length_unit} in the frame of the {frame}"
+    return f"{worst} µm rms; (x, y, z) in {state.session.length_unit} in the frame of the {frame}"
 
 
 def _show_group(group: Sequence[ResidualTable], comparison: ResidualTables, to_um: float) -> None:
@@ -231,21 +219,14 @@ def _show_group(group: Sequence[ResidualTable], comparison: ResidualTables, to_u
     has = "has" if len(group) == 2 else "have"
     others = f"; {_group_names(group[1:])} {has} the same bins" if len(group) > 1 else ""
     clear = "" if comparison.is_clear(table) else ", not clear"
-    rows = [
-        (
-            f"{table.low[i]:.4g}",
-            f"{table.high[i]:.4g}",
-            f"{table.mean[i] * to_um:+.1f}",
-            f"{table.mean_sigma[i] * to_um:.1f}",
-            f"{table.rms[i] * to_um:.1f}",
-            str(int(table.count[i])),
-            str(int(table.views[i])),
-        )
-        for i in range(len(table.count))
-    ]
-    show_table(
-        f"By {table.name}{unit}{others}: {_chance_text(comparison, table)} over all means{clear}",
-        ("from", "to", "mean (µm)", "± 1 σ", "rms (µm)", "count", "views"),
-        rows,
-        words=(),
+    columns = (
+        ("from", lambda i: f"{table.low[i]:.4g}"),
+        ("to", lambda i: f"{table.high[i]:.4g}"),
+        ("mean (µm)", lambda i: f"{table.mean[i] * to_um:+.1f}"),
+        ("± 1 σ", lambda i: f"{table.mean_sigma[i] * to_um:.1f}"),
+        ("rms (µm)", lambda i: f"{table.rms[i] * to_um:.1f}"),
+        ("count", lambda i: str(int(table.count[i]))),
+        ("views", lambda i: str(int(table.views[i]))),
     )
+    title = f"By {table.name}{unit}{others}: {_chance_text(comparison, table)} over all means{clear}"
+    show_columns(title, columns, range(len(table.count)), words=())

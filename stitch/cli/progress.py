@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from math import isfinite
 from pathlib import Path
@@ -38,12 +37,28 @@ def show_activity(text: str) -> Iterator[None]:
         live_line().stop()
 
 
+@contextmanager
+def opened_run(run: Path, effects_file: Path | None, trust: bool, activity: str) -> Iterator[RunData]:
+    """Hold a run folder as its only writer while the block lasts, and give the run that wrote it.
+
+    Args:
+        activity: what is said while it is read.
+    """
+    from stitch.output.run_folder import lock_run_folder
+    from stitch.output.stored_run import load_run
+
+    with lock_run_folder(run):
+        with show_activity(activity):
+            state = load_run(run, effects_file, trust=trust)
+        yield state
+
+
 def recorder_for(folder: Path, recording: bool) -> Recorder:
     """Return progress on a terminal or as lines, and the recording."""
     from stitch.output.run_folder import recordings
     from stitch.recorder import RecorderGroup
 
-    lines: list[Recorder] = [ProgressLines()] if progress_lines_requested() else []
+    lines: list[Recorder] = [ProgressLines()] if os.environ.get(PROGRESS_VARIABLE) == "json" else []
     return RecorderGroup([Progress(), *lines, *(recordings(folder) if recording else [])])
 
 
@@ -54,27 +69,41 @@ def live_line() -> LiveLine:
 
 
 class LiveLine:
-    """A line on standard error that begins with the first text."""
+    """A line on standard error that begins with the first text; as text its step, and for how long the work has lasted.
+
+    How many iterations there will be nobody knows.
+    """
 
     def __init__(self) -> None:
         self._status: Any = None
         self._visible = False
-        self._elapsed: _Elapsed | None = None
+        self._step = self._detail = ""
+        self._started: float | None = None
         self._plain = _PlainLines()
+
+    def __str__(self) -> str:
+        seconds = round(time.monotonic() - (self._started or 0.0))
+        return f"{self._step}{self._detail}; {seconds // 60}:{seconds % 60:02d}"
+
+    def __rich__(self) -> Any:
+        from rich.text import Text
+
+        return Text(str(self))
 
     def begin(self, step: str, detail: str = "") -> None:
         """Show a step with the time since the first one, until `stop`; loops stand in its place meanwhile."""
-        self._elapsed = _Elapsed(step, detail, time.monotonic() if self._elapsed is None else self._elapsed.started)
-        self.say(self._elapsed, step)
+        self._step, self._detail = step, detail
+        self._started = time.monotonic() if self._started is None else self._started
+        self.say(self, step)
 
     def loops_ended(self) -> None:
         """Show the step that stood before the loops; nothing if there was none."""
-        if self._elapsed is None:
+        if self._started is None:
             self.stop()
         else:
-            self.say(self._elapsed, self._elapsed.step)
+            self.say(self, self._step)
 
-    def say(self, text: str | _Elapsed, step: str) -> None:
+    def say(self, text: object, step: str) -> None:
         """Show a text of a step in place of the last."""
         if not sys.stderr.isatty():
             if not os.environ.get(PROGRESS_VARIABLE):
@@ -94,29 +123,11 @@ class LiveLine:
 
     def stop(self) -> None:
         """Clear the line; the next text begins it anew."""
-        self._elapsed = None
+        self._started = None
         self._plain.stop()
         if self._status is not None and self._visible:
             self._status.stop()
             self._visible = False
-
-
-@dataclass(frozen=True)
-class _Elapsed:
-    """A step, and for how long the work has lasted: how many iterations there will be nobody knows."""
-
-    step: str
-    detail: str
-    started: float
-
-    def __str__(self) -> str:
-        seconds = round(time.monotonic() - self.started)
-        return f"{self.step}{self.detail}; {seconds // 60}:{seconds % 60:02d}"
-
-    def __rich__(self) -> Any:
-        from rich.text import Text
-
-        return Text(str(self))
 
 
 class _PlainLines:
@@ -208,11 +219,6 @@ class Progress:
     def finish(self, run: RunData) -> None:
         """What follows takes its time too."""
         live_line().begin(f"{run.session.name}: writing cloud and page")
-
-
-def progress_lines_requested() -> bool:
-    """Return whether the program that started this one reads lines of JSON."""
-    return os.environ.get(PROGRESS_VARIABLE) == "json"
 
 
 class ProgressLines:

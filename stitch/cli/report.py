@@ -6,26 +6,20 @@ import os
 import shutil
 import subprocess
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from stitch.cli.options import EffectsFile, RunFolder, Tolerance, Trust, require_tolerance
-from stitch.cli.progress import show_activity
+from stitch.cli.progress import opened_run, show_activity
 from stitch.cli.terminal import say
 from stitch.errors import InputError, NoResultError
 
 # Browsers that print a page to PDF.
-_BROWSERS = (
-    "chromium",
-    "chromium-browser",
-    "google-chrome",
-    "google-chrome-stable",
-    "chrome",
-    "microsoft-edge",
-    "msedge",
-)
+_CHROMES = ("google-chrome", "google-chrome-stable", "chrome")
+_BROWSERS = ("chromium", "chromium-browser", *_CHROMES, "microsoft-edge", "msedge")
 _SECONDS = 120
 
 
@@ -58,7 +52,7 @@ def report(
       stitch report runs/before runs/after
     """
     require_tolerance(tolerance)
-    printer = printing_browser() if pdf else None
+    browser = printing_browser() if pdf else None
     if other is None and output is not None:
         raise InputError(f"--output {output}: the page of one run is its report.html; to fix: leave --output away")
     if other is not None and with_diagnosis is not None:
@@ -68,10 +62,10 @@ def report(
         page = _write_run_page(run, with_diagnosis is not False, tolerance, effects_file, trust)
     else:
         page = _write_two_run_page(run, other, output, tolerance, effects_file, trust)
-    if printer is not None:
-        print_page(printer, page, page.with_suffix(".pdf"))
-    for file in (page, page.with_suffix(".pdf")) if printer is not None else (page,):
-        say(f"  {file}")
+    say(f"  {page}")
+    if browser is not None:
+        print_page(browser, page, page.with_suffix(".pdf"))
+        say(f"  {page.with_suffix('.pdf')}")
 
 
 def printing_browser() -> str:
@@ -80,12 +74,12 @@ def printing_browser() -> str:
     Raises:
         InputError: none is on the path.
     """
-    found = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
-    if found is None:
+    path = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    if path is None:
         raise InputError(
             "--pdf: no Chromium, Chrome or Edge is on the path; to fix: install one, or print report.html by hand"
         )
-    return found
+    return path
 
 
 def print_page(browser: str, page: Path, path: Path) -> None:
@@ -117,28 +111,28 @@ def _write_run_page(
     run: Path, with_diagnosis: bool, tolerance: float | None, effects_file: Path | None, trust: bool
 ) -> Path:
     """Return the page of a run, written anew."""
-    from stitch.api.pipeline import diagnose
+    from stitch.api import pipeline
     from stitch.cli.compare import write_comparison
     from stitch.cli.diagnose import write_diagnosis
     from stitch.cli.run import show_light
-    from stitch.output import run_folder
-    from stitch.output.stored_run import load_run, standing_diagnosis
+    from stitch.output.run_folder import call_entry_points
+    from stitch.output.stored_run import standing_diagnosis
 
     page = run / "report.html"
-    with run_folder.lock_run_folder(run):
-        with show_activity("report: reading the scans, writing the page"):
-            shown = load_run(run, effects_file, trust=trust)
-            run_folder.call_entry_points("stitch.reports", shown, page, tolerance)
-        show_light(shown, tolerance)
+    activity = "report: reading the scans, writing the page"
+    with opened_run(run, effects_file, trust, activity) as state:
+        with show_activity(activity):
+            call_entry_points("stitch.reports", state, page, tolerance)
+        show_light(state, tolerance)
         # A diagnosis of this very model stays on the page.
         shows = page.is_file() and 'id="screen-data"' in page.read_text(encoding="utf-8")
-        stands = shows and standing_diagnosis(run, shown)
+        stands = shows and standing_diagnosis(run, state)
         if with_diagnosis and not (stands and (run / "compare.json").is_file()):
-            write_comparison(shown, run)
+            write_comparison(state, run)
         if with_diagnosis and not stands:
             with show_activity("diagnosing: trying every effect"):
-                found = diagnose(shown)
-            write_diagnosis(found, shown, run)
+                diagnosis = pipeline.diagnose(state)
+            write_diagnosis(diagnosis, state, run)
     return page
 
 
@@ -157,16 +151,13 @@ def _write_two_run_page(
             raise InputError(f"--output {output}: no place for a page; to fix: name a file that ends in .html")
         if not output.parent.is_dir():
             raise InputError(f"--output {output}: its folder does not exist; to fix: make it first")
-    folders = run.resolve(), other.resolve()
-    alike = folders[0].name == folders[1].name
+    folders = (run.resolve(), other.resolve())
+    names = [folder.name for folder in folders]
     with show_activity("report: reading both runs"):
         runs = [load_run(folder, effects_file, trust=trust) for folder in (run, other)]
-        names = [str(folder) if alike else folder.name for folder in folders]
-        both = compare_runs(runs, (names[0], names[1]))
-    if output is None:
-        with lock_run_folder(other):
-            call_entry_points("stitch.two_run_reports", both, other / "two-runs.html", tolerance)
-    else:
-        call_entry_points("stitch.two_run_reports", both, output, tolerance)
+        both = compare_runs(runs, [str(folder) for folder in folders] if names[0] == names[1] else names)
+    page = output or other / "two-runs.html"
+    with nullcontext() if output else lock_run_folder(other):
+        call_entry_points("stitch.two_run_reports", both, page, tolerance)
     say(comparison_sentence(both), bold=True)
-    return output or other / "two-runs.html"
+    return page

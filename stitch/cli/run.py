@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from stitch.api.live import LiveSession
     from stitch.model.model_toml import ModelFile
     from stitch.run_data import RunData
-    from stitch.session.capture import Capture
     from stitch.session.session import SessionData
 
 # Seconds between two looks, and how long a file may be half-written before that is said.
@@ -104,15 +103,21 @@ def run(
     """
     # A tenth of a second: scipy imports all that numpy has, also what compiles and tests.
     load_on_use("numpy.f2py", "numpy.testing")
-    _require_mesh_kind(mesh)
     named = [name for name in split_names(effects) if name]
-    _require_known(tolerance, named, effects_file, register)
+    _require_known(mesh, tolerance, named, effects_file, register)
     paths = sessions or [_current_session()]
-    if follow or views is not None:
-        _follow(paths, follow, views)
+    if views is not None and not follow:
+        raise InputError("--views: counts views that arrive; to fix: add --follow, or leave it out")
+    if follow and len(paths) > 1:
+        raise InputError("--follow: several sessions; to fix: name the one that is being measured")
+    if follow:
+        _follow_session(paths[0], views)
     loaded = _load_sessions(paths, memory)
+    from stitch.session.capture import prepare_capture
+    from stitch.system.threads import begin
+
     # A second of libraries is still to be loaded, which takes one core.
-    captures = _begin_to_prepare(loaded)
+    captures = [begin(partial(prepare_capture, session)) for session in loaded]
     from stitch.api.pipeline import run_rig
     from stitch.fusion.register import DEFAULT
     from stitch.output.json_file import to_json
@@ -121,10 +126,11 @@ def run(
 
     name = "+".join(session.name for session in loaded)
     target = output or Path("runs" if sessions else "../runs") / name
+    inner = [""] if len(loaded) == 1 else [session.name for session in loaded]
     model, kept, own_effects = _given_models(hand_eye, arm, named, effects_file, trust)
     preload_entry_points("stitch.reports")
     with show_activity(f"{name}: reading the scans"), new_folder(target, paths, force) as scratch:
-        folders = _run_folders(scratch, loaded)
+        folders = [scratch / folder for folder in inner]
         recorders = [recorder_for(folder, recording) for folder in folders]
         runs = run_rig(loaded, model, recorders, named, keep, arm=kept, register=register or DEFAULT, captures=captures)
         runs = [replace(result, effects_file=own_effects or result.effects_file) for result in runs]
@@ -132,19 +138,27 @@ def run(
             written = beside.submit(_write_runs, runs, folders, scratch, mesh, tolerance)
             if not as_json:
                 _show_runs(runs, tolerance)
-            fits = written.result()
+            mesh_fits = written.result()
     if as_json:
         documents = [result_document(result) for result in runs]
         emit(to_json(documents[0] if len(documents) == 1 else documents))
     else:
-        _show_written(_run_folders(target, loaded), fits)
+        _show_written([target / folder for folder in inner], mesh_fits)
     end_at_once()
 
 
 def _require_known(
-    tolerance: float | None, effects: list[str], effects_file: Path | None, register: str | None
+    mesh: str | None, tolerance: float | None, effects: list[str], effects_file: Path | None, register: str | None
 ) -> None:
-    """Refuse what cannot be meant before anything is read; load only what was asked for."""
+    """Refuse what cannot be meant, or lacks a package, before anything is read; load only what was asked for."""
+    if mesh is not None:
+        from stitch.output.mesh import KINDS, OPEN
+        from stitch.system.open3d_library import import_open3d
+
+        if mesh not in KINDS:
+            raise InputError(f"--mesh {mesh}: to fix: --mesh alone, or one of {', '.join(KINDS)}")
+        if mesh != OPEN:
+            import_open3d(f"--mesh {mesh}")
     require_tolerance(tolerance)
     if effects_file:
         from stitch.effects.user_file import load as load_effects
@@ -161,38 +175,8 @@ def _require_known(
         method_named(register)
 
 
-def _begin_to_prepare(sessions: list[SessionData]) -> list[Future[Capture]]:
-    """Return what `prepare_capture` will find of each session, in a thread that has begun with it."""
-    from stitch.session.capture import prepare_capture
-    from stitch.system.threads import begin
-
-    return [begin(partial(prepare_capture, session)) for session in sessions]
-
-
-def _require_mesh_kind(kind: str | None) -> None:
-    """Refuse a kind of mesh that is not known, and before the work begins one for which Open3D is missing."""
-    if kind is None:
-        return
-    from stitch.output.mesh import KINDS, OPEN
-    from stitch.system.open3d_library import import_open3d
-
-    if kind not in KINDS:
-        raise InputError(f"--mesh {kind}: to fix: --mesh alone, or one of {', '.join(KINDS)}")
-    if kind != OPEN:
-        import_open3d(f"--mesh {kind}")
-
-
-def _follow(sessions: list[Path], follow: bool, views: int | None) -> None:
-    """Judge the views of a session as they arrive, until it is to be run."""
-    if not follow:
-        raise InputError("--views: counts views that arrive; to fix: add --follow, or leave it out")
-    if len(sessions) > 1:
-        raise InputError("--follow: several sessions; to fix: name the one that is being measured")
-    _follow_session(sessions[0], views)
-
-
 def _follow_session(folder: Path, views: int | None) -> None:
-    """Take in views as they come, until so many are there or Ctrl-C is pressed.
+    """Judge views as they come, until so many are there or Ctrl-C is pressed.
 
     Args:
         views: how many to wait for; None: until Ctrl-C.
@@ -291,25 +275,20 @@ def _given_models(
             f"{'--arm' if arm else '--effects'} and --hand-eye: a model that is used as it is brings its own effects; "
             "to fix: name one of the two"
         )
-    own = str(effects_file.resolve()) if effects_file else None
+    stated_file = str(effects_file.resolve()) if effects_file else None
     if hand_eye is None and arm is None:
-        return None, None, own
+        return None, None, stated_file
     from stitch.model.model_toml import keep_arm_effects
     from stitch.output.stored_run import trusted_model
 
     if hand_eye:
-        return trusted_model(hand_eye, effects_file, trust)[0], None, own
+        return trusted_model(hand_eye, effects_file, trust)[0], None, stated_file
     assert arm is not None
     stated, file = trusted_model(arm, effects_file, trust)
     kept = keep_arm_effects(stated)
     if twice := set(effects) & set(kept.effects):
         raise InputError(f"--effects {twice.pop()}: the arm of {arm} brings it already; to fix: leave it out")
-    return None, kept, own or file
-
-
-def _run_folders(target: Path, sessions: list[SessionData]) -> list[Path]:
-    """Return the folders of the runs: of a rig one for each session."""
-    return [target] if len(sessions) == 1 else [target / session.name for session in sessions]
+    return None, kept, stated_file or file
 
 
 def _write_runs(
@@ -344,10 +323,10 @@ def _show_runs(runs: list[RunData], tolerance: float | None) -> None:
         show_report(result, tolerance, with_hand_eye=each or result is runs[-1])
 
 
-def _show_written(folders: list[Path], fits: list[str]) -> None:
+def _show_written(folders: list[Path], mesh_fits: list[str]) -> None:
     """Print how the meshes lie to their clouds, the files of the runs, and the next command."""
-    for fit in fits:
-        say(fit)
+    for sentence in mesh_fits:
+        say(sentence)
     for folder in folders if in_full() else ():
         show_files(folder, ("stitched.ply", "mesh.ply", "recording.rrd", "report.html"))
     show_next(f"Next: stitch diagnose {shlex.quote(str(folders[0]))}")
@@ -360,28 +339,27 @@ def show_report(result: RunData, tolerance: float | None = None, with_hand_eye: 
     from stitch.output.fit_report import report_rows, run_hand_eye_lines
     from stitch.run_data import doubt_remedy
 
-    session = result.session
-    say(f"{session.name}: {run_headline(result, model_history(result))}", bold=True)
-    for doubt in result.doubts if in_full() else ():
-        if more := doubt_remedy(doubt):
-            say(more)
-    gone = len(result.left_out)
-    for note in result.notes[:gone]:
+    say(f"{result.session.name}: {run_headline(result, model_history(result))}", bold=True)
+    for remedy in filter(None, map(doubt_remedy, result.doubts)) if in_full() else ():
+        say(remedy)
+    # The first notes say of each view that was left out why.
+    excluded = len(result.left_out)
+    for note in result.notes[:excluded]:
         say(note, bold=True)
     show_light(result, tolerance)
     rows = report_rows(result)
-    show_block(rows if in_full() else [rows[0], rows[2]])  # error on views left out, sensor's noise
     if not in_full():
+        show_block([rows[0], rows[2]])  # error on views left out, sensor's noise
         return
-    if with_hand_eye:
-        for line in run_hand_eye_lines(result):
-            say(line, hang=2)
+    show_block(rows)
+    for line in run_hand_eye_lines(result) if with_hand_eye else ():
+        say(line, hang=2)
     for stage in result.stages[1:]:
         if stage.note:
             say(f"{stage.name}: {stage.note}.")
     for direction in result.unobservable:
         say(f"Not observable from these motions: {direction}.")
-    for note in result.notes[gone:]:
+    for note in result.notes[excluded:]:
         say(note)
 
 

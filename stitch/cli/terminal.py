@@ -6,11 +6,17 @@ import codecs
 import os
 import sys
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import wraps
 from pathlib import Path
 from typing import IO, Any, TextIO, TypeVar
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+_SPELT = {"µ": "u", "μ": "u", "–": "-", "—": "-", "±": "+-", "×": "x", "·": "*", "…": "...", "→": "->", "°": " deg"}
+# Where results go, and whether headlines alone are printed: of the innermost command that runs.
+_results: list[IO[str]] = []
+_briefly: list[bool] = []
 
 
 def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = None) -> None:
@@ -60,21 +66,28 @@ def show_table(
     terminal = console(stream)
     if terminal.is_terminal and sum(widths) + 2 * len(widths) > terminal.width:
         for first, *cells in rows:
-            say(
-                f"  {first}: {', '.join(f'{h} {c}' for h, c in zip(headings[1:], cells, strict=True))}",
-                hang=4,
-                stream=stream,
-            )
+            named = ", ".join(f"{heading} {cell}" for heading, cell in zip(headings[1:], cells, strict=True))
+            say(f"  {first}: {named}", hang=4, stream=stream)
         return
     left = [heading in (headings[:1] if words is None else words) for heading in headings]
     for row in (headings, *rows):
+        pads = [" " * (width - cell_len(cell)) for cell, width in zip(row, widths, strict=True)]
         cells = [
-            cell + pad if to_left else pad + cell
-            for cell, pad, to_left in (
-                (cell, " " * (width - cell_len(cell)), own) for cell, width, own in zip(row, widths, left, strict=True)
-            )
+            f"{cell}{pad}" if to_left else f"{pad}{cell}" for cell, pad, to_left in zip(row, pads, left, strict=True)
         ]
         say(f"  {'  '.join(cells)}".rstrip(), stream=stream)
+
+
+def show_columns(
+    title: str,
+    columns: Sequence[tuple[str, Callable[[Any], str]]],
+    items: Iterable[Any],
+    words: Sequence[str] | None = None,
+    stream: IO[str] | None = None,
+) -> None:
+    """Print a table with a row an item: each column is its heading and what it says of an item."""
+    headings = [heading for heading, _ in columns]
+    show_table(title, headings, [[cell(item) for _, cell in columns] for item in items], words, stream)
 
 
 def show_files(folder: Path, names: Sequence[str]) -> None:
@@ -82,9 +95,6 @@ def show_files(folder: Path, names: Sequence[str]) -> None:
     for name in names:
         if (folder / name).exists():
             say(f"  {folder / name}")
-
-
-_briefly: list[bool] = []
 
 
 @contextmanager
@@ -106,22 +116,6 @@ def show_next(line: str) -> None:
     """Print the line that names the next command, unless another command has called this one."""
     if in_full():
         say(line)
-
-
-Command = TypeVar("Command", bound=Callable[..., Any])
-_REPLACEMENTS = {
-    "µ": "u",
-    "μ": "u",
-    "–": "-",
-    "—": "-",
-    "±": "+-",
-    "×": "x",
-    "·": "*",
-    "…": "...",
-    "→": "->",
-    "°": " deg",
-}
-_results: list[IO[str]] = []
 
 
 def stdout_for_results(command: Command) -> Command:
@@ -147,24 +141,25 @@ def emit(text: str) -> None:
 
 @contextmanager
 def _stdout_redirected() -> Iterator[None]:
-    with _descriptor_redirected(sys.stdout) as stream:
+    """Give standard error what is printed while the block lasts, also by compiled libraries to descriptor 1."""
+    out = sys.stdout
+    with _own_descriptor(out) as stream, redirect_stdout(sys.stderr):
         _results.append(stream)
         try:
-            with redirect_stdout(sys.stderr):
-                yield
+            yield
         finally:
             _results.pop()
 
 
 @contextmanager
-def _descriptor_redirected(out: TextIO) -> Iterator[IO[str]]:
-    """What compiled libraries write to descriptor 1 goes to 2 as well."""
+def _own_descriptor(out: TextIO) -> Iterator[IO[str]]:
+    """A stream to where descriptor 1 led, which leads to 2 while the block lasts; `out` itself where it is another."""
     try:
         out.flush()
-        real = out.fileno() == 1
+        is_descriptor = out.fileno() == 1
     except (OSError, ValueError):
-        real = False
-    if not real:
+        is_descriptor = False
+    if not is_descriptor:
         yield out
         return
     kept = os.dup(1)
@@ -189,8 +184,8 @@ def speak_any_terminal() -> None:
 def _replace_unencodable(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
-    told = ""
+    text = ""
     for letter in error.object[error.start : error.end]:
         plain = unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode()
-        told += _REPLACEMENTS.get(letter) or plain or "?"
-    return told, error.end
+        text += _SPELT.get(letter) or plain or "?"
+    return text, error.end
