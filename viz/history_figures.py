@@ -7,7 +7,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from stitch.numerics.units import MICROMETRES, length_text
-from stitch.output.comparison.disagreement_field import effect_changes, full_colour_distance, model_history
+from stitch.output.comparison.disagreement_field import full_colour_distance
+from stitch.output.comparison.model_history import effect_changes, model_history
 from stitch.run_data import RunData
 from viz.colours import BLUE, FIELD, GREEN, unsigned_colours
 from viz.figures import colormap

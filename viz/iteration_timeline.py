@@ -13,7 +13,7 @@ import rerun as rr
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, length_text
-from stitch.output.comparison.disagreement_field import COARSE, REGISTER, ModelHistory
+from stitch.output.comparison.model_history import COARSE, REGISTER, ModelHistory
 from stitch.run_data import RunData, StageResult
 from stitch.session.scan import even_indices
 from stitch.session.session import SessionData

@@ -12,7 +12,8 @@ import rerun as rr
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, length_text
-from stitch.output.comparison.disagreement_field import ModelHistory, ModelStep, full_colour_distance
+from stitch.output.comparison.disagreement_field import full_colour_distance
+from stitch.output.comparison.model_history import ModelHistory, ModelStep
 from stitch.run_data import RunData
 from stitch.session.scan import even_indices
 from stitch.system.threads import take_mapped

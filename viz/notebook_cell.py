@@ -7,7 +7,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from stitch.numerics.units import MICROMETRES
-from stitch.output.comparison.disagreement_field import full_colour_distance, model_history
+from stitch.output.comparison.disagreement_field import full_colour_distance
+from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import run_headline
 from stitch.run_data import RunData
 from viz.colours import BLUE, ORANGE

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES
-from stitch.output.comparison.disagreement_field import ModelHistory, full_colour_distance
+from stitch.output.comparison.disagreement_field import full_colour_distance
+from stitch.output.comparison.model_history import ModelHistory
 from viz.colours import signed_colours, unsigned_colours
 from viz.part_surface import Camera, PartSurface
 

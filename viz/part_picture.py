@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.units import length_text
-from stitch.output.comparison.disagreement_field import ModelStep
+from stitch.output.comparison.model_history import ModelStep
 from viz.colours import FIELD, unsigned_colours
 from viz.figures import colormap
 from viz.part_surface import Camera, PartSurface

@@ -8,7 +8,7 @@ import rerun as rr
 
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, length_text
-from stitch.output.comparison.disagreement_field import ModelHistory, effect_changes, model_history
+from stitch.output.comparison.model_history import ModelHistory, effect_changes, model_history
 from stitch.output.comparison.run_verdict import run_headline
 from stitch.run_data import RunData, StageResult
 from stitch.session.session import SessionData

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stitch.model.model import expanded_uncertainty, uncertainty_scope
 from stitch.numerics.units import MICROMETRES, value_uncertainty_text
 from stitch.observations.observability import NUMBERS
-from stitch.output.comparison.disagreement_field import ModelHistory, effect_changes, model_history
+from stitch.output.comparison.model_history import ModelHistory, effect_changes, model_history
 from stitch.output.comparison.run_verdict import run_headline, run_light
 from stitch.run_data import RunData, doubt_headline
 from viz import captions

@@ -12,7 +12,7 @@ from stitch.diagnosis.sentences import fitted_amounts
 from stitch.model.model import uncertainty_scope
 from stitch.numerics.units import MICROMETRES, length_text
 from stitch.output.comparison.residual_tables import ResidualTables
-from stitch.output.finding_screen import CandidateFields, candidate_fields, finding_screen
+from stitch.output.finding_screen import finding_screen
 from stitch.output.plain_finding import largest_error_sources, plain_finding, remedy_at_machine, suggested_command
 from stitch.output.plain_words import effect_description
 from stitch.run_data import RunData
@@ -122,7 +122,7 @@ def _evidence(found: Diagnosis, unit: str) -> str:
         "diagnosis.html.j2",
         found=found,
         plain=plain_finding(found, unit),
-        rows=_rows(found, candidate_fields(found), MICROMETRES[unit]),
+        rows=_rows(found, MICROMETRES[unit]),
         lacking=[(need, [name for name, needs in found.missing.items() if need in needs]) for need in lacking],
         unseen=[s.name for s in found.candidates if not s.ranked.score.observable],
         budget=budget_rows(found, unit),
@@ -133,10 +133,11 @@ def _evidence(found: Diagnosis, unit: str) -> str:
     )
 
 
-def _rows(found: Diagnosis, fields: CandidateFields | None, um: float) -> list[dict[str, str]]:
+def _rows(found: Diagnosis, um: float) -> list[dict[str, str]]:
     """The best candidate effects that these views can show."""
     shown = [s for s in found.candidates if s.ranked.score.observable][:_SHOWN]
-    on_part = {} if fields is None else {name: f"{f.mean_abs * um:.3g}" for name, f in fields.if_added.items()}
+    compared = finding_screen(found)["candidates"]
+    on_part = {row["effect"]: f"{row['mean'] * um:.3g}" for row in compared if row["mean"] is not None}
     return [
         {
             "name": s.name,

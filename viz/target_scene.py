@@ -8,7 +8,7 @@ import numpy as np
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.units import MICROMETRES
-from stitch.output.comparison.disagreement_field import TargetStep, target_history
+from stitch.output.comparison.model_history import TargetStep, target_history
 from stitch.run_data import RunData
 from viz.colours import robust_limit
 from viz.part_data import colour_stops, extent_of, packed_surface, packed_values

@@ -77,7 +77,7 @@ def drop(
 
 def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, as_json: bool) -> None:
     """Give the run folder the model with these effects, and show it; what was fitted before is not fitted anew."""
-    from stitch.api.stepwise import change
+    from stitch.api.pipeline import change
     from stitch.output import run_folder
     from stitch.output.stored_run import load_run
 

@@ -334,7 +334,7 @@ def _show_written(folders: list[Path], mesh_fits: list[str]) -> None:
 
 def show_report(result: RunData, tolerance: float | None = None, with_hand_eye: bool = True) -> None:
     """Print what a run found: a headline, what to do about it, numbers in a block, the hand-eye, and notes."""
-    from stitch.output.comparison.disagreement_field import model_history
+    from stitch.output.comparison.model_history import model_history
     from stitch.output.comparison.run_verdict import run_headline
     from stitch.output.fit_report import report_rows, run_hand_eye_lines
     from stitch.run_data import doubt_remedy
@@ -365,7 +365,7 @@ def show_report(result: RunData, tolerance: float | None = None, with_hand_eye: 
 
 def show_light(result: RunData, tolerance: float | None) -> None:
     """Print whether the part is within a tolerance, as the page's light says it; nothing where none is stated."""
-    from stitch.output.comparison.disagreement_field import model_history
+    from stitch.output.comparison.model_history import model_history
     from stitch.output.comparison.run_verdict import run_light
 
     light = None if tolerance is None else run_light(result, model_history(result), tolerance)

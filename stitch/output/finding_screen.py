@@ -3,7 +3,7 @@
 The page of a run, its review and the first tab of its recording draw from this part of diagnosis.json alone.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -38,54 +38,46 @@ _FLAT = 0.02
 _NAMING = ("missing_effect", "cannot_tell")
 
 
-@dataclass(frozen=True)
-class CandidateFields:
-    """The field as it is, and as it would be with each of the best candidate effects."""
-
-    patches: Patches
-    present: DisagreementField
-    if_added: dict[str, DisagreementField]
-
-
 @remembered
 def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the screen of a diagnosis; lengths in length_unit, angles in rad."""
-    fields = candidate_fields(diagnosis)
     candidates = compared(diagnosis)
-    courses = {c.name: trend_of_candidate(diagnosis.linear, c.ranked.score) for c in candidates}
-    why = _why(diagnosis, courses)
+    patches, present, if_added = _fields(diagnosis, candidates)
+    trends = {c.name: trend_of_candidate(diagnosis.linear, c.ranked.score) for c in candidates}
+    why = _why(diagnosis, trends)
     return {
         "headline": _headline(diagnosis, why),
         "proof": _proof(diagnosis, why),
         "certainty": certainty(diagnosis),
-        "now": {"heldout": diagnosis.heldout_rms} | _on_part(None if fields is None else fields.present),
+        "now": {"heldout": diagnosis.heldout_rms} | _on_part(present),
         "noise": diagnosis.noise_floor,
-        "why": _course_row(why),
-        "candidates": [
-            _candidate_row(diagnosis, c, None if fields is None else fields.if_added[c.name], courses[c.name])
-            for c in candidates
-        ],
-        "places": None if fields is None else np.round(fields.patches.points, 2).tolist(),
+        "why": _trend_row(why),
+        "candidates": [_candidate_row(diagnosis, c, if_added.get(c.name), trends[c.name]) for c in candidates],
+        "places": None if patches is None else np.round(patches.points, 2).tolist(),
         "doubts": list(open_doubts(diagnosis)),
     }
 
 
-@remembered
-def candidate_fields(diagnosis: Diagnosis) -> CandidateFields | None:
-    """Return what each of the best candidate effects would leave of the field of disagreement; None without clouds."""
+def _fields(
+    diagnosis: Diagnosis, candidates: Sequence[CandidateEffect]
+) -> tuple[Patches | None, DisagreementField | None, dict[str, DisagreementField]]:
+    """Return the field of disagreement on its patches as it is, and as each candidate would leave it.
+
+    None without clouds.
+    """
     linear = diagnosis.linear
     present = predicted_distances(linear)
     surfaces = surfaces_of(linear)
     if present is None or surfaces is None:
-        return None
+        return None, None, {}
     overlaps = surfaces.unconstrained.overlaps
     patches = patches_of(overlaps.matches, linear.measurement.views.count, overlaps.gram.scale, model_distances=present)
     if_added = {}
-    for candidate in compared(diagnosis):
+    for candidate in candidates:
         distances = predicted_distances(linear, candidate.ranked.score)
         assert distances is not None
         if_added[candidate.name] = patches.field(distances)
-    return CandidateFields(patches, patches.field(present), if_added)
+    return patches, patches.field(present), if_added
 
 
 def compared(diagnosis: Diagnosis) -> list[CandidateEffect]:
@@ -106,11 +98,11 @@ def compared(diagnosis: Diagnosis) -> list[CandidateEffect]:
     return helping[:_BEST]
 
 
-def _why(diagnosis: Diagnosis, courses: dict[str, EffectTrend | None]) -> EffectTrend | None:
-    """Return the course of what is named, of the last effect in a model that lacks nothing, or of what has no name."""
+def _why(diagnosis: Diagnosis, trends: dict[str, EffectTrend | None]) -> EffectTrend | None:
+    """Return the trend of what is named, of the last effect in a model that lacks nothing, or of what has no name."""
     linear = diagnosis.linear
     if diagnosis.verdict in _NAMING:
-        return courses.get(diagnosis.effects[0])
+        return trends.get(diagnosis.effects[0])
     if diagnosis.verdict == "adequate":
         return trend_in_model(linear, linear.model.terms[-1]) if linear.model.terms else None
     if diagnosis.curves:
@@ -119,15 +111,15 @@ def _why(diagnosis: Diagnosis, courses: dict[str, EffectTrend | None]) -> Effect
 
 
 def _candidate_row(
-    diagnosis: Diagnosis, candidate: CandidateEffect, field: DisagreementField | None, course: EffectTrend | None
+    diagnosis: Diagnosis, candidate: CandidateEffect, field: DisagreementField | None, trend: EffectTrend | None
 ) -> dict[str, Any]:
     validation = candidate.cross_validation
     return {
         "effect": candidate.name,
-        "words": _cause(candidate, course),
+        "words": _cause(candidate, trend),
         "heldout": None if validation is None else diagnosis.rms_if_added(validation)[1],
         **_on_part(field),
-        "why": _course_row(course),
+        "why": _trend_row(trend),
     }
 
 
@@ -141,20 +133,20 @@ def _on_part(field: DisagreementField | None) -> dict[str, Any]:
     return {"mean": field.mean_abs, "worst": worst, "field": values}
 
 
-def _course_row(course: EffectTrend | None) -> dict[str, Any] | None:
-    if course is None:
+def _trend_row(trend: EffectTrend | None) -> dict[str, Any] | None:
+    if trend is None:
         return None
     return {
-        "follows": course.follows,
-        "unit": course.unit,
-        "of": course.of,
-        "value_unit": course.value_unit,
-        "views": course.views.tolist(),
-        "at": _rounded(course.at),
-        "measured": _rounded(course.measured),
-        "sigma": _rounded(course.sigma),
-        "predicted": _rounded(course.predicted),
-        "law": [_rounded(row) for row in course.law],
+        "follows": trend.follows,
+        "unit": trend.unit,
+        "of": trend.of,
+        "value_unit": trend.value_unit,
+        "views": trend.views.tolist(),
+        "at": _rounded(trend.at),
+        "measured": _rounded(trend.measured),
+        "sigma": _rounded(trend.sigma),
+        "predicted": _rounded(trend.predicted),
+        "law": [_rounded(row) for row in trend.law],
     }
 
 
@@ -185,15 +177,15 @@ def _headline(diagnosis: Diagnosis, why: EffectTrend | None) -> str:
     return f"{'' if diagnosis.certain else 'Perhaps: '}{causes[0]}."
 
 
-def _cause(candidate: CandidateEffect, course: EffectTrend | None) -> str:
+def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
     """Return the cause as a sentence without its full stop."""
     name = candidate.name
     term = candidate.ranked.score.form.at(candidate.ranked.score.values)
     view = next((p.view for p in term.parameters if p.discrete), "")
     if view:
         return f"The part slipped before view {view}" if name == "part_slip" else f"{name} at {view}"
-    if course is not None and name in JOINT_DESCRIPTIONS and course.of.startswith("joint"):
-        return f"{course.of.capitalize()} {JOINT_DESCRIPTIONS[name]}"
+    if trend is not None and name in JOINT_DESCRIPTIONS and trend.of.startswith("joint"):
+        return f"{trend.of.capitalize()} {JOINT_DESCRIPTIONS[name]}"
     description = DESCRIPTIONS.get(name, name)
     return description[:1].upper() + description[1:]
 

@@ -5,7 +5,7 @@ from textwrap import wrap
 
 from stitch.model.model import hand_eye_lines
 from stitch.numerics.units import angle_text, length_text, uncertainty_text
-from stitch.output.comparison.disagreement_field import effect_changes, model_history
+from stitch.output.comparison.model_history import effect_changes, model_history
 from stitch.output.comparison.run_verdict import run_verdict
 from stitch.run_data import RunData
 

@@ -1,7 +1,5 @@
 """Meshes that Open3D makes of the fused cloud: closed, or with a tenth of the triangles."""
 
-from dataclasses import dataclass
-
 import igl
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -29,27 +27,7 @@ _ASKED = 20_000
 _SEEN_SPACINGS = 2.5
 
 
-@dataclass(frozen=True)
-class MeshFit:
-    """How a mesh lies to the points that it was made of; lengths in length_unit."""
-
-    triangles: int
-    closed: bool  # every edge belongs to two triangles
-    median: float  # of the distances of the points from the mesh
-    p95: float
-    unseen: float  # share of the area that is farther than 2.5 spacings from all points
-
-    def sentence(self, length_unit: str) -> str:
-        """Return the numbers in plain words."""
-        unseen = f" Nobody looked at {self.unseen:.0%} of its area." if self.closed else ""
-        return (
-            f"mesh.ply: {'closed' if self.closed else 'open'}, {self.triangles:,} triangles. Half of the fused points "
-            f"lie within {length_text(self.median, length_unit)} of it, 95 % within "
-            f"{length_text(self.p95, length_unit)}.{unseen}"
-        )
-
-
-def make_mesh(cloud: FusedCloud, kind: str) -> tuple[TriangleMesh, MeshFit]:
+def make_mesh(cloud: FusedCloud, kind: str) -> "tuple[TriangleMesh, MeshFit]":
     """Return a mesh of the fused points and how far off them it lies; reference frame, length_unit.
 
     Args:
@@ -64,7 +42,7 @@ def make_mesh(cloud: FusedCloud, kind: str) -> tuple[TriangleMesh, MeshFit]:
     else:
         mesh = mesh_of(cloud.points, cloud.normals)
         mesh = light(mesh, max(1, round(_LIGHT_SHARE * len(mesh.triangles)))) if kind == LIGHT else mesh
-    return mesh, mesh_fit(mesh, cloud.points)
+    return mesh, MeshFit(mesh, cloud.points)
 
 
 def watertight(points: Array, normals: Array) -> TriangleMesh:
@@ -84,11 +62,11 @@ def watertight(points: Array, normals: Array) -> TriangleMesh:
     cloud.normals = o3d.utility.Vector3dVector(np.asarray(normals, float))
     solve = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        found, density = solve(cloud, depth=_octree_depth(points), scale=_BOX_SCALE, n_threads=1)
+        surface, density = solve(cloud, depth=_octree_depth(points), scale=_BOX_SCALE, n_threads=1)
     levels = np.asarray(density)
-    triangles = np.asarray(found.triangles, np.int64)
+    triangles = np.asarray(surface.triangles, np.int64)
     triangles = triangles[(levels > np.median(levels) - _SPARSE_LEVELS)[triangles].all(axis=1)]
-    return _capped(np.asarray(found.vertices), _large_parts(_without_pinches(triangles)))
+    return _capped(np.asarray(surface.vertices), _large_parts(_without_pinches(triangles)))
 
 
 def light(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
@@ -101,26 +79,33 @@ def light(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
     whole = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.triangles.astype(np.int32))
     )
-    found = whole.simplify_quadric_decimation(triangles)
-    return TriangleMesh(np.asarray(found.vertices), np.asarray(found.triangles, np.int64))
+    simplified = whole.simplify_quadric_decimation(triangles)
+    return TriangleMesh(np.asarray(simplified.vertices), np.asarray(simplified.triangles, np.int64))
 
 
-def mesh_fit(mesh: TriangleMesh, points: Array) -> MeshFit:
-    """Compute how a mesh lies to points (N, 3) of the same frame and unit; of many points every so manieth is asked."""
-    tree = KDTree(np.ascontiguousarray(points, float))
-    asked = np.ascontiguousarray(points[:: max(1, len(points) // _ASKED)], float)
-    distance = np.sqrt(igl.point_mesh_squared_distance(asked, mesh.vertices, mesh.triangles)[0])
-    corners = mesh.vertices[mesh.triangles]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    far = tree.query(corners.mean(axis=1))[0] > _SEEN_SPACINGS * spacing(points, tree)
-    median, p95 = np.quantile(distance, [0.5, 0.95])
-    return MeshFit(
-        triangles=len(mesh.triangles),
-        closed=not len(_rim(mesh.triangles)),
-        median=float(median),
-        p95=float(p95),
-        unseen=float(area[far].sum() / area.sum()),
-    )
+class MeshFit:
+    """How a mesh lies to the points (N, 3) that it was made of, of the same frame and unit; of many some are asked."""
+
+    def __init__(self, mesh: TriangleMesh, points: Array) -> None:
+        tree = KDTree(np.ascontiguousarray(points, float))
+        asked = np.ascontiguousarray(points[:: max(1, len(points) // _ASKED)], float)
+        distance = np.sqrt(igl.point_mesh_squared_distance(asked, mesh.vertices, mesh.triangles)[0])
+        corners = mesh.vertices[mesh.triangles]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        far = tree.query(corners.mean(axis=1))[0] > _SEEN_SPACINGS * spacing(points, tree)
+        self.triangles = len(mesh.triangles)
+        self.closed = not len(_rim(mesh.triangles))  # every edge belongs to two triangles
+        self.median, self.p95 = map(float, np.quantile(distance, [0.5, 0.95]))  # of the points from the mesh
+        self.unseen = float(area[far].sum() / area.sum())  # share of the area far from all points
+
+    def sentence(self, length_unit: str) -> str:
+        """Return the numbers in plain words."""
+        unseen = f" Nobody looked at {self.unseen:.0%} of its area." if self.closed else ""
+        return (
+            f"mesh.ply: {'closed' if self.closed else 'open'}, {self.triangles:,} triangles. Half of the fused points "
+            f"lie within {length_text(self.median, length_unit)} of it, 95 % within "
+            f"{length_text(self.p95, length_unit)}.{unseen}"
+        )
 
 
 def _octree_depth(points: Array) -> int:
@@ -133,9 +118,9 @@ def _rim(triangles: Indices) -> Indices:
     """Return the directed edges (E, 2) of triangles (T, 3) that no neighbour runs through the other way."""
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     count = int(triangles.max(initial=0)) + 1
-    there, back = edges @ [count, 1], edges[:, ::-1] @ [count, 1]
-    rim: Indices = edges[~np.isin(there, back)]
-    return rim
+    there = edges @ [count, 1]
+    back = edges[:, ::-1] @ [count, 1]
+    return edges[~np.isin(there, back)]
 
 
 def _without_pinches(triangles: Indices) -> Indices:
@@ -154,7 +139,7 @@ def _large_parts(triangles: Indices) -> Indices:
         raise NoResultError(NO_SURFACE)
     part = _connected(triangles[:, [0, 1, 1, 2]].reshape(-1, 2), int(triangles.max()) + 1)[triangles[:, 0]]
     sizes = np.bincount(part)
-    return np.asarray(triangles[(sizes >= _PART_SHARE * sizes.max())[part]])
+    return triangles[(sizes >= _PART_SHARE * sizes.max())[part]]
 
 
 def _capped(vertices: Array, triangles: Indices) -> TriangleMesh:
@@ -172,5 +157,4 @@ def _capped(vertices: Array, triangles: Indices) -> TriangleMesh:
 def _connected(edges: Indices, count: int) -> Indices:
     """Return a label (count,) per vertex, the same where edges (E, 2) join two."""
     graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    label: Indices = connected_components(graph, directed=False)[1]
-    return label
+    return connected_components(graph, directed=False)[1]

@@ -17,7 +17,7 @@ from stitch.numerics.frames import Array
 from stitch.observations.surfaces.hand_eye_fit import Repeatability
 from stitch.observations.targets.outliers import Outlier, mask_outliers
 from stitch.observations.targets.target_model import TargetModelFit
-from stitch.output.comparison.disagreement_field import model_history
+from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import run_verdict
 from stitch.output.json_file import FORMAT
 from stitch.output.schema import (

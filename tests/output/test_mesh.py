@@ -6,7 +6,7 @@ import trimesh
 
 from stitch.errors import NoResultError
 from stitch.output.mesh import mesh_of, write_mesh
-from stitch.output.open3d_mesh import make_mesh, mesh_fit, watertight
+from stitch.output.open3d_mesh import MeshFit, make_mesh, watertight
 from stitch.run_data import FusedCloud
 from tests.needs import needs_open3d
 
@@ -144,7 +144,7 @@ def test_a_light_mesh_has_a_tenth_of_the_triangles_and_the_same_edge():
     assert len(mesh.triangles) == pytest.approx(0.1 * len(whole.triangles), rel=0.01) and not fit.closed
     assert solid(mesh).area == pytest.approx(solid(whole).area, rel=0.01)
     # Ten times as large triangles sag ten times as far.
-    assert fit.p95 < mesh_fit(whole, upper.points).p95 + 10 * 3 * spacing(8000) ** 2 / (8 * RADIUS)
+    assert fit.p95 < MeshFit(whole, upper.points).p95 + 10 * 3 * spacing(8000) ** 2 / (8 * RADIUS)
     assert "open" in fit.sentence("mm")
 
 

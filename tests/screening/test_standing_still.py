@@ -9,7 +9,7 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch.api.pipeline import run
 from stitch.numerics import frames
-from stitch.output.comparison.disagreement_field import model_history
+from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import run_verdict
 from stitch.screening.deep_check import deep_check
 from stitch.screening.scan_faults import find_standing_scene, find_static_background

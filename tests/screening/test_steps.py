@@ -12,7 +12,7 @@ from stitch.api.pipeline import run
 from stitch.numerics import frames
 from stitch.observations.pose_errors import PoseErrors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
-from stitch.output.comparison.disagreement_field import model_history
+from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import run_verdict
 from stitch.screening import pose_tests
 from stitch.screening.pose_tests import PoseTests, expected_poses, find_blunders, find_steps

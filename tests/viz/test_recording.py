@@ -17,7 +17,7 @@ from data_synth.write import write_session
 from stitch.api.pipeline import diagnose, run
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.numerics.units import length_text
-from stitch.output.comparison.disagreement_field import model_history
+from stitch.output.comparison.model_history import model_history
 from stitch.output.result_document import result_document
 from stitch.run_data import Note
 from viz.colours import UNSEEN, signed_colours

@@ -17,7 +17,7 @@ from markupsafe import escape
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
-from stitch.output.comparison.disagreement_field import model_history
+from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import check_tolerance, plain_verdict, run_headline
 from stitch.output.result_document import result_document
 from tests.in_browser import require_for_everybody

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.numerics import frames
-from stitch.output.comparison.disagreement_field import model_history
+from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.two_runs import compare_runs, comparison_sentence, hand_eye_change
 from tests.in_browser import WAYS, require_for_everybody, shown
 from viz.two_runs_page import facts, view_change_rows, write_two_runs

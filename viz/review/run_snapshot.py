@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from stitch.errors import InputError
 from stitch.numerics.units import MICROMETRES, format_amount
-from stitch.output.comparison.disagreement_field import effect_changes
+from stitch.output.comparison.model_history import effect_changes
 from stitch.output.comparison.run_verdict import shorten_doubts
 from stitch.output.plain_words import effect_description, effect_in_words
 from stitch.output.stored_run import read_documents

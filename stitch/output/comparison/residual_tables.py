@@ -1,6 +1,14 @@
-"""Tables of a residual against everything that is known of it, and their document."""
+"""The residual of a run against everything that is known of it: tables in bins, their means judged by the views.
 
-from collections.abc import Sequence
+Between surfaces every correspondence counts twice, with its distance as seen from either view: + e with the properties
+of one point, − e with those of the other. A mean that differs from zero then says that one end of the property sits off
+against the other end. Of labelled points a mean is that of the offset along the direction in which the bins of a
+property differ most, and its p-value knows that the direction was chosen; rms is that of the 3D distance.
+
+Views are the samples: all points of a view share its pose error.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -20,7 +28,20 @@ from stitch.run_data import RunData
 from stitch.session.measurement import Views
 from stitch.system.threads import library_threads_off
 
-# How well the mean of a bin is known: views are the samples, because all points of a view share its pose error.
+PLACE = "place on the part"
+APPROACH = "approach of j"
+CLEAR = 0.05  # p over all means
+_BINS = 6
+_PLACES = 4  # cells along each axis of the part
+_ENOUGH = 30  # correspondences of a view in a bin that make a sample
+_FAIR = 50  # correspondences of a bin that may be called the worst
+_DIRECTIONS = 3  # among so many dimensions a direction is chosen for every table of offsets
+_SAME_VALUE = 1e-9  # numbers closer than that are one
+# Of the size of the largest mean: sums of the same rows in another order differ by rounding.
+_ROUNDING = 1e-6
+
+# Name, unit and value of everything that is known, of the views (V,) or of the rows (N,).
+Properties = list[tuple[str, str, Array]]
 
 
 @dataclass(frozen=True)
@@ -36,69 +57,8 @@ class BinStatistics:
     p_value: Array  # (B,) that chance makes this one mean so large; NaN where that is unknown
 
 
-def view_statistics(n: Array, s: Array, q: Array, enough: float = 1.0, directions: int = 1) -> BinStatistics:
-    """Means of bins with what the scatter between views says of them.
-
-    A view off by its pose error ε is off in all its rows, so a mean over views with shares w of the rows has the
-    variance σ² Σ w². All rows together have the mean zero: what a bin is off the others are off the other way, which
-    leaves the factor 1 − (share of the bin). Where all rows of a view lie in one bin and views have equal counts,
-    mean over sigma is Student's t of the views in the bin against the other views.
-
-    Args:
-        n, s, q: (B, V) counts, sums and sums of squares of rows by bin and view.
-        enough: rows of a view in a bin that make a sample.
-        directions: dimensions among which the direction of the mean was chosen for being the clearest. The
-            p-value is that of the clearest (Scheffé 1953, Biometrika 40, 87).
-    """
-    use, total, seen = n >= enough, n.sum(axis=1), np.maximum(n.sum(axis=0), 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        dilution = ((n / total[:, None]) ** 2).sum(axis=1)
-        mean, rms = s.sum(axis=1) / total, np.sqrt(q.sum(axis=1) / total)
-        variance, freedom = _view_scatter(s / n, s.sum(axis=0) / seen, use)
-        of_rms, _ = _view_scatter(np.sqrt(q / n), np.sqrt(q.sum(axis=0) / seen), use)
-        sigma = np.sqrt(variance * dilution * (1 - total / total.sum()))
-        z = np.abs(mean) / sigma
-    tails = np.array([_mean_p_value(float(x), float(v), directions) for x, v in zip(z, freedom, strict=True)])
-    return BinStatistics(mean, sigma, rms, np.sqrt(of_rms * dilution), total, use.sum(axis=1), tails)
-
-
-def _view_scatter(values: Array, whole: Array, use: Mask) -> tuple[Array, Array]:
-    """Variance between views (B,) and its degrees of freedom (B,).
-
-    A bin of one or two views does not know it. Pooled with the views of the bin about their mean are the views that
-    do not lie in it, with the values of all their rows, about theirs.
-
-    Args:
-        values: (B, V) of the views in the bins.
-        whole: (V,) of all rows of the views.
-        use: (B, V) where a view makes a sample.
-    """
-    others = use.any(axis=0) & ~use
-    square, freedom = np.zeros(len(use)), np.zeros(len(use))
-    for chosen, of in ((use, values), (others, np.broadcast_to(whole, use.shape))):
-        count = chosen.sum(axis=1)
-        middle = np.where(chosen, of, 0.0).sum(axis=1) / np.maximum(count, 1)
-        square += np.where(chosen, (of - middle[:, None]) ** 2, 0.0).sum(axis=1)
-        freedom += np.maximum(count - 1, 0)
-    known = (freedom > 0) & use.any(axis=1)
-    return np.where(known, square / np.maximum(freedom, 1), np.nan), freedom
-
-
-def _mean_p_value(z: float, freedom: float, directions: int) -> float:
-    """P of a mean so many sigmas from zero by chance, in the worst direction; Student's t for one direction."""
-    left = freedom - directions + 1
-    if not np.isfinite(z):
-        return float("nan")
-    return f_tail(z**2 * left / (directions * freedom), directions, left) if left > 0 else 1.0
-
-
-# A residual against one property, in bins.
-
-_FAIR = 50  # correspondences of a bin that may be called the worst
-
-
 @dataclass(frozen=True)
-class ResidualTable:
+class ResidualTable(BinStatistics):
     """One property in bins; lengths in length_unit, counts of correspondences and of views.
 
     Example:
@@ -111,14 +71,7 @@ class ResidualTable:
     unit: str
     low: Array  # (B,) edges, or the number of the view or cell
     high: Array  # (B,)
-    label: tuple[str, ...]  # (B,) names of views, pairs or cells; else empty
-    mean: Array  # (B,) signed
-    mean_sigma: Array
-    rms: Array  # (B,)
-    rms_sigma: Array
-    count: Array
-    views: Array
-    p_value: Array  # (B,) of each mean, as if it were the only one
+    label: tuple[str, ...] = ()  # (B,) names of views, pairs or cells
 
     @property
     def clearest(self) -> float:
@@ -143,54 +96,6 @@ class ResidualTable:
         return [int(i) for i in np.argsort(-np.nan_to_num(self.rms), kind="stable") if fair[i]][:at_most]
 
 
-def _labelled_table(name: str, labels: Sequence[str], statistics: BinStatistics) -> ResidualTable:
-    """Return the table of rows with names and their statistics."""
-    number = np.arange(len(labels), dtype=float)
-    return ResidualTable(name, "", number, number, tuple(labels), **vars(statistics))
-
-
-def binned_table(name: str, unit: str, edges: Array, statistics: BinStatistics) -> ResidualTable:
-    """Return the table of bins between edges (B + 1,) and their statistics."""
-    return ResidualTable(name, unit, edges[:-1], edges[1:], (), **vars(statistics))
-
-
-# Properties whose bins hold the same rows: they say one thing under several names.
-
-# Of the size of the largest mean: sums of the same rows in another order differ by rounding.
-_ROUNDING = 1e-6
-
-
-def group_same_bins(tables: Sequence[ResidualTable]) -> tuple[tuple[ResidualTable, ...], ...]:
-    """Tables in groups whose bins hold the same rows, in whichever order; groups and tables as they come."""
-    groups: list[list[ResidualTable]] = []
-    for table in tables:
-        group = next((g for g in groups if _same_rows(g[0], table)), None)
-        if group is None:
-            groups.append(group := [])
-        group.append(table)
-    return tuple(tuple(g) for g in groups)
-
-
-def _same_rows(a: ResidualTable, b: ResidualTable) -> bool:
-    if len(a.count) != len(b.count):
-        return False
-    first, second = (np.lexsort((np.nan_to_num(t.rms), np.nan_to_num(t.mean), t.count)) for t in (a, b))
-    if not np.array_equal(a.count[first], b.count[second]):
-        return False
-    small = _ROUNDING * float(np.nanmax(a.rms, initial=0.0))
-    pairs = ((a.mean, b.mean), (a.rms, b.rms))
-    return all(np.allclose(x[first], y[second], rtol=0, atol=small, equal_nan=True) for x, y in pairs)
-
-
-# All tables of a run, and what they say together.
-
-PLACE = "place on the part"
-APPROACH = "approach of j"
-_SAME_VALUE = 1e-9  # numbers closer than that are one
-_BINS = 6
-CLEAR = 0.05  # p over all means
-
-
 @dataclass(frozen=True)
 class ResidualTables:
     """All tables, and the rms they share, length_unit.
@@ -203,7 +108,6 @@ class ResidualTables:
 
     tables: tuple[ResidualTable, ...]
     rms: float
-    scale: float
     views: tuple[str, ...] = ()  # names, V
     of_views: dict[str, Array] = field(default_factory=dict)  # property -> (V,) value of each view
     followed: tuple[FollowedCovariate, ...] = ()  # what the displacements of whole views follow, clearest first
@@ -225,8 +129,8 @@ class ResidualTables:
     @cached_property
     def groups(self) -> tuple[tuple[ResidualTable, ...], ...]:
         """Tables of properties, clearest dependence first; those whose bins hold the same rows together."""
-        own = group_same_bins([t for t in self.tables if not t.label])
-        return tuple(sorted(own, key=lambda g: (g[0].least_p, -g[0].clearest)))
+        groups = _group_same_bins([t for t in self.tables if not t.label])
+        return tuple(sorted(groups, key=lambda g: (g[0].least_p, -g[0].clearest)))
 
     @property
     def places(self) -> tuple[ResidualTable, ...]:
@@ -265,96 +169,122 @@ class ResidualTables:
         return self.p_of_all(table) <= CLEAR
 
 
-def view_properties(views: Views) -> list[tuple[str, str, Array]]:
-    """Name, unit and value (V,) of everything that is known of the views."""
-    out = [(f"j{i + 1}", "deg", np.degrees(views.joints[:, i])) for i in range(views.joints.shape[1])]
-    out += [(f"{APPROACH}{i + 1}", "", views.approach[:, i]) for i in range(views.approach.shape[1])]
-    out += [(f"torque {n}", "N m", views.torques.values[:, i]) for i, n in enumerate(views.torques.names)]
-    if views.has("time"):
-        out.append(("time", "s", views.time))
-    return out + [(name, covariate_unit(name), values) for name, values in views.covariates.items()]
-
-
-def property_varies(name: str, values: Array) -> bool:
-    """True if a property (V,) has two values; that no view came before the first is no approach."""
-    told = values[values != 0] if name.startswith(APPROACH) else values
-    return bool(len(told) and np.ptp(told) > _SAME_VALUE)
-
-
-def equal_count_bins(values: Array) -> tuple[Array, Indices]:
-    """(B + 1,) edges of bins with about equal counts, and the bin of every value (N,); equal values stay together.
-
-    Of no more values than bins, each has its own.
-    """
-    own = np.unique(values)
-    if len(own) <= _BINS:
-        edges = np.concatenate([own[:1], (own[1:] + own[:-1]) / 2, own[-1:]])
-    else:
-        edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
-    edges = edges if len(own) > 1 else np.array([own[0] - 0.5, own[0] + 0.5])
-    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
-    return edges, bins.astype(np.int64)
-
-
-def comparison_document(found: ResidualTables) -> dict[str, object]:
-    """The tables as plain lists."""
-    floats, counts = "low high mean mean_sigma rms rms_sigma p_value", "count views"
-    names = {t.name: [x.name for x in group if x is not t] for group in found.groups for t in group}
-    return {
-        "rms": found.rms,
-        "follows": [own.document() for own in found.followed],
-        "means": found.means,
-        "tables": [
-            {"name": t.name, "unit": t.unit, "label": list(t.label), "clearest": t.clearest}
-            | ({} if t.label else {"p_of_all": found.p_of_all(t), "same_bins": names[t.name]})
-            | {key: getattr(t, key).tolist() for key in floats.split()}
-            | {key: getattr(t, key).astype(int).tolist() for key in counts.split()}
-            for t in found.tables
-        ],
-        "views": [
-            {"view": name, "values": {key: float(values[v]) for key, values in found.of_views.items()}}
-            for v, name in enumerate(found.views)
-        ],
-    }
-
-
-# Where model and measurement part: the distance between views against everything that is known of them.
-#
-# Every correspondence counts twice, with its distance as seen from either view: + e with the properties of
-# one point, − e with those of the other. A mean that differs from zero then says that one end of the property
-# sits off against the other end. Intervals count views: points of one view share its error.
-
-# Correspondences of a view in a bin that make a sample.
-_ENOUGH = 30
-_PLACES = 4  # cells along each axis of the part
-
-
 def compare_surfaces(state: RunData) -> ResidualTables:
-    """Tables of the residual by view, pair, joint, torque, approach, range, incidence, field, time, covariate, place.
+    """Return the residual by view, pair, joint, torque, approach, range, incidence, field, time, covariate and place.
 
     Raises:
         NoResultError: no two views overlap.
     """
     with library_threads_off():
-        own = corrected_capture(state.measurement, state.model)
-        poses = own.poses(state.model.T_mount)
-        overlaps = collect_overlaps(own, poses, state.gate, [sample_points(s, FINE_SAMPLES) for s in own.scans])
+        capture = corrected_capture(state.measurement, state.model)
+        poses = capture.poses(state.model.T_mount)
+        samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
+        overlaps = collect_overlaps(capture, poses, state.gate, samples)
         followed = followed_covariates(linearise(state.session, state.measurement, state.model, state.gate))
     rows = _CorrespondenceRows(state, poses, overlaps.matches, overlaps.gram.scale)
     names = state.session.names
-    tables = [_view_table(rows, names), _pair_table(rows, names)]
-    for name, unit, values in _correspondence_properties(state, rows):
-        edges, bins = equal_count_bins(values)
-        tables.append(binned_table(name, unit, edges, rows.statistics(bins, len(edges) - 1)))
-    tables.append(_regions(rows))
+    known = view_properties(state.measurement.views)
+    tables = [
+        _view_table(rows, names),
+        _pair_table(rows, names),
+        *_binned_tables([*rows.properties, *_of_rows(known, rows.view)], rows.statistics),
+        _place_table(rows),
+    ]
     return ResidualTables(
-        tables=tuple(t for t in tables if len(t.count) > (0 if t.label else 1)),
+        tables=tuple(table for table in tables if len(table.count)),
         rms=overlaps.gram.rms,
-        scale=overlaps.gram.scale,
         views=tuple(names),
-        of_views={name: values for name, _, values in view_properties(state.measurement.views)},
+        of_views={name: values for name, _, values in known},
         followed=followed,
     )
+
+
+def compare_targets(state: RunData) -> ResidualTables:
+    """Return the offsets by view, target, joint, move, torque, approach, range, time and covariate."""
+    rows = _OffsetRows(state)
+    names = state.session.names
+    views = state.measurement.views
+    moves = np.degrees(views.joints - views.previous)
+    known = [
+        *((f"last move of j{i + 1}", "deg", moves[:, i]) for i in range(moves.shape[1])),
+        *view_properties(views),
+        ("order", "view", np.arange(views.count, dtype=float)),
+    ]
+    distance = ("range", state.session.length_unit, np.linalg.norm(rows.points, axis=1))
+    tables = [
+        _labelled_table("view", names, rows.statistics(rows.view, len(names))),
+        _labelled_table("target", rows.targets, rows.statistics(rows.target, len(rows.targets))),
+        *_binned_tables([distance, *_of_rows(known, rows.view)], rows.statistics),
+    ]
+    rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
+    with library_threads_off():
+        followed = followed_covariates(linearise(state.session, state.measurement, state.model, state.gate))
+    return ResidualTables(
+        tables=tuple(tables),
+        rms=rms,
+        views=tuple(names),
+        of_views={name: values for name, _, values in known},
+        followed=followed,
+    )
+
+
+def view_properties(views: Views) -> Properties:
+    """Return name, unit and value (V,) of everything that is known of the views."""
+    joints = range(views.joints.shape[1])
+    known = [(f"j{i + 1}", "deg", np.degrees(views.joints[:, i])) for i in joints]
+    known += [(f"{APPROACH}{i + 1}", "", views.approach[:, i]) for i in range(views.approach.shape[1])]
+    known += [(f"torque {n}", "N m", views.torques.values[:, i]) for i, n in enumerate(views.torques.names)]
+    if views.has("time"):
+        known.append(("time", "s", views.time))
+    return known + [(name, covariate_unit(name), values) for name, values in views.covariates.items()]
+
+
+def _of_rows(known: Properties, view: Indices) -> Properties:
+    """Return properties of the views that vary, for rows of these views (N,)."""
+    return [(name, unit, values[view]) for name, unit, values in known if property_varies(name, values)]
+
+
+def property_varies(name: str, values: Array) -> bool:
+    """Return True if a property (V,) has two values; that no view came before the first is no approach."""
+    known = values[values != 0] if name.startswith(APPROACH) else values
+    return bool(len(known) and np.ptp(known) > _SAME_VALUE)
+
+
+def _binned_tables(
+    properties: Properties, statistics: Callable[[Indices, int], BinStatistics]
+) -> Iterable[ResidualTable]:
+    """Return a table for each property of rows (N,) that takes more than one bin."""
+    for name, unit, values in properties:
+        edges, bins = equal_count_bins(values)
+        if len(edges) > 2:
+            yield binned_table(name, unit, edges, statistics(bins, len(edges) - 1))
+
+
+def equal_count_bins(values: Array) -> tuple[Array, Indices]:
+    """Return (B + 1,) edges of bins with about equal counts, and the bin of every value (N,).
+
+    Equal values stay together; of no more values than bins, each has its own.
+    """
+    different = np.unique(values)
+    if len(different) == 1:
+        edges = np.array([different[0] - 0.5, different[0] + 0.5])
+    elif len(different) <= _BINS:
+        edges = np.concatenate([different[:1], (different[1:] + different[:-1]) / 2, different[-1:]])
+    else:
+        edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
+    bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+    return edges, bins.astype(np.int64)
+
+
+def binned_table(name: str, unit: str, edges: Array, statistics: BinStatistics) -> ResidualTable:
+    """Return the table of bins between edges (B + 1,) and their statistics."""
+    return ResidualTable(**vars(statistics), name=name, unit=unit, low=edges[:-1], high=edges[1:])
+
+
+def _labelled_table(name: str, labels: Sequence[str], statistics: BinStatistics) -> ResidualTable:
+    """Return the table of rows with names and their statistics."""
+    number = np.arange(len(labels), dtype=float)
+    return ResidualTable(**vars(statistics), name=name, unit="", low=number, high=number, label=tuple(labels))
 
 
 class _CorrespondenceRows:
@@ -373,25 +303,67 @@ class _CorrespondenceRows:
                 values = (*views, sign * m.residual[inside], points, cosine, m.middle[inside])
                 for part, value in zip(parts, values, strict=True):
                     part.append(value)
-        view, partner, self.residual, self.points, self.cosine, self.place = (np.concatenate(p) for p in parts)
+        view, partner, self.residual, points, cosine, self.place = (np.concatenate(p) for p in parts)
         self.view, self.partner = view.astype(np.int64), partner.astype(np.int64)
+        x, y, z = points.T
+        self.properties = [
+            ("range", state.session.length_unit, np.linalg.norm(points, axis=1)),
+            ("incidence", "deg", np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
+            ("field a = x/z", "", x / z),
+            ("field b = y/z", "", y / z),
+            ("field ρ", "", np.hypot(x, y) / z),
+        ]
 
-    def sums(self, bins: Indices, size: int) -> tuple[Array, Array, Array]:
-        """(size, V, V) counts, sums of e and of e² by bin, view and partner."""
+    def sums(self, bins: Indices, size: int) -> list[Array]:
+        """Return (size, V, V) counts, sums of e and of e² by bin, view and partner."""
         key = (bins * self.count + self.view) * self.count + self.partner
-        shape, length = (size, self.count, self.count), size * self.count**2
-        return tuple(  # type: ignore[return-value]
-            np.bincount(key, w, length).reshape(shape) for w in (None, self.residual, self.residual**2)
-        )
+        length = size * self.count**2
+        weights = (None, self.residual, self.residual**2)
+        return [np.bincount(key, w, length).reshape(size, self.count, self.count).astype(float) for w in weights]
 
     def statistics(self, bins: Indices, size: int) -> BinStatistics:
-        """What the views say of the means of so many bins."""
+        """Return what the views say of the means of so many bins."""
         n, s, q = (x.sum(axis=2) for x in self.sums(bins, size))
         return view_statistics(n, s, q, _ENOUGH)
 
 
+class _OffsetRows:
+    """Labelled points in views: where a view puts each, less where hand-eye and effects put it best."""
+
+    def __init__(self, state: RunData) -> None:
+        capture = corrected_capture(state.measurement, state.model)
+        sightings = capture.sightings
+        assert sightings is not None
+        T_mount = state.model.T_mount
+        landmarks = initial_landmarks(capture, T_mount, drawing_of(state.session.nominal, sightings))
+        rows = target_rows(capture, T_mount, landmarks)
+        covariance = (rows.noise + rows.fixed)[:, :, None] * np.eye(rows.residual.shape[1])
+        nothing = np.zeros(rows.landmarks.shape[2])
+        placed = BlockLeastSquares(-rows.residual, rows.landmarks, covariance, nothing, nothing).solve()
+        residual = rows.residual + rows.landmarks @ placed
+        used = sightings.used
+        self.count = len(used)
+        self.targets = list(sightings.targets)
+        self.view, slot = np.nonzero(used)
+        self.target = sightings.target[self.view, slot]
+        self.offset = residual[: len(used), : rows.positions].reshape(*used.shape, 3)[self.view, slot]  # reference
+        self.points = sightings.points[self.view, slot]  # sensor frame
+
+    def statistics(self, bins: Indices, size: int) -> BinStatistics:
+        """Return what the views say of the means of so many bins, along the direction in which these differ most."""
+        count = np.bincount(bins, minlength=size)
+        sums = np.stack([np.bincount(bins, self.offset[:, i], size) for i in range(3)], axis=1)
+        mean = sums / np.maximum(count, 1)[:, None]
+        direction = np.linalg.svd(mean - mean.mean(axis=0), full_matrices=False)[2][0] if size > 1 else np.eye(3)[0]
+        along = self.offset @ direction
+        key = bins * self.count + self.view
+        weights = (np.ones(len(along)), along, np.sum(self.offset**2, axis=1))
+        n, s, q = (np.bincount(key, w, size * self.count).reshape(size, self.count).astype(float) for w in weights)
+        return view_statistics(n, s, q, directions=_DIRECTIONS)
+
+
 def _view_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
-    """One sample each: how well its own mean is known nothing says."""
+    """Return the table of views, one sample each: how well its own mean is known nothing says."""
     table = _labelled_table("view", names, rows.statistics(rows.view, len(names)))
     nothing = np.full(len(names), np.nan)
     return replace(table, mean_sigma=nothing, rms_sigma=nothing, p_value=nothing)
@@ -400,112 +372,144 @@ def _view_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTabl
 def _pair_table(rows: _CorrespondenceRows, names: Sequence[str]) -> ResidualTable:
     n, s, q = (x[0] for x in rows.sums(np.zeros(len(rows.view), np.int64), 1))
     v, w = np.nonzero(np.triu(n, 1))
-    count, mean, square = n[v, w], s[v, w], q[v, w]
-    nothing, two = np.full(len(v), np.nan), np.full(len(v), 2)
-    told = BinStatistics(mean / count, nothing, np.sqrt(square / count), nothing, count, two, nothing)
-    return _labelled_table("pair", [f"{names[int(a)]}–{names[int(b)]}" for a, b in zip(v, w, strict=True)], told)
+    count = n[v, w]
+    nothing = np.full(len(v), np.nan)
+    statistics = BinStatistics(
+        mean=s[v, w] / count,
+        mean_sigma=nothing,
+        rms=np.sqrt(q[v, w] / count),
+        rms_sigma=nothing,
+        count=count,
+        views=np.full(len(v), 2),
+        p_value=nothing,
+    )
+    return _labelled_table("pair", [f"{names[int(a)]}–{names[int(b)]}" for a, b in zip(v, w, strict=True)], statistics)
 
 
-def _correspondence_properties(state: RunData, rows: _CorrespondenceRows) -> list[tuple[str, str, Array]]:
-    """Name, unit and value of every property, per row."""
-    views, unit = state.measurement.views, state.session.length_unit
-    x, y, z = rows.points.T
-    out = [
-        ("range", unit, np.linalg.norm(rows.points, axis=1)),
-        ("incidence", "deg", np.degrees(np.arccos(np.clip(rows.cosine, -1, 1)))),
-        ("field a = x/z", "", x / z),
-        ("field b = y/z", "", y / z),
-        ("field ρ", "", np.hypot(x, y) / z),
-    ]
-    return out + [
-        (name, u, values[rows.view]) for name, u, values in view_properties(views) if property_varies(name, values)
-    ]
-
-
-def _regions(rows: _CorrespondenceRows) -> ResidualTable:
-    """Cells of the part along the axes of the reference frame."""
+def _place_table(rows: _CorrespondenceRows) -> ResidualTable:
+    """Return the table of cells of the part along the axes of the reference frame."""
     low, high = np.quantile(rows.place, [0.005, 0.995], axis=0)
     cell = np.clip(((rows.place - low) / np.maximum(high - low, 1e-12) * _PLACES).astype(np.int64), 0, _PLACES - 1)
-    bins = (cell[:, 0] * _PLACES + cell[:, 1]) * _PLACES + cell[:, 2]
-    used, bins = np.unique(bins, return_inverse=True)
+    number = (cell[:, 0] * _PLACES + cell[:, 1]) * _PLACES + cell[:, 2]
+    used, bins = np.unique(number, return_inverse=True)
     centre = [low + (np.array(np.unravel_index(b, (_PLACES,) * 3)) + 0.5) / _PLACES * (high - low) for b in used]
     labels = [f"({c[0]:.4g}, {c[1]:.4g}, {c[2]:.4g})" for c in centre]
     return _labelled_table(PLACE, labels, rows.statistics(bins.astype(np.int64), len(labels)))
 
 
-# Where model and labelled points part: offsets of the targets against everything that is known of the views.
-#
-# A mean is that of the offset along the direction in which the bins of a property differ most, and its p-value knows
-# that the direction was chosen; rms is that of the 3D distance. Targets of one view share its error.
+def view_statistics(n: Array, s: Array, q: Array, enough: float = 1.0, directions: int = 1) -> BinStatistics:
+    """Return means of bins with what the scatter between views says of them.
 
-# A direction is chosen for every table among so many dimensions.
-_DIRECTIONS = 3
+    A view off by its pose error ε is off in all its rows, so a mean over views with shares w of the rows has the
+    variance σ² Σ w². All rows together have the mean zero: what a bin is off the others are off the other way, which
+    leaves the factor 1 − (share of the bin). Where all rows of a view lie in one bin and views have equal counts,
+    mean over sigma is Student's t of the views in the bin against the other views.
 
-
-@dataclass(frozen=True)
-class _Offsets:
-    """N targets in views: where the view puts them less where they are."""
-
-    view: Indices  # (N,)
-    target: Indices  # (N,)
-    offset: Array  # (N, 3) reference frame
-    points: Array  # (N, 3) sensor frame
-    views: int
-
-    def statistics(self, bins: Indices, size: int) -> BinStatistics:
-        """What the views say of the means of so many bins, along the direction in which these differ most."""
-        count = np.asarray(np.bincount(bins, minlength=size), float)
-        sums = np.stack([np.bincount(bins, self.offset[:, i], size) for i in range(3)], axis=1)
-        mean = sums / np.maximum(count, 1)[:, None]
-        direction = np.linalg.svd(mean - mean.mean(axis=0), full_matrices=False)[2][0] if size > 1 else np.eye(3)[0]
-        along = self.offset @ direction
-        key, shape = bins * self.views + self.view, (size, self.views)
-        weights = np.ones(len(along)), along, np.sum(self.offset**2, axis=1)
-        n, s, q = (np.asarray(np.bincount(key, w, size * self.views), float).reshape(shape) for w in weights)
-        return view_statistics(n, s, q, directions=_DIRECTIONS)
-
-
-def compare_targets(state: RunData) -> ResidualTables:
-    """Tables of the offsets by view, target, joint, move, torque, approach, range, time and covariate."""
-    rows = _target_offsets(state)
-    s = state.measurement.capture.sightings
-    assert s is not None
-    tables = [
-        _labelled_table(name, names, rows.statistics(bins, len(names)))
-        for name, bins, names in (("view", rows.view, state.session.names), ("target", rows.target, list(s.targets)))
-    ]
-    known = _offset_view_properties(state.measurement.views)
-    every = [("range", state.session.length_unit, np.linalg.norm(rows.points, axis=1))]
-    every += [(name, unit, values[rows.view]) for name, unit, values in known if property_varies(name, values)]
-    for name, unit, values in every:
-        edges, bins = equal_count_bins(values)
-        if len(edges) > 2:
-            tables.append(binned_table(name, unit, edges, rows.statistics(bins, len(edges) - 1)))
-    rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
-    of_views = {name: values for name, _, values in known}
-    with library_threads_off():
-        followed = followed_covariates(linearise(state.session, state.measurement, state.model, state.gate))
-    return ResidualTables(tuple(tables), rms, rms, tuple(state.session.names), of_views, followed)
+    Args:
+        n, s, q: (B, V) counts, sums and sums of squares of rows by bin and view.
+        enough: rows of a view in a bin that make a sample.
+        directions: dimensions among which the direction of the mean was chosen for being the clearest. The
+            p-value is that of the clearest (Scheffé 1953, Biometrika 40, 87).
+    """
+    use = n >= enough
+    total = n.sum(axis=1)
+    of_view = np.maximum(n.sum(axis=0), 1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        dilution = ((n / total[:, None]) ** 2).sum(axis=1)
+        mean = s.sum(axis=1) / total
+        rms = np.sqrt(q.sum(axis=1) / total)
+        variance, freedom = _view_scatter(s / n, s.sum(axis=0) / of_view, use)
+        rms_variance, _ = _view_scatter(np.sqrt(q / n), np.sqrt(q.sum(axis=0) / of_view), use)
+        sigma = np.sqrt(variance * dilution * (1 - total / total.sum()))
+        z = np.abs(mean) / sigma
+    p_values = [_mean_p_value(float(x), float(v), directions) for x, v in zip(z, freedom, strict=True)]
+    return BinStatistics(
+        mean=mean,
+        mean_sigma=sigma,
+        rms=rms,
+        rms_sigma=np.sqrt(rms_variance * dilution),
+        count=total,
+        views=use.sum(axis=1),
+        p_value=np.array(p_values),
+    )
 
 
-def _target_offsets(state: RunData) -> _Offsets:
-    """Return offsets from where hand-eye and effects put the targets best."""
-    own = corrected_capture(state.measurement, state.model)
-    s = own.sightings
-    assert s is not None
-    T_mount = state.model.T_mount
-    rows = target_rows(own, T_mount, initial_landmarks(own, T_mount, drawing_of(state.session.nominal, s)))
-    covariance = (rows.noise + rows.fixed)[:, :, None] * np.eye(rows.residual.shape[1])
-    nothing = np.zeros(rows.landmarks.shape[2])
-    placed = BlockLeastSquares(-rows.residual, rows.landmarks, covariance, nothing, nothing).solve()
-    left = rows.residual + rows.landmarks @ placed
-    v, slot = np.nonzero(s.used)
-    offset = left[: len(s.used), : rows.positions].reshape(*s.used.shape, 3)[v, slot]
-    return _Offsets(v, s.target[v, slot], offset, s.points[v, slot], len(s.used))
+def _view_scatter(values: Array, whole: Array, use: Mask) -> tuple[Array, Array]:
+    """Return the variance between views (B,) and its degrees of freedom (B,).
+
+    A bin of one or two views does not know it. Pooled with the views of the bin about their mean are the views that
+    do not lie in it, with the values of all their rows, about theirs.
+
+    Args:
+        values: (B, V) of the views in the bins.
+        whole: (V,) of all rows of the views.
+        use: (B, V) where a view makes a sample.
+    """
+    others = use.any(axis=0) & ~use
+    square = np.zeros(len(use))
+    freedom = np.zeros(len(use))
+    for chosen, sample in ((use, values), (others, np.broadcast_to(whole, use.shape))):
+        count = chosen.sum(axis=1)
+        middle = np.where(chosen, sample, 0.0).sum(axis=1) / np.maximum(count, 1)
+        square += np.where(chosen, (sample - middle[:, None]) ** 2, 0.0).sum(axis=1)
+        freedom += np.maximum(count - 1, 0)
+    known = (freedom > 0) & use.any(axis=1)
+    return np.where(known, square / np.maximum(freedom, 1), np.nan), freedom
 
 
-def _offset_view_properties(views: Views) -> list[tuple[str, str, Array]]:
-    """Name, unit and value of every property, per view."""
-    moves = np.degrees(views.joints - views.previous)
-    of_view = [(f"last move of j{i + 1}", "deg", moves[:, i]) for i in range(moves.shape[1])]
-    return [*of_view, *view_properties(views), ("order", "view", np.arange(views.count, dtype=float))]
+def _mean_p_value(z: float, freedom: float, directions: int) -> float:
+    """Return P of a mean so many sigmas from zero by chance, in the worst direction; Student's t for one direction."""
+    left = freedom - directions + 1
+    if not np.isfinite(z):
+        return float("nan")
+    return f_tail(z**2 * left / (directions * freedom), directions, left) if left > 0 else 1.0
+
+
+def _group_same_bins(tables: Sequence[ResidualTable]) -> list[tuple[ResidualTable, ...]]:
+    """Return tables in groups whose bins hold the same rows, in whichever order; groups and tables as they come.
+
+    Such properties say one thing under several names.
+    """
+    groups: list[list[ResidualTable]] = []
+    for table in tables:
+        group = next((group for group in groups if _same_rows(group[0], table)), None)
+        if group is None:
+            groups.append([table])
+        else:
+            group.append(table)
+    return [tuple(group) for group in groups]
+
+
+def _same_rows(a: ResidualTable, b: ResidualTable) -> bool:
+    if len(a.count) != len(b.count):
+        return False
+    first, second = (np.lexsort((np.nan_to_num(t.rms), np.nan_to_num(t.mean), t.count)) for t in (a, b))
+    if not np.array_equal(a.count[first], b.count[second]):
+        return False
+    small = _ROUNDING * float(np.nanmax(a.rms, initial=0.0))
+    pairs = ((a.mean, b.mean), (a.rms, b.rms))
+    return all(np.allclose(x[first], y[second], rtol=0, atol=small, equal_nan=True) for x, y in pairs)
+
+
+def comparison_document(comparison: ResidualTables) -> dict[str, object]:
+    """Return compare.json: the tables as plain lists."""
+    return {
+        "rms": comparison.rms,
+        "follows": [followed.document() for followed in comparison.followed],
+        "means": comparison.means,
+        "tables": [_table_row(comparison, table) for table in comparison.tables],
+        "views": [
+            {"view": name, "values": {key: float(values[v]) for key, values in comparison.of_views.items()}}
+            for v, name in enumerate(comparison.views)
+        ],
+    }
+
+
+def _table_row(comparison: ResidualTables, table: ResidualTable) -> dict[str, object]:
+    row = {"name": table.name, "unit": table.unit, "label": list(table.label), "clearest": table.clearest}
+    if not table.label:
+        group = next(group for group in comparison.groups if any(x is table for x in group))
+        row |= {"p_of_all": comparison.p_of_all(table), "same_bins": [x.name for x in group if x is not table]}
+    for key in ("low", "high", "mean", "mean_sigma", "rms", "rms_sigma", "p_value"):
+        row[key] = getattr(table, key).tolist()
+    return row | {"count": table.count.astype(int).tolist(), "views": table.views.astype(int).tolist()}

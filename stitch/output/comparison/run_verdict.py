@@ -6,7 +6,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stitch.numerics.units import length_text
-from stitch.output.comparison.disagreement_field import DisagreementField, ModelHistory, effect_changes
+from stitch.output.comparison.disagreement_field import DisagreementField
+from stitch.output.comparison.model_history import ModelHistory, effect_changes
 from stitch.run_data import RunData, doubt_headline
 
 # What a run found in one sentence that everybody on the shop floor understands, and how it stands to a tolerance.

@@ -12,7 +12,7 @@ from stitch.numerics import frames
 from stitch.numerics.distributions import chi2_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.units import length_text
-from stitch.output.comparison.disagreement_field import ModelHistory, model_history
+from stitch.output.comparison.model_history import ModelHistory, model_history
 from stitch.run_data import RunData
 from stitch.session.reading.session_folder import UNKNOWN, session_hash
 
@@ -28,8 +28,16 @@ class ComparedRun:
 
     name: str  # of its folder
     run: RunData
-    history: ModelHistory | None  # None without clouds
-    data: str  # hash of its session
+
+    @property
+    def history(self) -> ModelHistory | None:
+        """The history of its model; None without clouds."""
+        return model_history(self.run)
+
+    @cached_property
+    def data(self) -> str:
+        """Hash of its session."""
+        return session_hash(self.run.session)
 
     @property
     def error(self) -> float:
@@ -83,26 +91,19 @@ def compare_runs(runs: Sequence[RunData], names: Sequence[str]) -> TwoRuns:
     Raises:
         InputError: their numbers mean different things: unit, mount, or surfaces against labelled points.
     """
-    a, b = runs
-    for what, of_a, of_b in (
-        ("length_unit", a.session.length_unit, b.session.length_unit),
-        ("mount", a.session.mount, b.session.mount),
-        ("what the views show", _seen_points(a), _seen_points(b)),
+    a, b = (ComparedRun(name, run) for name, run in zip(names, runs, strict=True))
+    for what, asked in (
+        ("length_unit", lambda run: run.session.length_unit),
+        ("mount", lambda run: run.session.mount),
+        ("what the views show", lambda run: "labelled points alone" if run.registered is None else "surfaces"),
     ):
+        of_a, of_b = asked(a.run), asked(b.run)
         if of_a != of_b:
             raise InputError(
-                f"{names[0]} and {names[1]} cannot be compared: {what} is {of_a} in the one and {of_b} in the other; "
+                f"{a.name} and {b.name} cannot be compared: {what} is {of_a} in the one and {of_b} in the other; "
                 "to fix: name two runs of one cell"
             )
-    sides = [
-        ComparedRun(name, run, model_history(run), session_hash(run.session))
-        for name, run in zip(names, runs, strict=True)
-    ]
-    return TwoRuns(*sides)
-
-
-def _seen_points(run: RunData) -> str:
-    return "labelled points alone" if run.registered is None else "surfaces"
+    return TwoRuns(a, b)
 
 
 def hand_eye_change(a: RunData, b: RunData) -> HandEyeChange:
@@ -128,28 +129,29 @@ def hand_eye_change(a: RunData, b: RunData) -> HandEyeChange:
 def comparison_sentence(both: TwoRuns) -> str:
     """Return what changed from A to B, for everybody."""
     unit = both.a.run.session.length_unit
-    off_a, off_b = (length_text(side.error, unit) for side in (both.a, both.b))
-    where = "rms over the labelled points" if both.a.history is None else "on average over the part"
-    told = f"as far as those of A, by {off_a}" if off_a == off_b else f"by {off_b} instead of {off_a}"
-    subject = _effects_difference(both.a.run.effects, both.b.run.effects) + (
-        "" if both.same_data else ", on other data"
-    )
-    seen = "targets" if both.a.history is None else "part"
-    return f"{subject}, the views of B disagree {told}, {where}. {_hand_eye_sentence(both.hand_eye, unit, seen)}."
+    error_a, error_b = (length_text(side.error, unit) for side in (both.a, both.b))
+    labelled = both.a.history is None
+    where = "rms over the labelled points" if labelled else "on average over the part"
+    change = f"as far as those of A, by {error_a}" if error_a == error_b else f"by {error_b} instead of {error_a}"
+    subject = _effects_difference(both.a.run.effects, both.b.run.effects)
+    data = "" if both.same_data else ", on other data"
+    hand_eyes = _hand_eye_sentence(both.hand_eye, unit, "targets" if labelled else "part")
+    return f"{subject}{data}, the views of B disagree {change}, {where}. {hand_eyes}."
 
 
 def _effects_difference(a: Sequence[str], b: Sequence[str]) -> str:
     """Return: With joint_compliance and without backlash in the model."""
-    gained, lost = [e for e in b if e not in a], [e for e in a if e not in b]
+    gained = [effect for effect in b if effect not in a]
+    lost = [effect for effect in a if effect not in b]
     parts = [f"with {' and '.join(gained)}"] * bool(gained) + [f"without {' and '.join(lost)}"] * bool(lost)
-    told = " and ".join(parts) or "with the same effects"
-    return f"{told[0].upper()}{told[1:]} in the model"
+    difference = " and ".join(parts) or "with the same effects"
+    return f"{difference[0].upper()}{difference[1:]} in the model"
 
 
-def _hand_eye_sentence(change: HandEyeChange, length_unit: str, seen: str) -> str:
+def _hand_eye_sentence(change: HandEyeChange, length_unit: str, what: str) -> str:
     if not change.twist.any():
         return "Both have the same hand-eye"
-    apart = f"The hand-eyes put the {seen} {length_text(change.at_part, length_unit)} apart"
+    apart = f"The hand-eyes put the {what} {length_text(change.at_part, length_unit)} apart"
     if np.isnan(change.p_value):
         return f"{apart}; their uncertainty is not stated"
     beyond = "more than" if change.p_value < _CHANCE else "no more than"

@@ -13,4 +13,4 @@ def compared(errors, properties, rms=1.0):
         n = (bins == np.arange(len(edges) - 1)[:, None]) * 1000.0
         statistics = view_statistics(n, n * errors, n * errors**2)
         tables.append(binned_table(name, "deg", edges, statistics))
-    return ResidualTables(tuple(tables), rms, rms)
+    return ResidualTables(tuple(tables), rms)

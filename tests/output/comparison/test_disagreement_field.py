@@ -14,7 +14,8 @@ from stitch.api.pipeline import change, run
 from stitch.numerics import frames
 from stitch.observations.surfaces.matching import sample_points, signed_distances
 from stitch.observations.surfaces.normal_equations import collect_overlaps
-from stitch.output.comparison.disagreement_field import model_history, patches_of
+from stitch.output.comparison.disagreement_field import patches_of
+from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import plain_verdict
 from stitch.output.result_document import result_document
 from stitch.output.run_folder import write_with_page
