@@ -1,8 +1,9 @@
 """A run as one block of text: what was found, how well, what is in the model and what is not."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from textwrap import wrap
 
+from stitch.effects.contract import Parameter
 from stitch.model.model import hand_eye_lines
 from stitch.numerics.units import angle_text, length_text, uncertainty_text
 from stitch.output.comparison.model_history import effect_changes, model_history
@@ -11,7 +12,6 @@ from stitch.run_data import RunData
 
 # Scanners leave a few points in the air beside edges, which is no news.
 _WORTH_A_LINE = 0.005
-
 # Characters of a line of the report.
 _WIDTH = 100
 
@@ -23,22 +23,23 @@ def fit_report(run: RunData, at_part: tuple[float, float]) -> str:
         at_part: U (k = 2) of the hand-eye at the part, mm and mrad.
     """
     session = run.session
-    left = f" of {len(session.views) + len(run.left_out)}" if run.left_out else ""
-    head = f"[[{session.name}]] {len(session.views)}{left} views, {session.mount}, {session.length_unit}"
+    of_all = f" of {len(session.views) + len(run.left_out)}" if run.left_out else ""
     name, *numbers = run_hand_eye_lines(run)
     place, turn = (uncertainty_text(x) if x > 0 else "–" for x in at_part)
-    at = "not known" if run.unknown else f"{place} mm and {turn} mrad"
     parts = [
-        [head, f"  {run_verdict(run, model_history(run))}"],
-        [f"[[Hand-eye]] {name.removeprefix('Hand-eye ')}", *numbers, f"  U at the part {at}"],
-        _part("Errors", _aligned(_errors(run))),
-        _part("Effects", _aligned(_effects(run))),
-        _part("History", _aligned(_history(run))),
-        _part("Not observable", run.unobservable),
-        _part("Left out", [f"{item.view}: {item.why}" for item in run.left_out]),
-        _part("Notes", run.notes),
+        f"[[{session.name}]] {len(session.views)}{of_all} views, {session.mount}, {session.length_unit}",
+        f"  {run_verdict(run, model_history(run))}",
+        f"[[Hand-eye]] {name.removeprefix('Hand-eye ')}",
+        *numbers,
+        f"  U at the part {'not known' if run.unknown else f'{place} mm and {turn} mrad'}",
+        *_part("Errors", _aligned(_errors(run))),
+        *_part("Effects", _aligned((f"{effect}.{p.name}", str(p.formatted)) for effect, p in _fitted(run))),
+        *_part("History", _aligned(_history(run))),
+        *_part("Not observable", run.unobservable),
+        *_part("Left out", [f"{item.view}: {item.why}" for item in run.left_out]),
+        *_part("Notes", run.notes),
     ]
-    return "\n".join(line for part in parts for line in part)
+    return "\n".join(parts)
 
 
 def run_hand_eye_lines(run: RunData) -> list[str]:
@@ -56,39 +57,36 @@ def run_hand_eye_lines(run: RunData) -> list[str]:
 def report_rows(run: RunData) -> list[tuple[str, str]]:
     """Return names and values: errors, of every model so far on views left out, noise, scatter, fitted effects."""
     (_, heldout), (_, inside), (_, noise), scatter = _errors(run)
-    parameters = {
-        term.name: ", ".join(f"{p.name} = {p.formatted}" for p in term.parameters if p.fitted or p.grid)
-        for term in run.terms
-    }
-    return [
+    amounts: dict[str, list[str]] = {}
+    for effect, p in _fitted(run):
+        amounts.setdefault(effect, []).append(f"{p.name} = {p.formatted}")
+    rows = [
         ("error on views left out", ", ".join(f"{model} {text}" for model, text in _history(run)) or heldout),
         ("error in the fit", inside),
         ("sensor's noise alone", noise),
         scatter,
-        *((name, text) for name, text in parameters.items() if text),
-        *([("points left out of the cloud", _unsupported(run))] if run.fit.unsupported.share > _WORTH_A_LINE else []),
+        *((effect, ", ".join(texts)) for effect, texts in amounts.items()),
     ]
-
-
-def _unsupported(run: RunData) -> str:
     dropped = run.fit.unsupported
-    alone, through = (n / dropped.points for n in (dropped.alone, dropped.looked_through))
-    return f"{dropped.share:.1%} ({alone:.1%} on no surface, {through:.1%} where other views look past)"
+    if dropped.share > _WORTH_A_LINE:
+        alone = f"{dropped.alone / dropped.points:.1%} on no surface"
+        through = f"{dropped.looked_through / dropped.points:.1%} where other views look past"
+        rows.append(("points left out of the cloud", f"{dropped.share:.1%} ({alone}, {through})"))
+    return rows
 
 
 def _part(heading: str, lines: Sequence[str]) -> list[str]:
-    if not lines:
-        return []
-    wrapped = (wrap(line, _WIDTH, initial_indent="  ", subsequent_indent="    ") for line in lines)
-    return [f"[[{heading}]]", *(row for rows in wrapped for row in rows)]
+    """Return a heading and its lines, wrapped; nothing without lines."""
+    wrapped = [wrap(line, _WIDTH, initial_indent="  ", subsequent_indent="    ") for line in lines]
+    return [f"[[{heading}]]", *(row for rows in wrapped for row in rows)] if lines else []
 
 
-def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
+def _aligned(rows: Iterable[tuple[str, str]]) -> list[str]:
     return [f"{name + ':':<30}{text}" for name, text in rows]
 
 
 def _errors(run: RunData) -> list[tuple[str, str]]:
-    """Residuals, noise and the scatter of the poses."""
+    """Return residuals, noise and the scatter of the poses."""
     unit, scatter = run.session.length_unit, run.repeatability
     return [
         ("on views left out", length_text(run.heldout_rms, unit)),
@@ -98,17 +96,14 @@ def _errors(run: RunData) -> list[tuple[str, str]]:
     ]
 
 
-def _effects(run: RunData) -> list[tuple[str, str]]:
-    """Parameters that were fitted or tried."""
-    return [
-        (f"{term.name}.{p.name}", str(p.formatted)) for term in run.terms for p in term.parameters if p.fitted or p.grid
-    ]
+def _fitted(run: RunData) -> list[tuple[str, Parameter]]:
+    """Return parameters that were fitted or tried, with the names of their effects."""
+    return [(term.name, p) for term in run.terms for p in term.parameters if p.fitted or p.grid]
 
 
 def _history(run: RunData) -> list[tuple[str, str]]:
-    """Every step of the model, where there are several, with its error on views left out."""
-    steps = run.ledger if len(run.ledger) > 1 else ()
-    return [
-        (effect_changes(run.ledger, i), length_text(s.heldout_rms, run.session.length_unit))
-        for i, s in enumerate(steps)
-    ]
+    """Return every step of the model, where there are several, with its error on views left out."""
+    if len(run.ledger) < 2:
+        return []
+    unit = run.session.length_unit
+    return [(effect_changes(run.ledger, i), length_text(s.heldout_rms, unit)) for i, s in enumerate(run.ledger)]

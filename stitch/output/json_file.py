@@ -1,4 +1,7 @@
-"""JSON without NaN, written whole or not at all."""
+"""JSON without NaN, written whole or not at all, and what in a run folder is the run's and may be replaced.
+
+Everything else there is a person's own.
+"""
 
 import json
 from collections.abc import Sequence
@@ -10,8 +13,6 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.session.reading.text_files import read_json_object
 from stitch.system.files import Ours, whole_file
-
-# What in a run folder is the run's, and may be replaced; everything else there is a person's own.
 
 # Of result.json.
 FORMAT = "stitch-run/1"
@@ -58,7 +59,7 @@ _PICTURES = {
 
 
 def is_run_file(path: Path) -> Ours:
-    """Whether a path inside the run folder `path` was written by stitch."""
+    """Return whether a path inside the run folder `path` was written by stitch."""
     inner = set(_runs_of_rig(path))
 
     def is_ours(inside: Path) -> bool:
@@ -77,15 +78,12 @@ def is_run_file(path: Path) -> Ours:
 
 
 def sessions_in(path: Path) -> list[str] | None:
-    """Paths of the sessions of a run folder as it states them; None for a folder that is no run."""
+    """Return paths of the sessions of a run folder as it states them; None for a folder that is no run."""
     if not path.is_dir() or (path / "session.toml").exists() or not (path / "model.toml").is_file():
         return None
-    told = [
-        _session_path(file)
-        for file in (path / "result.json", *(path / name / "result.json" for name in _runs_of_rig(path)))
-    ]
-    found = [session for session in told if session is not None]
-    return found or None
+    folders = (path, *(path / name for name in _runs_of_rig(path)))
+    sessions = [_session_path(folder / "result.json") for folder in folders]
+    return [session for session in sessions if session is not None] or None
 
 
 def require_free(path: Path, sessions: Sequence[Path], force: bool) -> None:
@@ -98,31 +96,31 @@ def require_free(path: Path, sessions: Sequence[Path], force: bool) -> None:
     target, here = path.resolve(), Path.cwd()
     if target in (here, *here.parents):
         raise InputError(f"{path}: one stands in this folder, and a run replaces it; name another with -o")
-    own = [session.resolve() for session in sessions]
+    read = [session.resolve() for session in sessions]
     for folder in (target, *target.parents):
-        if folder in own or (folder / "session.toml").is_file():
+        if folder in read or (folder / "session.toml").is_file():
             raise InputError(f"{path}: lies in the session {folder}, which is only read; name another folder with -o")
-    for session in own:
+    for session in read:
         if target in session.parents:
             raise InputError(f"{path}: the session {session} lies in it; name another folder with -o")
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
     if (before := sessions_in(target)) is None:
         raise InputError(f"{path}: exists and is not a run folder; name another with -o")
-    if not force and {str(Path(s).resolve()) for s in before} != {str(s) for s in own}:
+    if not force and {str(Path(s).resolve()) for s in before} != {str(s) for s in read}:
         raise InputError(
             f"{path}: holds the run of {', '.join(before)}; name another with -o, or replace it with --force"
         )
 
 
 def others_of_rig(run: Path) -> list[str]:
-    """Names of the runs that one rig's folder holds beside a run."""
-    own = run.resolve()
-    return [name for name in _runs_of_rig(own.parent) if name != own.name]
+    """Return names of the runs that one rig's folder holds beside a run."""
+    folder = run.resolve()
+    return [name for name in _runs_of_rig(folder.parent) if name != folder.name]
 
 
 def _runs_of_rig(path: Path) -> list[str]:
-    """Names of the runs in the folder of a rig, which has no result of its own."""
+    """Return names of the runs in the folder of a rig, which has no result of its own."""
     if not path.is_dir() or (path / "result.json").exists() or not (path / "model.toml").is_file():
         return []
     return sorted(file.parent.name for file in path.glob("*/result.json") if _session_path(file) is not None)
@@ -141,7 +139,7 @@ def write_json(document: Any, path: Path) -> None:
 
 
 def to_json(document: Any) -> str:
-    """JSON text; JSON has no NaN and no infinity: what is not known is null."""
+    """Return JSON text; JSON has no NaN and no infinity: what is not known is null."""
     return json.dumps(_without_nan(document), indent=1, allow_nan=False)
 
 

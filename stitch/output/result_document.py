@@ -220,6 +220,11 @@ def _target_rows(run: RunData) -> list[dict[str, Any]]:
     ]
 
 
+def _target_distances(run: RunData) -> Array:
+    assert run.targets is not None
+    return run.targets.rows.distances(run.targets.rows.residual)
+
+
 def _sizes(distances: Array) -> dict[str, float]:
     known = distances[np.isfinite(distances)]
     return {"mean": float(known.mean()), "median": float(np.median(known)), "max": float(known.max())}
@@ -248,17 +253,11 @@ def _labelled_beside_clouds(run: RunData) -> bool:
 def _all_views(run: RunData) -> list[ViewRow]:
     """Return all views of the session in their order; those that were left out stand between those that are fused."""
     rows = {
-        int(place): ViewRow(
-            run.session.views[v].name,
-            run.poses[v],
-            run.corrections[v],
-            float(run.view_rms[v]),
-            points_of(run.session.views[v]),
-        )
-        for v, place in enumerate(run.measurement.views.number)
+        int(place): ViewRow(view.name, run.poses[v], run.corrections[v], float(run.view_rms[v]), points_of(view))
+        for v, (view, place) in enumerate(zip(run.session.views, run.measurement.views.number, strict=True))
     }
-    free = (place for place in range(len(rows) + len(run.left_out)) if place not in rows)
-    for place, item in zip(list(free), run.left_out, strict=True):
+    free = [place for place in range(len(rows) + len(run.left_out)) if place not in rows]
+    for place, item in zip(free, run.left_out, strict=True):
         rows[place] = ViewRow(item.view, item.pose, np.zeros(6), None, item.points)
     return [rows[place] for place in sorted(rows)]
 
@@ -331,23 +330,22 @@ _LINKAGE = Document(
 _UNSUPPORTED = Document(*(Key(name, COUNT, optional=True) for name in ("points", "alone", "looked_through")))
 _COVARIANCE = Document(Key("parameters", TEXTS, "names"), Key("matrix", Kind(list_of(list_of(NUMBER)).schema)))
 _OUTLIER = Document(Key("view", TEXT), Key("target", Kind({"type": ["string", "null"]})))
+_DISAGREEMENT = Kind({"type": ["object", "null"], "properties": {"gate": NUMBER.schema}})
+_PATH = Kind({"type": "string", "pattern": "^[^\\u0000]+$", "maxLength": 4000})
+_SIZES = Kind({"type": "object"}, _sizes)
 _NUMBERS = Kind(list_of(NUMBER_OR_NULL).schema, read=lambda values: [number(value) for value in values])
 # Lengths in length_unit, angles in rad; twists and covariances rotation first.
 RESULT = Document(
     Key("format", write=lambda run: FORMAT),
-    Key(
-        "session",
-        Kind({"type": "string", "pattern": "^[^\\u0000]+$", "maxLength": 4000}),
-        write=lambda run: str(run.session.path.resolve()),
-    ),
-    Key("name", write=lambda run: run.session.name),
-    Key("length_unit", write=lambda run: run.session.length_unit),
-    Key("mount", write=lambda run: run.session.mount),
+    Key("session", _PATH, write=lambda run: str(run.session.path.resolve())),
+    Key("name", attribute="session.name"),
+    Key("length_unit", attribute="session.length_unit"),
+    Key("mount", attribute="session.mount"),
     Key("reference_frame", write=lambda run: "flange" if run.session.mount == "eye_to_hand" else "base"),
     Key("hand_eye", MATRIX, "T_mount"),
-    Key("hand_eye_coarse", field="T_mount_coarse"),
+    Key("hand_eye_coarse", attribute="T_mount_coarse"),
     Key("hand_eye_sigma", write=lambda run: np.sqrt(np.diag(run.mount_covariance))),
-    Key("hand_eye_covariance", field="mount_covariance"),
+    Key("hand_eye_covariance", attribute="mount_covariance"),
     Key("unobservable", TEXTS, of=Fit),
     Key("hand_eye_unknown", TEXTS, "unknown", of=Fit, optional=True),
     Key("hand_eye_stated", write=lambda run: run.session.scanner.T_mount is not None),
@@ -357,40 +355,19 @@ RESULT = Document(
     Key("noise_floor", NUMBER, of=RunData),
     Key("repeatability", _SCATTER.kind(partial(Repeatability, noise_factor=float("nan"))), of=Fit),
     Key("effects", table_of(table_of(_PARAMETER)), write=_effect_rows),
-    Key("effects_covariance", _COVARIANCE.kind(), write=lambda run: run.model.effects_covariance, optional=True),
+    Key("effects_covariance", _COVARIANCE.kind(), "model.effects_covariance", optional=True),
     Key("views", _VIEWS, write=_all_views),
     Key("left_out", _LEFT_OUT.rows(), optional=True),
     Key("linkage", _LINKAGE.kind(ViewLinks), "links", of=RunData, optional=True),
-    Key(
-        "unsupported_points",
-        _UNSUPPORTED.kind(Unsupported),
-        "unsupported",
-        of=Fit,
-        write=lambda run: run.fit.unsupported,
-        optional=True,
-    ),
+    Key("unsupported_points", _UNSUPPORTED.kind(Unsupported), "fit.unsupported", of=Fit, optional=True),
     Key("targets", write=_target_rows),
-    Key(
-        "position_error",
-        write=lambda run: _sizes(run.targets.rows.distances(run.targets.rows.residual)),
-        when=_labelled,
-    ),
+    Key("position_error", _SIZES, write=_target_distances, when=_labelled),
     Key("outliers", Kind(list_of(_OUTLIER.kind()).schema), write=_outlier_rows, when=_labelled),
-    Key(
-        "cloud_noise_factor",
-        NUMBER,
-        write=lambda run: run.measurement.capture.noise_factor,
-        when=_labelled_beside_clouds,
-    ),
+    Key("cloud_noise_factor", NUMBER, "measurement.capture.noise_factor", when=_labelled_beside_clouds),
     Key("rms_of", write=lambda run: "3D distances of the targets from their place", when=_labelled_alone),
-    Key("heldout_position_error", write=lambda run: _sizes(run.targets.heldout), when=_labelled_alone),
+    Key("heldout_position_error", _SIZES, "targets.heldout", when=_labelled_alone),
     Key("convergence", table_of(_NUMBERS), of=Fit),
-    Key(
-        "disagreement",
-        Kind({"type": ["object", "null"], "properties": {"gate": NUMBER.schema}}),
-        write=_disagreement,
-        optional=True,
-    ),
+    Key("disagreement", _DISAGREEMENT, write=_disagreement, optional=True),
     Key("plain", write=lambda run: run_verdict(run, model_history(run))),
     Key("verdict", TEXT, of=Fit),
     Key("doubts", TEXTS, of=RunData, optional=True),

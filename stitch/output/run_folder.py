@@ -13,7 +13,7 @@ from importlib.metadata import entry_points, version
 from itertools import chain
 from pathlib import Path
 from threading import Thread
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -27,12 +27,18 @@ from stitch.output.result_document import ledger, model_of, residual_columns, re
 from stitch.recorder import Recorder
 from stitch.run_data import FusedCloud, RunData
 from stitch.session.reading.session_folder import measured_files
-from stitch.session.session import SessionData, View
+from stitch.session.session import SessionData
 from stitch.system.files import claim_folder, rewrite_folder
 from stitch.system.ply_file import ply_header
 from stitch.system.threads import release_mapped
 
-# Recordings of a run, made by the packages that offer one.
+# Rows that are in memory at a time.
+_ROWS = 1_000_000
+_PLACE = ("x", "y", "z", "nx", "ny", "nz")
+_NUMBERS = (*_PLACE, "residual", "heldout")
+_RESERVED_COLUMNS = {"view", "partner", *_NUMBERS, "time_s"}
+# Fits that a run has had are kept by links; beyond so many bytes the oldest go.
+_KEPT_BYTES = 1e9
 
 
 def recordings(folder: Path) -> list[Recorder]:
@@ -40,22 +46,12 @@ def recordings(folder: Path) -> list[Recorder]:
     return [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]
 
 
-# stitched.ply and residuals.parquet.
-
-_Value = TypeVar("_Value")
-
-# Rows that are in memory at a time.
-_ROWS = 1_000_000
-_PLACE = ("x", "y", "z", "nx", "ny", "nz")
-_RESERVED_COLUMNS = {"view", "partner", *_PLACE, "residual", "heldout", "time_s"}
-
-
 def write_cloud(cloud: FusedCloud, path: Path) -> None:
-    """Binary PLY with normals, `residual` and `views`, how many support a point.
+    """Write binary PLY with normals, `residual` and `views`, how many support a point.
 
     Of a cloud in a file never more than a part is in memory.
     """
-    names = ("x", "y", "z", "nx", "ny", "nz", "residual")
+    names = (*_PLACE, "residual")
     layout = np.dtype([(name, "<f4") for name in names] + [("views", "<u2")])
     with path.open("wb") as out:
         out.write(ply_header({"vertex": (layout, len(cloud.points))}))
@@ -77,7 +73,7 @@ def write_residuals(run: RunData, path: Path) -> None:
 
     table = residual_table(run)
     # Of numbers that never repeat a dictionary takes four times as long as they do, and more room.
-    repeated = [name for name in table.column_names if name not in (*_PLACE, "residual", "heldout")]
+    repeated = [name for name in table.column_names if name not in _NUMBERS]
     pq.write_table(table, path, compression="zstd", use_dictionary=repeated)
 
 
@@ -97,54 +93,54 @@ def residual_table(run: RunData) -> Any:
         parts.append(residual_columns(run.targets, session))
     # Beside clouds, labelled points have the columns of these.
     common = [key for key in (parts or [{}])[0] if all(key in part for part in parts)]
-    columns = {key: [part[key] for part in parts] for key in common}
-    return pa.table({key: _joined(pa, own) for key, own in columns.items()})
+    return pa.table({key: _joined(pa, [part[key] for part in parts]) for key in common})
 
 
 def _joined(pa: Any, parts: Sequence[Array]) -> Any:
-    """One column of parts; of names that are the same all over a part each is encoded once."""
+    """Return one column of parts; of names that are the same all over a part each is encoded once."""
     if not parts or parts[0].dtype.kind != "U":
         return pa.array(np.concatenate(parts))
     encoded = [
-        pa.array(own).dictionary_encode()
-        if own.strides[0]
-        else pa.DictionaryArray.from_arrays(np.zeros(len(own), np.int32), own[:1])
-        for own in parts
+        pa.array(names).dictionary_encode()
+        if names.strides[0]
+        else pa.DictionaryArray.from_arrays(np.zeros(len(names), np.int32), names[:1])
+        for names in parts
     ]
     return pa.chunked_array(encoded).unify_dictionaries().combine_chunks()
 
 
 def _without_reserved_covariates(session: SessionData) -> SessionData:
-    """The session without covariates that would take the place of a column."""
+    """Return the session without covariates that would take the place of a column."""
 
-    def free(values: dict[str, _Value]) -> dict[str, _Value]:
+    def free(values: dict[str, Any]) -> dict[str, Any]:
         return {f"covariate_{key}" if key in _RESERVED_COLUMNS else key: value for key, value in values.items()}
 
-    def renamed(view: View) -> View:
+    views = []
+    for view in session.views:
         cloud = None if view.cloud is None else replace(view.cloud, scalars=free(view.cloud.scalars))
-        return replace(view, covariates=free(view.covariates), cloud=cloud)
-
-    return replace(session, views=tuple(renamed(view) for view in session.views))
+        views.append(replace(view, covariates=free(view.covariates), cloud=cloud))
+    return replace(session, views=tuple(views))
 
 
 def _columns(session: SessionData, m: Match, of_views: Iterable[str], of_points: Iterable[str]) -> dict[str, Array]:
-    """Columns of one pair of views, a row per correspondence."""
+    """Return columns of one pair of views, a row per correspondence."""
     size = len(m.residual)
-    own, time = session.views[m.v].covariates, session.views[m.v].time_s
-    out = {
-        name: np.broadcast_to(np.array(session.views[v].name), size) for name, v in (("view", m.v), ("partner", m.w))
+    view, partner = session.views[m.v], session.views[m.w]
+    columns = {
+        "view": np.broadcast_to(np.array(view.name), size),
+        "partner": np.broadcast_to(np.array(partner.name), size),
+        **dict(zip(_PLACE, (*m.middle.T, *m.normal.T), strict=True)),
+        "residual": m.residual,
+        "time_s": np.full(size, np.nan if view.time_s is None else view.time_s),
+        **{key: np.full(size, view.covariates.get(key, np.nan)) for key in sorted(of_views)},
     }
-    out |= dict(zip(_PLACE, (*m.middle.T, *m.normal.T), strict=True))
-    out |= {"residual": m.residual, "time_s": np.full(size, np.nan if time is None else time)}
-    out |= {key: np.full(size, own.get(key, np.nan)) for key in sorted(of_views)}
     for key in sorted(of_points):
-        for name, v, index in ((key, m.v, m.index_v), (f"partner_{key}", m.w, m.index_w)):
-            cloud = session.views[v].cloud
-            if cloud is not None and key in cloud.scalars:
-                out[name] = cloud.scalars[key][index]
+        for name, side, index in ((key, view, m.index_v), (f"partner_{key}", partner, m.index_w)):
+            if side.cloud is not None and key in side.cloud.scalars:
+                columns[name] = side.cloud.scalars[key][index]
             else:
-                out.setdefault(name, np.full(size, np.nan))
-    return out
+                columns.setdefault(name, np.full(size, np.nan))
+    return columns
 
 
 @contextmanager
@@ -176,12 +172,6 @@ def replace_run_files(path: Path) -> Iterator[Path]:
             _keep_fit(path, scratch)
 
 
-# Fits that a run has had, kept by links: the way back to one takes no fit.
-
-# All that are kept; beyond it the oldest go.
-_KEPT_BYTES = 1e9
-
-
 def restore_fit(path: Path, effects: Collection[str], recording: bool) -> bool:
     """Give a run the fit with these effects that it has had before, as a further step of its ledger.
 
@@ -196,25 +186,28 @@ def restore_fit(path: Path, effects: Collection[str], recording: bool) -> bool:
     with lock_run_folder(path), replace_run_files(path) as scratch:
         # No links: who edits model.toml where it stands would edit the kept one.
         shutil.copytree(kept, scratch, dirs_exist_ok=True)
-        steps, earlier = (json.loads((at / "ledger.json").read_text(encoding="utf-8")) for at in (path, kept))
-        again = {key: told for key, told in earlier[-1].items() if key != "notes"} | {"step": len(steps)}
-        write_json([*steps, again], scratch / "ledger.json")
+        steps = json.loads((path / "ledger.json").read_text(encoding="utf-8"))
+        step = json.loads((kept / "ledger.json").read_text(encoding="utf-8"))[-1] | {"step": len(steps)}
+        step.pop("notes", None)
+        write_json([*steps, step], scratch / "ledger.json")
     return True
 
 
 def _place_of_fit(path: Path, effects: Collection[str]) -> Path | None:
-    """Return where the fit of a run's session with these effects is kept; None where the session or the model is not
-    what was fitted, and for effects of a user's own file, which may change."""
+    """Return where the fit of a run's session with these effects is kept.
+
+    None where the session or the model is not what was fitted, and for effects of a user's own file, which may change.
+    """
     try:
         session = Path(json.loads((path / "result.json").read_text(encoding="utf-8"))["session"])
-        fitted, own = (path / "result.json").stat().st_mtime_ns, (path / "model.toml").stat().st_mtime_ns
-        marks = [
-            (file.name, told.st_size, told.st_mtime_ns) for file in measured_files(session) for told in [file.stat()]
-        ]
-        known = {effect.name for effect in EFFECTS.values() if effect.tier != "user"}
+        fitted = (path / "result.json").stat().st_mtime_ns
+        edited = (path / "model.toml").stat().st_mtime_ns
+        files = [(file.name, file.stat()) for file in measured_files(session)]
     except (OSError, ValueError, LookupError, csv.Error):
         return None
-    if max(own, *(time for _, _, time in marks)) > fitted or not known.issuperset(effects):
+    marks = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in files]
+    known = {effect.name for effect in EFFECTS.values() if effect.tier != "user"}
+    if max(edited, *(time for _, _, time in marks)) > fitted or not known.issuperset(effects):
         return None
     made_of = json.dumps([version("stitch"), sorted(effects), marks])
     return path / FITS / hashlib.sha256(made_of.encode()).hexdigest()[:16]
@@ -280,15 +273,13 @@ def write_with_page(run: RunData, folder: Path, tolerance: float | None = None) 
     """
     # The page, which takes longest, is made while all else is written.
     with ThreadPoolExecutor(2) as beside:
-        begun = [
-            beside.submit(call_entry_points, "stitch.reports", run, folder / "report.html", tolerance),
-            beside.submit(_write_points, run, folder),
-        ]
+        page = beside.submit(call_entry_points, "stitch.reports", run, folder / "report.html", tolerance)
+        points = beside.submit(_write_points, run, folder)
         write_model(model_of(run), folder / "model.toml")
         write_json(result_document(run), folder / "result.json")
         write_json(ledger(run), folder / "ledger.json")
-        for written in begun:
-            written.result()
+        page.result()
+        points.result()
 
 
 def _write_points(run: RunData, folder: Path) -> None:

@@ -7,6 +7,7 @@ import json
 import shlex
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,9 +83,9 @@ class Key(NamedTuple):
 
     name: str
     kind: Kind = ANYTHING
-    field: str = ""  # that it fills when it is read, if that is called otherwise
+    attribute: str = ""  # of the source, a.b, if that is called otherwise; when it is read, it fills the field b
     of: type | None = None  # whose field that is, where a document fills several
-    write: Callable[[Any], Any] | None = None  # what is written of the source; by default the attribute of that name
+    write: Callable[[Any], Any] | None = None  # what is written of the source in place of its attribute
     when: Callable[[Any], Any] | None = None  # of the source: else it is not written
     optional: bool = False  # earlier versions lack it
 
@@ -108,7 +109,7 @@ class Document:
     def write(self, source: Any) -> dict[str, Any]:
         """Return the document of its source."""
         return {
-            key.name: key.kind.write(key.write(source) if key.write else getattr(source, key.field or key.name))
+            key.name: key.kind.write((key.write or attrgetter(key.attribute or key.name))(source))
             for key in self.keys
             if key.when is None or key.when(source)
         }
@@ -116,7 +117,7 @@ class Document:
     def fields(self, document: dict[str, Any], of: type | None = None) -> dict[str, Any]:
         """Return what a document fills of a class, by the names of its fields."""
         return {
-            key.field or key.name: key.kind.read(document[key.name])
+            (key.attribute or key.name).rpartition(".")[2]: key.kind.read(document[key.name])
             for key in self.keys
             if key.of is of and key.kind is not ANYTHING and (key.name in document or not (key.optional or key.when))
         }

@@ -74,7 +74,7 @@ class DisagreementField:
 
 
 def full_colour_distance(field: DisagreementField) -> float:
-    """Return the distance at which colours are full: no step of them is smaller than the standard error of nearly all patches."""
+    """Return the distance at which colours are full: their steps are no smaller than nearly all standard errors."""
     return max(field.quantile(), COLOUR_STEPS * largest_standard_error(field.sigma))
 
 
