@@ -1,11 +1,11 @@
 """The commands of `stitch`: those of the core, and those of plug-ins, by the entry-point group `stitch.commands`.
 
 A command is imported when it is asked for, and a list of all reads what they are for from their source: nobody waits
-for the libraries of all.
+for the libraries of all. Modules of commands import libraries where they use them, so that --help stays fast.
 """
 
 import ast
-from collections.abc import Iterator, MutableMapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -38,7 +38,7 @@ _ORDER = (
 )
 
 
-class Commands(MutableMapping[str, Any]):
+class Commands(Mapping[str, Any]):
     """Name to command, loaded at first use."""
 
     def __init__(self) -> None:
@@ -51,12 +51,6 @@ class Commands(MutableMapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         return self._load(self._entries[name])
 
-    def __setitem__(self, name: str, command: Any) -> None:
-        raise TypeError("commands are added through the entry-point group stitch.commands")
-
-    def __delitem__(self, name: str) -> None:
-        del self._entries[name]
-
     def __iter__(self) -> Iterator[str]:
         return iter(self._entries)
 
@@ -64,21 +58,21 @@ class Commands(MutableMapping[str, Any]):
         return len(self._entries)
 
     def unloaded(self) -> dict[str, TyperCommand]:
-        """All of them by name with what they are for, as a list shows them; only what does not say so is loaded."""
-        told = {name: command_help(entry) for name, entry in self._entries.items()}
-        return {name: TyperCommand(name, help=text) if text else self[name] for name, text in told.items()}
+        """Return all by name with what they are for, as a list shows them; only what does not say so is loaded."""
+        texts = {name: command_help(entry) for name, entry in self._entries.items()}
+        return {name: TyperCommand(name, help=text) if text else self[name] for name, text in texts.items()}
 
 
 def _load_command(entry: EntryPoint) -> Any:
-    """The command behind an entry; a `typer.Typer` is a group of commands."""
-    found = entry.load()
-    if not isinstance(found, typer.Typer):
-        alone = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-        alone.command(entry.name, cls=Command)(
-            stdout_for_results(found) if entry.value in _CORE_COMMANDS.values() else found
-        )
-        found = alone
-    command = typer.main.get_command(found)
+    """Return the command behind an entry; a `typer.Typer` is a group of commands."""
+    loaded = entry.load()
+    if isinstance(loaded, typer.Typer):
+        group = loaded
+    else:
+        group = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+        is_core = entry.value in _CORE_COMMANDS.values()
+        group.command(entry.name, cls=Command)(stdout_for_results(loaded) if is_core else loaded)
+    command = typer.main.get_command(group)
     command.name = entry.name
     return command
 
@@ -89,16 +83,15 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
         """Give an option that stands alone the value `open`: what follows it is not its own."""
         values = {
-            name: tuple(told[1:-1].split("|"))
+            name: metavar[1:-1].split("|")
             for option in self.params
-            if (told := option.metavar or "").startswith("[") and option.param_type_name == "option"
+            if (metavar := option.metavar or "").startswith("[") and option.param_type_name == "option"
             for name in option.opts
         }
-        return super().parse_args(ctx, [_with_value(arg, after, values) for arg, after in pairwise([*args, ""])])
-
-
-def _with_value(argument: str, after: str, values: dict[str, tuple[str, ...]]) -> str:
-    return f"{argument}=open" if after not in values.get(argument, (after,)) else argument
+        given = [
+            f"{arg}=open" if arg in values and after not in values[arg] else arg for arg, after in pairwise([*args, ""])
+        ]
+        return super().parse_args(ctx, given)
 
 
 class CommandGroup(TyperGroup):
@@ -109,7 +102,7 @@ class CommandGroup(TyperGroup):
         self.commands: Any = Commands()
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """The list of commands, without waiting for the libraries of all."""
+        """Write the list of commands, without waiting for the libraries of all."""
         loaded, self.commands = self.commands, self.commands.unloaded()
         try:
             super().format_help(ctx, formatter)
@@ -117,7 +110,7 @@ class CommandGroup(TyperGroup):
             self.commands = loaded
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """Names alone: whoever presses the tab key does not wait for the libraries of all commands."""
+        """Complete names alone: whoever presses the tab key does not wait for the libraries of all commands."""
         loaded, self.commands = self.commands, {name: TyperCommand(name) for name in self.commands}
         try:
             return super().shell_complete(ctx, incomplete)
@@ -126,7 +119,7 @@ class CommandGroup(TyperGroup):
 
 
 def command_help(entry: EntryPoint) -> str | None:
-    """The docstring of the function behind an entry, or the `help` of a group of commands; None where it is neither."""
+    """Return the docstring of the function behind an entry, or the `help` of a group of commands; None of anything else."""
     try:
         source = _module_source(entry.module)
         if (start := source.find(f"\ndef {entry.attr}(")) >= 0:
@@ -146,7 +139,7 @@ def command_help(entry: EntryPoint) -> str | None:
 
 
 def _module_source(module: str) -> str:
-    """Source of a module; the packages above it are not imported."""
+    """Return the source of a module; the packages above it are not imported."""
     top, *inner = module.split(".")
     spec = find_spec(top)
     for folder in (spec.submodule_search_locations or ()) if spec else ():

@@ -30,9 +30,9 @@ _MIN_VIEWS_AT_END, _MOST_STEPS = 2, 40
 _AS_WELL = 20.0
 # Columns of which less than this share is new beside the model say nothing.
 _NEW_SHARE = 1e-4
-# Courses whose scatter is fitted anew, the clearest, and of more numbers than these (time).
+# Trends whose scatter is fitted anew, the clearest, and of more numbers than these (time).
 _REFITTED, _FEW_NUMBERS, _REFITTED_OF_MANY = 30, 400, 3
-# Fewer values than these are no course; bins that show it.
+# Fewer values than these are no trend; bins that show it.
 _MIN_VALUES, _BINS = 3, 5
 _SAME_VALUE = 1e-9
 
@@ -62,7 +62,7 @@ class FollowedCovariate:
 
 
 @dataclass(frozen=True)
-class _Course:
+class _Trend:
     """One way in which views may follow a covariate."""
 
     covariate: str
@@ -73,60 +73,64 @@ class _Course:
     split: float | None = None  # between the two bins of a step
 
 
-def equally_clear(found: Sequence[FollowedCovariate]) -> tuple[FollowedCovariate, ...]:
+def equally_clear(followed: Sequence[FollowedCovariate]) -> tuple[FollowedCovariate, ...]:
     """Return the clearest covariate and those that explain the displacements as well; () where nothing is clear."""
-    return tuple(own for own in found if own.clear and own.p_value <= _AS_WELL * found[0].p_value)
+    return tuple(x for x in followed if x.clear and x.p_value <= _AS_WELL * followed[0].p_value)
 
 
-def also_clear(found: Sequence[FollowedCovariate]) -> tuple[FollowedCovariate, ...]:
+def also_clear(followed: Sequence[FollowedCovariate]) -> tuple[FollowedCovariate, ...]:
     """Return those that are clear beside the clearest too."""
-    return tuple(own for own in found if own.clear and own.p_beside < FOLLOWS)
+    return tuple(x for x in followed if x.clear and x.p_beside < FOLLOWS)
 
 
 def followed_covariates(linear: LinearModel) -> tuple[FollowedCovariate, ...]:
     """Find what the displacements of whole views follow, clearest first; () where too few numbers are free."""
     linear = linear.restricted(())
-    courses = list(_courses(linear))
-    if not courses:
+    trends = list(_trends(linear))
+    if not trends:
         return ()
-    widths = [course.twists.shape[2] for course in courses]
-    twists = np.concatenate([course.twists.reshape(-1, k) for course, k in zip(courses, widths, strict=True)], axis=1)
-    numbers = np.split(linear.observation.from_twists(twists), np.cumsum(widths)[:-1], axis=1)
-    p_values = _p_values(linear, numbers)
+    widths = [trend.twists.shape[2] for trend in trends]
+    twists = np.concatenate([trend.twists.reshape(-1, k) for trend, k in zip(trends, widths, strict=True)], axis=1)
+    columns = np.split(linear.observation.from_twists(twists), np.cumsum(widths)[:-1], axis=1)
+    p_values = _p_values(linear, columns)
     best: dict[str, int] = {}
     for k in np.argsort(p_values, kind="stable"):
-        best.setdefault(courses[k].covariate, int(k))
+        best.setdefault(trends[k].covariate, int(k))
     first, *others = best.values()
-    beside = dict(
-        zip(others, _p_values(_conditioned(linear, numbers[first]), [numbers[k] for k in others]), strict=True)
+    p_beside = dict(
+        zip(others, _p_values(_conditioned(linear, columns[first]), [columns[k] for k in others]), strict=True)
     )
-    # Each is the likeliest of all that are tried.
+
+    tried = len(trends)  # each is the likeliest of all of them
     return tuple(
         _followed(
             linear,
-            courses[k],
-            numbers[k],
-            (min(len(courses) * p_values[k], 1.0), min(len(courses) * beside.get(k, 1.0), 1.0)),
+            trends[k],
+            columns[k],
+            p_value=min(tried * p_values[k], 1.0),
+            p_beside=min(tried * p_beside.get(k, 1.0), 1.0),
         )
         for k in best.values()
     )
 
 
-def _p_values(linear: LinearModel, numbers: Sequence[Array]) -> list[float]:
-    """Chance of what each of some columns (n, k) explains: of the clearest under the scatter that is left beside them.
+def _p_values(linear: LinearModel, columns: Sequence[Array]) -> list[float]:
+    """Return the chance of what each of some columns (n, k) explains.
+
+    That of the clearest is under the scatter that is left beside them.
 
     What views follow counts as scatter as long as it is not taken out, and hides itself.
     """
-    found = [_p_value(linear, columns) for columns in numbers]
+    p_values = [_p_value(linear, x) for x in columns]
     refitted = _REFITTED if linear.mixed.size <= _FEW_NUMBERS else _REFITTED_OF_MANY
-    for k in np.argsort(found, kind="stable")[:refitted]:
-        scatter = at_variances(linear.mixed, _conditioned(linear, numbers[k]).null.variances)
-        found[k] = _p_value(replace(linear, null=scatter), numbers[k])
-    return found
+    for k in np.argsort(p_values, kind="stable")[:refitted]:
+        scatter = at_variances(linear.mixed, _conditioned(linear, columns[k]).null.variances)
+        p_values[k] = _p_value(replace(linear, null=scatter), columns[k])
+    return p_values
 
 
 def _p_value(linear: LinearModel, columns: Array) -> float:
-    """Chance of what columns (n, k) explain, of a scatter that is known to so many degrees of freedom."""
+    """Return the chance of what columns (n, k) explain, of a scatter that is known to so many degrees of freedom."""
     white = linear.residual(columns)
     U = column_space(white) if np.abs(white).max(initial=0.0) > _SAME_VALUE else white[:, :0]
     if not U.shape[1]:
@@ -136,34 +140,38 @@ def _p_value(linear: LinearModel, columns: Array) -> float:
 
 
 def _conditioned(linear: LinearModel, columns: Array) -> LinearModel:
-    """The model with the combinations of columns (n, k) that it does not explain itself."""
+    """Return the model with the combinations of columns (n, k) that it does not explain itself."""
     white = linear.residual(columns)
     length = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
     _, s, turned = np.linalg.svd(white / length, full_matrices=False)
     keep = s > _NEW_SHARE * s[0]
-    own = (columns / length) @ (turned[keep].T / s[keep])
-    return linear.conditioned_on(own, np.full(int(keep.sum()), np.inf))
+    combined = (columns / length) @ (turned[keep].T / s[keep])
+    return linear.conditioned_on(combined, np.full(int(keep.sum()), np.inf))
 
 
-def _followed(linear: LinearModel, course: _Course, columns: Array, p: tuple[float, float]) -> FollowedCovariate:
-    """The bins of one course along the direction in which what it explains is largest."""
+def _followed(
+    linear: LinearModel, trend: _Trend, columns: Array, *, p_value: float, p_beside: float
+) -> FollowedCovariate:
+    """Return the bins of one trend along the direction in which what it explains is largest."""
     moved = columns @ fit_columns(linear.residual(columns), linear.white_residual)
     held = linear.reduce(linear.design) @ fit_columns(linear.white_design, linear.whiten(moved[:, None])[:, 0])
     direction = np.linalg.svd(linear.observation.part_displacements(moved - held), full_matrices=False)[2][0]
     direction = direction * np.sign(direction[np.abs(direction).argmax()])
-    along, x = linear.view_displacements() @ direction, course.values
+    along = linear.view_displacements() @ direction
+    x = trend.values
     order = np.argsort(x, kind="stable")
-    if course.split is not None:
-        parts = [order[x[order] < course.split], order[x[order] > course.split]]
+    if trend.split is not None:
+        parts = [order[x[order] < trend.split], order[x[order] > trend.split]]
     else:
         parts = [part for part in np.array_split(order, min(_BINS, max(len(x) // 2, 1))) if len(part)]
     spread = float(np.std(along, ddof=1))
     sigmas = [(np.std(along[part], ddof=1) if len(part) > 2 else spread) / np.sqrt(len(part)) for part in parts]
     return FollowedCovariate(
-        course.covariate,
-        course.unit,
-        course.shape,
-        *p,
+        covariate=trend.covariate,
+        unit=trend.unit,
+        shape=trend.shape,
+        p_value=p_value,
+        p_beside=p_beside,
         direction=direction,
         at=np.array([x[part].mean() for part in parts]),
         mean=np.array([along[part].mean() for part in parts]),
@@ -171,9 +179,10 @@ def _followed(linear: LinearModel, course: _Course, columns: Array, p: tuple[flo
     )
 
 
-def _courses(linear: LinearModel) -> Iterator[_Course]:
-    """All ways that are tried."""
-    views, measurement = linear.measurement.views, linear.measurement
+def _trends(linear: LinearModel) -> Iterator[_Trend]:
+    """Give all trends that are tried."""
+    measurement = linear.measurement
+    views = measurement.views
     still = np.broadcast_to(np.eye(6), (views.count, 6, 6))
     to_centre = frames.make(np.eye(3), -linear.observation.centre)
     carried = frames.adjoint(to_centre @ measurement.capture.T_reference_flange)
@@ -182,26 +191,26 @@ def _courses(linear: LinearModel) -> Iterator[_Course]:
         yield from _steps(views, moved)
         for name, unit, values in _slow_covariates(views):
             x = 2 * (values - values.min()) / np.ptp(values) - 1
-            yield _Course(name, unit, "a line", values, moved * x[:, None, None])
-            yield _Course(name, unit, "a bend", values, moved * (1.5 * x**2 - 0.5)[:, None, None])
+            yield _Trend(name, unit, "a line", values, moved * x[:, None, None])
+            yield _Trend(name, unit, "a bend", values, moved * (1.5 * x**2 - 0.5)[:, None, None])
     if views.joints.shape[1] and measurement.robot is not None:
         offset = term_of(measurement, EFFECTS["joint_offset"])
         motions = next(pose_derivatives(measurement, linear.model, [offset], linear.observation.centre))
-        yield from _joint_courses(views, motions)
+        yield from _joint_trends(views, motions)
 
 
-def _steps(views: Views, moved: Array) -> Iterator[_Course]:
-    """From some view on all are displaced alike."""
+def _steps(views: Views, moved: Array) -> Iterator[_Trend]:
+    """Give the trends in which from some view on all are displaced alike."""
     starts = np.arange(_MIN_VIEWS_AT_END, views.count - _MIN_VIEWS_AT_END + 1)
     picked = starts[np.unique(np.linspace(0, len(starts) - 1, min(len(starts), _MOST_STEPS)).astype(int))]
     order = np.arange(views.count, dtype=float)
     for start in picked if len(starts) else ():
         shape = f"a step at view {views.names[views.number[start]]}"
-        yield _Course(VIEW_ORDER, "view", shape, order, moved * (order >= start)[:, None, None], start - 0.5)
+        yield _Trend(VIEW_ORDER, "view", shape, order, moved * (order >= start)[:, None, None], start - 0.5)
 
 
 def _slow_covariates(views: Views) -> Iterator[tuple[str, str, Array]]:
-    """Name, unit and values (V,) of time and all columns of the views that take several values."""
+    """Give name, unit and values (V,) of time and all columns of the views that take several values."""
     known = [("time", "s", views.time)] if views.has("time") else []
     known += [(name, "", values) for name, values in views.covariates.items()]
     for name, unit, values in known:
@@ -209,7 +218,7 @@ def _slow_covariates(views: Views) -> Iterator[tuple[str, str, Array]]:
             yield name, unit, values
 
 
-def _joint_courses(views: Views, motions: Array) -> Iterator[_Course]:
+def _joint_trends(views: Views, motions: Array) -> Iterator[_Trend]:
     """What a joint may be off by: a constant, waves along its angle, its load, the way and how far it came, its speed.
 
     Args:
@@ -218,21 +227,20 @@ def _joint_courses(views: Views, motions: Array) -> Iterator[_Course]:
     q = views.joints
     for k, moved in enumerate(motions[..., None]):
         name, degrees = f"j{k + 1}", np.degrees(q[:, k])
-        yield _Course(name, "deg", "a wrong zero of the joint", degrees, moved)
+        yield _Trend(name, "deg", "a wrong zero of the joint", degrees, moved)
         for periods, words in ((1, "a wave, once a turn"), (2, "a wave, twice a turn")):
             waves = np.stack([np.sin(periods * q[:, k]), np.cos(periods * q[:, k])], axis=1)
-            yield _Course(name, "deg", words, degrees, moved * waves[:, None, :])
-        told = [
+            yield _Trend(name, "deg", words, degrees, moved * waves[:, None, :])
+        carried = [t for t, joint in enumerate(views.torques.joint) if joint == k]
+        known = [
             (f"approach of {name}", "", "a play of the joint", views.approach[:, k].astype(float)),
             (f"last move of {name}", "deg", "a share of the move", np.degrees(q[:, k] - views.previous[:, k])),
+            *((f"torque {views.torques.names[t]}", "N m", "a spring", views.torques.values[:, t]) for t in carried),
         ]
-        own = [t for t, joint in enumerate(views.torques.joint) if joint == k]
-        loads = views.torques.values
-        told += [(f"torque {views.torques.names[t]}", "N m", "a spring", loads[:, t]) for t in own]
-        for covariate, unit, words, values in told:
+        for covariate, unit, words, values in known:
             if np.ptp(values) > _SAME_VALUE:
-                yield _Course(covariate, unit, words, values, moved * values[:, None, None])
+                yield _Trend(covariate, unit, words, values, moved * values[:, None, None])
     if views.velocity is not None and len(motions):
         speed = np.degrees(np.linalg.norm(views.velocity, axis=1))
         late = np.einsum("kvi,vk->vi", motions, views.velocity)[..., None]
-        yield _Course("speed", "deg/s", "a delay", speed, late)
+        yield _Trend("speed", "deg/s", "a delay", speed, late)
