@@ -119,7 +119,7 @@ class CommandGroup(TyperGroup):
 
 
 def command_help(entry: EntryPoint) -> str | None:
-    """Return the docstring of the function behind an entry, or the `help` of a group of commands; None of anything else."""
+    """Return the docstring of the function behind an entry, or the `help` of a group of commands; else None."""
     try:
         source = _module_source(entry.module)
         if (start := source.find(f"\ndef {entry.attr}(")) >= 0:

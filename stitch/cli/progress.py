@@ -58,8 +58,7 @@ def recorder_for(folder: Path, recording: bool) -> Recorder:
     from stitch.output.run_folder import recordings
     from stitch.recorder import RecorderGroup
 
-    lines: list[Recorder] = [ProgressLines()] if os.environ.get(PROGRESS_VARIABLE) == "json" else []
-    return RecorderGroup([Progress(), *lines, *(recordings(folder) if recording else [])])
+    return RecorderGroup([Progress(), *(recordings(folder) if recording else [])])
 
 
 @cache
@@ -195,60 +194,45 @@ def time_left_text(label: str, done: int, total: int, seconds: float) -> str | N
 
 
 class Progress:
-    """A recorder that moves the changing line."""
+    """A recorder that moves the changing line, and prints lines for the program that asks for them.
+
+    Such a line says where the work stands: {"progress": "fit", "iteration": 3, "rms_um": 32.7}.
+    """
 
     def __init__(self) -> None:
-        self.unit = "mm"
+        self._unit = "mm"
+        self._to_um = 1e3
+        self._prints_lines = os.environ.get(PROGRESS_VARIABLE) == "json"
 
     def start(self, session: SessionData) -> None:
         """Name what is being done."""
-        self.unit = session.length_unit
+        from stitch.numerics.units import MICROMETRES
+
+        self._unit = session.length_unit
+        self._to_um = MICROMETRES[session.length_unit]
         live_line().begin(f"{session.name}: {len(session.views)} views, finding the hand-eye")
+        self._print(progress="start", session=session.name, views=len(session.views))
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """Show where the iteration stands."""
+        """Show where the iteration stands; the first is 1."""
         from stitch.numerics.units import length_text
 
         # Labelled points have their partners by name.
-        within = f", partners within {length_text(gate, self.unit)}" if isfinite(gate) else ""
-        live_line().begin(stage, f", iteration {index + 1}: {length_text(rms, self.unit, 4)} rms{within}")
+        within = f", partners within {length_text(gate, self._unit)}" if isfinite(gate) else ""
+        live_line().begin(stage, f", iteration {index + 1}: {length_text(rms, self._unit, 4)} rms{within}")
+        self._print(progress=stage, iteration=index + 1, rms_um=rms * self._to_um)
 
     def stage(self, result: StageResult, poses: Array) -> None:
         """A stage has ended."""
+        self._print(progress=result.name, ended=True, rms_um=result.rms * self._to_um)
 
     def finish(self, run: RunData) -> None:
-        """What follows takes its time too."""
+        """What follows takes its time too: recording and page are written next."""
         live_line().begin(f"{run.session.name}: writing cloud and page")
+        residual, heldout = run.residual_rms * self._to_um, run.heldout_rms * self._to_um
+        self._print(progress="writing", residual_um=residual, heldout_um=heldout)
 
-
-class ProgressLines:
-    """A recorder that prints where the work stands: {"progress": "fit", "iteration": 3, "rms_um": 32.7}."""
-
-    def __init__(self) -> None:
-        self.to_um = 1e3
-
-    def start(self, session: SessionData) -> None:
-        """What is worked on."""
-        from stitch.numerics.units import MICROMETRES
-
-        self.to_um = MICROMETRES[session.length_unit]
-        _print_line(progress="start", session=session.name, views=len(session.views))
-
-    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
-        """One more iteration; the first is 1."""
-        _print_line(progress=stage, iteration=index + 1, rms_um=rms * self.to_um)
-
-    def stage(self, result: StageResult, poses: Array) -> None:
-        """A stage has ended."""
-        _print_line(progress=result.name, ended=True, rms_um=result.rms * self.to_um)
-
-    def finish(self, run: RunData) -> None:
-        """Recording and page are written next."""
-        _print_line(
-            progress="writing", residual_um=run.residual_rms * self.to_um, heldout_um=run.heldout_rms * self.to_um
-        )
-
-
-def _print_line(**facts: Any) -> None:
-    known = {key: value for key, value in facts.items() if value == value}  # JSON has no NaN
-    print(json.dumps(known), file=sys.stderr, flush=True)
+    def _print(self, **facts: Any) -> None:
+        if self._prints_lines:
+            known = {key: value for key, value in facts.items() if value == value}  # JSON has no NaN
+            print(json.dumps(known), file=sys.stderr, flush=True)

@@ -118,12 +118,6 @@ def parameter_row(parameter: Parameter) -> dict[str, Any]:
     return row | ({"view": parameter.view} if parameter.view else {})
 
 
-def ledger_steps(document: list[dict[str, Any]]) -> tuple[LedgerStep, ...]:
-    """Return the history of a model as ledger.json has it."""
-    steps: tuple[LedgerStep, ...] = LEDGER.read(document)
-    return steps
-
-
 def excluded_views(document: dict[str, Any]) -> tuple[ExcludedView, ...]:
     """Return the views that the run of a result left out."""
     rows = {row.view: row for row in view_rows(document)}
@@ -136,8 +130,7 @@ def excluded_views(document: dict[str, Any]) -> tuple[ExcludedView, ...]:
 
 def view_rows(document: dict[str, Any]) -> tuple[ViewRow, ...]:
     """Return all views of a result in their order."""
-    rows: tuple[ViewRow, ...] = _VIEWS.read(document["views"])
-    return rows
+    return _VIEWS.read(document["views"])
 
 
 def has_model(document: dict[str, Any], model: ModelFile) -> bool:

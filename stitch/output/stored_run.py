@@ -38,7 +38,7 @@ def read_documents(folder: Path) -> tuple[dict[str, Any], tuple[LedgerStep, ...]
     Raises:
         InputError: no run folder, one of several sessions, or a damaged file.
     """
-    return read_result(folder), results.ledger_steps(read_ledger(folder))
+    return read_result(folder), results.LEDGER.read(read_ledger(folder))
 
 
 def read_result(folder: Path) -> dict[str, Any]:

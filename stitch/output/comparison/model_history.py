@@ -61,13 +61,13 @@ def model_history(run: RunData) -> ModelHistory | None:
     if run.registered is None:
         return None
     matches = run.registered.matches
-    states = [(name, *true_geometry(run.measurement, model)) for name, model in models_of(run)]
-    _, _, points = states[-1]
-    states.append((REGISTER, run.poses, points))
-    distances = [signed_distances(matches, poses, points) for _, poses, points in states]
+    placed = [(name, *true_geometry(run.measurement, model)) for name, model in models_of(run)]
+    distances = [signed_distances(matches, poses, points) for _, poses, points in placed]
     patches = patches_of(matches, len(run.poses), run.registered.gram.scale, model_distances=distances[1])
-    steps = [ModelStep(name, poses, patches.field(e)) for (name, poses, _), e in zip(states, distances, strict=True)]
-    return ModelHistory(patches, tuple(steps))
+    models = [ModelStep(name, poses, patches.field(e)) for (name, poses, _), e in zip(placed, distances, strict=True)]
+    _, _, points = placed[-1]
+    registered = patches.field(signed_distances(matches, run.poses, points))
+    return ModelHistory(patches, (*models, ModelStep(REGISTER, run.poses, registered)))
 
 
 def target_history(run: RunData) -> tuple[TargetStep, ...]:

@@ -91,7 +91,8 @@ def compare_runs(runs: Sequence[RunData], names: Sequence[str]) -> TwoRuns:
     Raises:
         InputError: their numbers mean different things: unit, mount, or surfaces against labelled points.
     """
-    a, b = (ComparedRun(name, run) for name, run in zip(names, runs, strict=True))
+    a = ComparedRun(names[0], runs[0])
+    b = ComparedRun(names[1], runs[1])
     for what, asked in (
         ("length_unit", lambda run: run.session.length_unit),
         ("mount", lambda run: run.session.mount),
