@@ -50,7 +50,7 @@ def write_mesh(mesh: TriangleMesh, path: Path) -> None:
 
 
 def mesh_of(points: Array, normals: Array, outside: float = 0.0) -> TriangleMesh:
-    """The surface through points (N, 3) with unit normals (N, 3), open where there are no points.
+    """Return the surface through points (N, 3) with unit normals (N, 3), open where there are no points.
 
     Marching cubes (Lorensen & Cline 1987) over the signed distance from the points' weighted tangent planes: implicit
     moving least squares (Kolluri 2008), in the cells about the points alone. Nothing is closed that nobody saw.
@@ -89,7 +89,7 @@ def spacing(points: Array, tree: Any) -> float:
 
 
 def _cells_about(points: Array, size: float) -> tuple[Array, Indices]:
-    """Corners (P, 3) of the cells in which or beside which points lie, and per cell its eight corners (C, 8)."""
+    """Return corners (P, 3) of the cells in or beside which points lie, and per cell its eight corners (C, 8)."""
     origin = points.min(axis=0) - 2 * size
     cell = np.floor((points - origin) / size).astype(np.int64)
     shape = cell.max(axis=0) + 3
@@ -102,7 +102,7 @@ def _cells_about(points: Array, size: float) -> tuple[Array, Indices]:
 
 
 def _heights(places: Array, points: Array, normals: Array, tree: Any, size: float) -> tuple[Array, Array]:
-    """Signed distance (P,) of places (P, 3) from the surface, and distance (P,) from the nearest point."""
+    """Return the signed distance (P,) of places (P, 3) from the surface, and distance (P,) from the nearest point."""
 
     # Coordinates first, then neighbours, each in one piece: sums over rows of three or sixteen take longer.
     columns, facing = np.ascontiguousarray(points.T), np.ascontiguousarray(normals.T)

@@ -42,7 +42,7 @@ _KEPT_BYTES = 1e9
 
 
 def recordings(folder: Path) -> list[Recorder]:
-    """What other packages record of a run into its folder, by the entry-point group `stitch.recorders`."""
+    """Return what other packages record of a run into its folder, by the entry-point group `stitch.recorders`."""
     return [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]
 
 

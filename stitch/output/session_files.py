@@ -45,7 +45,7 @@ class SessionFiles:
 
 
 def pose_columns(T: Array) -> dict[str, Array]:
-    """Columns x, y, z, qx, qy, qz, qw of poses (V, 4, 4)."""
+    """Return columns x, y, z, qx, qy, qz, qw of poses (V, 4, 4)."""
     columns = np.hstack([T[:, :3, 3], frames.to_quaternion(T)])
     return dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), columns.T, strict=True))
 
@@ -135,7 +135,7 @@ def write_table(file: Path, columns: TableColumns) -> None:
 
 
 def table_text(columns: TableColumns) -> str:
-    """A table as CSV."""
+    """Return a table as CSV."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(columns)
@@ -145,7 +145,7 @@ def table_text(columns: TableColumns) -> str:
 
 
 def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
-    """Rows of [robot] joints in session.toml, angles in degrees; None for an arm that came as URDF."""
+    """Return the rows of [robot] joints in session.toml, angles in degrees; None for an arm that came as URDF."""
     if robot.a is None or robot.alpha is None or robot.d is None:
         return None
     rows = []
@@ -163,7 +163,7 @@ def dh_rows(robot: Robot) -> list[dict[str, Any]] | None:
 
 
 def robot_toml(robot: Robot, comments: Sequence[str] = (), stated: StatedRepeatability | None = None) -> str | None:
-    """The [robot] table of session.toml below lines of comment; None for an arm that came as URDF.
+    """Return the [robot] table of session.toml below lines of comment; None for an arm that came as URDF.
 
     Args:
         stated: repeatability that the nominal table has; a table that takes its place says the same.

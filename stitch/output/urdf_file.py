@@ -11,7 +11,7 @@ from stitch.session.robot import Robot, elementary
 
 
 def to_urdf(robot: Robot) -> str:
-    """The chain base_link, link_1 … link_n, flange as URDF text: the same flange pose for every joint angle.
+    """Return the chain base_link, link_1 … link_n, flange as URDF text: the same flange pose for every joint angle.
 
     Masses are written as point masses; the payload is a link of its own fixed to the flange, so a reader
     of the file must not add it again.
@@ -58,7 +58,7 @@ def _add_joint(
 
 
 def roll_pitch_yaw(R: Array) -> Array:
-    """(3,) with R = Rz(yaw)·Ry(pitch)·Rx(roll), exact at and near a pitch of 90° too.
+    """Return (3,) with R = Rz(yaw)·Ry(pitch)·Rx(roll), exact at and near a pitch of 90° too.
 
     There yaw alone is ill-determined; roll is read from what remains after the yaw that was chosen,
     so that an error of one undoes that of the other.
@@ -74,5 +74,5 @@ def xml_comment(lines: Sequence[str]) -> str:
 
 
 def _text(values: Array) -> str:
-    """Shortest decimals that read back as the same float64."""
+    """Return the shortest decimals that read back as the same float64."""
     return " ".join(repr(float(x)) for x in values)

@@ -180,7 +180,6 @@ def compare_surfaces(state: RunData) -> ResidualTables:
         poses = capture.poses(state.model.T_mount)
         samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
         overlaps = collect_overlaps(capture, poses, state.gate, samples)
-        followed = followed_covariates(linearise(state.session, state.measurement, state.model, state.gate))
     rows = _CorrespondenceRows(state, poses, overlaps.matches, overlaps.gram.scale)
     names = state.session.names
     known = view_properties(state.measurement.views)
@@ -190,13 +189,7 @@ def compare_surfaces(state: RunData) -> ResidualTables:
         *_binned_tables([*rows.properties, *_of_rows(known, rows.view)], rows.statistics),
         _place_table(rows),
     ]
-    return ResidualTables(
-        tables=tuple(table for table in tables if len(table.count)),
-        rms=overlaps.gram.rms,
-        views=tuple(names),
-        of_views={name: values for name, _, values in known},
-        followed=followed,
-    )
+    return _comparison(state, tables, overlaps.gram.rms, known)
 
 
 def compare_targets(state: RunData) -> ResidualTables:
@@ -217,12 +210,17 @@ def compare_targets(state: RunData) -> ResidualTables:
         *_binned_tables([distance, *_of_rows(known, rows.view)], rows.statistics),
     ]
     rms = float(np.sqrt(np.mean(np.sum(rows.offset**2, axis=1))))
+    return _comparison(state, tables, rms, known)
+
+
+def _comparison(state: RunData, tables: Sequence[ResidualTable], rms: float, known: Properties) -> ResidualTables:
+    """Return tables with what is known of the views, and what the displacements of whole views follow of it."""
     with library_threads_off():
         followed = followed_covariates(linearise(state.session, state.measurement, state.model, state.gate))
     return ResidualTables(
-        tables=tuple(tables),
+        tables=tuple(table for table in tables if len(table.count)),
         rms=rms,
-        views=tuple(names),
+        views=tuple(state.session.names),
         of_views={name: values for name, _, values in known},
         followed=followed,
     )
