@@ -59,11 +59,11 @@ def bytes_of(size: str | None) -> float | None:
     """
     if size is None:
         return None
-    told = re.fullmatch(r"([0-9.]+) *([KMGT])i?B?", size.strip(), re.IGNORECASE)
+    parts = re.fullmatch(r"([0-9.]+) *([KMGT])i?B?", size.strip(), re.IGNORECASE)
     try:
-        found = float(told[1]) * 1e3 ** (1 + "KMGT".index(told[2].upper())) if told else float(size)
+        count = float(parts[1]) * 1e3 ** (1 + "KMGT".index(parts[2].upper())) if parts else float(size)
     except ValueError:
-        found = float("nan")
-    if not 0 < found < float("inf"):
+        count = float("nan")
+    if not 0 < count < float("inf"):
         raise InputError(f"--memory {size}: to fix: give a size such as 2GB or 800MB")
-    return found
+    return count

@@ -108,10 +108,6 @@ def points_of(view: View) -> int:
     return labelled + (0 if view.cloud is None else view.cloud.count)
 
 
-def _effect_rows(run: RunData) -> dict[str, dict[str, Any]]:
-    return {term.name: {p.name: parameter_row(p) for p in term.parameters} for term in run.terms}
-
-
 def parameter_row(parameter: Parameter) -> dict[str, Any]:
     """Return a parameter of an effect as the documents list it."""
     row = {"value": parameter.value, "sigma": parameter.sigma, "unit": parameter.unit}
@@ -309,6 +305,10 @@ _VIEW = Document(
 )
 _VIEWS = _VIEW.rows(ViewRow)
 _PARAMETER = Kind({"type": "object", "properties": {"value": NUMBER.schema}, "required": ["value"]})
+_EFFECTS = Kind(
+    table_of(table_of(_PARAMETER)).schema,
+    lambda terms: {term.name: {p.name: parameter_row(p) for p in term.parameters} for term in terms},
+)
 _SCATTER = Document(Key("rotation", NUMBER_OR_NULL), Key("translation", NUMBER_OR_NULL))
 _LEFT_OUT = Document(Key("view", TEXT), Key("why", TEXT))
 _WEAK = Document(
@@ -347,7 +347,7 @@ RESULT = Document(
     Key("heldout_rms", NUMBER_OR_NULL, of=RunData),
     Key("noise_floor", NUMBER, of=RunData),
     Key("repeatability", _SCATTER.kind(partial(Repeatability, noise_factor=float("nan"))), of=Fit),
-    Key("effects", table_of(table_of(_PARAMETER)), write=_effect_rows),
+    Key("effects", _EFFECTS, "terms"),
     Key("effects_covariance", _COVARIANCE.kind(), "model.effects_covariance", optional=True),
     Key("views", _VIEWS, write=_all_views),
     Key("left_out", _LEFT_OUT.rows(), optional=True),

@@ -61,7 +61,8 @@ class Witness:
 
     def sentences(self, length_unit: str) -> list[str]:
         """Return what an auditor reads, one fact a sentence."""
-        here, there = (_summary(d) for d in (self.to_run, self.from_run))
+        here = _summary(self.to_run)
+        there = _summary(self.from_run)
         worst = int(np.argmax(self.shift))
         return [
             f"Open3D {self.version} registered the same scans by {self.pairs} pairs and a graph of poses.",
@@ -102,8 +103,8 @@ def open3d_witness(run: RunData) -> Witness:
     difference = frames.inverse(run.poses) @ poses
     middles = np.array([points.mean(axis=0) for points in clouds])
     moved = np.array([frames.transform(T, m[None])[0] - m for T, m in zip(difference, middles, strict=True)])
-    own = np.concatenate([frames.transform(T, points) for T, points in zip(poses, clouds, strict=True)])
-    own_normals = np.concatenate([frames.rotate(T, n) for T, n in zip(poses, normals, strict=True)])
+    placed = np.concatenate([frames.transform(T, points) for T, points in zip(poses, clouds, strict=True)])
+    placed_normals = np.concatenate([frames.rotate(T, n) for T, n in zip(poses, normals, strict=True)])
     fused, fused_normals = run.fused.points, run.fused.normals
     asked = fused[:: max(1, len(fused) // _ASKED)]
     return Witness(
@@ -113,8 +114,8 @@ def open3d_witness(run: RunData) -> Witness:
         shift=np.linalg.norm(moved, axis=1),
         turn=np.linalg.norm(frames.log(difference)[:, :3], axis=1),
         pairs=pairs,
-        to_run=_from_surface(own[:: max(1, len(own) // _ASKED)], fused, fused_normals),
-        from_run=_from_surface(asked, own, own_normals),
+        to_run=_from_surface(placed[:: max(1, len(placed) // _ASKED)], fused, fused_normals),
+        from_run=_from_surface(asked, placed, placed_normals),
         places=asked,
     )
 
@@ -196,10 +197,8 @@ def _one_sided(clouds: list[Array], poses: Array) -> list[tuple[int, int]]:
 
 def _common_motion(clouds: list[Array], poses: Array, wanted: Array) -> Array:
     """Return the rigid motion (4, 4) that brings all views nearest to where others put them."""
-    a, b = (
-        np.concatenate([frames.transform(T, points) for T, points in zip(own, clouds, strict=True)])
-        for own in (poses, wanted)
-    )
+    a = np.concatenate([frames.transform(T, points) for T, points in zip(poses, clouds, strict=True)])
+    b = np.concatenate([frames.transform(T, points) for T, points in zip(wanted, clouds, strict=True)])
     R = frames.nearest_rotation((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
     return frames.make(R, b.mean(axis=0) - R @ a.mean(axis=0))
 
@@ -207,5 +206,4 @@ def _common_motion(clouds: list[Array], poses: Array, wanted: Array) -> Array:
 def _from_surface(points: Array, surface: Array, normals: Array) -> Array:
     """Return the distance (N,) of points from the tangent plane of the nearest surface point."""
     _, at = KDTree(np.ascontiguousarray(surface, float)).query(np.ascontiguousarray(points, float))
-    distance: Array = np.einsum("ni,ni->n", points - surface[at], normals[at])
-    return distance
+    return np.einsum("ni,ni->n", points - surface[at], normals[at])
