@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stitch.cli.options import EffectsFile, Json
-from stitch.cli.terminal import emit, results_stream, say, show_table
+from stitch.cli.terminal import emit, results_stream, say, show_columns
 
 if TYPE_CHECKING:
     from stitch.effects.contract import Effect
@@ -33,18 +33,20 @@ def effects(
 
     if effects_file:
         load(effects_file)
+    listed = [find_effect(name)] if name else list(EFFECTS.values())
+    columns = (
+        ("effect", lambda e: e.name),
+        ("place", lambda e: e.place),
+        ("what nature does", lambda e: e.formula),
+        ("parameters", parameter_signature),
+    )
     if as_json:
-        emit(to_json([_document(e) for e in ([find_effect(name)] if name else EFFECTS.values())]))
+        emit(to_json([_document(effect) for effect in listed]))
     elif name:
-        _show_effect(find_effect(name))
+        _show_effect(listed[0])
     else:
-        show_table(
-            "Physical effects",
-            ("effect", "place", "what nature does", "parameters"),
-            [(e.name, e.place, e.formula, parameter_signature(e)) for e in EFFECTS.values()],
-            words=("effect", "place", "what nature does", "parameters"),
-            stream=results_stream(),
-        )
+        words = [heading for heading, _ in columns]
+        show_columns("Physical effects", columns, listed, words, stream=results_stream())
 
 
 def parameter_signature(effect: Effect) -> str:
@@ -53,23 +55,22 @@ def parameter_signature(effect: Effect) -> str:
 
 
 def _document(effect: Effect) -> dict[str, Any]:
-    parameters = [
-        {
-            "name": key,
-            "kind": s.kind,
-            "unit": s.unit,
-            "plausible": s.typical,
-            "limit": s.limit if isfinite(s.limit) else None,
-        }
-        | ({"unit_shift": s.unit_shift, "plausible_shift": s.typical_shift} if s.kind == "twist" else {})
-        for key, s in effect.specs.items()
-    ]
     return {
         "effect": effect.name,
         "place": effect.place,
         "tier": effect.tier,
         "formula": effect.formula,
-        "parameters": parameters,
+        "parameters": [
+            {
+                "name": key,
+                "kind": spec.kind,
+                "unit": spec.unit,
+                "plausible": spec.typical,
+                "limit": spec.limit if isfinite(spec.limit) else None,
+            }
+            | ({"unit_shift": spec.unit_shift, "plausible_shift": spec.typical_shift} if spec.kind == "twist" else {})
+            for key, spec in effect.specs.items()
+        ],
         "needs": list(effect.needs),
         "uses": list(effect.prefers),
     }

@@ -18,43 +18,16 @@ from stitch.system.files import Ours, whole_file
 FORMAT = "stitch-run/1"
 # Every file that a command writes into a run folder. What is not listed here is never removed.
 FILES = {
-    "model.toml",
-    "result.json",
-    "ledger.json",
-    "stitched.ply",
-    "mesh.ply",
-    "residuals.parquet",
-    "recording.rrd",
-    "report.html",
-    "report.pdf",
-    "features.json",
-    "features.csv",
-    "features.html",
-    "two-runs.html",
-    "two-runs.pdf",
-    "compare.json",
-    "witness.json",
-    "witness.png",
-    "diagnosis.json",
-    "diagnosis.rrd",
-    "robot.toml",
-    "robot.urdf",
+    *("model.toml", "result.json", "ledger.json", "stitched.ply", "mesh.ply", "residuals.parquet", "recording.rrd"),
+    *("report.html", "report.pdf", "two-runs.html", "two-runs.pdf", "features.json", "features.csv", "features.html"),
+    *("compare.json", "witness.json", "witness.png", "diagnosis.json", "diagnosis.rrd", "robot.toml", "robot.urdf"),
 }
 # Earlier fits of the run, by what they were made of.
 FITS = ".fits"
 # "suspects" is what "candidates" was called once.
 _PICTURES = {
-    "budget",
-    "candidates",
-    "suspects",
-    "added_variable",
-    "shape",
-    "aliases",
-    "views",
-    "joint_courses",
-    "time_course",
-    "field_map",
-    "compare",
+    *("budget", "candidates", "suspects", "added_variable", "shape", "aliases", "views", "joint_courses"),
+    *("time_course", "field_map", "compare"),
 }
 
 
