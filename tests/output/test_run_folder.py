@@ -11,7 +11,7 @@ from pyarrow.parquet import read_table
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.edits import set_cell
 from data_synth.write import write_session
-from stitch.api import pipeline
+from stitch.api import pipeline, stepwise
 from stitch.api.pipeline import run_rig
 from stitch.cli.main import main
 from stitch.errors import NoResultError
@@ -217,7 +217,7 @@ def test_of_what_was_suggested_the_run_that_stays_is_recorded_and_not_fitted_aga
         return own
 
     monkeypatch.setattr(pipeline, "change", None)
-    monkeypatch.setattr(pipeline, "suggest", suggest)
+    monkeypatch.setattr(stepwise, "suggest", suggest)
     monkeypatch.setattr("stitch.cli.change.recorder_for", told_to)
     monkeypatch.setattr("stitch.cli.diagnose.write_diagnosis", lambda found, state, run: {})
     monkeypatch.setattr("stitch.output.plain_finding.suggested_command", lambda found, run: "")
@@ -230,7 +230,7 @@ def test_of_what_was_suggested_the_run_that_stays_is_recorded_and_not_fitted_aga
 
 def test_where_nothing_is_to_be_added_the_present_result_is_printed(changing, monkeypatch, stitch_command):
     run, result = changing
-    monkeypatch.setattr(pipeline, "suggest", lambda *_: (None, [], None))
+    monkeypatch.setattr(stepwise, "suggest", lambda *_: (None, [], None))
     monkeypatch.setattr("stitch.cli.diagnose.write_diagnosis", lambda found, state, run: {})
     assert json.loads(stitch_command("add", run, "--suggested", "--json")) == told(run)
     assert result.model.T_mount.tolist() == told(run)["hand_eye"]
