@@ -12,7 +12,7 @@ from stitch.cli.main import main
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.output.comparison.model_history import model_history
-from stitch.output.comparison.two_runs import compare_runs, comparison_sentence, hand_eye_change
+from stitch.output.comparison.two_runs import HandEyeChange, compare_runs, comparison_sentence
 from tests.in_browser import WAYS, require_for_everybody, shown
 from viz.two_runs_page import facts, view_change_rows, write_two_runs
 
@@ -43,7 +43,7 @@ def page(file):
 def test_the_difference_of_two_hand_eyes_scatters_as_its_covariance_says(pair):
     """Both drawn 20,000 times by their own covariances; the variance of a sample is known to 1 %, five of them."""
     a, b = pair
-    change = hand_eye_change(a, b)
+    change = HandEyeChange(a, b)
     np.testing.assert_allclose(change.twist, MOVED, atol=1e-12)
     draws = np.random.default_rng(1)
     own = [draws.multivariate_normal(np.zeros(6), x.mount_covariance, 20_000) for x in (a, b)]

@@ -45,14 +45,28 @@ class ComparedRun:
         return self.run.residual_rms if self.history is None else self.history.models[-1].field.mean_abs
 
 
-@dataclass(frozen=True)
 class HandEyeChange:
-    """From the hand-eye of A to that of B, as twist (6,): T_A⁻¹·T_B = exp(twist), scanner frame of A."""
+    """From the hand-eye of A to that of B, to first order in their errors: T_A⁻¹·T_B = exp(twist), scanner frame of A.
 
-    twist: Array  # (6,) rotation in rad, translation in length_unit
-    covariance: Array  # (6, 6) of both, as if they erred independently
-    at_part: float  # rms distance between the places where both put the points of a view
-    U_at_part: float  # what their uncertainties alone make of it, k = 2
+    `twist` (6,) is rotation in rad, then translation in length_unit; `covariance` (6, 6) that of both, as if they erred
+    independently. `at_part` is the rms distance between the places where both put the points of a view, `U_at_part`
+    what their uncertainties alone make of it (k = 2).
+    """
+
+    def __init__(self, a: RunData, b: RunData) -> None:
+        same = np.array_equal(a.T_mount, b.T_mount)  # else rounding would make a difference of it
+        D = np.eye(4) if same else frames.inverse(a.T_mount) @ b.T_mount
+        # exp(−ξ_A)·D·exp(ξ_B) = exp(Ad_D·ξ_B − ξ_A)·D for small ξ.
+        carried = frames.adjoint(D)
+        points = np.vstack(b.measurement.capture.point_sets)
+        points = points[:: max(1, len(points) // _POINTS)]
+        lever = np.concatenate([-frames.skew(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2)
+        moments = np.einsum("nij,nik->jk", lever, lever) / len(points)
+        apart = frames.transform(D, points) - points
+        self.twist = frames.log(D)
+        self.covariance = a.mount_covariance + carried @ b.mount_covariance @ carried.T
+        self.at_part = float(np.sqrt((apart**2).sum(axis=1).mean()))
+        self.U_at_part = COVERAGE_FACTOR * float(np.sqrt(np.sum(moments * self.covariance)))
 
     @property
     def U(self) -> Array:
@@ -82,7 +96,7 @@ class TwoRuns:
     @cached_property
     def hand_eye(self) -> HandEyeChange:
         """Return how far the hand-eyes differ."""
-        return hand_eye_change(self.a.run, self.b.run)
+        return HandEyeChange(self.a.run, self.b.run)
 
 
 def compare_runs(runs: Sequence[RunData], names: Sequence[str]) -> TwoRuns:
@@ -105,26 +119,6 @@ def compare_runs(runs: Sequence[RunData], names: Sequence[str]) -> TwoRuns:
                 "to fix: name two runs of one cell"
             )
     return TwoRuns(a, b)
-
-
-def hand_eye_change(a: RunData, b: RunData) -> HandEyeChange:
-    """Return the difference of two hand-eyes with what is known of both, to first order in their errors."""
-    same = np.array_equal(a.T_mount, b.T_mount)  # else rounding would make a difference of it
-    D = np.eye(4) if same else frames.inverse(a.T_mount) @ b.T_mount
-    # exp(−ξ_A)·D·exp(ξ_B) = exp(Ad_D·ξ_B − ξ_A)·D for small ξ.
-    carried = frames.adjoint(D)
-    covariance = a.mount_covariance + carried @ b.mount_covariance @ carried.T
-    points = np.vstack(b.measurement.capture.point_sets)
-    points = points[:: max(1, len(points) // _POINTS)]
-    lever = np.concatenate([-frames.skew(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2)
-    moments = np.einsum("nij,nik->jk", lever, lever) / len(points)
-    apart = frames.transform(D, points) - points
-    return HandEyeChange(
-        twist=frames.log(D),
-        covariance=covariance,
-        at_part=float(np.sqrt((apart**2).sum(axis=1).mean())),
-        U_at_part=COVERAGE_FACTOR * float(np.sqrt(np.sum(moments * covariance))),
-    )
 
 
 def comparison_sentence(both: TwoRuns) -> str:
