@@ -135,7 +135,7 @@ def test_the_folder_of_raw_scans_is_no_session_and_becomes_one_by_init(tmp_path,
     assert f"`stitch init '{tmp_path}/my scans'`" in told
 
 
-def test_effects_as_json(capsys):
+def test_the_library_of_effects_is_printed_as_json(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["effects", "part_slip", "--json"])
     assert not ended.value.code

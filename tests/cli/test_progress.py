@@ -61,7 +61,7 @@ def test_loops_within_loops_are_told_together(said):
     assert said[-1] == ""  # the line is cleared
 
 
-def test_nobody_watches_nobody_counts(said):
+def test_no_step_is_counted_where_nobody_watches(said):
     assert list(steps("scans", (i for i in range(3)))) == [0, 1, 2] and list(steps("scans", [1, 2])) == [1, 2]
     assert not said
 

@@ -38,7 +38,7 @@ def chatty(points, view, k):
 MAIN = [sys.executable, "-c", "from stitch.cli.main import main; main()"]
 
 
-def test_what_is_printed_on_the_way_goes_aside(capsys):
+def test_what_a_command_prints_on_the_way_goes_to_standard_error(capsys):
     @stdout_for_results
     def command():
         print("noise")

@@ -36,7 +36,7 @@ def make_run(folder, session):
         ("damaged", "not a run folder"),
     ],
 )
-def test_places_where_something_would_be_lost(place, target, expected):
+def test_a_place_where_something_would_be_lost_is_refused(place, target, expected):
     (place / "link").symlink_to(place / "s")
     for name in ("own", "model", "damaged"):
         (place / name).mkdir()
@@ -49,7 +49,7 @@ def test_places_where_something_would_be_lost(place, target, expected):
         require_free(place / target, [place / "s"], force=False)
 
 
-def test_places_that_are_free(place):
+def test_a_run_may_go_where_nothing_would_be_lost(place):
     (place / "empty").mkdir()
     make_run(place / "same", place / "s")
     make_run(place / "other", place / "t")

@@ -52,7 +52,7 @@ def test_nothing_is_closed_that_nobody_saw():
     assert half.area == pytest.approx(2 * np.pi * RADIUS**2, rel=2.5 * spacing(count) / RADIUS)
 
 
-def test_both_sides_of_a_sheet_two_spacings_thick():
+def test_a_sheet_two_spacings_thick_keeps_both_sides():
     side = np.stack(np.meshgrid(*[np.arange(-20, 20.1, 0.5)] * 2), axis=-1).reshape(-1, 2)
     points = np.vstack([np.column_stack([side, np.full(len(side), z)]) for z in (0.5, -0.5)])
     normals = np.repeat([[0, 0, 1.0], [0, 0, -1.0]], len(side), axis=0)

@@ -75,13 +75,13 @@ def model(tmp_path):
 
 
 @pytest.mark.parametrize("whole_folder", [False, True])
-def test_nothing_of_it_runs_by_itself(model, whole_folder):
+def test_no_file_of_effects_runs_by_itself(model, whole_folder):
     with pytest.raises(InputError, match=r"names effects in .*sent.py.*--trust.*--effects-file"):
         trusted_model(model.parent if whole_folder else model)
     assert not (model.parent / "executed").exists() and "of_a_stranger" not in EFFECTS
 
 
-def test_it_runs_where_it_is_trusted(model):
+def test_a_file_of_effects_runs_where_it_is_trusted(model):
     assert trusted_model(model, trust=True)[1] == str(model.parent / "sent.py")
     assert "of_a_stranger" in EFFECTS
 

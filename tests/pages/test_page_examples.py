@@ -85,7 +85,7 @@ def test_the_notebook_prints_what_it_shows(file):
 
 
 @pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
-def test_its_page_has_every_cell_and_every_picture(file):
+def test_the_page_of_a_notebook_has_every_cell_and_picture(file):
     page, code = notebook_page(file), code_of(file)
     assert page.count("```python\n") == len(code)
     assert page.count("](data:image/png;base64,") == (1 if file == NOTEBOOK else 0)

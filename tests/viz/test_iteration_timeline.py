@@ -50,7 +50,7 @@ def pose_at(path, name, iteration):
     return T
 
 
-def test_every_stage_and_every_iteration_is_there(recorded):
+def test_the_timeline_has_every_stage_and_iteration(recorded):
     result, path = recorded
     # The last of `correct` is the rms after its last step.
     corrected, registered = len(result.convergence["correct"]) - 1, len(result.convergence["register"])
@@ -95,7 +95,7 @@ def test_a_view_that_is_left_out_stays_until_then(recorded, tmp_path):
     assert not rows(path, "/views/v000", "Clear:is_recursive")
 
 
-def test_labelled_points_move_too(tmp_path):
+def test_labelled_points_move_in_the_timeline_too(tmp_path):
     session = labelled_cell(3, views=12)[0]
     result = run(session, recorder=RerunRecorder(tmp_path / "t.rrd"))
     reached = titles(tmp_path / "t.rrd")

@@ -209,7 +209,7 @@ def test_the_recording_of_a_small_run(recorded):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["rubik"])
-def test_page_and_recording_of_a_real_object(reghec, name, tmp_path, stitch_command):
+def test_a_real_object_has_a_page_and_a_recording(reghec, name, tmp_path, stitch_command):
     stitch_command("run", reghec(name), "-o", tmp_path / "r")
     rows = json.loads((tmp_path / "r" / "result.json").read_text())["disagreement"]["steps"]
     require_steps(tmp_path / "r" / "recording.rrd", rows)

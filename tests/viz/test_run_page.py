@@ -76,7 +76,7 @@ def test_the_page_needs_nothing_beside_it_and_can_be_mailed(page):
 @pytest.mark.parametrize(
     "way", ["light", pytest.param("dark", marks=pytest.mark.slow), pytest.param("phone", marks=pytest.mark.slow)]
 )
-def test_everybody_can_read_and_reach_it(browser, file, way):
+def test_everybody_can_read_and_reach_the_page(browser, file, way):
     require_for_everybody(browser, file, way)
 
 

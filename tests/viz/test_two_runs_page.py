@@ -131,7 +131,7 @@ def test_what_turns_the_one_part_turns_the_other(browser, file):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
-def test_everybody_can_read_and_reach_it(browser, file, way):
+def test_everybody_can_read_and_reach_the_page(browser, file, way):
     require_for_everybody(browser, file, way)
 
 

@@ -52,7 +52,7 @@ def test_a_view_that_the_run_has_elsewhere_is_the_one_that_differs(run, witness)
     assert moved.sentences("mm")[-1].startswith(f"{witness.views[2]} differs most")
 
 
-def test_the_command_writes_and_says_it(run, witness, tmp_path, capsys):
+def test_compare_with_open3d_writes_the_witness_and_says_what_differs(run, witness, tmp_path, capsys):
     folder = run.save(tmp_path / "run", recording=False)
     with pytest.raises(SystemExit) as ended:
         main(["compare", str(folder), "--with", "open3d"])

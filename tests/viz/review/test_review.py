@@ -72,7 +72,7 @@ def address(soft_joint):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("colours", ["light", "dark"])
-def test_everybody_can_read_and_reach_it(browser, address, colours):
+def test_everybody_can_read_and_reach_the_page(browser, address, colours):
     story = Story(browser, address, color_scheme=colours)
     page = story.page
     story.says("#plots", "signed mean")
