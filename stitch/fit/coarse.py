@@ -260,7 +260,7 @@ def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) 
 
 def scanner_centre(captures: Sequence[Capture]) -> Array:
     """Mean centroid of the scans in the scanner frame (3,)."""
-    return np.asarray(np.mean([scan.points.mean(axis=0) for c in captures for scan in c.scans], axis=0))
+    return np.mean([scan.points.mean(axis=0) for c in captures for scan in c.scans], axis=0)
 
 
 def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:

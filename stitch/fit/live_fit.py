@@ -166,7 +166,7 @@ def _last_step(g: Gram) -> Array:
     values, vectors = np.linalg.eigh(g.matrix.sum(axis=0) / np.outer(unit, unit))
     keep = values > NEAR_NULL * values[-1]
     pull = vectors[:, keep].T @ (g.vector.sum(axis=0) / unit)
-    return np.asarray(vectors[:, keep] @ (pull / values[keep]) / unit)
+    return vectors[:, keep] @ (pull / values[keep]) / unit
 
 
 def _solve_together(capture: Capture, poses: Array, matches: list[Match], gate: float) -> UnconstrainedPoses:

@@ -11,6 +11,9 @@ is built here follows its published relatives and says of each part what is sour
   a plus and a minus class, each with a scale. Choice: the middle is the weighted median, so that both classes hold the
   same weight and exchange their places with the views; the cleaner class gives both their scale.
 - *Weights*, `dpwvm_weights`: distance, sign class, density and incidence, found anew at every iteration.
+
+The other method, `plane_weights`, is plane to plane (GICP) inside Tukey's biweight: of the families compared in
+docs/register.md the best. Both factors are 1 where two views agree, and neither depends on the order of the views.
 """
 
 from collections.abc import Sequence
@@ -24,39 +27,8 @@ from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import Gram, robust_scale
 from stitch.session.capture import Capture
 
-# What each correspondence counts in `register`: plane to plane (GICP) inside Tukey's biweight.
-#
-# Of the families compared in docs/register.md the best. Both factors are 1 where two views agree, and neither depends
-# on the order of the views.
-
 # Variance along the normal over that across it (Segal, Haehnel & Thrun 2009).
 _EPSILON = 1e-3
-
-
-def plane_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> list[Array]:
-    """Weights (M,) per match: agreement of the normals times the biweight of the distance.
-
-    Args:
-        poses: T_reference_scanner, (V, 4, 4).
-    """
-    scale = robust_scale(matches)
-    return [agreement(m, capture, poses) * tukey(m.residual, scale) for m in matches]
-
-
-def agreement(m: Match, capture: Capture, poses: Array) -> Array:
-    """(M,) weight of two planes whose normals part by θ: 1/(cos² + sin²/ε) of θ/2.
-
-    The inverse of nᵀ(C_v + C_w)n, with n the mean normal and C variances ε along a point's normal and 1 across it, over
-    its value at θ = 0. What is not the same plane, as the two sides of a thin edge or points that fly behind a
-    silhouette, counts little even where the distance happens to be small.
-    """
-    T_w_v = frames.inverse(poses[m.w]) @ poses[m.v]
-    normals = frames.rotate(T_w_v, capture.scans[m.v].normals.take(m.index_v, axis=0))
-    cosine = np.einsum("ij,ij->i", normals, capture.scans[m.w].normals.take(m.index_w, axis=0))
-    sine2 = np.clip(1 - cosine, 0.0, 2.0) / 2
-    return np.asarray(1 / (1 - sine2 + sine2 / _EPSILON))
-
-
 # A pair's own scale counts as if so many correspondences had shown the scale of all.
 _POOLED = 200
 # A class with fewer correspondences has no scale of its own.
@@ -89,7 +61,7 @@ def dpwvm_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> l
 
 def incidence(m: Match, capture: Capture, poses: Array) -> Array:
     """Return (M,) how squarely both views look at one and the same plane: √(cos·cos') times the normals' agreement."""
-    return np.asarray(np.sqrt(m.weight) * agreement(m, capture, poses))
+    return np.sqrt(m.weight) * agreement(m, capture, poses)
 
 
 def density(m: Match, capture: Capture) -> Array:
@@ -99,7 +71,7 @@ def density(m: Match, capture: Capture) -> Array:
     halfway between a weight per point and a weight per surface).
     """
     area = np.sqrt(capture.scans[m.v].area[m.index_v] * capture.scans[m.w].area[m.index_w])
-    return np.asarray(np.clip(np.sqrt(area / np.median(area)), 1 / _SPARSE, _SPARSE))
+    return np.clip(np.sqrt(area / np.median(area)), 1 / _SPARSE, _SPARSE)
 
 
 def weighted_median(d: Array, weight: Array) -> float:
@@ -117,8 +89,8 @@ def class_scale(e: Array, scale: float) -> float:
     classes = [side for side in (e[e > 0], -e[e < 0]) if len(side) >= _CLASS]
     if not classes:
         return scale
-    own = MAD_TO_SIGMA * min(float(np.median(side)) for side in classes)
-    return float(np.sqrt((len(e) * own**2 + _POOLED * scale**2) / (len(e) + _POOLED)))
+    cleaner = MAD_TO_SIGMA * min(float(np.median(side)) for side in classes)
+    return float(np.sqrt((len(e) * cleaner**2 + _POOLED * scale**2) / (len(e) + _POOLED)))
 
 
 class OffsetSums:
@@ -196,3 +168,27 @@ def shared_offsets(information: Array, vector: Array, least: float) -> list[int]
         column = A[:, best] / size[best]
         A, c = A - np.outer(column, A[best]), c - column * c[best]
     return free
+
+
+def plane_weights(matches: Sequence[Match], capture: Capture, poses: Array) -> list[Array]:
+    """Return weights (M,) per match: agreement of the normals times the biweight of the distance.
+
+    Args:
+        poses: T_reference_scanner, (V, 4, 4).
+    """
+    scale = robust_scale(matches)
+    return [agreement(m, capture, poses) * tukey(m.residual, scale) for m in matches]
+
+
+def agreement(m: Match, capture: Capture, poses: Array) -> Array:
+    """Return the (M,) weight of two planes whose normals part by θ: 1/(cos² + sin²/ε) of θ/2.
+
+    The inverse of nᵀ(C_v + C_w)n, with n the mean normal and C variances ε along a point's normal and 1 across it, over
+    its value at θ = 0. What is not the same plane, as the two sides of a thin edge or points that fly behind a
+    silhouette, counts little even where the distance happens to be small.
+    """
+    T_w_v = frames.inverse(poses[m.w]) @ poses[m.v]
+    normals = frames.rotate(T_w_v, capture.scans[m.v].normals.take(m.index_v, axis=0))
+    cosine = np.einsum("ij,ij->i", normals, capture.scans[m.w].normals.take(m.index_w, axis=0))
+    sine2 = np.clip(1 - cosine, 0.0, 2.0) / 2
+    return 1 / (1 - sine2 + sine2 / _EPSILON)

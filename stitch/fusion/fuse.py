@@ -1,10 +1,14 @@
 """Fuse registered views into one cloud: overlap averaged by weight on a grid of the scans' spacing.
 
 What a view shows in a cell is a voxel of it. A point counts where it is supported (`support.py`).
+
+Scans of which memory holds only some points are read once more, slab by slab of the part. The slabs end where cells of
+the grid end, so that what comes out does not depend on how many there are. A voxel takes normal, edge and support from
+the nearest point in memory, whose surface was that of all points.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from threading import Lock
@@ -34,84 +38,6 @@ from stitch.system.threads import map_parts, parallel
 
 # Points seen at a grazing angle weigh little and edges less, but a place only they saw stays.
 _EDGE_WEIGHT = 0.05
-
-
-def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedCloud:
-    """Average all points of all views in cells of `cell` (default: the scans' spacing), in the reference frame.
-
-    Returns:
-        Points, normals, `residual` = rms distance of the views' surfaces from the fused one along
-        its normal (NaN where one view only), and the number of views per point.
-    """
-    return fuse_points(place_scans(capture.scans, poses), cell or capture.spacing)
-
-
-def point_weights(confidence: Array, usable: Array) -> Array:
-    """(N,) what points count by their cosine of incidence, and by whether they lie on a smooth surface."""
-    return np.asarray(confidence**2 * np.where(usable, 1.0, _EDGE_WEIGHT))
-
-
-def place_scans(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
-    """All points of all scans in the reference frame, one view after the other."""
-    placed = [_place_scan(scan, T, v) for v, (scan, T) in enumerate(zip(scans, poses, strict=True))]
-    return PlacedPoints(*(np.concatenate([getattr(p, f.name) for p in placed]) for f in fields(PlacedPoints)))
-
-
-def _place_scan(scan: Scan, T: Array, v: int) -> PlacedPoints:
-    points, normals = frames.transform(T, scan.points), frames.rotate(T, scan.normals)
-    weight = point_weights(scan.confidence, scan.usable)
-    return PlacedPoints(points, normals, weight, np.full(len(points), v), np.asarray(scan.usable, bool))
-
-
-def fuse_points(placed: PlacedPoints, size: float) -> FusedCloud:
-    """The same of placed points, in cells of `size`; the grid is the reference frame's own."""
-    return _fuse_voxels(_voxels(placed, cell_numbers(placed.points, size)))
-
-
-@dataclass(frozen=True)
-class _Voxels:
-    """What views show in cells of the grid, one row for a view in a cell; a view's rows stand in the order of cells."""
-
-    cell: Indices  # (G,)
-    weight: Array  # (G,)
-    points: Array  # (G, 3) weighted mean
-    normals: Array  # (G, 3) weighted mean, shorter than 1
-
-
-def _voxels(placed: PlacedPoints, cells: Indices) -> _Voxels:
-    """The voxels of points of any views, given the cell of each (N,)."""
-    different, at = number_groups(cells)
-    views = int(placed.view.max(initial=0)) + 1
-    keys, at = number_groups(at * views + placed.view)
-    weight: Array = np.asarray(np.bincount(at, placed.weight), float)
-    mean, normal = (
-        weighted_sums(at, placed.weight, values) / weight[:, None] for values in (placed.points, placed.normals)
-    )
-    return _Voxels(different[keys // views], weight, mean, normal)
-
-
-def _fuse_voxels(voxels: _Voxels) -> FusedCloud:
-    """The mean surface in every cell, in the order of cells, and how far those of the views lie from it."""
-    _, at = number_groups(voxels.cell)
-    weight = np.bincount(at, voxels.weight)
-    points = weighted_sums(at, voxels.weight, voxels.points) / weight[:, None]
-    normals = weighted_sums(at, voxels.weight, voxels.normals)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    offset = np.zeros(len(at))
-    # One axis after the other, as rows of three take several times the memory of what they come to.
-    for p, m, n in zip(voxels.points.T, points.T, normals.T, strict=True):
-        offset += (p - m[at]) * n[at]
-    count = np.bincount(at)
-    square = np.bincount(at, voxels.weight * offset**2)
-    residual = np.where(count > 1, np.sqrt(square / weight), np.nan)
-    return FusedCloud(points, normals, residual, count.astype(np.int32))
-
-
-# Fuse scans of which memory holds only some points: every point read once more, slab by slab of the part.
-#
-# The slabs end where cells of the grid end, so that what comes out does not depend on how many there are. A voxel takes
-# normal, edge and support from the nearest point in memory, whose surface was that of all points.
-
 # Points of a slab; as many slabs are at work as there are cores, at some 200 bytes a point.
 _SLAB = 1_250_000
 # A scan is read for so many slabs at once; points of slabs that are to come wait in memory, at 24 bytes a point.
@@ -141,11 +67,6 @@ class RegisteredSession:
         return intensity_scale(self.session)
 
 
-def has_whole_clouds(session: SessionData) -> bool:
-    """True if memory holds only some of the points that were scanned."""
-    return any(view.cloud is not None and view.cloud.whole is not None for view in session.views)
-
-
 def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[FusedCloud, Unsupported]:
     """Fuse all supported points that were scanned, those in memory and those in files; return what was dropped as well.
 
@@ -155,44 +76,114 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     Raises:
         InputError: a scan is not what it was when it was read, or there is no room for the fused cloud.
     """
-    own, poses = registered.own, registered.poses
-    cell = float(np.median([scan.scanned_spacing for scan in own.scans]))
+    scans, poses = registered.own.scans, registered.poses
+    cell = float(np.median([scan.scanned_spacing for scan in scans]))
     whole = has_whole_clouds(registered.session)
     # Points in memory may stand in rows: not their spacing says what place one has, but its surface.
-    place = float(np.sqrt(np.median([np.median(scan.area) for scan in own.scans]))) if whole else own.spacing
-    placed = place_scans(own.scans, poses)
-    support = find_support(own.scans, poses, placed, place)
+    place = float(np.sqrt(np.median([np.median(scan.area) for scan in scans]))) if whole else registered.own.spacing
+    placed = place_scans(scans, poses)
+    support = find_support(scans, poses, placed, place)
     if not whole:
         dropped = Unsupported(len(support.kept), int(support.alone.sum()), int(support.looked_through.sum()))
         return fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell), dropped
     del placed  # of every view: memory is for the slabs
     # One point in memory is looked up for a block of voxels, which is no larger than the place of such a point.
-    block = max(1, int(place / cell))
-    slabs = _cut_into_slabs(registered, cell, block, slab)
-    split = np.cumsum([len(scan.points) for scan in own.scans])[:-1]
+    slabs = _cut_into_slabs(registered, cell, max(1, int(place / cell)), slab)
+    split = np.cumsum([len(scan.points) for scan in scans])[:-1]
     parts = zip(np.split(support.alone, split), np.split(support.looked_through, split), support.junk, strict=True)
     views = [_ViewInSlabs(registered, v, slabs, *part) for v, part in enumerate(parts)]
     dropped = Unsupported()
 
-    def of_slab(number: int) -> tuple[FusedCloud | None, Unsupported]:
-        found, dropped = list[_Voxels](), Unsupported()
-        for view in views:
-            own, of_view = view.voxels(number)
-            found.append(own)
-            dropped += of_view
-        voxels = _Voxels(*(np.concatenate([getattr(f, field.name) for f in found]) for field in fields(_Voxels)))
-        found.clear()
-        return _fuse_voxels(voxels) if len(voxels.cell) else None, dropped
+    def fuse_slab(number: int) -> tuple[FusedCloud | None, Unsupported]:
+        voxels, unsupported = zip(*(view.voxels(number) for view in views), strict=True)
+        together = _Voxels(*(np.concatenate(columns) for columns in zip(*map(_columns, voxels), strict=True)))
+        del voxels
+        return _fuse_voxels(together) if len(together.cell) else None, sum(unsupported, Unsupported())
 
     def clouds() -> Iterator[FusedCloud]:
         nonlocal dropped
-        for cloud, of_one in parallel(of_slab, range(slabs.count), "fusing slabs"):
-            dropped += of_one
+        for cloud, unsupported in parallel(fuse_slab, range(slabs.count), "fusing slabs"):
+            dropped += unsupported
             if cloud is not None:
                 yield cloud
 
     cloud = next(clouds()) if slabs.count == 1 else FusedCloud(**map_parts(vars(cloud) for cloud in clouds()))
     return cloud, dropped
+
+
+def has_whole_clouds(session: SessionData) -> bool:
+    """Return whether memory holds only some of the points that were scanned."""
+    return any(view.cloud is not None and view.cloud.whole is not None for view in session.views)
+
+
+def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedCloud:
+    """Average all points of all views in cells of `cell` (default: the scans' spacing), in the reference frame.
+
+    Returns:
+        Points, normals, `residual` = rms distance of the views' surfaces from the fused one along
+        its normal (NaN where one view only), and the number of views per point.
+    """
+    return fuse_points(place_scans(capture.scans, poses), cell or capture.spacing)
+
+
+def place_scans(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
+    """Return all points of all scans in the reference frame, one view after the other."""
+    placed = [_place_scan(scan, T, v) for v, (scan, T) in enumerate(zip(scans, poses, strict=True))]
+    return PlacedPoints(*(np.concatenate(columns) for columns in zip(*map(_columns, placed), strict=True)))
+
+
+def _place_scan(scan: Scan, T: Array, v: int) -> PlacedPoints:
+    points, normals = frames.transform(T, scan.points), frames.rotate(T, scan.normals)
+    # By their cosine of incidence, and by whether they lie on a smooth surface.
+    weight = scan.confidence**2 * np.where(scan.usable, 1.0, _EDGE_WEIGHT)
+    return PlacedPoints(points, normals, weight, np.full(len(points), v), np.asarray(scan.usable, bool))
+
+
+def fuse_points(placed: PlacedPoints, size: float) -> FusedCloud:
+    """Return the mean surface of placed points in cells of `size`; the grid is the reference frame's own."""
+    return _fuse_voxels(_voxels(placed, cell_numbers(placed.points, size)))
+
+
+@dataclass(frozen=True)
+class _Voxels:
+    """What views show in cells of the grid, one row for a view in a cell; a view's rows stand in the order of cells."""
+
+    cell: Indices  # (G,)
+    weight: Array  # (G,)
+    points: Array  # (G, 3) weighted mean
+    normals: Array  # (G, 3) weighted mean, shorter than 1
+
+
+def _columns(rows: _Voxels | PlacedPoints) -> tuple[Array, ...]:
+    return tuple(vars(rows).values())
+
+
+def _voxels(placed: PlacedPoints, cells: Indices) -> _Voxels:
+    """Return the voxels of points of any views, given the cell of each (N,)."""
+    different, at = number_groups(cells)
+    views = int(placed.view.max(initial=0)) + 1
+    keys, at = number_groups(at * views + placed.view)
+    weight = np.bincount(at, placed.weight).astype(float, copy=False)
+    points = weighted_sums(at, placed.weight, placed.points) / weight[:, None]
+    normals = weighted_sums(at, placed.weight, placed.normals) / weight[:, None]
+    return _Voxels(different[keys // views], weight, points, normals)
+
+
+def _fuse_voxels(voxels: _Voxels) -> FusedCloud:
+    """Return the mean surface in every cell, in the order of cells, and how far those of the views lie from it."""
+    _, at = number_groups(voxels.cell)
+    weight = np.bincount(at, voxels.weight)
+    points = weighted_sums(at, voxels.weight, voxels.points) / weight[:, None]
+    normals = weighted_sums(at, voxels.weight, voxels.normals)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    offset = np.zeros(len(at))
+    # One axis after the other, as rows of three take several times the memory of what they come to.
+    for p, m, n in zip(voxels.points.T, points.T, normals.T, strict=True):
+        offset += (p - m[at]) * n[at]
+    count = np.bincount(at)
+    square = np.bincount(at, voxels.weight * offset**2)
+    residual = np.where(count > 1, np.sqrt(square / weight), np.nan)
+    return FusedCloud(points, normals, residual, count.astype(np.int32))
 
 
 @dataclass(frozen=True)
@@ -221,9 +212,9 @@ class _Slabs:
 def _cut_into_slabs(registered: RegisteredSession, cell: float, block: int, slab: int) -> _Slabs:
     """Slabs of so many points across the part's longest axis, which end where blocks end."""
     step = block * cell
-    own, poses = registered.own, registered.poses
-    shown = [frames.transform(T, scan.points) for scan, T in zip(own.scans, poses, strict=True)]
-    low, high = (f([f(p, axis=0) for p in shown], axis=0) for f in (np.min, np.max))
+    shown = [frames.transform(T, scan.points) for scan, T in zip(registered.own.scans, registered.poses, strict=True)]
+    low = np.min([points.min(axis=0) for points in shown], axis=0)
+    high = np.max([points.max(axis=0) for points in shown], axis=0)
     axis = int(np.argmax(high - low))
     first = np.floor(low[axis] / step)
     share = [1.0 if v.cloud is None else v.cloud.count / len(v.cloud.points) for v in registered.session.views]
@@ -250,17 +241,23 @@ class _ViewInSlabs:
             through: those past which other views look.
             junk: share of the points that stand alone.
         """
-        self.registered, self.v, self.slabs = registered, v, slabs
-        self.scan, self.T = registered.own.scans[v], registered.poses[v]
+        self.registered = registered
+        self.v = v
+        self.slabs = slabs
+        self.scan = registered.own.scans[v]
+        self.T = registered.poses[v]
         cloud = registered.session.views[v].cloud
         self.whole = None if cloud is None else cloud.whole
         self.moves = moves_points(registered.model.terms)
-        self.kept, self.through = ~(alone | through), through
+        self.kept = ~(alone | through)
+        self.through = through
         self.surface = np.flatnonzero(~alone) if not alone.all() else np.arange(len(alone))
         some = len(self.surface) < len(alone)
         self.tree = KDTree(self.scan.points[self.surface], leafsize=16) if some else self.scan.tree
         self.off_plane = _OFF_PLANE * (1 + edge_credit(junk))
-        self.first, self.last, self.margin = 0, slabs.count - 1, slabs.cell
+        self.first = 0
+        self.last = slabs.count - 1
+        self.margin = slabs.cell
         if self.whole is not None:
             self.margin += _MAX_MOVE * float(np.ptp(self.whole.box, axis=0).max()) if self.moves else 0.0
             height = frames.transform(self.T, box_corners(self.whole.box))[:, slabs.axis]
@@ -276,9 +273,8 @@ class _ViewInSlabs:
             every = _place_scan(self.scan, self.T, self.v)
             inside = self.slabs.of(every.points[:, axis]) == slab
             keep = inside & self.kept
-            dropped = Unsupported(
-                *(int(np.sum(m & inside)) for m in (inside, ~self.kept & ~self.through, self.through))
-            )
+            alone = ~self.kept & ~self.through & inside
+            dropped = Unsupported(int(inside.sum()), int(alone.sum()), int((self.through & inside).sum()))
             kept = every.take(keep)
             return _voxels(kept, pack_cells(self.slabs.cells(kept.points.T), axis)), dropped
         in_memory, placed = self._points_in(slab, self.whole)
@@ -291,15 +287,16 @@ class _ViewInSlabs:
         nearest = self._nearest(mean, count)
         normal = in_memory.normals[nearest]
         away = mean - in_memory.points[nearest]
-        far, off = np.einsum("ij,ij->i", away, away), np.abs(np.einsum("ij,ij->i", away, normal))
+        far = np.einsum("ij,ij->i", away, away)
+        off = np.abs(np.einsum("ij,ij->i", away, normal))
         del away
         alone = far > _WITHIN**2 * self.scan.area[nearest]
         alone |= self.scan.usable[nearest] & (off > _SIGMAS * self.scan.noise + self.off_plane * np.sqrt(far))
         through = self.through[nearest] & ~alone
         keep = ~(alone | through)
         weight = (count * in_memory.weight[nearest])[keep]
-        found = _Voxels(different[keep], weight, mean[keep], normal[keep])
-        return found, Unsupported(len(at), int(count[alone].sum()), int(count[through].sum()))
+        voxels = _Voxels(different[keep], weight, mean[keep], normal[keep])
+        return voxels, Unsupported(len(at), int(count[alone].sum()), int(count[through].sum()))
 
     def _points_in(self, slab: int, whole: WholeCloud) -> tuple[PlacedPoints | None, list[Array]]:
         """The view's points in memory, None beside an empty slab, and columns x, y, z of all points of the slab.
@@ -319,12 +316,12 @@ class _ViewInSlabs:
         return in_memory if len(columns[0]) else None, columns
 
     def _cut(self, whole: WholeCloud, start: int, stop: int) -> dict[int, list[Array]]:
-        """The same of slabs from `start` up to `stop`, by their numbers."""
-        every = whole.read()
-        height = _along(self.T, every.points, self.slabs.axis)
+        """Return the columns of slabs from `start` up to `stop`, by their numbers."""
+        cloud = whole.read()
+        height = _along(self.T, cloud.points, self.slabs.axis)
         low, high = self.slabs.cell * self.slabs.ends[[start, stop]]
         near = np.flatnonzero((height >= low - self.margin) & (height < high + self.margin))
-        points = self._corrected(every, near) if self.moves else every.points[near]
+        points = self._corrected(cloud, near) if self.moves else cloud.points[near]
         columns = [_along(self.T, points, i) for i in range(3)]
         # Numbers of 16 bits are sorted in a fifth of the time.
         slab = self.slabs.of(columns[self.slabs.axis]).astype(np.int16)
@@ -332,12 +329,23 @@ class _ViewInSlabs:
         ends = np.searchsorted(slab[order], np.arange(start, stop + 1))
         return {k: [c[order[a:b]] for c in columns] for k, (a, b) in enumerate(pairwise(ends), start)}
 
-    def _corrected(self, every: Cloud, index: Indices) -> Array:
-        """Some of the points, scanner frame, without the effects in use."""
-        blocks = np.array_split(index, len(index) // _SLAB + 1)
-        return np.concatenate(
-            [_corrected_points(self.registered, self.v, every.points[b], every.scalars, b) for b in blocks]
-        )
+    def _corrected(self, cloud: Cloud, index: Indices) -> Array:
+        """Return some of the points, scanner frame, without the effects in use."""
+        registered, terms = self.registered, self.registered.model.terms
+        scan, scale = registered.measurement.capture.scans[self.v], registered.intensity_scale
+        T = registered.own.poses(registered.model.T_mount)[self.v]
+        corrected = []
+        for block in np.array_split(index, len(index) // _SLAB + 1):
+            points = cloud.points[block]
+            _, nearest = scan.tree.query(points, k=1)
+            cosine = np.abs(np.einsum("ij,ij->i", scan.normals[nearest], scan.rays(points)))
+            view = replace(
+                registered.measurement.scan_views[self.v],
+                cosine=np.maximum(cosine, MIN_COSINE),
+                intensity=None if scale is None else (cloud.scalars["intensity"][block] - scale[0]) / scale[1],
+            )
+            corrected.append(points + point_correction(terms, points, view, T))
+        return np.concatenate(corrected)
 
     def _nearest(self, mean: Array, count: Indices) -> Indices:
         """(G,) the point in memory that is nearest to the block in which a voxel lies."""
@@ -345,27 +353,11 @@ class _ViewInSlabs:
         different, at = number_groups(pack_cells(cells, self.slabs.axis))
         middle = weighted_sums(at, count.astype(float), mean) / np.bincount(at, count, len(different))[:, None]
         _, index = self.tree.query(frames.transform(frames.inverse(self.T), middle), k=1)
-        return np.asarray(self.surface[index][at])
+        return self.surface[index][at]
 
 
 def _along(T: Array, points: Array, axis: int) -> Array:
     """(N,) one coordinate of points (N, 3) under T."""
     # A product of matrices this narrow takes ten times as long.
     (x, y, z), (a, b, c, t) = points.T, T[axis]
-    return np.asarray(x * a + y * b + z * c + t)
-
-
-def _corrected_points(
-    registered: RegisteredSession, v: int, points: Array, scalars: dict[str, Array], index: Indices
-) -> Array:
-    """Points (N, 3) of view v, scanner frame, without the effects in use."""
-    scan, terms = registered.measurement.capture.scans[v], registered.model.terms
-    _, nearest = scan.tree.query(points, k=1)
-    cosine = np.abs(np.einsum("ij,ij->i", scan.normals[nearest], scan.rays(points)))
-    scale = registered.intensity_scale
-    view = replace(
-        registered.measurement.scan_views[v],
-        cosine=np.maximum(cosine, MIN_COSINE),
-        intensity=None if scale is None else (scalars["intensity"][index] - scale[0]) / scale[1],
-    )
-    return points + point_correction(terms, points, view, registered.own.poses(registered.model.T_mount)[v])
+    return x * a + y * b + z * c + t

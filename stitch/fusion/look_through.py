@@ -55,7 +55,7 @@ class RangeImages:
         cosine = away @ self.axes[2] / np.maximum(far, 1e-300)
         inside = np.arccos(np.clip(cosine, -1, 1)) <= field + np.arcsin(np.minimum(radii / np.maximum(far, 1e-300), 1))
         farthest = max(float(self.nearest.max()), self.reach[1])
-        return np.asarray((far <= radii) | (inside & (far - radii <= farthest)))
+        return (far <= radii) | (inside & (far - radii <= farthest))
 
     def views_through(self, scan: Scan, T: Array, v: int, columns: Array, normals: Array, margin: float) -> Indices:
         """(N,) 1 where view v looks past places with normals (N, 3), 2 where it ought to have seen one; else 0.
@@ -65,9 +65,9 @@ class RangeImages:
             columns: (3, N) x, y, z of the places.
             margin: by which a surface lies behind a place, length_unit.
         """
-        found = np.zeros(columns.shape[1], np.int64)
+        through = np.zeros(columns.shape[1], np.int64)
         if not self.trusted[v]:
-            return found
+            return through
         # Column by column: products of matrices this narrow take several times as long.
         x, y, z = columns
         turn = self.axes @ T[:3, :3].T
@@ -78,13 +78,13 @@ class RangeImages:
         i, j = across / scale - self.low[0] / self.bin, up / scale - self.low[1] / self.bin
         inside = np.flatnonzero((i >= 0) & (i < self.field.shape[0]) & (j >= 0) & (j < self.field.shape[1]))
         far, i, j = far[inside], i[inside].astype(np.int64), j[inside].astype(np.int64)
-        found[inside[self.nearest[v, i, j] > far + margin]] = 1
+        through[inside[self.nearest[v, i, j] > far + margin]] = 1
         missed = self.empty[v, i, j] & self.field[i, j] & (far > self.reach[0]) & (far < self.reach[1])
-        missed &= found[inside] == 0
+        missed &= through[inside] == 0
         inside, far = inside[missed], far[missed]
         away = columns[:, inside].T - frames.transform(T, scan.eye)
-        found[inside[np.einsum("ij,ij->i", normals[inside], away) < -_FACING * far]] = 2
-        return found
+        through[inside[np.einsum("ij,ij->i", normals[inside], away) < -_FACING * far]] = 2
+        return through
 
 
 def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> RangeImages:
@@ -141,7 +141,7 @@ def _axes_about(middle: Array) -> Array:
 def _on_map(rays: Array, axes: Array) -> Array:
     """(N, 2) stereographic map of unit rays (N, 3); what lies behind the scanner lies far off."""
     x = rays @ axes.T
-    return np.asarray(x[:, :2] / np.maximum(1 + x[:, 2:], _BEHIND))
+    return x[:, :2] / np.maximum(1 + x[:, 2:], _BEHIND)
 
 
 def _of_nine_bins(image: Array) -> tuple[Array, Indices]:
@@ -152,4 +152,4 @@ def _of_nine_bins(image: Array) -> tuple[Array, Indices]:
     for i, j in np.ndindex(3, 3):
         least = np.minimum(least, shifted[:, :, i, j])
         filled += np.isfinite(shifted[:, :, i, j])
-    return np.asarray(least), filled
+    return least, filled

@@ -6,7 +6,8 @@ and `gicp`, plane to plane inside Tukey's biweight (`plane_weights`). The cost i
 `dpwvm` λ is 0 for a view that shows an offset of its own, as stock on a casting.
 
 Solving all views together leaves no drift around a loop. The prior is each view's pose from the robot, with the
-scatter that the overlaps themselves show (REML).
+scatter that the overlaps themselves show (REML). Where there are labelled points alone, each view moves by its own most
+likely error (`register_targets`).
 """
 
 from collections.abc import Callable, Sequence
@@ -36,31 +37,11 @@ from stitch.observations.targets.rows import TargetRows
 from stitch.recorder import Recorder, SilentRecorder
 from stitch.session.capture import Capture
 
-# Each view moved by its own most likely error, where its labelled points show one.
-
-
-def register_targets(rows: TargetRows, variances: Array, poses: Array) -> tuple[Array, Array]:
-    """Poses (V, 4, 4) moved by each view's most likely error, and what is left of its targets, (V, S).
-
-    The most likely twist of a view is C·leverᵀ·V⁻¹·(−left) (best linear unbiased prediction, Robinson 1991).
-    """
-    V = len(rows.lever)
-    to_centre = frames.make(np.eye(3), -rows.centre)
-    carried = frames.adjoint(to_centre @ rows.capture.T_reference_flange)
-    scatter = carried * np.repeat(variances[:2], 3) @ carried.transpose(0, 2, 1)
-    covariance = rows.mixed_model(rows.hand_eye).covariance(variances)[:V]
-    pushed = np.linalg.solve(covariance, -rows.residual[:V, :, None])
-    twist = (scatter @ rows.lever.transpose(0, 2, 1) @ pushed)[..., 0]
-    moved = frames.moved_about(rows.centre, twist, poses)
-    left = rows.residual.copy()
-    left[:V] += np.einsum("vmi,vi->vm", rows.lever, twist)
-    return moved, rows.distances(left)
-
-
 _MAXIMUM_ITERATIONS = 25
 _CONVERGED = 5e-3
 # Iterations in a row in which neither the rms nor the step may fall by this share, at a gate that stands still.
 _PATIENCE, _FALLS = 3, 1e-3
+
 # Weights (M,) per match, from the matches, their capture and T_reference_scanner (V, 4, 4).
 CorrespondenceWeights = Callable[[Sequence[Match], Capture, Array], Sequence[Array]]
 
@@ -102,29 +83,6 @@ class Registration:
     offsets: dict[int, float] = field(default_factory=dict)  # by which whole surfaces of views stand off, outwards
 
 
-def unseen_moves(found: Registration, model_poses: Array) -> Array:
-    """Return (V,) how far register moved each view along its surfaces, where no overlap shows it; length_unit.
-
-    A ball turns and a cylinder slides on itself: such moves come from the noise and from the prior.
-    """
-    g = found.overlaps.gram
-    blocks, factors = np.zeros((g.views, 6, 6)), g.displacement_factors
-    for side in g.pairs.T:
-        np.add.at(blocks, side, g.matrix / np.outer(factors, factors))
-    values, vectors = np.linalg.eigh(blocks)
-    to_centre = frames.make(np.eye(3), -g.centre)
-    moved = frames.log(to_centre @ found.poses @ frames.inverse(model_poses) @ frames.inverse(to_centre)) * factors
-    along = np.einsum("vik,vi->vk", vectors, moved - moved.mean(axis=0))
-    return np.asarray(np.linalg.norm(along * (values < NEAR_NULL * values[:, -1:]), axis=1))
-
-
-def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> Array:
-    """(V, 6, 6) inverse covariance of the views' twists about `centre`."""
-    carried = frames.adjoint(frames.make(np.eye(3), -centre) @ capture.T_reference_flange)
-    sigma = np.diag([scatter.rotation**2] * 3 + [scatter.translation**2] * 3)
-    return np.asarray(np.linalg.inv(carried @ sigma @ carried.transpose(0, 2, 1)))
-
-
 def register(
     capture: Capture,
     model_poses: Array,
@@ -149,9 +107,10 @@ def register(
         NoResultError: no two views overlap.
     """
     recorder = recorder or SilentRecorder()
-    picked = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
-    poses, history = np.array(model_poses if start is None else _without_mean_motion(start, model_poses)), list[float]()
-    overlaps = collect_overlaps(capture, poses, gate, picked, before)
+    samples = [sample_points(scan, FINE_SAMPLES) for scan in capture.scans]
+    poses = np.array(model_poses if start is None else _without_mean_motion(start, model_poses))
+    history: list[float] = []
+    overlaps = collect_overlaps(capture, poses, gate, samples, before)
     last: LastStep = None
     progress = _Progress()
     for index in range(_MAXIMUM_ITERATIONS):
@@ -169,8 +128,58 @@ def register(
             break
         poses, last = take_step(poses, g, step, last)
         gate = tighter
-        overlaps = collect_overlaps(capture, poses, gate, picked, overlaps)
+        overlaps = collect_overlaps(capture, poses, gate, samples, overlaps)
     return replace(best, history=tuple(history), note=progress.note(len(history)))
+
+
+def _without_mean_motion(start: Array, model_poses: Array) -> Array:
+    """`start` without its mean motion against the robot, which no overlap can show."""
+    common = frames.log(start @ frames.inverse(model_poses)).mean(axis=0)
+    return frames.exp(-common) @ start
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Of data and prior, for twists of all views about the centre; the inverse of H is their covariance."""
+
+    H: Array  # (6V, 6V)
+    b: Array  # (6V,)
+    offsets: dict[int, float] = field(default_factory=dict)  # that views show, eliminated
+
+    @property
+    def step(self) -> Array:
+        """(V, 6) of Gauss and Newton."""
+        return np.linalg.solve(self.H, -self.b).reshape(-1, 6).astype(float, copy=False)
+
+
+def normal_equations(
+    overlaps: Overlaps, capture: Capture, poses: Array, model_poses: Array, *, scatter: Repeatability, method: Method
+) -> NormalEquations:
+    """Return what the overlaps say under a method's weights, and the robot's prior."""
+    old = overlaps.gram
+    weights = method.weigh(overlaps.matches, capture, poses)
+    surfaces = gram(overlaps.matches, old.views, old.centre, old.scale, weights)
+    sums = OffsetSums(surfaces, overlaps.matches, weights) if method.offsets else None
+    if sums is not None:
+        surfaces = replace(surfaces, square=sums.square)
+    g = append_targets(surfaces, overlaps.targets, capture.noise_factor)
+    variance = g.variance * scatter.noise_factor
+    prior = prior_precision(capture, scatter, g.centre)
+    to_centre = frames.make(np.eye(3), -g.centre)
+    off = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))
+    H, b = assemble(g)
+    H = H / variance
+    b = b / variance + np.einsum("vij,vj->vi", prior, off).reshape(-1)
+    for v, precision in enumerate(prior):
+        H[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += precision
+    return NormalEquations(H, b) if sums is None else NormalEquations(*with_offsets(H, b, sums, variance, old.scale))
+
+
+def prior_precision(capture: Capture, scatter: Repeatability, centre: Array) -> Array:
+    """Return the (V, 6, 6) inverse covariance of the views' twists about `centre`."""
+    carried = frames.adjoint(frames.make(np.eye(3), -centre) @ capture.T_reference_flange)
+    sigma = np.diag([scatter.rotation**2] * 3 + [scatter.translation**2] * 3)
+    return np.linalg.inv(carried @ sigma @ carried.transpose(0, 2, 1)).astype(float, copy=False)
 
 
 class _Progress:
@@ -201,41 +210,37 @@ class _Progress:
         return f"did not come to rest in {iterations} iterations; the poses of iteration {kept} are kept"
 
 
-def _without_mean_motion(start: Array, model_poses: Array) -> Array:
-    """`start` without its mean motion against the robot, which no overlap can show."""
-    common = frames.log(start @ frames.inverse(model_poses)).mean(axis=0)
-    return np.asarray(frames.exp(-common) @ start)
+def unseen_moves(registration: Registration, model_poses: Array) -> Array:
+    """Return (V,) how far register moved each view along its surfaces, where no overlap shows it; length_unit.
 
-
-@dataclass(frozen=True)
-class NormalEquations:
-    """Of data and prior, for twists of all views about the centre; the inverse of H is their covariance."""
-
-    H: Array  # (6V, 6V)
-    b: Array  # (6V,)
-    offsets: dict[int, float] = field(default_factory=dict)  # that views show, eliminated
-
-    @property
-    def step(self) -> Array:
-        """(V, 6) of Gauss and Newton."""
-        return np.asarray(np.linalg.solve(self.H, -self.b).reshape(-1, 6))
-
-
-def normal_equations(
-    overlaps: Overlaps, capture: Capture, poses: Array, model_poses: Array, *, scatter: Repeatability, method: Method
-) -> NormalEquations:
-    """Return what the overlaps say under a method's weights, and the robot's prior."""
-    old, weights = overlaps.gram, method.weigh(overlaps.matches, capture, poses)
-    surfaces = gram(overlaps.matches, old.views, old.centre, old.scale, weights)
-    sums = OffsetSums(surfaces, overlaps.matches, weights) if method.offsets else None
-    if sums is not None:
-        surfaces = replace(surfaces, square=sums.square)
-    g = append_targets(surfaces, overlaps.targets, capture.noise_factor)
-    variance, prior = g.variance * scatter.noise_factor, prior_precision(capture, scatter, g.centre)
+    A ball turns and a cylinder slides on itself: such moves come from the noise and from the prior.
+    """
+    g = registration.overlaps.gram
+    blocks = np.zeros((g.views, 6, 6))
+    factors = g.displacement_factors
+    for side in g.pairs.T:
+        np.add.at(blocks, side, g.matrix / np.outer(factors, factors))
+    values, vectors = np.linalg.eigh(blocks)
     to_centre = frames.make(np.eye(3), -g.centre)
-    off = frames.log(to_centre @ poses @ frames.inverse(model_poses) @ frames.inverse(to_centre))
-    H, b = assemble(g)
-    H, b = H / variance, b / variance + np.einsum("vij,vj->vi", prior, off).reshape(-1)
-    for v, precision in enumerate(prior):
-        H[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += precision
-    return NormalEquations(H, b) if sums is None else NormalEquations(*with_offsets(H, b, sums, variance, old.scale))
+    motions = to_centre @ registration.poses @ frames.inverse(model_poses) @ frames.inverse(to_centre)
+    moved = frames.log(motions) * factors
+    along = np.einsum("vik,vi->vk", vectors, moved - moved.mean(axis=0))
+    return np.linalg.norm(along * (values < NEAR_NULL * values[:, -1:]), axis=1)
+
+
+def register_targets(rows: TargetRows, variances: Array, poses: Array) -> tuple[Array, Array]:
+    """Return poses (V, 4, 4) moved by each view's most likely error, and what is left of its targets, (V, S).
+
+    The most likely twist of a view is C·leverᵀ·V⁻¹·(−residual) (best linear unbiased prediction, Robinson 1991).
+    """
+    V = len(rows.lever)
+    to_centre = frames.make(np.eye(3), -rows.centre)
+    carried = frames.adjoint(to_centre @ rows.capture.T_reference_flange)
+    scatter = carried * np.repeat(variances[:2], 3) @ carried.transpose(0, 2, 1)
+    covariance = rows.mixed_model(rows.hand_eye).covariance(variances)[:V]
+    pushed = np.linalg.solve(covariance, -rows.residual[:V, :, None])
+    twist = (scatter @ rows.lever.transpose(0, 2, 1) @ pushed)[..., 0]
+    moved = frames.moved_about(rows.centre, twist, poses)
+    residual = rows.residual.copy()
+    residual[:V] += np.einsum("vmi,vi->vm", rows.lever, twist)
+    return moved, rows.distances(residual)

@@ -6,7 +6,7 @@ stands in the way of some views: others look past it, and it hangs together with
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -65,8 +65,8 @@ class PlacedPoints:
     usable: Mask  # (N,): on a smooth surface
 
     def take(self, keep: Mask) -> "PlacedPoints":
-        """Some of them."""
-        return PlacedPoints(*(getattr(self, f.name).compress(keep, axis=0) for f in fields(PlacedPoints)))
+        """Return some of them."""
+        return PlacedPoints(*(column.compress(keep, axis=0) for column in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Support:
     @property
     def kept(self) -> Mask:
         """What is surface."""
-        return np.asarray(~(self.alone | self.looked_through))
+        return ~(self.alone | self.looked_through)
 
 
 def find_support(scans: Sequence[Scan], poses: Array, placed: PlacedPoints, cell: float) -> Support:
@@ -115,7 +115,7 @@ def cell_numbers(points: Array, size: float) -> Indices:
 def pack_cells(cells: Sequence[Indices], axis: int) -> Indices:
     """(N,) one number for three of a cell, a million to either side of the origin, in the order along `axis`."""
     first, second, third = (cells[i] + (1 << _BITS - 1) for i in (axis, *(i for i in range(3) if i != axis)))
-    return np.asarray((first << 2 * _BITS) | (second << _BITS) | third)
+    return (first << 2 * _BITS) | (second << _BITS) | third
 
 
 def number_groups(key: Indices) -> tuple[Indices, Indices]:
@@ -149,20 +149,23 @@ def _points_on_surface(placed: PlacedPoints, cell: float) -> tuple[Mask, float]:
     views = int(placed.view.max()) + 1
     _, at = number_groups(cell_numbers(placed.points, cell))
     weight = np.bincount(at, placed.weight)
-    mean, normal = (weighted_sums(at, placed.weight, values) for values in (placed.points, placed.normals))
+    mean = weighted_sums(at, placed.weight, placed.points)
     mean /= weight[:, None]
+    normal = weighted_sums(at, placed.weight, placed.normals)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    off, cosine = np.zeros(len(at)), np.zeros(len(at))
+    off = np.zeros(len(at))
+    cosine = np.zeros(len(at))
     # One axis after the other: of hundreds of views, rows of three are hundreds of megabytes.
     for p, n, m, across in zip(placed.points.T, placed.normals.T, mean.T, normal.T, strict=True):
-        own = across[at]
-        off += (p - m[at]) * own
-        cosine += n * own
-    off, alike = np.abs(off), cosine > _ALIKE
+        surface_normal = across[at]
+        off += (p - m[at]) * surface_normal
+        cosine += n * surface_normal
+    off = np.abs(off)
+    alike = cosine > _ALIKE
     del cosine, mean, normal
     groups, group = number_groups(at * views + placed.view)
-    seen = np.bincount(groups // views, minlength=len(weight))
-    several = placed.usable & (seen > 1)[at]
+    views_in_cell = np.bincount(groups // views, minlength=len(weight))
+    several = placed.usable & (views_in_cell > 1)[at]
     scatter = MAD_TO_SIGMA * float(np.median(off[several])) if several.any() else 0.0
     near = off < _SIGMAS * scatter
     shows = np.bincount(group, placed.usable & near & alike, len(groups)) > 0
@@ -182,7 +185,8 @@ def _held_by_own_view(scan: Scan, settled: Mask, noise: float, angle_each: float
         noise: of the scan across a surface, length_unit.
         angle_each: solid angle that a point on a smooth surface has for itself.
     """
-    held, asked = np.ones(len(scan.points), bool), np.flatnonzero(~settled)
+    held = np.ones(len(scan.points), bool)
+    asked = np.flatnonzero(~settled)
     if not len(asked) or len(scan.points) <= _NEIGHBOURS:
         return held, 0.0
     distance, index = scan.tree.query(scan.points[asked], k=_NEIGHBOURS + 1)
@@ -195,7 +199,8 @@ def _held_by_own_view(scan: Scan, settled: Mask, noise: float, angle_each: float
     credit = edge_credit(junk)
     vote = np.where(scan.usable[index], 1.0, _EDGE_VOTE)
     around = scan.points.take(index, axis=0) - scan.points.take(asked, axis=0)[:, None]
-    centroid, normals = around.mean(axis=1), scan.normals.take(index, axis=0)
+    centroid = around.mean(axis=1)
+    normals = scan.normals.take(index, axis=0)
     # What the first round throws out supports nothing in the second.
     for _ in range(2):
         local = _LocalSurface(around, normals, vote * held[index])
@@ -227,15 +232,16 @@ def _masked_median(values: Array, counts: Mask) -> Array:
     """(N,) lower median of those values (N, k) that count; a large number where none does."""
     ordered = np.sort(np.where(counts, values, _NONE), axis=1)
     middle = np.maximum(counts.sum(axis=1) - 1, 0) // 2
-    return np.asarray(np.take_along_axis(ordered, middle[:, None], axis=1)[:, 0])
+    return np.take_along_axis(ordered, middle[:, None], axis=1)[:, 0]
 
 
 def _held_by_all_views(placed: PlacedPoints, held: Mask, scatter: float, cell: float) -> Mask:
     """Points (N,) that lie on a surface of the held points of all views, though not on one of their own view."""
-    found, asked = np.zeros_like(held), np.flatnonzero(~held)
+    on_surface = np.zeros_like(held)
+    asked = np.flatnonzero(~held)
     base = np.flatnonzero(held)
     if not len(asked) or len(base) < _NEIGHBOURS:
-        return found
+        return on_surface
     tree = KDTree(np.ascontiguousarray(placed.points[base]), leafsize=16)
     distance, index = tree.query(placed.points[asked], k=_NEIGHBOURS, distance_upper_bound=_NEAR * cell)
     near = np.isfinite(distance[:, -1])
@@ -243,8 +249,8 @@ def _held_by_all_views(placed: PlacedPoints, held: Mask, scatter: float, cell: f
     around = placed.points.take(index, axis=0) - placed.points[asked][:, None]
     local = _LocalSurface(around, placed.normals.take(index, axis=0), np.ones(index.shape))
     within = _SIGMAS * scatter + local.bend * radius / 2
-    found[asked] = (local.votes > _NEIGHBOURS / 2 - 1) & (np.abs(local.height) < within)
-    return found
+    on_surface[asked] = (local.votes > _NEIGHBOURS / 2 - 1) & (np.abs(local.height) < within)
+    return on_surface
 
 
 def _looked_through(
@@ -261,30 +267,31 @@ def _looked_through(
     if not all(keep.any() for keep in kept):
         return np.zeros(len(asked), bool)
     images = range_images(scans, kept, cell)
-    points, normals, own = placed.points[asked], placed.normals[asked], placed.view[asked]
-    centres, radii = _balls_around(points, own, len(scans))
+    points, normals, view = placed.points[asked], placed.normals[asked], placed.view[asked]
+    centres, radii = _balls_around(points, view, len(scans))
     columns = np.ascontiguousarray(points.T)
 
     def by_view(v: int) -> tuple[Indices, Indices]:
         concerned = images.may_concern(scans[v], poses[v], centres, radii)
         concerned[v] = False
-        near = np.flatnonzero(concerned[own])
+        near = np.flatnonzero(concerned[view])
         return near, images.views_through(scans[v], poses[v], v, columns[:, near], normals[near], _MARGIN * cell)
 
-    past, missed = np.zeros(len(asked), np.int64), np.zeros(len(asked), np.int64)
-    for near, found in parallel(by_view, range(len(scans))):
-        past[near] += found == 1
-        missed[near] += found == 2
+    past = np.zeros(len(asked), np.int64)
+    missed = np.zeros(len(asked), np.int64)
+    for near, answer in parallel(by_view, range(len(scans))):
+        past[near] += answer == 1
+        missed[near] += answer == 2
     through = past >= np.where(placed.usable[asked], _PAST, 1)
     contradicted = np.zeros(len(held), bool)
     contradicted[asked] = past + missed > 0
     loose = np.zeros(len(held), bool)
     ends = np.cumsum([0, *(len(scan.points) for scan in scans)])
-    for v in np.flatnonzero(np.bincount(own[contradicted[asked]]) > _WITNESSES):
+    for v in np.flatnonzero(np.bincount(view[contradicted[asked]]) > _WITNESSES):
         # What stands in the way of one view may stand near what others show.
-        every = ends[v] + np.flatnonzero(kept[v])
-        loose[every] = _in_loose_body(placed.points[every], settled[every], contradicted[every], cell)
-    return np.asarray(through | loose[asked])
+        rows = ends[v] + np.flatnonzero(kept[v])
+        loose[rows] = _in_loose_body(placed.points[rows], settled[rows], contradicted[rows], cell)
+    return through | loose[asked]
 
 
 def _balls_around(points: Array, view: Indices, views: int) -> tuple[Array, Array]:
@@ -306,5 +313,6 @@ def _in_loose_body(points: Array, settled: Mask, contradicted: Mask, cell: float
     grid[at] = True
     body = label(grid, np.ones((3, 3, 3)))[0][at]
     size = np.bincount(body)
-    twice, against = (np.bincount(body, mask, len(size)) for mask in (settled, contradicted))
-    return np.asarray(((twice < _SEEN_TWICE * size) & (against > np.maximum(_CONTRADICTED * size, _WITNESSES)))[body])
+    twice = np.bincount(body, settled, len(size))
+    against = np.bincount(body, contradicted, len(size))
+    return ((twice < _SEEN_TWICE * size) & (against > np.maximum(_CONTRADICTED * size, _WITNESSES)))[body]
