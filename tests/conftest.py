@@ -48,7 +48,7 @@ LONGEST = (
     "test_admission.py",
     "test_run_folder.py",
     "test_window.py",
-    "test_surface_stages.py",
+    "test_correct.py",
     "test_sphere.py",
     "test_cell_outputs.py",
 )

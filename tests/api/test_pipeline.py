@@ -1,19 +1,34 @@
-"""The arm of one run kept in another, under another mount: what stays, how much it helps, and what its errors cost."""
+"""What a run conducts: the last steps beside the screening, the method that was asked for, the arm of another run."""
 
 import json
+from concurrent.futures import CancelledError
 from dataclasses import replace
+from threading import current_thread
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+import stitch
+from data_synth.fixtures.blade_cells import measured_blade
+from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.api.pipeline import run
+from stitch.api.pipeline import change, run
 from stitch.cli.main import main
+from stitch.errors import InputError
+from stitch.fit import surface_steps
+from stitch.fusion.fuse import RegisteredSession, fuse_every_point
+from stitch.fusion.register import DEFAULT
 from stitch.model.model_toml import keep_arm_effects
 from stitch.output.result_document import model_of
+from stitch.output.run_folder import write_with_page
+from stitch.output.stored_run import load_run
+from stitch.recorder import RecorderMemory, SilentRecorder
+from stitch.session.reading.session_folder import load_session
+from stitch.system.threads import begin
+from viz.recording import run_markdown
 
 OFFSET = np.array([0, 1e-3, -1.5e-3, 4e-4, 2e-3, 0])
 
@@ -28,6 +43,100 @@ def error_of(found, T_mount):
     """Twist (6,) of the true hand-eye in the frame of the one found, rotation first."""
     relative = np.linalg.inv(found.T_mount) @ T_mount
     return np.append(Rotation.from_matrix(relative[:3, :3]).as_rotvec(), relative[:3, 3])
+
+
+def told_of(found):
+    """What a run says of the arm it was given: as a doubt, and as a note."""
+    return [[line for line in own if "arm of the other run" in line] for own in (found.doubts, found.notes)]
+
+
+class _Told(SilentRecorder):
+    def __init__(self) -> None:
+        self.told: list[tuple[str, int]] = []
+
+    def iteration(self, stage: str, index: int, *_: object) -> None:
+        self.told.append((stage, index))
+
+
+def test_iterations_are_told_in_their_order_and_not_before():
+    memory, recorder = RecorderMemory(), _Told()
+    for index in range(3):
+        memory.iteration("register", index, np.eye(4)[None], 1.0, 2.0)
+    assert recorder.told == []
+    memory.replay(recorder)
+    assert recorder.told == [("register", 0), ("register", 1), ("register", 2)]
+
+
+def test_a_stage_that_nobody_wants_ends_with_its_next_iteration():
+    memory = RecorderMemory()
+
+    def stage() -> None:
+        for index in range(10**9):
+            memory.iteration("register", index, np.eye(4)[None], 1.0, 2.0)
+
+    begun = begin(stage)
+    memory.stopped = True
+    with pytest.raises(CancelledError):
+        begun.result(timeout=10)
+
+
+def test_an_error_is_raised_where_the_result_is_asked():
+    with pytest.raises(ZeroDivisionError):
+        begin(lambda: 1 / 0).result(timeout=10)
+
+
+def test_views_are_fused_while_they_are_screened_and_errors_are_told(monkeypatch):
+    session, threads = session_of(measured_blade(2, views=3, pixels=40)), []
+
+    def fused(registered):
+        threads.append(current_thread().name)
+        return fuse_every_point(registered)
+
+    monkeypatch.setattr(surface_steps, "fuse_every_point", fused)
+    found = run(session)
+    own = RegisteredSession(session, found.measurement, found.model, found.measurement.capture, found.poses)
+    assert threads == ["stitch-beside"]
+    assert np.array_equal(found.fused.points, fuse_every_point(own)[0].points)
+
+    def without_room(registered):
+        raise InputError("no room")
+
+    monkeypatch.setattr(surface_steps, "fuse_every_point", without_room)
+    with pytest.raises(InputError, match="no room"):
+        run(session)
+
+
+def test_the_method_is_written_read_again_and_kept_by_a_change(session, tmp_path):
+    loaded = load_session(session)
+    usual, asked = run(loaded), run(loaded, register="gicp")
+    assert usual.register_method == DEFAULT
+    assert asked.register_method == "gicp"
+    assert not np.array_equal(usual.poses, asked.poses)
+    write_with_page(asked, tmp_path)
+    stages = json.loads((tmp_path / "result.json").read_text())["stages"]
+    assert [stage.get("method") for stage in stages] == [None, None, "gicp", None]
+    state = load_run(tmp_path)
+    assert state.register_method == "gicp"
+    assert change(state, []).register_method == "gicp"
+    assert usual.register_method == DEFAULT
+    assert "Registered by plane to plane (GICP)" in run_markdown(asked, None)
+    assert "Registered by DPWVM-style weighted fit" in run_markdown(usual, None)
+
+
+def test_a_method_of_another_name_is_bad_input(session):
+    with pytest.raises(InputError, match="--register icp: no method has this name; to fix: dpwvm or gicp"):
+        run(load_session(session), register="icp")
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(session), "--register", "icp"])
+    assert ended.value.code == 2
+
+
+def test_from_python_the_method_is_that_of_the_command(session):
+    loaded = stitch.load_session(session)
+    found = stitch.run(loaded, register="gicp")
+    assert found.register_method == "gicp"
+    assert np.array_equal(found.poses, run(loaded, register="gicp").poses)
+    assert stitch.run_rig([loaded], register="gicp")[0].register_method == "gicp"
 
 
 @pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
@@ -68,9 +177,9 @@ def test_the_command_keeps_the_arm_through_what_follows(tmp_path, stitch_command
     stitch_command("run", a, "-o", "ra", "--effects", "joint_offset", "--no-recording")
     stitch_command("run", b, "-o", "rb", "--arm", "ra", "--no-recording")
     stated = json.loads((tmp_path / "ra" / "result.json").read_text())["effects"]["joint_offset"]
-    for change in ((), ("add", "rb", "link_geometry"), ("drop", "rb", "link_geometry")):
-        if change:
-            stitch_command(*change, "--no-recording")
+    for command in ((), ("add", "rb", "link_geometry"), ("drop", "rb", "link_geometry")):
+        if command:
+            stitch_command(*command, "--no-recording")
         assert json.loads((tmp_path / "rb" / "result.json").read_text())["effects"]["joint_offset"] == stated
 
 
@@ -93,11 +202,6 @@ def test_what_cannot_be_kept_is_refused_in_one_line(tmp_path, stitch_command, mo
     line = capsys.readouterr().err
     assert told in line and line.count("\n") == 1
     assert not (tmp_path / "q").exists()
-
-
-def told_of(found):
-    """What a run says of the arm it was given: as a doubt, and as a note."""
-    return [[line for line in own if "arm of the other run" in line] for own in (found.doubts, found.notes)]
 
 
 def test_a_kept_arm_is_held_against_the_nominal_one():

@@ -1,22 +1,36 @@
-"""Cells whose motions leave the hand-eye partly open: what they show is found, and the rest is never a number."""
+"""A hand-eye from nothing: what the motions show is found, the same in every run, and the rest is never a number."""
+
+import os
+import subprocess
+import sys
+import textwrap
+import tracemalloc
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from data_synth.fixtures.blade_cells import captured_blade
 from stitch.errors import InputError
-from stitch.fit.coarse import centroid_hand_eyes
+from stitch.fit.coarse import centroid_hand_eyes, find_coarse_hand_eye
 from stitch.fit.correct import correct
 from stitch.model.model import hand_eye_lines
 from stitch.numerics import frames
-from stitch.observations.observability import hidden_translations, unknown_numbers
+from stitch.observations.observability import hidden_translations, unknown_numbers, unobservable
 from stitch.plugins.export.hand_eye_formats import HAND_EYE_FORMATS, hand_eye_of_run
-from stitch.session.capture import build_capture
+from stitch.session.capture import Capture, build_capture
 from stitch.session.scan import prepare_scan
+from tests.fit.at_part import at_part
 from tests.plugins.export.test_hand_eye_formats import ANYWHERE, COVARIANCE, bare_run
 
 X = frames.make(Rotation.from_rotvec([0.08, -0.12, 0.75]).as_matrix(), np.array([62.0, -38.0, 95.0]))
+
+
 VIEWS, NOISE = 8, 0.01
+
+
 # Poses that are written with so many digits turn by this where they stand still, rad.
 ROUNDED = 2e-5
 
@@ -41,7 +55,7 @@ def flange_poses(kind, rng):
     return frames.make(R.as_matrix(), move - looks)
 
 
-def cell(kind, seed=0):
+def plate_of(kind, seed=0):
     """The capture of a wavy plate, 120 mm long, seen from a machine's poses."""
     rng = np.random.default_rng(seed)
     T_base_flange = flange_poses(kind, rng)
@@ -51,6 +65,63 @@ def cell(kind, seed=0):
         z = 6 * np.sin(x / 11) * np.cos(y / 15) + 0.002 * x**2 + NOISE * rng.standard_normal(1500)
         scans.append(prepare_scan(f"v{v}", frames.transform(frames.inverse(T), np.column_stack([x, y, z]))))
     return build_capture(kind, scans, T_base_flange, "eye_in_hand")
+
+
+SEARCH = """
+    import numpy as np
+    from data_synth.fixtures.blade_cells import captured_blade
+    from stitch.fit.coarse import feature_motions, find_coarse_hand_eye, sequence_motions
+    _, capture = captured_blade(2, views=3, pixels=40)
+    found = find_coarse_hand_eye([capture])
+    T = np.stack([found.T_mount, *feature_motions(capture)[1], *sequence_motions(capture)[1]])
+    print(found.source, " ".join(x.hex() for x in T.ravel().tolist()), sep="|")
+"""
+
+
+@cache
+def searched(threads: int, cores: int, run: int) -> tuple[str, np.ndarray]:
+    """What a process of its own finds: source, and hand-eye with all scan motions."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    environment = os.environ | {name: str(threads) for name in names}
+    limit = f"import os; os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:{cores}])\n"
+    done = subprocess.run(
+        [sys.executable, "-c", limit + textwrap.dedent(SEARCH)],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    source, numbers = done.stdout.strip().split("|")
+    return source, np.array([float.fromhex(x) for x in numbers.split()])
+
+
+def turning_only(capture: Capture, T_mount: np.ndarray) -> Capture:
+    """The same scans on a flange that only turns about its z axis."""
+    turns = frames.exp(np.array([[0, 0, np.radians(20 * i), 0, 0, 0] for i in range(len(capture.scans))]))
+    flange = capture.T_reference_mount[0]
+    return replace(capture, T_reference_mount=turns @ flange)
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", pytest.param("eye_in_hand", marks=pytest.mark.slow)])
+def test_a_hand_eye_is_found_from_nothing(mount):
+    measured, capture = captured_blade(5, mount=mount, pixels=110)
+    found = find_coarse_hand_eye([capture])
+    assert found.runner_up_ratio > 1.1
+    fine = correct([capture], found.T_mount, found.gate).hand_eye
+    xi = frames.log(frames.inverse(measured.T_mount) @ fine.T_mount)
+    _, J = at_part(capture, fine.T_mount)
+    assert np.linalg.norm(J @ xi) < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be set aside here")
+def test_a_hand_eye_from_nothing_is_the_same_again_and_on_other_threads():
+    once, again, other = searched(2, 8, 0), searched(2, 8, 1), searched(1, 1, 0)
+    assert again[0] == once[0] and np.array_equal(again[1], once[1])
+    # Positions are hundreds of mm: 1e-9 of them and of rotations.
+    assert other[0] == once[0]
+    np.testing.assert_allclose(other[1], once[1], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +134,7 @@ def cell(kind, seed=0):
     ],
 )
 def test_what_a_machine_leaves_open_is_named_and_stays_near_the_part(kind, unknown, shifts):
-    capture = cell(kind)
+    capture = plate_of(kind)
     assert hidden_translations([capture], X).shape == (3, shifts)
     found = unknown_numbers([capture], X)
     assert set(unknown) <= set(found) and bool(found) == bool(unknown)
@@ -75,7 +146,7 @@ def test_what_a_machine_leaves_open_is_named_and_stays_near_the_part(kind, unkno
 
 @pytest.mark.parametrize("kind", ["gantry", "scara"])
 def test_what_is_known_is_found_and_the_rest_stays_where_it_was(kind):
-    capture = cell(kind)
+    capture = plate_of(kind)
     start = X @ frames.exp(np.array([0.01, -0.008, 0.012, 0, 0, 0]))
     fit = correct([capture], start, 10.0).hand_eye
     off = frames.log(frames.inverse(X) @ fit.T_mount)
@@ -100,3 +171,29 @@ def test_every_format_refuses_open_numbers_unless_they_are_stated(tmp_path):
     run = bare_run(tmp_path / "t", ANYWHERE, COVARIANCE, hand_eye_unknown=["x", "y"], hand_eye_stated=True)
     for write in HAND_EYE_FORMATS.values():
         assert "As stated in session.toml, not measured: x, y" in write(hand_eye_of_run(run))
+
+
+def test_turning_the_last_joint_alone_hides_two_directions():
+    measured, capture = captured_blade(6, views=10, tilt=0.0)
+    # Views that turn about exactly one axis of the flange.
+    phrases = unobservable([turning_only(capture, measured.T_mount)], measured.T_mount)
+    assert len(phrases) == 2
+    assert phrases[0] == "translation along the axis about which all views were turned"
+    assert phrases[1] == "rotation about the axis about which all views were turned"
+
+
+def test_all_directions_are_seen_by_a_tilting_set():
+    measured, capture = captured_blade(7, views=8)
+    assert unobservable([capture], measured.T_mount) == ()
+
+
+def test_what_motions_cannot_show_takes_memory_with_their_number_and_not_with_its_square():
+    measured, capture = captured_blade(7, views=8)
+    again = 500
+    many = replace(capture, T_reference_mount=np.tile(capture.T_reference_mount, (again, 1, 1)))
+    tracemalloc.start()
+    try:
+        assert unobservable([many], measured.T_mount) == ()
+        assert tracemalloc.get_traced_memory()[1] < 10e3 * again * 8
+    finally:
+        tracemalloc.stop()
