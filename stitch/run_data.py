@@ -17,34 +17,10 @@ from stitch.observations.targets.target_model import TargetModelFit
 from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData
 
-# A doubt of a session as a whole in one clause: what it means and what to do stands elsewhere.
-
-_CLAUSE_END = re.compile(r"[:.] |; to fix: ")
-
-
-def doubt_headline(doubt: str) -> str:
-    """A doubt up to what to do, or to its first colon or full stop outside brackets."""
-    ends = (found.start() for found in _CLAUSE_END.finditer(doubt) if _brackets_closed(doubt[: found.start()]))
-    return f"{doubt[: next(ends, len(doubt.rstrip('.')))]}."
-
-
-def effect_cure(effect: str) -> str:
-    """Return what a doubt says of an effect that would hold what is doubted."""
-    return f"add the effect {effect}"
-
-
-def doubt_remedy(doubt: str) -> str:
-    """Return what a doubt says after its headline; empty where that is all."""
-    more = doubt[len(doubt_headline(doubt)) - 1 :].lstrip(";:. ")
-    return more[:1].upper() + more[1:]
-
-
-def _brackets_closed(text: str) -> bool:
-    return text.count("(") == text.count(")")
-
-
 # By which methods register moves single views, for people.
 METHOD_TITLES = {"dpwvm": "DPWVM-style weighted fit", "gicp": "plane to plane (GICP) inside Tukey's biweight"}
+# Where the first clause of a doubt ends: what it means and what to do comes after.
+_CLAUSE_END = re.compile(r"[:.] |; to fix: ")
 
 
 @dataclass(frozen=True)
@@ -327,3 +303,21 @@ class RunData:
             f"Run({self.session.name!r}, {len(self.session.views)} views, residual {self.residual_rms:.4g} {unit}, "
             f"held-out {self.heldout_rms:.4g} {unit}, {self.model!r})"
         )
+
+
+def doubt_headline(doubt: str) -> str:
+    """Return a doubt in one clause: up to what to do, or to its first colon or full stop outside brackets."""
+    ends = (end.start() for end in _CLAUSE_END.finditer(doubt))
+    outside = (i for i in ends if doubt[:i].count("(") == doubt[:i].count(")"))
+    return f"{doubt[: next(outside, len(doubt.rstrip('.')))]}."
+
+
+def effect_cure(effect: str) -> str:
+    """Return what a doubt says of an effect that would hold what is doubted."""
+    return f"add the effect {effect}"
+
+
+def doubt_remedy(doubt: str) -> str:
+    """Return what a doubt says after its headline; empty where that is all."""
+    more = doubt[len(doubt_headline(doubt)) - 1 :].lstrip(";:. ")
+    return more[:1].upper() + more[1:]

@@ -371,6 +371,8 @@ def _assemble_run(
     fit, noise_floor = finished
     model = fitted.model_of(index)
     left_out, kept = ((), screening.left_out) if keep else (screening.left_out, ())
+    of_views = view_notes(left_out, kept, screening.suspected)
+    of_fit = pipeline_for(session).notes(session, fitted, index, start)
     # Where several sessions share a hand-eye no joint has one place for all.
     shared = fitted.captures if session.has_clouds else [fitted.captures[index]]
     joints = session.joints if len(shared) == 1 else None
@@ -381,30 +383,21 @@ def _assemble_run(
         unobservable=unobservable(shared, model.T_mount, session.robot, joints),
         # A hand-eye of another run is as well known as it was there.
         unknown=() if start.source == REUSED else unknown_numbers(shared, model.T_mount),
-        notes=(
-            *view_notes(left_out, kept, screening.suspected),
-            *pipeline_for(session).notes(session, fitted, index, start),
-            *session_notes(session),
-            *notes,
-        ),
+        notes=(*of_views, *of_fit, *session_notes(session), *notes),
     )
-    step = LedgerStep(
-        effects=tuple(model.effects),
-        residual_rms=next(stage.rms for stage in fit.stages if stage.name == "correct"),
-        heldout_rms=fitted.heldout_rms(index),
-        noise_floor=noise_floor,
-        T_mount=model.T_mount,
-        values={term.name: {p.name: p.value for p in term.parameters} for term in model.terms},
-    )
+    rms = next(stage.rms for stage in fit.stages if stage.name == "correct")
+    heldout_rms = fitted.heldout_rms(index)
+    values = {term.name: {p.name: p.value for p in term.parameters} for term in model.terms}
+    step = LedgerStep(tuple(model.effects), rms, heldout_rms, noise_floor, model.T_mount, values)
     return RunData(
         session=session,
         measurement=fitted.sessions[index].measurement,
         model=model,
         T_mount_coarse=start.T_mount,
         gate=float("nan") if fit.overlaps is None else fit.overlaps.gate,
-        residual_rms=step.residual_rms,
-        heldout_rms=step.heldout_rms,
-        noise_floor=step.noise_floor,
+        residual_rms=rms,
+        heldout_rms=heldout_rms,
+        noise_floor=noise_floor,
         source=fit,
         register_method=next((stage.method for stage in fit.stages if stage.method), ""),
         ledger=(step,),

@@ -85,18 +85,18 @@ class CoarseHandEye:
     _met: dict[int, tuple[Capture, Overlaps]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def overlaps(self, capture: Capture) -> Overlaps:
-        """What a few points of each view meet under it. The stage is told of it, and the correction begins with it.
+        """Return what a few points of each view meet under it: the stage shows it, and the correction begins with it.
 
         Raises:
             NoResultError: no two views overlap.
         """
         # The second who asks takes it along: nobody asks a third time.
-        own, found = self._met.pop(id(capture), (None, None))
-        if found is None or own is not capture:
+        known, overlaps = self._met.pop(id(capture), (None, None))
+        if overlaps is None or known is not capture:
             samples = common_samples(capture.scans, COARSE_SAMPLES)
-            found = collect_overlaps(capture, capture.poses(self.T_mount), self.gate, samples)
-            self._met[id(capture)] = capture, found
-        return found
+            overlaps = collect_overlaps(capture, capture.poses(self.T_mount), self.gate, samples)
+            self._met[id(capture)] = capture, overlaps
+        return overlaps
 
     @property
     def is_ambiguous(self) -> bool:
@@ -110,7 +110,7 @@ class CoarseHandEye:
 
 
 def use_given_hand_eye(captures: Sequence[Capture], T_mount: Array, source: str) -> CoarseHandEye:
-    """Take a hand-eye that is known from elsewhere: the gate is wide enough for 5° and 30 mm.
+    """Return a hand-eye that is known from elsewhere as the start: the gate is wide enough for 5° and 30 mm.
 
     Args:
         source: where from, in words.
@@ -119,7 +119,7 @@ def use_given_hand_eye(captures: Sequence[Capture], T_mount: Array, source: str)
 
 
 def find_coarse_hand_eye(captures: Sequence[Capture]) -> CoarseHandEye:
-    """Search the hand-eye.
+    """Return the hand-eye that a search finds.
 
     Raises:
         NoResultError: fewer than three views, or no candidate makes the views overlap.
@@ -149,7 +149,7 @@ def _without_hidden_shift(captures: Sequence[Capture], T_mount: Array) -> Array:
 
 
 def _starting_hand_eyes(captures: Sequence[Capture], size: float) -> list[tuple[str, Array]]:
-    """Distinct starting hand-eyes with the name of the idea behind each.
+    """Return distinct starting hand-eyes with the name of the idea behind each.
 
     Turns of a quarter and a half about the line of sight are there to be refuted: they say how far
     the runner-up is.
@@ -162,18 +162,17 @@ def _starting_hand_eyes(captures: Sequence[Capture], size: float) -> list[tuple[
     for quarter in (1, 2, 3):
         turn = centre / np.linalg.norm(centre) * np.pi / 2 * quarter
         starts.append((f"turned by {90 * quarter}° about the line of sight", centroids[0] @ turn_about(turn, centre)))
-    motions = [(f"scan motions, {name}", T) for name, T in motion_candidates(captures)]
-    kept: list[tuple[str, Array]] = []
-    for name, T in motions:
-        if not any(same_hand_eye(captures, size, T, other) for _, other in kept):
-            kept.append((name, T))
-    return starts + kept
+    of_motions: list[tuple[str, Array]] = []
+    for name, T in motion_candidates(captures):
+        if not any(same_hand_eye(captures, size, T, other) for _, other in of_motions):
+            of_motions.append((f"scan motions, {name}", T))
+    return starts + of_motions
 
 
 def icp_from_starts(
     captures: Sequence[Capture], starts: Sequence[tuple[str, Array]], size: float
 ) -> list[HandEyeCandidate]:
-    """Close in from every start on few points; starts under which no views overlap are dropped.
+    """Return where the hand-eye ends from every start on few points; starts under which no views overlap are dropped.
 
     Half way, starts that have met go on as one: most end in the same place.
     """
@@ -199,7 +198,7 @@ def icp_from_starts(
 def _icp_steps(
     captures: Sequence[Capture], T_mount: Array, gates: Sequence[float], steps: int
 ) -> tuple[Array, list[float]] | None:
-    """Close in by some steps: hand-eye and the gates to go on with; None if no views overlap."""
+    """Return hand-eye and gates to go on with after some steps; None if no views overlap."""
     try:
         T_mount, overlaps, _ = icp_hand_eye(captures, T_mount, gates, samples=SEARCH_SAMPLES, maximum=steps)
     except NoResultError:
@@ -210,7 +209,7 @@ def _icp_steps(
 def distinct_hand_eyes(
     captures: Sequence[Capture], tried: Sequence[HandEyeCandidate], size: float
 ) -> list[HandEyeCandidate]:
-    """Distinct answers, best first; each keeps its best hand-eye and the name of its first start."""
+    """Return distinct answers, best first; each keeps its best hand-eye and the name of its first start."""
     groups: list[list[HandEyeCandidate]] = []
     for candidate in tried:
         for group in groups:
@@ -227,7 +226,7 @@ def distinct_hand_eyes(
 
 
 def same_hand_eye(captures: Sequence[Capture], size: float, T_a: Array, T_b: Array) -> bool:
-    """True if two hand-eyes place a part of this size (length_unit) alike: by its largest displacement."""
+    """Return whether two hand-eyes place a part of this size (length_unit) alike: by its largest displacement."""
     centre = scanner_centre(captures)
     corners = centre + size / 2 * np.vstack([np.eye(3), -np.eye(3)])
     off = np.linalg.norm(frames.transform(T_a, corners) - frames.transform(T_b, corners), axis=1)
@@ -235,36 +234,36 @@ def same_hand_eye(captures: Sequence[Capture], size: float, T_a: Array, T_b: Arr
 
 
 def view_consistency(captures: Sequence[Capture], T_mount: Array, limit: float) -> float:
-    """Root mean square distance of points to every other view, truncated at `limit`.
+    """Return the root mean square distance of points to every other view, truncated at `limit`.
 
     Views that fail to meet count with the limit, so falling apart cannot pay.
     """
     squares: list[float] = []
     for c in captures:
         poses = c.poses(T_mount)
-        picked = [sample_points(scan, SEARCH_SAMPLES) for scan in c.scans]
-        every = neighbour_queries(c.scans, poses, picked)
+        samples = [sample_points(scan, SEARCH_SAMPLES) for scan in c.scans]
+        queries = neighbour_queries(c.scans, poses, samples)
 
-        def mean_squares(w: int, every: NeighbourQueries = every) -> list[float]:
-            parts = [(v, slice(None)) for v in range(len(every.scans)) if v != w and len(every.index[v])]
+        def mean_squares(w: int, queries: NeighbourQueries = queries) -> list[float]:
+            parts = [(v, slice(None)) for v in range(len(queries.scans)) if v != w and len(queries.index[v])]
             if not parts:
                 return []
-            _, points, normals = every.gather(parts)
-            distance, facing = every.search(w, points, normals, limit)
-            by_view = np.split(np.where(facing, distance, limit) ** 2, np.cumsum(every.counts(parts))[:-1])
-            return [float(np.mean(own)) for own in by_view]
+            _, points, normals = queries.gather(parts)
+            distance, facing = queries.search(w, points, normals, limit)
+            by_view = np.split(np.where(facing, distance, limit) ** 2, np.cumsum(queries.counts(parts))[:-1])
+            return [float(np.mean(view_squares)) for view_squares in by_view]
 
         squares += chain.from_iterable(parallel(mean_squares, range(len(c.scans))))
     return float(np.sqrt(np.mean(squares)))
 
 
 def scanner_centre(captures: Sequence[Capture]) -> Array:
-    """Mean centroid of the scans in the scanner frame (3,)."""
+    """Return the mean centroid (3,) of the scans in the scanner frame."""
     return np.mean([scan.points.mean(axis=0) for c in captures for scan in c.scans], axis=0)
 
 
 def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
-    """Hand-eyes (4, 4) that bring the clouds' centroids of each capture to one point, best first.
+    """Return hand-eyes (4, 4) that bring the clouds' centroids of each capture to one point, best first.
 
     The centroid of a view leans to the side it sees, so this is coarse: 2–17° and 20–60 mm.
     """
@@ -290,12 +289,12 @@ def centroid_hand_eyes(captures: Sequence[Capture]) -> list[Array]:
         fit = least_squares(residual, first, method="trf", max_nfev=100, x_scale="jac")
         fits.append((float(fit.cost), fit.x))
     fits.sort(key=lambda pair: pair[0])
-    found: list[Array] = []
+    distinct: list[Array] = []
     for _, x in fits:
         T = hand_eye(x)
-        if all(np.degrees(frames.angle_between(T, other)) > 3 for other in found):
-            found.append(T)
-    return found
+        if all(np.degrees(frames.angle_between(T, other)) > 3 for other in distinct):
+            distinct.append(T)
+    return distinct
 
 
 def turn_about(rotation: Array, centre: Array) -> Array:
@@ -306,7 +305,7 @@ def turn_about(rotation: Array, centre: Array) -> Array:
 
 
 def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
-    """(source, T_mount (4, 4)) of every solver on every kind of motion that has enough of them."""
+    """Return (source, T_mount (4, 4)) of every solver on every kind of motion that has enough of them."""
     out: list[tuple[str, Array]] = []
     for kind, motions in (("features", feature_motions), ("KISS-ICP", sequence_motions)):
         robot, scanner = [], []
@@ -328,18 +327,18 @@ def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
 
 
 def robot_motions(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
-    """A (M, 4, 4) with A·X = X·B, B the motion that maps view w's scanner frame into view v's."""
+    """Return A (M, 4, 4) with A·X = X·B, B the motion that maps view w's scanner frame into view v's."""
     return motions_between(capture.T_reference_mount, pairs)
 
 
 def consistent_motions(A: Array, B: Array) -> tuple[Array, Array]:
-    """The motions whose rotation angles agree."""
+    """Return the motions whose rotation angles agree."""
     keep = angle_differences(A, B) < _ANGLE_TOLERANCE
     return A[keep], B[keep]
 
 
 def feature_motions(capture: Capture) -> tuple[Array, Array]:
-    """(A, B), each (M, 4, 4): motions between neighbours of the sequence (and its ends) by feature matching."""
+    """Return (A, B), each (M, 4, 4): motions between neighbours of the sequence (and its ends) by feature matching."""
     size = _FEATURE_SPACINGS * capture.spacing
 
     def described(scan: Scan) -> FeaturedSurface:
@@ -360,19 +359,19 @@ def feature_motions(capture: Capture) -> tuple[Array, Array]:
 
 
 def neighbouring_views(views: int) -> list[tuple[int, int]]:
-    """Pairs of views one and two apart, of two views the pair."""
+    """Return pairs of views one and two apart, of two views the pair."""
     steps = [(v, v + step) for step in (1, 2) for v in range(views - step)]
     return steps if views > 2 else [(0, 1)]
 
 
 def even_grid_size(points: Array) -> float:
-    """Grid size that leaves about `_POINTS` points of a surface."""
+    """Return the grid size that leaves about `_POINTS` points of a surface."""
     extent = np.ptp(points, axis=0)
     return float(np.sqrt(np.prod(np.sort(extent)[1:]) / _POINTS))
 
 
 def sequence_motions(capture: Capture) -> tuple[Array, Array]:
-    """(A, B), each (M, 4, 4): motions of a stream of scans by its odometry; none of separate views."""
+    """Return (A, B), each (M, 4, 4): motions of a stream of scans by its odometry; none of separate views."""
     scans = [scan.points[even_indices(len(scan.points), _POINTS)] for scan in capture.scans]
     if not is_stream(capture.T_reference_mount, scans):
         return np.zeros((0, 4, 4)), np.zeros((0, 4, 4))

@@ -65,15 +65,15 @@ class NewView:
     seen_before: float  # share of its sampled points that lie on the surface of another view
 
 
-# From a capture, its freed views and a hand-eye to how the poses may err, and to the scanner's errors by source.
+# From a capture, its free-network poses and a hand-eye to how the poses may err, and to the scanner's errors by source.
 ErrorPrior = Callable[[Capture, UnconstrainedPoses, Array], tuple[PoseErrors, dict[str, list[Array]]]]
 
 
 def start_live_fit(correction: Correction) -> LiveFit:
     """Return the fit of the first views, as `correct` found it, ready for further ones."""
-    own, T_mount = correction.captures[0], correction.model.T_mount
-    freed = correction.unconstrained[0].relative_to(own.poses(T_mount))
-    return LiveFit(own, T_mount, correction.hand_eye.covariance, freed)
+    capture, T_mount = correction.captures[0], correction.model.T_mount
+    unconstrained = correction.unconstrained[0].relative_to(capture.poses(T_mount))
+    return LiveFit(capture, T_mount, correction.hand_eye.covariance, unconstrained)
 
 
 def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_flange: Array) -> NewView:
@@ -85,32 +85,32 @@ def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_f
     Raises:
         NoResultError: it overlaps with no other view.
     """
-    own = replace(
+    capture = replace(
         fit.capture,
         scans=(*fit.capture.scans, scan),
         T_reference_mount=np.concatenate([fit.capture.T_reference_mount, T_reference_mount[None]]),
         T_reference_flange=np.concatenate([fit.capture.T_reference_flange, T_reference_flange[None]]),
     )
-    model_poses = own.poses(fit.T_mount)
+    model_poses = capture.poses(fit.T_mount)
     poses = np.concatenate([fit.unconstrained.poses, model_poses[-1:]])
-    gate, last = REUSE_GATE * part_size([own]), len(poses) - 1
+    gate, last = REUSE_GATE * part_size([capture]), len(poses) - 1
     # The others stand still meanwhile: only their place counts, and the new view's samples.
-    samples = [sample_points(s, SAMPLES) for s in own.scans]
-    matches = _match_last(own, poses, gate, samples)
+    samples = [sample_points(s, SAMPLES) for s in capture.scans]
+    matches = _match_last(capture, poses, gate, samples)
     for _ in range(_MAXIMUM_ITERATIONS):
         g = sum_matches(matches, len(poses))
         step = _last_step(g)
         poses[last] = frames.moved_about(g.centre, step, poses[last])
-        gate = min(gate, max(next_gate(Overlaps([], matches, g, gate), own), 0.6 * gate))
-        matches = _match_last(own, poses, gate, samples)
+        gate = min(gate, max(next_gate(Overlaps([], matches, g, gate), capture), 0.6 * gate))
+        matches = _match_last(capture, poses, gate, samples)
         if np.linalg.norm(step * g.displacement_factors) < _CONVERGED * g.scale and gate <= 1.01 * fit.gate:
             break
-    together = _solve_together(own, poses, [*fit.unconstrained.overlaps.matches, *matches], min(gate, fit.gate))
+    together = _solve_together(capture, poses, [*fit.unconstrained.overlaps.matches, *matches], min(gate, fit.gate))
     moved = np.linalg.norm(frames.log(frames.inverse(poses) @ together.poses)[:, 3:], axis=1)
     seen = np.unique(np.concatenate([m.index_w for m in matches]))
     fitted = replace(
         fit,
-        capture=own,
+        capture=capture,
         unconstrained=together.relative_to(model_poses),
         drifted=fit.drifted + float(moved[:-1].max(initial=0.0)),
     )
@@ -119,17 +119,17 @@ def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_f
 
 def fit_live_hand_eye(fit: LiveFit, prior: ErrorPrior) -> LiveFit:
     """Fit the hand-eye to the views as they stand; partners are searched anew where the views have moved far."""
-    freed = fit.unconstrained
+    unconstrained = fit.unconstrained
     if fit.drifted > _SEARCH_ANEW * fit.gate:
-        freed = unconstrained_poses(fit.capture, fit.capture.poses(fit.T_mount), fit.gate)
-    errors, of_scanner = prior(fit.capture, freed, fit.T_mount)
-    found = fit_hand_eye([fit.capture], [freed], fit.T_mount, scanner_errors=of_scanner, errors=errors)
+        unconstrained = unconstrained_poses(fit.capture, fit.capture.poses(fit.T_mount), fit.gate)
+    errors, of_scanner = prior(fit.capture, unconstrained, fit.T_mount)
+    hand_eye = fit_hand_eye([fit.capture], [unconstrained], fit.T_mount, scanner_errors=of_scanner, errors=errors)
     return LiveFit(
         fit.capture,
-        found.T_mount,
-        found.covariance,
-        freed.relative_to(fit.capture.poses(found.T_mount)),
-        fit.drifted if freed is fit.unconstrained else 0.0,
+        hand_eye.T_mount,
+        hand_eye.covariance,
+        unconstrained.relative_to(fit.capture.poses(hand_eye.T_mount)),
+        fit.drifted if unconstrained is fit.unconstrained else 0.0,
     )
 
 
@@ -141,12 +141,12 @@ def without_view(fit: LiveFit, view: int) -> LiveFit:
     """
     old = fit.unconstrained.overlaps
     matches = [replace(m, v=m.v - (m.v > view), w=m.w - (m.w > view)) for m in old.matches if view not in (m.v, m.w)]
-    own = fit.capture.without(np.array([view]))
+    capture = fit.capture.without(np.array([view]))
     if not matches:
-        raise NoResultError(f"{own.name}: no two views overlap")
+        raise NoResultError(f"{capture.name}: no two views overlap")
     poses = np.delete(fit.unconstrained.poses, view, axis=0)
-    together = _solve_together(own, poses, matches, old.gate)
-    return replace(fit, capture=own, unconstrained=together.relative_to(own.poses(fit.T_mount)))
+    together = _solve_together(capture, poses, matches, old.gate)
+    return replace(fit, capture=capture, unconstrained=together.relative_to(capture.poses(fit.T_mount)))
 
 
 def _match_last(capture: Capture, poses: Array, gate: float, samples: Sequence[Indices]) -> list[Match]:
@@ -154,10 +154,10 @@ def _match_last(capture: Capture, poses: Array, gate: float, samples: Sequence[I
     last = len(poses) - 1
     pairs = [pair for pair in near_pairs(capture.scans, poses, gate) if pair[1] == last]
     least = MINIMUM_OVERLAP * len(samples[last])
-    found = [m for m in match_pairs(capture.scans, poses, pairs, gate, samples)[0] if len(m.residual) > least]
-    if not found:
+    matches = [m for m in match_pairs(capture.scans, poses, pairs, gate, samples)[0] if len(m.residual) > least]
+    if not matches:
         raise NoResultError(f"{capture.scans[last].name}: it shares no surface with the other views")
-    return found
+    return matches
 
 
 def _last_step(g: Gram) -> Array:

@@ -14,10 +14,8 @@ from stitch.observations.targets.target_model import TargetModelFit
 from stitch.run_data import ExcludedView, Unsupported
 from stitch.session.session import SessionData
 
-# Sources of the hand-eye's variance in words; the keys are the names of the components of its covariance.
-
 ANOTHER_ARM = "another run's arm"
-
+# Sources of the hand-eye's variance in words; the keys are the names of the components of its covariance.
 SOURCES = {
     "white rotation": "random errors of the robot's rotations",
     "white translation": "random errors of the robot's positions",
@@ -38,13 +36,6 @@ SOURCES = {
     ANOTHER_ARM: "the arm model of another run",
     "unseen": "directions that these views do not constrain",
 }
-
-
-def unfitted(effect: str) -> str:
-    """Return the source of variance for parameters of an effect that stay at zero, in words."""
-    return f"parameters of {effect} held at zero, because these views hardly separate them from the hand-eye"
-
-
 # Residuals within a quarter of the noise floor's square are noise; above, something else is there.
 _NEAR_FLOOR = 1.1
 # Sigmas that were widened by more than this factor on the variance are worth a note.
@@ -79,21 +70,21 @@ def surface_sentence(
     )
 
 
-def register_note(found: Registration, session: SessionData, unseen: Array) -> str:
+def register_note(registration: Registration, session: SessionData, unseen: Array) -> str:
     """Return which surfaces lie off as a whole, which moves mean nothing, and whether register ended early.
 
     Args:
         unseen: (V,) how far views were moved where no overlap shows it, length_unit.
     """
     lines = []
-    for v, size in found.offsets.items():
+    for v, size in registration.offsets.items():
         side = "outside" if size > 0 else "inside"
         apart = length_text(abs(size), session.length_unit)
         lines.append(f"{session.names[v]} lies as a whole {side} the other views, by {apart}")
-    if unseen.max(initial=0.0) > _SLID * found.overlaps.gram.scale:
+    if unseen.max(initial=0.0) > _SLID * registration.overlaps.gram.scale:
         farthest = length_text(float(unseen.max()), session.length_unit, 2)
         lines.append(f"views slide along these surfaces unseen, here by up to {farthest}: such moves mean nothing")
-    return "; ".join([*lines, *([found.note] if found.note else [])])
+    return "; ".join([*lines, *([registration.note] if registration.note else [])])
 
 
 def support_note(dropped: Unsupported) -> str:
@@ -106,13 +97,13 @@ def support_note(dropped: Unsupported) -> str:
     )
 
 
-def target_sentence(found: TargetModelFit, registered: float, scatter: Repeatability, length_unit: str) -> str:
+def target_sentence(targets: TargetModelFit, registered: float, scatter: Repeatability, length_unit: str) -> str:
     """Return the residual at the targets, the noise floor, and the scatter of the poses."""
-    floor = found.noise_floor
-    left, out, noise = (length_text(x, length_unit, 4) for x in (found.rms, found.heldout_rms, floor))
-    if found.uninformative:
+    floor = targets.noise_floor
+    left, out, noise = (length_text(x, length_unit, 4) for x in (targets.rms, targets.heldout_rms, floor))
+    if targets.uninformative:
         return "No target is seen in two views, so nothing shows how well the model places them."
-    if found.rms < _NEAR_FLOOR * floor:
+    if targets.rms < _NEAR_FLOOR * floor:
         return f"The model fits all targets to {left} rms (3D). The sensor's noise ({noise}) explains that."
     return (
         f"The model fits the targets to {left} rms (3D), and to {out} in views left out with their neighbours. "
@@ -141,13 +132,13 @@ def coarse_note(start: CoarseHandEye) -> str:
         return start.source
     best = start.candidates[0]
     tried = sum(c.reached for c in start.candidates)
-    found = f"found from {best.source}; {best.reached} of {tried} starts agree"
+    source = f"found from {best.source}; {best.reached} of {tried} starts agree"
     if len(start.candidates) == 1:
-        return f"{found}, no other answer"
-    return f"{found}, the runner-up is {start.runner_up_ratio:.1f} times worse"
+        return f"{source}, no other answer"
+    return f"{source}, the runner-up is {start.runner_up_ratio:.1f} times worse"
 
 
-def warnings(start: CoarseHandEye, found: HandEyeFit) -> tuple[str, ...]:
+def warnings(start: CoarseHandEye, hand_eye: HandEyeFit) -> tuple[str, ...]:
     """Return what a user should know before trusting the hand-eye."""
     notes = []
     if start.is_ambiguous:
@@ -155,23 +146,23 @@ def warnings(start: CoarseHandEye, found: HandEyeFit) -> tuple[str, ...]:
             f"Two different hand-eyes fit almost equally well (ratio {start.runner_up_ratio:.2f}); to fix: "
             "state scanner.pose in session.toml, or add views with other orientations."
         )
-    if found.degrees is not None and found.degrees < _FEW_DEGREES:
+    if hand_eye.degrees is not None and hand_eye.degrees < _FEW_DEGREES:
         notes.append(
-            f"U of the hand-eye rests on {found.degrees} degrees of freedom, and on how much arms usually err; to fix: "
-            "add views."
+            f"U of the hand-eye rests on {hand_eye.degrees} degrees of freedom, and on how much arms usually err; "
+            "to fix: add views."
         )
-    if found.inflation > _WIDENED:
+    if hand_eye.inflation > _WIDENED:
         notes.append(
-            f"U of the hand-eye is {np.sqrt(found.inflation):.1f} times larger than noise alone would give. "
-            f"{_largest_sources(found)}"
+            f"U of the hand-eye is {np.sqrt(hand_eye.inflation):.1f} times larger than noise alone would give. "
+            f"{_largest_sources(hand_eye)}"
         )
     return tuple(notes)
 
 
-def _largest_sources(found: HandEyeFit) -> str:
+def _largest_sources(hand_eye: HandEyeFit) -> str:
     """Return the largest source of the variance of rotation and position."""
     (turn, of_turn), (shift, of_shift) = (
-        max(shares.items(), key=lambda item: item[1]) for shares in (found.rotation_shares, found.position_shares)
+        max(shares.items(), key=lambda item: item[1]) for shares in (hand_eye.rotation_shares, hand_eye.position_shares)
     )
     first, second = (SOURCES.get(source, source) for source in (turn, shift))
     if turn == shift:
@@ -199,30 +190,30 @@ def view_notes(
     return tuple(notes)
 
 
-def target_notes(found: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> tuple[str, ...]:
+def target_notes(targets: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> tuple[str, ...]:
     """Return notes on outliers, targets seen once, clouds that were not used, and a widened covariance."""
-    notes = _unused_points(found, outliers, session)
+    notes = _unused_points(targets, outliers, session)
     if any(view.cloud is not None for view in session.views):
         notes.append("Some views have no cloud: only the labelled points were fitted.")
-    if found.inflation > _WIDENED:
+    if targets.inflation > _WIDENED:
         notes.append(
-            f"All sigmas are {np.sqrt(found.inflation):.1f} times larger than for independent pose errors, because "
+            f"All sigmas are {np.sqrt(targets.inflation):.1f} times larger than for independent pose errors, because "
             "neighbouring views have similar errors."
         )
     return tuple(notes)
 
 
-def mixed_notes(found: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> tuple[str, ...]:
+def mixed_notes(targets: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> tuple[str, ...]:
     """Return notes on outliers, targets seen once, and labelled data that clouds replace."""
-    notes = _unused_points(found, outliers, session)
+    notes = _unused_points(targets, outliers, session)
     if session.nominal is not None:
         notes.append("Nominal positions in targets.csv were not used: with clouds, target positions are fitted.")
-    if found.landmarks.orientation is not None:
+    if targets.landmarks.orientation is not None:
         notes.append("Only positions from frames.csv were used, not rotations, because the session has clouds.")
     return tuple(notes)
 
 
-def _unused_points(found: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> list[str]:
+def _unused_points(targets: TargetModelFit, outliers: Sequence[Outlier], session: SessionData) -> list[str]:
     notes = []
     if outliers:
         named_outliers = [
@@ -232,8 +223,8 @@ def _unused_points(found: TargetModelFit, outliers: Sequence[Outlier], session: 
         ]
         more = f" and {len(named_outliers) - _LISTED} more" if len(named_outliers) > _LISTED else ""
         notes.append(f"Outliers were not used: {', '.join(named_outliers[:_LISTED])}{more}.")
-    if found.single_view_targets and not found.uninformative:
-        notes.append(f"Targets seen in fewer than two views add nothing: {', '.join(found.single_view_targets)}.")
+    if targets.single_view_targets and not targets.uninformative:
+        notes.append(f"Targets seen in fewer than two views add nothing: {', '.join(targets.single_view_targets)}.")
     return notes
 
 
@@ -241,3 +232,8 @@ def outlier_name(outlier: Outlier, session: SessionData) -> str:
     """Return the names of an outlier's target and view."""
     view = session.views[outlier.view].name
     return f"view {view}" if outlier.target is None else f"{outlier.target} in view {view}"
+
+
+def unfitted(effect: str) -> str:
+    """Return the source of variance for parameters of an effect that stay at zero, in words."""
+    return f"parameters of {effect} held at zero, because these views hardly separate them from the hand-eye"

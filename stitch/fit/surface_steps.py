@@ -13,7 +13,7 @@ from stitch.fit.sentences import correct_note, mixed_notes, register_note, suppo
 from stitch.fit.surface_fit import fit_surfaces
 from stitch.fit.target_fit import locate_targets
 from stitch.fusion.fuse import RegisteredSession, fuse_every_point, has_whole_clouds
-from stitch.fusion.register import METHODS, register, unseen_moves
+from stitch.fusion.register import METHODS, Registration, register, unseen_moves
 from stitch.model.forward import corrected_capture
 from stitch.model.model import Model
 from stitch.model.model_toml import ModelFile, bind_to_session
@@ -140,38 +140,24 @@ def finish(
     Raises:
         InputError: a scan changed on disk since it was read.
     """
-    clock = Clock()
     correction, measurement = fitted.correction, fitted.sessions[index].measurement
     assert correction is not None
     model, capture, overlaps = correction.geometry, correction.captures[index], correction.overlaps[index]
-    scatter = correction.scatter[index]
     poses_model = capture.poses(model.T_mount)
     note = "" if correction.given else correct_note(coarse.rms, overlaps.gram.rms)
     corrected = _overlap_stage("correct", overlaps, len(correction.history), seconds, note)
     recorder.stage(corrected, poses_model)
-    registration = register(
-        capture,
-        poses_model,
-        scatter,
-        overlaps.gate,
-        recorder,
-        correction.unconstrained[index].poses,
-        method=METHODS[method],
-        before=overlaps,
-    )
-    note = register_note(registration, session, unseen_moves(registration, poses_model))
-    registered = _overlap_stage("register", registration.overlaps, len(registration.history), clock.lap(), note)
-    registered = replace(registered, method=method)
-    recorder.stage(registered, registration.poses)
+    registration, registered = _register_views(session, correction, index, recorder, method)
     if has_whole_clouds(session):
         # To read every point again takes time and room: only for views that stay.
         until_screened()
-        clock.lap()
+    clock = Clock()
     fused, unsupported = fuse_every_point(RegisteredSession(session, measurement, model, capture, registration.poses))
     several = int((fused.count > 1).sum())
     last = StageResult("fuse", _fused_rms(fused.residual), several, 1, clock.lap(), support_note(unsupported))
     recorder.stage(last, registration.poses)
     floor = noise_floor(capture, registration.overlaps, session.scanner.noise)
+    scatter = correction.scatter[index]
     fit = Fit(
         stages=(coarse, corrected, registered, last),
         poses_model=poses_model,
@@ -188,6 +174,30 @@ def finish(
         registered=replace(registration.overlaps, searched=None),
     )
     return fit, floor
+
+
+def _register_views(
+    session: SessionData, correction: Correction, index: int, recorder: Recorder, method: str
+) -> tuple[Registration, StageResult]:
+    """Return where register puts the single views of one session, and its stage, which the recorder is shown."""
+    clock = Clock()
+    capture, overlaps = correction.captures[index], correction.overlaps[index]
+    poses_model = capture.poses(correction.geometry.T_mount)
+    registration = register(
+        capture,
+        poses_model,
+        correction.scatter[index],
+        overlaps.gate,
+        recorder,
+        correction.unconstrained[index].poses,
+        method=METHODS[method],
+        before=overlaps,
+    )
+    note = register_note(registration, session, unseen_moves(registration, poses_model))
+    stage = _overlap_stage("register", registration.overlaps, len(registration.history), clock.lap(), note)
+    stage = replace(stage, method=method)
+    recorder.stage(stage, registration.poses)
+    return registration, stage
 
 
 def _overlap_stage(name: str, overlaps: Overlaps, iterations: int, seconds: float, note: str) -> StageResult:

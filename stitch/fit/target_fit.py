@@ -188,7 +188,7 @@ class LinearisedTargets:
         values = np.where(stays, before, 0.0)
         values[choice] += x[self.base.shape[2] :]
         terms = with_parameter_values(terms, values)
-        moved = [session.moved(x[own], terms) for session, own in zip(self.sessions, self.unknowns_of, strict=True)]
+        moved = [session.moved(x[at], terms) for session, at in zip(self.sessions, self.unknowns_of, strict=True)]
         return Step(
             linearised=self,
             choice=choice,
