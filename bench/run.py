@@ -6,8 +6,8 @@ a change. `--only WORD[,WORD…]` keeps the jobs that have one of the words amon
 
 import argparse
 import importlib
-import json
 import sys
+import textwrap
 from pathlib import Path
 
 sys.path[0] = str(Path(__file__).resolve().parents[1])
@@ -55,12 +55,12 @@ TABLES = {
 
 def main() -> None:
     """Run the jobs of a table, print its lines, and write them into its page."""
-    names = "tables: " + ", ".join(sorted(TABLES))
+    names = textwrap.fill("tables: " + ", ".join(TABLES), 100, break_on_hyphens=False)
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, epilog=names, formatter_class=raw)
     parser.add_argument("table", choices=TABLES, metavar="TABLE")
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), help="END itself is left out")
-    parser.add_argument("--only", action="append", default=[], metavar="WORDS")
+    parser.add_argument("--only", action="append", default=[], metavar="WORDS", help="keeps jobs with one of these values")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of the table")
     parser.add_argument("--rows", type=Path, help="keeps a line for each trial; those that stand there are not run")
     parser.add_argument("--workers", type=int, default=1)
@@ -73,7 +73,8 @@ def main() -> None:
         key, _, value = text.partition("=")
         if key not in settings:
             parser.error(f"no setting {key!r}; {asked.table} has {', '.join(settings) or 'none'}")
-        settings[key] = type(settings[key])(json.loads(value) if value[:1] in "[0123456789-tf" else value)
+        default = settings[key]
+        settings[key] = value == "true" if isinstance(default, bool) else type(default)(value)
     jobs = list(table.jobs(range(*asked.seeds) if asked.seeds else table.seeds, **settings))
     for words in asked.only:
         jobs = [job for job in jobs if {words, *words.split(",")} & _values(job)]
