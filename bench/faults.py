@@ -222,6 +222,7 @@ def _copy_session(room: Path) -> None:
 
 
 _PREPARE: dict[str, Callable[[Path], object]] = {
+    "cell": lambda room: (room / "cell").mkdir(),
     "copied_session": _copy_session,
     "foreign_code": _foreign_code,
     "german_folder": lambda room: _german_folder(_german())(room),
@@ -234,12 +235,15 @@ _PREPARE: dict[str, Callable[[Path], object]] = {
 
 def _tables() -> Iterator[Case]:
     """A long header, and points in other units."""
-    rest = lambda t: "«h×100000»," + t.replace("\n", "\n1,").rstrip("1,")  # noqa: E731
-    long = lambda file: file.write_text(_repeated(rest(file.read_text())))  # noqa: E731
-    yield Case("views.csv: rows", "long header", _changed("s/views.csv", long, RUN))
+    yield Case("views.csv: rows", "long header", _changed("s/views.csv", _long_header, RUN))
     for name, factor in {"metres": 1e-3, "micrometres": 1e3}.items():
         spoil = _changed("p/points.csv", lambda file, f=factor: _scaled(file, f), ["run", "p", *RUN[2:]])
         yield Case("points.csv: rows", name, spoil)
+
+
+def _long_header(file: Path) -> None:
+    rest = file.read_text().replace("\n", "\n1,").rstrip("1,")
+    file.write_text("h" * 100_000 + "," + rest)
 
 
 def _scaled(file: Path, factor: float) -> None:
@@ -319,18 +323,19 @@ def _results() -> Iterator[Case]:
     """result.json with keys of another kind, or without them, or of a session elsewhere."""
     report = ["report", "r", "--no-diagnosis"]
     for key, value in _WRONG.items():
-        yield Case("result.json", f"{key} wrong", _with_result(lambda d, k=key, v=value: {**d, k: v}, report))
-        less = lambda d, k=key: {name: v for name, v in d.items() if name != k}  # noqa: E731
-        yield Case("result.json", f"no {key}", _with_result(less, report))
+        yield Case("result.json", f"{key} wrong", _with_result(report, {key: value}))
+        yield Case("result.json", f"no {key}", _with_result(report, {}, without=key))
     for value in ("", "/nowhere", "\0", "x" * 100_000, "."):
-        spoil = _with_result(lambda d, v=value: {**d, "session": v}, ["compare", "r"])
-        yield Case("result.json", f"session {value[:9]!r}", spoil)
+        yield Case("result.json", f"session {value[:9]!r}", _with_result(["compare", "r"], {"session": value}))
 
 
-def _with_result(change: Callable[[dict[str, Any]], Any], command: list[str]) -> Spoil:
-    return _changed(
-        "r/result.json", lambda file: file.write_text(json.dumps(change(json.loads(file.read_text())))), command
-    )
+def _with_result(command: list[str], entries: dict[str, Any], without: str = "") -> Spoil:
+    def change(file: Path) -> None:
+        document = {**json.loads(file.read_text()), **entries}
+        document.pop(without, None)
+        file.write_text(json.dumps(document))
+
+    return _changed("r/result.json", change, command)
 
 
 def _with_columns(names: Sequence[str], rows: Sequence[Sequence[str]]) -> Spoil:
@@ -360,7 +365,12 @@ def _disks() -> Iterator[Case]:
     for size in (3_000, 20_000, 60_000, 120_000):
         for command in (["run", "s", "-o", "out"], ["run", "s", "-o", "r"], ["add", "r", "incidence_bias"]):
             name = f"{' '.join(command)} {size // 1000} kB"
-            yield Case("disk full", name, lambda room, c=command: c, largest_file=size, writes=("q", "r", "out"))
+            yield Case("disk full", name, _asked(command), largest_file=size, writes=("q", "r", "out"))
+
+
+def _asked(command: list[str]) -> Spoil:
+    """The room as it is."""
+    return lambda room: command
 
 
 def _terminals() -> Iterator[Case]:
@@ -368,8 +378,7 @@ def _terminals() -> Iterator[Case]:
     for encoding in ("ascii", "latin-1", "cp437"):
         for command in (["effects"], ["compare", "r"], RUN):
             more: dict[str, Any] = {"environment": {"PYTHONIOENCODING": encoding}, "writes": ("r", "out")}
-            spoil = lambda room, c=command: c  # noqa: E731
-            yield Case("terminals without UTF-8", f"{encoding} {command[0]}", spoil, fine=True, **more)
+            yield Case("terminals without UTF-8", f"{encoding} {command[0]}", _asked(command), fine=True, **more)
     prints = 'print("chatty"); sys.stdout.write("more"); import os; os.write(1, b"raw")\n    return points + k'
     command = [*RUN, "--effects-file", "mine.py", "--effects", "own", "--json"]
     chatty = _changed("mine.py", lambda file: file.write_text(_EFFECT.format(prints)), command)
@@ -485,9 +494,12 @@ def _clocks() -> Iterator[Case]:
         "afternoon": ([f"0{i}:00 PM" for i in range(1, 7)], [60 * m for m in minutes]),
     }
     for name, (cells, seconds) in clocks.items():
-        change = lambda rows, cells=cells: [[*row, cell] for row, cell in zip(rows, cells, strict=True)]  # noqa: E731
-        spoil = _german_folder(_german(change, _HEADER + ";Uhrzeit"))
+        spoil = _german_folder(_german(_with_clock(cells), _HEADER + ";Uhrzeit"))
         yield Case("clock times", name, spoil, fine=True, writes=("raw/",), right=_times_right(seconds))
+
+
+def _with_clock(cells: list[str]) -> Change:
+    return lambda rows: [[*row, cell] for row, cell in zip(rows, cells, strict=True)]
 
 
 def _others() -> Iterator[Case]:
@@ -511,12 +523,11 @@ def _others() -> Iterator[Case]:
         "another database": _database("CREATE TABLE parts (name)"),
         "an older form": _database(*older),
     }.items():
-        make = lambda room: (room / "cell").mkdir()  # noqa: E731
-        spoil = _changed("cell/history.sqlite", change, ["watch", "cell", "--add", "r"], make)
+        spoil = _changed("cell/history.sqlite", change, ["watch", "cell", "--add", "r"], _PREPARE["cell"])
         yield Case("histories of cells", name, spoil)
     yield Case("arms of other runs", "five joints", _five_joints)
     yield Case("stitch review", "port in use", _port_in_use)
-    yield Case("command lines", "", lambda room: [])
+    yield Case("command lines", "", _asked([]))
     yield Case("links out of a run", "pictures", _pictures_elsewhere, writes=("r",))
 
 

@@ -60,7 +60,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, epilog=names, formatter_class=raw)
     parser.add_argument("table", choices=TABLES, metavar="TABLE")
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "END"), help="END itself is left out")
-    parser.add_argument("--only", action="append", default=[], metavar="WORDS", help="keeps jobs with one of these values")
+    parser.add_argument("--only", action="append", default=[], metavar="WORDS", help="jobs with one of these values")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting of the table")
     parser.add_argument("--rows", type=Path, help="keeps a line for each trial; those that stand there are not run")
     parser.add_argument("--workers", type=int, default=1)
