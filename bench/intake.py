@@ -47,8 +47,8 @@ from stitch.plugins.intake.convention_choice import choose_convention, choose_mo
 from stitch.plugins.intake.first_session import capture_of
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.readings import StatedTable, all_readings, candidate_units
-from stitch.screening.conventions import register_scan_pairs
 from stitch.screening.hypotheses import ORDERS
+from stitch.screening.motions import register_scan_pairs
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.session_folder import load_session
 from stitch.session.session import SessionData

@@ -28,7 +28,8 @@ from stitch.model.model import Model
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.view_poses import unconstrained_poses
-from stitch.screening.deep_check import apply_displacement_limits, deep_check
+from stitch.screening.deep_check import deep_check
+from stitch.screening.plausibility import apply_displacement_limits
 from stitch.screening.snooping import Snooping, snoop_views
 from stitch.screening.view_model import UsualEffects
 from stitch.session.capture import prepare_capture

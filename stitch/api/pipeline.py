@@ -318,7 +318,7 @@ def _check_against_own_model(screened: ScreenedFit, effects: Sequence[str], mode
         start = FitStart(hand_eyes, _initial_model(session, effects, arm_model(model)))
         return steps.fit(screened.sessions, screened.measurements, start, SilentRecorder())
 
-    return check_model_transfer(screened, fit)
+    return screened.with_doubts(check_model_transfer(screened.sessions, screened.fitted, fit))
 
 
 def _check_common_model(
@@ -342,9 +342,8 @@ def _check_common_model(
         apart = find_disagreeing_sessions([s.name for s in screened.sessions], screened.fitted, fit_session)
         doubts = tuple(disagreement.doubt(first.length_unit) for disagreement in apart)
     if arm:
-        transfer = check_arm_transfer(fit_with_arm, arm, screened.fitted)
-        sentence = transfer.sentence(first.length_unit)
-        if transfer.holds:
+        holds, sentence = check_arm_transfer(fit_with_arm, arm, screened.fitted, first.length_unit)
+        if holds:
             notes = (sentence,)
         else:
             doubts = (*doubts, sentence)

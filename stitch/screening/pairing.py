@@ -1,12 +1,14 @@
 """Views that do not belong, explained: exchanged rows, a neighbour's joints, a copy, a wrong digit, another part."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
+from stitch.screening.hypotheses import problem
 from stitch.screening.placement import (
     CLOSE_SHARE,
     FEW_SHARED,
@@ -24,6 +26,109 @@ from stitch.session.session import SessionData
 
 # So many views make a step, and this share of those on its side; displacements agree within this share of their size.
 _FEWEST, _SHARE, _AGREES = 3, 0.7, 0.2
+# A scan belongs to another row's pose if it lies this much closer to that than to its own, and this close absolutely
+# (`CLOSE_SHARE` of the part's size).
+_CLOSER_SHARE = 0.2
+# One joint explains a displacement if it leaves less than this share of it.
+_MAX_REMAINING_SHARE = 0.1
+# Points of a scan that stand for it: every so many.
+_EVERY = 50
+# What sits elsewhere from some row on, by what moved.
+_MOVED = {"part": "the part was clamped anew", "scanner": "the scanner moved on its mount"}
+
+
+def explain_misplaced(
+    session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
+) -> list[SessionProblem]:
+    """Return one problem for everything that snooping found, with the rows and what to do.
+
+    Args:
+        session, capture: with the same views.
+        T_mount: (4, 4) hand-eye under which `snooping` was made.
+    """
+    names = session.names
+    unexplained = {m.view: m for m in snooping.misplaced}
+    out = list[SessionProblem]()
+
+    def explain(mistake: str, views: Sequence[int], **words: Any) -> None:
+        out.append(problem(mistake, names_of_views(views, names), **words))
+        for v in views:
+            unexplained.pop(v, None)
+
+    for v, w in find_copies(capture):
+        bad, good = (v, w) if v in snooping.left_out and w not in snooping.left_out else (w, v)
+        unexplained.pop(bad, None)
+        out.append(problem("copied scan", (names[v], names[w]), of=names[good]))
+    rows = find_fitting_rows(capture, snooping, [*unexplained.values()])
+    for cycle in exchange_cycles(rows):
+        if len(cycle) == 2:
+            explain("pair", cycle, pair=f"{names[cycle[0]]} and {names[cycle[1]]}")
+        else:
+            moves = ", ".join(f"the cloud of {names[v]} to row {names[int(rows[v] or 0)]}" for v in cycle)
+            explain("cycle", cycle, count=len(cycle), moves=moves)
+    rest = {v: row for v, row in rows.items() if v in unexplained}
+    for v, row in exchanged_pairs(rest, [*unexplained.values()]):
+        explain("pair with a silent scan", sorted((v, row)), view=names[v], silent=names[row])
+    moved = None if snooping.steps else find_common_displacement(capture, snooping.expected, [*unexplained.values()])
+    if moved is not None:
+        explain("moved", moved[0], **_between(moved[0], moved[1], names))
+    same = find_same_poses(capture)
+    out += [_single_view_problem(session, capture, T_mount, snooping, m, same) for m in unexplained.values()]
+    for step in snooping.steps:
+        side = range(step.start) if step.start <= snooping.largest_segment.start else range(step.start, len(names))
+        explain("moved", side, **_between(side, step.moved if step.distinguishable else "either", names))
+    if len(snooping.disconnected) > 1:
+        shown = " | ".join(list_views(names_of_views(group, names), names) for group in snooping.disconnected)
+        explain("groups", [v for group in snooping.disconnected[1:] for v in group], groups=shown)
+    return out
+
+
+def _between(views: range, moved: str, names: Sequence[str]) -> dict[str, str]:
+    """Return the words of views at one end of the list that stand off from the rest."""
+    start = views.start or views.stop
+    what = _MOVED.get(moved, "the part or the scanner moved")
+    return {"what": what, "before": names[start - 1], "after": names[start]}
+
+
+def _single_view_problem(
+    session: SessionData,
+    capture: Capture,
+    T_mount: Array,
+    snooping: Snooping,
+    m: MisplacedView,
+    same: Sequence[tuple[int, int]],
+) -> SessionProblem:
+    """Return what is wrong with a view by itself: its cloud, the pose of another row, one joint, or its pose."""
+    names = session.names
+    name = names[m.view]
+    scan = capture.scans[m.view]
+    if m.kind != "several" and not shows_no_surface(scan):
+        # Something may be wrong with the cloud rather than with its pose.
+        others = [v for v in snooping.linkage.core if v != m.view]
+        surface = surface_of(capture.scans, snooping.unconstrained.poses, others, snooping.tolerance)
+        look = scan_fault if m.T is None else scale_fault
+        fault = look(scan, snooping.expected[m.view], surface, part_size([capture]), snooping.needed)
+        if fault is not None:
+            return problem(fault[0], [name], **fault[1])
+    if m.kind == "torn":
+        return problem("torn", [name])
+    if m.kind == "several":
+        return problem("several places", [name])
+    if m.T is None:
+        return problem("foreign", [name])
+    amount = displacement_text((m.rotation, m.distance), m.at_least, session.length_unit)
+    off = f"off by {amount}" if amount else "off by an amount that its surface does not show"
+    partner = next((v if w == m.view else w for v, w in same if m.view in (v, w)), None)
+    if partner is not None:
+        by_joints = session.views[m.view].joints is not None and abs(partner - m.view) == 1
+        mistake = "copied joints" if by_joints else "copied pose"
+        return problem(mistake, (name, names[partner]), view=name, of=names[partner], off=off)
+    joint = find_wrong_joint(session, capture, T_mount, m)
+    if joint is None:
+        return problem("displaced", [name], off=off)
+    column, stated, fits, is_neighbours = joint
+    mistake = "neighbour's joint" if is_neighbours else "wrong joint"
+    return problem(mistake, [name], view=name, joint=column, stated=stated, fits=fits, off=off)
 
 
 def find_common_displacement(
@@ -39,40 +144,38 @@ def find_common_displacement(
     placed = {m.view: m.T for m in misplaced if m.T is not None}
     runs = end_runs({m.view for m in misplaced}, len(poses))
     for views in (run for run in runs if len(run) >= _FEWEST):
-        for what in ("part", "scanner"):
-            some = {v: placed[v] for v in views if v in placed}
-            if _count_sharing_displacement(capture, poses, some, what) >= _SHARE * len(views):
-                return views, what
+        of_run = {v: placed[v] for v in views if v in placed}
+        for moved in ("part", "scanner"):
+            sharing = _count_sharing_displacement(capture, poses, of_run, moved)
+            if sharing >= _FEWEST and sharing >= _SHARE * len(views):
+                return views, moved
     return None
 
 
-def _count_sharing_displacement(capture: Capture, poses: Array, placed: Mapping[int, Array], what: str) -> int:
+def _count_sharing_displacement(capture: Capture, poses: Array, placed: Mapping[int, Array], moved: str) -> int:
     """Count the views that share one displacement, at most: a left twist of the part or a right one of the scanner."""
     best = 0
     for v, T in placed.items():
         back = frames.inverse(poses[v])
         sharing = 0
         for w, there in placed.items():
-            expected = T @ back @ poses[w] if what == "part" else poses[w] @ back @ T
-            points = capture.scans[w].points[::50]
+            expected = T @ back @ poses[w] if moved == "part" else poses[w] @ back @ T
+            points = capture.scans[w].points[::_EVERY]
             stated, fitted, shared = (frames.transform(pose, points) for pose in (poses[w], there, expected))
             sharing += bool(np.linalg.norm(shared - fitted) < _AGREES * np.linalg.norm(fitted - stated))
         best = max(best, sharing)
-    return best if best >= _FEWEST else 0
-
-
-# One joint explains a displacement if it leaves less than this share of it.
-_MAX_REMAINING_SHARE = 0.1
+    return best
 
 
 def find_wrong_joint(
     session: SessionData, capture: Capture, T_mount: Array, m: MisplacedView
 ) -> tuple[str, float, float, bool] | None:
     """Find the joint that alone explains a displacement: name, degrees stated and that fit, whether a neighbour's."""
-    robot, joints = session.robot, session.views[m.view].joints
+    robot = session.robot
+    joints = session.views[m.view].joints
     if robot is None or joints is None or m.T is None:
         return None
-    points = capture.scans[m.view].points[::50]
+    points = capture.scans[m.view].points[::_EVERY]
     there = frames.transform(m.T, points)
 
     def off(q: Array) -> float:
@@ -80,66 +183,35 @@ def find_wrong_joint(
         T = frames.inverse(T) if session.mount == "eye_to_hand" else T
         return float(np.sqrt(((frames.transform(T @ T_mount, points) - there) ** 2).sum(axis=1).mean()))
 
-    start = off(joints)
     best: tuple[float, int, float] = (np.inf, 0, 0.0)
     for j in range(len(joints)):
         unit = np.eye(len(joints))[j]
         grid = np.linspace(-np.pi, np.pi, 181)
-        near = grid[int(np.argmin([off(joints + a * unit) for a in grid]))]
-        for a in (near, 0.0):
-            fit = minimize_scalar(lambda x, u=unit: off(joints + x * u), bracket=(a - 0.02, a + 0.02))
+        near = grid[int(np.argmin([off(joints + turn * unit) for turn in grid]))]
+        for start in (near, 0.0):
+            fit = minimize_scalar(lambda x, u=unit: off(joints + x * u), bracket=(start - 0.02, start + 0.02))
             best = min(best, (float(fit.fun), j, float(fit.x)))
     left, j, turn = best
-    if left > _MAX_REMAINING_SHARE * start:
+    if left > _MAX_REMAINING_SHARE * off(joints):
         return None
-    fits = joints[j] + turn
-    others = [session.views[r].joints for r in (m.view - 1, m.view + 1) if 0 <= r < len(session.views)]
-    neighbour = any(q is not None and abs(q[j] - joints[j]) < 1e-9 for q in others)
-    return f"j{j + 1}_deg", float(np.degrees(joints[j])), float(np.degrees(fits)), neighbour
+    others = [session.views[row].joints for row in (m.view - 1, m.view + 1) if 0 <= row < len(session.views)]
+    is_neighbours = any(q is not None and abs(q[j] - joints[j]) < 1e-9 for q in others)
+    return f"j{j + 1}_deg", float(np.degrees(joints[j])), float(np.degrees(joints[j] + turn)), is_neighbours
 
 
-# A scan belongs to another row's pose if it lies this much closer to that than to its own, and this close absolutely
-# (`CLOSE_SHARE` of the part's size).
-_CLOSER_SHARE = 0.2
-
-
-def find_fitting_rows(capture: Capture, found: Snooping, misplaced: Sequence[MisplacedView]) -> dict[int, int | None]:
+def find_fitting_rows(
+    capture: Capture, snooping: Snooping, misplaced: Sequence[MisplacedView]
+) -> dict[int, int | None]:
     """Return for every misplaced scan that fits the part the row to whose pose it belongs; None for no other row."""
-    some = [m for m in misplaced if m.T is not None]
-    rows = {m.view: _nearest_row(capture, found.expected, m.view, m.T) for m in some if m.T is not None}
-    open_ones = [view for view, row in rows.items() if row is None]
-    if not open_ones or len(misplaced) < 2:
+    rows = {m.view: _nearest_row(capture, snooping.expected, m.view, m.T) for m in misplaced if m.T is not None}
+    elsewhere = [view for view, row in rows.items() if row is None]
+    if not elsewhere or len(misplaced) < 2:
         return rows
     # Where scans slide along the part, each came to rest somewhere else than in the row where it would fit as well.
-    core = [v for v in found.linkage.core if v not in found.not_belonging]
-    surface = surface_of(capture.scans, found.unconstrained.poses, core, found.tolerance)
+    core = [v for v in snooping.linkage.core if v not in snooping.not_belonging]
+    surface = surface_of(capture.scans, snooping.unconstrained.poses, core, snooping.tolerance)
     every = [m.view for m in misplaced]
-    return rows | {v: _row_where_it_fits(capture, found, surface, v, every) for v in open_ones}
-
-
-def exchanged_pairs(rows: dict[int, int | None], misplaced: Sequence[MisplacedView]) -> list[tuple[int, int]]:
-    """Find pairs of views of which one's scan fits the other's pose, whose own scan shows too little.
-
-    Args:
-        rows: of `find_fitting_rows`, less those of closed rounds.
-    """
-    silent = {m.view for m in misplaced if rows.get(m.view) is None} & set(rows.values())
-    claimed = {row: [v for v, other in rows.items() if other == row] for row in silent}
-    return [(views[0], row) for row, views in claimed.items() if len(views) == 1 and views[0] not in rows.values()]
-
-
-def exchange_cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:
-    """Find closed rounds of scans that stand in each other's rows."""
-    out, seen = [], set[int]()
-    for start in sorted(rows):
-        path, at = [start], rows[start]
-        while at is not None and at not in path and at not in seen:
-            path.append(at)
-            at = rows.get(at)
-        if at == start and len(path) > 1:
-            out.append(tuple(path))
-            seen |= set(path)
-    return out
+    return rows | {v: _row_where_it_fits(capture, snooping, surface, v, every) for v in elsewhere}
 
 
 def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | None:
@@ -151,15 +223,16 @@ def _nearest_row(capture: Capture, poses: Array, view: int, T: Array) -> int | N
 
 
 def _row_where_it_fits(
-    capture: Capture, found: Snooping, surface: ReferenceSurface, view: int, rows: Sequence[int]
+    capture: Capture, snooping: Snooping, surface: ReferenceSurface, view: int, rows: Sequence[int]
 ) -> int | None:
     """Return the row in which a scan, moved least, fits the others; None for its own."""
-    near, moved = CLOSE_SHARE * part_size([capture]), dict[int, float]()
+    near = CLOSE_SHARE * part_size([capture])
+    moved = dict[int, float]()
     for row in rows:
-        T = found.expected[row]
+        T = snooping.expected[row]
         best = place_scan(capture.scans[view], surface, T[None], near)[0]
         away = float(_pose_distances(capture, view, best.T, T[None])[0])
-        if best.closure > found.needed and best.near > FEW_SHARED and away < near:
+        if best.closure > snooping.needed and best.near > FEW_SHARED and away < near:
             moved[row] = away
     best_row = min(moved, key=lambda row: moved[row], default=view)
     return best_row if view not in moved and best_row != view else None
@@ -167,123 +240,33 @@ def _row_where_it_fits(
 
 def _pose_distances(capture: Capture, view: int, T: Array, poses: Array) -> Array:
     """(P,) rms distance between the points of a scan at one pose (4, 4) and at others (P, 4, 4)."""
-    points = capture.scans[view].points[::50]
+    points = capture.scans[view].points[::_EVERY]
     there = frames.transform(T, points)
-    return np.asarray(np.sqrt(((frames.transform(poses, points) - there) ** 2).sum(axis=2).mean(axis=1)))
+    return np.sqrt(((frames.transform(poses, points) - there) ** 2).sum(axis=2).mean(axis=1))
 
 
-_TORN = (
-    "a part of this scan contradicts the other scans wherever it is put: something moved during the scan, or two scans "
-    "are in one file; to fix: scan again"
-)
-_EXCHANGED = (
-    "the scan of {0} fits the pose of {1}, whose own scan shows too little of the others to be placed; to fix: "
-    "exchange the clouds of {0} and {1} in views.csv, or leave both out"
-)
-_SEVERAL = (
-    "this scan overlaps too little with the others at its pose, and fits the part at several other places alike; to "
-    "fix: add views that overlap with it, or leave it out"
-)
-_COPY = "this scan is a copy of that of {}; to fix: put the right file in its row"
+def exchange_cycles(rows: dict[int, int | None]) -> list[tuple[int, ...]]:
+    """Find closed rounds of scans that stand in each other's rows."""
+    cycles = []
+    seen = set[int]()
+    for start in sorted(rows):
+        path = [start]
+        row = rows[start]
+        while row is not None and row not in path and row not in seen:
+            path.append(row)
+            row = rows.get(row)
+        if row == start and len(path) > 1:
+            cycles.append(tuple(path))
+            seen |= set(path)
+    return cycles
 
 
-def explain_misplaced(session: SessionData, capture: Capture, T_mount: Array, found: Snooping) -> list[SessionProblem]:
-    """Return one problem for everything that snooping found, with the rows and what to do.
+def exchanged_pairs(rows: dict[int, int | None], misplaced: Sequence[MisplacedView]) -> list[tuple[int, int]]:
+    """Find pairs of views of which one's scan fits the other's pose, whose own scan shows too little.
 
     Args:
-        session, capture: with the same views.
-        T_mount: (4, 4) hand-eye under which `found` was made.
+        rows: of `find_fitting_rows`, less those of closed rounds.
     """
-    names, out, open_ones = session.names, list[SessionProblem](), {m.view: m for m in found.misplaced}
-
-    def explain(kind: str, views: Sequence[int], fix: str) -> None:
-        out.append(SessionProblem(kind, names_of_views(views, names), fix))
-        for v in views:
-            open_ones.pop(v, None)
-
-    for v, w in find_copies(capture):
-        bad, good = (v, w) if v in found.left_out and w not in found.left_out else (w, v)
-        open_ones.pop(bad, None)
-        out.append(SessionProblem("duplicate_scan", (names[v], names[w]), _COPY.format(names[good])))
-    rows = find_fitting_rows(capture, found, [*open_ones.values()])
-    for cycle in exchange_cycles(rows):
-        explain("exchanged", cycle, _exchange_fix(cycle, rows, names))
-    left = {v: row for v, row in rows.items() if v in open_ones}
-    for v, row in exchanged_pairs(left, [*open_ones.values()]):
-        explain("exchanged", sorted((v, row)), _EXCHANGED.format(names[v], names[row]))
-    step = None if found.steps else find_common_displacement(capture, found.expected, [*open_ones.values()])
-    if step is not None:
-        explain("reclamped", *_reclamped(step[0], step[1], names))
-    same = find_same_poses(capture)
-    out += [_single_view_problem(session, capture, T_mount, found, m, same) for m in open_ones.values()]
-    for s in found.steps:
-        side = range(s.start) if s.start <= found.largest_segment.start else range(s.start, len(names))
-        explain("reclamped", *_reclamped(side, s.moved if s.distinguishable else "either", names))
-    if len(found.disconnected) > 1:
-        shown = " | ".join(list_views(names_of_views(group, names), names) for group in found.disconnected)
-        views = [v for group in found.disconnected[1:] for v in group]
-        explain("disconnected", views, f"no surface links {shown}; to fix: add views between them")
-    return out
-
-
-def _exchange_fix(cycle: Sequence[int], rows: dict[int, int | None], names: Sequence[str]) -> str:
-    if len(cycle) == 2:
-        pair = f"{names[cycle[0]]} and {names[cycle[1]]}"
-        return f"the scans of {pair} fit each other's poses; to fix: exchange the clouds of {pair} in views.csv"
-    moves = ", ".join(f"the cloud of {names[v]} to row {names[int(rows[v] or 0)]}" for v in cycle)
-    return f"the clouds of {len(cycle)} rows are mixed up; to fix: move {moves}"
-
-
-def _reclamped(views: range, moved: str, names: Sequence[str]) -> tuple[range, str]:
-    """Return views at one end of the list that stand off from the rest, and what to do."""
-    start = views.start or views.stop
-    what = {"part": "the part was clamped anew", "scanner": "the scanner moved on its mount"}.get(
-        moved, "the part or the scanner moved"
-    )
-    return views, f"{what} between {names[start - 1]} and {names[start]}; to fix: make two sessions of it"
-
-
-def _single_view_problem(
-    session: SessionData,
-    capture: Capture,
-    T_mount: Array,
-    found: Snooping,
-    m: MisplacedView,
-    same: Sequence[tuple[int, int]],
-) -> SessionProblem:
-    names, scan = session.names, capture.scans[m.view]
-    own = (names[m.view],)
-    if m.kind != "several" and not shows_no_surface(scan):
-        # Something may be wrong with the cloud rather than with its pose.
-        others = [v for v in found.linkage.core if v != m.view]
-        surface = surface_of(capture.scans, found.unconstrained.poses, others, found.tolerance)
-        look = scan_fault if m.T is None else scale_fault
-        fault = look(scan, found.expected[m.view], surface, part_size([capture]), found.needed)
-        if fault is not None:
-            return SessionProblem(fault.kind, own, fault.fix)
-    if m.kind == "torn":
-        return SessionProblem("displaced", own, _TORN)
-    if m.kind == "several":
-        return SessionProblem("foreign", own, _SEVERAL)
-    if m.T is None:
-        return SessionProblem(
-            "foreign",
-            own,
-            "this scan fits nowhere on the part: it shows another part or too little; to fix: leave it out",
-        )
-    amount = displacement_text((m.rotation, m.distance), m.at_least, session.length_unit)
-    off = f"off by {amount}" if amount else "off by an amount that its surface does not show"
-    partner = next((v if w == m.view else w for v, w in same if m.view in (v, w)), None)
-    if partner is not None:
-        joint = session.views[m.view].joints is not None and abs(partner - m.view) == 1
-        kind = "joint_row" if joint else "duplicate_pose"
-        what = "joint angles" if joint else "pose"
-        fix = f"{own[0]} has the {what} of {names[partner]}, and is {off}; to fix: put in its own"
-        return SessionProblem(kind, (*own, names[partner]), fix)
-    digit = find_wrong_joint(session, capture, T_mount, m)
-    if digit is not None:
-        joint_name, stated, fits, neighbour = digit
-        kind = "joint_row" if neighbour else "displaced"
-        reads = f"{joint_name} of {own[0]} reads {stated:.4f}, {fits:.4f} would fit (it is {off})"
-        return SessionProblem(kind, own, f"{reads}; to fix: correct it")
-    return SessionProblem("displaced", own, f"its pose is {off}; to fix: correct the row, or scan again")
+    silent = {m.view for m in misplaced if rows.get(m.view) is None} & set(rows.values())
+    claimed = {row: [v for v, other in rows.items() if other == row] for row in silent}
+    return [(views[0], row) for row, views in claimed.items() if len(views) == 1 and views[0] not in rows.values()]

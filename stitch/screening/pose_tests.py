@@ -1,4 +1,15 @@
-"""Tests of the poses of views: steps that all views from one on share, single blunders, a factor on lengths."""
+"""Tests of the poses of views: steps that all views from one on share, single blunders, a factor on lengths.
+
+Single blunders: generalised extreme Studentised deviate (Rosner 1983, Technometrics 25:165). The most deviant view is
+let go, the scatter estimated anew, and so on; the number of blunders is the largest count whose last one is
+significant, so that several cannot hide in the scatter which they inflate. Beside a step, which all views from one on
+have in common, single ones are sought anew.
+
+Steps: under one hand-eye for all views every change point in the order of time is tested, for the part and for the
+scanner, as a displacement that all views from there on share: Baarda's test as for single views, an F since the scatter
+comes from the same data, times the number of tests (Bonferroni). What drifts, warms up, remembers or follows the pose
+is no step, so the scatter holds all by which poses of a good session may err, in sizes that they show.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,7 +23,7 @@ from stitch.numerics.least_squares import least_squares
 from stitch.numerics.reml import VarianceFit
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.run_data import effect_cure
-from stitch.screening.hypotheses import scale_text
+from stitch.screening.hypotheses import scale_text, sentence
 from stitch.screening.problems import DisplacementSize, SessionProblem, displacement_text
 from stitch.screening.view_model import (
     Projector,
@@ -31,6 +42,31 @@ MovedBody = Literal["part", "scanner"]
 MOVED_BODIES: tuple[MovedBody, MovedBody] = ("part", "scanner")
 # −2 log likelihood of part against scanner at odds of 20 to 1; closer ones these views do not tell apart.
 _DISTINGUISHABLE_DEVIANCE = 2 * np.log(20)
+# Chance that a session without blunders loses a view.
+FAMILY_WISE = 0.01
+# At most a third of the views can be blunders: beyond, nothing says which are the good ones.
+_MAX_BLUNDER_SHARE = 1 / 3
+# Masking shows within a few steps; a search that has found nothing by then ends.
+_MASKING_DEPTH = 3
+# Fewer degrees of freedom tell no view from the scatter of the others.
+FEWEST_DEGREES = 12
+# The most deviant views, tested under the scatter of the others alone.
+_LEAVE_ONE_OUT_COUNT = 3
+# That a session without a step shows one. What an arm does wrong where its poses change their kind is a step to a list
+# without joint angles: at nine equal poses three of four measured objects show the same one, at p of 0.006 to 0.06.
+STEP_CHANCE = 1e-4
+# Views from which on all by which poses may err takes minutes to hold against a step.
+MAX_VIEWS_WITH_EFFECTS = 100
+# Fewer views at an end than this are blunders of their own; more changes than this are no steps but a drift.
+_MIN_VIEWS_AT_END, _MAX_STEPS = 2, 3
+# Fewer views than this show no step beside their scatter.
+_MIN_VIEWS_FOR_STEP = 6
+# Less of its columns than this outside the mean is rounding.
+_NEW_COLUMN_SHARE = 1e-6
+# No scanner in use is off by this share of its lengths, and no arm.
+_SCALE = 0.01
+# Chance of a factor by which a session is refused, and of one that is named where it is refused anyway.
+_LENGTH_CHANCE, _LIKELY_LENGTH = 1e-4, 0.01
 
 
 @dataclass(frozen=True)
@@ -46,15 +82,17 @@ class PoseStep:
 
     def describe(self, names: Sequence[str], length_unit: str) -> str:
         """Return a warning with what to do."""
-        before, after = names[self.start - 1], names[self.start]
         off = displacement_text(self.size, self.at_least, length_unit)
-        by = f"{off} off at the part" if off else "by an amount that these surfaces do not show"
         other = "scanner" if self.moved == "part" else "part"
-        unsure = "" if self.distinguishable else f" (or the {other}: these views do not show which)"
-        further = f", or {effect_cure('part_slip')}" if self.moved == "part" and self.distinguishable else ""
-        return (
-            f"From view {after} on the {self.moved} sits elsewhere{unsure}, {by}; to fix: make two sessions, one up to "
-            f"{before} and one from {after} on{further}."
+        slip = self.moved == "part" and self.distinguishable
+        return sentence(
+            "step",
+            before=names[self.start - 1],
+            after=names[self.start],
+            moved=self.moved,
+            unsure="" if self.distinguishable else f" (or the {other}: these views do not show which)",
+            by=f"{off} off at the part" if off else "by an amount that these surfaces do not show",
+            further=f", or {effect_cure('part_slip')}" if slip else "",
         )
 
     def columns(self, model: ViewModel) -> Array:
@@ -64,49 +102,7 @@ class PoseStep:
 
 def step_columns(model: ViewModel, start: int, moved: str) -> Array:
     """(n, 6) of a displacement that views from `start` on have in common."""
-    return np.asarray((model.views if moved == "part" else model.mounts)[start:].sum(axis=0))
-
-
-def likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody, int], tests: int) -> PoseStep:
-    """Return the likelier one of a step of the part and one of the scanner, with its size.
-
-    Args:
-        columns: (n, K) of what else there is.
-        best: the view from which on each of the two would have moved.
-        tests: how many steps were looked at.
-    """
-    own = {moved: hstack_columns(columns, step_columns(model, best[moved], moved)) for moved in MOVED_BODIES}
-    deviance = {moved: model.deviance(own[moved]) for moved in MOVED_BODIES}
-    likelier = min(MOVED_BODIES, key=lambda moved: deviance[moved])
-    told = bool(abs(deviance["part"] - deviance["scanner"]) > _DISTINGUISHABLE_DEVIANCE)
-    start = best[likelier]
-    displaced = step_columns(model, start, likelier)
-    p = test_alternative(projector(model, model.fit(columns), columns), displaced).p_value * tests
-    under = projector(model, model.fit(own[likelier]), columns)
-    tested = test_alternative(under, displaced)
-    carried = model.mount_twists[start:] if likelier == "scanner" else np.eye(6)[None]
-    moved = (carried @ tested.estimate).reshape(-1, 2, 3)
-    sizes = np.linalg.norm(moved, axis=2), [rotation_shift_lower_bounds(tested, under.degrees, own) for own in carried]
-    (turn, shift), (least_turn, least_shift) = (np.median(size, axis=0).tolist() for size in sizes)
-    size, at_least = (turn / model.lever, shift), (least_turn / model.lever, least_shift)
-    return PoseStep(start, likelier, told, size, at_least, p)
-
-
-# Single blunders: generalised extreme Studentised deviate (Rosner 1983, Technometrics 25:165). The most deviant view is
-# let go, the scatter estimated anew, and so on; the number of blunders is the largest count whose last one is
-# significant, so that several cannot hide in the scatter which they inflate. Beside a step, which all views from one on
-# have in common, single ones are sought anew.
-
-# Chance that a session without blunders loses a view.
-FAMILY_WISE = 0.01
-# At most a third of the views can be blunders: beyond, nothing says which are the good ones.
-_MAX_BLUNDER_SHARE = 1 / 3
-# Masking shows within a few steps; a search that has found nothing by then ends.
-_MASKING_DEPTH = 3
-# Fewer degrees of freedom tell no view from the scatter of the others.
-FEWEST_DEGREES = 12
-# The most deviant views, tested under the scatter of the others alone.
-_LEAVE_ONE_OUT_COUNT = 3
+    return (model.views if moved == "part" else model.mounts)[start:].sum(axis=0)
 
 
 @dataclass(frozen=True)
@@ -125,174 +121,6 @@ class BlunderSearch:
     fit: VarianceFit
     mean_columns: Array | None  # (n, K) columns of blunders and steps in the mean
     null_projector: Projector  # null hypothesis with those columns in it
-
-
-def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequence[PoseStep] = ()) -> BlunderSearch:
-    """Find blunders among the views of a model.
-
-    Args:
-        excluded: views that are known to be off: they stay free and are not counted.
-        steps: what all views from one on have in common.
-    """
-    freed: list[Blunder] = []
-    columns, states = free_view_columns(model, excluded, steps), list[tuple[VarianceFit, Array | None, Projector]]()
-    most = max(int(_MAX_BLUNDER_SHARE * model.count) - len(excluded), 0)
-    significant = 0
-    while True:
-        fit = model.fit(columns)
-        under = projector(model, fit, columns)
-        states.append((fit, columns, under))
-        rest = [v for v in range(model.count) if v not in excluded and v not in [b.view for b in freed]]
-        if len(freed) >= most or len(freed) >= significant + _MASKING_DEPTH or under.degrees < FEWEST_DEGREES:
-            break
-        tests = {v: test_alternative(under, model.views[v]) for v in rest}
-        likely = sorted(rest, key=lambda v: tests[v].rank)[:_LEAVE_ONE_OUT_COUNT]
-        # Either test alone holds its level; together they were seen to stay below it (docs/integrity.md).
-        chance = {v: min(tests[v].p_value, leave_one_out_test(model, columns, v)[1]) for v in likely}
-        worst = min(likely, key=lambda v: chance[v])
-        p = min(1.0, chance[worst] * len(rest))
-        freed.append(Blunder(worst, p))
-        if p < FAMILY_WISE:
-            significant = len(freed)
-        columns = hstack_columns(columns, model.views[worst])
-    fit, columns, under = states[significant]
-    return BlunderSearch(tuple(freed[:significant]), fit, columns, under)
-
-
-def find_unlinked_blunders(
-    model: ViewModel, excluded: Sequence[int], unlinked: Sequence[int], steps: Sequence[PoseStep] = ()
-) -> list[Blunder]:
-    """Return the unlinked views that the scatter of all others does not explain."""
-    out = []
-    for v in unlinked:
-        others = [*excluded, *(w for w in unlinked if w != v)]
-        p = model.count * leave_one_out_test(model, free_view_columns(model, others, steps), v)[1]
-        if p < FAMILY_WISE:
-            out.append(Blunder(v, p))
-    return out
-
-
-def free_view_columns(model: ViewModel, excluded: Sequence[int], steps: Sequence[PoseStep]) -> Array | None:
-    """(n, K) of views that stay free, and of steps."""
-    own = [model.columns(excluded), *(step.columns(model) for step in steps)]
-    return hstack_columns(*own) if len(excluded) or steps else None
-
-
-# Steps: under one hand-eye for all views every change point in the order of time is tested, for the part and for the
-# scanner, as a displacement that all views from there on share: Baarda's test as for single views, an F since the
-# scatter comes from the same data, times the number of tests (Bonferroni). What drifts, warms up, remembers or follows
-# the pose is no step, so the scatter holds all by which poses of a good session may err, in sizes that they show.
-
-# That a session without a step shows one. What an arm does wrong where its poses change their kind is a step to a list
-# without joint angles: at nine equal poses three of four measured objects show the same one, at p of 0.006 to 0.06.
-STEP_CHANCE = 1e-4
-# Views from which on all by which poses may err takes minutes to hold against a step.
-MAX_VIEWS_WITH_EFFECTS = 100
-
-# Fewer views at an end than this are blunders of their own; more changes than this are no steps but a drift.
-_MIN_VIEWS_AT_END, _MAX_STEPS = 2, 3
-# Fewer views than this show no step beside their scatter.
-_MIN_VIEWS_FOR_STEP = 6
-# Less of its columns than this outside the mean is rounding.
-_NEW_COLUMN_SHARE = 1e-6
-
-
-def find_steps(
-    model: ViewModel, first: Array | None, singles: tuple[Array | None, int], chance: float
-) -> tuple[PoseStep, ...]:
-    """Change points in the order of time, beside single views that are off.
-
-    Args:
-        model: with all that may happen without a step.
-        first: (n, K) columns of views that are known to be off.
-        singles: columns (n, K) of these and all single blunders, and how many there are: they may explain as much.
-        chance: that a session without a step shows one.
-    """
-    found, columns = _search_steps(model, first, chance)
-    if singles[1]:
-        beside_them, every = _search_steps(model, singles[0], chance)
-        if not found or _akaike_criterion(model, every) < _akaike_criterion(model, columns):
-            found = beside_them
-    return tuple(sorted(found, key=lambda s: s.start))
-
-
-@dataclass(frozen=True)
-class _Pick:
-    """What explains most beside what was picked before: a step, or a single view that is off."""
-
-    columns: Array  # (n, 6)
-    p_value: float
-    tests: int  # of which it is the likeliest
-    starts: dict[MovedBody, int] | None = None  # where the step of each begins; None: a single view
-
-
-def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple[list[PoseStep], Array | None]:
-    """Find steps on top of columns that are in the mean already; return all columns with them and with single views.
-
-    As with single views (Rosner 1983) the search goes on beside what does not stand out yet: what is moved there and
-    back are two steps, and each hides in the scatter that the other makes, as a step does beside one view far off.
-    """
-
-    def with_columns_of(some: Sequence[_Pick]) -> Array | None:
-        return hstack_columns(first, *(pick.columns for pick in some)) if some else first
-
-    picked, significant = list[_Pick](), 0
-    while model.count >= _MIN_VIEWS_FOR_STEP and len(picked) < significant + _MAX_STEPS:
-        taken = [pick.starts for pick in picked if pick.starts is not None]
-        pick = _next_pick(model, with_columns_of(picked), taken) if len(taken) < _MAX_STEPS else None
-        if pick is None:
-            break
-        p = pick.p_value
-        if len(picked) > significant:
-            # Each of the last two may hide in the scatter that the other makes, and then neither stands out alone.
-            columns, last = with_columns_of(picked[:-1]), picked[-1]
-            under = projector(model, model.fit(columns), columns)
-            both = test_alternative(under, hstack_columns(last.columns, pick.columns))
-            p = min(p, both.p_value * last.tests * pick.tests)
-        picked.append(pick)
-        significant = len(picked) if p < chance else significant
-    picked = picked[:significant]
-    steps = [
-        likelier_step(model, with_columns_of([other for other in picked if other is not pick]), pick.starts, pick.tests)
-        for pick in picked
-        if pick.starts is not None
-    ]
-    # What was picked early may stand out no more beside the rest.
-    return [step for step in steps if step.p_value < chance], with_columns_of(picked)
-
-
-def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[MovedBody, int]]) -> _Pick | None:
-    """Return the likeliest step, or single view that is off, beside some columns; None where these leave no view."""
-    under, mean = projector(model, model.fit(columns), columns), model.mixed(columns).A[0]
-    # What the orthonormal columns of the mean hold of a view says nothing more.
-    free = [
-        v
-        for v, own in enumerate(model.views)
-        if np.linalg.norm(own - mean @ (mean.T @ own)) >= _NEW_COLUMN_SHARE * np.linalg.norm(own)
-    ]
-    if not free:
-        return None
-    every = range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
-    starts = [k for k in every if k not in [k for own in taken for k in own.values()]]
-    tests = {
-        (moved, k): test_alternative(under, step_columns(model, k, moved)) for moved in MOVED_BODIES for k in starts
-    }
-    alone = {v: test_alternative(under, model.views[v]) for v in free}
-    view, likelier = min(alone, key=lambda v: alone[v].rank), min(tests, key=lambda at: tests[at].rank, default=None)
-    # Of few views every start of a step may be taken.
-    if likelier is None or alone[view].rank < tests[likelier].rank:
-        return _Pick(model.views[view], alone[view].p_value * model.count, model.count)
-    best = {moved: max(starts, key=lambda k: tests[moved, k].statistic) for moved in MOVED_BODIES}
-    moved, start = likelier
-    count = len(MOVED_BODIES) * len(every) * _MAX_STEPS
-    return _Pick(step_columns(model, start, moved), tests[likelier].p_value * count, count, best)
-
-
-def _akaike_criterion(model: ViewModel, columns: Array | None) -> float:
-    """Return Akaike's for few numbers (Hurvich and Tsai 1989): half of the views, let go, would leave no scatter."""
-    count = len(model.z)
-    taken = model.hand_eye.shape[1] + (0 if columns is None else columns.shape[1])
-    return model.deviance(columns) + 2 * taken * count / (count - taken - 1) if count > taken + 1 else np.inf
 
 
 @dataclass(frozen=True)
@@ -332,17 +160,200 @@ def pose_tests(
         chance: that a session without a step shows one.
     """
     unplaced, placed = unlinked
-    off = find_unlinked_blunders(model, unplaced, placed)
-    found = find_blunders(model, [*unplaced, *(b.view for b in off)])
-    few = usual is not None and model.count < MAX_VIEWS_WITH_EFFECTS
-    erring = model.with_errors(usual.errors(unconstrained)) if usual is not None and few else model
-    steps = find_steps(erring, model.columns(unplaced), (found.mean_columns, len(off) + len(found.blunders)), chance)
+    off = _find_unlinked_blunders(model, unplaced, placed)
+    search = find_blunders(model, [*unplaced, *(b.view for b in off)])
+    erring = model
+    if usual is not None and model.count < MAX_VIEWS_WITH_EFFECTS:
+        erring = model.with_errors(usual.errors(unconstrained))
+    singles = search.mean_columns, len(off) + len(search.blunders)
+    steps = find_steps(erring, model.columns(unplaced), singles, chance)
     if steps:
         # A view at the step may stand for one of its sides.
-        off = find_unlinked_blunders(model, unplaced, placed, steps)
-        found = find_blunders(model, [*unplaced, *(b.view for b in off)], steps)
-    sure = find_unlinked_blunders(erring, unplaced, [b.view for b in off], steps)
-    return PoseTests(unplaced, off, found, steps, {b.view for b in sure})
+        off = _find_unlinked_blunders(model, unplaced, placed, steps)
+        search = find_blunders(model, [*unplaced, *(b.view for b in off)], steps)
+    sure = _find_unlinked_blunders(erring, unplaced, [b.view for b in off], steps)
+    return PoseTests(unplaced, off, search, steps, {b.view for b in sure})
+
+
+def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequence[PoseStep] = ()) -> BlunderSearch:
+    """Find blunders among the views of a model.
+
+    Args:
+        excluded: views that are known to be off: they stay free and are not counted.
+        steps: what all views from one on have in common.
+    """
+    freed = list[Blunder]()
+    states = list[tuple[VarianceFit, Array | None, Projector]]()
+    columns = _free_view_columns(model, excluded, steps)
+    most = max(int(_MAX_BLUNDER_SHARE * model.count) - len(excluded), 0)
+    significant = 0
+    while True:
+        fit = model.fit(columns)
+        under = projector(model, fit, columns)
+        states.append((fit, columns, under))
+        rest = [v for v in range(model.count) if v not in excluded and v not in [b.view for b in freed]]
+        if len(freed) >= most or len(freed) >= significant + _MASKING_DEPTH or under.degrees < FEWEST_DEGREES:
+            break
+        tests = {v: test_alternative(under, model.views[v]) for v in rest}
+        likely = sorted(rest, key=lambda v: tests[v].rank)[:_LEAVE_ONE_OUT_COUNT]
+        # Either test alone holds its level; together they were seen to stay below it (docs/integrity.md).
+        chance = {v: min(tests[v].p_value, leave_one_out_test(model, columns, v)[1]) for v in likely}
+        worst = min(likely, key=lambda v: chance[v])
+        p = min(1.0, chance[worst] * len(rest))
+        freed.append(Blunder(worst, p))
+        if p < FAMILY_WISE:
+            significant = len(freed)
+        columns = hstack_columns(columns, model.views[worst])
+    return BlunderSearch(tuple(freed[:significant]), *states[significant])
+
+
+def _find_unlinked_blunders(
+    model: ViewModel, excluded: Sequence[int], unlinked: Sequence[int], steps: Sequence[PoseStep] = ()
+) -> list[Blunder]:
+    """Return the unlinked views that the scatter of all others does not explain."""
+    blunders = []
+    for v in unlinked:
+        others = [*excluded, *(w for w in unlinked if w != v)]
+        p = model.count * leave_one_out_test(model, _free_view_columns(model, others, steps), v)[1]
+        if p < FAMILY_WISE:
+            blunders.append(Blunder(v, p))
+    return blunders
+
+
+def _free_view_columns(model: ViewModel, excluded: Sequence[int], steps: Sequence[PoseStep]) -> Array | None:
+    """(n, K) of views that stay free, and of steps."""
+    if not len(excluded) and not steps:
+        return None
+    return hstack_columns(model.columns(excluded), *(step.columns(model) for step in steps))
+
+
+def find_steps(
+    model: ViewModel, first: Array | None, singles: tuple[Array | None, int], chance: float
+) -> tuple[PoseStep, ...]:
+    """Find change points in the order of time, beside single views that are off.
+
+    Args:
+        model: with all that may happen without a step.
+        first: (n, K) columns of views that are known to be off.
+        singles: columns (n, K) of these and all single blunders, and how many there are: they may explain as much.
+        chance: that a session without a step shows one.
+    """
+    steps, columns = _search_steps(model, first, chance)
+    if singles[1]:
+        beside_them, every = _search_steps(model, singles[0], chance)
+        if not steps or _akaike_criterion(model, every) < _akaike_criterion(model, columns):
+            steps = beside_them
+    return tuple(sorted(steps, key=lambda step: step.start))
+
+
+@dataclass(frozen=True)
+class _Pick:
+    """What explains most beside what was picked before: a step, or a single view that is off."""
+
+    columns: Array  # (n, 6)
+    p_value: float
+    tests: int  # of which it is the likeliest
+    starts: dict[MovedBody, int] | None = None  # where the step of each begins; None: a single view
+
+
+def _search_steps(model: ViewModel, first: Array | None, chance: float) -> tuple[list[PoseStep], Array | None]:
+    """Find steps on top of columns that are in the mean already; return all columns with them and with single views.
+
+    As with single views (Rosner 1983) the search goes on beside what does not stand out yet: what is moved there and
+    back are two steps, and each hides in the scatter that the other makes, as a step does beside one view far off.
+    """
+
+    def with_columns_of(picks: Sequence[_Pick]) -> Array | None:
+        return hstack_columns(first, *(pick.columns for pick in picks)) if picks else first
+
+    picked = list[_Pick]()
+    significant = 0
+    while model.count >= _MIN_VIEWS_FOR_STEP and len(picked) < significant + _MAX_STEPS:
+        taken = [pick.starts for pick in picked if pick.starts is not None]
+        pick = _next_pick(model, with_columns_of(picked), taken) if len(taken) < _MAX_STEPS else None
+        if pick is None:
+            break
+        p = pick.p_value
+        if len(picked) > significant:
+            # Each of the last two may hide in the scatter that the other makes, and then neither stands out alone.
+            columns = with_columns_of(picked[:-1])
+            last = picked[-1]
+            under = projector(model, model.fit(columns), columns)
+            both = test_alternative(under, hstack_columns(last.columns, pick.columns))
+            p = min(p, both.p_value * last.tests * pick.tests)
+        picked.append(pick)
+        significant = len(picked) if p < chance else significant
+    picked = picked[:significant]
+    steps = []
+    for pick in picked:
+        if pick.starts is not None:
+            others = with_columns_of([other for other in picked if other is not pick])
+            steps.append(_likelier_step(model, others, pick.starts, pick.tests))
+    # What was picked early may stand out no more beside the rest.
+    return [step for step in steps if step.p_value < chance], with_columns_of(picked)
+
+
+def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[MovedBody, int]]) -> _Pick | None:
+    """Return the likeliest step, or single view that is off, beside some columns; None where these leave no view."""
+    under = projector(model, model.fit(columns), columns)
+    mean = model.mixed(columns).A[0]
+
+    def says_more(displaced: Array) -> bool:
+        # What the orthonormal columns of the mean hold says nothing more.
+        rest = displaced - mean @ (mean.T @ displaced)
+        return bool(np.linalg.norm(rest) >= _NEW_COLUMN_SHARE * np.linalg.norm(displaced))
+
+    alone = {v: test_alternative(under, own) for v, own in enumerate(model.views) if says_more(own)}
+    if not alone:
+        return None
+    every = range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
+    starts = [k for k in every if k not in [k for starts in taken for k in starts.values()]]
+    steps = {(moved, k): step_columns(model, k, moved) for moved in MOVED_BODIES for k in starts}
+    tests = {at: test_alternative(under, displaced) for at, displaced in steps.items() if says_more(displaced)}
+    view = min(alone, key=lambda v: alone[v].rank)
+    likelier = min(tests, key=lambda at: tests[at].rank, default=None)
+    # Of few views every start of a step may be taken.
+    if likelier is None or alone[view].rank < tests[likelier].rank:
+        return _Pick(model.views[view], alone[view].p_value * model.count, model.count)
+    best = dict[MovedBody, int]()
+    for moved in MOVED_BODIES:
+        statistics = {k: tests[moved, k].statistic for k in starts if (moved, k) in tests}
+        best[moved] = max(statistics, key=statistics.__getitem__, default=likelier[1])
+    count = len(MOVED_BODIES) * len(every) * _MAX_STEPS
+    return _Pick(steps[likelier], tests[likelier].p_value * count, count, best)
+
+
+def _likelier_step(model: ViewModel, columns: Array | None, best: dict[MovedBody, int], tests: int) -> PoseStep:
+    """Return the likelier one of a step of the part and one of the scanner, with its size.
+
+    Args:
+        columns: (n, K) of what else there is.
+        best: the view from which on each of the two would have moved.
+        tests: how many steps were looked at.
+    """
+    with_step = {moved: hstack_columns(columns, step_columns(model, best[moved], moved)) for moved in MOVED_BODIES}
+    deviance = {moved: model.deviance(with_step[moved]) for moved in MOVED_BODIES}
+    likelier = min(MOVED_BODIES, key=lambda moved: deviance[moved])
+    distinguishable = bool(abs(deviance["part"] - deviance["scanner"]) > _DISTINGUISHABLE_DEVIANCE)
+    start = best[likelier]
+    displaced = step_columns(model, start, likelier)
+    p = test_alternative(projector(model, model.fit(columns), columns), displaced).p_value * tests
+    under = projector(model, model.fit(with_step[likelier]), columns)
+    tested = test_alternative(under, displaced)
+    carried = model.mount_twists[start:] if likelier == "scanner" else np.eye(6)[None]
+    moved = np.linalg.norm((carried @ tested.estimate).reshape(-1, 2, 3), axis=2)
+    least = [rotation_shift_lower_bounds(tested, under.degrees, to_view) for to_view in carried]
+    turn, shift = np.median(moved, axis=0).tolist()
+    least_turn, least_shift = np.median(least, axis=0).tolist()
+    lever = model.lever
+    return PoseStep(start, likelier, distinguishable, (turn / lever, shift), (least_turn / lever, least_shift), p)
+
+
+def _akaike_criterion(model: ViewModel, columns: Array | None) -> float:
+    """Return Akaike's for few numbers (Hurvich and Tsai 1989): half of the views, let go, would leave no scatter."""
+    count = len(model.z)
+    taken = model.hand_eye.shape[1] + (0 if columns is None else columns.shape[1])
+    return model.deviance(columns) + 2 * taken * count / (count - taken - 1) if count > taken + 1 else np.inf
 
 
 def expected_poses(model: ViewModel, model_poses: Array, unconstrained: UnconstrainedPoses, tests: PoseTests) -> Array:
@@ -358,49 +369,42 @@ def expected_poses(model: ViewModel, model_poses: Array, unconstrained: Unconstr
         (V, 4, 4) T_reference_scanner.
     """
     alone = tests.standing_off
-    moved = [_step_displacement(model, tests, alone, k) for k in range(len(tests.steps))]
+    fit = tests.blunder_search.fit
+    moved = []
+    for step in tests.steps:
+        # The least that it may have moved, rotations in 1/lever: along itself a part slides unseen.
+        others = _free_view_columns(model, alone, [other for other in tests.steps if other is not step])
+        under = projector(model, fit, others)
+        moved.append(displacement_lower_bound(test_alternative(under, step.columns(model)), under.degrees))
     z = model.z - sum(step.columns(model) @ by for step, by in zip(tests.steps, moved, strict=True))
     X = hstack_columns(model.hand_eye, model.columns(alone))
-    CX = np.linalg.solve(model.mixed().covariance(tests.blunder_search.fit.variances)[0], X)
+    CX = np.linalg.solve(model.mixed().covariance(fit.variances)[0], X)
     twists = model.mount_twists @ least_squares(X.T @ CX, -CX.T @ z)[:6]
     for step, by in zip(tests.steps, moved, strict=True):
-        own = model.mount_twists[step.start :] if step.moved == "scanner" else np.eye(6)[None]
-        twists[step.start :] += own @ by
+        carried = model.mount_twists[step.start :] if step.moved == "scanner" else np.eye(6)[None]
+        twists[step.start :] += carried @ by
     twists[:, :3] /= model.lever
     # Surfaces do not say where all views together stand.
     twists += np.mean(np.delete(unconstrained.twists - twists, alone, axis=0), axis=0)
     return frames.moved_about(model.centre, twists, model_poses)
 
 
-def _step_displacement(model: ViewModel, tests: PoseTests, excluded: list[int], k: int) -> Array:
-    """(6,) the least that step k may have moved, rotations in 1/lever: along itself a part slides unseen."""
-    others = free_view_columns(model, excluded, (*tests.steps[:k], *tests.steps[k + 1 :]))
-    under = projector(model, tests.blunder_search.fit, others)
-    return displacement_lower_bound(test_alternative(under, tests.steps[k].columns(model)), under.degrees)
-
-
 def least_displacement(
-    model: ViewModel, found: BlunderSearch, others: list[int], steps: tuple[PoseStep, ...], view: int, middle: Array
+    model: ViewModel, search: BlunderSearch, others: list[int], steps: tuple[PoseStep, ...], view: int, middle: Array
 ) -> DisplacementSize:
     """Return the smallest displacement of a view's middle that its evidence admits.
 
     Args:
-        found: the scatter of the poses.
+        search: the scatter of the poses.
         others: views that are off beside this one: they stay free.
         middle: (3,) of the view's points, reference frame.
     """
-    under = projector(model, found.fit, free_view_columns(model, others, steps))
+    under = projector(model, search.fit, _free_view_columns(model, others, steps))
     carried = np.eye(6)
     carried[3:, :3] = -frames.skew(middle - model.centre) / model.lever
     tested = test_alternative(under, model.held_responses[view])
     turn, shift = rotation_shift_lower_bounds(tested, under.degrees, carried)
     return turn / model.lever, shift
-
-
-# No scanner in use is off by this share of its lengths, and no arm.
-_SCALE = 0.01
-# Chance of a factor by which a session is refused, and of one that is named where it is refused anyway.
-_LENGTH_CHANCE, _LIKELY_LENGTH = 1e-4, 0.01
 
 
 def length_problem(
@@ -419,8 +423,8 @@ def length_problem(
     if further is not None and model.deviance(column) + 2 < model.deviance(further) + 2 * further.shape[1]:
         # One number says as much as the six of every view (Akaike 1974): of few views one takes the factor upon itself.
         further = None
-    found, p = left_out_test(model, further, column, column)
-    share = float(found.estimate[0])
+    tested, p = left_out_test(model, further, column, column)
+    share = float(tested.estimate[0])
     if abs(share) < _SCALE or p > (_LIKELY_LENGTH if likely else _LENGTH_CHANCE):
         return None
-    return SessionProblem("scale", (), scale_text(1 + share, float(found.normal[0, 0]) ** -0.5))
+    return SessionProblem("scale", (), scale_text(1 + share, float(tested.normal[0, 0]) ** -0.5))

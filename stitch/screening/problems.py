@@ -9,11 +9,35 @@ import numpy as np
 from stitch.numerics.units import angle_text, length_text
 from stitch.observations.pose_errors import usual_twist
 
-# Digits that are known of a displacement.
-_DIGITS = 2
-
 # Rotation (rad) and shift (length_unit).
 DisplacementSize = tuple[float, float]
+
+# Digits that are known of a displacement.
+_DIGITS = 2
+# Names or ranges that a message lists, and how many views in a row make a range.
+_LISTED, _RANGE = 6, 3
+
+
+@dataclass(frozen=True)
+class SessionProblem:
+    """A problem of a session, its views and its remedy; no views where it concerns the whole session."""
+
+    # exchanged | shifted | reversed | inverse | mount | euler | degrees | quaternion | unit | scale | mirrored |
+    # linear_axis | joint_sign | joint_coupling | joint_row | duplicate_scan | duplicate_pose | displaced | foreign |
+    # reclamped | disconnected
+    kind: str
+    views: tuple[str, ...]
+    fix: str  # one line
+    certain: bool = True  # False: a hint that the numbers do not prove
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as `stitch check --deep --json` prints it."""
+        return {"kind": self.kind, "views": list(self.views), "fix": self.fix}
+
+    def line(self, order: Sequence[str]) -> str:
+        """Return it as a message: kind, views, what and how to fix; `order` has the names of all views."""
+        where = f" ({list_views(self.views, order)})" if self.views else ""
+        return f"{self.kind}{where}: {self.fix}"
 
 
 def displacement_text(best: DisplacementSize, least: DisplacementSize, length_unit: str) -> str:
@@ -23,27 +47,22 @@ def displacement_text(best: DisplacementSize, least: DisplacementSize, length_un
     Args:
         best, least: the estimate, and the smallest displacement that the evidence admits.
     """
-    lower = _significant_displacement(least, least, length_unit)
-    if lower and lower == _significant_displacement(best, least, length_unit):
+    usual_angle, usual_length = usual_twist(length_unit)[[0, 3]]
+
+    def text(rotation: float, shift: float) -> str:
+        parts = []
+        if least[1] > usual_length:
+            parts.append(length_text(shift, length_unit, _DIGITS))
+        if least[0] > usual_angle:
+            degrees = float(np.degrees(rotation))
+            in_degrees = f"{degrees:.{0 if degrees >= 10 else 1}f}°"
+            parts.append(in_degrees if degrees > 1 else angle_text(rotation, _DIGITS))
+        return " and ".join(parts)
+
+    lower = text(*least)
+    if not lower or lower == text(*best):
         return lower
-    return f"at least {lower}" if lower else ""
-
-
-def _significant_displacement(size: DisplacementSize, least: DisplacementSize, length_unit: str) -> str:
-    """Return the rotation and the shift that surely exceed the repeatability of arms."""
-    angle, length = usual_twist(length_unit)[[0, 3]]
-    parts = [length_text(size[1], length_unit, _DIGITS)] if least[1] > length else []
-    return " and ".join([*parts, angle_in_words(size[0])] if least[0] > angle else parts)
-
-
-def angle_in_words(angle: float) -> str:
-    """Return an angle in mrad, or in degrees where it is more than one."""
-    degrees = float(np.degrees(angle))
-    return f"{degrees:.{0 if degrees >= 10 else 1}f}°" if degrees > 1 else angle_text(angle, _DIGITS)
-
-
-# Names or ranges that a message lists, and how many views in a row make a range.
-_LISTED, _RANGE = 6, 3
+    return f"at least {lower}"
 
 
 def list_views(names: Sequence[str], order: Sequence[str]) -> str:
@@ -71,25 +90,3 @@ def names_of_views(indices: Iterable[int], names: Sequence[str]) -> tuple[str, .
 def likeliest_text(fixes: Sequence[str]) -> str:
     """Return the likeliest explanation, followed by up to two others that are as likely."""
     return "; or, as likely: ".join([*dict.fromkeys(fixes)][:3])
-
-
-@dataclass(frozen=True)
-class SessionProblem:
-    """A problem of a session, its views and its remedy; no views where it concerns the whole session."""
-
-    # exchanged | shifted | reversed | inverse | mount | euler | degrees | quaternion | unit | scale | mirrored |
-    # linear_axis | joint_sign | joint_coupling | joint_row | duplicate_scan | duplicate_pose | displaced | foreign |
-    # reclamped | disconnected
-    kind: str
-    views: tuple[str, ...]
-    fix: str  # one line
-    certain: bool = True  # False: a hint that the numbers do not prove
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it as `stitch check --deep --json` prints it."""
-        return {"kind": self.kind, "views": list(self.views), "fix": self.fix}
-
-    def line(self, order: Sequence[str]) -> str:
-        """Return it as a message: kind, views, what and how to fix; `order` has the names of all views."""
-        where = f" ({list_views(self.views, order)})" if self.views else ""
-        return f"{self.kind}{where}: {self.fix}"

@@ -14,14 +14,11 @@ import numpy as np
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
+from stitch.screening.linkage import STILL_CONTRADICTS, Linkage, find_contradicting_views, linkage
 from stitch.screening.placement import (
-    STILL_CONTRADICTS,
-    Linkage,
     Placement,
     evaluate_placement,
-    find_contradicting_views,
     lies_in_a_line,
-    linkage,
     needed_closure,
     place_scan,
     place_unlinked_views,
@@ -42,137 +39,8 @@ from stitch.session.capture import Capture, part_size
 # Chance at which a step is tried: whether it stands out among the few views that are linked or not, that it links more
 # of them is the proof.
 _ANY_CHANCE = 1.0
-
-
-def place_across_steps(
-    capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, usual: UsualEffects | None
-) -> tuple[Array, UnconstrainedPoses]:
-    """Return where views are expected, and where overlaps put them: beside a step, if that links more of them.
-
-    A step pulls the hand-eye, and the side of it that has fewer views stands farther from the others than two scans can
-    share. Tried wide, such a view would close somewhere on a part that looks alike from several sides, and would be
-    called displaced; one step explains more than that, and views are tried from where it puts them first.
-
-    Args:
-        T_mount: (4, 4) hand-eye of the model poses from which `unconstrained` is seen.
-
-    Returns:
-        (V, 4, 4) T_reference_scanner, those of the model without a step; and the views freed, seen from these.
-    """
-    model_poses, apart = capture.poses(T_mount), list(linkage(unconstrained.overlaps).unlinked)
-    if not apart:
-        return model_poses, unconstrained
-    model = view_model(capture, T_mount, unconstrained)
-    tests = pose_tests(model, unconstrained, (apart, []), usual, _ANY_CHANCE)
-    if not tests.steps:
-        return model_poses, unconstrained
-    expected = expected_poses(model, model_poses, unconstrained, tests)
-    poses = np.array(unconstrained.poses)
-    poses[apart] = expected[apart]
-    tried = [unconstrained_poses(capture, start, unconstrained.overlaps.gate) for start in (expected, poses)]
-    best = min((unconstrained, *tried), key=lambda found: len(linkage(found.overlaps).unlinked))
-    return (model_poses, unconstrained) if best is unconstrained else (expected, best.relative_to(expected))
-
-
-def place_together(
-    capture: Capture,
-    model_poses: Array,
-    unconstrained: UnconstrainedPoses,
-    placed: Mapping[int, Placement],
-    *,
-    unlinked: Collection[int],
-    tolerance: float,
-) -> UnconstrainedPoses | None:
-    """Free unlinked views at one end of the list from where one of them was found, all displaced as it was.
-
-    After a knock of the scanner, or a part clamped anew, each of them alone may overlap too little with the others to
-    be placed, and would be taken for a scan of another part.
-
-    Args:
-        model_poses: (V, 4, 4) T_reference_scanner by the robot.
-        unconstrained: the views where overlaps alone put them.
-        placed: where some of the unlinked views belong.
-        tolerance: distance that is the same place, length_unit.
-
-    Returns:
-        The freed views, if that links them all and none contradicts; None if no common displacement does.
-    """
-    for views in end_runs(unlinked, len(model_poses)):
-        for v in sorted(set(views) & set(placed), key=lambda v: -placed[v].closure):
-            T, back = placed[v].T, frames.inverse(model_poses[v])
-            for moved in (model_poses @ back @ T, T @ back @ model_poses):
-                poses = np.array(unconstrained.poses)
-                poses[views] = moved[views]
-                tried = unconstrained_poses(capture, poses, unconstrained.overlaps.gate).relative_to(model_poses)
-                apart = linkage(tried.overlaps).unlinked
-                if not (apart or find_contradicting_views(capture.scans, tried.poses, tolerance, part_size([capture]))):
-                    return tried
-    return None
-
-
-def end_runs(views: Collection[int], count: int) -> list[range]:
-    """Return the unbroken runs of some views at the end and at the beginning of a list of so many."""
-    rest = [v for v in range(count) if v not in views]
-    return [range(rest[-1] + 1, count), range(rest[0])] if rest else []
-
-
 # On the surface of the others: four robust sigmas of the overlaps.
 _TOLERANCE_SIGMAS = 4.0
-
-
-@dataclass(frozen=True)
-class PlacedViews:
-    """Views where their surfaces put them."""
-
-    unconstrained: UnconstrainedPoses  # with the views where they belong
-    linkage: Linkage  # at the poses that overlaps alone give, from the model's
-    placed: dict[int, Placement]  # views that nothing linked, and where they belong
-    unplaced: list[int]  # views that belong nowhere
-    several: set[int]  # of these, views that close at several places alike
-    torn: tuple[int, ...]  # views that contradict the others, and still do where they belong
-    lines: list[int]  # views whose points lie in a line
-    tolerance: float  # distance from the surface of the others that still lies on it, length_unit
-    needed: float  # closure at which a scan counts as placed
-
-    @property
-    def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Views that surfaces link, with all in their places."""
-        silent = {*self.lines, *(v for v in self.torn if v in self.unplaced)}
-        return linkage(self.unconstrained.overlaps, silent).components
-
-
-def place_views(capture: Capture, model_poses: Array, unconstrained: UnconstrainedPoses) -> PlacedViews:
-    """Find where views belong by their surfaces: those that nothing links are tried wide.
-
-    Args:
-        model_poses: (V, 4, 4) T_reference_scanner by the robot.
-        unconstrained: the views freed from there.
-    """
-    lines = [v for v, scan in enumerate(capture.scans) if lies_in_a_line(scan)]
-    tolerance, size = _TOLERANCE_SIGMAS * unconstrained.overlaps.gram.scale, part_size([capture])
-    groups = linkage(unconstrained.overlaps, lines).components
-    torn = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, groups=groups)
-    linked = linkage(unconstrained.overlaps, {*lines, *torn})
-    needed = needed_closure(capture, unconstrained.poses, linked, tolerance)
-    placed, unplaced, several = place_unlinked_views(capture, model_poses, unconstrained, linked, (tolerance, needed))
-    apart = linked.unlinked
-    if placed and len(apart) > 1:
-        # One displacement of all explains more than one of each, which may have closed in a wrong place.
-        together = place_together(capture, model_poses, unconstrained, placed, unlinked=apart, tolerance=tolerance)
-        if together is not None:
-            unconstrained, linked, torn = together, linkage(together.overlaps, lines), ()
-            placed, unplaced, several = {}, [], set()
-    if placed:
-        poses = np.array(unconstrained.poses)
-        for v, placement in placed.items():
-            poses[v] = placement.T
-        unconstrained = unconstrained_poses(capture, poses, unconstrained.overlaps.gate).relative_to(model_poses)
-        if torn:
-            still = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, STILL_CONTRADICTS)
-            torn = tuple(v for v in still if v in torn)
-    return PlacedViews(
-        unconstrained, linked, placed, unplaced, several, torn, lines=lines, tolerance=tolerance, needed=needed
-    )
 
 
 @dataclass(frozen=True)
@@ -233,6 +101,21 @@ class Snooping:
         return float(np.sqrt(self.blunder_search.fit.variances[1]))
 
 
+@dataclass(frozen=True)
+class PlacedViews:
+    """Views where their surfaces put them."""
+
+    unconstrained: UnconstrainedPoses  # with the views where they belong
+    linkage: Linkage  # at the poses that overlaps alone give, from the model's
+    placed: dict[int, Placement]  # views that nothing linked, and where they belong
+    unplaced: list[int]  # views that belong nowhere
+    several: set[int]  # of these, views that close at several places alike
+    torn: tuple[int, ...]  # views that contradict the others, and still do where they belong
+    lines: list[int]  # views whose points lie in a line
+    tolerance: float  # distance from the surface of the others that still lies on it, length_unit
+    needed: float  # closure at which a scan counts as placed
+
+
 def snoop_views(
     capture: Capture,
     T_mount: Array,
@@ -252,12 +135,11 @@ def snoop_views(
         NoResultError: no two views overlap.
     """
     model_poses = capture.poses(T_mount)
-    unconstrained = (
-        unconstrained_poses(capture, model_poses, gate)
-        if unconstrained is None
-        else unconstrained.relative_to(model_poses)
-    )
-    located = place_views(capture, *place_across_steps(capture, T_mount, unconstrained, usual))
+    if unconstrained is None:
+        unconstrained = unconstrained_poses(capture, model_poses, gate)
+    else:
+        unconstrained = unconstrained.relative_to(model_poses)
+    located = place_views(capture, *_place_across_steps(capture, T_mount, unconstrained, usual))
     located = replace(located, unconstrained=located.unconstrained.relative_to(model_poses))
     model = view_model(capture, T_mount, located.unconstrained)
     tests = pose_tests(model, located.unconstrained, (located.unplaced, list(located.placed)), usual)
@@ -268,9 +150,11 @@ def snoop_views(
     sure = {m.view for m in standing_out}
     if sure and usual is not None:
         # Those that stand out beside what usually happens to all of them too.
-        again = find_blunders(model.with_usual(usual.twists(located.unconstrained)), tests.excluded, tests.steps)
+        with_usual = model.with_usual(usual.twists(located.unconstrained))
+        again = find_blunders(with_usual, tests.excluded, tests.steps)
         sure &= {b.view for b in again.blunders} | tests.sure | torn
-    groups = located.groups
+    silent = {*located.lines, *(v for v in located.torn if v in located.unplaced)}
+    groups = linkage(located.unconstrained.overlaps, silent).components
     foreign = [
         MisplacedView(v, "several" if v in located.several else "foreign", np.nan, np.nan, 0.0, None)
         for v in located.unplaced
@@ -282,7 +166,7 @@ def snoop_views(
         misplaced=tuple(sorted([*misplaced, *foreign], key=lambda m: m.view)),
         suspected=tuple(m for m in standing_out if m.view not in sure),
         steps=tests.steps,
-        disconnected=tuple(g for g in groups if not set(g) <= {m.view for m in foreign}),
+        disconnected=tuple(group for group in groups if not set(group) <= {m.view for m in foreign}),
         model=model,
         blunder_search=tests.blunder_search,
         unconstrained=located.unconstrained,
@@ -292,28 +176,140 @@ def snoop_views(
     )
 
 
+def _place_across_steps(
+    capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses, usual: UsualEffects | None
+) -> tuple[Array, UnconstrainedPoses]:
+    """Return where views are expected, and where overlaps put them: beside a step, if that links more of them.
+
+    A step pulls the hand-eye, and the side of it that has fewer views stands farther from the others than two scans can
+    share. Tried wide, such a view would close somewhere on a part that looks alike from several sides, and would be
+    called displaced; one step explains more than that, and views are tried from where it puts them first.
+
+    Args:
+        T_mount: (4, 4) hand-eye of the model poses from which `unconstrained` is seen.
+
+    Returns:
+        (V, 4, 4) T_reference_scanner, those of the model without a step; and the unconstrained views, seen from these.
+    """
+    model_poses = capture.poses(T_mount)
+    unlinked = list(linkage(unconstrained.overlaps).unlinked)
+    if not unlinked:
+        return model_poses, unconstrained
+    model = view_model(capture, T_mount, unconstrained)
+    tests = pose_tests(model, unconstrained, (unlinked, []), usual, _ANY_CHANCE)
+    if not tests.steps:
+        return model_poses, unconstrained
+    expected = expected_poses(model, model_poses, unconstrained, tests)
+    poses = np.array(unconstrained.poses)
+    poses[unlinked] = expected[unlinked]
+    tried = [unconstrained_poses(capture, start, unconstrained.overlaps.gate) for start in (expected, poses)]
+    best = min((unconstrained, *tried), key=lambda views: len(linkage(views.overlaps).unlinked))
+    return (model_poses, unconstrained) if best is unconstrained else (expected, best.relative_to(expected))
+
+
+def place_views(capture: Capture, model_poses: Array, unconstrained: UnconstrainedPoses) -> PlacedViews:
+    """Find where views belong by their surfaces: those that nothing links are tried wide.
+
+    Args:
+        model_poses: (V, 4, 4) T_reference_scanner by the robot.
+        unconstrained: the views freed from there.
+    """
+    lines = [v for v, scan in enumerate(capture.scans) if lies_in_a_line(scan)]
+    tolerance = _TOLERANCE_SIGMAS * unconstrained.overlaps.gram.scale
+    size = part_size([capture])
+    groups = linkage(unconstrained.overlaps, lines).components
+    torn = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, groups=groups)
+    linked = linkage(unconstrained.overlaps, {*lines, *torn})
+    needed = needed_closure(capture, unconstrained.poses, linked, tolerance)
+    placed, unplaced, several = place_unlinked_views(capture, model_poses, unconstrained, linked, (tolerance, needed))
+    if placed and len(linked.unlinked) > 1:
+        # One displacement of all explains more than one of each, which may have closed in a wrong place.
+        together = _place_together(capture, model_poses, unconstrained, placed, linked.unlinked, tolerance)
+        if together is not None:
+            unconstrained = together
+            linked = linkage(together.overlaps, lines)
+            torn, placed, unplaced, several = (), {}, [], set()
+    if placed:
+        poses = np.array(unconstrained.poses)
+        for v, placement in placed.items():
+            poses[v] = placement.T
+        unconstrained = unconstrained_poses(capture, poses, unconstrained.overlaps.gate).relative_to(model_poses)
+        if torn:
+            still = find_contradicting_views(capture.scans, unconstrained.poses, tolerance, size, STILL_CONTRADICTS)
+            torn = tuple(v for v in still if v in torn)
+    return PlacedViews(unconstrained, linked, placed, unplaced, several, torn, lines, tolerance, needed)
+
+
+def _place_together(
+    capture: Capture,
+    model_poses: Array,
+    unconstrained: UnconstrainedPoses,
+    placed: Mapping[int, Placement],
+    unlinked: Collection[int],
+    tolerance: float,
+) -> UnconstrainedPoses | None:
+    """Free unlinked views at one end of the list from where one of them was found, all displaced as it was.
+
+    After a knock of the scanner, or a part clamped anew, each of them alone may overlap too little with the others to
+    be placed, and would be taken for a scan of another part.
+
+    Args:
+        model_poses: (V, 4, 4) T_reference_scanner by the robot.
+        unconstrained: the views where overlaps alone put them.
+        placed: where some of the unlinked views belong.
+        tolerance: distance that is the same place, length_unit.
+
+    Returns:
+        The unconstrained views, if that links them all and none contradicts; None if no common displacement does.
+    """
+    size = part_size([capture])
+    for views in end_runs(unlinked, len(model_poses)):
+        for v in sorted(set(views) & set(placed), key=lambda v: -placed[v].closure):
+            T = placed[v].T
+            back = frames.inverse(model_poses[v])
+            for moved in (model_poses @ back @ T, T @ back @ model_poses):
+                poses = np.array(unconstrained.poses)
+                poses[views] = moved[views]
+                tried = unconstrained_poses(capture, poses, unconstrained.overlaps.gate).relative_to(model_poses)
+                if linkage(tried.overlaps).unlinked:
+                    continue
+                if not find_contradicting_views(capture.scans, tried.poses, tolerance, size):
+                    return tried
+    return None
+
+
+def end_runs(views: Collection[int], count: int) -> list[range]:
+    """Return the unbroken runs of some views at the end and at the beginning of a list of so many."""
+    rest = [v for v in range(count) if v not in views]
+    return [range(rest[-1] + 1, count), range(rest[0])] if rest else []
+
+
 def _displaced_views(
-    capture: Capture, model: ViewModel, expected: Array, placed: PlacedViews, tests: PoseTests
+    capture: Capture, model: ViewModel, expected: Array, located: PlacedViews, tests: PoseTests
 ) -> list[MisplacedView]:
     """Return views that stand off and torn ones, with where the surface of the others puts them."""
-    freed, search = placed.unconstrained, tests.blunder_search
+    unconstrained = located.unconstrained
+    search = tests.blunder_search
     off = sorted((*tests.displaced, *search.blunders), key=lambda b: b.view)
-    found = [(b.view, b.p_value, _refine_pose(capture, freed, b.view, placed.tolerance)) for b in off]
-    known = {b.view for b in off} | set(placed.unplaced)
-    out = []
-    for v, p, T in (*found, *((v, 0.0, freed.poses[v]) for v in placed.torn if v not in known)):
+    places = [(b.view, b.p_value, _refine_pose(capture, unconstrained, b.view, located.tolerance)) for b in off]
+    known = {b.view for b in off} | set(located.unplaced)
+    places += [(v, 0.0, unconstrained.poses[v]) for v in located.torn if v not in known]
+    displaced = []
+    for v, p, T in places:
         middle = capture.scans[v].points.mean(axis=0)[None]
-        there = frames.transform(freed.poses[v], middle)[0]
-        least = least_displacement(model, search, [w for w in tests.standing_off if w != v], tests.steps, v, there)
+        there = frames.transform(unconstrained.poses[v], middle)[0]
+        others = [w for w in tests.standing_off if w != v]
+        least = least_displacement(model, search, others, tests.steps, v, there)
         turn = float(frames.angle_between(expected[v], T))
         shift = float(np.linalg.norm(frames.transform(T, middle) - frames.transform(expected[v], middle)))
-        out.append(MisplacedView(v, "displaced", turn, shift, p, T, least))
-    return out
+        displaced.append(MisplacedView(v, "displaced", turn, shift, p, T, least))
+    return displaced
 
 
 def _refine_pose(capture: Capture, unconstrained: UnconstrainedPoses, view: int, tolerance: float) -> Array:
     """(4, 4) where the surface of the other views puts one: robust weights of all pairs hold it back."""
-    scan, T = capture.scans[view], unconstrained.poses[view]
+    scan = capture.scans[view]
+    T = unconstrained.poses[view]
     others = [v for v in range(len(capture.scans)) if v != view]
     surface = surface_of(capture.scans, unconstrained.poses, others, tolerance)
     best = place_scan(scan, surface, T[None], part_size([capture]))[0]

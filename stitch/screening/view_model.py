@@ -1,4 +1,20 @@
-"""What overlaps and targets say about the pose of every view, as one linear model of visible directions."""
+"""What overlaps and targets say about the pose of every view, as one linear model of visible directions, and its tests.
+
+A view's own displacement, or a block's, is tested under the scatter of the other poses. The evidence is linear:
+z = X ξ + Σ L_v δ_v + ε, with ξ the hand-eye, δ_v a displacement of view v (left twist in the reference frame) and
+cov(ε) of pose scatter and sensor noise. With P = C⁻¹ − C⁻¹X(XᵀC⁻¹X)⁻¹XᵀC⁻¹, the statistic of an alternative with
+columns G is T = uᵀN⁻¹u, u = GᵀPz, N = GᵀPG: χ² with rank(N) degrees of freedom, with non-centrality δᵀNδ where a
+blunder δ is present (Baarda 1968; Teunissen, Testing Theory, 2000).
+
+What only a weak direction seems to show is no size of a displacement: a scan that slides along the part, or that few
+holes keep from turning, comes to rest millimetres from where it belongs, and where all scans slid together each stands
+off from its pose by that. The estimate of the test knows both: what the views have in common, and how well each
+direction is held.
+
+A view that stands out from white scatter may do so by a blunder, or because the arm bends as arms do. The second is a
+random effect (Searle, Casella and McCulloch 1992): every parameter of every effect is zero give or take its size, and
+the views scatter accordingly, together and not one by one (`UsualEffects`).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -33,6 +49,12 @@ SEEN = 1e-6
 # A direction of one view's displacement is held if surfaces see this share of it. Where a scan slides along the others
 # it is 0.001 and less, and what little is seen is their noise; elsewhere 0.9.
 _HELD_SHARE = 0.1
+# Chance that the evidence tells the least displacement that is likely from the right one.
+_CHANCE = 0.01
+# Standard deviation of a parameter, in usual sizes: effects of up to four times the usual size are not rare then.
+_TIMES_USUAL = 2.0
+# Correspondences that tell what an effect does to the views where its size is free.
+_MAX_CORRESPONDENCES = 20_000
 
 
 @dataclass(frozen=True)
@@ -72,43 +94,48 @@ class ViewModel:
         """Number of views."""
         return len(self.mount_jacobians)
 
-    @cached_property
-    def _blocks(self) -> Array:
-        """(V, n, 6) response to a left twist of one view, rad and length_unit."""
-        return self.reduced.reduction.reshape(-1, self.count, 6).transpose(1, 0, 2)
-
     @property
-    def _unit(self) -> Array:
-        """(6,) by which twists with rotations in 1/lever become such."""
+    def unit(self) -> Array:
+        """(6,) by which twists with rotations in 1/lever become such with rotations in rad."""
         return np.array([1 / self.lever] * 3 + [1.0] * 3)
 
     @cached_property
     def views(self) -> Array:
-        """(V, n, 6) the same, rotations in 1/lever."""
-        return self._blocks * self._unit
+        """(V, n, 6) response to a left twist of one view, rotations in 1/lever."""
+        return self._by_view * self.unit
 
     @cached_property
     def mounts(self) -> Array:
-        """(V, n, 6) response of one view to a correction of its own hand-eye."""
-        return np.asarray(self._blocks @ self.mount_jacobians)
+        """(V, n, 6) response of one view to a correction of its own hand-eye, rad and length_unit."""
+        return self._by_view @ self.mount_jacobians
+
+    @cached_property
+    def _by_view(self) -> Array:
+        """(V, n, 6) response to a left twist of one view, rad and length_unit."""
+        return self.reduced.reduction.reshape(-1, self.count, 6).transpose(1, 0, 2)
 
     @cached_property
     def mount_twists(self) -> Array:
-        """(V, 6, 6) the twist of a view that such a correction makes, rotations in 1/lever."""
-        return self.mount_jacobians / self._unit[:, None]
+        """(V, 6, 6) the twist of a view that a correction of its hand-eye makes, rotations in 1/lever."""
+        return self.mount_jacobians / self.unit[:, None]
 
     @cached_property
     def held_responses(self) -> Array:
         """(V, n, 6) as `views`, less the directions in which nothing holds a single view."""
         _, values, vectors = np.linalg.svd(self.views, full_matrices=False)
         held = vectors * (values**2 > _HELD_SHARE)[:, :, None]
-        return np.asarray(self.views @ held.transpose(0, 2, 1) @ vectors)
+        return self.views @ held.transpose(0, 2, 1) @ vectors
+
+    def columns(self, free_views: Sequence[int]) -> Array | None:
+        """(n, 6k) that let some views stand anywhere."""
+        return np.concatenate([self.views[v] for v in free_views], axis=1) if len(free_views) else None
 
     def mixed(self, further: Array | None = None) -> MixedModel:
         """Return the model with further columns (n, K) in its mean, ready for restricted maximum likelihood."""
-        mean, usual = hstack_columns(self.hand_eye, further), None if self.usual is None else self.usual[None]
-        own = replace(self._scatter_model, A=column_space(mean, SEEN)[None], fixed=usual)
-        return own if self.errors is None else with_pose_errors(own, self.errors)
+        mean = column_space(hstack_columns(self.hand_eye, further), SEEN)
+        usual = None if self.usual is None else self.usual[None]
+        mixed = replace(self._scatter_model, A=mean[None], fixed=usual)
+        return mixed if self.errors is None else with_pose_errors(mixed, self.errors)
 
     @cached_property
     def _scatter_model(self) -> MixedModel:
@@ -131,23 +158,20 @@ class ViewModel:
         C = self.mixed(further).covariance(fit.variances)[0]
         return float(np.linalg.slogdet(C)[1] + self.z @ projector(self, fit, further).projected)
 
-    def columns(self, free_views: Sequence[int]) -> Array | None:
-        """(n, 6k) that let some views stand anywhere."""
-        return np.concatenate([self.views[v] for v in free_views], axis=1) if len(free_views) else None
-
 
 def view_model(capture: Capture, T_mount: Array, unconstrained: UnconstrainedPoses) -> ViewModel:
-    """Reduce freed views to the evidence about their poses.
+    """Reduce unconstrained views to the evidence about their poses.
 
     Args:
-        T_mount: (4, 4) hand-eye of the model poses from which the twists of the freed views are counted.
+        T_mount: (4, 4) hand-eye of the model poses from which the twists of the unconstrained views are counted.
     """
-    g, mounts = unconstrained.overlaps.gram, capture.hand_eye_frames(T_mount)
+    gram = unconstrained.overlaps.gram
+    mounts = capture.hand_eye_frames(T_mount)
     return ViewModel(
-        reduced=reduce_poses(g, unconstrained.twists, mounts, capture.T_reference_flange),
-        mount_jacobians=hand_eye_jacobian(mounts, g.centre).reshape(-1, 6, 6),
-        centre=g.centre,
-        lever=max(g.lever, 1e-300),
+        reduced=reduce_poses(gram, unconstrained.twists, mounts, capture.T_reference_flange),
+        mount_jacobians=hand_eye_jacobian(mounts, gram.centre).reshape(-1, 6, 6),
+        centre=gram.centre,
+        lever=max(gram.lever, 1e-300),
     )
 
 
@@ -161,20 +185,14 @@ class Projector:
 
 
 def projector(model: ViewModel, fit: VarianceFit, further: Array | None = None) -> Projector:
-    """P for variances that were fitted, with further columns (n, K) in the mean."""
+    """Return P for variances that were fitted, with further columns (n, K) in the mean."""
     mixed = model.mixed(further)
-    A, C = mixed.A[0], mixed.covariance(fit.variances)[0]
+    A = mixed.A[0]
+    C = mixed.covariance(fit.variances)[0]
     both = np.linalg.solve(C, np.column_stack([A, np.eye(len(C))]))
     CA, inverse = both[:, : A.shape[1]], both[:, A.shape[1] :]
     P = inverse - CA @ np.linalg.solve(A.T @ CA, CA.T)
     return Projector(P, P @ model.z, len(C) - A.shape[1])
-
-
-# One view's own displacement, or a block's, is tested under the scatter of the other poses. The evidence is linear:
-# z = X ξ + Σ L_v δ_v + ε, with ξ the hand-eye, δ_v a displacement of view v (left twist in the reference frame) and
-# cov(ε) of pose scatter and sensor noise. With P = C⁻¹ − C⁻¹X(XᵀC⁻¹X)⁻¹XᵀC⁻¹, the statistic of an alternative with
-# columns G is T = uᵀN⁻¹u, u = GᵀPz, N = GᵀPG: χ² with rank(N) degrees of freedom, with non-centrality δᵀNδ where a
-# blunder δ is present (Baarda 1968; Teunissen, Testing Theory, 2000).
 
 
 @dataclass(frozen=True)
@@ -195,13 +213,20 @@ class AlternativeTest:
 
 def hstack_columns(*columns: Array | None) -> Array:
     """(n, ·) those columns that there are, side by side."""
-    return np.hstack([own for own in columns if own is not None])
+    return np.hstack([block for block in columns if block is not None])
 
 
 def test_alternative(under: Projector, columns: Array) -> AlternativeTest:
-    """The alternative with `columns` (n, 6) under a null hypothesis."""
-    N, u = columns.T @ under.P @ columns, columns.T @ under.projected
-    inverse, degrees = _pseudo_inverse(N)
+    """Test the alternative with `columns` (n, 6) under a null hypothesis."""
+    N = columns.T @ under.P @ columns
+    u = columns.T @ under.projected
+    # Units of the columns may differ.
+    same_units, unit = equilibrated(N)
+    values, vectors = np.linalg.eigh(same_units)
+    keep = values > SEEN * max(values[-1], 1e-300)
+    scaled = vectors[:, keep] * unit[:, None]
+    inverse = (scaled / values[keep]) @ scaled.T
+    degrees = int(keep.sum())
     statistic = float(u @ inverse @ u)
     nu = under.degrees - degrees
     if degrees == 0 or nu < 1:
@@ -212,44 +237,29 @@ def test_alternative(under: Projector, columns: Array) -> AlternativeTest:
     return AlternativeTest(statistic, degrees, p, inverse @ u, N)
 
 
-def _pseudo_inverse(N: Array) -> tuple[Array, int]:
-    """Pseudo-inverse and rank of a symmetric matrix whose units may differ."""
-    same_units, unit = equilibrated(N)
-    values, vectors = np.linalg.eigh(same_units)
-    keep = values > SEEN * max(values[-1], 1e-300)
-    scaled = vectors[:, keep] * unit[:, None]
-    return np.asarray((scaled / values[keep]) @ scaled.T), int(keep.sum())
-
-
-def left_out_test(model: ViewModel, columns: Array | None, own: Array, held: Array) -> tuple[AlternativeTest, float]:
-    """An alternative tested under the scatter that is left where it is free, and the chance of that.
+def left_out_test(
+    model: ViewModel, columns: Array | None, alternative: Array, held: Array
+) -> tuple[AlternativeTest, float]:
+    """Test an alternative under the scatter that is left where it is free; return the chance of that too.
 
     One of six views hides in a scatter that it inflates itself. Rotations and translations share the degrees of freedom
     of a scatter taken from the rest: half of them count.
 
     Args:
         columns: (n, K) of what else there is.
-        own: (n, k) of the alternative.
+        alternative: (n, k).
         held: (n, k) the same, less directions that nothing holds.
     """
-    under = projector(model, model.fit(hstack_columns(columns, own)), columns)
+    under = projector(model, model.fit(hstack_columns(columns, alternative)), columns)
     tested = test_alternative(under, held)
     free = max((under.degrees - tested.degrees) // 2, 1)
-    return tested, f_tail(tested.statistic / max(tested.degrees, 1), max(tested.degrees, 1), free)
+    degrees = max(tested.degrees, 1)
+    return tested, f_tail(tested.statistic / degrees, degrees, free)
 
 
 def leave_one_out_test(model: ViewModel, columns: Array | None, view: int) -> tuple[AlternativeTest, float]:
-    """One view tested under the scatter that all others have without it: where a scan slides it rests anywhere."""
+    """Test one view under the scatter that all others have without it: where a scan slides it rests anywhere."""
     return left_out_test(model, columns, model.views[view], model.held_responses[view])
-
-
-# What only a weak direction seems to show is no size of a displacement: a scan that slides along the part, or that few
-# holes keep from turning, comes to rest millimetres from where it belongs, and where all scans slid together each
-# stands off from its pose by that. The estimate of the test knows both: what the views have in common, and how well
-# each direction is held.
-
-# Chance that the evidence tells it from the right one.
-_CHANCE = 0.01
 
 
 def displacement_lower_bound(tested: AlternativeTest, degrees: int) -> Array:
@@ -259,18 +269,21 @@ def displacement_lower_bound(tested: AlternativeTest, degrees: int) -> Array:
 
 
 def rotation_shift_lower_bounds(tested: AlternativeTest, degrees: int, carried: Array) -> tuple[float, float]:
-    """The smallest rotation, in 1/lever, and the smallest shift, whatever the other one is.
+    """Return the smallest rotation, in 1/lever, and the smallest shift, whatever the other one is.
 
     Args:
         carried: (6, 6) from displacements as they were tested to those of the point whose shift counts.
     """
     back = np.linalg.inv(carried)
-    N, estimate, limit = back.T @ tested.normal @ back, carried @ tested.estimate, _confidence_limit(tested, degrees)
-    parts = []
-    for own, other in ((slice(0, 3), slice(3, 6)), (slice(3, 6), slice(0, 3))):
-        left = N[own, own] - N[own, other] @ np.linalg.pinv(N[other, other], rcond=1e-9, hermitian=True) @ N[other, own]
-        parts.append(float(np.linalg.norm(_shortest_within_limit(left, estimate[own], limit))))
-    return parts[0], parts[1]
+    N = back.T @ tested.normal @ back
+    estimate = carried @ tested.estimate
+    limit = _confidence_limit(tested, degrees)
+    bounds = []
+    for part, other in ((slice(0, 3), slice(3, 6)), (slice(3, 6), slice(0, 3))):
+        inverse = np.linalg.pinv(N[other, other], rcond=1e-9, hermitian=True)
+        left = N[part, part] - N[part, other] @ inverse @ N[other, part]
+        bounds.append(float(np.linalg.norm(_shortest_within_limit(left, estimate[part], limit))))
+    return bounds[0], bounds[1]
 
 
 def _confidence_limit(tested: AlternativeTest, degrees: int) -> float:
@@ -280,7 +293,8 @@ def _confidence_limit(tested: AlternativeTest, degrees: int) -> float:
 def _shortest_within_limit(normal: Array, estimate: Array, limit: float) -> Array:
     """(k,) the shortest displacement of which the evidence (k, k) is within a limit of that of the estimate (k,)."""
     held, axes = np.linalg.eigh(normal)
-    held, seen = np.maximum(held, 0.0), axes.T @ estimate
+    held = np.maximum(held, 0.0)
+    seen = axes.T @ estimate
     if held @ seen**2 <= limit:
         return np.zeros(len(seen))
 
@@ -291,17 +305,7 @@ def _shortest_within_limit(normal: Array, estimate: Array, limit: float) -> Arra
     # A pull towards none moves the estimate the farther the less a direction is held.
     strongest = np.log(held[-1])
     pull = np.exp(brentq(missed, strongest - 60, strongest + 60))
-    return np.asarray(axes @ (held / (held + pull) * seen))
-
-
-# A view that stands out from white scatter may do so by a blunder, or because the arm bends as arms do. The second is a
-# random effect (Searle, Casella and McCulloch 1992): every parameter of every effect is zero give or take its size, and
-# the views scatter accordingly, together and not one by one.
-
-# Standard deviation of a parameter, in usual sizes: effects of up to four times the usual size are not rare then.
-_TIMES_USUAL = 2.0
-# Correspondences that tell what an effect does to the views where its size is free.
-_MAX_CORRESPONDENCES = 20_000
+    return axes @ (held / (held + pull) * seen)
 
 
 @dataclass(frozen=True)
@@ -324,11 +328,12 @@ class UsualEffects:
 
         Mount and part also wander as slowly as a session is long: they warm up, creep or settle by no law.
         """
-        own, centre = self.measurement.capture, unconstrained.overlaps.gram.centre
+        capture = self.measurement.capture
+        centre = unconstrained.overlaps.gram.centre
         errors = prior_pose_errors([self.measurement], self.model, [centre])
         alike = drift_kernel([self.measurement], max(DRIFT_MEMORY.values()))
         unit = usual_twist(self.measurement.length_unit)
-        of_mount = frames.adjoint(frames.make(np.eye(3), -centre) @ own.hand_eye_frames(self.model.T_mount))
+        of_mount = frames.adjoint(frames.make(np.eye(3), -centre) @ capture.hand_eye_frames(self.model.T_mount))
         of_part = np.tile(np.eye(6), (len(unconstrained.poses), 1, 1))
         for name, moved in (("wandering mount", of_mount), ("wandering part", of_part)):
             errors = errors.with_component(name, process_covariance((moved * unit).reshape(-1, 6), alike), 1.0)
@@ -339,23 +344,20 @@ class UsualEffects:
     def _by_place(self, unconstrained: UnconstrainedPoses) -> dict[str, Array]:
         """(6V, P) twists by the effects of each place of the chain, one column a parameter, of usual size."""
         # Steps between two views are tested as blocks of views.
-        physical = [
-            e
-            for e in EFFECTS.values()
-            if e.tier == "physical" and all(spec.grid != EVERY_VIEW for spec in e.specs.values())
+        possible = [
+            effect
+            for effect in EFFECTS.values()
+            if effect.tier == "physical"
+            and all(spec.grid != EVERY_VIEW for spec in effect.specs.values())
+            and not missing_need(self.measurement, effect)
         ]
-        terms = [term_of(self.measurement, e) for e in physical if not missing_need(self.measurement, e)]
-        columns = [
-            response.columns[:, ~term.gridded] * term.typical[~term.gridded]
-            for term, response in zip(
-                terms, view_responses(self.measurement, self.model, terms, unconstrained), strict=True
-            )
-        ]
-        places = dict.fromkeys(term.effect.place for term in terms)
-        return {
-            place: np.hstack([c for term, c in zip(terms, columns, strict=True) if term.effect.place == place])
-            for place in places
-        }
+        terms = [term_of(self.measurement, effect) for effect in possible]
+        columns = dict[str, list[Array]]()
+        responses = view_responses(self.measurement, self.model, terms, unconstrained)
+        for term, response in zip(terms, responses, strict=True):
+            usual = response.columns[:, ~term.gridded] * term.typical[~term.gridded]
+            columns.setdefault(term.effect.place, []).append(usual)
+        return {place: np.hstack(blocks) for place, blocks in columns.items()}
 
 
 def _thin_correspondences(unconstrained: UnconstrainedPoses) -> UnconstrainedPoses:

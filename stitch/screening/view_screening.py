@@ -1,4 +1,7 @@
-"""Which views of a run may be fused: blunders named and left out, contradictions beyond any arm refused."""
+"""Which views of a run may be fused: blunders named and left out, contradictions beyond any arm refused.
+
+A rig is fitted, its views are examined, what does not belong is left out, and the rest is fitted again.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,30 +16,35 @@ from stitch.numerics.frames import Array
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.run_data import ExcludedView, ViewLinks
 from stitch.screening.deep_check import (
-    apply_displacement_limits,
-    beyond_any_arm,
     deep_check,
-    displacement_in_words,
-    poses_contradict_scans,
     refuse,
+    refuse_contradiction,
     refuse_whole,
     require_majority,
-    require_own_model,
-    require_two_motions,
-    scatter_is_doubtful,
-    snooping_warnings,
-    unexplained_error,
 )
+from stitch.screening.hypotheses import sentence
+from stitch.screening.model_transfer import require_matching_hand_eye
 from stitch.screening.pairing import explain_misplaced
+from stitch.screening.plausibility import (
+    apply_displacement_limits,
+    beyond_any_arm,
+    beyond_effects,
+    poses_contradict_scans,
+    snooping_warnings,
+    suspicion_in_words,
+)
 from stitch.screening.pose_tests import MAX_VIEWS_WITH_EFFECTS, length_problem
-from stitch.screening.problems import SessionProblem, list_views
-from stitch.screening.snooping import MisplacedView, Snooping, snoop_views
+from stitch.screening.problems import list_views
+from stitch.screening.snooping import Snooping, snoop_views
 from stitch.screening.target_checks import check_targets, target_warnings
 from stitch.screening.view_model import UsualEffects
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
-from stitch.session.session import SessionData, View
+from stitch.session.session import SessionData
 from stitch.system.process import announce
+
+# Blunders that hide behind others come out in the next round; three are enough to end or to give up.
+_MAX_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -55,139 +63,13 @@ class ViewScreening:
 
     def line(self, order: Sequence[str]) -> str:
         """Return what was left out and why; `order` has the names of all views."""
-        why = dict.fromkeys(item.why for item in self.left_out)
-        groups = {w: [item.view for item in self.left_out if item.why == w] for w in why}
-        return "; ".join(f"{list_views(views, order)}: {w}" for w, views in groups.items())
+        reasons = dict.fromkeys(item.why for item in self.left_out)
+        views = {why: [item.view for item in self.left_out if item.why == why] for why in reasons}
+        return "; ".join(f"{list_views(views[why], order)}: {why}" for why in reasons)
 
     def indices(self, session: SessionData) -> list[int]:
         """Return the indices of the views that are left out."""
         return [v for v, view in enumerate(session.views) if view.name in self.names]
-
-
-def screen_views(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> ViewScreening:
-    """Examine the views of one session of a rig under a corrected model.
-
-    Args:
-        index: of the session in the rig.
-
-    Raises:
-        InputError: the poses contradict the scans beyond any arm, and a usual mistake explains it.
-        NoResultError: they do, and none does; or two views alone do; or groups of views share no surface.
-    """
-    own, T_mount = correction.captures[index], correction.geometry.T_mount
-    if correction.given:
-        require_own_model(session, correction, index)
-    announce("checking every view against the others")
-    found = _snoop_session(session, measurement, correction, index)
-    if poses_contradict_scans(session, found):
-        if not correction.given:
-            require_two_motions(session)
-        refuse(session, deep_check(session))
-        raise unexplained_error(session, found)
-    size = length_problem(found.model, own.T_reference_mount, found.blunder_search.mean_columns)
-    if size is not None:
-        # Other mistakes look like a factor on lengths too.
-        refuse(session, [size if problem.kind == size.kind else problem for problem in deep_check(session)])
-        refuse(session, [size])
-    if scatter_is_doubtful(session, found):
-        # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
-        refuse_whole(session)
-    warnings = (*target_warnings(session, own.sightings), *snooping_warnings(session, own, found, T_mount))
-    if not any(beyond_any_arm(session, *step.at_least) for step in found.steps):
-        # A slip of the part, or a knock of the mount, within what a model can hold: said, and left to the diagnosis.
-        found = replace(found, steps=())
-    problems = explain_misplaced(session, own, T_mount, found) if found.left_out else []
-    apart = next((p for p in problems if p.kind == "disconnected"), None)
-    if apart is not None:
-        raise NoResultError(f"{session.path}: {apart.line(session.names)}")
-    out = _excluded_views(session, own, found, T_mount, problems)
-    return ViewScreening(
-        left_out=out,
-        suspected=tuple(_suspected_view(session, own, m, T_mount) for m in found.suspected),
-        links=_view_links(session, found),
-        doubts=warnings,
-    )
-
-
-def session_warnings(
-    session: SessionData, measurement: Measurement, correction: Correction | None, index: int
-) -> tuple[str, ...]:
-    """Return the warnings of a session as a whole under a model, whose views were screened before.
-
-    Args:
-        correction: of surfaces; None where there are none.
-    """
-    targets = target_warnings(session, measurement.capture.sightings)
-    if correction is None:
-        return targets
-    announce("checking every view against the others")
-    found = _snoop_session(session, measurement, correction, index)
-    return (*targets, *snooping_warnings(session, correction.captures[index], found, correction.geometry.T_mount))
-
-
-def _snoop_session(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> Snooping:
-    usual, gate = UsualEffects(measurement, correction.geometry), correction.overlaps[index].gate
-    found = snoop_views(
-        correction.captures[index], correction.geometry.T_mount, gate, correction.unconstrained[index], usual
-    )
-    if len(session.views) >= MAX_VIEWS_WITH_EFFECTS:
-        # Held against white scatter alone, since what arms do takes minutes there: what they do looks like steps.
-        large = (step for step in found.steps if beyond_any_arm(session, *step.at_least))
-        found = replace(found, steps=tuple(large))
-    return apply_displacement_limits(session, found)
-
-
-def screen_targets(session: SessionData, found: TargetModelFit) -> ViewScreening:
-    """Labelled points: outliers are taken out one by one; poses that contradict them all are refused.
-
-    Raises:
-        InputError: a usual mistake explains it.
-        NoResultError: none does.
-    """
-    rotation, translation = np.sqrt(found.variances[:2])
-    if beyond_any_arm(session, rotation, translation):
-        refuse(session, check_targets(session))
-    return ViewScreening(doubts=target_warnings(session, found.rows.sightings))
-
-
-def _suspected_view(session: SessionData, own: Capture, found: MisplacedView, T_mount: Array) -> ExcludedView:
-    view = session.views[found.view]
-    return ExcludedView(
-        view.name, displacement_in_words(session, found), own.poses(T_mount)[found.view], _point_count(view)
-    )
-
-
-_NO_SURFACE = "it shares no surface with the others; to fix: add views that overlap with it"
-
-
-def _excluded_views(
-    session: SessionData, own: Capture, found: Snooping, T_mount: Array, problems: Sequence[SessionProblem]
-) -> tuple[ExcludedView, ...]:
-    poses = own.poses(T_mount)
-    out = []
-    for v in found.left_out:
-        name = session.views[v].name
-        why = next((p.line(session.names) for p in problems if name in p.views), _NO_SURFACE)
-        out.append(ExcludedView(name, why, poses[v], _point_count(session.views[v])))
-    return tuple(out)
-
-
-def _point_count(view: View) -> int:
-    return 0 if view.cloud is None else view.cloud.count
-
-
-def _view_links(session: SessionData, found: Snooping) -> ViewLinks:
-    names = session.names
-    return ViewLinks(
-        components=tuple(tuple(names[v] for v in part) for part in found.linkage.components),
-        weak=tuple((names[v], names[w]) for v, w in found.linkage.single),
-    )
-
-
-# The fit of a rig with the views that belong: fit, examine, leave out what does not belong, and again.
-
-# Blunders that hide behind others come out in the next round; three are enough to end or to give up.
-_MAX_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -198,6 +80,11 @@ class ScreenedFit:
     measurements: list[Measurement]
     fitted: FittedRig
     screenings: list[ViewScreening]
+
+    def with_doubts(self, doubts: Sequence[tuple[str, ...]]) -> "ScreenedFit":
+        """Return the same with further doubts of each session."""
+        every = zip(self.screenings, doubts, strict=True)
+        return replace(self, screenings=[replace(a, doubts=(*a.doubts, *further)) for a, further in every])
 
 
 def fit_screened_views(
@@ -215,27 +102,30 @@ def fit_screened_views(
         InputError: poses contradict the scans, and a usual mistake explains it.
         NoResultError: they do, and none does; too few views are left; groups of views share no surface.
     """
-    own, measured = list(sessions), list(measurements)
-    taken = [ViewScreening() for _ in own]
+    left = list(sessions)
+    measured = list(measurements)
+    taken = [ViewScreening() for _ in sessions]
     for _ in range(_MAX_ROUNDS):
         with _naming_excluded_views(sessions, taken):
-            fitted = fit(own, measured)
-            found = [_screen_fitted_session(session, fitted, i) for i, session in enumerate(own)]
-        taken = [replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, found, strict=True)]
-        if keep or not any(a.left_out for a in found):
+            fitted = fit(left, measured)
+            screenings = [_screen_session(session, fitted, i) for i, session in enumerate(left)]
+        taken = [
+            replace(new, left_out=(*old.left_out, *new.left_out)) for old, new in zip(taken, screenings, strict=True)
+        ]
+        if keep or not any(screening.left_out for screening in screenings):
             break
-        for session, a in zip(sessions, taken, strict=True):
-            require_majority(session, a.left_out)
-        measured = [m.without(a.indices(s)) for m, a, s in zip(measured, found, own, strict=True)]
-        own = [s.without(a.names) for s, a in zip(own, found, strict=True)]
-        short = next((i for i, s in enumerate(own) if len(s.views) < 2), None)
+        for session, screening in zip(sessions, taken, strict=True):
+            require_majority(session, screening.left_out)
+        measured = [m.without(new.indices(s)) for m, new, s in zip(measured, screenings, left, strict=True)]
+        left = [session.without(screening.names) for session, screening in zip(left, screenings, strict=True)]
+        short = next((i for i, session in enumerate(left) if len(session.views) < 2), None)
         if short is not None:
             gone = taken[short].line(sessions[short].names)
-            raise NoResultError(f"{own[short].path}: fewer than two views belong together ({gone}); to fix: add views")
+            raise NoResultError(f"{left[short].path}: fewer than two views belong together ({gone}); to fix: add views")
     else:
         # The last round has left views out too: what is returned is the fit of those that are left.
-        fitted = fit(own, measured)
-    return ScreenedFit(own, measured, fitted, taken)
+        fitted = fit(left, measured)
+    return ScreenedFit(left, measured, fitted, taken)
 
 
 @contextmanager
@@ -250,9 +140,121 @@ def _naming_excluded_views(sessions: Sequence[SessionData], taken: Sequence[View
         raise NoResultError(f"{error}; left out before: {gone}") from error
 
 
-def _screen_fitted_session(session: SessionData, fitted: FittedRig, index: int) -> ViewScreening:
+def _screen_session(session: SessionData, fitted: FittedRig, index: int) -> ViewScreening:
     if fitted.correction is not None:
         return screen_views(session, fitted.sessions[index].measurement, fitted.correction, index)
-    found = fitted.sessions[index].targets
+    targets = fitted.sessions[index].targets
     # What says nothing about the poses cannot say which of them are wrong.
-    return ViewScreening() if found is None else screen_targets(session, found)
+    return ViewScreening() if targets is None else screen_targets(session, targets)
+
+
+def screen_views(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> ViewScreening:
+    """Examine the views of one session of a rig under a corrected model.
+
+    Args:
+        index: of the session in the rig.
+
+    Raises:
+        InputError: the poses contradict the scans beyond any arm, and a usual mistake explains it.
+        NoResultError: they do, and none does; or two views alone do; or groups of views share no surface.
+    """
+    capture = correction.captures[index]
+    T_mount = correction.geometry.T_mount
+    if correction.given:
+        require_matching_hand_eye(session, correction, index)
+    snooping = _snoop_session(session, measurement, correction, index)
+    if poses_contradict_scans(session, snooping):
+        refuse_contradiction(session, snooping, given=correction.given)
+    lengths = length_problem(snooping.model, capture.T_reference_mount, snooping.blunder_search.mean_columns)
+    if lengths is not None:
+        # Other mistakes look like a factor on lengths too.
+        refuse(session, [lengths if found.kind == lengths.kind else found for found in deep_check(session)])
+        refuse(session, [lengths])
+    if beyond_effects(session, snooping.rotation, snooping.translation):
+        # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
+        refuse_whole(session)
+    warnings = snooping_warnings(session, capture, snooping, T_mount)
+    if not any(beyond_any_arm(session, *step.at_least) for step in snooping.steps):
+        # A slip of the part, or a knock of the mount, within what a model can hold: said, and left to the diagnosis.
+        snooping = replace(snooping, steps=())
+    poses = capture.poses(T_mount)
+    return ViewScreening(
+        left_out=_misplaced_views(session, capture, T_mount, snooping),
+        suspected=tuple(
+            _excluded_view(session, m.view, suspicion_in_words(session, m), poses) for m in snooping.suspected
+        ),
+        links=_view_links(session, snooping),
+        doubts=(*target_warnings(session, capture.sightings), *warnings),
+    )
+
+
+def _misplaced_views(
+    session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
+) -> tuple[ExcludedView, ...]:
+    problems = explain_misplaced(session, capture, T_mount, snooping) if snooping.left_out else []
+    disconnected = next((found for found in problems if found.kind == "disconnected"), None)
+    if disconnected is not None:
+        raise NoResultError(f"{session.path}: {disconnected.line(session.names)}")
+    poses = capture.poses(T_mount)
+    why = {name: found.line(session.names) for found in reversed(problems) for name in found.views}
+    return tuple(
+        _excluded_view(session, v, why.get(session.names[v], sentence("alone")), poses) for v in snooping.left_out
+    )
+
+
+def _excluded_view(session: SessionData, v: int, why: str, poses: Array) -> ExcludedView:
+    view = session.views[v]
+    return ExcludedView(view.name, why, poses[v], 0 if view.cloud is None else view.cloud.count)
+
+
+def _view_links(session: SessionData, snooping: Snooping) -> ViewLinks:
+    names = session.names
+    return ViewLinks(
+        components=tuple(tuple(names[v] for v in part) for part in snooping.linkage.components),
+        weak=tuple((names[v], names[w]) for v, w in snooping.linkage.single),
+    )
+
+
+def screen_targets(session: SessionData, targets: TargetModelFit) -> ViewScreening:
+    """Screen labelled points: outliers are taken out one by one; poses that contradict them all are refused.
+
+    Raises:
+        InputError: a usual mistake explains it.
+        NoResultError: none does.
+    """
+    rotation, translation = np.sqrt(targets.variances[:2])
+    if beyond_any_arm(session, rotation, translation):
+        refuse(session, check_targets(session))
+    return ViewScreening(doubts=target_warnings(session, targets.rows.sightings))
+
+
+def session_warnings(
+    session: SessionData, measurement: Measurement, correction: Correction | None, index: int
+) -> tuple[str, ...]:
+    """Return the warnings of a session as a whole under a model, whose views were screened before.
+
+    Args:
+        correction: of surfaces; None where there are none.
+    """
+    of_targets = target_warnings(session, measurement.capture.sightings)
+    if correction is None:
+        return of_targets
+    snooping = _snoop_session(session, measurement, correction, index)
+    capture = correction.captures[index]
+    return (*of_targets, *snooping_warnings(session, capture, snooping, correction.geometry.T_mount))
+
+
+def _snoop_session(session: SessionData, measurement: Measurement, correction: Correction, index: int) -> Snooping:
+    announce("checking every view against the others")
+    snooping = snoop_views(
+        correction.captures[index],
+        correction.geometry.T_mount,
+        correction.overlaps[index].gate,
+        correction.unconstrained[index],
+        UsualEffects(measurement, correction.geometry),
+    )
+    if len(session.views) >= MAX_VIEWS_WITH_EFFECTS:
+        # Held against white scatter alone, since what arms do takes minutes there: what they do looks like steps.
+        large = [step for step in snooping.steps if beyond_any_arm(session, *step.at_least)]
+        snooping = replace(snooping, steps=tuple(large))
+    return apply_displacement_limits(session, snooping)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from stitch.numerics import frames
-from stitch.screening.placement import find_contradicting_views
+from stitch.screening.linkage import find_contradicting_views
 from stitch.session.scan import prepare_scan
 
 POSES = np.tile(np.eye(4), (3, 1, 1))

@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.numerics import frames
-from stitch.screening.conventions import RelativeScans, likeliest_hypotheses, proven_hypotheses, rank_hypotheses
+from stitch.screening.conventions import likeliest_hypotheses, proven_hypotheses, rank_hypotheses
 from stitch.screening.hypotheses import hypotheses
+from stitch.screening.motions import RelativeScans
 from stitch.screening.target_checks import check_targets
 from tests.screening.mistakes import MISTAKES, with_poses
 

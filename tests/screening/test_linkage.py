@@ -1,6 +1,6 @@
 """The graph of overlaps against graphs whose structure is known by construction."""
 
-from stitch.screening.placement import Link, linkage_of_links
+from stitch.screening.linkage import Link, linkage_of_links
 
 
 def links(*pairs, share=1.0, count=100):

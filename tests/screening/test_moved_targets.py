@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.screening.target_checks import find_moved_targets
+from stitch.screening.moved_targets import find_moved_targets
 from tests.screening.targets import PLACES, SIGMA, VIEWS, sightings
 
 

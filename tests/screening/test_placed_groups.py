@@ -3,7 +3,8 @@
 import numpy as np
 
 from stitch.numerics import frames
-from stitch.screening.placement import Link, linkage_of_links, place_groups
+from stitch.screening.linkage import Link, linkage_of_links
+from stitch.screening.placement import place_groups
 
 SLIP = np.array([0.004, -0.003, 0.005, 2.0, -2.0, 1.0])
 

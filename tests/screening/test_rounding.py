@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stitch.numerics import frames
-from stitch.screening.rounding import find_rounding
+from stitch.screening.plausibility import find_rounding
 
 EXACT = Rotation.random(400, rng=np.random.default_rng(3))
 

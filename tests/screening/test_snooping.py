@@ -7,7 +7,7 @@ import pytest
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch.numerics import frames
-from stitch.screening.conventions import register_scan_pairs
+from stitch.screening.motions import register_scan_pairs
 from stitch.screening.placement import lies_in_a_line
 from stitch.screening.snooping import snoop_views
 from stitch.session.scan import prepare_scan

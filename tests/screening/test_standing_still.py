@@ -11,8 +11,8 @@ from stitch.api.pipeline import run
 from stitch.numerics import frames
 from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import run_verdict
+from stitch.screening.background import find_standing_scene, find_static_background
 from stitch.screening.deep_check import deep_check
-from stitch.screening.scan_faults import find_standing_scene, find_static_background
 from stitch.session.capture import part_size, prepare_capture
 from stitch.session.scan import prepare_scan
 from stitch.session.session import Cloud

@@ -9,7 +9,7 @@ import pytest
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from stitch.api.pipeline import run
-from stitch.screening.deep_check import check_few_views
+from stitch.screening.plausibility import check_few_views
 from stitch.session.session import Cloud
 
 

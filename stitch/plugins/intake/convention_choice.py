@@ -17,20 +17,11 @@ from stitch.plugins.intake.cloud_pairs import Pairing
 from stitch.plugins.intake.folder_files import Guess
 from stitch.plugins.intake.layouts import MM, POSE_UNITS
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading
-from stitch.screening.conventions import (
-    CLEARLY_BETTER,
-    FEWEST,
-    ROTATION,
-    TRANSLATION_M,
-    RelativeScans,
-    equivalent_hypotheses,
-    fit_centroids,
-    fit_hypotheses,
-    rotation_angles,
-    surface_misfit,
-)
+from stitch.screening.background import find_standing_scene
+from stitch.screening.closing import CLEARLY_BETTER, fit_centroids, surface_misfit
+from stitch.screening.conventions import equivalent_hypotheses, fit_hypotheses
 from stitch.screening.hypotheses import Hypothesis
-from stitch.screening.scan_faults import find_standing_scene
+from stitch.screening.motions import FEWEST, ROTATION, TRANSLATION_M, RelativeScans, rotation_angles
 from stitch.session.capture import Capture
 from stitch.session.session import Mount
 from stitch.system.process import steps

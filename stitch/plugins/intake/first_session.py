@@ -42,7 +42,7 @@ from stitch.plugins.intake.readings import (
 )
 from stitch.plugins.intake.scan_targets import TargetSearch, find_folder_targets, target_motions
 from stitch.plugins.intake.stops import rows_with_scans
-from stitch.screening.conventions import RelativeScans, register_scan_pairs
+from stitch.screening.motions import RelativeScans, register_scan_pairs
 from stitch.session.capture import Capture
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES

@@ -24,7 +24,7 @@ from stitch.plugins.intake.folder_files import Guess
 from stitch.plugins.intake.layouts import ColumnLayout
 from stitch.plugins.intake.readings import Reading, arm_link_pairs
 from stitch.plugins.intake.stops import AROUND, middle_of_stops, stationary_scans
-from stitch.screening.conventions import register_scan_pairs
+from stitch.screening.motions import register_scan_pairs
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.robot_description import moving_joints, robot_from_urdf
 from stitch.session.reading.session_toml import SESSION_FORMAT

@@ -14,7 +14,7 @@ from stitch.plugins.intake.detection.balls import ball_sightings
 from stitch.plugins.intake.detection.boards import Board, PlacedBoard, board_sightings, boards_in
 from stitch.plugins.intake.folder_files import FolderFiles, Guess
 from stitch.plugins.intake.layouts import MM
-from stitch.screening.conventions import RelativeScans
+from stitch.screening.motions import RelativeScans
 from stitch.session.reading.range_image import read_range_image
 from stitch.session.reading.session_toml import read_session_document
 from stitch.session.reading.text_files import import_extra

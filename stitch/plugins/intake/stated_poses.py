@@ -15,7 +15,7 @@ from stitch.plugins.intake.first_session import StatedFolder, capture_of
 from stitch.plugins.intake.layouts import MM
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.readings import all_readings
-from stitch.screening.conventions import register_scan_pairs
+from stitch.screening.motions import register_scan_pairs
 from stitch.session.session import SessionData
 
 # Two motions, the fewest that tell a reading.

@@ -1,0 +1,261 @@
+"""Find what scans show beside the part: what stands still before the scanner, and what is in the way of other scans.
+
+A wall, a table or the scanner's own bracket belongs to the scanner: it stands at one place before it whatever the arm
+did. A cable, a clamp or an operator's arm belongs to nothing: it stands where other scans look through.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from pykdtree.kdtree import KDTree
+
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.observations.surfaces.matching import sample_points
+from stitch.screening.linkage import points_in_place
+from stitch.session.scan import Scan
+
+# Points of a scan that are asked whether they are in the way, and other scans, all over the session, asked for each.
+_OCCLUDER_PROBES, _OCCLUDER_VIEWS = 400, 20
+# Of the part's size: what is farther from a scan's points it does not show, and what it sees farther behind it looks
+# through. Where poses err or an edge is seen aslant, scans differ by less; so do those whose points lie as far apart.
+_APART, _SPACINGS = 0.03, 2.0
+# Nearest looks of another scan that must all pass a point.
+_LOOK_DIRECTIONS = 8
+# Share of a scan's points that is worth a word, and how many; scans of good sessions had 0.0025 at the most.
+_OCCLUDER_MIN_SHARE, _FEWEST = 0.01, 5
+# Points of a scan that are asked whether they stand still, other scans in which they are sought, and how many of these
+# must move them, by what share of the part's size.
+_BACKGROUND_PROBES, _BACKGROUND_VIEWS, _LEAST, _MOVED = 200, 12, 3, 0.1
+# Share of the scans' points that is worth a word. Where one of these is looked through under the model it is not on the
+# part, where another shows it there it is: so many must be looked through, and 20 to 1.
+_BACKGROUND_MIN_SHARE, _THROUGH, _ODDS = 0.01, 5, 20.0
+# Of the part's size between it and what stands still, so that a box can part them.
+_GAP = 0.02
+# Behind a point is farther than so many spacings.
+_BEHIND = 4.0
+# Without a model: a point stands still if so many of the other scans have it, within so many spacings and sigmas of
+# their surface; it moves if so few have it. A scene stands still if most points do.
+_STANDS, _MOVES, _BESIDE, _ACROSS = 0.6, 0.3, 2.0, 4.0
+_MOSTLY, _SEEN_TO_MOVE, _SELDOM = 0.5, 20, 0.25
+
+
+def find_occluder(scans: Sequence[Scan], poses: Array, size: float) -> tuple[tuple[int, ...], float] | None:
+    """Return the views that show something where others look through and see nothing, and the share of their points
+    that does so at least: where no other scan looks, nobody can say. None if it is too little.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner where surfaces put the views.
+        size: of the part, length_unit.
+    """
+    views = [v for v, scan in enumerate(scans) if len(scan.points)]
+    # Most scans are never asked.
+    look_into = cache(lambda w: _ray_tree(scans[w]))
+    shares = {}
+    for v in views:
+        asked = _evenly([w for w in views if w != v], _OCCLUDER_VIEWS)
+        points = scans[v].points[sample_points(scans[v], _OCCLUDER_PROBES)]
+        seen_from = {w: frames.inverse(poses[w]) @ poses[v] for w in asked}
+        apart = {w: max(_APART * size, _SPACINGS * scans[w].spacing) for w in asked}
+        # Most are shown by the first scans that are asked; only the rest can be in the way.
+        alone = points
+        for w in asked:
+            there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
+            if len(alone):
+                shown, _ = scans[w].tree.query(there, k=1, distance_upper_bound=apart[w])
+                alone = alone[shown >= apart[w]]
+        through = np.zeros(len(alone), bool)
+        for w in asked if len(alone) >= _FEWEST else ():
+            there = np.ascontiguousarray(frames.transform(seen_from[w], alone))
+            through |= _looks_through(scans[w], look_into(w), there, apart[w])
+        shares[v] = through.sum() / len(points) if through.sum() >= _FEWEST else 0.0
+    showing = tuple(v for v, share in shares.items() if share > _OCCLUDER_MIN_SHARE)
+    return (showing, float(np.mean([shares[v] for v in showing]))) if showing else None
+
+
+def _ray_tree(scan: Scan) -> KDTree:
+    """Return the search tree over the directions in which a scan sees its points."""
+    return KDTree(scan.rays(scan.points))
+
+
+def _evenly(views: Sequence[int], count: int) -> list[int]:
+    """Return so many of some views at most, all over the list."""
+    return [int(views[i]) for i in np.linspace(0, len(views) - 1, min(len(views), count)).astype(int)]
+
+
+def _looks_through(scan: Scan, look: KDTree, points: Array, behind: float) -> Mask:
+    """(n,) points in the frame of a scan all about whose direction what it sees is farther away.
+
+    One look alone would pass an edge beside which it sees nearer: a face that the scan sees from its side stands there.
+    Where that face is too steep to be seen, there are looks on one side of the point alone.
+    """
+    away = np.linalg.norm(points - scan.eye, axis=1)
+    rays = scan.rays(points)
+    reach = _SPACINGS * scan.spacing / np.maximum(away, 1e-300)
+    through = look.query(rays, k=1, distance_upper_bound=float(reach.max()))[0] < reach
+    asked = np.flatnonzero(through)
+    if len(asked):
+        _, partners = look.query(rays[asked], k=min(_LOOK_DIRECTIONS, len(scan.points)))
+        near = scan.points[partners.reshape(len(asked), -1).astype(int)]
+        seen = np.linalg.norm(near - scan.eye, axis=2).min(axis=1)
+        looks = scan.rays(near.reshape(-1, 3)).reshape(near.shape)
+        through[asked] = (seen > away[asked] + behind) & _surrounded(rays[asked], looks)
+    return through
+
+
+def _surrounded(rays: Array, looks: Array) -> Mask:
+    """(n,) which unit vectors (n, 3) have some of others (n, k, 3) on every side: in each half of the directions."""
+    across = np.linalg.svd(rays[:, None, :])[2][:, 1:]  # (n, 2, 3) perpendicular to each
+    off = np.einsum("nij,nkj->nki", across, looks - rays[:, None])
+    angles = np.sort(np.arctan2(off[..., 1], off[..., 0]), axis=1)
+    gaps = np.diff(angles, axis=1, append=angles[:, :1] + 2 * np.pi)
+    return gaps.max(axis=1, initial=0.0) < np.pi
+
+
+@dataclass(frozen=True)
+class StaticBackground:
+    """Points at one place before the scanner in all views: a wall, a table, a bracket."""
+
+    share: float  # of the points of all scans
+    views: tuple[int, ...]  # that show it
+    box: Array  # (2, 3) lowest and highest corner, scanner frame
+    within: Array | None  # (2, 3) corners of a box with the part and without it, where one side of a box parts them
+
+    def words(self, length_unit: str) -> dict[str, Any]:
+        """Return the words of "background" in the list of mistakes."""
+        sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *self.box, strict=True))
+        how = f"cut {', '.join(sides)} {length_unit} out of the scans"
+        if self.within is not None:
+            low, high = (", ".join(f"{side:.4g}" for side in corner) for corner in self.within)
+            how = f"state within = [[{low}], [{high}]] under [scanner] in session.toml"
+        return {"share": self.share, "count": len(self.views), "how": how}
+
+
+def find_static_background(
+    scans: Sequence[Scan], poses: Array, tolerance: float, size: float
+) -> StaticBackground | None:
+    """Return what the scans show at one place before the scanner whatever the arm did; None if it is too little.
+
+    Where scanner or part are carried around, what belongs to the part changes its place before the scanner with every
+    view. What does not belongs to the scanner, and every view puts it elsewhere in the stitched cloud. A panel that
+    slides along itself, or a disc that turns about its axis, looks as if it stood still too; but under the model others
+    show it where it is, and nobody looks through it.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner under the model.
+        tolerance: distance along the normal that is the same place, length_unit.
+        size: of the part, length_unit.
+    """
+    probes = [sample_points(scan, _BACKGROUND_PROBES) for scan in scans]
+    points = [scan.points[index] for scan, index in zip(scans, probes, strict=True)]
+    stays = []
+    for v, scan in enumerate(scans):
+        others = [scans[w] for w in _views_moving_points(points[v], poses, v, size)]
+        stays.append(_static_points(scan, probes[v], others, tolerance))
+    still = np.concatenate(stays)
+    if still.mean() < _BACKGROUND_MIN_SHARE:
+        return None
+    looks = [_ray_tree(scan) for scan in scans]
+    judged = [_under_model(scans, looks, poses, (v, index), tolerance) for v, index in enumerate(probes)]
+    on_part = np.concatenate([shown for shown, _ in judged])
+    through = np.concatenate([looked_through for _, looked_through in judged])
+    if np.sum(still & through & ~on_part) < max(_THROUGH, _ODDS * np.sum(still & on_part)):
+        return None
+    every = np.concatenate(points)
+    return StaticBackground(
+        share=float(np.mean(still & ~on_part)),
+        views=tuple(v for v, mask in enumerate(stays) if mask.any()),
+        box=_bounding_box(every[still & ~on_part]),
+        within=_box_beyond_part(every[on_part & ~still], every[still & ~on_part], _bounding_box(every), size),
+    )
+
+
+def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> list[int]:
+    """Return views between which and view v the model moves its points before the scanner, all over the session."""
+    if not len(points):
+        return []
+    there = frames.transform(frames.inverse(poses) @ poses[v], points[None])
+    far = np.flatnonzero(np.median(np.linalg.norm(there - points, axis=2), axis=1) > _MOVED * size)
+    return _evenly(far.tolist(), _BACKGROUND_VIEWS)
+
+
+def _static_points(scan: Scan, index: Indices, others: Sequence[Scan], tolerance: float) -> Mask:
+    """(n,) points that most of the others show at the same place before the scanner."""
+    if len(others) < _LEAST:
+        return np.zeros(len(index), bool)
+    points, normals = scan.points[index], scan.normals[index]
+    return np.mean([points_in_place(other, points, normals, tolerance) for other in others], axis=0) > 0.5
+
+
+def _under_model(
+    scans: Sequence[Scan], looks: Sequence[KDTree], poses: Array, probes: tuple[int, Indices], tolerance: float
+) -> tuple[Mask, Mask]:
+    """(n,) (n,) points of a view that another shows where the model has them, and that another looks through there."""
+    v, index = probes
+    on_part = np.zeros(len(index), bool)
+    through = np.zeros(len(index), bool)
+    for w, scan in enumerate(scans):
+        if w == v or not len(index):
+            continue
+        T_w_v = frames.inverse(poses[w]) @ poses[v]
+        points = frames.transform(T_w_v, scans[v].points[index])
+        normals = frames.rotate(T_w_v, scans[v].normals[index])
+        on_part |= points_in_place(scan, points, normals, tolerance)
+        away = np.linalg.norm(points - scan.eye, axis=1)
+        beside, partner = looks[w].query(scan.rays(points), k=1)
+        hit = beside * away < 2 * scan.spacing
+        seen = np.linalg.norm(scan.points[partner.astype(int)] - scan.eye, axis=1)
+        through |= hit & (seen > away + _BEHIND * scan.spacing)
+    return on_part, through
+
+
+def find_standing_scene(scans: Sequence[Scan]) -> tuple[float, Array] | None:
+    """Return the share of points that stand still before the scanner, and the corners (2, 3) of a box without them.
+
+    Nothing of poses is asked. None where less than half stands still, or no side of a box parts it from what moves.
+    """
+    probes = [scan.points[sample_points(scan, _BACKGROUND_PROBES)] for scan in scans]
+    chosen = np.unique(np.linspace(0, len(scans) - 1, min(len(scans), _BACKGROUND_VIEWS)).round().astype(int))
+    shares = []
+    for v, points in enumerate(probes):
+        hits = []
+        for scan in (scans[w] for w in chosen if w != v):
+            distance, index = scan.tree.query(points)
+            across = np.abs(np.einsum("ij,ij->i", points - scan.points[index], scan.normals[index]))
+            hits.append((distance < _BESIDE * scan.spacing) & (across < _ACROSS * scan.noise))
+        shares.append(np.mean(hits, axis=0))
+    share = np.concatenate(shares)
+    every = np.concatenate(probes)
+    still, moving = every[share >= _STANDS], every[share < _MOVES]
+    if len(still) < _MOSTLY * len(every) or len(moving) < _SEEN_TO_MOVE:
+        return None
+    # Of what stands still some is seen seldom: at the rim, and in the shadow of the part.
+    part = np.clip(moving, *np.quantile(moving, (_SELDOM, 1 - _SELDOM), axis=0))
+    other = np.clip(still, *np.quantile(still, (_SELDOM / 10, 1 - _SELDOM / 10), axis=0))
+    size = float(np.linalg.norm(np.ptp(part, axis=0)))
+    box = _box_beyond_part(part, other, _bounding_box(every), size)
+    return None if box is None else (len(other) / len(every), box)
+
+
+def _bounding_box(points: Array) -> Array:
+    return np.array([points.min(axis=0), points.max(axis=0)])
+
+
+def _box_beyond_part(part: Array, other: Array, every: Array, size: float) -> Array | None:
+    """(2, 3) the box of everything, widened, less what lies beyond the side that parts best."""
+    if not len(part):
+        return None
+    box = every + size * np.array([[-1.0], [1.0]])
+    low, high = _bounding_box(part)
+    other_low, other_high = _bounding_box(other)
+    gaps = np.array([low - other_high, other_low - high])
+    side, axis = np.unravel_index(gaps.argmax(), gaps.shape)
+    if gaps[side, axis] < _GAP * size:
+        return None
+    # Nearer to what stands still: between the probes the part may reach farther.
+    near, far = (low[axis], other_high[axis]) if side == 0 else (high[axis], other_low[axis])
+    box[side, axis] = 0.2 * near + 0.8 * far
+    return box

@@ -1,0 +1,207 @@
+"""Which views hold each other, and which show a surface where others show it elsewhere.
+
+Two views are linked if most of their correspondences close within the robust gate. A pair that only lies near, with
+surfaces that cross, has correspondences too, but they do not close: it links nothing, and the robust weights of the fit
+ignore it without a word. Partners beyond the gate are no partners: a scan may keep its few that fit and contradict all
+others. So every scan is asked whether others show elsewhere what it shows.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from stitch.numerics import frames
+from stitch.numerics.distributions import binomial_tail
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.observations.surfaces.matching import near_pairs, sample_points
+from stitch.observations.surfaces.normal_equations import Overlaps
+from stitch.session.scan import Scan
+from stitch.system.threads import parallel
+
+# Share of a pair's correspondences within four robust sigmas. Pairs of good sessions have 0.7 to 1, simulated and
+# real; pairs with a view displaced by more than the gate 0 to 0.3.
+LINKED_SHARE = 0.5
+# Correspondences that determine six numbers with some to spare.
+HOLDING = 20
+# The same side of a part: normals within 45°; at the same place: within two spacings along the surface.
+_SAME_SIDE, _SPACINGS = np.cos(np.radians(45.0)), 2.0
+# Elsewhere is farther than so many tolerances: what a lens or a slant does to a scan moves it by less.
+_OFF_SURFACE_TOLERANCES = 3.0
+# Points of a scan that are asked, in so many other scans each (with more they take turns), and how far from their
+# surface, as a share of the part's size.
+_CONTRADICTION_PROBES, _VIEWS_COMPARED, _SEARCH_REACH = 500, 20, 0.1
+# A scan contradicts the others if this share of what they show of it stands elsewhere; one that was put where it fits
+# best, and still does by the second, is torn.
+CONTRADICTS, STILL_CONTRADICTS = 0.2, 0.05
+# The chance of as many where the share is no larger: of a scan seen from its edge others show few points.
+_CONTRADICTION_CHANCE = 1e-4
+
+# Per point what a scan shows of it: 2 in its place, 1 elsewhere, 0 nothing, or neither.
+PointVisibility = NDArray[np.int8]
+
+
+@dataclass(frozen=True)
+class Link:
+    """The overlap of two views."""
+
+    v: int
+    w: int
+    count: int  # correspondences within the robust gate
+    share: float  # of all correspondences of the pair, 0 … 1
+
+    @property
+    def holds(self) -> bool:
+        """True if the pair says something about its two poses."""
+        return self.share >= LINKED_SHARE and self.count >= HOLDING
+
+
+@dataclass(frozen=True)
+class Linkage:
+    """The graph of overlaps of V views; components are sorted, largest first."""
+
+    views: int
+    components: tuple[tuple[int, ...], ...]
+    single: tuple[tuple[int, int], ...]  # (view, partner): held by this one pair alone
+
+    @property
+    def core(self) -> tuple[int, ...]:
+        """The largest component."""
+        return self.components[0]
+
+    @property
+    def unlinked(self) -> tuple[int, ...]:
+        """Views outside the largest component."""
+        return tuple(sorted(v for part in self.components[1:] for v in part))
+
+
+def linkage(overlaps: Overlaps, holding_nothing: Collection[int] = ()) -> Linkage:
+    """Find components, and views held by a single pair, from the correspondences at the poses of `overlaps`.
+
+    Args:
+        holding_nothing: views whose scans hold no pose, however well they lie on the others.
+    """
+    gram = overlaps.gram
+    matched = {(m.v, m.w): len(m.residual) for m in overlaps.matches}
+    links = []
+    for i, pair in enumerate(gram.pairs):
+        v, w = (int(view) for view in pair)
+        if gram.labelled[i]:
+            # Common targets have names: they always belong together.
+            links.append(Link(v, w, HOLDING, 1.0))
+        elif v not in holding_nothing and w not in holding_nothing and matched.get((v, w)):
+            count = int(gram.count[i])
+            links.append(Link(v, w, count, count / matched[v, w]))
+    return linkage_of_links(gram.views, links)
+
+
+def linkage_of_links(views: int, links: Sequence[Link]) -> Linkage:
+    """Return the linkage of V views from their links."""
+    near = np.zeros((views, views), bool)
+    for link in links:
+        near[link.v, link.w] = near[link.w, link.v] = link.holds
+    single = [(v, int(np.argmax(near[v]))) for v in range(views) if near[v].sum() == 1]
+    count, label = connected_components(coo_array(near), directed=False)
+    parts = [tuple(int(v) for v in np.flatnonzero(label == k)) for k in range(count)]
+    return Linkage(views, tuple(sorted(parts, key=lambda part: (-len(part), part))), tuple(single))
+
+
+def find_contradicting_views(
+    scans: Sequence[Scan],
+    poses: Array,
+    tolerance: float,
+    size: float,
+    share: float = CONTRADICTS,
+    groups: Sequence[Sequence[int]] = (),
+) -> tuple[int, ...]:
+    """Find views that show a surface where others show it elsewhere, facing the same way; the worst first.
+
+    Partners beyond the gate are no partners, so that such a scan keeps its few that fit and seems to fit well, and the
+    stitched cloud gets a second surface beside the first. What is torn in itself, because the part moved during the
+    scan or two scans are in one file, fits with one half and contradicts with the other. Each view is asked without
+    those before it.
+
+    Args:
+        poses: (V, 4, 4) T_reference_scanner at which the views fit best.
+        tolerance: distance along the normal that is the same place, length_unit.
+        size: of the part, length_unit.
+        share: of what others show of a view that stands elsewhere.
+        groups: views that link each other: only within one is each asked, since groups may stand apart. Empty: all are.
+    """
+    shown = _point_visibility(scans, poses, tolerance, _SEARCH_REACH * size)
+    for group in groups:
+        for v in group:
+            shown[v] = {w: by_w for w, by_w in shown[v].items() if w in group}
+    contradicting = list[int]()
+    while True:
+        shares = [
+            0.0 if v in contradicting else _contradicted_share(by_view, contradicting, share)
+            for v, by_view in enumerate(shown)
+        ]
+        worst = int(np.argmax(shares))
+        if not shares[worst]:
+            return tuple(contradicting)
+        contradicting.append(worst)
+
+
+def _contradicted_share(shown: dict[int, PointVisibility], without: Sequence[int], least: float) -> float:
+    """Return the share of points shown by other views that all of these show elsewhere; 0 up to the least one."""
+    others = [by_view for w, by_view in shown.items() if w not in without]
+    if not others:
+        return 0.0
+    best = np.max(others, axis=0)
+    elsewhere = int(np.sum(best == 1))
+    asked = int(np.sum(best > 0))
+    return elsewhere / asked if binomial_tail(elsewhere - 1, asked, least) < _CONTRADICTION_CHANCE else 0.0
+
+
+def _point_visibility(
+    scans: Sequence[Scan], poses: Array, tolerance: float, reach: float
+) -> list[dict[int, PointVisibility]]:
+    """Per view and other view what that shows of each asked point (n,)."""
+    near: list[list[int]] = [[] for _ in scans]
+    for v, w in near_pairs(scans, poses, reach):
+        near[v].append(w)
+        near[w].append(v)
+
+    def of_view(v: int) -> dict[int, PointVisibility]:
+        scan = scans[v]
+        turns = -(-len(near[v]) // _VIEWS_COMPARED)
+        index = sample_points(scan, _CONTRADICTION_PROBES)
+        shown = {w: np.zeros(len(index), np.int8) for w in near[v]}
+        for k, w in enumerate(near[v]):
+            asked = slice(k % turns, None, turns)
+            T_w_v = frames.inverse(poses[w]) @ poses[v]
+            points = frames.transform(T_w_v, scan.points.take(index[asked], axis=0))
+            normals = frames.rotate(T_w_v, scan.normals.take(index[asked], axis=0))
+            _, along, beside = _nearest_partners(scans[w], points, normals, reach)
+            at_same_place = beside < _SPACINGS * scans[w].spacing
+            away = np.abs(along) / tolerance
+            shown[w][asked] = 2 * (at_same_place & (away < 1)) + (at_same_place & (away > _OFF_SURFACE_TOLERANCES))
+        return shown
+
+    return list(parallel(of_view, range(len(scans))))
+
+
+def points_in_place(scan: Scan, points: Array, normals: Array, tolerance: float) -> Mask:
+    """Return (n,) bool: points (n, 3) with normals (n, 3), in the scan's frame, that it shows where they are, however
+    sparse it is there."""
+    reach = float(np.sqrt(scan.area.max())) * _SPACINGS + tolerance
+    index, along, beside = _nearest_partners(scan, points, normals, reach)
+    return (np.abs(along) < tolerance) & (beside < _SPACINGS * np.sqrt(scan.area[index]))
+
+
+def _nearest_partners(scan: Scan, points: Array, normals: Array, reach: float) -> tuple[Indices, Array, Array]:
+    """Return the point of a scan (n,) nearest to each one in its frame, and how far that is (n,) along and beside its
+    normal: infinitely far beside where it is none, or of the other side of the part."""
+    distance, partner = scan.tree.query(np.ascontiguousarray(points), distance_upper_bound=reach)
+    same_side = np.isfinite(distance)
+    partner = np.where(same_side, partner, 0).astype(np.int64)
+    normal = scan.normals.take(partner, axis=0)
+    along = np.einsum("ni,ni->n", points - scan.points.take(partner, axis=0), normal)
+    same_side &= scan.usable[partner] & (np.einsum("ni,ni->n", normals, normal) > _SAME_SIDE)
+    beside = np.sqrt(np.maximum(distance**2 - along**2, 0.0), where=same_side, out=np.full(len(points), np.inf))
+    return partner, along, beside

@@ -1,0 +1,160 @@
+"""Find labelled points that sit elsewhere among the others from some view on: a ball that was bumped, a nest put back
+wrong.
+
+Distances between the targets of one view are the same whatever the arm and the hand-eye are. Where those from one
+target to the others step between two views, or change little by little, and those of the others among themselves do
+not, that one has moved; the fit would put it half way, and call the misfit of its views errors of the arm.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.numerics.distributions import MAD_TO_SIGMA, nan_median
+from stitch.numerics.frames import Array, Indices
+from stitch.observations.targets.outliers import LIMIT_TARGET
+from stitch.observations.targets.rows import COMPARED_TARGETS, distance_sigma, target_distances, target_positions
+from stitch.screening.hypotheses import sentence
+from stitch.session.capture import Sightings
+
+# Views on each side of a step: fewer are outliers of their own. Targets, so that one of them can be told.
+_SIDE, _TARGETS = 2, 3
+# Standard error of a median over that of a mean.
+_MEDIAN = 1.25
+# Targets that are looked at closely, and how far a single distance pulls where all are looked at, in sigmas.
+_LIKELIEST, _CLIPPED = 8, 10.0
+# What creeps leaves so much less about a straight line than about a step.
+_DRIFT_SHARE = 0.7
+
+
+@dataclass(frozen=True)
+class MovedTarget:
+    """From view `start` on a target sits elsewhere among the others, or wanders off over the whole session."""
+
+    target: str
+    start: int
+    distance: float  # length_unit: by which its distances to the others change at the most
+    drifts: bool = False
+
+    def describe(self, view: str, length: str) -> str:
+        """Return a warning with what to do; with the name of the view and that distance in words."""
+        mistake = "target creeps" if self.drifts else "target moved"
+        return sentence(mistake, target=self.target, view=view, length=length)
+
+
+def find_moved_targets(sightings: Sightings) -> tuple[MovedTarget, ...]:
+    """Return targets that moved once, the clearest first; each is asked without those before it."""
+    places = target_positions(sightings)
+    sigma = distance_sigma(sightings)
+    left = list(range(len(sightings.targets)))
+    moved = list[MovedTarget]()
+    while len(left) >= _TARGETS:
+        steps = {
+            k: _target_step(places[:, left], k, start, sigma)
+            for k, start in _most_stepped_targets(places[:, left], sigma)
+        }
+        k = max(steps, key=lambda k: steps[k][0], default=-1)
+        if k < 0 or steps[k][0] < LIMIT_TARGET:
+            break
+        moved.append(replace(steps[k][1], target=sightings.targets[left.pop(k)]))
+    return tuple(moved)
+
+
+def _most_stepped_targets(places: Array, sigma: float) -> list[tuple[int, int]]:
+    """Return the targets (V, K, 3) of which means before and after some view differ most, and that view."""
+    count = places.shape[1]
+    some = np.linspace(0, count - 1, min(count, COMPARED_TARGETS)).astype(int)
+    typical = []
+    for k in some:
+        off = _distances_from_median(places, k)
+        seen = np.isfinite(off)
+        typical.append(float(np.median(np.abs(off[seen]))) if seen.any() else 0.0)
+    scatter = max(sigma, MAD_TO_SIGMA * float(np.median(typical)))
+    stepped = []
+    for k in range(count):
+        times = _steps_of_means(_distances_from_median(places, k) / scatter)
+        if times.max(initial=0.0) > 0:
+            stepped.append((float(times.max()), k, int(np.argmax(times))))
+    return [(k, start) for _, k, start in sorted(stepped, reverse=True)[:_LIKELIEST]]
+
+
+def _distances_from_median(places: Array, k: int) -> Array:
+    """(V, P) distances from target k to its partners, less the median of each."""
+    distances = np.linalg.norm(places[:, _partners(places, k)] - places[:, k : k + 1], axis=2)
+    return distances - nan_median(distances)
+
+
+def _partners(places: Array, k: int) -> Indices:
+    """Other targets that hold one (V, K, 3): of those often seen with it some, all over the list."""
+    seen = np.isfinite(places[:, :, 0])
+    together = seen[:, k].astype(float) @ seen
+    together[k] = 0
+    others = np.flatnonzero(together > together.max() / 2)
+    return others[np.linspace(0, len(others) - 1, min(len(others), COMPARED_TARGETS - 1)).astype(int)]
+
+
+def _steps_of_means(off: Array) -> Array:
+    """(V,) standard errors by which distances (V, P), in sigmas, step before each view, rms; 0 where few are seen."""
+    seen = np.isfinite(off)
+    clipped = np.where(seen, np.clip(off, -_CLIPPED, _CLIPPED), 0.0)
+    before = np.cumsum(seen.astype(float), axis=0) - seen.astype(float)
+    sums = np.cumsum(clipped, axis=0) - clipped
+    after = seen.sum(axis=0) - before
+    known = (before >= _SIDE) & (after >= _SIDE)
+    n = np.where(known, before, 1.0)
+    m = np.where(known, after, 1.0)
+    squares = known * (sums / n - (clipped.sum(axis=0) - sums) / m) ** 2 / (1 / n + 1 / m)
+    few = known.sum(axis=1) < _TARGETS - 1
+    return np.where(few, 0.0, np.sqrt(squares.sum(axis=1) / max(off.shape[1], 1)))
+
+
+def _target_step(places: Array, k: int, start: int, sigma: float) -> tuple[float, MovedTarget]:
+    """Return by how many times the usual step the distances from target k change before a view, and that move."""
+    partners = _partners(places, k)
+    among = target_distances(places[:, partners])[:, *np.triu_indices(len(partners), 1)]
+    distances = _seen_on_both_sides(np.linalg.norm(places[:, partners] - places[:, k : k + 1], axis=2), start)
+    others = _seen_on_both_sides(among, start)
+    if not others.shape[1]:
+        return 0.0, MovedTarget("", start, 0.0)
+    # By the sensor's sigma, or by what is left on both sides: a lens changes distances too, but with every view.
+    left = distances - _levels(distances, start)
+    left_of_others = others - _levels(others, start)
+    both = np.concatenate([left, left_of_others], axis=1)
+    scatter = max(sigma, MAD_TO_SIGMA * float(np.nanmedian(np.abs(both))))
+    steps, times = _median_steps(distances, start, scatter)
+    _, usual = _median_steps(others, start, scatter)
+    lines = _fitted_lines(distances)
+    creeps = bool(np.nansum(np.abs(distances - lines)) < _DRIFT_SHARE * np.nansum(np.abs(left)))
+    distance = np.max(np.nanmax(lines, axis=0) - np.nanmin(lines, axis=0)) if creeps else steps.max()
+    return float(np.median(times) / max(np.median(usual), 1.0)), MovedTarget("", start, float(distance), creeps)
+
+
+def _seen_on_both_sides(distances: Array, start: int) -> Array:
+    """(V, p) those of the distances that are seen on both sides."""
+    seen = np.isfinite(distances)
+    return distances[:, (seen[:start].sum(axis=0) >= _SIDE) & (seen[start:].sum(axis=0) >= _SIDE)]
+
+
+def _levels(distances: Array, start: int) -> Array:
+    """(V, p) medians before and from a view on."""
+    sides = np.arange(len(distances))[:, None] < start
+    return np.where(sides, nan_median(distances[:start]), nan_median(distances[start:]))
+
+
+def _fitted_lines(distances: Array) -> Array:
+    """(V, p) straight lines through distances over the session, by least squares."""
+    seen = np.isfinite(distances)
+    order = np.where(seen, np.arange(len(distances))[:, None], np.nan)
+    at = np.where(seen, order - np.nanmean(order, axis=0), 0.0)
+    middle = np.nanmean(distances, axis=0)
+    slope = np.sum(at * np.where(seen, distances - middle, 0.0), axis=0) / np.maximum(np.sum(at**2, axis=0), 1e-300)
+    return np.where(seen, middle + slope * at, np.nan)
+
+
+def _median_steps(distances: Array, start: int, scatter: float) -> tuple[Array, Array]:
+    """(p,) steps of the medians, in length_unit and in standard errors."""
+    levels = _levels(distances, start)
+    before = np.isfinite(distances[:start]).sum(axis=0)
+    after = np.isfinite(distances[start:]).sum(axis=0)
+    steps = np.abs(levels[-1] - levels[0])
+    return steps, steps / (_MEDIAN * scatter * np.sqrt(1 / before + 1 / after))

@@ -1,0 +1,220 @@
+"""What no arm does, and what to say of a session whose poses contradict its scans: limits, few views, rounded tables.
+
+Limits in metres and radians are what arms in use stay far below; below them the session's own scatter decides.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stitch.numerics import frames
+from stitch.numerics.distributions import chi2_tail
+from stitch.numerics.frames import Array
+from stitch.numerics.units import METRES, angle_text, length_text
+from stitch.observations.pose_errors import usual_twist
+from stitch.screening.background import find_occluder, find_static_background
+from stitch.screening.hypotheses import BOTH_ORDERS, euler_angles, problem, sentence
+from stitch.screening.pose_tests import FEWEST_DEGREES
+from stitch.screening.problems import SessionProblem, displacement_text, list_views, names_of_views
+from stitch.screening.snooping import MisplacedView, Snooping
+from stitch.session.capture import Capture, part_size
+from stitch.session.session import SessionData
+
+# No arm scatters by more.
+_ROTATION, _TRANSLATION_M = 0.010, 0.005
+# No effect of an arm is believed to displace a single view by more than half of that.
+_VIEW_ROTATION, _VIEW_M = 0.005, 0.0025
+# So many views leave too few degrees of freedom for their scatter to accuse one of them.
+_FEW_VIEWS = 5
+_NUMBERS = {2: "two", 3: "three", 4: "four", 5: "five"}
+# Chance that poses which repeat as those of arms do are said to disagree.
+_FEW_VIEWS_CHANCE = 1e-4
+# Views that are named as farthest off.
+_LISTED = 3
+# Rounding explains a scatter of no more than so many times what it makes, and no less than its part.
+_TIMES_ROUNDING = 2.0
+# Of a step: numbers that are whole within this were rounded. By chance one row in thousands is.
+_WHOLE = 2e-3
+_MOST_DECIMALS = 3
+# Below so many views chance makes whole numbers.
+_FEWEST_ROUNDED = 3
+_DECIMALS = {0: "no decimals", 1: "one decimal", 2: "two decimals", 3: "three decimals"}
+
+
+def beyond_any_arm(session: SessionData, rotation: float, translation: float) -> bool:
+    """Return True if a rotation (rad) or a translation (length_unit) is larger than what any arm does."""
+    return rotation > _ROTATION or translation > _TRANSLATION_M / METRES[session.length_unit]
+
+
+def beyond_effects(session: SessionData, rotation: float, translation: float) -> bool:
+    """Return True if no effect of an arm is believed to displace a single view so far (rad, length_unit)."""
+    return rotation > _VIEW_ROTATION or translation * METRES[session.length_unit] > _VIEW_M
+
+
+def apply_displacement_limits(session: SessionData, snooping: Snooping) -> Snooping:
+    """Return the findings with those suspected views misplaced that are surely off by more than effects of an arm."""
+    sure = [m for m in snooping.suspected if beyond_effects(session, *m.at_least)]
+    return replace(
+        snooping,
+        misplaced=tuple(sorted((*snooping.misplaced, *sure), key=lambda m: m.view)),
+        suspected=tuple(m for m in snooping.suspected if m not in sure),
+    )
+
+
+def poses_contradict_scans(session: SessionData, snooping: Snooping) -> bool:
+    """Return True if the poses contradict the scans beyond what any arm does."""
+    lost = len(snooping.not_belonging) > len(session.views) / 2
+    return lost or beyond_any_arm(session, snooping.rotation, snooping.translation)
+
+
+def scatter_in_words(session: SessionData, snooping: Snooping) -> str:
+    """Return the scatter by which the poses contradict the scans, in words."""
+    return f"{1e3 * snooping.rotation:.3g} mrad and {snooping.translation:.3g} {session.length_unit}"
+
+
+def suspicion_in_words(session: SessionData, view: MisplacedView) -> str:
+    """Return how far a suspected view is off, in words."""
+    amount = displacement_text(view.at_least, view.at_least, session.length_unit)
+    return f"is off by at least {amount}" if amount else "is off by an amount that its surface does not show"
+
+
+def snooping_warnings(session: SessionData, capture: Capture, snooping: Snooping, T_mount: Array) -> tuple[str, ...]:
+    """Return session-level warnings: background in the scans, steps between views, implausible pose errors.
+
+    Args:
+        T_mount: (4, 4) hand-eye under which `snooping` was made.
+    """
+    background = (found.fix for found in background_problems(session, capture, T_mount, snooping))
+    steps = (step.describe(session.names, session.length_unit) for step in snooping.steps)
+    warnings = (*background, *steps)
+    rounding = rounding_that_explains(session, snooping)
+    if rounding is not None:
+        return (f"{rounding.describe()}.", *warnings)
+    if beyond_effects(session, snooping.rotation, snooping.translation):
+        return (_implausible_scatter(session, capture, snooping, T_mount), *warnings)
+    few = check_few_views(session, snooping)
+    return warnings if few is None else (few, *warnings)
+
+
+def background_problems(
+    session: SessionData, capture: Capture, T_mount: Array, snooping: Snooping
+) -> list[SessionProblem]:
+    """Return the problems of what the scans show beside the part: static background, or what only one scan shows.
+
+    Args:
+        T_mount: (4, 4) hand-eye under which `snooping` was made.
+    """
+    size = part_size([capture])
+    names = session.names
+    still = find_static_background(capture.scans, capture.poses(T_mount), snooping.tolerance, size)
+    if still is not None:
+        return [problem("background", names_of_views(still.views, names), **still.words(session.length_unit))]
+    if snooping.left_out or snooping.steps:
+        # The part itself stands elsewhere where a view is off; without that view it is asked again.
+        return []
+    occluder = find_occluder(capture.scans, snooping.unconstrained.poses, size)
+    if occluder is None:
+        return []
+    views, share = occluder
+    named = names_of_views(views, names)
+    show = "shows" if len(views) == 1 else "show"
+    return [problem("in the way", named, share=share, where=list_views(named, names), show=show)]
+
+
+def _implausible_scatter(session: SessionData, capture: Capture, snooping: Snooping, T_mount: Array) -> str:
+    model_poses = capture.poses(T_mount)
+    twists = frames.log(snooping.unconstrained.poses @ frames.inverse(model_poses))
+    middles = np.array([points.mean(axis=0) for points in capture.visible_points])
+    placed = frames.transform(model_poses, middles[:, None])[:, 0]
+    moved = np.linalg.norm(twists[:, 3:] + np.cross(twists[:, :3], placed), axis=1)
+    worst = [v for v in np.argsort(-moved) if v not in snooping.left_out][:_LISTED]
+    farthest = ", ".join(f"{session.names[v]} ({moved[v]:.3g} {session.length_unit})" for v in worst)
+    return sentence("implausible scatter", by=scatter_in_words(session, snooping), farthest=farthest)
+
+
+def check_few_views(session: SessionData, snooping: Snooping) -> str | None:
+    """Return a warning of few views whose poses disagree by more than arms repeat, or that nothing can be tested by.
+
+    They show few motions: that something is wrong, but not which scan, row or effect. None where poses agree, or where
+    the views are enough for each to be tested by the others.
+    """
+    views = len(session.views)
+    unit = session.length_unit
+    count = _NUMBERS.get(views, str(views))
+    degrees = snooping.blunder_search.null_projector.degrees
+    if (views > _FEW_VIEWS and degrees >= FEWEST_DEGREES) or snooping.left_out or snooping.suspected:
+        return None
+    if degrees < 1:
+        return sentence("no test", count=count)
+    rotation, translation = usual_twist(unit)[[0, 3]]
+    if _global_model_test(snooping, np.array([rotation**2, translation**2, 1.0])):
+        return None
+    by = f"{length_text(snooping.translation, unit, 2)} and {angle_text(snooping.rotation, 2)}"
+    usual = f"{length_text(translation, unit, 2)} and {angle_text(rotation, 2)}"
+    return sentence("few views", count=count.capitalize(), by=by, usual=usual, few=count)
+
+
+def _global_model_test(snooping: Snooping, variances: Array) -> bool:
+    """Test the model as a whole (Baarda 1968): the scatter is known and not taken from the same data."""
+    mixed = snooping.model.mixed()
+    C, A, z = mixed.covariance(variances)[0], mixed.A[0], mixed.z[0]
+    CA = np.linalg.solve(C, A)
+    Cz = np.linalg.solve(C, z)
+    statistic = z @ Cz - Cz @ A @ np.linalg.solve(A.T @ CA, A.T @ Cz)
+    return chi2_tail(float(statistic), len(z) - A.shape[1]) > _FEW_VIEWS_CHANCE
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """Rotations that were written with few decimals."""
+
+    kind: str  # quaternion | euler, as a problem is called
+    decimals: int
+    rotation: float  # rad, by which rounding turns each pose about an axis, rms
+
+    def describe(self) -> str:
+        """Return what rounding alone does, and what to do."""
+        numbers = "quaternions" if self.kind == "quaternion" else "angles"
+        return sentence("rounded", numbers=numbers, decimals=_DECIMALS[self.decimals], rotation=1e3 * self.rotation)
+
+
+def rounding_that_explains(session: SessionData, snooping: Snooping) -> Rounding | None:
+    """Return the rounding of the table's rotations, if it turns poses by more than arms do and as much as they scatter.
+
+    It is asked before rows are blamed: no row of such a table is wrong.
+    """
+    rounding = find_rounding(np.array([view.T_base_flange for view in session.views]))
+    if rounding is None or rounding.rotation < usual_twist(session.length_unit)[0]:
+        return None
+    times = _TIMES_ROUNDING
+    as_much = rounding.rotation / times < snooping.rotation < times * rounding.rotation
+    return rounding if as_much else None
+
+
+def find_rounding(T: Array) -> Rounding | None:
+    """Find the decimals of the rotations of poses (V, 4, 4); None where they have more, or too few poses turn."""
+    R = Rotation.from_matrix(T[:, :3, :3])
+    if len(T) < _FEWEST_ROUNDED or frames.angle_between(T[0], T[1:]).max(initial=0.0) == 0:
+        return None
+    for decimals in range(1, _MOST_DECIMALS + 1):
+        step = 0.1**decimals
+        if _quaternions_have(R.as_quat(), step):
+            # A quaternion is half the rotation vector, and a number rounded to a step scatters by step/√12.
+            return Rounding("quaternion", decimals, 2 * step / np.sqrt(12))
+    for decimals in range(_MOST_DECIMALS):
+        step = 0.1**decimals
+        for order in BOTH_ORDERS:
+            numbers = euler_angles(R, order) * 180 / np.pi / step
+            if (np.abs(numbers - np.round(numbers)) < _WHOLE).all():
+                return Rounding("euler", decimals, float(np.radians(step)) / np.sqrt(12))
+    return None
+
+
+def _quaternions_have(q: Array, step: float) -> bool:
+    """Return True if each quaternion (V, 4), of any length near 1, has whole numbers of a step."""
+    largest = np.abs(q).max(axis=1)
+    # What was normalised was shorter or longer by a few steps.
+    counts = np.round(largest / step)[:, None] + np.arange(-2, 3)
+    numbers = q[:, None] * (counts / largest[:, None])[:, :, None]
+    return bool((np.abs(numbers - np.round(numbers)).max(axis=2) < _WHOLE).any(axis=1).all())
