@@ -69,11 +69,11 @@ def compute_fpfh(points: Array, normals: Array, radius: float) -> FeaturedSurfac
     tree = KDTree(points)
     count = min(_NEIGHBOURS, len(points))
     distance, index = (a.reshape(len(points), count) for a in tree.query(points, k=count, distance_upper_bound=radius))
-    own, column = np.nonzero(np.isfinite(distance) & (distance > 0))
-    other = index[own, column].astype(int)
-    simple = _angle_histograms(points, normals, own, other)
-    weight = 1 / distance[own, column] ** 2
-    sums = [np.bincount(own, weight * share[other], len(points)) for share in simple.T]
+    point, column = np.nonzero(np.isfinite(distance) & (distance > 0))
+    neighbour = index[point, column].astype(int)
+    simple = _angle_histograms(points, normals, point, neighbour)
+    weight = 1 / distance[point, column] ** 2
+    sums = [np.bincount(point, weight * share[neighbour], len(points)) for share in simple.T]
     around: Array = np.stack(sums, axis=1).astype(float)
     return FeaturedSurface(points, normals, _normalised(simple) + _normalised(around), tree)
 
@@ -88,8 +88,8 @@ def register_ransac(source: FeaturedSurface, target: FeaturedSurface, reach: flo
     Returns:
         The motion of the triple with the least truncated cost; identity where no triple is a rigid copy.
     """
-    own, other = _partners(source.histograms, target.histograms)
-    a, b = source.points[own], target.points[other]
+    in_source, in_target = _partners(source.histograms, target.histograms)
+    a, b = source.points[in_source], target.points[in_target]
     triples = np.random.default_rng(seed).integers(len(a), size=(draws, _MIN_SAMPLE))
     # Only where the edges have the same length in both.
     edges = [np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2) for p in (a[triples], b[triples])]
@@ -97,7 +97,10 @@ def register_ransac(source: FeaturedSurface, target: FeaturedSurface, reach: flo
     T = align_points(a[triples], b[triples])
     moved = a[triples] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
     T = T[np.linalg.norm(moved - b[triples], axis=2).max(axis=1, initial=0.0) < reach]
-    return np.asarray(T[np.argmin(_msac_costs(T, a, b, reach))]) if len(T) else np.eye(4)
+    if not len(T):
+        return np.eye(4)
+    best: Array = T[np.argmin(_msac_costs(T, a, b, reach))]
+    return best
 
 
 def align_icp(source: FeaturedSurface, target: FeaturedSurface, T: Array, reach: float) -> Array:
@@ -120,10 +123,10 @@ def align_icp(source: FeaturedSurface, target: FeaturedSurface, T: Array, reach:
     return T
 
 
-def _angle_histograms(points: Array, normals: Array, own: Indices, other: Indices) -> Array:
+def _angle_histograms(points: Array, normals: Array, point: Indices, neighbour: Indices) -> Array:
     """(N, 33): of three angles between each point and its neighbours, the shares in 11 bins each."""
-    line = _unit(points[other] - points[own])
-    first, second = normals[own], normals[other]
+    line = _unit(points[neighbour] - points[point])
+    first, second = normals[point], normals[neighbour]
     # The frame sits on that of the two points whose normal lies closer to the line between them.
     swap = np.abs(np.einsum("ij,ij->i", first, line)) < np.abs(np.einsum("ij,ij->i", second, line))
     first, second = np.where(swap[:, None], second, first), np.where(swap[:, None], first, second)
@@ -135,7 +138,7 @@ def _angle_histograms(points: Array, normals: Array, own: Indices, other: Indice
     histograms = []
     for share in (theta / (2 * np.pi) + 0.5, *((cosine + 1) / 2 for cosine in cosines)):
         bins = np.clip((share * _BINS).astype(int), 0, _BINS - 1)
-        histograms.append(np.bincount(own * _BINS + bins, minlength=len(points) * _BINS).reshape(-1, _BINS))
+        histograms.append(np.bincount(point * _BINS + bins, minlength=len(points) * _BINS).reshape(-1, _BINS))
     return _normalised(np.hstack(histograms).astype(float))
 
 
@@ -153,9 +156,9 @@ def _unit(vectors: Array) -> Array:
 def _partners(a: Array, b: Array) -> tuple[Indices, Indices]:
     """Indices of histograms that are each other's nearest; where those are too few, of every one and its nearest."""
     forth, back = (KDTree(y).query(x, k=1)[1].astype(int) for x, y in ((a, b), (b, a)))
-    own = np.arange(len(a))
-    mutual = back[forth] == own
-    return (own[mutual], forth[mutual]) if mutual.sum() >= 3 * _MIN_SAMPLE else (own, forth)
+    every = np.arange(len(a))
+    mutual = back[forth] == every
+    return (every[mutual], forth[mutual]) if mutual.sum() >= 3 * _MIN_SAMPLE else (every, forth)
 
 
 def _msac_costs(T: Array, a: Array, b: Array, reach: float) -> Array:

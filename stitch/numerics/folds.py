@@ -35,7 +35,7 @@ class JointEnd:
 
 
 def grouped_folds(T_base_flange: Array, lever: float) -> list[Indices]:
-    """Index arrays of the views to leave out together; every view is left out twice where there are enough.
+    """Return index arrays of the views to leave out together; every view is left out twice where there are enough.
 
     Args:
         T_base_flange: (V, 4, 4) in the order of time.
@@ -50,7 +50,7 @@ def grouped_folds(T_base_flange: Array, lever: float) -> list[Indices]:
 
 
 def halves_of(T_base_flange: Array, lever: float) -> list[tuple[Indices, Indices]]:
-    """Three ways to halve V views: in the order of time, by the region of their poses, alternately.
+    """Return three ways to halve V views: in the order of time, by the region of their poses, alternately.
 
     Args:
         T_base_flange: (V, 4, 4) in the order of time.
@@ -66,7 +66,7 @@ def halves_of(T_base_flange: Array, lever: float) -> list[tuple[Indices, Indices
 
 
 def view_clusters(T_base_flange: Array, lever: float) -> list[Indices]:
-    """Index arrays of views near each other, every view in one: what a model does not know errs alike in one place."""
+    """Return index arrays of views near each other, every view in one: unknown errors are alike in one place."""
     count = len(T_base_flange)
     if count < _PLACES * _VIEWS_PER_PLACE:
         return [np.array([v]) for v in range(count)]
@@ -74,14 +74,15 @@ def view_clusters(T_base_flange: Array, lever: float) -> list[Indices]:
 
 
 def joint_ends(joints: Array, observed: Indices) -> list[JointEnd]:
-    """Both ends of every joint's range; none of a joint that stands still, or where views are few.
+    """Return both ends of every joint's range; none of a joint that stands still, or where views are few.
 
     Args:
         joints: (V, n) rad.
         observed: indices of the views that show something.
     """
-    out, every = [], joints[observed]
-    for joint, (q, low, high) in enumerate(zip(every.T, *np.quantile(every, [_END, 1 - _END], axis=0), strict=True)):
+    out = []
+    angles = joints[observed]
+    for joint, (q, low, high) in enumerate(zip(angles.T, *np.quantile(angles, [_END, 1 - _END], axis=0), strict=True)):
         for upper, views in ((False, observed[q <= low]), (True, observed[q >= high])):
             # Where many views share one angle, an end may be most of them.
             if _VIEWS_PER_END <= len(views) <= len(observed) // 2:
@@ -90,7 +91,7 @@ def joint_ends(joints: Array, observed: Indices) -> list[JointEnd]:
 
 
 def _pose_offsets(T_base_flange: Array, lever: float) -> Array:
-    """(V, 6) twists of the flange from its first pose, as lengths: the same wherever the base's frame lies."""
+    """Return twists (V, 6) of the flange from its first pose, as lengths: the same wherever the base's frame lies."""
     return frames.log(frames.inverse(T_base_flange[:1]) @ T_base_flange) * np.repeat([lever, 1.0], 3)
 
 

@@ -122,7 +122,8 @@ def rotate(T: Array, vectors: Array) -> Array:
     """Turn directions (..., N, 3) by the rotation of T (..., 4, 4)."""
     # A factor that lies transposed in memory costs a product of thousands of rows three times as much.
     turned = np.ascontiguousarray(np.swapaxes(np.asarray(T, float)[..., :3, :3], -1, -2))
-    return np.asarray(vectors) @ turned
+    rows = np.asarray(vectors)
+    return rows @ turned
 
 
 def plane_rows(arms: Array, normals: Array) -> Array:

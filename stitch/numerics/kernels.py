@@ -100,7 +100,7 @@ class SmoothErrors:
 
     def of_joint(self, joint: int) -> list[int]:
         """The processes of a joint, counted from 0."""
-        return [p for p, own in enumerate(self.joints) if own == joint]
+        return [p for p, of_process in enumerate(self.joints) if of_process == joint]
 
     def twist_covariance(self, process: int) -> Array:
         """(6V, 6V) covariance of the twists by one process alone."""
@@ -118,5 +118,5 @@ def process_covariance(columns: Array, kernel: Array) -> Array:
         columns: (6V, P) twists of the views per unit of each process.
     """
     views = len(kernel)
-    own = (columns @ columns.T).reshape(views, 6, views, 6)
-    return (own * kernel[:, None, :, None]).reshape(6 * views, 6 * views)
+    unit = (columns @ columns.T).reshape(views, 6, views, 6)
+    return (unit * kernel[:, None, :, None]).reshape(6 * views, 6 * views)

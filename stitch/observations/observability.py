@@ -106,15 +106,11 @@ def unknown_numbers(captures: Sequence[Capture], T_mount: Array) -> tuple[str, .
 def unobservable(
     captures: Sequence[Capture], T_mount: Array, robot: Robot | None = None, joints: Array | None = None
 ) -> tuple[str, ...]:
-    """One phrase per direction of the hand-eye that these motions cannot show."""
+    """Return one phrase per direction of the hand-eye that these motions cannot show."""
     gains, directions = motion_gain(captures, T_mount, *seen_part(captures))
-    hidden = directions[:, gains < _VISIBLE]
     axes = _named_axes(captures, robot, joints)
-    phrases = []
-    for kind, direction in _split(hidden):
-        in_mount = T_mount[:3, :3] @ direction
-        phrases.append(f"{kind} {_name(in_mount, axes)}")
-    return tuple(phrases)
+    hidden = _split(directions[:, gains < _VISIBLE])
+    return tuple(f"{kind} {_name(T_mount[:3, :3] @ direction, axes)}" for kind, direction in hidden)
 
 
 def _split(hidden: Array) -> list[tuple[str, Array]]:
@@ -123,25 +119,25 @@ def _split(hidden: Array) -> list[tuple[str, Array]]:
         return []
     U, s, Vt = np.linalg.svd(hidden[:3])
     rank = int((s > 1e-6 * np.linalg.norm(hidden[:3]) + 1e-12).sum()) if np.abs(hidden[:3]).max() > 1e-9 else 0
-    out = [("translation along", v) for v in (hidden[3:] @ Vt[rank:].T).T]
-    out += [("rotation about", U[:, i]) for i in range(rank)]
-    return [(kind, v / np.linalg.norm(v)) for kind, v in out]
+    kinds = [("translation along", v) for v in (hidden[3:] @ Vt[rank:].T).T]
+    kinds += [("rotation about", U[:, i]) for i in range(rank)]
+    return [(kind, v / np.linalg.norm(v)) for kind, v in kinds]
 
 
 def _named_axes(captures: Sequence[Capture], robot: Robot | None, joints: Array | None) -> dict[str, Array]:
     """Directions in the mount frame that people know by name."""
-    axes = {}
+    axes = dict[str, Array]()
     first = captures[0]
     if robot is not None and joints is not None:
         T_base_flange = kinematics.forward(robot, joints)
         _, base_axes = kinematics.joint_axes(robot, joints)
         for i in np.flatnonzero(np.ptp(joints, axis=0) > _TURNED):
-            seen = base_axes[:, i]
+            axis = base_axes[:, i]
             if first.scanner_rides:
-                seen = np.einsum("vji,vj->vi", T_base_flange[:, :3, :3], seen)
+                axis = np.einsum("vji,vj->vi", T_base_flange[:, :3, :3], axis)
             # A joint's axis has a place in the mount frame only while it does not move there.
-            if np.linalg.norm(seen.mean(axis=0)) > _PARALLEL:
-                axes[f"the axis of joint {i + 1}"] = seen.mean(axis=0)
+            if np.linalg.norm(axis.mean(axis=0)) > _PARALLEL:
+                axes[f"the axis of joint {i + 1}"] = axis.mean(axis=0)
     motions = frames.log(frames.inverse(first.T_reference_mount[:1]) @ first.T_reference_mount[1:])[:, :3]
     _, s, Vt = np.linalg.svd(motions, full_matrices=False)
     if len(s) and s[0] > 1e-9 and np.all(s[1:] < 0.02 * s[0]):

@@ -286,7 +286,7 @@ class PoseErrors:
         return replace(
             self,
             components=np.array([reduction @ C @ reduction.T for C in self.components]),
-            effects={name: (component, reduction @ own) for name, (component, own) in self.effects.items()},
+            effects={name: (component, reduction @ columns) for name, (component, columns) in self.effects.items()},
         )
 
     def restricted(self, keep: Collection[str]) -> "PoseErrors":

@@ -49,7 +49,7 @@ class Rows(Observation):
     @property
     def fixed(self) -> Array:
         """(B, m) variance that is known: 1 in absent rows."""
-        return np.asarray(self.noise == 0, float)
+        return (self.noise == 0).astype(float)
 
     @cached_property
     def used(self) -> Mask:
@@ -240,7 +240,7 @@ class RowTrial:
         scaled, unit = equilibrated(self.blocks.information)
         moves = self.blocks.residual_vectors(coefficients) * unit @ np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
         sizes = np.linalg.norm(moves[: len(self.rows.lever)], axis=1)
-        return np.asarray(np.argsort(-sizes, kind="stable")[:_CARRIERS], np.int64)
+        return np.argsort(-sizes, kind="stable")[:_CARRIERS].astype(np.int64)
 
     def _rest(self, coefficients: Array, views: Indices | Mask) -> Array:
         V = len(self.rows.lever)

@@ -73,12 +73,12 @@ def test_the_motion_between_two_samples_of_half_a_part_is_found(seed):
     assert np.linalg.norm(off, axis=1).max() < size / 4
 
 
-def test_same_surfaces_same_motion_bit_for_bit():
+def test_the_same_surfaces_give_the_same_motion_bit_for_bit():
     a, b = (compute_fpfh(*samples(800, seed), 15.0) for seed in (1, 2))
     assert np.array_equal(register_ransac(a, b, 9.0, 2000, seed=3), register_ransac(a, b, 9.0, 2000, seed=3))
 
 
-def test_nothing_in_common_is_no_motion():
+def test_surfaces_with_nothing_in_common_give_no_motion():
     points = np.random.default_rng(0).uniform(-1, 1, (5, 3))
     one = compute_fpfh(points, np.tile([0, 0, 1.0], (5, 1)), 0.5)
     other = compute_fpfh(1e3 * points, np.tile([0, 0, 1.0], (5, 1)), 0.5)

@@ -28,7 +28,7 @@ def test_log_inverts_exp(xi, scale):
         assert np.allclose(frames.log(frames.exp(xi)), xi, atol=1e-9)
 
 
-def test_log_near_half_a_turn():
+def test_the_logarithm_is_exact_near_half_a_turn():
     for rest in (1e-3, 1e-6, 1e-8):
         xi = np.array([0.0, 0.6, 0.8, 1.0, 2.0, 3.0])
         xi[:3] *= np.pi - rest
@@ -49,7 +49,7 @@ def test_left_jacobian_is_a_finite_difference(xi, eta):
 
 
 @given(twists)
-def test_inverse_and_quaternion(xi):
+def test_inverse_and_quaternion_lead_back_to_the_transform(xi):
     T = frames.exp(xi)
     assert np.allclose(frames.inverse(T) @ T, np.eye(4), atol=1e-12)
     assert np.allclose(frames.from_quaternion(T[:3, 3], frames.to_quaternion(T)), T, atol=1e-12)

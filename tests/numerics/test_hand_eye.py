@@ -25,7 +25,7 @@ def motions(seed: int, count: int = 8, noise: float = 0.0):
 
 
 @pytest.mark.parametrize("name", AXXB_SOLVERS)
-def test_exact_without_noise(name):
+def test_solvers_are_exact_without_noise(name):
     for seed in range(20):
         X, _, _, A, B = motions(seed)
         error = frames.log(frames.inverse(X) @ AXXB_SOLVERS[name](A, B))
@@ -95,7 +95,7 @@ def turned_by(angles, seed, shift=100.0, noise=0.0):
 @pytest.mark.parametrize("shift", [0.0, 100.0])
 @pytest.mark.parametrize("off", [0.0, 1e-9, 1e-4, 0.02])
 @pytest.mark.parametrize("name", AXXB_SOLVERS)
-def test_exact_at_half_turns(name, off, shift):
+def test_solvers_are_exact_at_half_turns(name, off, shift):
     """The logarithm may go either way round at π; with and without translation of the flange."""
     for seed in range(10):
         X, A, B = turned_by([np.pi - off, np.pi - off / 3, np.pi - off / 7, np.pi - off / 5], seed, shift)
@@ -105,7 +105,7 @@ def test_exact_at_half_turns(name, off, shift):
 
 
 @pytest.mark.parametrize("name", AXXB_SOLVERS)
-def test_half_turns_under_noise(name):
+def test_half_turns_under_noise_cost_no_accuracy(name):
     """As good as with turns by 150°, where no logarithm is in doubt."""
     errors = {}
     for angle in (2.6, np.pi):
@@ -118,7 +118,7 @@ def test_half_turns_under_noise(name):
 
 
 @pytest.mark.parametrize("name", AXXB_SOLVERS)
-def test_hand_eye_that_is_itself_a_half_turn(name):
+def test_a_hand_eye_that_is_a_half_turn_is_found_exactly(name):
     rng = np.random.default_rng(3)
     for axis in (*np.eye(3), *rng.normal(size=(5, 3))):
         _, A, _ = turned_by([0.5, 0.8, 1.2, 0.7], 1)

@@ -130,7 +130,7 @@ def test_what_one_joint_moves_far_stays_half_alike_and_near_views_are_alike():
     assert rbf_joints(np.array([[0.0], [np.pi]]))[0, 1] == pytest.approx((1 + np.exp(-2)) / 2)
 
 
-def test_time_forgets():
+def test_errors_far_apart_in_time_are_independent():
     alike = exponential_kernel(*[np.array([0.0, 1.0, 500.0])] * 2, 20.0)
     assert alike[0, 1] == pytest.approx(np.exp(-1 / 20))
     assert alike[0, 2] < 1e-10

@@ -85,7 +85,7 @@ def test_an_effect_in_the_model_keeps_its_best_group_however_weak():
     assert chosen[2] and chosen[:2].sum() == 1
 
 
-def test_what_nobody_sees_is_believed_of_the_size_of_its_like():
+def test_a_parameter_that_nobody_sees_is_believed_of_the_size_of_its_like():
     """Six parameters of an effect, in a share and of a size that are drawn for the effect; nothing tells the last.
 
     Mean squares told and true agree, whether the five others are small or large.
@@ -129,7 +129,7 @@ def test_what_stays_at_zero_may_be_as_large_as_it_is_on_the_average():
 
 
 @pytest.mark.parametrize("scales", [PLAUSIBLE, ANY_SIZE])
-def test_shares_add_up_to_all(scales):
+def test_shares_of_a_mixture_add_up_to_one(scales):
     assert sum(scales.values()) == pytest.approx(1.0)
 
 

@@ -1,1 +1,1 @@
-"""Overlapping surfaces: matches, sums over pairs of views, freed views, their linear model."""
+"""Overlapping surfaces: matches, sums over pairs of views, free-network views, their linear model."""

@@ -437,7 +437,7 @@ def whiten_captures(
 
     Args:
         sessions: per capture its free-network views and the twists (6V, P) of the effects.
-        values: (P,) of the effects at which the views were freed; z is what was seen without them.
+        values: (P,) of the effects at which the views were moved; z is what was seen without them.
         free: (P,) effects that explain scatter.
     """
     stacked = []

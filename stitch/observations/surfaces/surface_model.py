@@ -135,7 +135,7 @@ class SurfaceObservation(Observation):
         return self.reduced_poses.reduction @ response
 
     def expand(self, columns: Array) -> Array:
-        """(6V, P) the shortest twists that make numbers (n, P) of the channel."""
+        """(6V, P) the shortest twists that make reduced observations (n, P)."""
         return self.reduced_poses.expansion @ columns
 
     def trial(self, linear: LinearModel, response: Array, points: PointSums | None = None) -> SurfaceTrial:
@@ -148,7 +148,7 @@ class SurfaceObservation(Observation):
         return mask
 
     def part_displacements(self, numbers: Array) -> Array:
-        """(V, 3) translations of the twists that make numbers (n,) of the channel, less the common motion."""
+        """(V, 3) translations of the twists that make reduced observations (n,), less the common motion."""
         out = self.expand(numbers).reshape(-1, 6)[:, 3:]
         return out - out.mean(axis=0)
 

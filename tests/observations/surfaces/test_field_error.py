@@ -125,7 +125,7 @@ def test_a_scanner_that_looks_against_its_z_has_the_same_map_turned():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", [along(nothing), askew])
-def test_no_map_of_what_is_no_error_along_the_ray(change):
+def test_no_map_is_drawn_of_errors_across_the_ray(change):
     assert found(change)[0].map is None
 
 
@@ -174,7 +174,7 @@ def sound() -> LinearModel:
     return linear_of(None)
 
 
-def test_what_either_view_does_adds_up(sound: LinearModel):
+def test_sums_for_either_view_add_up_to_those_of_both(sound: LinearModel):
     """Sums for either view of a pair its own, added up, are those for both together."""
     apart, _ = sum_smooth_errors(sound.measurement, sound.observation.unconstrained, per_view=True)
     together, _ = sum_smooth_errors(sound.measurement, sound.observation.unconstrained)
@@ -220,7 +220,7 @@ def test_a_sound_scanner_errs_in_no_view_of_its_own(sound: LinearModel):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "with_time"), [(swings, False), (bends, True)])
-def test_every_view_by_itself(law: LawOfErrorsByView, with_time: bool):
+def test_errors_of_single_views_are_told_as_such(law: LawOfErrorsByView, with_time: bool):
     """Neither is laid on the scanner's field; what grows with the session is told from what does not."""
     linear = linear_of(law)
     found = field_error(linear.measurement, linear.model, linear.observation.unconstrained, 0.01)
@@ -231,7 +231,7 @@ def test_every_view_by_itself(law: LawOfErrorsByView, with_time: bool):
 
 
 @pytest.mark.slow
-def test_the_same_in_every_view_is_no_view_of_its_own():
+def test_an_error_that_all_views_share_is_not_laid_on_single_views():
     linear = linear_of(alike)
     found = field_error(linear.measurement, linear.model, linear.observation.unconstrained, 0.01)
     assert found.rms > 0 and not found.by_view
@@ -279,7 +279,7 @@ def test_where_the_iteration_ended_makes_no_error_of_the_scanner(sound: LinearMo
     assert not field_error(sound.measurement, sound.model, freed, 0.01, beside).unusual
 
 
-def test_what_is_beside_may_have_any_size(sound: LinearModel):
+def test_nuisance_effects_may_have_any_size(sound: LinearModel):
     """Errors that parameters beside them explain wholly are not seen."""
     freed = sound.observation.unconstrained
     sums, noise = sum_smooth_errors(sound.measurement, freed, per_view=True)
@@ -320,7 +320,7 @@ def chi_squares(share: float) -> tuple[list[float], list[float]]:
         pytest.param(4.0, True, True, marks=pytest.mark.slow),
     ],
 )
-def test_what_repeats_is_told_with_its_size(share, unusual, over_noise):
+def test_errors_that_repeat_are_told_with_their_size(share, unusual, over_noise):
     """A usual scanner, one that errs by nearly its noise, and one by four times that: none too much is said of any."""
     measured = repeated(share, 0)
     linear = linear_model_of(pipeline.run(session_of(measured)))

@@ -104,7 +104,7 @@ def test_pairs_serve_again_until_something_has_moved(blade_capture, overlaps):
 
 
 @pytest.mark.parametrize(("motion", "gate", "reused"), [(0.01, 2.0, True), (0.05, 1.9, True), (1.0, 1.9, False)])
-def test_what_is_not_searched_again_is_what_a_search_finds(blade_capture, overlaps, motion, gate, reused):
+def test_partners_not_searched_again_are_those_that_a_search_finds(blade_capture, overlaps, motion, gate, reused):
     """Every view moved by itself, mm: the same correspondences to the last bit, whether few or all points look again."""
     measured, capture = blade_capture
     samples = [sample_points(s, 400) for s in capture.scans]
@@ -118,7 +118,7 @@ def test_what_is_not_searched_again_is_what_a_search_finds(blade_capture, overla
         assert all(np.array_equal(own, other) for own, other in zip(a.columns, b.columns, strict=True))
 
 
-def test_pair_equations_against_finite_differences(blade_capture, overlaps):
+def test_pair_equations_are_the_finite_differences_of_the_cost(blade_capture, overlaps):
     """Moving view v by a twist changes every residual of its pairs by B·δ, normals turning along."""
     measured, capture = blade_capture
     centre, step = overlaps.gram.centre, 1e-5
@@ -136,7 +136,7 @@ def test_pair_equations_against_finite_differences(blade_capture, overlaps):
         assert np.allclose((moves[0] - moves[1]) / (2 * step), B[:, i], rtol=1e-5, atol=1e-4)
 
 
-def test_hand_eye_jacobian_against_finite_differences(blade_capture):
+def test_the_hand_eye_jacobian_is_a_finite_difference(blade_capture):
     measured, capture = blade_capture
     centre, step = np.array([10.0, -5, 30]), 1e-6
     J = hand_eye_jacobian(capture.poses(measured.T_mount), centre).reshape(-1, 6, 6)
