@@ -124,18 +124,18 @@ class Observation(ABC):
 
     @abstractmethod
     def from_twists(self, moved: Array) -> Array:
-        """(n, P) numbers of the reduced observations of left twists (6V, P) of the views."""
+        """(n, P) reduced observations of left twists (6V, P) of the views."""
 
     @abstractmethod
     def responses(self, measurement: Measurement, model: Model, terms: Sequence[Term]) -> list[Response]:
         """Per term how the observation answers to its parameters."""
 
     def reduce(self, response: Array) -> Array:
-        """(n, P) numbers of the reduced observations of a response (·, P)."""
+        """(n, P) reduced observations of a response (·, P)."""
         return response
 
     def expand(self, columns: Array) -> Array:
-        """(·, P) a response that has these numbers (n, P) of the reduced observations."""
+        """(·, P) a response that has these reduced observations (n, P)."""
         return columns
 
     @abstractmethod
@@ -176,9 +176,7 @@ class LinearModel:
     values: Array  # (a,) at which the parameters of effects in use stand; 0 for the rest
     mixed: MixedModel  # what was seen, its mean's columns, and the components of the covariance
     null: VarianceFit  # fitted without further columns
-    pose_errors: PoseErrors | None = (
-        None  # how poses may err beside white scatter, among the reduced observations (c, n, n)
-    )
+    pose_errors: PoseErrors | None = None  # how poses may err beside white scatter, reduced (c, n, n)
     # (B, m, n) plausible offsets of the joints, each block a view, where the covariance counts no scatter of theirs.
     offsets: Array | None = None
     # (2,) variances, rad² and length_unit², by which a unit of joint scatter turns and moves the flange along an axis.
@@ -295,7 +293,7 @@ class LinearModel:
         return self.observation.responses(self.measurement, self.model, terms)
 
     def reduce(self, response: Array) -> Array:
-        """(n, P) numbers of the reduced observations of a response (·, P)."""
+        """(n, P) reduced observations of a response (·, P)."""
         return self.observation.reduce(response)
 
     @cached_property
@@ -324,7 +322,7 @@ class LinearModel:
         return column_space(np.hstack([self.white_design, self.whiten(self.observation.from_twists(twists))]))
 
     def residual(self, columns: Array) -> Array:
-        """(n, P) whitened columns of the reduced observations, what the model explains projected out."""
+        """(n, P) whitened columns, what the model explains projected out."""
         white = self.whiten(columns)
         return white - self._explained @ (self._explained.T @ white)
 
