@@ -40,13 +40,19 @@ from stitch.system.threads import library_threads_off
 Verdict = Literal["waiting", "fits", "does_not_belong", "adds_nothing"]
 
 # Views before a hand-eye is searched, and before one that is stated is corrected: fewer leave nothing to test it by.
-_FEWEST_TO_SEARCH, _FEWEST_TO_CORRECT = 4, 3
+_FEWEST_TO_SEARCH = 4
+_FEWEST_TO_CORRECT = 3
 # A view adds nothing if others see so much of it already, and U falls by no more than this share.
-_SEEN_BEFORE, _LEAST_GAIN = 0.98, 0.05
+_SEEN_BEFORE = 0.98
+_LEAST_GAIN = 0.05
 # Turns below this are not worth a word, rad.
 _SMALLEST_TURN = 5e-5
 # Views in a row that do not belong before one cause is named.
 _IN_A_ROW = 2
+# By which proposed poses are turned from those taken.
+_TURNS_DEG = (15.0, 30.0, 45.0)
+# Weight of a prior on every direction, as a share of the clearest.
+_UNSEEN = 1e-8
 
 
 @dataclass(frozen=True)
@@ -155,22 +161,22 @@ class LiveSession:
             'waiting'
         """
         began = time.perf_counter()
-        own = self.session
-        name = name or f"v{len(own.views):03d}"
-        if name in own.names:
+        cell = self.session
+        name = name or f"v{len(cell.views):03d}"
+        if name in cell.names:
             raise InputError(f"view {name}: there is one of that name; to fix: give it another name")
         one = Session.from_arrays(
             {name: cloud},
             None if pose is None else [pose],
-            mount=own.mount,
+            mount=cell.mount,
             joints=None if joints is None else [joints],
-            robot=own.robot,
+            robot=cell.robot,
             times=None if time_s is None else [time_s],
             covariates={key: [value] for key, value in (covariates or {}).items()},
-            scanner=own.scanner,
-            unit=own.length_unit,
+            scanner=cell.scanner,
+            unit=cell.length_unit,
             cloud_unit=self._cloud_unit,
-            name=own.name,
+            name=cell.name,
             check=False,
         )
         return self._take(replace(one.views[0], approach=None), began)
@@ -207,10 +213,9 @@ class LiveSession:
         """The hand-eye so far; its U holds for a complete model. None before there is one."""
         if self._fit is None:
             return None
-        own = self._fit
-        return fitted_hand_eye(
-            self.session, own.capture, own.T_mount, own.covariance, unknown=unknown_numbers([own.capture], own.T_mount)
-        )
+        fit = self._fit
+        unknown = unknown_numbers([fit.capture], fit.T_mount)
+        return fitted_hand_eye(self.session, fit.capture, fit.T_mount, fit.covariance, unknown=unknown)
 
     def next_pose(self) -> ProposedPose | None:
         """Return the pose, near those taken, that would lower U of the hand-eye most; None before there is one.
@@ -223,8 +228,10 @@ class LiveSession:
             >>> proposed.T_base_flange.shape, proposed.U_mm < live.hand_eye.U.mm
             ((4, 4), True)
         """
-        known = self.hand_eye
-        return None if self._fit is None or known is None else _next_pose(self._fit, self._views(), known)
+        hand_eye = self.hand_eye
+        if self._fit is None or hand_eye is None:
+            return None
+        return _next_pose(self._fit, [self.session.views[i] for i in self._members], hand_eye)
 
     def finish(self, recorder: Recorder | None = None, **options: Any) -> Run:
         """Run the session: the same result as `stitch.run` on all its views.
@@ -258,32 +265,35 @@ class LiveSession:
             return self._first_fit(view)
         before = self.hand_eye
         assert before is not None
-        own = prepare_capture(replace(self.session, views=(view,)))
+        capture = prepare_capture(replace(self.session, views=(view,)))
         try:
-            new = place_view(self._fit, own.scans[0], own.T_reference_mount[0], own.T_reference_flange[0])
+            placed = place_view(
+                self._fit, capture.scans[0], capture.T_reference_mount[0], capture.T_reference_flange[0]
+            )
         except NoResultError:
             return self._rejected(
                 view, "It shares no surface with the others: its pose is far off, or it shows another part."
             )
         members = [*self._members, len(self.session.views) - 1]
-        off = self._blunders(new.fit, members)
+        off = self._blunders(placed.fit, members)
         if len(members) - 1 in off:
             return self._rejected(view, off[len(members) - 1])
-        self._members, self._fit = members, new.fit
+        self._members = members
+        self._fit = placed.fit
         for v in sorted(off, reverse=True):
             self._fit = without_view(self._fit, v)
             del self._members[v]
         self._fit = fit_live_hand_eye(self._fit, self._errors)
         others = " ".join(f"{self.session.names[members[v]]} does not belong: {why}" for v, why in off.items())
         gain = 1 - self.hand_eye.U.mm / before.U.mm  # type: ignore[union-attr]
-        idle = new.seen_before > _SEEN_BEFORE and gain < _LEAST_GAIN and not off
-        share = f"{100 * new.seen_before:.0f} % of it was seen before, U falls by {max(100 * gain, 0):.0f} %."
+        idle = placed.seen_before > _SEEN_BEFORE and gain < _LEAST_GAIN and not off
+        share = f"{100 * placed.seen_before:.0f} % of it was seen before, U falls by {max(100 * gain, 0):.0f} %."
         return self._report(view, "adds_nothing" if idle else "fits", f"{others} {share}".strip())
 
     def _first_fit(self, view: View) -> LiveView:
         """Fit the views so far, if they are enough."""
-        stated = self.session.scanner.T_mount is not None
-        count, least = len(self.session.views), _FEWEST_TO_CORRECT if stated else _FEWEST_TO_SEARCH
+        count = len(self.session.views)
+        least = _FEWEST_TO_SEARCH if self.session.scanner.T_mount is None else _FEWEST_TO_CORRECT
         if count < least:
             return self._report(view, "waiting", f"The hand-eye is fitted from {least} views on.")
         check_convention(self.session)
@@ -295,33 +305,33 @@ class LiveSession:
                     view, "waiting", "Two hand-eyes fit these views equally well; a turned view decides."
                 )
             fit = partial(surface_steps.fit, start=FitStart(starts), recorder=SilentRecorder())
-            found = fit_screened_views([self.session], [measurement], fit)
+            screened = fit_screened_views([self.session], [measurement], fit)
         except NoResultError as error:
             return self._report(view, "waiting", f"No hand-eye yet: {error}.")
-        out = found.screenings[0]
-        assert found.fitted.correction is not None
-        self._members = [i for i in range(count) if self.session.names[i] not in out.names]
-        self._fit = start_live_fit(found.fitted.correction)
-        gone = out.line(self.session.names)
-        if view.name in out.names:
-            return self._report(view, "does_not_belong", gone)
-        return self._report(view, "fits", f"The first hand-eye.{f' {gone}.' if gone else ''}")
+        screening = screened.screenings[0]
+        assert screened.fitted.correction is not None
+        self._members = [i for i in range(count) if self.session.names[i] not in screening.names]
+        self._fit = start_live_fit(screened.fitted.correction)
+        left_out = screening.line(self.session.names)
+        if view.name in screening.names:
+            return self._report(view, "does_not_belong", left_out)
+        return self._report(view, "fits", f"The first hand-eye.{f' {left_out}.' if left_out else ''}")
 
     def _blunders(self, fit: LiveFit, members: list[int]) -> dict[int, str]:
         """Return the views of a fit that contradict the others beyond what usual effects of an arm do, and why."""
         model = view_model(fit.capture, fit.T_mount, fit.unconstrained)
-        found = find_blunders(model)
-        if not found.blunders:
+        search = find_blunders(model)
+        if not search.blunders:
             return {}
         measurement = measurement_of(self._session_of(members), fit.capture)
         usual = UsualEffects(measurement, Model(fit.T_mount)).twists(fit.unconstrained)
         sure = {b.view for b in find_blunders(model.with_usual(usual)).blunders}
-        off = [b.view for b in found.blunders if b.view in sure]
-        return {v: self._displacement(fit, model, found, v, [w for w in off if w != v]) for v in off}
+        off = [b.view for b in search.blunders if b.view in sure]
+        return {v: self._displacement(fit, model, search, v, [w for w in off if w != v]) for v in off}
 
-    def _displacement(self, fit: LiveFit, model: ViewModel, found: BlunderSearch, view: int, others: list[int]) -> str:
+    def _displacement(self, fit: LiveFit, model: ViewModel, search: BlunderSearch, view: int, others: list[int]) -> str:
         middle = frames.transform(fit.unconstrained.poses[view], fit.capture.scans[view].points.mean(axis=0)[None])[0]
-        rotation, shift = least_displacement(model, found, others, (), view, middle)
+        rotation, shift = least_displacement(model, search, others, (), view, middle)
         turn = f" and {1e3 * rotation:.2g} mrad" if rotation > _SMALLEST_TURN else ""
         return f"Its pose is off by at least {length_text(shift, self.session.length_unit)}{turn}."
 
@@ -341,10 +351,6 @@ class LiveSession:
     def _session_of(self, members: list[int]) -> Session:
         return replace(self.session, views=tuple(self.session.views[i] for i in members))
 
-    def _views(self) -> list[View]:
-        """Views that the fit holds."""
-        return [self.session.views[i] for i in self._members]
-
     def _errors(
         self, capture: Capture, freed: UnconstrainedPoses, T_mount: Array
     ) -> tuple[PoseErrors, dict[str, list[Array]]]:
@@ -360,14 +366,14 @@ class LiveSession:
         self._drawn = len(self.said) if self._fit is not None else 0
 
     def _pose_of(self, index: int) -> Array | None:
-        """(4, 4) T_reference_scanner of a view by the surfaces, or by the robot where it does not belong."""
+        """Return T_reference_scanner (4, 4) of a view by the surfaces, or by the robot where it does not belong."""
         if self._fit is None:
             return None
         if index in self._members:
-            return np.asarray(self._fit.unconstrained.poses[self._members.index(index)])
+            return self._fit.unconstrained.poses[self._members.index(index)]
         alone = self.session.views[index].T_base_flange[None]
         capture = build_capture(self.session.name, (), alone, self.session.mount)
-        return np.asarray(capture.poses(self._fit.T_mount)[0])
+        return capture.poses(self._fit.T_mount)[0]
 
 
 def live(
@@ -409,40 +415,36 @@ def follow(session: SessionData) -> LiveSession:
 
 
 def _recording(session: Session, target: str) -> LiveRecording:
-    found = next(iter(entry_points(group="stitch.live_recordings")), None)
-    if found is None:
+    entry = next(iter(entry_points(group="stitch.live_recordings")), None)
+    if entry is None:
         raise InputError("recording: nothing here shows it; to fix: install rerun-sdk, or leave recording out")
-    made: LiveRecording = found.load()(session, target)
-    return made
+    recording: LiveRecording = entry.load()(session, target)
+    return recording
 
 
-_TURNS_DEG = (15.0, 30.0, 45.0)
-# Weight of a prior on every direction, as a share of the clearest.
-_UNSEEN = 1e-8
-
-
-def _next_pose(live_fit: LiveFit, views: list[View], known: FittedHandEye) -> ProposedPose:
+def _next_pose(live_fit: LiveFit, views: list[View], hand_eye: FittedHandEye) -> ProposedPose:
     """Return the turned pose after which the information of all views, each like the others, leaves the least U."""
-    own, g = live_fit.capture, live_fit.unconstrained.overlaps.gram
-    eye_in_hand = known.frame == "flange"
+    capture = live_fit.capture
+    gram = live_fit.unconstrained.overlaps.gram
     turns = [np.radians(angle) * axis for angle in _TURNS_DEG for axis in np.vstack([np.eye(3), -np.eye(3)])]
-    about = [turn_about(turn, g.centre) for turn in turns]
-    poses = np.array([T @ mount for mount in own.T_reference_mount for T in about])
-    have = frames.adjoint(frames.make(np.eye(3), -g.centre) @ own.hand_eye_frames(live_fit.T_mount))
-    more = frames.adjoint(frames.make(np.eye(3), -g.centre) @ poses @ live_fit.T_mount)
-    unit = np.array([g.lever] * 3 + [1.0] * 3)[:, None]
+    about_part = [turn_about(turn, gram.centre) for turn in turns]
+    poses = np.array([T @ mount for mount in capture.T_reference_mount for T in about_part])
+    to_centre = frames.make(np.eye(3), -gram.centre)
+    taken = frames.adjoint(to_centre @ capture.hand_eye_frames(live_fit.T_mount))
+    proposed = frames.adjoint(to_centre @ poses @ live_fit.T_mount)
+    unit = np.array([gram.lever] * 3 + [1.0] * 3)[:, None]
 
-    def left(jacobians: Array) -> float:
+    def uncertainty(jacobians: Array) -> float:
         """U up to a factor; what all views have in common shows nothing."""
         apart = unit * (jacobians - jacobians.mean(axis=0))
         information = np.einsum("vki,vkj->ij", apart, apart)
         # What no view shows yet is far from known, not known without error.
         weak = np.diag(_UNSEEN * np.diag(information).max() / unit[:, 0] ** 2)
-        return displacement(np.linalg.inv(information + weak), known.middle)
+        return displacement(np.linalg.inv(information + weak), hand_eye.middle)
 
-    after = [left(np.concatenate([have, J[None]])) for J in more]
+    after = [uncertainty(np.concatenate([taken, J[None]])) for J in proposed]
     best = int(np.argmin(after))
     view = views[best // len(turns)]
-    T = poses[best] if eye_in_hand else frames.inverse(poses[best])
+    T = poses[best] if hand_eye.frame == "flange" else frames.inverse(poses[best])
     moved = Rotation.from_matrix(T[:3, :3] @ view.T_base_flange[:3, :3].T).as_rotvec(degrees=True)
-    return ProposedPose(T, view.name, moved, known.U.mm * after[best] / left(have))
+    return ProposedPose(T, view.name, moved, hand_eye.U.mm * after[best] / uncertainty(taken))

@@ -313,13 +313,13 @@ class Run(RunData):
         folder = Path(folder)
         whole = self.measured or public_session(self.session)
         path = _save_session_of_run(whole, folder) if whole.in_memory else whole.path
-        own = replace(self, session=replace(self.session, path=path))
+        saved = replace(self, session=replace(self.session, path=path))
         with run_folder.new_folder(folder, [path], force) as scratch:
             for recorder in recordings(scratch) if recording else []:
                 for call, arguments in self.recorded:
                     getattr(recorder, call)(*arguments)
-                recorder.finish(own)
-            run_folder.write_with_page(own, scratch, tolerance)
+                recorder.finish(saved)
+            run_folder.write_with_page(saved, scratch, tolerance)
         return folder
 
     def plot(self) -> Any:
@@ -385,9 +385,9 @@ def public_run(run: RunData, whole: Session | None, recorder: ReplayRecorder | N
         whole: its session with the views that were left out; None: as the run has it.
         recorder: was told of it.
     """
-    own = {f.name: getattr(run, f.name) for f in fields(RunData)}
+    values = {f.name: getattr(run, f.name) for f in fields(RunData)}
     calls = () if recorder is None else tuple(recorder.calls)
-    return Run(**own | {"session": public_session(run.session)}, measured=whole, recorded=calls)
+    return Run(**values | {"session": public_session(run.session)}, measured=whole, recorded=calls)
 
 
 def rigid_transform(pose: Array) -> Any:

@@ -13,6 +13,7 @@ from typing import Any, cast, get_args
 import numpy as np
 
 from stitch.errors import InputError, NoResultError, StitchError
+from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
 from stitch.output.session_files import (
@@ -111,15 +112,13 @@ class Session(SessionData):
             ...     print(str(error)[:92])
             <session>: the poses contradict what was measured: inverse: the poses are T_flange_base, ...
         """
-        toml = Path(f"<{require_folder_name('name', name, 'name')}>") / "session.toml"
-        with _in_arguments(toml.parent.name):
-            known = _stated(toml, unit=unit, cloud_unit=cloud_unit, mount=mount, robot=robot, scanner=scanner)
+        cell = cls.empty(mount=mount, robot=robot, scanner=scanner, unit=unit, cloud_unit=cloud_unit, name=name)
+        with _in_arguments(cell.path.name):
             names, scans = _views_of(clouds, poses, joints, points)
-            T, q = _arm(known, names, poses, joints)
-            rows = _rows(known, names, scans, points)
-            views = _described(rows, T, q, times, covariates or {})
-            session = cls._of_cell(toml.parent, name, mount, known, views)
-            check_scale(session, known.cloud_unit)
+            T, q = _arm(cell, names, poses, joints)
+            views = _measured_views(cell, names, scans, points, cloud_unit or unit)
+            session = replace(cell, views=_placed_views(views, T, q, times, covariates or {}))
+            check_scale(session, cloud_unit or unit)
             if check:
                 check_convention(session)
         return session
@@ -144,25 +143,32 @@ class Session(SessionData):
             >>> stitch.Session.empty(mount="eye_in_hand", name="bracket").views
             ()
         """
-        toml = Path(f"<{require_folder_name('name', name, 'name')}>") / "session.toml"
-        with _in_arguments(toml.parent.name):
-            known = _stated(toml, unit=unit, cloud_unit=cloud_unit, mount=mount, robot=robot, scanner=scanner)
-        return cls._of_cell(toml.parent, name, mount, known, ())
-
-    @classmethod
-    def _of_cell(cls, path: Path, name: str, mount: str, known: "_Stated", views: tuple[View, ...]) -> "Session":
+        path = Path(f"<{require_folder_name('name', name, 'name')}>")
+        # Checked as a session.toml with the same entries is.
+        toml = path / "session.toml"
+        repeatability = StatedRepeatability()
+        with _in_arguments(path.name):
+            table_choice(toml, {"unit": unit}, "unit", tuple(METRES))
+            table_choice(toml, {"cloud_unit": cloud_unit or unit}, "cloud_unit", tuple(METRES))
+            table_choice(toml, {"mount": mount}, "mount", get_args(Mount))
+            if not isinstance(scanner, Scanner):
+                scanner = read_scanner(toml, dict(scanner or {}))
+            if robot is not None and not isinstance(robot, Robot):
+                table = {"urdf": str(Path(robot).resolve())} if isinstance(robot, str | Path) else dict(robot)
+                repeatability = read_repeatability(toml, table)
+                robot = read_robot(toml, table, unit)
         return cls(
             path=path,
             name=name,
-            length_unit=known.unit,
+            length_unit=unit,
             mount=cast(Mount, mount),
-            scanner=known.scanner,
-            robot=known.robot,
+            scanner=scanner,
+            robot=robot,
             sphere_radius=None,
             cad=None,
             cad_unit=None,
-            views=views,
-            repeatability=known.repeatability,
+            views=(),
+            repeatability=repeatability,
         )
 
     @property
@@ -222,69 +228,27 @@ def public_session(session: SessionData) -> Session:
     return Session(**{f.name: getattr(session, f.name) for f in fields(SessionData)})
 
 
-@dataclass(frozen=True)
-class _Stated:
-    """What was said of the cell, checked."""
-
-    unit: str
-    cloud_unit: str
-    scanner: Scanner
-    robot: Robot | None
-    repeatability: StatedRepeatability
-
-    @property
-    def scale(self) -> float:
-        """Turns the unit of the scans into the session's."""
-        return METRES[self.cloud_unit] / METRES[self.unit]
-
-
-def _stated(
-    toml: Path,
-    *,
-    unit: str,
-    cloud_unit: str | None,
-    mount: str,
-    robot: Any,
-    scanner: Scanner | Mapping[str, Any] | None,
-) -> _Stated:
-    """Check what is stated of the cell, as a session.toml with the same entries is checked."""
-    cloud_unit = cloud_unit or unit
-    for key, value, known in (
-        ("unit", unit, tuple(METRES)),
-        ("cloud_unit", cloud_unit, tuple(METRES)),
-        ("mount", mount, get_args(Mount)),
-    ):
-        table_choice(toml, {key: value}, key, known)
-    if not isinstance(scanner, Scanner):
-        scanner = read_scanner(toml, dict(scanner or {}))
-    if robot is None or isinstance(robot, Robot):
-        return _Stated(unit, cloud_unit, scanner, robot, StatedRepeatability())
-    table = {"urdf": str(Path(robot).resolve())} if isinstance(robot, str | Path) else dict(robot)
-    stated = read_repeatability(toml, table)
-    return _Stated(unit, cloud_unit, scanner, read_robot(toml, table, unit), stated)
-
-
 def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[str], list[Any]]:
     """Return names of the views, and their scans; None where there are none."""
     if isinstance(clouds, Mapping):
         names = [require_name("clouds", str(key), "view") for key in clouds]
         return names, list(clouds.values())
-    given = [x for x in (clouds, points, joints, poses) if x is not None]
-    if not given or (clouds is None and points is None):
+    if clouds is None and points is None:
         raise InputError("clouds: none, and no labelled points; to fix: pass one of the two, one a view")
-    scans = list(clouds) if clouds is not None else [None] * len(given[0])
+    scans = list(clouds) if clouds is not None else [None] * len(points)
     return [f"v{i:03d}" for i in range(len(scans))], scans
 
 
-def _arm(known: _Stated, names: list[str], poses: Any, joints: Any) -> tuple[Array, Array | None]:
+def _arm(cell: Session, names: list[str], poses: Any, joints: Any) -> tuple[Array, Array | None]:
     """Return T_base_flange (V, 4, 4) and joint angles (V, n) rad, which agree."""
     count = len(names)
+    robot = cell.robot
     q = None if joints is None else per_view(joints, count, "joints", 2)
-    if q is not None and known.robot is not None and q.shape[1] != known.robot.n_joints:
-        raise InputError(f"joints: {q.shape[1]} a view, the robot has {known.robot.n_joints}; to fix: pass one a joint")
+    if q is not None and robot is not None and q.shape[1] != robot.n_joints:
+        raise InputError(f"joints: {q.shape[1]} a view, the robot has {robot.n_joints}; to fix: pass one a joint")
     if q is not None and not np.isfinite(q).all():
         raise InputError("joints: some are not finite; to fix: leave those views out")
-    from_joints = None if q is None or known.robot is None else forward(known.robot, q)
+    from_joints = None if q is None or robot is None else forward(robot, q)
     if poses is None:
         if from_joints is None:
             raise InputError("poses: none; to fix: pass them, or joints with the robot")
@@ -293,47 +257,48 @@ def _arm(known: _Stated, names: list[str], poses: Any, joints: Any) -> tuple[Arr
     if len(T) != count:
         raise InputError(f"poses: {len(T)} for {count} views; to fix: pass one a view, in the same order")
     if from_joints is not None:
-        for name, reported, own in zip(names, T, from_joints, strict=True):
-            require_agreement(f"view {name}", reported, own, METRES[known.unit])
+        for name, reported, computed in zip(names, T, from_joints, strict=True):
+            require_agreement(f"view {name}", reported, computed, METRES[cell.length_unit])
     return T, q
 
 
-def _rows(known: _Stated, names: list[str], scans: list[Any], points: Any) -> list[View]:
+def _measured_views(cell: Session, names: list[str], scans: list[Any], points: Any, cloud_unit: str) -> list[View]:
     """Return views with what was seen, at no pose yet."""
     if points is not None and len(points) != len(names):
         raise InputError(f"points: {len(points)} for {len(names)} views; to fix: pass one mapping a view, or None")
+    metres = METRES[cell.length_unit]
+    scale = METRES[cloud_unit] / metres
 
-    def scan(at: int) -> Cloud | None:
+    def cloud(at: int) -> Cloud | None:
         if scans[at] is None:
             return None
         where = f"view {names[at]}"
-        read = partial(cloud_of, scans[at], where, known.scale)
-        metres = METRES[known.unit]
-        cloud = checked_scan(names[at], where, read, metres=metres, scanner=known.scanner, at_most=MAX_POINTS)
+        read = partial(cloud_of, scans[at], where, scale)
+        scan = checked_scan(names[at], where, read, metres=metres, scanner=cell.scanner, at_most=MAX_POINTS)
         # A small scan is the session's own; a large one stays with whoever holds it.
-        return replace(cloud, points=cloud.points.copy()) if cloud.points is scans[at] else cloud
+        return replace(scan, points=scan.points.copy()) if scan.points is scans[at] else scan
 
-    seen = parallel(scan, range(len(names)), "reading scans")
+    clouds = list(parallel(cloud, range(len(names)), "reading scans"))
     return [
         View(
-            name=view,
-            cloud=cloud,
+            name=name,
+            cloud=clouds[v],
             T_base_flange=np.eye(4),
             joints=None,
             approach=None,
             time_s=None,
             covariates={},
-            sighting=None if points is None else sighting_of(points[v], f"view {view}"),
+            sighting=None if points is None else sighting_of(points[v], f"view {name}"),
         )
-        for v, (view, cloud) in enumerate(zip(names, seen, strict=True))
+        for v, name in enumerate(names)
     ]
 
 
-def _described(
-    rows: list[View], T: Array, q: Array | None, times: Any, covariates: Mapping[str, Any]
+def _placed_views(
+    views: list[View], T: Array, q: Array | None, times: Any, covariates: Mapping[str, Any]
 ) -> tuple[View, ...]:
-    """Return the views with poses, times and covariates."""
-    count = len(rows)
+    """Return the views with poses (V, 4, 4), joint angles (V, n) rad, times and covariates."""
+    count = len(views)
     time = None if times is None else per_view(times, count, "times")
     if time is not None and not (np.isfinite(time).all() and (np.diff(time) >= 0).all()):
         raise InputError(
@@ -344,14 +309,14 @@ def _described(
     approach = None if q is None else np.sign(np.diff(q, axis=0, prepend=q[:1]))
     return tuple(
         replace(
-            row,
+            view,
             T_base_flange=T[v],
             joints=None if q is None else q[v],
             approach=None if approach is None else approach[v],
             time_s=None if time is None else float(time[v]),
             covariates={key: float(x[v]) for key, x in columns.items() if np.isfinite(x[v])},
         )
-        for v, row in enumerate(rows)
+        for v, view in enumerate(views)
     )
 
 
@@ -384,6 +349,35 @@ def _in_arguments(path: str) -> Iterator[None]:
         raise type(error)(text) from None
 
 
+def _files_of(session: SessionData) -> SessionFiles:
+    """Return everything that a folder of the session holds."""
+    plain = all(_PLAIN.fullmatch(name) for name in session.names)
+    files = [f"clouds/{view.name if plain else f'v{i:03d}'}.ply" for i, view in enumerate(session.views)]
+    clouds = {file: view.cloud for file, view in zip(files, session.views, strict=True) if view.cloud is not None}
+    points, probes = _labelled_columns(session)
+    tables, texts = _tables(session)
+    nominal = session.nominal
+    if nominal is not None:
+        columns = {"target": list(nominal.targets)}
+        columns |= {axis: _digits(values) for axis, values in zip("xyz", nominal.points.T, strict=True)}
+        if np.isfinite(nominal.sigma).any():
+            columns["sigma"] = [_cell(x) for x in nominal.sigma]
+        texts["targets.csv"] = table_text(columns)
+    return SessionFiles(
+        name=session.name,
+        length_unit=session.length_unit,
+        mount=session.mount,
+        views=_view_columns(session, files if clouds else None),
+        tables=tables,
+        clouds=_WholeClouds(clouds),
+        points=points,
+        frames=probes,
+        copies=() if session.cad is None else (session.cad,),
+        texts=texts,
+        scalar="<f8",
+    )
+
+
 class _WholeClouds(Mapping[str, Cloud]):
     """Every point of every scan by its file, in memory one scan after the other."""
 
@@ -401,87 +395,65 @@ class _WholeClouds(Mapping[str, Cloud]):
         return len(self.clouds)
 
 
-def _files_of(session: SessionData) -> SessionFiles:
-    """Return everything that a folder of the session holds."""
-    plain = all(_PLAIN.fullmatch(name) for name in session.names)
-    files = [f"clouds/{view.name if plain else f'v{i:03d}'}.ply" for i, view in enumerate(session.views)]
-    clouds = {file: view.cloud for file, view in zip(files, session.views, strict=True) if view.cloud is not None}
-    points, probes = _labelled_columns(session)
-    tables, texts = _tables(session)
-    if session.nominal is not None:
-        own = session.nominal
-        columns = {"target": list(own.targets), **dict(zip("xyz", map(_digits, own.points.T), strict=True))}
-        known = {"sigma": [_cell(x) for x in own.sigma]} if np.isfinite(own.sigma).any() else {}
-        texts["targets.csv"] = table_text(columns | known)
-    return SessionFiles(
-        name=session.name,
-        length_unit=session.length_unit,
-        mount=session.mount,
-        views=_view_columns(session, files if clouds else None),
-        tables=tables,
-        clouds=_WholeClouds(clouds),
-        points=points,
-        frames=probes,
-        copies=() if session.cad is None else (session.cad,),
-        texts=texts,
-        scalar="<f8",
-    )
-
-
 def _view_columns(session: SessionData, files: list[str] | None) -> dict[str, list[str]]:
-    """views.csv with all digits; an empty cell where nothing is known."""
+    """Return views.csv with all digits; an empty cell where nothing is known.
+
+    Args:
+        files: of the scans; None where no view has one.
+    """
     views = session.views
     columns: dict[str, list[str]] = {"view": session.names}
     if files is not None:
         columns["cloud"] = [file if view.cloud else "" for file, view in zip(files, views, strict=True)]
     if any(view.time_s is not None for view in views):
         columns["time_s"] = [_cell(view.time_s) for view in views]
-    count = next((len(view.joints) for view in views if view.joints is not None), 0)
-    for i in range(count):
+    joints = range(next((len(view.joints) for view in views if view.joints is not None), 0))
+    for i in joints:
         columns[f"j{i + 1}_deg"] = [_cell(None if v.joints is None else float(np.degrees(v.joints[i]))) for v in views]
     columns |= {name: _digits(x) for name, x in pose_columns(np.array([v.T_base_flange for v in views])).items()}
-    for i in range(count):
+    for i in joints:
         columns[f"j{i + 1}_approach"] = ["" if v.approach is None else f"{v.approach[i]:.0f}" for v in views]
-    names = dict.fromkeys(name for view in views for name in view.covariates)
-    return columns | {name: [_cell(view.covariates.get(name)) for view in views] for name in names}
+    for name in dict.fromkeys(name for view in views for name in view.covariates):
+        columns[name] = [_cell(view.covariates.get(name)) for view in views]
+    return columns
 
 
 def _labelled_columns(session: SessionData) -> tuple[dict[str, list[str]] | None, dict[str, list[str]] | None]:
-    """Columns of points.csv, or of frames.csv where views show a probe."""
-    rows = [(view.name, view.sighting) for view in session.views if view.sighting is not None]
-    if not rows:
+    """Return the columns of points.csv, or of frames.csv where views show a probe."""
+    seen = {view.name: view.sighting for view in session.views if view.sighting is not None}
+    if not seen:
         return None, None
-    if all(sighting.rotation is None for _, sighting in rows):
+    if all(sighting.rotation is None for sighting in seen.values()):
         table = [
             [name, target, *_digits(place), _cell(sigma)]
-            for name, own in rows
-            for target, place, sigma in zip(own.targets, own.points, own.sigma, strict=True)
+            for name, sighting in seen.items()
+            for target, place, sigma in zip(sighting.targets, sighting.points, sighting.sigma, strict=True)
         ]
         return _columns(("view", "target", "x", "y", "z", "sigma"), table), None
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    for v, (_, own) in enumerate(rows):
-        T[v, :3, 3] = own.points[0]
-        T[v, :3, :3] = np.eye(3) if own.rotation is None else own.rotation
-    columns = {"view": [name for name, _ in rows], **{key: _digits(x) for key, x in pose_columns(T).items()}}
-    columns["sigma"] = [_cell(own.sigma[0]) for _, own in rows]
-    columns["sigma_deg"] = [_cell(float(np.degrees(own.sigma_rotation))) for _, own in rows]
+    rotations = [np.eye(3) if sighting.rotation is None else sighting.rotation for sighting in seen.values()]
+    T = frames.make(np.array(rotations), np.array([sighting.points[0] for sighting in seen.values()]))
+    columns = {"view": list(seen), **{key: _digits(x) for key, x in pose_columns(T).items()}}
+    columns["sigma"] = [_cell(sighting.sigma[0]) for sighting in seen.values()]
+    columns["sigma_deg"] = [_cell(float(np.degrees(sighting.sigma_rotation))) for sighting in seen.values()]
     return None, columns
 
 
 def _columns(names: Sequence[str], rows: list[list[str]]) -> dict[str, list[str]]:
-    """Columns of a table; one in which nothing stands is left out."""
+    """Return the columns of a table; one in which nothing stands is left out."""
     columns = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
     return {name: column for name, column in columns.items() if any(column)}
 
 
 def _tables(session: SessionData) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Tables of session.toml beside its head, and texts that lie beside it."""
-    own, texts = session.scanner, dict[str, str]()
-    scanner: dict[str, Any] = {"optical_axis": "-z" if own.optical_axis[2] < 0 else "+z"}
-    scanner |= {} if own.T_mount is None else {"pose": own.T_mount.tolist()}
-    known = (("noise", own.noise), ("standoff", own.standoff), ("kind", own.kind))
-    scanner |= {key: value for key, value in known if value is not None}
+    """Return the tables of session.toml beside its head, and texts that lie beside it."""
+    stated = session.scanner
+    scanner: dict[str, Any] = {"optical_axis": "-z" if stated.optical_axis[2] < 0 else "+z"}
+    if stated.T_mount is not None:
+        scanner["pose"] = stated.T_mount.tolist()
+    known = {"noise": stated.noise, "standoff": stated.standoff, "kind": stated.kind}
+    scanner |= {key: value for key, value in known.items() if value is not None}
     tables: dict[str, dict[str, Any]] = {"scanner": scanner}
+    texts: dict[str, str] = {}
     if session.robot is not None:
         table = robot_toml(session.robot)
         if table is None:
@@ -490,8 +462,8 @@ def _tables(session: SessionData) -> tuple[dict[str, dict[str, Any]], dict[str, 
             tables["robot"] = {**links, "gravity": session.robot.gravity.tolist()}
         else:
             tables |= tomllib.loads(table)
-    if stated := repeatability_table(session.repeatability):
-        tables.setdefault("robot", {})["repeatability"] = stated
+    if repeatability := repeatability_table(session.repeatability):
+        tables.setdefault("robot", {})["repeatability"] = repeatability
     if session.sphere_radius is not None:
         tables["sphere"] = {"radius": session.sphere_radius}
     if session.cad is not None:
@@ -500,7 +472,7 @@ def _tables(session: SessionData) -> tuple[dict[str, dict[str, Any]], dict[str, 
 
 
 def _digits(values: Array) -> list[str]:
-    """Numbers that read back as they are."""
+    """Return numbers that read back as they are."""
     return [repr(float(x)) for x in values]
 
 

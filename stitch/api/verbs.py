@@ -91,10 +91,14 @@ def run_rig(
     """
     others: Sequence[Recorder | None] = recorders or [None] * len(sessions)
     replays = [ReplayRecorder(other) for other in others]
-    stated = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, RunData) else arm
-    fitted = None if model is None else _model(model)
-    found = pipeline.run_rig(sessions, fitted, replays, _names(effects), keep, stated, register=register)
-    return [public_run(*own) for own in zip(found, map(public_session, sessions), replays, strict=True)]
+    kept_arm = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, RunData) else arm
+    known_model = None if model is None else _model(model)
+    known_effects = [find_effect(name).name for name in effects]
+    runs = pipeline.run_rig(sessions, known_model, replays, known_effects, keep, kept_arm, register=register)
+    return [
+        public_run(run, public_session(session), replay)
+        for run, session, replay in zip(runs, sessions, replays, strict=True)
+    ]
 
 
 def load_run(folder: Path | str, effects_file: Path | None = None, trust: bool = False) -> Run:
@@ -217,11 +221,6 @@ def stored_cloud(run: RunData) -> FusedCloud:
 
 def _model(model: ModelFile | RunData) -> ModelFile:
     return model_of(model) if isinstance(model, RunData) else model
-
-
-def _names(effects: Sequence[str]) -> list[str]:
-    """Names of effects, each of which is known."""
-    return [find_effect(name).name for name in effects]
 
 
 def _changed(run: RunData, effects: Sequence[str], recorder: Recorder | None) -> Run:
