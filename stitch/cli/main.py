@@ -16,7 +16,7 @@ from stitch.cli.progress import TimeLeft, live_line
 from stitch.cli.terminal import say, speak_any_terminal
 from stitch.errors import StitchError
 from stitch.session.reading.text_files import shortened
-from stitch.system import process
+from stitch.system import process, time_limit
 from stitch.system.process import watched
 
 _LONGEST = 2000
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     speak_any_terminal()
-    process.may_end_process()
+    time_limit.may_end_process()
     try:
         with watched(TimeLeft()):
             try:
@@ -107,7 +107,7 @@ def _exit_with_message(message: str, code: int) -> None:
         say(line)
     else:
         print(line, file=sys.stderr, flush=True)
-    if process.running_over():
+    if time_limit.running_over():
         # The thread of an effect that never ends would be waited for.
         os._exit(code)
     sys.exit(code)

@@ -20,7 +20,7 @@ from stitch.effects.contract import EFFECTS, Effect, Spec
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.session.robot import Links
-from stitch.system.process import time_limit
+from stitch.system.time_limit import time_limit
 
 _KINDS = ("number", "vector", "offset", "joint", "torque", "twist")
 # Seconds for the file and for every call of an effect; a call on a million points takes less than one.

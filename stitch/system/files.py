@@ -18,8 +18,151 @@ from pathlib import Path
 
 from stitch.errors import BusyError
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 _AT_FDCWD = -100  # AT_FDCWD of Linux
 _RENAME_EXCHANGE = 2  # RENAME_EXCHANGE of Linux, RENAME_SWAP of macOS
+_COMMIT = ".stitch-commit"
+_GOES = ".goes.json"
+Ours = Callable[[Path], bool]  # True for a path, relative to the folder, that may go
+_held: dict[Path, int] = {}  # locks of this process and how many blocks hold each
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a scratch file beside `path` that takes its place if the block succeeds, and goes if it fails."""
+    scratch = path.with_name(f".{path.name}.new")
+    # One that a stranger has put there may be a link to elsewhere.
+    with report_errors_as(path, scratch):
+        scratch.unlink(missing_ok=True)
+        try:
+            yield scratch
+            sync_to_disk(scratch)
+            scratch.replace(path)
+        finally:
+            scratch.unlink(missing_ok=True)
+
+
+@contextmanager
+def rewrite_folder(path: Path, ours: Ours) -> Iterator[Path]:
+    """Yield a scratch folder that takes the place of `path` if the block succeeds, and goes if it fails.
+
+    A link stays one: what it points to is rewritten. What in `path` is not `ours` is kept.
+
+    Raises:
+        InputError: another process writes there.
+    """
+    asked, path = path, path.resolve()
+    with claim_folder(asked) as home:
+        with report_errors_as(asked):
+            scratch = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=home))
+        try:
+            yield scratch
+            scratch.chmod(0o777 & ~_umask())
+            sync_to_disk(scratch)
+            _commit(scratch, path, ours)
+        except OSError as error:
+            # The scratch folder is gone when somebody reads this.
+            place = str(error.filename or path).replace(str(scratch), str(path))
+            raise OSError(error.errno, error.strerror or str(error), place) from None
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
+def claim_folder(path: Path) -> Iterator[Path]:
+    """Hold a folder as its only writer, in the state of its last writer; yields where its scratch folders go.
+
+    Raises:
+        InputError: another process writes there.
+    """
+    asked, path = path, path.resolve()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.parent if os.access(path.parent, os.W_OK) or not path.is_dir() else path
+    with only_writer(beside / f".{path.name}.lock", asked):
+        # A new folder is made beside the old one, or in it where that must stay.
+        here = Path.cwd()
+        home = path if path in (here, *here.parents) or os.path.ismount(path) else beside
+        _recover(home, path)
+        yield home
+
+
+def _prefix(path: Path) -> str:
+    return f".{path.name}.stitch-"
+
+
+def _recover(home: Path, path: Path) -> None:
+    """Finish or clear away what a process that was ended has left."""
+    if (path / _COMMIT).is_dir():
+        _finish_commit(path)
+    old = home / f"{_prefix(path)}old"
+    if old.is_dir() and not path.exists():
+        old.rename(path)
+    for left in home.glob(f"{glob.escape(_prefix(path))}*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _commit(scratch: Path, path: Path, ours: Ours) -> None:
+    if scratch.parent == path:
+        goes = [str(f.relative_to(path)) for f in _list_files(path) if ours(f.relative_to(path))]
+        (scratch / _GOES).write_text(json.dumps(goes), encoding="utf-8")
+        scratch.rename(path / _COMMIT)
+        _finish_commit(path)
+    elif not path.exists():
+        scratch.rename(path)
+    else:
+        for file in _list_files(path):
+            inside = file.relative_to(path)
+            if not ours(inside) and not (scratch / inside).exists():
+                _preserve_file(file, scratch / inside)
+        if not exchange_paths(scratch, path):
+            old = scratch.with_name(f"{_prefix(path)}old")
+            path.rename(old)
+            scratch.rename(path)
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _finish_commit(path: Path) -> None:
+    """What was committed takes its place; done twice it does the same."""
+    commit = path / _COMMIT
+    new = {file.relative_to(commit) for file in _list_files(commit)} - {Path(_GOES)}
+    if (commit / _GOES).is_file():
+        for name in json.loads((commit / _GOES).read_text(encoding="utf-8")):
+            if Path(name) not in new and not (path / name).is_dir():
+                (path / name).unlink(missing_ok=True)
+        (commit / _GOES).unlink()
+    for inside in sorted(new):
+        (path / inside).parent.mkdir(parents=True, exist_ok=True)
+        (commit / inside).replace(path / inside)
+    shutil.rmtree(commit, ignore_errors=True)
+
+
+def _list_files(folder: Path) -> Iterator[Path]:
+    """Yield everything in a folder but its folders, links and empty folders included, scratch folders left out."""
+    for entry in sorted(folder.iterdir()):
+        if entry.name.startswith((f".{folder.name}.stitch-", f".{folder.name}.lock", _COMMIT)):
+            continue
+        if entry.is_dir() and not entry.is_symlink() and any(entry.iterdir()):
+            yield from _list_files(entry)
+        else:
+            yield entry
+
+
+def _preserve_file(file: Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    if file.is_dir() and not file.is_symlink():
+        place.mkdir(exist_ok=True)
+        return
+    try:
+        os.link(file, place, follow_symlinks=False)
+    except OSError:
+        if file.is_symlink():
+            place.symlink_to(file.readlink())
+        else:
+            shutil.copy2(file, place)
 
 
 def exchange_paths(first: Path, second: Path) -> bool:
@@ -38,29 +181,10 @@ def exchange_paths(first: Path, second: Path) -> bool:
 
 
 @contextmanager
-def report_errors_as(stated: Path, hidden: Path | None = None) -> Iterator[None]:
-    """Let errors at `hidden`, a file made for what a person asked for, name `stated`; without `hidden` all do."""
-    try:
-        yield
-    except OSError as error:
-        if hidden is None or str(error.filename) == str(hidden):
-            error.filename = str(stated)
-        raise
-
-
-# One writer at a time: locks that the operating system lets go when their process ends, however it ends.
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
-_held: dict[Path, int] = {}  # locks of this process and how many blocks hold each
-
-
-@contextmanager
 def only_writer(lock: Path, what: Path) -> Iterator[None]:
-    """Hold the file `lock` while the block runs; a block inside a block of the same process holds it with it.
+    """Hold the file `lock` while the block runs; the system lets it go when the process ends, however it ends.
+
+    A block inside a block of the same process holds it with it.
 
     Args:
         what: what is written, for the message.
@@ -107,18 +231,14 @@ def _locked(lock: Path, what: Path) -> int:
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A scratch file beside `path` that takes its place if the block succeeds, and goes if it fails."""
-    scratch = path.with_name(f".{path.name}.new")
-    # One that a stranger has put there may be a link to elsewhere.
-    with report_errors_as(path, scratch):
-        scratch.unlink(missing_ok=True)
-        try:
-            yield scratch
-            sync_to_disk(scratch)
-            scratch.replace(path)
-        finally:
-            scratch.unlink(missing_ok=True)
+def report_errors_as(stated: Path, hidden: Path | None = None) -> Iterator[None]:
+    """Let errors at `hidden`, a file made for what a person asked for, name `stated`; without `hidden` all do."""
+    try:
+        yield
+    except OSError as error:
+        if hidden is None or str(error.filename) == str(hidden):
+            error.filename = str(stated)
+        raise
 
 
 def sync_to_disk(path: Path) -> None:
@@ -136,133 +256,6 @@ def sync_to_disk(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-Ours = Callable[[Path], bool]  # True for a path, relative to the folder, that may go
-_COMMIT = ".stitch-commit"
-_GOES = ".goes.json"
-
-
-@contextmanager
-def claim_folder(path: Path) -> Iterator[Path]:
-    """Hold a folder as its only writer, in the state of its last writer; yields where its scratch folders go.
-
-    Raises:
-        InputError: another process writes there.
-    """
-    asked, path = path, path.resolve()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.parent if os.access(path.parent, os.W_OK) or not path.is_dir() else path
-    with only_writer(beside / f".{path.name}.lock", asked):
-        # A new folder is made beside the old one, or in it where that must stay.
-        here = Path.cwd()
-        home = path if path in (here, *here.parents) or os.path.ismount(path) else beside
-        _recover(home, path)
-        yield home
-
-
-@contextmanager
-def rewrite_folder(path: Path, ours: Ours) -> Iterator[Path]:
-    """A scratch folder that takes the place of `path` if the block succeeds, and goes if it fails.
-
-    A link stays one: what it points to is rewritten. What in `path` is not `ours` is kept.
-
-    Raises:
-        InputError: another process writes there.
-    """
-    asked, path = path, path.resolve()
-    with claim_folder(asked) as home:
-        with report_errors_as(asked):
-            scratch = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=home))
-        try:
-            yield scratch
-            scratch.chmod(0o777 & ~_umask())
-            sync_to_disk(scratch)
-            _commit(scratch, path, ours)
-        except OSError as error:
-            # The scratch folder is gone when somebody reads this.
-            place = str(error.filename or path).replace(str(scratch), str(path))
-            raise OSError(error.errno, error.strerror or str(error), place) from None
-        finally:
-            shutil.rmtree(scratch, ignore_errors=True)
-
-
-def _prefix(path: Path) -> str:
-    return f".{path.name}.stitch-"
-
-
-def _old_folder(home: Path, path: Path) -> Path:
-    return home / f"{_prefix(path)}old"
-
-
-def _recover(home: Path, path: Path) -> None:
-    """Finish or clear away what a process that was ended has left."""
-    if (path / _COMMIT).is_dir():
-        _finish_commit(path)
-    old = _old_folder(home, path)
-    if old.is_dir() and not path.exists():
-        old.rename(path)
-    for left in home.glob(f"{glob.escape(_prefix(path))}*"):
-        shutil.rmtree(left, ignore_errors=True)
-
-
-def _commit(scratch: Path, path: Path, ours: Ours) -> None:
-    if scratch.parent == path:
-        goes = [str(f.relative_to(path)) for f in _list_files(path) if ours(f.relative_to(path))]
-        (scratch / _GOES).write_text(json.dumps(goes), encoding="utf-8")
-        scratch.rename(path / _COMMIT)
-        _finish_commit(path)
-    elif not path.exists():
-        scratch.rename(path)
-    else:
-        for file in _list_files(path):
-            inside = file.relative_to(path)
-            if not ours(inside) and not (scratch / inside).exists():
-                _preserve_file(file, scratch / inside)
-        if not exchange_paths(scratch, path):
-            path.rename(_old_folder(scratch.parent, path))
-            scratch.rename(path)
-            shutil.rmtree(_old_folder(scratch.parent, path), ignore_errors=True)
-
-
-def _finish_commit(path: Path) -> None:
-    """What was committed takes its place; done twice it does the same."""
-    commit = path / _COMMIT
-    new = {file.relative_to(commit) for file in _list_files(commit)} - {Path(_GOES)}
-    if (commit / _GOES).is_file():
-        for name in json.loads((commit / _GOES).read_text(encoding="utf-8")):
-            if Path(name) not in new and not (path / name).is_dir():
-                (path / name).unlink(missing_ok=True)
-        (commit / _GOES).unlink()
-    for inside in sorted(new):
-        (path / inside).parent.mkdir(parents=True, exist_ok=True)
-        (commit / inside).replace(path / inside)
-    shutil.rmtree(commit, ignore_errors=True)
-
-
-def _list_files(folder: Path) -> Iterator[Path]:
-    """Everything in a folder but its folders, links and empty folders included, scratch folders left out."""
-    for entry in sorted(folder.iterdir()):
-        if entry.name.startswith((f".{folder.name}.stitch-", f".{folder.name}.lock", _COMMIT)):
-            continue
-        if entry.is_dir() and not entry.is_symlink() and any(entry.iterdir()):
-            yield from _list_files(entry)
-        else:
-            yield entry
-
-
-def _preserve_file(file: Path, place: Path) -> None:
-    place.parent.mkdir(parents=True, exist_ok=True)
-    if file.is_dir() and not file.is_symlink():
-        place.mkdir(exist_ok=True)
-        return
-    try:
-        os.link(file, place, follow_symlinks=False)
-    except OSError:
-        if file.is_symlink():
-            place.symlink_to(file.readlink())
-        else:
-            shutil.copy2(file, place)
 
 
 def _umask() -> int:

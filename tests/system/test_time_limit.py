@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from stitch.errors import InputError
-from stitch.system.process import running_over, time_limit
+from stitch.system.time_limit import running_over, time_limit
 
 
 def spin(seconds):
