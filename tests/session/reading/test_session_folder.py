@@ -1,12 +1,35 @@
 """Sessions: what is read, and the one line that every bad input gets."""
 
+import contextlib
+import json
+from dataclasses import replace
+from datetime import timedelta
+
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from data_synth.fixtures.edits import edit, set_cell
+from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
 from stitch.errors import InputError
+from stitch.output.stored_run import read_ledger, read_result
+from stitch.session.reading.clouds import read_cloud
+from stitch.session.reading.scale_checks import check_scale
 from stitch.session.reading.session_folder import load_session
+from stitch.session.reading.session_toml import (
+    cad_file,
+    positive_number,
+    read_crop_box,
+    read_robot,
+    read_scanner,
+    read_session_document,
+    session_name,
+)
+from stitch.session.reading.target_tables import read_frames, read_points
+from stitch.session.reading.views_table import read_views
 
 
 def test_good_session(session):
@@ -138,3 +161,254 @@ def test_bad_input_is_one_line_exit_2_and_leaves_nothing(session, tmp_path, caps
 def test_real_sessions_are_read(shared_data):
     for name, views in (("reghec/david", 9), ("fanuc-line-sphere", 15), ("irb120-tracker", 600), ("ur10-tmac", 1495)):
         assert len(load_session(shared_data / name).views) == views
+
+
+def refusal(session):
+    with pytest.raises(InputError) as error:
+        load_session(session)
+    return str(error.value)
+
+
+def test_semicolons_are_named(session):
+    file = session / "views.csv"
+    file.write_text(file.read_text().replace(",", ";"))
+    told = refusal(session)
+    assert "views.csv line 1: is separated by semicolons; to fix: save it with commas" in told
+    assert f"stitch init {session} --poses {file} -o" in told and "decimal" not in told
+
+
+def test_decimal_commas_are_named_with_the_semicolons(session):
+    file = session / "views.csv"
+    file.write_text(file.read_text().replace(",", ";").replace(".ply", "#").replace(".", ",").replace("#", ".ply"))
+    assert "semicolons, with decimal commas; to fix: save it with commas between the cells and decimal points" in (
+        refusal(session)
+    )
+
+
+def test_tabs_are_named(session):
+    file = session / "views.csv"
+    file.write_text(file.read_text().replace(",", "\t"))
+    assert "line 1: is separated by tabs" in refusal(session)
+
+
+def test_semicolons_in_the_cells_of_a_table_with_commas_are_left_alone(session):
+    rows = (session / "views.csv").read_text().splitlines()
+    more = ["note;n", *["a;b"] * (len(rows) - 1)]
+    told = "\n".join(f"{row},{cell}" for row, cell in zip(rows, more, strict=True)) + "\n"
+    (session / "views.csv").write_bytes(b"\xef\xbb\xbf" + told.encode())
+    assert len(load_session(session).views) == len(rows) - 1
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_the_line_of_the_first_byte_that_is_no_utf8(session, mark):
+    file = session / "views.csv"
+    file.write_bytes(mark + file.read_text().replace("v001", "Fl\u00fcgel", 1).encode("latin-1"))
+    assert "views.csv line 3: not UTF-8 text, byte 0xfc is" in (told := refusal(session))
+    assert told.endswith("to fix: save it as CSV UTF-8")
+
+
+def test_utf16_is_named(session):
+    file = session / "views.csv"
+    file.write_bytes(file.read_text().encode("utf-16"))
+    assert refusal(session).endswith("views.csv line 1: is UTF-16 text, not UTF-8; to fix: save it as CSV UTF-8")
+
+
+def test_the_description_says_its_line_too(session):
+    edit(session / "session.toml", "length_unit", "# F\u00fcgung\nlength_unit")
+    told = (session / "session.toml").read_text(encoding="utf-8")
+    (session / "session.toml").write_bytes(told.encode("latin-1"))
+    line = told.splitlines().index("# F\u00fcgung") + 1
+    assert f"session.toml line {line}: not UTF-8 text" in refusal(session)
+
+
+BROKEN = [
+    ("view,target,x,y\nv0,a,1,2\n", "no column 'z'"),
+    ("view,target,x,y,z\nv0,a,1,2,3\nv0,a,1,2,3\n", "line 3"),
+    ("view,target,x,y,z\nnobody,a,1,2,3\n", "line 2"),
+    ("view,target,x,y,z\nv0,a,1,two,3\n", "y is 'two'"),
+    ("view,target,x,y,z,sigma\nv0,a,1,2,3,-1\n", "sigma is -1"),
+    ("view,target,x,y,z\nv0,,1,2,3\n", "target is empty"),
+    ("view,target,x,y,z\n", "no rows"),
+]
+
+
+@pytest.mark.parametrize(("text", "told"), BROKEN)
+def test_broken_points_are_refused_in_one_line(text, told, tmp_path):
+    session, *_ = labelled_cell(0, views=3)
+    folder = write_labelled(tmp_path / "s", session)
+    (folder / "points.csv").write_text(text)
+    with pytest.raises(InputError, match=told) as error:
+        load_session(folder)
+    assert "\n" not in str(error.value)
+
+
+def moved(session, change):
+    """The session with its cloud's or target's points changed."""
+
+    def view_of(view):
+        if view.cloud is not None:
+            return replace(view, cloud=replace(view.cloud, points=change(view.cloud.points)))
+        return replace(view, sighting=replace(view.sighting, points=change(view.sighting.points)))
+
+    return replace(session, views=tuple(view_of(view) for view in session.views))
+
+
+@pytest.fixture(params=["clouds", "points"])
+def right(request):
+    if request.param == "clouds":
+        return load_session(request.getfixturevalue("session"))
+    return labelled_cell(3, views=12)[0]
+
+
+def test_a_right_session_passes(right):
+    check_scale(right, "mm")
+
+
+def test_the_origin_may_lie_in_the_measuring_volume(right):
+    """Points about the sensor's origin: the median distance is a few millimetres, the size is what it was."""
+    middle = np.mean([
+        np.mean(v.cloud.points if v.cloud is not None else v.sighting.points, axis=0) for v in right.views
+    ], axis=0)  # fmt: skip
+    check_scale(moved(right, lambda points: points - middle), "mm")
+    check_scale(moved(right, lambda points: points - points.mean(axis=0)), "mm")
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_another_unit_is_refused(right, factor):
+    with pytest.raises(InputError, match="the scale looks off by 1000"):
+        check_scale(moved(right, lambda points: points * factor), "mm")
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_one_cloud_in_another_unit_is_told_from_a_session_in_another_unit(session, factor):
+    """Whichever unit the session states, its advice leads to the one odd cloud and not back."""
+    right = load_session(session)
+    first, *others = right.views
+    odd = replace(first, cloud=replace(first.cloud, points=first.cloud.points * factor))
+    mixed = replace(right, views=(*others, odd))
+    with pytest.raises(InputError, match=f"view {first.name} .* that cloud alone is in another unit .* in mm$"):
+        check_scale(mixed, "mm")
+    with pytest.raises(InputError, match='set cloud_unit = "mm"'):
+        check_scale(moved(mixed, lambda points: points * 1000), "m")
+
+
+def test_one_stray_point_is_named(session):
+    file = sorted((session / "clouds").iterdir())[1]
+    points = read_cloud(file).points
+    points[7, 2] = 1e30
+    np.savetxt(file.with_suffix(".xyz"), points)
+    edit(session / "views.csv", file.name, file.with_suffix(".xyz").name)
+    with pytest.raises(InputError, match=r"view v001 .* 1 of \d+ points lie more than 1000 m .* point 8; to fix"):
+        load_session(session)
+
+
+quick = settings(
+    max_examples=60, deadline=timedelta(seconds=5), suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+CELL = st.one_of(
+    st.floats(allow_nan=True).map(str),
+    st.integers().map(str),
+    st.text(max_size=8),
+    st.sampled_from(["v0", "v1", "", "1"]),
+)
+JSON = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@contextlib.contextmanager
+def read_or_refused():
+    try:
+        yield
+    except InputError as error:
+        assert str(error) and "\n" not in str(error)
+
+
+def any_table(header, rows):
+    def cell(text):
+        return '"' + text.replace('"', '""') + '"'
+
+    return "\n".join([",".join(header), *(",".join(cell(c) for c in row) for row in rows)])
+
+
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "xyz", "csv"])
+@quick
+@given(data=st.data())
+def test_bytes_that_are_no_cloud(tmp_path, suffix, data):
+    start = {"ply": b"ply\nformat ", "pcd": b"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"}.get(suffix, b"")
+    file = tmp_path / f"c.{suffix}"
+    file.write_bytes(start * data.draw(st.booleans()) + data.draw(st.binary(max_size=300)))
+    with read_or_refused():
+        cloud = read_cloud(file)
+        assert len(cloud.points) and np.isfinite(cloud.points).all()
+
+
+@quick
+@given(
+    count=st.integers(-5, 10**15),
+    encoding=st.sampled_from(["ascii", "binary", "binary_compressed"]),
+    body=st.binary(max_size=200),
+    sizes=st.lists(st.integers(-1, 9), min_size=3, max_size=3),
+)
+def test_headers_that_promise_anything(tmp_path, count, encoding, body, sizes):
+    told = " ".join(map(str, sizes))
+    header = f"FIELDS x y z\nSIZE {told}\nTYPE F U I\nCOUNT 1 1 1\nPOINTS {count}\nDATA {encoding}\n"
+    (tmp_path / "c.pcd").write_bytes(header.encode() + body)
+    kind = {"binary": "binary_little_endian"}.get(encoding, encoding)
+    header = f"ply\nformat {kind} 1.0\nelement vertex {count}\nproperty float x\nproperty int y\nproperty float z\n"
+    (tmp_path / "c.ply").write_bytes(header.encode() + b"end_header\n" + body)
+    for name in ("c.pcd", "c.ply"):
+        with read_or_refused():
+            assert len(read_cloud(tmp_path / name).points) <= max(count, 0)
+
+
+@quick
+@given(rows=st.lists(st.lists(CELL, min_size=9, max_size=9), max_size=4), width=st.integers(1, 9))
+def test_tables_of_anything(tmp_path, rows, width):
+    pose = ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    readers = {
+        "views.csv": (["view", "cloud", *pose], lambda file: read_views(file, None)),
+        "points.csv": (["view", "target", *pose], lambda file: read_points(file, ["v0", "v1"])),
+        "frames.csv": (["view", "note", *pose], lambda file: read_frames(file, ["v0", "v1"])),
+    }
+    for name, (header, read) in readers.items():
+        (tmp_path / name).write_text(
+            any_table(header[: max(width, 5)] if width < 9 else header, rows), encoding="utf-8"
+        )
+        with read_or_refused():
+            read(tmp_path / name)
+
+
+@quick
+@given(text=st.text(max_size=200), value=JSON, key=st.sampled_from(["name", "scanner", "robot", "part", "sphere"]))
+def test_descriptions_of_anything(tmp_path, text, value, key):
+    file = tmp_path / "session.toml"
+    file.write_text(f'format = "stitch-session/1"\n{text}', encoding="utf-8")
+    with read_or_refused():
+        read_session_document(file)
+    tables = {key: value} if key == "name" else {key: value if isinstance(value, dict) else {}}
+    inner = tables[key] if isinstance(tables[key], dict) else {}
+    for read in (
+        lambda: session_name(file, {"name": value}),
+        lambda: read_scanner(file, inner | {"pose": value, "noise": value}),
+        lambda: read_crop_box(file, inner | {"within": value}),
+        lambda: read_robot(file, {"joints": value, "gravity": value}, "mm"),
+        lambda: read_robot(file, {"joints": [{"a": value, "com": value}], "payload": value}, "mm"),
+        lambda: read_robot(file, {"urdf": value}, "mm"),
+        lambda: cad_file(file, {"cad": value, "cad_unit": value}),
+        lambda: positive_number(file, {"radius": value}, "sphere", "radius"),
+    ):
+        with read_or_refused():
+            read()
+
+
+@quick
+@given(value=JSON, key=st.sampled_from(["session", "views", "stages", "hand_eye", "effects", "notes", "convergence"]))
+def test_results_of_anything(tmp_path, value, key):
+    for name, read in (("result.json", read_result), ("ledger.json", read_ledger)):
+        for told in (value, {key: value}, [{key: value}]):
+            (tmp_path / name).write_text(json.dumps(told))
+            with read_or_refused():
+                read(tmp_path)

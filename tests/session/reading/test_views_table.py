@@ -1,4 +1,6 @@
-"""views.csv: joints, poses, times and covariates."""
+"""views.csv: joints, poses, times, loads and covariates."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from data_synth.fixtures.edits import edit
 from stitch.errors import InputError
 from stitch.session.reading.robot_description import robot_from_dh
 from stitch.session.reading.session_folder import load_session
+from stitch.session.reading.views_table import require_loads
 from stitch.session.robot import forward
 
 JOINTS = [
@@ -107,3 +110,25 @@ def test_robot_with_another_number_of_joints(session):
     joints_session(session, ["a,clouds/v000.ply,10,20"], "view,cloud,j1_deg,j2_deg")
     with pytest.raises(InputError, match="2 joint columns, but the robot has 3"):
         load_session(session)
+
+
+BOTH = ["j1_torque_nm", "j2_torque_nm"]
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "told"),
+    [
+        (BOTH, [["5", "-6"], ["7", "8"]], None),
+        (BOTH, [["", ""], ["", ""]], None),
+        (BOTH[:1], [["5"], ["6"]], "line 1: torques of j1_torque_nm, but the table has 2 joints"),
+        ([*BOTH, "j3_torque_nm"], [["5", "6", "7"]], "line 1: torques of .*j3_torque_nm, but the table has 2 joints"),
+        (BOTH, [["5", "6"], ["7", ""]], "line 3: j2_torque_nm is ''; write a number in every row"),
+        (BOTH, [["5", "6e9"]], "line 2: j2_torque_nm is 6e.09, as on no arm; to fix: correct its unit"),
+    ],
+)
+def test_torques_are_whole_or_refused(header, rows, told):
+    cells = [(line, dict(zip(header, row, strict=True))) for line, row in enumerate(rows, 2)]
+    if told is None:
+        return require_loads(Path("views.csv"), header, cells, joints=2)
+    with pytest.raises(InputError, match=told):
+        require_loads(Path("views.csv"), header, cells, joints=2)

@@ -1,4 +1,4 @@
-"""What the flange carries and what drives report, view by view, against virtual work and an arm that sags by hand."""
+"""What effects know of the views: torques against virtual work, what friction within play leaves behind, gaps of columns."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from data_synth.fixtures.labelled_arm import flange, labelled_cell
 from stitch.api.pipeline import run
 from stitch.cli.check import session_summary
 from stitch.session.measurement import views_of
-from stitch.session.notes import payload_note
+from stitch.session.notes import gaps_note, payload_note
 from stitch.session.torques import torques_of
 
 GRAVITY = 9.81
@@ -85,3 +85,52 @@ def test_torques_that_drives_report_take_the_place_of_those_of_gravity():
     np.testing.assert_array_equal(views.sag(np.eye(6)[1])[:, 1], -drives[:, 1])
     some = tuple(replace(view, covariates={"j1_torque_nm": 1.0}) for view in session.views)
     assert not views_of(replace(session, views=some)).torques.measured
+
+
+THERE_AND_BACK = np.array([0.0, 0.1, 0.5, 1.0, 0.9, 0.7, 0.5, 0.6, 0.9])
+# Within 0.2: dragged from 0.5 on; at rest at 0.8 until the joint is below 0.6; dragged back to 0.7; at rest again.
+STAYS_AT = np.array([0.0, 0.0, 0.3, 0.8, 0.8, 0.8, 0.7, 0.7, 0.7])
+
+
+@pytest.fixture
+def views():
+    session, *_ = labelled_cell(0, views=len(THERE_AND_BACK))
+    known = views_of(session)
+    joints = known.joints.copy()
+    joints[:, 2] = THERE_AND_BACK
+    return replace(known, joints=joints, path=joints)
+
+
+def test_a_joint_that_comes_back_leaves_it_behind_until_the_play_is_over(views):
+    np.testing.assert_allclose(views.behind(2, 0.2), STAYS_AT - THERE_AND_BACK, atol=1e-12)
+
+
+def test_some_of_the_views_remember_those_between(views):
+    keep = [3, 6, 8]
+    np.testing.assert_allclose(views.only(keep).behind(2, 0.2), (STAYS_AT - THERE_AND_BACK)[keep], atol=1e-12)
+
+
+def test_a_pose_that_nobody_took_yet_is_approached_from_the_last_one(views):
+    there = np.array([[0.8], [0.95], [0.2]])
+    joints = np.repeat(views.joints[-1:], 3, axis=0)
+    joints[:, 2:3] = there
+    asked = replace(views, count=3, joints=joints, number=np.full(3, len(THERE_AND_BACK)))
+    np.testing.assert_allclose(asked.behind(2, 0.2), [0.7 - 0.8, 0.75 - 0.95, 0.4 - 0.2], atol=1e-12)
+
+
+def test_a_column_with_a_gap_is_told_and_not_used():
+    session = labelled_cell(3, views=5)[0]
+    assert gaps_note(session) == ""
+    full = replace(session, views=[replace(v, covariates={"hall": 20.0}) for v in session.views])
+    assert gaps_note(full) == "" and views_of(full).has("hall")
+    gap = replace(full, views=[*full.views[:3], *(replace(v, covariates={}) for v in full.views[3:])])
+    first = gap.names[3]
+    assert gaps_note(gap) == f"Not used, since some views have none: hall ({first} and 1 more without)."
+    assert not views_of(gap).has("hall")
+
+
+def test_so_is_a_time_or_a_pose_of_joints_that_is_missing_once():
+    session = labelled_cell(3, views=5)[0]
+    views = [*session.views[:4], replace(session.views[4], time_s=None, joints=None)]
+    told = gaps_note(replace(session, views=views))
+    assert ("time_s" in told) == any(v.time_s is not None for v in views) and "joint angles (" in told

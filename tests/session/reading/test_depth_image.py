@@ -1,4 +1,4 @@
-"""Depth images written by OpenCV, NumPy and OpenEXR, with intrinsics as tools write them: points against the formula."""
+"""Depth images of OpenCV, NumPy and OpenEXR, with intrinsics as tools write them: points against the formula."""
 
 import json
 

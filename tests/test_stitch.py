@@ -1,0 +1,299 @@
+"""What `import stitch` offers, what it loads before it does anything, and that a wheel runs where nothing else is installed."""
+
+import ast
+import inspect
+import json
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import textwrap
+import tomllib
+import venv
+from contextlib import chdir
+from importlib import import_module, util
+from pathlib import Path
+from zipfile import ZipFile
+
+import numpy as np
+import pytest
+
+import stitch
+from data_synth.fixtures.blade_cells import measured_blade
+
+# How the docstring of a function begins.
+VERBS = {"Compute", "Find", "Fit", "Read", "Return", "Stitch", "Write"}
+
+
+def imported_for_type_checkers():
+    """Names and modules of the package's stub, names exported by `as` alone."""
+    tree = ast.parse(Path(stitch.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    return {(alias.asname, node.module) for node in imports for alias in node.names if alias.asname == alias.name}
+
+
+@pytest.mark.parametrize("name", stitch.__all__)
+def test_every_public_name_resolves_in_its_module(name):
+    module = import_module(stitch.MODULES[name])
+    assert getattr(stitch, name) is getattr(module, name)
+    # Where it is written, and not a module that happens to import it.
+    assert getattr(stitch, name).__module__ == module.__name__
+
+
+def test_one_table_gives_the_names_the_directory_and_the_types():
+    assert stitch.__all__ == sorted(stitch.MODULES)
+    assert set(stitch.__all__) <= set(dir(stitch))
+    assert imported_for_type_checkers() == set(stitch.MODULES.items())
+    assert all(util.find_spec(module) for module in stitch.MODULES.values())
+
+
+def test_the_version_is_that_of_the_project():
+    project = tomllib.loads((Path(stitch.__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    assert stitch.__version__ == project["project"]["version"] and "__version__" in dir(stitch)
+
+
+def test_another_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'stitch' has no attribute 'stich'"):
+        stitch.stich  # noqa: B018
+
+
+@pytest.mark.parametrize("name", stitch.__all__)
+def test_every_public_name_says_what_it_returns_or_is(name):
+    public = getattr(stitch, name)
+    first, *_ = inspect.getdoc(public).split(maxsplit=1)
+    if inspect.isclass(public):
+        # What dataclass writes where nobody does begins with the name and its arguments.
+        assert not public.__doc__.startswith(f"{name}(")
+        assert re.fullmatch(r"[A-Z]\w+,?", first) and first not in {"What", "How", "Everything", "Whether"}
+    else:
+        assert first in VERBS
+
+
+def test_the_package_alone_is_imported_at_once():
+    """The best of three: another process may be at work."""
+    code = "import time; began = time.perf_counter(); import stitch; print(time.perf_counter() - began)"
+    runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True) for _ in range(3)]
+    assert min(float(run.stdout) for run in runs) <= 0.15
+
+
+def test_the_example_of_the_package_runs(tmp_path, capsys):
+    code = stitch.__doc__.split("\n", 1)[1]
+    cell = measured_blade(0, views=6, mount="eye_in_hand", pixels=50)
+    names = {"clouds": [cloud.points for cloud in cell.clouds], "poses": np.array(cell.T_base_flange)}
+    with chdir(tmp_path):
+        exec(compile(code, "the docstring of stitch", "exec"), names)
+    assert capsys.readouterr().out.strip()
+    assert names["run"].effects == ["range_scale"]
+    assert (tmp_path / "runs" / "blade-17" / "result.json").is_file()
+    assert stitch.drop(names["run"], "range_scale").effects == []
+
+
+DEAR = {"scipy.stats", "matplotlib", "rerun", "trimesh", "open3d", "dask", "distributed", "cv2", "jsonschema"}
+# What a command needs to say what it could do.
+LIGHT = DEAR | {"numpy", "scipy", "pyarrow", "asyncio"}
+
+
+def loaded(code):
+    """Modules of a process that has run some code."""
+    told = f"import json, sys\n{code}\nprint('modules', json.dumps(list(sys.modules)))"
+    out = subprocess.run([sys.executable, "-c", told], capture_output=True, check=False, text=True)
+    assert not out.returncode, out.stderr
+    return set(json.loads(out.stdout.rpartition("modules ")[2]))
+
+
+@pytest.mark.parametrize(
+    ("module", "also_without"),
+    [("stitch", {"numpy"}), ("stitch.cli.main", LIGHT), ("stitch.cli.run", set())],
+)
+def test_dear_libraries_are_loaded_when_they_are_needed(module, also_without):
+    assert not loaded(f"import {module}") & (DEAR | also_without)
+
+
+def test_a_run_loads_nothing_of_the_diagnosis():
+    """Nor of plug-ins, pictures and meshes: all that it needs from the first file to the page."""
+    on_use = "from stitch.system.process import load_on_use; load_on_use('numpy.f2py', 'numpy.testing')\n"
+    modules = loaded(f"{on_use}import stitch.cli.run, stitch.api.pipeline, stitch.output.run_folder, viz.run_page")
+    assert {"stitch.fusion.register", "scipy.optimize", "numpy.f2py"} <= modules
+    without = {"scipy.cluster", "scipy.interpolate", "scipy.ndimage", "yaml", "numpy.f2py.rules", "unittest"}
+    assert not modules & (DEAR | without | {"stitch.diagnosis", "stitch.plugins"})
+    asked = "import scipy.optimize, numpy; numpy.testing.assert_allclose(1, 1); numpy.f2py.run_main"
+    assert {"numpy.f2py.rules", "unittest"} <= loaded(on_use + asked)
+
+
+def test_a_run_from_arrays_loads_no_plug_in_but_the_search_of_a_convention():
+    code = """
+import numpy, stitch
+from data_synth.fixtures.blade_cells import measured_blade
+cell = measured_blade(0, views=4, mount="eye_in_hand", pixels=30)
+clouds, poses = [cloud.points for cloud in cell.clouds], numpy.array(cell.T_base_flange)
+stitch.run(stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", check=CHECK))
+"""
+    plug_ins = {name for name in loaded(code.replace("CHECK", "False")) if name.startswith("stitch.plugins")}
+    assert not plug_ins
+    searching = {name for name in loaded(code.replace("CHECK", "True")) if name.startswith("stitch.plugins.")}
+    assert searching and all(name.startswith("stitch.plugins.intake") for name in searching)
+
+
+def test_scans_are_read_and_prepared_while_scipy_is_loaded():
+    assert "scipy" not in loaded("import stitch.session.reading.session_folder, stitch.session.capture")
+
+
+@pytest.mark.parametrize("line", ["--version", "--help"])
+def test_the_list_of_commands_loads_no_mathematics(line):
+    code = f"from stitch.cli.main import main\ntry:\n    main({line.split()})\nexcept SystemExit:\n    pass"
+    assert not loaded(code) & LIGHT
+
+
+def test_no_command_s_help_loads_mathematics():
+    """In one process, one after another: the first that loads something dear is named."""
+    code = f"""
+import sys
+import typer
+from stitch.cli.main import build
+
+def helps(group, words=()):
+    for name in group.commands:
+        command = group.commands[name]
+        yield " ".join((*words, name)), command.get_help(typer.Context(command, info_name=name))
+        yield from helps(command, (*words, name)) if hasattr(command, "commands") else ()
+
+told = 0
+for name, text in helps(typer.main.get_command(build())):
+    dear = {LIGHT!r} & set(sys.modules)
+    assert not dear, f"stitch {{name}} --help loads {{sorted(dear)}}"
+    told += "Examples:" in text
+assert told > 25, told
+"""
+    assert not loaded(code) & LIGHT
+
+
+def test_an_arm_without_meshes_needs_no_library_of_meshes():
+    assert "trimesh" not in loaded("import viz.recording, viz.run_page")
+
+
+def test_a_batch_on_one_process_needs_no_cluster():
+    assert not loaded("import stitch.plugins.watch.batch.command") & {"distributed", "dask", "tornado", "asyncio"}
+
+
+def test_page_recording_and_diagnosis_are_drawn_without_a_plotting_library():
+    assert "matplotlib" not in loaded("import viz.recording, viz.run_page, viz.sections, viz.two_runs_page")
+
+
+# What displays, cameras and their drivers bring to a machine, and a bare one lacks.
+STRIPPED = """
+    import ctypes
+    import sys
+    real = ctypes.CDLL.__init__
+    def stripped(self, name, *args, **kwargs):
+        if any(lacking in str(name) for lacking in ("libusb", "libEGL", "libGL", "libX11")):
+            raise OSError(f"{name}: as on a bare machine")
+        real(self, name, *args, **kwargs)
+    ctypes.CDLL.__init__ = stripped
+    sys.modules["open3d"] = None
+"""
+# Parts of every Debian: the C library's and the compiler's. Pillow looks for fribidi and does without.
+C_LIBRARY = ("libm.so", "librt.so", "libdl.so", "libpthread.so", "libutil.so")
+ALWAYS = (*C_LIBRARY, "libstdc++.so", "libgcc_s.so", "libfribidi.so")
+
+
+def run_python(code: str) -> str:
+    """Standard output of a fresh interpreter; loading a library cannot be undone in this one."""
+    code = textwrap.dedent(STRIPPED) + textwrap.dedent(code)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_scan_motions_mesh_and_cad_in_a_stripped_environment():
+    said = run_python("""
+        import numpy as np
+        from data_synth.fixtures.blade_cells import captured_blade
+        from stitch.plugins.cells import cad, scan_to_cad
+        from stitch.fusion.fuse import fuse
+        from stitch.fit.coarse import motion_candidates
+        from stitch.output.mesh import mesh_of
+        measured, capture = captured_blade(0, views=4, pixels=60)
+        assert motion_candidates([capture])
+        fused = fuse(capture, measured.T_reference_scanner)
+        assert len(mesh_of(fused.points, fused.normals).triangles)
+        found = cad.nearest_partners(cad.cad_surface(measured.mesh), fused.points, fused.normals)
+        print(float(np.median(np.abs(found.distance))) < 0.1)
+    """)
+    assert said == "True"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads which libraries are mapped from /proc")
+def test_every_library_comes_with_python_or_a_package():
+    mapped = """
+        def mapped():
+            paths = {line.split()[-1] for line in open("/proc/self/maps") if ".so" in line}
+            return {path.rsplit("/", 1)[1] for path in paths if "site-packages" not in path and "lib-dynload" not in path}
+    """
+    everything = """
+        import importlib, pkgutil
+        # Python's own modules may load the system's ssl, sqlite and the like, which a Python always has.
+        import bz2, ctypes, lzma, readline, sqlite3, ssl, uuid, zlib, pyexpat
+        before = mapped()
+        import data_synth, stitch, viz
+        for package in (stitch, data_synth, viz):
+            for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+                importlib.import_module(module.name)
+        import embreex.rtcore_scene, kiss_icp.registration, manifold3d, matplotlib.pyplot, pyarrow.parquet, rerun
+        print(*sorted(mapped() - before))
+    """
+    beyond = run_python(textwrap.dedent(mapped) + textwrap.dedent(everything)).split()
+    assert [name for name in beyond if not name.startswith(ALWAYS)] == []
+
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel of this checkout."""
+    folder = tmp_path_factory.mktemp("wheel")
+    # A build writes into its source, and packs what an earlier one left there.
+    left_out = shutil.ignore_patterns(".*", "build", "*.egg-info", "__pycache__", "tests", "bench", "docs")
+    source = shutil.copytree(ROOT, folder / "source", ignore=left_out)
+    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", folder, source]
+    subprocess.run(pip, check=True, cwd=folder, capture_output=True)
+    (built,) = folder.glob("stitch-*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def environment(wheel, tmp_path_factory):
+    """The bin folder of an environment with the wheel; what it depends on is that of this environment."""
+    folder = tmp_path_factory.mktemp("environment") / "venv"
+    venv.create(folder, with_pip=False)
+    (packages,) = folder.glob("lib/python*/site-packages")
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    python = folder / "bin" / "python"
+    pip = [python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--force-reinstall", wheel]
+    subprocess.run(pip, check=True, cwd=folder, capture_output=True)
+    return folder / "bin"
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_data_types_and_licence(wheel):
+    names = set(ZipFile(wheel).namelist())
+    assert {"stitch/py.typed", "stitch/__main__.py", "data_synth/scenes/blade.toml"} <= names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    for room in ("stitch", "viz", "data_synth"):
+        tracked = {p.relative_to(ROOT).as_posix() for p in (ROOT / room).rglob("*") if p.is_file()}
+        assert {name for name in tracked if "__pycache__" not in name} <= names
+
+
+@pytest.mark.slow
+def test_the_installed_program_runs_outside_the_checkout(environment, tmp_path):
+    def run(*arguments):
+        return subprocess.run(arguments, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+
+    place = run(environment / "python", "-c", "import stitch; print(stitch.__file__)")
+    assert place.startswith(str(environment.parent))
+    version = run(environment / "python", "-m", "stitch", "--version")
+    assert version == run(environment / "stitch", "--version")
+    run(environment / "stitch", "synth", "blade", "cell", "--views", "6", "--seed", "3")
+    run(environment / "stitch", "run", "cell", "-o", "found")
+    assert {"result.json", "report.html", "recording.rrd"} <= {p.name for p in (tmp_path / "found").iterdir()}
