@@ -45,7 +45,7 @@ LONGEST = (
     "test_review.py",
     "test_blade_diagnosis.py",
     "test_diagnose.py",
-    "test_admission.py",
+    "test_view_screening.py",
     "test_run_folder.py",
     "test_window.py",
     "test_correct.py",

@@ -1,4 +1,4 @@
-"""Every mistake with poses is named from the motions of the scanner alone, made here from known poses."""
+"""Every mistake with poses is named from the motions of the scanner alone, made here from known poses; and on scans."""
 
 from dataclasses import replace
 
@@ -6,13 +6,26 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.quiet_scenes import simulated, with_part
+from data_synth.scene import load_scene
 from stitch.numerics import frames
+from stitch.run_data import doubt_headline
 from stitch.screening.conventions import likeliest_hypotheses, proven_hypotheses, rank_hypotheses
-from stitch.screening.hypotheses import hypotheses
+from stitch.screening.deep_check import deep_check
+from stitch.screening.hypotheses import hypotheses, scale_text
 from stitch.screening.motions import RelativeScans
 from stitch.screening.target_checks import check_targets
+from stitch.session.robot import forward
 from tests.screening.mistakes import MISTAKES, with_poses
+
+JOINTS = {
+    "j2 counts the other way": lambda q: q * [1, -1, 1, 1, 1, 1],
+    "j2 and j3 count the other way": lambda q: q * [1, -1, -1, 1, 1, 1],
+    "write j3 + j2 in place of j3": lambda q: q - np.outer(q[:, 1], [0, 0, 1, 0, 0, 0]),
+    "j4 alone is in radians": lambda q: q * [1, 1, 1, np.pi / 180, 1, 1],
+}
 
 
 def motions(session, T_mount, seed=0):
@@ -122,3 +135,90 @@ def test_undoing_every_order_of_euler_angles_is_among_the_hypotheses():
         tried = hypotheses(with_poses(session, bad))
         off = min(np.abs(h.T_base_flange - T).max() for h in tried if h.kind == "euler")
         assert off < 1e-6, (right, wrong)
+
+
+def with_joints(session, change):
+    """The session whose table states other joint angles (V, 6), and poses that follow from them."""
+    q = change(np.array([view.joints for view in session.views]))
+    every = zip(session.views, q, forward(session.robot, q), strict=True)
+    return replace(session, views=tuple(replace(v, joints=own, T_base_flange=T) for v, own, T in every))
+
+
+@pytest.mark.parametrize("said", JOINTS)
+def test_joints_that_count_otherwise_are_named(said):
+    (problem,) = check_targets(with_joints(labelled_cell(seed=4, views=12)[0], JOINTS[said]))
+    assert said in problem.fix
+
+
+@pytest.mark.parametrize("mount", ["eye_to_hand", "eye_in_hand"])
+def test_what_moved_as_a_whole_is_named_with_the_row(mount):
+    session, D = (
+        labelled_cell(seed=2, views=400, mount=mount)[0],
+        frames.exp(np.array([0.02, -0.03, 0.05, 40, -25, 10])),
+    )
+    for start in (97, 311):
+        views = list(session.views)
+        for v in range(start, 400):
+            shown = views[v].sighting
+            T = views[v].T_base_flange
+            moved = (
+                replace(views[v], sighting=replace(shown, points=frames.transform(D, shown.points)))
+                if mount == "eye_to_hand"
+                else replace(views[v], T_base_flange=D @ T, joints=None)
+            )
+            views[v] = moved
+        (problem,) = check_targets(replace(session, views=tuple(views)))
+        assert problem.kind == "reclamped" and problem.views[0] == session.names[start]
+
+
+def test_a_rail_beside_the_poses_is_named_with_its_axis():
+    """The robot rides along y; the table has its poses within the carriage, and the carriage's place in metres."""
+    session, T_mount = cell_of("eye_in_hand")
+    rail = np.linspace(0, 700, len(session.views)) + np.random.default_rng(0).normal(size=len(session.views)) * 80
+    T = np.array([view.T_base_flange for view in session.views])
+    seen = motions(session, T_mount)
+    inner = with_poses(session, frames.make(T[:, :3, :3], T[:, :3, 3] - np.outer(rail, [0, 1, 0])))
+    beside = [replace(v, covariates={"e1": e / 1000, "force": 3.0}) for v, e in zip(inner.views, rail, strict=True)]
+    found = proven_hypotheses(rank_hypotheses(replace(inner, views=tuple(beside)), seen))
+    assert found[0].hypothesis.kind == "linear_axis"
+    assert "write y + 1000 * e1 in place of y" in found[0].hypothesis.fix
+
+
+@pytest.mark.parametrize("scale", [1.0254, 0.97, 25.4, 1000.0, 0.001])
+def test_a_possible_factor_is_printed(scale):
+    assert f"the clouds are {scale:.5g} times as large" in scale_text(scale)
+
+
+@pytest.mark.parametrize("scale", [-0.0003, 0.0, -1.0, 1e-5, 4e4, 0.1318, 3.0])
+def test_an_impossible_factor_is_not_printed(scale):
+    said = scale_text(scale)
+    assert f"{scale:.5g} times" not in said
+    assert said == (
+        "The robot's positions do not explain how the scanner moved; its rotations do; to fix: is an axis missing "
+        "(column E1), or a column mixed up?"
+    )
+
+
+def test_a_factor_near_that_of_a_unit_is_that():
+    assert "the clouds are 10 times as large" in scale_text(9.9525)
+
+
+def test_the_headline_of_a_doubt_ends_before_what_to_do():
+    assert doubt_headline("ball3 creeps; to fix: leave it out, and measure again.") == "ball3 creeps."
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mistake", ["euler", "quaternion"])
+def test_a_convention_is_named_on_a_plate_with_holes(mistake):
+    scene = with_part(
+        load_scene("blade-table"), "curved_drill_plate", length=150.0, width=120.0, pitch=36.0, radius=150.0
+    )
+    scene = replace(scene, scanner=replace(scene.scanner, columns=100, rows=100))
+    session = session_of(simulated(scene, {}, 31, 12))
+    T = np.array([view.T_base_flange for view in session.views])
+    R = Rotation.from_matrix(T[:, :3, :3])
+    wrong = Rotation.from_euler("xyz", R.as_euler("ZYX")) if mistake == "euler" else R.inv()
+    poses = frames.make(wrong.as_matrix(), T[:, :3, 3])
+    views = zip(session.views, poses, strict=True)
+    session = replace(session, views=tuple(replace(v, T_base_flange=pose, joints=None) for v, pose in views))
+    assert [p.kind for p in deep_check(session)] == [mistake]

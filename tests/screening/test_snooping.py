@@ -1,4 +1,4 @@
-"""Views that do not belong, in a cell of known truth: found, named, and where they really stood."""
+"""Views that do not belong, in cells of known truth: what links and contradicts them, and where they really stood."""
 
 from dataclasses import replace
 
@@ -7,12 +7,15 @@ import pytest
 
 from data_synth.fixtures.blade_cells import captured_blade
 from stitch.numerics import frames
+from stitch.screening.linkage import Link, find_contradicting_views, linkage_of_links
 from stitch.screening.motions import register_scan_pairs
 from stitch.screening.placement import lies_in_a_line
 from stitch.screening.snooping import snoop_views
 from stitch.session.scan import prepare_scan
 
 GATE, OFF = 2.5, 6
+POSES = np.tile(np.eye(4), (3, 1, 1))
+TOLERANCE, SIZE = 0.1, 100.0
 
 
 @pytest.fixture(scope="module")
@@ -77,3 +80,66 @@ def test_motions_between_scans_are_those_of_the_cell(cell):
     off = frames.angle_between(true, found.T)
     assert len(found.pairs) >= 8
     assert np.mean(off < 2e-3) > 0.7
+
+
+def links(*pairs, share=1.0, count=100):
+    return [Link(v, w, count, share) for v, w in pairs]
+
+
+def test_a_chain_is_one_component_and_its_ends_hang_by_one_pair():
+    found = linkage_of_links(5, links((0, 1), (1, 2), (2, 3), (3, 4)))
+    assert found.components == ((0, 1, 2, 3, 4),)
+    assert found.single == ((0, 1), (4, 3))
+
+
+def test_in_a_ring_nothing_hangs_by_one_pair():
+    found = linkage_of_links(6, links(*((v, (v + 1) % 6) for v in range(6))))
+    assert (found.single, found.unlinked) == ((), ())
+
+
+def test_two_rings_are_two_groups():
+    found = linkage_of_links(7, links((0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 6), (6, 3)))
+    assert found.components == ((3, 4, 5, 6), (0, 1, 2))
+
+
+def test_pairs_that_lie_near_without_closing_link_nothing():
+    found = linkage_of_links(3, [*links((0, 1)), *links((1, 2), share=0.2)])
+    assert found.unlinked == (2,)
+    assert linkage_of_links(3, [*links((0, 1)), *links((1, 2), count=5)]).unlinked == (2,)
+
+
+def test_a_view_without_any_pair_is_unlinked_and_not_a_group():
+    found = linkage_of_links(3, links((0, 1)))
+    assert found.unlinked == (2,)
+
+
+def plate(x=(-40.0, 40.0), raised=0.0, of=lambda x, y: x > 0):
+    """Points every 2 mm of a plate 300 mm before the scanner, some of them nearer."""
+    x, y = (c.ravel() for c in np.meshgrid(np.arange(*x, 2.0), np.arange(-40.0, 40.0, 2.0)))
+    return prepare_scan("plate", np.c_[x, y, 300.0 - raised * of(x, y)])
+
+
+def asked(scan):
+    return find_contradicting_views([plate(), scan, plate()], POSES, TOLERANCE, SIZE)
+
+
+def test_plates_in_one_place_do_not_contradict():
+    assert asked(plate()) == ()
+
+
+def test_half_of_a_scan_that_stands_elsewhere_is_told_near_and_far():
+    for raised in (-8.0, -1.0, 1.0, 5.0, 8.0):
+        assert asked(plate(raised=raised)) == (1,)
+
+
+def test_a_few_points_that_others_show_tell_nothing():
+    """Of a scan beside the others they show one row alone, and that elsewhere."""
+    beside = plate(x=(36.0, 60.0), raised=2.0, of=lambda x, y: (x < 40) & (np.abs(y) < 4))
+    assert asked(beside) == ()
+
+
+def test_groups_that_stand_apart_do_not_contradict_each_other():
+    poses = POSES.copy()
+    poses[2] = frames.exp(np.array([0, 0, 0, 0, 0, 3.0]))
+    assert find_contradicting_views([plate()] * 3, poses, TOLERANCE, SIZE) == (2,)
+    assert find_contradicting_views([plate()] * 3, poses, TOLERANCE, SIZE, groups=[(0, 1), (2,)]) == ()

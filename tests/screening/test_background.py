@@ -1,4 +1,4 @@
-"""What stands still before the scanner: walls of known place in simulated scans, and surfaces that only look still."""
+"""What scans show beside the part: squares and walls of known place in simulated scans, and what only looks still."""
 
 from dataclasses import replace
 
@@ -11,15 +11,76 @@ from stitch.api.pipeline import run
 from stitch.numerics import frames
 from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import run_verdict
-from stitch.screening.background import find_standing_scene, find_static_background
+from stitch.screening.background import find_occluder, find_standing_scene, find_static_background
 from stitch.screening.deep_check import deep_check
 from stitch.session.capture import part_size, prepare_capture
 from stitch.session.scan import prepare_scan
 from stitch.session.session import Cloud
 
+BLADE_VIEWS, SQUARE_SIDE, SQUARE_POINTS = 10, 8.0, 300
 TOLERANCE = 0.1
 SIDE = np.arange(-40.0, 40.0, 1.0)
 GRID = np.stack(np.meshgrid(SIDE, SIDE), axis=-1).reshape(-1, 2)
+
+
+@pytest.fixture(scope="module")
+def blade():
+    return measured_blade(21, views=BLADE_VIEWS, pixels=80)
+
+
+def with_squares(blade, shown_by):
+    """Some scans with a square before the part, on the way to another scanner; in each before another one."""
+    session, T = session_of(blade), blade.T_reference_scanner
+    rng, views = np.random.default_rng(3), list(session.views)
+    for v in shown_by:
+        other = (v + BLADE_VIEWS // 2) % BLADE_VIEWS
+        flat = np.column_stack(
+            [rng.uniform(-SQUARE_SIDE / 2, SQUARE_SIDE / 2, (SQUARE_POINTS, 2)), np.zeros(SQUARE_POINTS)]
+        )
+        square = 0.8 * session.views[other].cloud.points.mean(axis=0) + flat
+        here = frames.transform(frames.inverse(T[v]) @ T[other], square)
+        views[v] = replace(views[v], cloud=Cloud(np.concatenate([views[v].cloud.points, here])))
+    return replace(session, views=tuple(views))
+
+
+def found_in(blade, session):
+    own = prepare_capture(session)
+    return find_occluder(own.scans, blade.T_reference_scanner, part_size([own]))
+
+
+def test_nothing_is_in_the_way_of_a_good_session(blade):
+    assert found_in(blade, session_of(blade)) is None
+
+
+@pytest.mark.parametrize("shown_by", [(4,), (1, 6), range(BLADE_VIEWS)])
+def test_what_others_look_through_is_said_with_the_views_and_its_share(blade, shown_by):
+    session = with_squares(blade, shown_by)
+    views, share = found_in(blade, session)
+    # A square that its scan sees from the edge has no normals, and does not count.
+    assert set(views) <= set(shown_by) and len(views) >= 0.5 * len(shown_by)
+    shares = [SQUARE_POINTS / len(session.views[v].cloud.points) for v in shown_by]
+    # Only what has the part behind it is looked through.
+    assert 0.3 * np.mean(shares) < share < 1.3 * np.mean(shares)
+
+
+@pytest.mark.parametrize(("edge", "in_the_way_of_it"), [(30.0, True), (0.0, False)])
+def test_what_stands_beside_all_looks_is_looked_through_by_none(edge, in_the_way_of_it):
+    """A strip before a wall, and one beside its end, where a face too steep to be seen may lead to it."""
+    x, y = np.meshgrid(np.arange(-60.0, edge + 0.5), np.arange(-40.0, 40.5))
+    wall = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 500.0)])
+    # Its rays pass the wall's end by less than the wall's points lie apart.
+    x, y = np.meshgrid(np.linspace(0.2, 1.0, 5), np.linspace(-20.0, 20.0, 60))
+    strip = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 500.0)]) * 0.9
+    scans = [prepare_scan("wall", wall), prepare_scan("strip", np.concatenate([strip, wall[:3000]]))]
+    found = find_occluder(scans, np.tile(np.eye(4), (2, 1, 1)), 100.0)
+    assert (found is not None and found[0] == (1,)) == in_the_way_of_it
+
+
+def test_a_run_and_a_deep_check_say_it_alike(blade):
+    session = with_squares(blade, (4,))
+    (said,) = run(session).doubts
+    assert "of what v004 shows stands where other scans see through" in said
+    assert [(p.kind, p.views) for p in deep_check(session)] == [("foreign", ("v004",))]
 
 
 @pytest.fixture(scope="module")

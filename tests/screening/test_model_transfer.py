@@ -1,4 +1,4 @@
-"""The model of another day: what moved since is said, what holds is not doubted, what no arm does is refused."""
+"""The model of another day, and an arm that sessions share: what holds is not doubted, what does not is said or refused."""
 
 from dataclasses import replace
 
@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import TARGETS, labelled_cell
-from stitch.api.pipeline import change, diagnose, run
+from stitch.api.pipeline import change, diagnose, run, run_rig
 from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.output.comparison.run_verdict import run_light, run_verdict
 from stitch.output.plain_finding import plain_finding, suggested_command
 from stitch.output.result_document import model_of
+from stitch.screening.model_transfer import compare_with_own_effects
+
+OFFSETS = np.array([0, 8e-4, -9e-4, 0, 1e-3, 0])
 
 
 def seen_by(session, T):
@@ -114,3 +117,29 @@ def test_targets_nobody_knows_and_one_view_alone_shows_are_placed_without_a_verd
     places = np.array([model.targets[name].position for name in names])
     assert np.linalg.norm(found.targets.landmarks.positions - places, axis=1).max() < 0.3
     assert "seen in one view alone" in run_verdict(found, None) and run_light(found, None, 0.1) is None
+
+
+def two_days(second):
+    """Two sessions, the joints of the second off by so much (6,), rad."""
+    found = [labelled_cell(50 + k, views=24, offset=off)[0] for k, off in enumerate((OFFSETS, second))]
+    return [replace(session, name=f"day {k}") for k, session in enumerate(found)]
+
+
+def test_two_arms_in_one_fit_are_doubted():
+    runs = run_rig(two_days(-OFFSETS), effects=["joint_offset"])
+    for k, r in enumerate(runs):
+        assert any(f"day {k} does not share the effects of this rig" in doubt for doubt in r.doubts)
+
+
+@pytest.mark.parametrize("effects", [["joint_offset"], ["joint_offset", "link_geometry"], []])
+def test_one_arm_is_not(effects):
+    assert not any("does not share" in doubt for r in run_rig(two_days(OFFSETS), effects=effects) for doubt in r.doubts)
+
+
+@pytest.mark.parametrize(("shared", "alone", "large"), [(0.296, 0.279, False), (0.511, 0.501, False), (0.6, 0.3, True)])
+def test_what_is_significant_is_said_only_where_it_is_large(shared, alone, large):
+    """Of 600 views a twentieth of the rms is beyond chance too."""
+    squares = np.random.default_rng(0).chisquare(3, 600) / 3
+    found = compare_with_own_effects("day 1", shared**2 * squares, alone**2 * squares, 6)
+    assert found.p_value < 1e-3 and found.large == large
+    assert found.separate_rms < found.expected_rms < 1.01 * found.separate_rms
