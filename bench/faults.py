@@ -32,8 +32,6 @@ from data_synth.fixtures.raw_folders import Convention, session_poses, table_of
 
 # The room, spoilt -> the arguments of the command that meets it.
 Spoil = Callable[[Path], list[str]]
-Rows = list[list[str]]
-Change = Callable[[Rows], Rows]
 
 RUN = ["run", "s", "-o", "out", "--no-recording"]
 NOISE = bytes(range(256)) * 40
@@ -66,7 +64,7 @@ def all_cases() -> Iterator[Case]:
     """Return every case."""
     listed = tomllib.loads(Path(__file__).with_name("faults.toml").read_text(encoding="utf-8"))["kind"]
     yield from chain.from_iterable(map(_listed, listed))
-    computed = (_tables, _cloud_headers, _points, _results, _disks, _terminals, _spreadsheets, _clocks, _others)
+    computed = (_tables, _cloud_headers, _points, _results, _disks, _terminals, _clocks, _others)
     yield from chain.from_iterable(source() for source in computed)
 
 
@@ -76,6 +74,8 @@ def _listed(kind: dict[str, Any]) -> Iterator[Case]:
     more: dict[str, Any] = {"fine": kind.get("fine", False)}
     if "writes" in kind:
         more["writes"] = tuple(kind["writes"])
+    if "right" in kind:
+        more["right"] = _poses_right
     prepare = _PREPARE[kind["prepare"]] if "prepare" in kind else lambda room: None
     for line in _repeated(kind.get("lines", "")).strip().splitlines():
         words = [*kind.get("before", "").split(), *line.split()]
@@ -153,7 +153,7 @@ def _edited(kind: dict[str, Any], edit: Sequence[str], count: int) -> Callable[[
     """Patterns and their replacements, one after the other."""
 
     def change(file: Path) -> None:
-        text = kind["text"] if "text" in kind else file.read_text(encoding="utf-8")
+        text = kind["text"] if "text" in kind else file.read_bytes().decode()
         for pattern, replacement in zip(edit[::2], edit[1::2], strict=True):
             text = re.sub(pattern, replacement, text, count=count)
         file.write_bytes(text.encode(kind.get("encoding", "utf-8")))
@@ -385,16 +385,16 @@ def _terminals() -> Iterator[Case]:
     yield Case("an effect that prints", "--json", chatty, fine=True, holds='{\n "format"')
 
 
-def _german(change: Change = lambda rows: rows, header: str = _HEADER) -> Callable[[Path], str]:
-    """A table as a German spreadsheet saves it: semicolons, decimal commas; `change` works on its cells."""
+def _german(clock: Sequence[str] = ()) -> Callable[[Path], str]:
+    """A table as a German spreadsheet saves it: semicolons, decimal commas; with times of day beside."""
 
     def text(session: Path) -> str:
         T, clouds = session_poses(session)
-        numbers = table_of(T, Convention(order="ZYX", degrees=True, angles_first=False))
-        cells = [[f"{x:.6f}".replace(".", ",") for x in row] for row in numbers]
-        names = [[str(i), Path(cloud).name] for i, cloud in enumerate(clouds, 1)]
-        rows = change([name + row for name, row in zip(names, cells, strict=True)])
-        return "\r\n".join([header, *map(";".join, rows)]) + "\r\n"
+        lines = [_HEADER + (";Uhrzeit" if clock else "")]
+        for i, row in enumerate(table_of(T, Convention(order="ZYX", degrees=True, angles_first=False))):
+            numbers = [f"{x:.6f}".replace(".", ",") for x in row]
+            lines.append(";".join([str(i + 1), Path(clouds[i]).name, *numbers, *clock[i : i + 1]]))
+        return "\r\n".join(lines) + "\r\n"
 
     return text
 
@@ -417,68 +417,15 @@ def _times_right(seconds: Sequence[float] | None) -> Callable[[Path], bool]:
     return right
 
 
-def _cell(row: int, column: int, value: str) -> Change:
-    return lambda rows: [[*r[:column], value, *r[column + 1 :]] if i == row else r for i, r in enumerate(rows)]
-
-
-def _thousands(mark: str) -> Change:
-    def marked(cell: str) -> str:
-        whole, _, rest = cell.partition(",")
-        return f"{int(whole):,}".replace(",", mark) + f",{rest}" if abs(int(whole)) > 999 else cell
-
-    return lambda rows: [[*row[:2], *map(marked, row[2:])] for row in rows]
-
-
-def _german_folder(table: Callable[[Path], str], encoding: str = "utf-8") -> Spoil:
+def _german_folder(table: Callable[[Path], str]) -> Spoil:
     """The scans of s beside a table of their poses."""
 
     def spoil(room: Path) -> list[str]:
         shutil.copytree(room / "s" / "clouds", room / "raw")
-        (room / "raw" / "Posen.csv").write_bytes(table(room / "s").encode(encoding))
+        (room / "raw" / "Posen.csv").write_bytes(table(room / "s").encode())
         return ["init", "raw", "--yes"]
 
     return spoil
-
-
-def _spreadsheets() -> Iterator[Case]:
-    """Tables of another country: what can be read is read right, the rest is refused with its line."""
-    right: dict[str, Change] = {
-        "as it is": lambda rows: rows,
-        "separators at the end": lambda rows: [[*row, "", ""] for row in rows],
-        "empty rows": lambda rows: [*rows, [""] * 8, [""] * 8],
-        "quotes": lambda rows: [[f'"{cell}"' for cell in row] for row in rows],
-        "rows of another order": lambda rows: rows[::-1],
-        "units in a row of their own": lambda rows: [["", "", *["mm"] * 3, *["°"] * 3], *rows],
-        "remarks in some rows": lambda rows: [[*row, "gut" * (i == 3)] for i, row in enumerate(rows)],
-    }
-    more: dict[str, Any] = {"writes": ("raw/",), "right": _poses_right}
-    for name, change in right.items():
-        header = _HEADER + ";Bemerkung" * (name[:7] == "remarks")
-        for encoding in ("cp1252", "utf-16") if name == "as it is" else ("cp1252",):
-            spoil = _german_folder(_german(change, header), encoding)
-            yield Case("spreadsheets that are right", f"{name}, {encoding}", spoil, fine=True, **more)
-    odd: dict[str, Change] = {
-        "thousands with points": _thousands("."),
-        "thousands with spaces": _thousands("\u00a0"),
-        "a whole number with a point for thousands": _cell(2, 2, "1.269"),
-        "minus of a typesetter": lambda rows: [[cell.replace("-", "\u2212") for cell in row] for row in rows],
-        "mean in the last row": lambda rows: [*rows, ["", "Mittelwert", *rows[0][2:]]],
-        "#WERT!": _cell(1, 4, "#WERT!"),
-        "no number": _cell(1, 4, ""),
-        "a cell more": lambda rows: [rows[0], [*rows[1], "5"], *rows[2:]],
-        "a row less": lambda rows: rows[:-1],
-        "a row twice": lambda rows: [*rows, rows[-1]],
-        "a row alone": lambda rows: rows[:1],
-        "cloud of another name": _cell(3, 1, "other.ply"),
-        "cloud twice": _cell(3, 1, "v000.ply"),
-        "open quote": _cell(3, 1, '"v003.ply'),
-        "400 digits": _cell(3, 2, "9" * 400),
-    }
-    for name, change in odd.items():
-        yield Case("spreadsheets", name, _german_folder(_german(change)), **more)
-    twice = _german(header=_HEADER.replace("Lage Y", "Lage X"))
-    yield Case("spreadsheets", "column twice", _german_folder(twice), **more)
-    yield Case("spreadsheets", "UTF-16 without a mark", _german_folder(_german(), "utf-16-le"))
 
 
 def _clocks() -> Iterator[Case]:
@@ -494,12 +441,8 @@ def _clocks() -> Iterator[Case]:
         "afternoon": ([f"0{i}:00 PM" for i in range(1, 7)], [60 * m for m in minutes]),
     }
     for name, (cells, seconds) in clocks.items():
-        spoil = _german_folder(_german(_with_clock(cells), _HEADER + ";Uhrzeit"))
+        spoil = _german_folder(_german(cells))
         yield Case("clock times", name, spoil, fine=True, writes=("raw/",), right=_times_right(seconds))
-
-
-def _with_clock(cells: list[str]) -> Change:
-    return lambda rows: [[*row, cell] for row, cell in zip(rows, cells, strict=True)]
 
 
 def _others() -> Iterator[Case]:
