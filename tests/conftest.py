@@ -43,7 +43,7 @@ gc.disable()
 # The longest files, which begin first: with files spread over two processes none is left alone at the end.
 LONGEST = (
     "test_review.py",
-    "test_blade_diagnosis.py",
+    "test_diagnosis.py",
     "test_diagnose.py",
     "test_view_screening.py",
     "test_run_folder.py",

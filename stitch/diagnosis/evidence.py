@@ -131,9 +131,13 @@ def which_explains_most(linear: LinearModel, candidates: Sequence[Candidate], ev
     """Which effect explains most, where none that could be named is among the errors that remain?"""
     if not evidence.alarm:
         return None
-    contenders, base = rescore_contenders(linear, [r for r in evidence.ranked if is_contender(r)])
+    contenders = [r for r in evidence.ranked if is_contender(r)]
     if not contenders:
         return Reply("none that could be named", ends=True)
+    base = linear.restricted(linear.causes - {r.name for r in contenders})
+    if len(contenders) > 1 and base is not linear:
+        # There their Bayes factors are over one and the same.
+        contenders = sorted((rescored_in(base, r) for r in contenders), key=lambda r: -r.log_posterior)
     best = contenders[0]
     unmodelled = unmodelled_log_posterior(base)
     changes = {
@@ -463,15 +467,6 @@ def required_group(linear: LinearModel, candidates: Sequence[Candidate], tests: 
     near = [r for r in again if is_contender(r) and r.log_posterior > again[0].log_posterior - limits.ODDS]
     # One that is far ahead of the others is still not wanted beside them, all of them being a little wrong.
     return tuple(near) if len(near) > 1 else again
-
-
-def rescore_contenders(linear: LinearModel, contenders: Sequence[Ranked]) -> tuple[list[Ranked], LinearModel]:
-    """Return contenders, likeliest first, where none of them is among the errors that remain; and the model in which
-    they are not: there their Bayes factors are over one and the same."""
-    base = linear.restricted(linear.causes - {r.name for r in contenders})
-    if len(contenders) < 2 or base is linear:
-        return list(contenders), base
-    return sorted((rescored_in(base, r) for r in contenders), key=lambda r: -r.log_posterior), base
 
 
 def rescored_in(base: LinearModel, ranked: Ranked) -> Ranked:

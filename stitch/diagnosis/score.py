@@ -22,7 +22,7 @@ from stitch.diagnosis.candidates import Candidate, Form, candidate_of
 from stitch.diagnosis.regime import regime_of
 from stitch.effects.contract import find_effect
 from stitch.fit.pipelines import linearise
-from stitch.model.model import Model, Term, term_of
+from stitch.model.model import Model, term_of
 from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.numerics.distributions import chi2_limit, f_tail
 from stitch.numerics.frames import Array, Mask
@@ -263,16 +263,12 @@ def start_with_effects(
     terms = [term_of(measurement, find_effect(name)) for name in effects]
     if any(term.gridded.any() for term in terms):
         linear = linearise(session, measurement, model, gate)
-        terms = [_suggest_values(linear, term) if term.gridded.any() else term for term in terms]
+        for k, term in enumerate(terms):
+            candidate = candidate_of(linear, term.effect) if term.gridded.any() else None
+            if candidate is not None:
+                best = score(linear, candidate)
+                terms[k] = best.form.at(best.values)
     return model.with_terms([*model.terms, *terms])
-
-
-def _suggest_values(linear: LinearModel, zero: Term) -> Term:
-    candidate = candidate_of(linear, zero.effect)
-    if candidate is None:
-        return zero
-    best = score(linear, candidate)
-    return best.form.at(best.values)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ The smallest size that shows is the one at which both tests in use pass with 80 
 parameters θ shifts the squared length of its whitened columns' projection by λ = θᵀIθ. The scatter is known to ν
 degrees of freedom only, and takes its share of what the effect does: the test statistic q is non-central F, and the log
 evidence ½ ν log(1 + q/ν) in place of ½ q. For one parameter, known scatter and the p-value alone this is |θ| =
-(z_{1−α/2K} + z_{power})/√I."""
+(z_{1−α/2K} + z_{power})/√I.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,22 +34,20 @@ class Alias:
     correlation: float  # of this one's fitted pattern with the best that the other can do
 
 
-def effect_pattern(linear: LinearModel, scored: Score) -> Array:
-    """Return (n,) what the fitted candidate does to the views, in units of their scatter."""
-    white = linear.residual(scored.form.columns)
-    if np.any(scored.values):
-        return white @ scored.values
-    # Nothing fitted: the most visible combination of plausible size.
-    U, s, _ = np.linalg.svd(white * scored.form.sizes, full_matrices=False)
-    return U[:, 0] * s[0]
-
-
 def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
     """Return (K, K): how much of the fitted pattern of row k the effect of the column can imitate, 0 … 1.
 
     The other effect may use all its parameters, but none beyond ten times its plausible size.
     """
-    patterns = [effect_pattern(linear, s) for s in scores]
+    patterns = []
+    for scored in scores:
+        white = linear.residual(scored.form.columns)
+        if np.any(scored.values):
+            patterns.append(white @ scored.values)
+        else:
+            # Nothing fitted: the most visible combination of plausible size.
+            U, s, _ = np.linalg.svd(white * scored.form.sizes, full_matrices=False)
+            patterns.append(U[:, 0] * s[0])
     whites = [linear.residual(s.candidate.forms[0].columns) for s in scores]
     matrix = np.eye(len(scores))
     for i, pattern in enumerate(patterns):

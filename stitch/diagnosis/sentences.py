@@ -42,7 +42,7 @@ def diagnosis_sentence(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranke
 
 def _adequate(d: Diagnosis, length_unit: str) -> Iterator[str]:
     yield f"The model is adequate. {_residual_sentence(d, length_unit)}"
-    if _poses_show(d):
+    if d.rotation > 0 or d.translation > 0:
         scatter = _scatter(d.translation, d.rotation, length_unit)
         yield f"The robot's poses scatter by {scatter} (1 σ), which explains the rest."
         limits = _scatter(d.scatter_limit.translation, d.scatter_limit.rotation, length_unit)
@@ -138,7 +138,8 @@ def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
         yield f"The pose errors repeat{amount}: they {' and '.join(error.words for error in errors)}."
         yield f"Apart from that the poses scatter by {scatter}."
     elif not d.implausible:
-        yield f"The poses scatter by {scatter}." if _poses_show(d) else "The measured points do not show the poses."
+        shown = d.rotation > 0 or d.translation > 0
+        yield f"The poses scatter by {scatter}." if shown else "The measured points do not show the poses."
     elif d.overlap_misfit:
         yield f"The poses scatter by {scatter}; how much of that is the robot's shows once the misfit is corrected."
     else:
@@ -160,11 +161,6 @@ def _odds_over_chance(d: Diagnosis) -> str:
 
 def _scatter(translation: float, rotation: float, length_unit: str) -> str:
     return f"{length_text(translation, length_unit)} and {angle_text(rotation)}"
-
-
-def _poses_show(d: Diagnosis) -> bool:
-    """Return True unless what was seen is the same wherever the poses are."""
-    return d.rotation > 0 or d.translation > 0
 
 
 def _not_named(d: Diagnosis) -> Iterator[str]:

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from pykdtree.kdtree import KDTree
 
-from stitch.model.model import Model, Term
+from stitch.model.model import ARM_PLACES, Model, Term
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
 from stitch.session.capture import Capture
@@ -61,17 +61,12 @@ def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[A
     """Return (V, 4, 4) what stands left of the hand-eye and right of it under effects of robot, mount and part."""
     errors = chain_errors(measurement, terms)
     T_base_flange = measurement.T_base_flange
-    if measurement.robot is not None and any(moves_arm(term) for term in terms):
+    if measurement.robot is not None and any(term.effect.place in ARM_PLACES for term in terms):
         true = forward_with_errors(measurement.robot, errors.joints, errors.links)
         # A reported pose that differs from the nominal kinematics (a calibrated controller) keeps its difference.
         T_base_flange = T_base_flange @ frames.inverse(forward(measurement.robot, measurement.views.joints)) @ true
     left = frames.inverse(T_base_flange) if measurement.eye_to_hand else T_base_flange
     return frames.exp(-errors.part) @ left, frames.exp(errors.mount)
-
-
-def moves_arm(term: Term) -> bool:
-    """Return whether it is an effect of joints or links."""
-    return term.effect.place in ("robot", "links")
 
 
 def scan_correction(
@@ -234,7 +229,7 @@ def pose_derivatives(measurement: Measurement, model: Model, terms: Sequence[Ter
         fitted = [i for i, p in enumerate(term.parameters) if not p.discrete]
         steps = [[chain_errors(measurement, [moved], others) for moved in _stepped(term, i, sizes[i])] for i in fitted]
         if steps:
-            twists = chain.twists(steps, moves_arm(term))
+            twists = chain.twists(steps, term.effect.place in ARM_PLACES)
             derivatives[fitted] = twists / (2 * np.array(sizes)[fitted, None, None])
         yield derivatives
 

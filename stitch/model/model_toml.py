@@ -13,14 +13,13 @@ import tomli_w
 
 from stitch.effects.contract import Effect, Parameter, find_effect, parameters_in, require_available
 from stitch.errors import InputError
-from stitch.model.model import EffectsCovariance, Model, Target, Term
+from stitch.model.model import ARM_PLACES, EffectsCovariance, Model, Target, Term
 from stitch.numerics.frames import Array, is_rigid
 from stitch.numerics.units import METRES
 from stitch.session.measurement import Measurement
 from stitch.session.reading.text_files import optional_text, read_toml, table_choice
 
 FORMAT = "stitch-model/1"
-ARM_PLACES = ("robot", "links")  # where the effects of an arm stand in the chain
 _HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps scanner
 # coordinates into the {carrier} frame. sigma and covariance belong to a right perturbation
 # T·exp(ξ), ξ = (rotation in rad, translation in {unit}), in the scanner frame.
@@ -66,7 +65,11 @@ def write_model(model: ModelFile, path: Path) -> None:
         },
     }
     if model.targets:
-        document["targets"] = {name: _target_table(target) for name, target in model.targets.items()}
+        targets = {name: {"position": t.position, "sigma": t.sigma} for name, t in model.targets.items()}
+        for name, target in model.targets.items():
+            if target.orientation is not None:
+                targets[name]["orientation"] = target.orientation
+        document["targets"] = {name: {k: v.tolist() for k, v in table.items()} for name, table in targets.items()}
     if model.effects_file:
         document["effects_file"] = model.effects_file
     header = _HEADER.format(frame=f"T_{carrier}_scanner", carrier=carrier, unit=model.length_unit)
@@ -77,11 +80,6 @@ def _parameter_table(p: Parameter) -> dict[str, Any]:
     """Return the table of a parameter: TOML has a nan, but who reads it expects a word."""
     known = {"sigma": p.sigma} if p.fitted else {"observable": False}
     return {"value": p.value, **known, "unit": p.unit, **({"kept": True} if p.kept else {})}
-
-
-def _target_table(target: Target) -> dict[str, Any]:
-    table = {"position": target.position.tolist(), "sigma": target.sigma.tolist()}
-    return table if target.orientation is None else table | {"orientation": target.orientation.tolist()}
 
 
 def read_model(path: Path | str) -> ModelFile:

@@ -1,4 +1,4 @@
-"""The sentence says of the poses what was seen of them, and nothing where nothing was."""
+"""A diagnosis says of the poses and the scans what was seen of them, and nothing where nothing was."""
 
 from types import SimpleNamespace
 
@@ -7,8 +7,9 @@ import pytest
 
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.score import ScatterLimit
-from stitch.diagnosis.sentences import diagnosis_sentence, odds_text
+from stitch.diagnosis.sentences import diagnosis_sentence, odds_text, scanner_advice, scanner_error_sentence
 from stitch.diagnosis.verdict import Evidence
+from stitch.observations.surfaces.field_error import FieldError
 
 
 @pytest.mark.parametrize("verdict", ["adequate", "unknown_effect"])
@@ -91,7 +92,7 @@ def test_a_scale_of_the_scanner_may_be_one_of_the_arm(effect, said):
     assert ("arm lengths that are all off by the same share" in said_at(25.0, "missing_effect", effect)) == said
 
 
-def test_what_is_larger_than_anybody_would_expect_is_asked_about():
+def test_a_size_larger_than_plausible_is_asked_about():
     """No size forbids a name: a number in a table may be wrong."""
     free = [SimpleNamespace(name=name, limit=5.0, unit="mm") for name in ("da1", "da2")]
     form = SimpleNamespace(free=free, term=SimpleNamespace(parameters=[]))
@@ -102,13 +103,13 @@ def test_what_is_larger_than_anybody_would_expect_is_asked_about():
 
 
 @pytest.mark.parametrize(("odds", "said"), [(25.0, "Something is missing: "), (4.0, "Something may be missing: ")])
-def test_so_may_a_group(odds, said):
+def test_a_group_less_than_twenty_to_one_over_chance_may_be_missing(odds, said):
     told = said_at(odds, "cannot_tell", "settling", "backlash")
     assert told.startswith(said) and ("more than chance are 4 to 1." in told) == (odds < 20)
     assert "missing: settling or backlash. These views cannot tell which." in told
 
 
-def test_of_a_group_one_is_enough():
+def test_odds_of_a_group_are_that_one_of_it_is_there():
     """Odds add up: two at 10 to 1 each are 20 to 1 that one is there."""
     each = SimpleNamespace(log_odds_over_nothing=np.log(10.0))
     group = Evidence((each, each), (), alarm=True, explanation=(each, each))
@@ -124,3 +125,21 @@ def test_odds_are_told_as_far_as_anybody_can_vouch_for_them():
         "1 to more than 100",
     ]
     assert odds_text(-np.inf) == "1 to more than 100"
+
+
+SAME_IN_ALL = FieldError(0.02, 0.0, 9.0, over_noise=False)
+BOTH_KINDS = FieldError(0.02, 0.01, 9.0, over_noise=True, with_time=True)
+OF_EACH_VIEW = FieldError(0.0, 0.03, 9.0, over_noise=True, by_view=True)
+
+
+def test_the_clearer_kind_is_said_with_its_size():
+    same, both, own = (scanner_error_sentence(found, "mm") for found in (SAME_IN_ALL, BOTH_KINDS, OF_EACH_VIEW))
+    assert "the same in every view: 20 µm" in same and "by itself" not in same
+    assert "the same in every view" in both and "each view errs by itself, larger as the session goes on" in both
+    assert "of its own: 30 µm" in own and "same" not in own
+
+
+def test_a_scanner_error_that_the_poses_alone_show_has_no_size():
+    assert "rms" not in " ".join(scanner_advice(None, "mm"))
+    assert "20 µm rms" in " ".join(scanner_advice(SAME_IN_ALL, "mm"))
+    assert "again at the end" in " ".join(scanner_advice(OF_EACH_VIEW, "mm"))

@@ -8,8 +8,8 @@ import numpy as np
 from stitch.effects.contract import find_effect, missing_need
 from stitch.errors import InputError
 from stitch.model.forward import perturbed_frames
-from stitch.model.model import EffectsCovariance, Term
-from stitch.model.model_toml import ARM_PLACES, ModelFile, bind_to_session, convert_unit
+from stitch.model.model import ARM_PLACES, EffectsCovariance, Term
+from stitch.model.model_toml import ModelFile, bind_to_session, convert_unit
 from stitch.numerics.frames import Array
 from stitch.output.session_files import robot_toml
 from stitch.output.stored_run import read_result, trusted_model

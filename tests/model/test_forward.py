@@ -1,4 +1,4 @@
-"""Slopes of effects against finite differences and nature's laws."""
+"""Slopes of poses and points against differences and against nature."""
 
 from dataclasses import replace
 

@@ -48,14 +48,14 @@ def test_a_group_that_helps_is_added_as_one(first, monkeypatch):
     assert "do not tell its parts apart" in lines[-1] and result.notes[0] == lines[-1]
 
 
-def test_a_group_of_which_nothing_is_there_stays_out(monkeypatch):
+def test_a_group_stays_out_where_none_of_its_effects_is_there(monkeypatch):
     answered(monkeypatch, "cannot_tell", ("backlash", "settling"))
     session, *_ = labelled_cell(3, views=24)
     result, lines, _ = stepwise.suggest_group(run(session))
     assert result is None and "do not help on views left out" in lines[-1]
 
 
-def test_what_has_a_name_is_no_group(first):
+def test_no_group_is_suggested_where_one_effect_is_named(first):
     result, lines, found = stepwise.suggest_group(first)
     assert found.verdict == "missing_effect" and result is None and "no group" in lines[-1]
     # For everybody first, then the evidence.
@@ -63,7 +63,7 @@ def test_what_has_a_name_is_no_group(first):
     assert lines[1] == found.sentence
 
 
-def test_what_is_less_likely_than_chance_is_not_added(first, diagnosed, monkeypatch):
+def test_an_effect_less_likely_than_chance_is_not_added(first, diagnosed, monkeypatch):
     found = replace(diagnosed, log_odds_over_nothing=-0.1)
     monkeypatch.setattr(stepwise, "diagnose", lambda state: found)
     result, lines, _ = stepwise.suggest(first, at_most=3)
@@ -100,7 +100,7 @@ def test_the_uncertainty_of_the_error_on_views_left_out_is_that_between_folds(di
     assert judged.heldout_sigma == pytest.approx(jackknife, rel=0.3)
 
 
-def test_what_was_added_first_gives_way_to_what_does_more_together(first):
+def test_effects_that_were_added_give_way_to_others_that_do_more_together(first):
     """Gears that run out imitate wrong zeros over these ranges, worse than the zeros themselves."""
     stuck = stepwise.change(first, ["gear_eccentricity", "gear_harmonic"])
     result, told = stepwise._exchange_added(stuck, given=set())
@@ -110,7 +110,7 @@ def test_what_was_added_first_gives_way_to_what_does_more_together(first):
     assert stepwise._exchange_added(result, given=set()) == (result, [])
 
 
-def test_what_was_tried_and_dropped_is_remembered_and_not_proposed_again(monkeypatch, tmp_path):
+def test_an_effect_that_was_dropped_is_remembered_and_not_proposed_again(monkeypatch, tmp_path):
     session, *_ = labelled_cell(1, views=24, offset=OFFSET)
     first = run(load_session(write_labelled(tmp_path / "session", session)))
     monkeypatch.setattr(stepwise, "change", lambda state, effects, recorder: replace(first, heldout_rms=9.0))

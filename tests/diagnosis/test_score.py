@@ -1,4 +1,6 @@
-"""How much likelier an effect makes the views: against densities by scipy, at every size that it may be of."""
+"""How much likelier an effect makes the views, against densities by scipy, and where a fit of it begins."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,6 +8,10 @@ from scipy.linalg import null_space
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
+from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.quiet_scenes import simulated
+from data_synth.scene import load_scene
+from stitch.api.pipeline import run
 from stitch.diagnosis.candidates import candidate_of
 from stitch.diagnosis.score import score, try_form
 from stitch.effects.contract import EFFECTS
@@ -50,3 +56,16 @@ def test_an_effect_below_what_is_plausible_is_found_at_its_scale(linear):
     found = score(linear, candidate)
     assert found.p_value < 1e-5 and found.log_bayes_factor > 3
     assert found.scale < 1
+
+
+@pytest.mark.slow
+def test_a_slip_that_the_run_is_told_of_is_found_where_it_was():
+    scene = load_scene("drill-plate")
+    scene = replace(scene, scanner=replace(scene.scanner, columns=50, rows=50))
+    measured = simulated(scene, {"part_slip": 4.0}, 5, views=12)
+    true = measured.hidden["part_slip"]["v"]
+    assert true != 6  # the middle, where a fit that does not look would begin
+    found = run(session_of(measured), effects=["part_slip"])
+    (term,) = found.terms
+    (place,) = (p for p in term.parameters if p.name == "v")
+    assert place.value == true and str(place.formatted) == session_of(measured).names[int(true)]

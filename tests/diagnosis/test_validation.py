@@ -1,4 +1,4 @@
-"""Errors of gears: what is learned where a joint was driven, judged at the ends that were left out."""
+"""What is learned where views were taken is judged where they were left out."""
 
 import numpy as np
 

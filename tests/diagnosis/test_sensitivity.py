@@ -1,14 +1,27 @@
-"""The smallest size that shows, against closed forms and drawn noise."""
+"""What views can show of an effect: aliases, and the smallest size that shows, against closed forms and drawn noise."""
 
 import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
-from stitch.diagnosis.sensitivity import least_noncentrality
+from stitch.diagnosis.sensitivity import imitated_share, least_noncentrality
 from stitch.diagnosis.thresholds import ALPHA_NAME, LOG_BAYES_FACTOR
 from stitch.numerics.reml import MixedModel, VarianceFit, fit_variances
 from stitch.numerics.variance_posterior import satterthwaite
+
+
+def test_a_pattern_in_the_plane_of_two_columns_is_imitated_by_the_cosine_of_its_angle_to_it():
+    X = 1e3 * np.eye(5)[:, :2]
+    assert imitated_share(np.array([3.0, 4.0, 0, 0, 0]), X) == pytest.approx(1.0, abs=1e-6)
+    assert imitated_share(np.array([3.0, 0, 4.0, 0, 0]), X) == pytest.approx(0.6, abs=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-310])
+def test_a_pattern_that_views_cannot_show_is_like_nothing(size):
+    """Patterns so small that products of their lengths vanish."""
+    assert imitated_share(size * np.ones(4), np.zeros((4, 2))) == 0.0
+    assert imitated_share(size * np.ones(4), 1e-200 * np.ones((4, 1))) == 0.0
 
 
 def test_known_scatter_and_one_parameter_need_what_two_quantiles_say():

@@ -1,0 +1,210 @@
+"""The model of a cell: what is printed of its hand-eye, the covariance of its effects, its file, and its use in sessions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from data_synth.fixtures.edits import edit
+from data_synth.fixtures.in_memory import session_of
+from stitch.api.pipeline import require_effects, run_rig
+from stitch.effects import EFFECTS
+from stitch.effects.contract import parameters_in
+from stitch.errors import InputError
+from stitch.model.model import (
+    EffectsCovariance,
+    Term,
+    covariance_of_fit,
+    expanded_uncertainty,
+    kept_root,
+    printed_covariance,
+    term_of,
+)
+from stitch.model.model_toml import ModelFile, bind_to_session, convert_unit, read_model, write_model
+from stitch.numerics import frames
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
+from stitch.session.robot import unit_torques
+
+
+@pytest.mark.parametrize("angle", [1e-5, 0.8, 3.1])
+def test_the_printed_hand_eye_scatters_as_printed(angle):
+    """Hand-eyes drawn from the scanner-frame covariance, printed each, have the covariance that is predicted."""
+    rng = np.random.default_rng(2)
+    axis = np.array([2.0, -1.0, 2.0]) / 3
+    T = frames.make(Rotation.from_rotvec(angle * axis).as_matrix(), np.array([650.0, -150.0, 900.0]))
+    half = rng.normal(size=(6, 6)) * np.array([1e-5] * 3 + [1e-2] * 3)[:, None]
+    drawn = T @ frames.exp(rng.standard_normal((200_000, 6)) @ half.T)
+    turns = (Rotation.from_matrix(drawn[:, :3, :3]).as_rotvec() - angle * axis).T
+    printed = np.cov(np.vstack([turns, drawn[:, :3, 3].T]))
+    expected = printed_covariance(T, half @ half.T)
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(printed / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.015)
+    np.testing.assert_allclose(expanded_uncertainty(T, half @ half.T), 2 * scale)
+
+
+def test_axes_of_the_scanner_are_not_those_of_the_mount():
+    """Sure along the scanner's z alone; the scanner looks along the base's x: there the sigma must stand."""
+    T = frames.make(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.zeros(3))
+    covariance = np.diag([0.0, 0, 0, 0.123**2, 0.05**2, 0.0126**2])
+    np.testing.assert_allclose(expanded_uncertainty(T, covariance)[3:], 2 * np.array([0.0126, 0.05, 0.123]))
+
+
+@pytest.fixture
+def term():
+    parameters = EFFECTS["joint_offset"].parameters(6, (), "mm")
+    return Term(EFFECTS["joint_offset"], parameters)
+
+
+@pytest.fixture
+def matrix():
+    half = np.random.default_rng(0).normal(size=(3, 3)) * [1e-5, 2e-4, 3e-5]
+    return half.T @ half
+
+
+def known(term, matrix, names):
+    sigma = dict(zip(names, np.sqrt(np.diag(matrix)), strict=True))
+    return replace(
+        term, parameters=tuple(replace(p, sigma=sigma.get(p.name, np.nan)) for p in term.parameters)
+    ), EffectsCovariance(tuple(f"joint_offset.{n}" for n in names), matrix)
+
+
+def test_the_root_squared_is_the_matrix_wherever_its_parameters_stand(term, matrix):
+    own, covariance = known(term, matrix, ["d4", "d2", "d3"])
+    L = covariance.root([own])
+    whole = np.zeros((6, 6))
+    at = [3, 1, 2]
+    whole[np.ix_(at, at)] = matrix
+    np.testing.assert_allclose(L @ L.T, whole, rtol=1e-9, atol=1e-22)
+
+
+def test_a_sigma_that_was_edited_counts_alone(term, matrix):
+    own, covariance = known(term, matrix, ["d4", "d2", "d3"])
+    edited = tuple(replace(p, sigma=7e-4) if p.name == "d2" else p for p in own.parameters)
+    L = covariance.root([replace(own, parameters=edited)])
+    whole = L @ L.T
+    assert whole[1, 1] == pytest.approx(49e-8) and not whole[1, [0, 2, 3, 4, 5]].any()
+    np.testing.assert_allclose(whole[np.ix_([3, 2], [3, 2])], matrix[np.ix_([0, 2], [0, 2])], rtol=1e-9)
+
+
+def test_parameters_of_another_run_are_kept_beside_those_that_are_fitted(term, matrix):
+    own, covariance = known(term, matrix, ["d4", "d2", "d3"])
+    assert kept_root([own], covariance).shape == (6, 0)
+    own = replace(own, parameters=tuple(replace(p, kept=p.name in ("d2", "d3", "d4")) for p in own.parameters))
+    root = kept_root([own], covariance)
+    fitted = np.array([False, False, False, False, True, False])
+    both = covariance_of_fit([own], fitted, np.array([[4e-10]]), root)
+    assert both.names == tuple(f"joint_offset.d{i}" for i in (2, 3, 4, 5))
+    at = [both.names.index(f"joint_offset.{n}") for n in ("d4", "d2", "d3")]
+    np.testing.assert_allclose(both.matrix[np.ix_(at, at)], matrix, rtol=1e-9, atol=1e-22)
+    assert both.matrix[3, 3] == pytest.approx(4e-10)
+
+
+def test_lengths_of_the_matrix_follow_the_unit():
+    rows = EFFECTS["link_geometry"].parameters(2, (), "mm")
+    lengths, angles = (next(p for p in rows if p.unit == unit) for unit in ("mm", "rad"))
+    names = tuple(f"link_geometry.{p.name}" for p in (lengths, angles))
+    file = ModelFile("mm", "eye_to_hand", np.eye(4), np.eye(4), np.eye(6), {"link_geometry": {p.name: p for p in rows}})
+    file = replace(file, effects_covariance=EffectsCovariance(names, np.array([[4.0, 0.2], [0.2, 1.0]])))
+    np.testing.assert_allclose(convert_unit(file, "m").effects_covariance.matrix, [[4e-6, 2e-4], [2e-4, 1.0]])
+
+
+def without(session, *columns):
+    """The session without some covariates."""
+    views = [replace(v, covariates={k: x for k, x in v.covariates.items() if k not in columns}) for v in session.views]
+    return replace(session, views=tuple(views))
+
+
+def massless(session):
+    return replace(session, robot=replace(session.robot, mass=np.zeros(6), payload_mass=0.0))
+
+
+def wrist_only(session):
+    """The session as if joints 1 to 3 had stood still."""
+    first = session.views[0].joints[:3]
+    views = [replace(v, joints=np.concatenate([first, v.joints[3:]])) for v in session.views]
+    return replace(session, views=tuple(views))
+
+
+@pytest.fixture(scope="module")
+def placed_session(still_cells):
+    """A session with its scans made ready once; what tests change of it the scans do not know."""
+    session = session_of(still_cells["eye_to_hand"])
+    return session, prepare_capture(session)
+
+
+def fitted(measurement, name):
+    """A model in which every parameter of an effect has a value and a sigma of its own."""
+    size = len(parameters_in(measurement, EFFECTS[name]))
+    values, sigmas = np.arange(1.0, size + 1) * 1e-6, np.arange(1.0, size + 1) * 1e-8
+    term = term_of(measurement, EFFECTS[name]).at(values, sigmas)
+    stated = {name: {p.name: p for p in term.parameters}}
+    return ModelFile("mm", "eye_to_hand", np.eye(4), np.eye(4), np.eye(6), stated), values, sigmas
+
+
+def test_compliances_of_an_arm_without_masses_mean_the_same_in_every_session(placed_session):
+    """Fitted on views that move all joints, used on views that move the wrist alone: every coefficient still bends."""
+    session, own = placed_session
+    full, wrist = (measurement_of(s, own) for s in (massless(session), wrist_only(massless(session))))
+    model, values, sigmas = fitted(full, "joint_compliance")
+    (term,) = bind_to_session(model, wrist).terms
+    np.testing.assert_array_equal(term.values, values)
+    np.testing.assert_array_equal(term.sigmas, sigmas)
+    assert {f.unit for f in model.effects["joint_compliance"].values()} == {"kg rad/(N m)"}
+    unit, bent = unit_torques(wrist.robot, wrist.views.joints), np.zeros(wrist.views.joints.shape)
+    for name, f in model.effects["joint_compliance"].items():
+        joint, link = (int(number) - 1 for number in name[1:].split("_"))
+        bent[:, joint] += f.value * unit[:, joint, link]
+    np.testing.assert_allclose(wrist.views.sag(term.values), bent, rtol=1e-12)
+
+
+def test_parameters_of_a_model_are_never_dropped_or_read_in_another_unit(placed_session):
+    session, own = placed_session
+    with_masses, bare = (measurement_of(s, own) for s in (session, massless(session)))
+    for there, here in ((with_masses, bare), (bare, with_masses)):
+        with pytest.raises(InputError, match="the model's joint_compliance has c.*link masses") as error:
+            bind_to_session(fitted(there, "joint_compliance")[0], here)
+        assert "\n" not in str(error.value)
+    for name, column in (("part_growth", "part_temperature_c"), ("robot_thermal_growth", "robot_temperature_c")):
+        warm, timed = with_masses, measurement_of(without(session, column), own)
+        assert all(p.unit.endswith("/°C") for p in parameters_in(warm, EFFECTS[name]))
+        assert all(p.unit.endswith("/h") for p in parameters_in(timed, EFFECTS[name]))
+        for there, here in ((warm, timed), (timed, warm)):
+            bind_to_session(fitted(there, name)[0], there)
+            with pytest.raises(InputError, match=f"{name}.g is in '1/(h|°C)'.*{column}"):
+                bind_to_session(fitted(there, name)[0], here)
+
+
+def test_sessions_of_a_rig_have_the_same_parameters_or_are_refused(placed_session):
+    session, own = placed_session
+    bare = massless(session)
+    require_effects([measurement_of(s, own) for s in (bare, wrist_only(bare))], ["joint_compliance"])
+    for others, effect, told in (
+        ((session, bare), "joint_compliance", r"do not share c1 \(rad/\(N m\)\)"),
+        ((session, without(session, "part_temperature_c")), "part_growth", r"do not share .*g \(1/h\)"),
+        ((session, without(session, "scanner_temperature_c")), "scanner_thermal_scale", "scanner_temperature_c.*other"),
+    ):
+        rig = [others[0], replace(others[1], name="other")]
+        with pytest.raises(InputError, match=told):
+            run_rig(rig, effects=[effect])
+        with pytest.raises(InputError, match=told):
+            run_rig(rig, fitted(measurement_of(session, own), effect)[0])
+
+
+def test_a_scan_does_not_count_twice(placed_session):
+    session, _ = placed_session
+    with pytest.raises(InputError, match="the scan of view v000 is that of view v000"):
+        run_rig([session, replace(session, name="other")])
+
+
+@pytest.mark.parametrize(("old", "new", "expected"), [
+    ('length_unit = "mm"', 'length_unit = "cm"', "length_unit is 'cm'"), ('length_unit = "mm"\n', "", "length_unit is None"),
+    ("^", "effects_file = 5\n", "effects_file is 5"),
+])  # fmt: skip
+def test_a_model_that_was_edited_wrongly_is_refused(tmp_path, old, new, expected):
+    file = tmp_path / "model.toml"
+    write_model(ModelFile("mm", "eye_to_hand", np.eye(4), np.eye(4), np.eye(6)), file)
+    edit(file, old, new)
+    with pytest.raises(InputError, match=f"model.toml: {expected}; "):
+        read_model(file)
