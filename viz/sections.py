@@ -147,7 +147,7 @@ def _rows(found: Diagnosis, um: float) -> list[dict[str, str]]:
             "rms_if_added": _rms(found, s, 0, um),
             "heldout": _rms(found, s, 1, um),
             "on_part": on_part.get(s.name, "–"),
-            "aliases": ", ".join(f"{a.name} {a.correlation:.2f}" for a in s.aliases[:2]),
+            "aliases": ", ".join(f"{name} {alike:.2f}" for name, alike in list(s.aliases.items())[:2]),
         }
         for s in shown
     ]

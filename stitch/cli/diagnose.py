@@ -150,7 +150,7 @@ def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], l
         say(f"{rest:.2f} of the posterior: nothing is missing, or something without a name.")
     for c in listed:
         if c.ranked.score.observable and (c.name in diagnosis.effects or c.ranked.adjusted < _CLEAR):
-            aliases = ", ".join(f"{alias.name} {alias.correlation:.2f}" for alias in c.aliases[:2])
+            aliases = ", ".join(f"{name} {alike:.2f}" for name, alike in list(c.aliases.items())[:2])
             say(f"  {c.name}: {fitted_amounts(c.ranked)}{f'; aliases: {aliases}' if aliases else ''}", hang=2)
     show_budget(diagnosis.budget, length_unit)
     if unseen := [c.name for c in diagnosis.candidates if not c.ranked.score.observable]:

@@ -128,7 +128,7 @@ def _examine_candidates(linear: LinearModel, evidence: Evidence, matrix: Array, 
             validation = cross_validate(linear, scored)
         return CandidateEffect(
             ranked=evidence.ranked[k],
-            aliases=tuple(aliases_of(k, matrix, scores)),
+            aliases=aliases_of(k, matrix, scores),
             cross_validation=validation,
             detectable=detectable,
             hand_eye=omitted_effect_bias(linear, response, scored.candidate, detectable),

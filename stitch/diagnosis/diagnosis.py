@@ -7,7 +7,6 @@ import numpy as np
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.residual_structure import BudgetLine, Dependence
 from stitch.diagnosis.score import ScatterLimit
-from stitch.diagnosis.sensitivity import Alias
 from stitch.diagnosis.thresholds import ODDS
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.diagnosis.unmodelled_time_effects import RepeatingError, TimeCurve, reportable
@@ -33,7 +32,7 @@ class CandidateEffect:
     """One candidate as diagnosis.json shows it."""
 
     ranked: Ranked
-    aliases: tuple[Alias, ...]
+    aliases: dict[str, float]  # effects that could do what this one does, and their correlation, largest first
     cross_validation: CrossValidation | None
     detectable: dict[str, float]  # smallest detectable size per parameter, alone
     hand_eye: float | None  # how far it would push the hand-eye unseen, length_unit (`omitted_effect_bias`)

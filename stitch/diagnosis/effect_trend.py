@@ -357,11 +357,11 @@ def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: 
     effect moves it, the cosine of that motion to the normal, the distance that is left, and its view."""
     poses = surfaces.capture.poses(linear.model.T_mount)
     matches = surfaces.unconstrained.overlaps.matches
-    every = max(sum(len(m.residual) for m in matches) // _ASKED, 1)
+    step = max(sum(len(m.residual) for m in matches) // _ASKED, 1)
     rows = list[tuple[Array, ...]]()
     start = 0
     for m in matches:
-        some = np.arange(0, len(m.residual), every)
+        some = np.arange(0, len(m.residual), step)
         left = distances[start + some]
         start += len(m.residual)
         for v, index, sign in ((m.v, m.index_v[some], 1.0), (m.w, m.index_w[some], -1.0)):

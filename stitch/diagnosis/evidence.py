@@ -61,8 +61,20 @@ class Reply(NamedTuple):
     ends: bool = False
 
 
+class Case(NamedTuple):
+    """What all questions are asked about: the views of a session, and effects that could be missing."""
+
+    linear: LinearModel
+    candidates: Sequence[Candidate]
+
+    @property
+    def many_views(self) -> bool:
+        """True where many views tell several effects apart at once."""
+        return regime_of(self.linear).many_views
+
+
 # A question; None where it does not arise.
-Question = Callable[[LinearModel, Sequence[Candidate], Evidence], Reply | None]
+Question = Callable[[Case, Evidence], Reply | None]
 
 
 def gather_evidence(
@@ -74,7 +86,7 @@ def gather_evidence(
         overlap_misfit: rms that no motion of the views removes (`overlap_misfit_beyond_noise`), length_unit.
     """
     proposed = propose_names(linear, candidates, limit)
-    evidence = ask(TESTS, linear, candidates, replace(proposed, proposed=proposed))
+    evidence = ask(TESTS, Case(linear, candidates), replace(proposed, proposed=proposed))
     if overlap_misfit:
         misfit = Reply("yes, beyond the noise", {"overlap_misfit": overlap_misfit})
         evidence = _answered(evidence, overlap_misfit_beyond_noise, misfit)
@@ -85,15 +97,13 @@ def propose_names(linear: LinearModel, candidates: Sequence[Candidate], limit: S
     """Return the effects that would explain the views, and what explains them as well; nothing is left out yet."""
     ranked, empirical = rank_all(linear, candidates)
     evidence = Evidence(ranked, empirical, implausible_scatter=implausible(linear, limit))
-    return ask(NAMING, linear, candidates, evidence)
+    return ask(NAMING, Case(linear, candidates), evidence)
 
 
-def ask(
-    questions: Sequence[Question], linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
-) -> Evidence:
+def ask(questions: Sequence[Question], case: Case, evidence: Evidence) -> Evidence:
     """Return the evidence after questions that were asked in order, with their answers."""
     for question in questions:
-        reply = question(linear, candidates, evidence)
+        reply = question(case, evidence)
         if reply is None:
             continue
         evidence = _answered(evidence, question, reply)
@@ -111,7 +121,7 @@ def _answered(evidence: Evidence, question: Callable[..., object], reply: Reply)
     return replace(after, answers=(*evidence.answers, answer))
 
 
-def is_anything_certain(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+def is_anything_certain(case: Case, evidence: Evidence) -> Reply | None:
     """Is an effect certain by itself, or a shape without a cause?"""
     certain = [r.name for r in evidence.ranked if is_certain(r)]
     if _certain_shape(evidence) is None and not certain:
@@ -119,23 +129,23 @@ def is_anything_certain(linear: LinearModel, candidates: Sequence[Candidate], ev
     return Reply(", ".join(certain) or "a shape without a cause", {"alarm": True})
 
 
-def are_several_required(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+def are_several_required(case: Case, evidence: Evidence) -> Reply | None:
     """Are several effects required of which none is certain by itself?"""
     if evidence.alarm:
         return None
-    group = required_group(linear, candidates, len(evidence.ranked))
+    group = required_group(case.linear, case.candidates, len(evidence.ranked))
     return Reply(_names(group) or "no", {"explanation": group}, ends=bool(group))
 
 
-def which_explains_most(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
     """Which effect explains most, where none that could be named is among the errors that remain?"""
     if not evidence.alarm:
         return None
     contenders = [r for r in evidence.ranked if is_contender(r)]
     if not contenders:
         return Reply("none that could be named", ends=True)
-    base = linear.restricted(linear.causes - {r.name for r in contenders})
-    if len(contenders) > 1 and base is not linear:
+    base = case.linear.restricted(case.linear.causes - {r.name for r in contenders})
+    if len(contenders) > 1 and base is not case.linear:
         # There their Bayes factors are over one and the same.
         contenders = sorted((rescored_in(base, r) for r in contenders), key=lambda r: -r.log_posterior)
     best = contenders[0]
@@ -151,13 +161,13 @@ def which_explains_most(linear: LinearModel, candidates: Sequence[Candidate], ev
     return Reply(best.name, changes)
 
 
-def which_hold_together(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+def which_hold_together(case: Case, evidence: Evidence) -> Reply | None:
     """Of many views: which effects are missing at once, each holding its place beside the others?"""
-    if not evidence.alarm or not regime_of(linear).many_views:
+    if not evidence.alarm or not case.many_views:
         return None
     best = evidence.explanation[0]
     shape = _shape_beside_contenders(evidence)
-    selection = forward_selection(linear, candidates, best)
+    selection = forward_selection(case.linear, case.candidates, best)
     explained = max(selection.explained, best.log_posterior)
     nothing = {"explanation": (), "together": (), **_refusals(selection.refused)}
     if shape is not None and shape.log_posterior > explained + limits.ODDS:
@@ -165,8 +175,8 @@ def which_hold_together(linear: LinearModel, candidates: Sequence[Candidate], ev
     if selection.refused and not selection.effects:
         return Reply("none holds beyond the measured poses", nothing, ends=True)
     effects, idle = list(selection.effects or (best,)), dict[str, str]()
-    if not regime_of(linear).prior:
-        effects, idle = keep_worth_adding(linear, effects, sum(not c.empirical for c in candidates))
+    if not regime_of(case.linear).prior:
+        effects, idle = keep_worth_adding(case.linear, effects, sum(not c.empirical for c in case.candidates))
     refused = _refusals(selection.refused | idle)
     if not effects:
         return Reply("none helps on views left out", {**nothing, **refused, "alarm": False})
@@ -175,32 +185,28 @@ def which_hold_together(linear: LinearModel, candidates: Sequence[Candidate], ev
     return Reply(_names(effects), changes)
 
 
-def do_poses_err_without_a_name(
-    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
-) -> Reply | None:
+def do_poses_err_without_a_name(case: Case, evidence: Evidence) -> Reply | None:
     """Where no effect is wanted: do the poses err again in a way that has no name?"""
     if evidence.alarm:
         return None
-    errors = find_repeating_errors(linear)
+    errors = find_repeating_errors(case.linear)
     text = "they " + " and ".join(error.words for error in errors) if errors else "no"
     return Reply(text, {"repeating_errors": errors}, ends=True)
 
 
-def does_an_unmodelled_effect_explain_it(
-    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
-) -> Reply | None:
+def does_an_unmodelled_effect_explain_it(case: Case, evidence: Evidence) -> Reply | None:
     """Of few views: does something without a name explain them as well, alone and beside a second effect?
 
     Two known effects at once may look like none of them: the best is tried with a second one.
     """
-    if regime_of(linear).many_views:
+    if case.many_views:
         return None
     best = evidence.explanation[0]
     shape = _shape_beside_contenders(evidence)
     unmodelled = evidence.unmodelled_log_posterior
     if not _beaten_by_unmodelled(best.log_posterior, shape, unmodelled):
         return Reply("no")
-    second = find_second_effect(linear, candidates, best)
+    second = find_second_effect(case.linear, case.candidates, best)
     if second is not None:
         prior = float(np.log(limits.PRIOR_PHYSICAL / len(evidence.ranked)))
         of_both = best.log_posterior + (second.score.log_bayes_factor + prior)
@@ -209,24 +215,21 @@ def does_an_unmodelled_effect_explain_it(
     return Reply("yes", {"unmodelled_explains_it": True}, ends=True)
 
 
-def is_it_wanted_beside_smooth_errors(
-    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
-) -> Reply | None:
+def is_it_wanted_beside_smooth_errors(case: Case, evidence: Evidence) -> Reply | None:
     """Is it wanted beside the others and beside any trend without a name, of a joint or in time?"""
-    if regime_of(linear).prior:
+    if regime_of(case.linear).prior:
         return None  # the prior of pose errors has asked already
     best, *others = evidence.together
-    if least_log_bayes_factor(conditioned_on_effects(linear, others), best.score) > limits.ODDS:
+    if least_log_bayes_factor(conditioned_on_effects(case.linear, others), best.score) > limits.ODDS:
         return Reply("yes")
     note = f"{best.name}: an unnamed error, smooth in the joint angles or in time, explains these views as well"
     return Reply("no", {"unmodelled_explains_it": True, "notes": (*evidence.notes, note)}, ends=True)
 
 
-def may_a_gear_be_of_another_order(
-    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
-) -> Reply | None:
+def may_a_gear_be_of_another_order(case: Case, evidence: Evidence) -> Reply | None:
     """May an error of a gear, over so short a range, be one of an order without a name?"""
-    best, base = evidence.explanation[0], evidence.base
+    best = evidence.explanation[0]
+    base = evidence.base
     if best.name not in _GEARS or base is None:
         return None
     nameless = [r for r in evidence.empirical if r.name.startswith(_NAMELESS_ORDERS)]
@@ -237,7 +240,7 @@ def may_a_gear_be_of_another_order(
     return Reply("no")
 
 
-def which_come_near(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+def which_come_near(case: Case, evidence: Evidence) -> Reply | None:
     """Which other effects come within 20 to 1?"""
     if evidence.further is not None:
         return None  # each was asked beside the other
@@ -247,11 +250,11 @@ def which_come_near(linear: LinearModel, candidates: Sequence[Candidate], eviden
     return Reply(_names(near) or "none", {"explanation": (best, *near)})
 
 
-def are_two_missing(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+def are_two_missing(case: Case, evidence: Evidence) -> Reply | None:
     """Of few views: are two missing, of which one alone took for itself what both do?"""
-    if len(evidence.explanation) == 1 or regime_of(linear).many_views:
+    if len(evidence.explanation) == 1 or case.many_views:
         return None
-    pair = find_missing_pair(linear, candidates, evidence.explanation[0])
+    pair = find_missing_pair(case.linear, case.candidates, evidence.explanation[0])
     return Reply("no") if pair is None else Reply(_names(pair), _naming(pair))
 
 
@@ -269,7 +272,7 @@ NAMING: tuple[Question, ...] = (
 )
 
 
-def does_it_hold_elsewhere(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+def does_it_hold_elsewhere(case: Case, evidence: Evidence) -> Reply | None:
     """Does it hold on views left out and in halves of the views?
 
     Every effect that may be named is asked beside all that it was named beside or, where pose errors have no prior,
@@ -279,7 +282,7 @@ def does_it_hold_elsewhere(linear: LinearModel, candidates: Sequence[Candidate],
     effects = _named_effects(evidence)
     alone = {r.name: r for r in evidence.ranked}
     asked = {r.name: (r if r.score.base_model else alone[r.name]).score for r in effects}
-    left_out = {name: cross_validate(linear, scored) for name, scored in asked.items()}
+    left_out = {name: cross_validate(case.linear, scored) for name, scored in asked.items()}
     if evidence.verdict != "missing_effect":
         return Reply("not asked of a group", {"left_out": left_out}) if effects else None
     objections = list[str]()
@@ -296,46 +299,42 @@ def does_it_hold_elsewhere(linear: LinearModel, candidates: Sequence[Candidate],
     second = alone[effect.name]
     changes = {"left_out": left_out, "explanation": (second,), "further": None}
     refuted = not is_certain(second)
-    if not refuted and (objection := _objection(second, cross_validate(linear, second.score))) is not None:
+    if not refuted and (objection := _objection(second, cross_validate(case.linear, second.score))) is not None:
         refuted = True
         objections.append(objection)
     return Reply("; ".join(objections), {**changes, "refuted": refuted, "notes": (*evidence.notes, *objections)})
 
 
-def does_the_scanner_explain_it(
-    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
-) -> Reply | None:
+def does_the_scanner_explain_it(case: Case, evidence: Evidence) -> Reply | None:
     """Do the scans err smoothly: by more than every scanner, and by as many nats as what is named?"""
     if evidence.verdict == "adequate":
-        error = find_scanner_error(linear)
+        error = find_scanner_error(case.linear)
         return Reply("no" if error is None else "yes", {"scanner_error": error})
     if evidence.verdict != "missing_effect":
         return None
-    error = _scanner_error_in_place_of(linear, evidence)
+    error = _scanner_error_in_place_of(case.linear, evidence)
     if error is None:
         return Reply("no")
     less_clear = f"{evidence.named[0].name} explains less than the scanner's own error"
     return Reply("yes", {"scanner_error": error, "notes": (less_clear, *evidence.notes)})
 
 
-def does_it_hold_with_a_second(
-    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
-) -> Reply | None:
+def does_it_hold_with_a_second(case: Case, evidence: Evidence) -> Reply | None:
     """Of few views: does a name that fell hold beside a second effect?
 
     What that one did made the first another in each half of the views, or looked like a smooth error of the scanner.
     """
     proposed = evidence.proposed
-    if proposed is None or proposed.verdict != "missing_effect" or evidence.named or regime_of(linear).many_views:
+    if proposed is None or proposed.verdict != "missing_effect" or evidence.named or case.many_views:
         return None
-    pair = _pair_that_stands(linear, candidates, replace(evidence, explanation=proposed.explanation))
+    pair = _pair_that_stands(case, replace(evidence, explanation=proposed.explanation))
     if pair is None:
         return Reply("no")
     back = {"notes": proposed.notes, "refuted": False, "scanner_error": None}
     return Reply(f"yes, beside {pair[1].name}", {**_naming(pair), **back})
 
 
-def which_predict_as_well(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+def which_predict_as_well(case: Case, evidence: Evidence) -> Reply | None:
     """Which contenders predict views left out as well as a single name, or better?
 
     These views cannot tell it from those. One that predicts them clearly better and stands every other test takes the
@@ -350,21 +349,21 @@ def which_predict_as_well(linear: LinearModel, candidates: Sequence[Candidate], 
         for r in evidence.ranked[: limits.CROSS_VALIDATED_CANDIDATES]
         if r.name != named.name and is_contender(r) and not any(r.name in note for note in evidence.notes)
     }
-    of_rivals = {name: cross_validate(linear, r.score) for name, r in rivals.items()}
+    of_rivals = {name: cross_validate(case.linear, r.score) for name, r in rivals.items()}
     left_out = dict(evidence.left_out) | of_rivals
     ahead = [name for name, validation in of_rivals.items() if validation.better_than(left_out[named.name])]
     better = min(ahead, key=lambda name: of_rivals[name].heldout, default=named.name)
     if better != named.name and _objection(rivals[better], of_rivals[better]) is None:
         rivals, named = rivals | {named.name: named}, rivals[better]
     as_good = [r for name, r in rivals.items() if r is not named and left_out[name].as_good_as(left_out[named.name])]
-    if as_good and not regime_of(linear).many_views:
-        pair = _pair_that_stands(linear, candidates, evidence)
+    if as_good and not case.many_views:
+        pair = _pair_that_stands(case, evidence)
         if pair is not None:
             return Reply(f"none beside {pair[1].name}", _naming(pair))
     return Reply(_names(as_good) or "none", {"explanation": (named, *as_good), "left_out": left_out})
 
 
-def does_a_joint_turn_back(linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence) -> Reply | None:
+def does_a_joint_turn_back(case: Case, evidence: Evidence) -> Reply | None:
     """Does a joint turn back where a jump in time is named, so that this session cannot tell the two apart?
 
     A path that was driven once shows both at the same view. A jump that is missing beside other effects is not added
@@ -372,7 +371,8 @@ def does_a_joint_turn_back(linear: LinearModel, candidates: Sequence[Candidate],
     """
     if evidence.verdict != "missing_effect":
         return None
-    views, named = linear.measurement.views, evidence.named[0]
+    views = case.linear.measurement.views
+    named = evidence.named[0]
     coincidences = {r.name: _coincidence(views, r) for r in (named, *evidence.together)}
     if not any(coincidences.values()):
         return Reply("no")
@@ -577,16 +577,14 @@ def _scanner_error_in_place_of(linear: LinearModel, evidence: Evidence) -> Field
     return error if scanner_explains_it(replace(evidence, scanner_error=error)) else None
 
 
-def _pair_that_stands(
-    linear: LinearModel, candidates: Sequence[Candidate], evidence: Evidence
-) -> tuple[Ranked, Ranked] | None:
+def _pair_that_stands(case: Case, evidence: Evidence) -> tuple[Ranked, Ranked] | None:
     """Return the first of the explanation with a second effect, where both stand every test beside each other."""
     named = evidence.explanation[0]
-    pair = find_missing_pair(linear, candidates, named)
-    if pair is None or pair[0].name != named.name or not pair_is_validated(linear, pair):
+    pair = find_missing_pair(case.linear, case.candidates, named)
+    if pair is None or pair[0].name != named.name or not pair_is_validated(case.linear, pair):
         return None
     both = replace(evidence, refuted=False, scanner_error=None, **_naming(pair))
-    return pair if _scanner_error_in_place_of(linear, both) is None else None
+    return pair if _scanner_error_in_place_of(case.linear, both) is None else None
 
 
 def _coincidence(views: Views, ranked: Ranked) -> str:

@@ -94,7 +94,8 @@ def _best_pose(linear: LinearModel, group: Sequence[Score]) -> tuple[Array, int,
     """Return joint angles (n,) in degrees where the two that stay most alike gain most, the number of such views, and
     what they separate; None if poses cannot separate anything.
     """
-    joints, separable = None, []
+    joints = None
+    separable = []
     for a, b in combinations(group, 2):
         gains = _gains(linear, a, b)
         if gains is not None and gains[2].max() > WORTHWHILE_GAIN * SEPARATION_LAMBDA:

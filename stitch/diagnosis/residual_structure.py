@@ -163,12 +163,12 @@ def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Depend
         group = r.score.candidate.effect.group
         if group not in best or r.score.log_bayes_factor > best[group].score.log_bayes_factor:
             best[group] = r
-    found = [
+    shown = [
         _dependence(linear, r, values)
         for name, r in best.items()
         if (values := covariate_values(views, name)) is not None
     ]
-    return sorted(found, key=lambda d: (d.p_value, -d.score))
+    return sorted(shown, key=lambda d: (d.p_value, -d.score))
 
 
 def covariate_values(views: Views, name: str) -> Array | None:
@@ -251,8 +251,8 @@ def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Arr
         if moves_points([term]):
             # Such an effect changes the points, and the views only as hand-eye and the others follow.
             twists = X[:, :-k] @ solution[:-k]
-            measurement, every = fitted.measurement, slice(None)
-            points = [p + scan_correction(measurement, [term], v, poses[v], every) for v, p in enumerate(points)]
+            corrections = (scan_correction(fitted.measurement, [term], v, T, slice(None)) for v, T in enumerate(poses))
+            points = [p + correction for p, correction in zip(points, corrections, strict=True)]
         else:
             twists = X @ solution
     overlaps = surfaces.unconstrained.overlaps

@@ -11,7 +11,6 @@ evidence ½ ν log(1 + q/ν) in place of ½ q. For one parameter, known scatter 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
@@ -24,14 +23,6 @@ from stitch.numerics import frames
 from stitch.numerics.distributions import f_limit, noncentral_f_tail
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
-
-
-@dataclass(frozen=True)
-class Alias:
-    """Another effect that could do what this one does."""
-
-    name: str
-    correlation: float  # of this one's fitted pattern with the best that the other can do
 
 
 def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
@@ -59,10 +50,11 @@ def alias_matrix(linear: LinearModel, scores: Sequence[Score]) -> Array:
 
 def aliases_of(
     k: int, matrix: Array, scores: Sequence[Score], least: float = limits.LISTED_ALIAS_CORRELATION
-) -> list[Alias]:
-    """Return the most similar effects of candidate k."""
-    order = np.argsort(-matrix[k])
-    return [Alias(scores[j].name, float(matrix[k, j])) for j in order if j != k and matrix[k, j] > least][:5]
+) -> dict[str, float]:
+    """Return the effects most similar to candidate k, and the correlation of its fitted pattern with the best that each
+    can do, largest first."""
+    alike = [j for j in np.argsort(-matrix[k]) if j != k and matrix[k, j] > least]
+    return {scores[j].name: float(matrix[k, j]) for j in alike[:5]}
 
 
 def imitated_share(y: Array, X: Array) -> float:

@@ -221,17 +221,18 @@ def joint_curve_sentence(curve: JointCurve) -> str:
 
 def _place_in_words(curve: JointCurve, k: int) -> str:
     """At j4 = -48°, after a move of 12°, 12 min into the session, at view 7, under 31 N m, under 0.3 N m of each kg."""
-    there, name = curve.at[k], curve.covariate
+    place = curve.at[k]
+    name = curve.covariate
     match name.split("_", 1)[-1]:
         case "move_deg":
-            return f"after a move of {there:.0f}°"
+            return f"after a move of {place:.0f}°"
         case "deg":
-            return f"at {name.removesuffix('_deg')} = {there:.0f}°"
+            return f"at {name.removesuffix('_deg')} = {place:.0f}°"
         case "s":
-            return f"{duration_text(there - curve.view_values.min())} into the session"
+            return f"{duration_text(place - curve.view_values.min())} into the session"
         case "view":
-            return f"at view {there:.0f}"
-    load = rounded(there, 0.1 * (curve.at[-1] - curve.at[0]))
+            return f"at view {place:.0f}"
+    load = rounded(place, 0.1 * (curve.at[-1] - curve.at[0]))
     return f"under {load} N m" + (" of each kg" if name.endswith("_per_kg") else "")
 
 

@@ -170,9 +170,9 @@ def _smooth_trends(angles: Array, reach: float = REACH) -> Array:
 @lru_cache(maxsize=_KEPT)
 def _smooth_trends_of(angles: bytes, views: int, reach: float) -> Array:
     """Return (V, R) of the views whose angles these are: the same in every diagnosis of a session."""
-    every = np.frombuffer(angles).reshape(views, -1)
+    of_views = np.frombuffer(angles).reshape(views, -1)
     knots = _knots(views)
-    covariance = rbf_joints(every, every[knots], reach)
+    covariance = rbf_joints(of_views, of_views[knots], reach)
     shapes = covariance @ leading_trends(covariance[knots], limits.PROCESS_COLUMNS)
     return shapes - shapes.mean(axis=0)
 

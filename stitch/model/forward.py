@@ -182,9 +182,9 @@ def true_geometry(measurement: Measurement, model: Model) -> tuple[Array, list[A
     """Return poses (V, 4, 4) T_reference_scanner, and points (N, 3) of every scan, without the effects of a model."""
     poses = _without_motion(measurement, model.terms).poses(model.T_mount)
     points = [scan.points for scan in measurement.capture.scans]
-    every = slice(None)
     if moves_points(model.terms):
-        points = [p + scan_correction(measurement, model.terms, v, poses[v], every) for v, p in enumerate(points)]
+        terms = model.terms
+        points = [p + scan_correction(measurement, terms, v, poses[v], slice(None)) for v, p in enumerate(points)]
     return poses, points
 
 
@@ -245,10 +245,9 @@ class _ChainJacobian:
 
     def is_about(self, errors: ChainErrors) -> bool:
         """Return whether errors are those of this model: of the same effects, summed in another order, they are."""
-        here, there = ((e.joints, *vars(e.links).values(), e.mount, e.part) for e in (self.errors, errors))
-        return all(
-            np.array_equal(a, b) or np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in zip(here, there, strict=True)
-        )
+        arrays, others = ((e.joints, *vars(e.links).values(), e.mount, e.part) for e in (self.errors, errors))
+        pairs = zip(arrays, others, strict=True)
+        return all(np.array_equal(a, b) or np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in pairs)
 
     def twists(self, steps: Sequence[Sequence[ChainErrors]], of_arm: bool) -> Array:
         """Return (P, V, 6) left twists of the views between the two errors of each step, near these."""

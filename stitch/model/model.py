@@ -114,10 +114,11 @@ class EffectsCovariance:
         alone = [i for i, (_, p) in enumerate(rows) if p.fitted and i not in together]
         out = np.zeros((len(rows), len(known) + len(alone)))
         if known:
-            here, there = (list(index) for index in zip(*known, strict=True))
-            size = sigma[there]
-            values, vectors = np.linalg.eigh(self.matrix[np.ix_(there, there)] / np.outer(size, size))
-            out[here, : len(known)] = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+            rows_known = [i for i, _ in known]
+            columns = [k for _, k in known]
+            size = sigma[columns]
+            values, vectors = np.linalg.eigh(self.matrix[np.ix_(columns, columns)] / np.outer(size, size))
+            out[rows_known, : len(known)] = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
         for k, i in enumerate(alone, len(known)):
             out[i, k] = rows[i][1].sigma
         return out

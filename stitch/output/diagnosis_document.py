@@ -92,7 +92,7 @@ def _candidate_row(diagnosis: Diagnosis, candidate: CandidateEffect) -> dict[str
         "minimum_detectable_of": clearest,
         "minimum_detectable_each": detectable,
         "hand_eye_if_missed": candidate.hand_eye,
-        "aliases": [{"effect": alias.name, "correlation": alias.correlation} for alias in candidate.aliases],
+        "aliases": [{"effect": name, "correlation": alike} for name, alike in candidate.aliases.items()],
         "tier": ranked.score.candidate.effect.tier,
     }
 

@@ -24,6 +24,7 @@ from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 from tests.diagnosis.freed_blade import freed_blade
 
+NO_CASE = gathering.Case(None, ())
 ONE, OTHER = (SimpleNamespace(name=n, score=SimpleNamespace(log_bayes_factor=8.0)) for n in ("backlash", "settling"))
 LARGE, SMALL = (FieldError(0.02, 0.0, gain, over_noise) for gain, over_noise in ((20.0, True), (5.0, False)))
 REPEATS = (SimpleNamespace(words="wander"),)
@@ -103,11 +104,11 @@ def upheld(monkeypatch, evidence, *, together, refused):
     monkeypatch.setattr(
         gathering, "find_scanner_error", lambda linear, other_terms=(): found.get(tuple(t.name for t in other_terms))
     )
-    return gathering.ask(gathering.TESTS[:3], None, (), replace(evidence, proposed=evidence))
+    return gathering.ask(gathering.TESTS[:3], NO_CASE, replace(evidence, proposed=evidence))
 
 
 def rivals_of(evidence):
-    return gathering.ask([gathering.which_predict_as_well], None, (), evidence)
+    return gathering.ask([gathering.which_predict_as_well], NO_CASE, evidence)
 
 
 @pytest.mark.usefixtures("without_halves")
@@ -206,7 +207,7 @@ def held(monkeypatch, left_out: CrossValidation) -> tuple[str, tuple[str, ...]]:
     evidence = Evidence((named,), (), alarm=True, explanation=(named,))
     monkeypatch.setattr(gathering, "objection_in_halves", lambda score: None)
     monkeypatch.setattr(gathering, "cross_validate", lambda linear, score: left_out)
-    upheld = gathering.ask([gathering.does_it_hold_elsewhere], None, (), evidence)
+    upheld = gathering.ask([gathering.does_it_hold_elsewhere], NO_CASE, evidence)
     return upheld.verdict, upheld.notes
 
 
@@ -231,7 +232,7 @@ def named_with_gain(gain: float) -> Evidence:
 
 def beside_the_scanner(monkeypatch: pytest.MonkeyPatch, evidence: Evidence, shown: FieldError | None) -> Evidence:
     monkeypatch.setattr(gathering, "find_scanner_error", lambda linear, other_terms=(): shown)
-    return gathering.ask([gathering.does_the_scanner_explain_it], None, (), evidence)
+    return gathering.ask([gathering.does_the_scanner_explain_it], NO_CASE, evidence)
 
 
 def scanner_error(gain: float, over_noise: bool = True) -> FieldError:
