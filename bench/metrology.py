@@ -46,6 +46,7 @@ from stitch.plugins.metrology.budget import measure_features, monte_carlo
 from stitch.plugins.metrology.error_sources import place_errors
 from stitch.plugins.metrology.feature_file import FeatureList
 from stitch.plugins.metrology.features import Feature
+from stitch.plugins.metrology.place_errors import PlaceErrors
 from stitch.plugins.metrology.planning import expected_model as expected
 from stitch.plugins.metrology.planning.detection_chances import DRAWS, ExpectedDiagnosis
 from stitch.session.measurement import measurement_of, with_part_origin
@@ -81,7 +82,7 @@ def feature_trial(job: Row) -> Row:
     return {"numbers": [(GROUPS[n.feature.kind], n.U, e) for n, e in zip(numbers, errors.tolist(), strict=True)]}
 
 
-def _measured(job: Row):
+def _measured(job: Row) -> tuple[PlaceErrors, FeatureList, Array]:
     """Errors of places in a run of the cell, what is measured there, and its true numbers."""
     kind = job["kind"]
     # The same part in all cells, and a quarter of the simulation.

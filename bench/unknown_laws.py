@@ -28,7 +28,7 @@ from data_synth.laws.blind_second import FURTHER, FURTHER_IN_TIME, FURTHER_OF_FL
 from data_synth.laws.blind_third import LATER, LATER_IN_TIME, LATER_OF_FLANGE
 from data_synth.laws.unnamed import IN_TIME, UNNAMED
 from data_synth.ordinary_arm import draw_arm, with_memory
-from stitch.diagnosis.candidates import Form, candidate_of
+from stitch.diagnosis.candidates import Candidate, Form, candidate_of
 from stitch.diagnosis.evidence import gather_evidence
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.sensitivity import least_noncentrality
@@ -369,7 +369,7 @@ def _oracle_size(cell: LinearCell, name: str, true: dict[str, float]) -> float |
     return float(np.sqrt(brentq(lambda shift: ncx2.sf(limit, rank, shift) - POWER, 1e-3, 1e3))) / length
 
 
-def nearest_form(candidate, true: dict[str, float]) -> Form:
+def nearest_form(candidate: Candidate, true: dict[str, float]) -> Form:
     """Return the form of a candidate with all fitted parameters whose grid lies nearest to the true values."""
     values = np.array([true.get(p.name, 0.0) for p in candidate.parameters])
     fitted = np.array([not p.grid for p in candidate.parameters])

@@ -101,7 +101,7 @@ def turned(seed: int) -> Array:
     return frames.make(Rotation.random(rng=np.random.default_rng(seed)).as_matrix(), [3567.7, -2954.3, 1932.9])
 
 
-def scanned(mesh, kind: str, seed: int, overview: slice, close: slice) -> JoinedScans:
+def scanned(mesh: trimesh.Trimesh, kind: str, seed: int, overview: slice, close: slice) -> JoinedScans:
     """Return overview scans and close scans along the edges."""
     T = turned(seed)
     far, far_poses = window_scans.scan_outside(mesh, T, NOISE, seed, (3, 1) if kind == "pane" else (3, 3))
@@ -115,7 +115,7 @@ def joined(clouds: list[Array], poses: Array) -> JoinedScans:
     return join_scans([prepare_scan("", points) for points in clouds], poses)
 
 
-def furthest(T: Array, true: Array, mesh) -> float:
+def furthest(T: Array, true: Array, mesh: trimesh.Trimesh) -> float:
     """Return the largest distance between where two poses put a point of the part, mm."""
     off = frames.transform(T, mesh.vertices) - frames.transform(true, mesh.vertices)
     return float(np.linalg.norm(off, axis=1).max())
