@@ -197,7 +197,10 @@ def trials_summary(rows: list[Row]) -> list[str]:
     return [f"{what}: {ratios.min():.3f} to {ratios.max():.3f}."]
 
 
-MONTE_CARLO = Table(trials_jobs, trials_trial, trials_summary, range(40_200, 40_204), settings={"trials": 4000})
+MONTE_CARLO = Table(
+    trials_jobs, trials_trial, trials_summary, range(40_200, 40_204), page="measure", block="monte-carlo",
+    settings={"trials": 4000},
+)  # fmt: skip
 
 
 def chance_jobs(seeds: range) -> Iterator[Row]:
