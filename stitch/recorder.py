@@ -11,28 +11,27 @@ from stitch.session.session import SessionData
 
 
 class Recorder(Protocol):
-    """Receives every stage and iteration. All poses are T_reference_scanner, (V, 4, 4)."""
+    """Receives every stage and iteration, and does nothing. All poses are T_reference_scanner, (V, 4, 4)."""
 
     def start(self, session: SessionData) -> None:
         """Called once, before the first stage, with the scans and the robot's path."""
+        return
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
         """Called after each iteration of a stage; `gate` is the largest distance paired."""
+        return
 
     def stage(self, result: StageResult, poses: Array) -> None:
         """Called at the end of a stage."""
+        return
 
     def finish(self, run: RunData) -> None:
         """Called once, with the result."""
+        return
 
 
-class SilentRecorder:
+class SilentRecorder(Recorder):
     """A recorder that shows nothing."""
-
-    def start(self, session: SessionData) -> None: ...
-    def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None: ...
-    def stage(self, result: StageResult, poses: Array) -> None: ...
-    def finish(self, run: RunData) -> None: ...
 
 
 class RecorderMemory:

@@ -267,7 +267,7 @@ class LiveSession:
         assert before is not None
         capture = prepare_capture(replace(self.session, views=(view,)))
         try:
-            placed = place_view(
+            fit, seen_before = place_view(
                 self._fit, capture.scans[0], capture.T_reference_mount[0], capture.T_reference_flange[0]
             )
         except NoResultError:
@@ -275,19 +275,19 @@ class LiveSession:
                 view, "It shares no surface with the others: its pose is far off, or it shows another part."
             )
         members = [*self._members, len(self.session.views) - 1]
-        off = self._blunders(placed.fit, members)
+        off = self._blunders(fit, members)
         if len(members) - 1 in off:
             return self._rejected(view, off[len(members) - 1])
         self._members = members
-        self._fit = placed.fit
+        self._fit = fit
         for v in sorted(off, reverse=True):
             self._fit = without_view(self._fit, v)
             del self._members[v]
         self._fit = fit_live_hand_eye(self._fit, self._errors)
         others = " ".join(f"{self.session.names[members[v]]} does not belong: {why}" for v, why in off.items())
         gain = 1 - self.hand_eye.U.mm / before.U.mm  # type: ignore[union-attr]
-        idle = placed.seen_before > _SEEN_BEFORE and gain < _LEAST_GAIN and not off
-        share = f"{100 * placed.seen_before:.0f} % of it was seen before, U falls by {max(100 * gain, 0):.0f} %."
+        idle = seen_before > _SEEN_BEFORE and gain < _LEAST_GAIN and not off
+        share = f"{100 * seen_before:.0f} % of it was seen before, U falls by {max(100 * gain, 0):.0f} %."
         return self._report(view, "adds_nothing" if idle else "fits", f"{others} {share}".strip())
 
     def _first_fit(self, view: View) -> LiveView:

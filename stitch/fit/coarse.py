@@ -310,9 +310,11 @@ def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
     for kind, motions in (("features", feature_motions), ("KISS-ICP", sequence_motions)):
         robot, scanner = [], []
         for capture in captures:
-            A, B = consistent_motions(*motions(capture))
-            robot.append(A)
-            scanner.append(B)
+            A, B = motions(capture)
+            # Single motions may be wrong: one counts only if it turns by as much as the robot's, as under any hand-eye.
+            keep = angle_differences(A, B) < _ANGLE_TOLERANCE
+            robot.append(A[keep])
+            scanner.append(B[keep])
         A, B = np.concatenate(robot), np.concatenate(scanner)
         if len(A) < _MINIMUM_MOTIONS:
             continue
@@ -326,19 +328,11 @@ def motion_candidates(captures: Sequence[Capture]) -> list[tuple[str, Array]]:
     return out
 
 
-def robot_motions(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
-    """Return A (M, 4, 4) with A·X = X·B, B the motion that maps view w's scanner frame into view v's."""
-    return motions_between(capture.T_reference_mount, pairs)
-
-
-def consistent_motions(A: Array, B: Array) -> tuple[Array, Array]:
-    """Return the motions whose rotation angles agree."""
-    keep = angle_differences(A, B) < _ANGLE_TOLERANCE
-    return A[keep], B[keep]
-
-
 def feature_motions(capture: Capture) -> tuple[Array, Array]:
-    """Return (A, B), each (M, 4, 4): motions between neighbours of the sequence (and its ends) by feature matching."""
+    """Return (A, B), each (M, 4, 4): motions between neighbours of the sequence by feature matching.
+
+    A·X = X·B, with B the motion that maps view w's scanner frame into view v's, A that of the mount.
+    """
     size = _FEATURE_SPACINGS * capture.spacing
 
     def described(scan: Scan) -> FeaturedSurface:
@@ -355,7 +349,8 @@ def feature_motions(capture: Capture) -> tuple[Array, Array]:
         return feature_matching.align_icp(source, target, T, reach=size)
 
     pairs = neighbouring_views(len(capture.scans))
-    return robot_motions(capture, pairs), np.array(list(parallel(motion, pairs, "pairs of scans"))).reshape(-1, 4, 4)
+    scanner = np.array(list(parallel(motion, pairs, "pairs of scans"))).reshape(-1, 4, 4)
+    return motions_between(capture.T_reference_mount, pairs), scanner
 
 
 def neighbouring_views(views: int) -> list[tuple[int, int]]:

@@ -57,14 +57,6 @@ class LiveFit:
         return self.unconstrained.overlaps.gate
 
 
-@dataclass(frozen=True)
-class NewView:
-    """A view where the surfaces of the others put it."""
-
-    fit: LiveFit  # with this view as its last
-    seen_before: float  # share of its sampled points that lie on the surface of another view
-
-
 # From a capture, its free-network poses and a hand-eye to how the poses may err, and to the scanner's errors by source.
 ErrorPrior = Callable[[Capture, UnconstrainedPoses, Array], tuple[PoseErrors, dict[str, list[Array]]]]
 
@@ -76,8 +68,11 @@ def start_live_fit(correction: Correction) -> LiveFit:
     return LiveFit(capture, T_mount, correction.hand_eye.covariance, unconstrained)
 
 
-def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_flange: Array) -> NewView:
+def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_flange: Array) -> tuple[LiveFit, float]:
     """Move a new view to where the surfaces of the others put it, and add its correspondences.
+
+    Returns:
+        The fit with this view as its last, and the share of its sampled points that lie on the surface of another view.
 
     Args:
         T_reference_mount, T_reference_flange: (4, 4) of the view, as in `Capture`.
@@ -114,7 +109,7 @@ def place_view(fit: LiveFit, scan: Scan, T_reference_mount: Array, T_reference_f
         unconstrained=together.relative_to(model_poses),
         drifted=fit.drifted + float(moved[:-1].max(initial=0.0)),
     )
-    return NewView(fitted, float(np.isin(samples[last], seen).mean()))
+    return fitted, float(np.isin(samples[last], seen).mean())
 
 
 def fit_live_hand_eye(fit: LiveFit, prior: ErrorPrior) -> LiveFit:

@@ -107,7 +107,13 @@ def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> Ra
     views = list(zip(scans, kept, strict=True))
     middles, ranges = zip(*parallel(middle_and_ranges, views), strict=True)
     axes = _axes_about(np.sum(middles, axis=0))
-    maps = list(parallel(lambda item: _on_map(rays(*item)[1], axes), views))
+
+    def on_map(item: tuple[Scan, Mask]) -> Array:
+        """(N, 2) stereographic map of a view's rays; what lies behind the scanner lies far off."""
+        x = rays(*item)[1] @ axes.T
+        return x[:, :2] / np.maximum(1 + x[:, 2:], _BEHIND)
+
+    maps = list(parallel(on_map, views))
     # On the map lengths are half the angles, in the middle of the field.
     angle = np.sqrt(np.median([scan.solid_angle for scan in scans]))
     size = max(_BIN * angle, cell / float(np.median(np.concatenate(ranges)))) / 2
@@ -118,7 +124,8 @@ def range_images(scans: Sequence[Scan], kept: Sequence[Mask], cell: float) -> Ra
         """Nearest surface of closed bins, empty bins, whether the view is trusted, and bins that hold something."""
         m, far = item
         i, j = ((m - low) / size).astype(np.int64).T
-        image, order = np.full(shape, np.inf), np.argsort(-far)
+        image = np.full(shape, np.inf)
+        order = np.argsort(-far)
         image[i[order], j[order]] = far[order]
         least, filled = _of_nine_bins(image)
         held = np.isfinite(image)
@@ -136,12 +143,6 @@ def _axes_about(middle: Array) -> Array:
     across = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
     across /= np.linalg.norm(across)
     return np.stack([across, np.cross(ahead, across), ahead])
-
-
-def _on_map(rays: Array, axes: Array) -> Array:
-    """(N, 2) stereographic map of unit rays (N, 3); what lies behind the scanner lies far off."""
-    x = rays @ axes.T
-    return x[:, :2] / np.maximum(1 + x[:, 2:], _BEHIND)
 
 
 def _of_nine_bins(image: Array) -> tuple[Array, Indices]:
