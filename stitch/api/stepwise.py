@@ -60,52 +60,56 @@ def suggest(
         known: what a diagnosis of this state has named to be added; None: it is diagnosed.
         recorder: told of every run that is tried, one after the other.
     """
-    lines, given, left = list[str](), set(state.model.effects), at_most
+    lines: list[str] = []
+    given = set(state.model.effects)
+    left = at_most
     result: RunData | None = None
     while True:
-        found = None if known is not None and left else diagnose(state)
-        finding = known if found is None else _finding_of(found)
+        diagnosis = None if known is not None and left else diagnose(state)
+        finding = known if diagnosis is None else _finding_of(diagnosis)
         assert finding is not None
         lines += finding.lines
-        if found is not None and (why := _reason_to_stop(found, left, at_most)) is not None:
-            return result, [*lines, *why], found
-        before, known = result, None
-        result, told = _add_found(state, finding, left, given, recorder)
-        lines += told
-        if not set(result.effects) - set(state.effects):
-            return before, lines, replace(found or diagnose(state), tried=result.tried)
-        left -= min(len(set(result.effects) - set(state.effects)), left)
+        if diagnosis is not None and (why := _reason_to_stop(diagnosis, left, at_most)) is not None:
+            return result, [*lines, *why], diagnosis
+        known = None
+        before = result
+        result, happened = _add_found(state, finding, left, given, recorder)
+        lines += happened
+        added = set(result.effects) - set(state.effects)
+        if not added:
+            return before, lines, replace(diagnosis or diagnose(state), tried=result.tried)
+        left -= min(len(added), left)
         if set(state.effects) - given:
-            result, told = _exchange_added(result, given, recorder)
-            lines += told
+            result, happened = _exchange_added(result, given, recorder)
+            lines += happened
         state = result
         # Of thousands of poses a diagnosis holds half a gigabyte of columns: gone before the next has its own.
-        del found
+        del diagnosis
 
 
-def _finding_of(found: Diagnosis) -> Finding:
+def _finding_of(diagnosis: Diagnosis) -> Finding:
     from stitch.diagnosis.diagnosis import Finding
 
-    notes = (f"{note}." for note in found.notes if note not in found.sentence)
-    validations = {c.name: c.cross_validation for c in found.candidates if c.cross_validation is not None}
-    return Finding((*_finding_and_evidence(found), *notes), found.together, validations)
+    notes = (f"{note}." for note in diagnosis.notes if note not in diagnosis.sentence)
+    validations = {c.name: c.cross_validation for c in diagnosis.candidates if c.cross_validation is not None}
+    return Finding((*_finding_and_evidence(diagnosis), *notes), diagnosis.together, validations)
 
 
-def _reason_to_stop(found: Diagnosis, left: int, at_most: int) -> list[str] | None:
+def _reason_to_stop(diagnosis: Diagnosis, left: int, at_most: int) -> list[str] | None:
     """Return why nothing is added after a diagnosis, in lines; None where something is."""
-    if found.verdict != "missing_effect":
+    if diagnosis.verdict != "missing_effect":
         return []
-    name = found.effects[0]
-    if not found.likelier_than_not:
+    name = diagnosis.effects[0]
+    if not diagnosis.likelier_than_not:
         return [f"{name} was not added: chance is more likely. To add it anyway: stitch add RUN {name}."]
-    if found.dropped_before is not None:
+    if diagnosis.dropped_before is not None:
         return [f"{name} was dropped in this run before. To add it all the same: stitch add RUN {name}."]
     effects = "1 effect" if at_most == 1 else f"{at_most} effects"
     return None if left else [f"Stopped after {effects}; run it again to go on."]
 
 
 def _add_found(
-    state: RunData, found: Finding, at_most: int, given: set[str], recorder: Recorder | None
+    state: RunData, finding: Finding, at_most: int, given: set[str], recorder: Recorder | None
 ) -> tuple[RunData, list[str]]:
     """Return the run with what was found together, as far as it earns its place, and what happened.
 
@@ -114,12 +118,12 @@ def _add_found(
     """
     from stitch.diagnosis.thresholds import FAINT_SIGMAS
 
-    names = [name for name in found.names if name not in state.tried][:at_most]
+    names = [name for name in finding.names if name not in state.tried][:at_most]
     while names:
         tried, lines = _drop_unneeded(change(state, [*state.effects, *names], recorder), given, recorder)
         kept = [name for name in names if name in tried.effects]
         share = (tried.heldout_rms / state.heldout_or_fit_rms) ** 2
-        validation = found.validations.get(names[0])
+        validation = finding.validations.get(names[0])
         zero = max((t.sigmas_from_zero for t in tried.terms if t.name in kept), default=0.0) < FAINT_SIGMAS
         reason = validation.fit_rejection_reason(" and ".join(kept), share, zero=zero) if validation and kept else None
         if kept and reason is None:
@@ -160,37 +164,30 @@ def suggest_group(state: RunData, recorder: Recorder | None = None) -> tuple[Run
     """
     from stitch.diagnosis.validation import group_helps, group_share
 
-    found = diagnose(state)
-    if found.verdict != "cannot_tell":
-        return (
-            None,
-            [*_finding_and_evidence(found), "These views leave no group of effects undecided."],
-            found,
-        )
-    names = " + ".join(found.effects)
-    asked = [c.ranked.score for c in found.candidates if c.name in found.effects]
-    share, sigma = group_share(found.linear, asked)
+    diagnosis = diagnose(state)
+    evidence = _finding_and_evidence(diagnosis)
+    if diagnosis.verdict != "cannot_tell":
+        return None, [*evidence, "These views leave no group of effects undecided."], diagnosis
+    names = " + ".join(diagnosis.effects)
+    asked = [c.ranked.score for c in diagnosis.candidates if c.name in diagnosis.effects]
+    share, sigma = group_share(diagnosis.linear, asked)
     judged = f"of the mean square error of poses left out they leave {share:.2f} ± {sigma:.2f}"
     if not group_helps(share, sigma):
-        return (
-            None,
-            [*_finding_and_evidence(found), f"{names} together do not help on views left out: {judged}."],
-            found,
-        )
-    tried = change(state, [*state.model.effects, *found.effects], recorder)
-    told = (
+        return None, [*evidence, f"{names} together do not help on views left out: {judged}."], diagnosis
+    tried = change(state, [*state.model.effects, *diagnosis.effects], recorder)
+    sentence = (
         f"{names} are fitted as one group: {judged}, and together they stand for what is missing; these views do not "
         "tell its parts apart, so that none of their values means anything alone"
     )
-    tried = tried.with_fit(notes=(f"{told}.", *tried.notes))
-    return tried, [*_finding_and_evidence(found), f"{told}."], diagnose(tried)
+    tried = tried.with_fit(notes=(f"{sentence}.", *tried.notes))
+    return tried, [*evidence, f"{sentence}."], diagnose(tried)
 
 
-def _finding_and_evidence(found: Diagnosis) -> list[str]:
+def _finding_and_evidence(diagnosis: Diagnosis) -> list[str]:
     """Return the plain finding and the evidence, as `stitch diagnose` prints them."""
     from stitch.output.plain_finding import plain_finding
 
-    return [plain_finding(found, found.linear.measurement.length_unit), found.sentence]
+    return [plain_finding(diagnosis, diagnosis.linear.measurement.length_unit), diagnosis.sentence]
 
 
 def _drop_unneeded(result: RunData, given: set[str], recorder: Recorder | None) -> tuple[RunData, list[str]]:
