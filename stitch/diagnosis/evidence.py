@@ -123,10 +123,15 @@ def _answered(evidence: Evidence, question: Callable[..., object], reply: Reply)
 
 def is_anything_certain(case: Case, evidence: Evidence) -> Reply | None:
     """Is an effect certain by itself, or a shape without a cause?"""
-    certain = [r.name for r in evidence.ranked if is_certain(r)]
-    if _certain_shape(evidence) is None and not certain:
+    certain = [r for r in evidence.ranked if is_certain(r)]
+    shape = next(iter(evidence.empirical), None)
+    if shape is not None and not (
+        shape.adjusted < limits.ALPHA_UNKNOWN and shape.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
+    ):
+        shape = None
+    if shape is None and not certain:
         return Reply("no")
-    return Reply(", ".join(certain) or "a shape without a cause", {"alarm": True})
+    return Reply(_names(certain) or "a shape without a cause", {"alarm": True, "shape": shape})
 
 
 def are_several_required(case: Case, evidence: Evidence) -> Reply | None:
@@ -153,6 +158,7 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
     changes = {
         "explanation": (best,),
         "together": (best,),
+        "shape": evidence.shape and rescored_in(base, evidence.shape),
         "contenders": tuple(contenders),
         "base": base,
         "unmodelled_log_posterior": unmodelled,
@@ -166,7 +172,7 @@ def which_hold_together(case: Case, evidence: Evidence) -> Reply | None:
     if not evidence.alarm or not case.many_views:
         return None
     best = evidence.explanation[0]
-    shape = _shape_beside_contenders(evidence)
+    shape = evidence.shape
     selection = forward_selection(case.linear, case.candidates, best)
     explained = max(selection.explained, best.log_posterior)
     nothing = {"explanation": (), "together": (), **_refusals(selection.refused)}
@@ -202,15 +208,13 @@ def does_an_unmodelled_effect_explain_it(case: Case, evidence: Evidence) -> Repl
     if case.many_views:
         return None
     best = evidence.explanation[0]
-    shape = _shape_beside_contenders(evidence)
-    unmodelled = evidence.unmodelled_log_posterior
-    if not _beaten_by_unmodelled(best.log_posterior, shape, unmodelled):
+    if not _beaten_by_unmodelled(best.log_posterior, evidence):
         return Reply("no")
     second = find_second_effect(case.linear, case.candidates, best)
     if second is not None:
         prior = float(np.log(limits.PRIOR_PHYSICAL / len(evidence.ranked)))
         of_both = best.log_posterior + (second.score.log_bayes_factor + prior)
-        if not _beaten_by_unmodelled(of_both, shape, unmodelled):
+        if not _beaten_by_unmodelled(of_both, evidence):
             return Reply(f"not beside {second.name}", {"further": second, "together": (best, second)})
     return Reply("yes", {"unmodelled_explains_it": True}, ends=True)
 
@@ -515,21 +519,7 @@ def pair_is_validated(linear: LinearModel, pair: tuple[Ranked, Ranked]) -> bool:
     )
 
 
-def _certain_shape(evidence: Evidence) -> Ranked | None:
-    """Return the likeliest shape without a cause, where it is enough for an alarm."""
-    shape = next(iter(evidence.empirical), None)
-    if shape is None or shape.adjusted >= limits.ALPHA_UNKNOWN:
-        return None
-    return shape if shape.score.log_bayes_factor > limits.LOG_BAYES_FACTOR else None
-
-
-def _shape_beside_contenders(evidence: Evidence) -> Ranked | None:
-    """Return that shape where none of the contenders is among the errors that remain."""
-    shape, base = _certain_shape(evidence), evidence.base
-    return None if shape is None or base is None else rescored_in(base, shape)
-
-
-def _beaten_by_unmodelled(known: float, shape: Ranked | None, unmodelled: float) -> bool:
+def _beaten_by_unmodelled(known: float, evidence: Evidence) -> bool:
     """Return whether something without a name does what effects of the library do.
 
     A shape without a cause must be 20 to 1 likelier; that a joint or the flange follows nothing that has a name must be
@@ -537,9 +527,10 @@ def _beaten_by_unmodelled(known: float, shape: Ranked | None, unmodelled: float)
 
     Args:
         known: log posterior of the effects.
-        unmodelled: that of an unmodelled effect.
     """
-    return (shape is not None and shape.log_posterior > known + limits.ODDS) or unmodelled > known - limits.ODDS
+    shape = evidence.shape
+    by_shape = shape is not None and shape.log_posterior > known + limits.ODDS
+    return by_shape or evidence.unmodelled_log_posterior > known - limits.ODDS
 
 
 def _refusals(refused: Mapping[str, str]) -> dict[str, Any]:

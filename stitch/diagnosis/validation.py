@@ -231,8 +231,17 @@ def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
         return None
     a = linear.design.shape[1]
     trial = linear.trial(np.hstack([linear.design, scored.form.response]))
-    prior = _student_prior(linear, trial, np.append(linear.sizes, scored.sizes))
-    priors = prior, CoefficientPrior(prior.precision[:a], prior.mean[:a])
+    # A prior of the parameters' plausible sizes with the tails of Student's t: what the other views hardly see would
+    # otherwise be anything, and the end would judge that instead of the effect. The normal prior that stands for t with
+    # ν degrees of freedom at an estimate θ has the variance (ν·s² + θ²)/(ν + 1) (Lange, Little & Taylor 1989, J. Am.
+    # Stat. Assoc. 84:881).
+    sizes = np.append(linear.sizes, scored.sizes)
+    mean = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
+    free = CoefficientPrior(1 / (limits.END_PRIOR_SIZES * sizes) ** 2, mean)
+    estimate = np.where(np.isfinite(sizes), trial.solve_each([free])[0] - mean, 0.0)
+    freedom = limits.END_PRIOR_FREEDOM
+    precision = (freedom + 1) / (freedom * sizes**2 + estimate**2)
+    priors = CoefficientPrior(precision, mean), CoefficientPrior(precision[:a], mean[:a])
     squares = [[trial.squares(x, end.views) for x in trial.solve_each(priors, end.views)] for end in ends]
     shares = [mean_square_share(with_it, without) for with_it, without in squares]
     worst = max(range(len(ends)), key=lambda k: (shares[k][0] - 1) / max(shares[k][1], 1e-300))
@@ -241,20 +250,6 @@ def extrapolate(linear: LinearModel, scored: Score) -> Extrapolation | None:
     spread = np.std(logs, ddof=1) * np.sqrt(1 + 1 / len(logs)) if len(logs) > 1 else 0.0
     likely = normal_tail(float(np.mean(logs) / max(spread, 1e-12)))
     return Extrapolation(*total, ends[worst], *shares[worst], likely)
-
-
-def _student_prior(linear: LinearModel, trial: LinearTrial, sizes: Array) -> CoefficientPrior:
-    """Return a prior of the parameters' plausible sizes with the tails of Student's t, for fits that lack an end.
-
-    What the other views hardly see would otherwise be anything, and the end would judge that instead of the effect. The
-    normal prior that stands for t with ν degrees of freedom at an estimate θ has the variance (ν·s² + θ²)/(ν + 1)
-    (Lange, Little & Taylor 1989, J. Am. Stat. Assoc. 84:881).
-    """
-    middle = np.append(-linear.values, np.zeros(len(sizes) - len(linear.values)))
-    free = CoefficientPrior(1 / (limits.END_PRIOR_SIZES * sizes) ** 2, middle)
-    estimate = np.where(np.isfinite(sizes), trial.solve_each([free])[0] - middle, 0.0)
-    freedom = limits.END_PRIOR_FREEDOM
-    return CoefficientPrior((freedom + 1) / (freedom * sizes**2 + estimate**2), middle)
 
 
 @dataclass(frozen=True)

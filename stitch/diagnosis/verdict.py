@@ -51,9 +51,11 @@ class Evidence:
     notes: tuple[str, ...] = ()  # effects that explain much and are not named, and why
     coincidence: str = ""  # why a jump in time cannot be told from an error of a joint that turns back
     answers: tuple[Answer, ...] = ()  # of the questions that led here, in the order they were asked
-    # What questions hand on to the next: effects that could be named, likeliest first,
+    # What questions hand on to the next: the likeliest shape without a cause, where it is enough for an alarm,
+    shape: Ranked | None = None
+    # effects that could be named, likeliest first,
     contenders: tuple[Ranked, ...] = ()
-    # the model in which none of them is among the errors that remain,
+    # the model in which none of them is among the errors that remain, where shape and contenders are scored then,
     base: LinearModel | None = None
     # the log posterior there of an unmodelled effect, of a joint or in time,
     unmodelled_log_posterior: float = -np.inf
