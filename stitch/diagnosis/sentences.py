@@ -220,7 +220,8 @@ def joint_curve_sentence(curve: JointCurve) -> str:
 
 
 def _place_in_words(curve: JointCurve, k: int) -> str:
-    """At j4 = -48°, after a move of 12°, 12 min into the session, at view 7, under 31 N m, under 0.3 N m of each kg."""
+    """Return at j4 = -48°, after a move of 12°, 12 min into the session, at view 7, under 31 N m, under 0.3 N m of each
+    kg."""
     place = curve.at[k]
     name = curve.covariate
     match name.split("_", 1)[-1]:

@@ -45,7 +45,7 @@ class SmoothProcess:
     frequency: float | None = None  # 1/step, of a swing
 
     def columns(self, linear: LinearModel) -> Array:
-        """(n, p·R) of the reduced observations: each motion in each trend."""
+        """Return (n, p·R) of the reduced observations: each motion in each trend."""
         moved = self.motions[:, :, :, None] * self.shapes[:, None, None, :]
         return linear.observation.from_twists(moved.reshape(6 * len(moved), -1))
 
