@@ -11,7 +11,9 @@ from viz.page_parts import page_written, render, versions
 
 # Sources of a budget that a row shows by name.
 _SHOWN = 3
-_WORDS = ("error", "verdict", "what brings U")
+_WORDS = ("error", "verdict", "what brings U", "answers to", "kept or not")
+# Classes of a verdict: kept, not kept, and undecided.
+_MARKS = {True: "good", False: "bad", None: "check"}
 
 
 def write_features(document: Mapping[str, Any], path: Path) -> None:
@@ -27,7 +29,7 @@ def write_features(document: Mapping[str, Any], path: Path) -> None:
                 _degrees(n),
                 _conformity(n),
             ],
-            "mark": {True: "good", False: "bad", None: "check"}[n["conforms"]],
+            "mark": _MARKS[n["conforms"]],
             "budget": [b for b in n["budget"] if b["variance_share"] > 0.005],
             "told": ", ".join(f"{b['source']} {100 * b['variance_share']:.0f} %" for b in n["budget"][:_SHOWN]),
         }
@@ -57,8 +59,9 @@ def write_certificate(document: Mapping[str, Any], path: Path) -> None:
                 *(_rounded(n[key], n["U"]) for key in ("U", "U_calibrated")),
                 f"{n['E_n']:+.2f}",
                 *_kept(n),
+                ", ".join(n["answers_to"]).replace("_", "-") or "the artefact alone",
             ],
-            "mark": "good" if n["passes"] else "bad",
+            "mark": _MARKS[n["passes"]],
         }
         for n in document["numbers"]
     ]
@@ -68,9 +71,29 @@ def write_certificate(document: Mapping[str, Any], path: Path) -> None:
     ]
     unit = document["length_unit"]
     headings = ("feature", "error", "calibrated", "measured", "deviation", "U", "U calibrated", "Eₙ")
-    limits = ("limit", "verdict")
+    limits = ("limit", "kept or not")
+    hand_eye = document["hand_eye"]
+    apart = [_rounded(hand_eye[key], hand_eye["U"]) for key in ("distance", "U", "U_given")]
+    verdict = "agrees" if hand_eye["agrees"] else "does not agree"
+    agreement = {
+        "cells": ["hand-eye of the model", *apart, f"{hand_eye['ratio']:.2f}", verdict],
+        "mark": _MARKS[hand_eye["agrees"]],
+    }
+    asked = (
+        "against the views",
+        "apart at the part",
+        "U of both",
+        "U of the model",
+        "over what U allows",
+        "kept or not",
+    )
     tables = [
-        {"name": f"Sizes, distances and places, {unit} (k = 2)", "headings": (*headings, *limits), "rows": numbers},
+        {
+            "name": f"Sizes, distances and places, {unit} (k = 2)",
+            "headings": (*headings, *limits, "answers to"),
+            "rows": numbers,
+        },
+        {"name": f"Hand-eye, {unit} (k = 2)", "headings": asked, "rows": [agreement]},
         {"name": f"Form, {unit}", "headings": ("feature", "band of 95 % of the points", *limits), "rows": forms},
     ]
     standards = ", ".join(document["in_the_manner_of"])
@@ -78,11 +101,14 @@ def write_certificate(document: Mapping[str, Any], path: Path) -> None:
         path,
         title="Certificate",
         sentence=document["sentence"],
-        mark="light good" if document["passed"] else "light bad",
+        mark={True: "light good", False: "light bad", None: "light check"}[document["passed"]],
         tables=[table for table in tables if table["rows"]],
         facts=[
             ("Model", document["run"]),
             ("Artefact", document["session"]),
+            ("Answers to", ", ".join(document["answers_to"]).replace("_", "-") or "nothing of the cell"),
+            *(("Doubt", doubt) for doubt in document["doubts"]),
+            *(("Left out", f"{item['view']}: {item['why']}") for item in document["left_out"]),
             ("Valid until", document["valid_until"] or "not known: the cell's history was not named"),
             ("In the manner of", f"{standards}; these exclude scanners that an arm positions"),
         ],
@@ -119,4 +145,4 @@ def _kept(error: Mapping[str, Any]) -> tuple[str, str]:
     passes, limit = error["passes"], error["limit"]
     if limit is None:
         return "–", "agrees" if passes else "does not agree"
-    return f"{limit:g}", "within" if passes else "beyond"
+    return f"{limit:g}", {True: "within", False: "beyond", None: "U is too large to say"}[passes]

@@ -28,6 +28,7 @@ from stitch.observations.observability import unknown_numbers, unobservable
 from stitch.recorder import Recorder, RecorderMemory, SilentRecorder
 from stitch.run_data import Fit, LedgerStep, RunData, StageResult
 from stitch.screening.deep_check import refuse_explained_mistake
+from stitch.screening.hand_eye_transfer import hand_eye_transfer
 from stitch.screening.model_transfer import check_arm_transfer, check_model_transfer, find_disagreeing_sessions
 from stitch.screening.view_screening import ScreenedFit, ViewScreening, fit_screened_views, session_warnings
 from stitch.session.capture import Capture, part_size, prepare_capture
@@ -108,8 +109,9 @@ def run_rig(
         start = FitStart(hand_eyes, _initial_model(sessions[0], effects, arm), given=model)
         with closing(_Conductor(sessions, start, coarse, recorders, register)) as conductor:
             screened = fit_screened_views(sessions, measurements, conductor.fit, keep)
-            if model and not sessions[0].has_clouds:
-                screened = _check_against_own_model(screened, effects, model)
+            if model:
+                check = _check_given_hand_eye if sessions[0].has_clouds else _check_against_own_model
+                screened = check(screened, effects, model)
             notes, doubts = _check_common_model(screened, hand_eyes, effects, arm)
             fits = conductor.finish()
         runs = []
@@ -306,6 +308,20 @@ class _Conductor:
         for memory in self._memories:
             memory.stopped = True
         self._screened.set()
+
+
+def _check_given_hand_eye(screened: ScreenedFit, effects: Sequence[str], model: ModelFile) -> ScreenedFit:
+    """Hold the hand-eye of another run against the one that the scans of each session show."""
+    correction = screened.fitted.correction
+    assert correction is not None
+    screenings = []
+    for i, (screening, session) in enumerate(zip(screened.screenings, screened.sessions, strict=True)):
+        measurement = screened.fitted.sessions[i].measurement
+        capture, unconstrained = correction.captures[i], correction.unconstrained[i]
+        transfer = hand_eye_transfer(measurement, capture, unconstrained, correction.model)
+        doubts = () if transfer.holds else (transfer.sentence(session.length_unit),)
+        screenings.append(replace(screening, doubts=(*screening.doubts, *doubts)))
+    return replace(screened, screenings=screenings)
 
 
 def _check_against_own_model(screened: ScreenedFit, effects: Sequence[str], model: ModelFile) -> ScreenedFit:

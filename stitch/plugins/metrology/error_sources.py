@@ -59,17 +59,18 @@ _MANY = 1e6
 _ROUNDING = 1e-12
 
 
-def place_errors(run: RunData) -> PlaceErrors:
+def place_errors(run: RunData, chain: "ErrorChain | None" = None) -> PlaceErrors:
     """Return the places of a run's points with all that its own views say may be wrong about them.
+
+    Args:
+        chain: what `error_chain` returns of the run, if it is at hand.
 
     Raises:
         InputError: a run without clouds.
         NoResultError: no two views overlap.
     """
-    if not run.measurement.capture.scans or run.registered is None:
-        raise InputError(f"{run.session.name}: has no clouds, so no surface; to fix: name a run of scans")
     with library_threads_off():
-        chain = error_chain(run)
+        chain = chain or error_chain(run)
         terms = [term for term in run.terms if moves_points([term])]
         return PlaceErrors(
             measurement=run.measurement,
@@ -112,7 +113,14 @@ class ErrorChain:
 
 
 def error_chain(run: RunData) -> ErrorChain:
-    """Return the linear maps by which errors reach the registered views of a run."""
+    """Return the linear maps by which errors reach the registered views of a run.
+
+    Raises:
+        InputError: a run without clouds.
+        NoResultError: no two views overlap.
+    """
+    if not run.measurement.capture.scans or run.registered is None:
+        raise InputError(f"{run.session.name}: has no clouds, so no surface; to fix: name a run of scans")
     measurement, model = run.measurement, run.model
     own = corrected_capture(measurement, model)
     freed = unconstrained_poses(own, own.poses(model.T_mount), run.gate)

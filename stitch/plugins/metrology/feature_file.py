@@ -46,7 +46,7 @@ class FeatureList:
 
     features: tuple[Feature, ...]
     contributions: tuple[Contribution, ...] = ()
-    limits: dict[str, float] | None = None  # largest permissible errors of a verification: form, size, distance
+    limits: dict[str, float] | None = None  # largest permissible errors of a verification: form, size, distance, place
 
 
 def read_features(file: Path, length_unit: str, spacing: float) -> FeatureList:
@@ -203,7 +203,7 @@ class _Reader:
         if table is None:
             return None
         where = f"{self.file}: limits"
-        require_known_keys(where, table, ("form", "size", "distance"))
+        require_known_keys(where, table, ("form", "size", "distance", "place"))
         return {key: self.scale * float(self._numbers(where, table, key, ())) for key in table}
 
     def _tolerance(self, where: str, row: dict[str, Any]) -> tuple[float, float] | None:

@@ -111,7 +111,7 @@ def _write_dfq(found: MeasuredFeatures, part: str, run: Path, file: Path) -> Non
 
 def _show_numbers(found: MeasuredFeatures, checked: MonteCarlo | None) -> None:
     from stitch.plugins.metrology.error_sources import NOT_INCLUDED
-    from stitch.plugins.metrology.verification import verify
+    from stitch.plugins.metrology.verification import agreeing, verified_numbers
 
     title = f"Numbers with U (k = 2), {found.length_unit} and rad"
     rows = [
@@ -121,9 +121,9 @@ def _show_numbers(found: MeasuredFeatures, checked: MonteCarlo | None) -> None:
     if checked is not None:
         low, high = float(checked.ratio.min()), float(checked.ratio.max())
         say(f"Monte Carlo over propagation, {checked.trials:,} trials: {low:.3f} to {high:.3f}.")
-    held = verify(found, None)
-    if held.numbers:
-        say(f"{held.agreeing} of {len(held.numbers)} calibrated numbers agree within U and that of their calibration.")
+    numbers = verified_numbers(found)
+    if numbers:
+        say(f"{agreeing(numbers)} of {len(numbers)} calibrated numbers agree within U and that of their calibration.")
     show_block([("not in U", text) for text in NOT_INCLUDED])
 
 

@@ -1,26 +1,49 @@
-"""An artefact that no fit has seen judges a model: errors of form, size and distance, E_n, and whether U covers them.
+"""An artefact that no fit has seen judges a model: its numbers, their U, and the hand-eye that its views show.
 
 The quantities are those of VDI/VDE 2634 part 3 and ISO 10360-13: probing error of form (the band of 95 % of the points
 of a sphere) and of size, and errors of distances. Only in the manner of both: they are for scanners that position
 themselves, or that are positioned by their own markers; a scanner on an arm errs by its arm, and the places and number
 of spheres that these prescribe are nobody's duty here.
+
+Register moves each view to where surfaces agree: most numbers of a stitched artefact hold little of the hand-eye. So
+each number says what it answers to, and the hand-eye is held against the one that the views of the artefact show.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 from stitch.numerics.distributions import binomial_tail
+from stitch.plugins.metrology import error_sources
 from stitch.plugins.metrology.budget import COVERAGE_FACTOR, MeasuredFeatures, Number
-from stitch.plugins.metrology.error_sources import NOT_INCLUDED
+from stitch.run_data import RunData
+from stitch.screening.hand_eye_transfer import HandEyeTransfer
 
 VERIFY_FORMAT = "stitch-verify/1"
 # |E_n| up to 1 agrees (ISO 13528); of numbers of which 95 % should agree, so few by chance in one case of a hundred
-# say that U does not hold.
+# say that U does not hold; a single number fails where chance lets the largest of all be as large as seldom.
 _COVERAGE, _CHANCE = 0.95, 0.01
+# A limit is kept, or exceeded, where that is as probable (JCGM 106, 7.3; ISO 14253-1 states the same probability).
+_CONFORMITY = 0.95
+# A number answers to what brings this share of its variance: an error of five times its U would move it by U.
+_ANSWERING_SHARE = 0.04
+HAND_EYE, ARM, SCANNER = ANSWERS = ("hand_eye", "arm", "scanner")
+_ANSWERS_TO = {
+    error_sources.OTHER_RUN: HAND_EYE,
+    error_sources.UNSEEN: HAND_EYE,
+    error_sources.OTHER_ARM: ARM,
+    error_sources.SCATTER: ARM,
+    error_sources.ARM: ARM,
+    error_sources.WANDERING: ARM,
+    error_sources.STOP: ARM,
+    error_sources.SCANNER: SCANNER,
+}
 # By kind of feature the name of the error of its first number.
 _ERRORS = {"sphere": "size", "cylinder": "size", "circle": "size", "distance": "distance"}
+_LENGTHS = ("size", "distance")
 
 
 @dataclass(frozen=True)
@@ -32,6 +55,7 @@ class VerifiedNumber:
     calibrated: float
     U_calibrated: float
     limit: float | None  # largest permissible error
+    E_n_limit: float  # that chance lets the largest |E_n| of all numbers exceed in one case of a hundred
 
     @property
     def deviation(self) -> float:
@@ -39,14 +63,38 @@ class VerifiedNumber:
         return self.number.value - self.calibrated
 
     @property
-    def E_n(self) -> float:
-        """The deviation over the expanded uncertainty of the difference."""
-        return self.deviation / max(float(np.hypot(self.number.U, self.U_calibrated)), 1e-300)
+    def U(self) -> float:
+        """Expanded uncertainty of the deviation."""
+        return max(float(np.hypot(self.number.U, self.U_calibrated)), 1e-300)
 
     @property
-    def passes(self) -> bool:
-        """Whether it lies within its limit, or agrees where there is none."""
-        return abs(self.E_n) <= 1 if self.limit is None else abs(self.deviation) <= self.limit
+    def E_n(self) -> float:
+        """The deviation over its expanded uncertainty."""
+        return self.deviation / self.U
+
+    @property
+    def passes(self) -> bool | None:
+        """True if it agrees and its limit is kept, False if either fails, None where U is too large to decide."""
+        if abs(self.E_n) > self.E_n_limit:
+            return False
+        if self.limit is None:
+            return True
+        sigma = self.U / COVERAGE_FACTOR
+        within = float(ndtr((self.limit - self.deviation) / sigma) - ndtr((-self.limit - self.deviation) / sigma))
+        if within >= _CONFORMITY:
+            return True
+        return False if within <= 1 - _CONFORMITY else None
+
+    @property
+    def answers_to(self) -> tuple[str, ...]:
+        """Which errors would show in it: of hand-eye, arm and scanner (every length answers to a scanner's scale)."""
+        shares = dict.fromkeys(ANSWERS, 0.0)
+        for source, share in self.number.shares.items():
+            if source in _ANSWERS_TO:
+                shares[_ANSWERS_TO[source]] += share
+        if self.error in _LENGTHS:
+            shares[SCANNER] = 1.0
+        return tuple(name for name, share in shares.items() if share >= _ANSWERING_SHARE)
 
 
 @dataclass(frozen=True)
@@ -59,7 +107,7 @@ class FormError:
 
     @property
     def passes(self) -> bool:
-        """Whether it lies within its limit, if there is one."""
+        """True if it lies within its limit, if there is one."""
         return self.limit is None or self.form <= self.limit
 
 
@@ -69,62 +117,133 @@ class Verification:
 
     numbers: tuple[VerifiedNumber, ...]
     forms: tuple[FormError, ...]
+    hand_eye: HandEyeTransfer
     length_unit: str
 
     @property
     def agreeing(self) -> int:
         """Numbers with |E_n| ≤ 1."""
-        return sum(abs(n.E_n) <= 1 for n in self.numbers)
+        return agreeing(self.numbers)
 
     @property
     def U_holds(self) -> bool:
-        """Whether no fewer numbers agree than chance lets, if U covers 95 %."""
+        """True if no fewer numbers agree, and none lies farther off, than chance lets, if U covers 95 %."""
         off = len(self.numbers) - self.agreeing
-        return binomial_tail(off, len(self.numbers), 1 - _COVERAGE) > _CHANCE
+        enough = binomial_tail(off, len(self.numbers), 1 - _COVERAGE) > _CHANCE
+        return enough and all(abs(n.E_n) <= n.E_n_limit for n in self.numbers)
 
     @property
-    def passed(self) -> bool:
-        """Whether every limit is kept and U holds."""
-        kept = [n.passes for n in self.numbers if n.limit is not None] + [form.passes for form in self.forms]
-        return all(kept) and self.U_holds
+    def answers_to(self) -> tuple[str, ...]:
+        """Which errors of the cell this verification would have shown."""
+        shown = {name for number in self.numbers for name in number.answers_to}
+        shown |= {HAND_EYE} if self.hand_eye.decides else set()
+        return tuple(name for name in ANSWERS if name in shown)
 
     @property
-    def sentence(self) -> str:
-        """The verdict for people."""
-        beyond = sum(not n.passes for n in self.numbers if n.limit is not None) + sum(not f.passes for f in self.forms)
-        told = f"{self.agreeing} of {len(self.numbers)} calibrated numbers agree within U."
-        if beyond:
-            many = "errors exceed their limits" if beyond > 1 else "error exceeds its limit"
-            return f"The artefact fails: {beyond} {many}. {told}"
-        return f"The artefact passes. {told}" if self.U_holds else f"The artefact fails: U is too small. {told}"
+    def passed(self) -> bool | None:
+        """True if all is kept and the hand-eye was put to the test, False if anything fails, None if undecided."""
+        verdicts = [n.passes for n in self.numbers] + [form.passes for form in self.forms]
+        verdicts += [self.U_holds, self.hand_eye.holds]
+        if False in verdicts:
+            return False
+        return None if None in verdicts or HAND_EYE not in self.answers_to else True
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The verdict for people, and what it rests on, one fact each."""
+        heading = {
+            True: "The artefact passes.",
+            False: "The artefact fails.",
+            None: "Pass or fail cannot be decided.",
+        }[self.passed]
+        facts = [heading, f"{self.agreeing} of {len(self.numbers)} calibrated numbers agree within U."]
+        far = [n for n in self.numbers if abs(n.E_n) > n.E_n_limit]
+        if far:
+            worst = max(far, key=lambda n: abs(n.E_n))
+            name = worst.number.feature.name
+            facts.append(f"{name} is off by {abs(worst.E_n):.1f} times U; chance lets {worst.E_n_limit:.1f}.")
+        elif not self.U_holds:
+            facts.append("U is too small: fewer numbers agree than chance lets.")
+        beyond = [n for n in self.numbers if n.passes is False and n not in far]
+        beyond_forms = [form for form in self.forms if not form.passes]
+        names = [n.number.feature.name for n in beyond] + [f"form of {form.feature}" for form in beyond_forms]
+        if names:
+            facts.append(f"Beyond their limits: {', '.join(names)}.")
+        open_numbers = [n for n in self.numbers if n.passes is None]
+        if open_numbers:
+            worst = max(open_numbers, key=lambda n: n.U)
+            more = f" and {len(open_numbers) - 1} more" if len(open_numbers) > 1 else ""
+            facts.append(
+                f"U is too large for the limit of {worst.number.feature.name}{more}: "
+                f"{worst.deviation:+.2g} ± {worst.U:.2g} {self.length_unit} beside {worst.limit:g}."
+            )
+        facts.append(self.hand_eye.sentence(self.length_unit))
+        if HAND_EYE not in self.answers_to:
+            facts.append(
+                f"These views would not show a hand-eye that is off by {5 * self.hand_eye.U_given:.2g} "
+                f"{self.length_unit}; to fix: turn the scanner more between views."
+            )
+        return tuple(facts)
 
 
-def verify(found: MeasuredFeatures, limits: dict[str, float] | None) -> Verification:
-    """Judge measured features by their calibrated values.
+def verify(measured: MeasuredFeatures, limits: dict[str, float] | None, hand_eye: HandEyeTransfer) -> Verification:
+    """Judge measured features by their calibrated values, and the hand-eye by what the views show.
 
     Args:
-        limits: largest permissible errors of form, size and distance; what has none is judged by E_n.
+        limits: largest permissible errors of form, size, distance and place; what has none is judged by E_n.
+        hand_eye: the model's against the one that the views of the artefact show.
     """
-    limits, first = limits or {}, dict[str, Number]()
-    for number in found.numbers:
-        first.setdefault(number.feature.name, number)
-    numbers = []
-    for number in first.values():
-        feature = number.feature
-        if feature.calibrated is not None:
-            error = _ERRORS.get(feature.kind, "place")
-            U = feature.calibrated_U
-            numbers.append(VerifiedNumber(number, error, feature.calibrated, U, limits.get(error)))
+    limits = limits or {}
     forms = [
         FormError(fit.feature.name, fit.form, limits.get("form"))
-        for fit in found.fits
+        for fit in measured.fits
         if fit.feature.kind in ("sphere", "plane", "cylinder")
     ]
-    return Verification(tuple(numbers), tuple(forms), found.length_unit)
+    return Verification(verified_numbers(measured, limits), tuple(forms), hand_eye, measured.length_unit)
 
 
-def verification_document(result: Verification, run: str, session: str, valid_until: str | None) -> dict[str, Any]:
-    """Return certificate.json."""
+def verified_numbers(
+    measured: MeasuredFeatures, limits: Mapping[str, float] | None = None
+) -> tuple[VerifiedNumber, ...]:
+    """Return the first number of each calibrated feature against its calibrated value."""
+    limits = limits or {}
+    first = dict[str, Number]()
+    for number in measured.numbers:
+        first.setdefault(number.feature.name, number)
+    calibrated = [number for number in first.values() if number.feature.calibrated is not None]
+    largest = largest_E_n(len(calibrated))
+    verified = []
+    for number in calibrated:
+        error = _ERRORS.get(number.feature.kind, "place")
+        value = number.feature.calibrated
+        assert value is not None
+        verified.append(VerifiedNumber(number, error, value, number.feature.calibrated_U, limits.get(error), largest))
+    return tuple(verified)
+
+
+def agreeing(numbers: Sequence[VerifiedNumber]) -> int:
+    """Return how many numbers have |E_n| ≤ 1."""
+    return sum(abs(n.E_n) <= 1 for n in numbers)
+
+
+def largest_E_n(count: int) -> float:
+    """Return the |E_n| that the largest of so many independent numbers exceeds in one case of a hundred, at least 1.
+
+    With U = 2 σ, E_n is half a standard normal number (Šidák 1967, J. Am. Stat. Assoc. 62:626).
+    """
+    share = (1 - _CHANCE) ** (1 / max(count, 1))
+    return max(1.0, float(ndtri((1 + share) / 2)) / COVERAGE_FACTOR)
+
+
+def verification_document(
+    result: Verification, state: RunData, run: str, session: str, valid_until: str | None, notes: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return certificate.json.
+
+    Args:
+        state: the artefact's session stitched under the model: its doubts, notes and views left out stand there too.
+    """
+    hand_eye = result.hand_eye
     return {
         "format": VERIFY_FORMAT,
         "run": run,
@@ -132,9 +251,19 @@ def verification_document(result: Verification, run: str, session: str, valid_un
         "length_unit": result.length_unit,
         "k": COVERAGE_FACTOR,
         "passed": result.passed,
-        "sentence": result.sentence,
+        "sentence": " ".join(result.sentences),
+        "answers_to": list(result.answers_to),
         "U_holds": result.U_holds,
         "agreeing": result.agreeing,
+        "hand_eye": {
+            "agrees": hand_eye.holds,
+            "distance": hand_eye.distance,
+            "turn": hand_eye.turn,
+            "ratio": hand_eye.ratio,
+            "U": hand_eye.U,
+            "U_given": hand_eye.U_given,
+            "p_value": hand_eye.p_value,
+        },
         "numbers": [
             {
                 "feature": n.number.feature.name,
@@ -145,15 +274,20 @@ def verification_document(result: Verification, run: str, session: str, valid_un
                 "U_calibrated": n.U_calibrated,
                 "deviation": n.deviation,
                 "E_n": n.E_n,
+                "E_n_limit": n.E_n_limit,
                 "limit": n.limit,
                 "passes": n.passes,
+                "answers_to": list(n.answers_to),
             }
             for n in result.numbers
         ],
         "forms": [
             {"feature": f.feature, "form_95": f.form, "limit": f.limit, "passes": f.passes} for f in result.forms
         ],
+        "doubts": list(state.doubts),
+        "notes": [*state.notes, *notes],
+        "left_out": [{"view": item.view, "why": item.why} for item in state.left_out],
         "valid_until": valid_until,
-        "conditional_on": list(NOT_INCLUDED),
+        "conditional_on": list(error_sources.NOT_INCLUDED),
         "in_the_manner_of": ["VDI/VDE 2634 part 3", "ISO 10360-13"],
     }

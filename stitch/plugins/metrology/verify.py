@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -37,7 +39,7 @@ def verify(
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
-    """Verify a run's hand-eye and effects, as they are, by a calibrated artefact; exit code 3 where it fails.
+    """Verify a run's hand-eye and effects by a calibrated artefact; exit code 3 where it fails or cannot be decided.
 
     \b
     Examples:
@@ -49,22 +51,26 @@ def verify(
     from stitch.output.run_folder import call_entry_points
     from stitch.output.stored_run import read_result, trusted_model
     from stitch.plugins.metrology.budget import measure_features
-    from stitch.plugins.metrology.error_sources import place_errors
+    from stitch.plugins.metrology.error_sources import error_chain, place_errors
     from stitch.plugins.metrology.feature_file import read_features
     from stitch.plugins.metrology.verification import verification_document
     from stitch.plugins.metrology.verification import verify as judge
+    from stitch.screening.hand_eye_transfer import hand_eye_transfer
     from stitch.session.reading.session_folder import load_session
 
     listed = features or session / "artefact.toml"
-    _require_unseen(run, session, read_result(run)["session"])
+    notes = _require_unseen(run, session, Path(read_result(run)["session"]))
     with show_activity("verifying: stitching the artefact under the model"):
         model, _ = trusted_model(run, effects_file, trust)
         state = stitch_session(load_session(session), model)
         wanted = read_features(listed, state.session.length_unit, state.measurement.capture.spacing)
         if all(feature.calibrated is None for feature in wanted.features):
             raise InputError(f"{listed}: no feature is calibrated; to fix: write calibrated = … and U = … of some")
-        result = judge(measure_features(place_errors(state), wanted), wanted.limits)
-    document = verification_document(result, str(run), str(session), _valid_until(cell))
+        chain = error_chain(state)
+        measured = measure_features(place_errors(state, chain), wanted)
+        hand_eye = hand_eye_transfer(state.measurement, chain.capture, chain.freed, state.model)
+        result = judge(measured, wanted.limits, hand_eye)
+    document = verification_document(result, state, str(run), str(session), _valid_until(cell), notes)
     folder = output or Path("verify") / state.session.name
     folder.mkdir(parents=True, exist_ok=True)
     write_json(document, folder / "certificate.json")
@@ -73,16 +79,34 @@ def verify(
         emit(to_json(document))
     else:
         _show_certificate(result, document, folder)
-    if not result.passed:
+    if result.passed is not True:
         raise typer.Exit(_FAILS)
 
 
-def _require_unseen(run: Path, session: Path, fitted: str) -> None:
-    """Refuse the session that the model was fitted on: it would judge itself."""
-    if session.resolve() == Path(fitted).resolve():
-        raise InputError(
-            f"{session}: {run} was fitted on it; to fix: name a session of an artefact that no fit has seen"
-        )
+def _require_unseen(run: Path, session: Path, fitted: Path) -> tuple[str, ...]:
+    """Refuse scans that the model was fitted on: they would judge themselves. Return a note where that is not known."""
+    fix = "to fix: name a session of an artefact that no fit has seen"
+    if session.resolve() == fitted.resolve():
+        raise InputError(f"{session}: {run} was fitted on it; {fix}")
+    try:
+        known = {_digest(file): file for file in _clouds(fitted)}
+    except (OSError, ValueError, csv.Error):
+        return (f"{fitted} is not there any more, so that nobody knows whether these scans were fitted.",)
+    for file in _clouds(session):
+        if (copied := known.get(_digest(file))) is not None:
+            raise InputError(f"{file}: is the scan {copied}, on which {run} was fitted; {fix}")
+    return ()
+
+
+def _clouds(session: Path) -> list[Path]:
+    from stitch.session.reading.session_folder import TABLES, measured_files
+
+    return [file for file in measured_files(session) if file.name not in TABLES]
+
+
+def _digest(file: Path) -> bytes:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").digest()
 
 
 def _valid_until(cell: Path | None) -> str | None:
@@ -98,7 +122,10 @@ def _valid_until(cell: Path | None) -> str | None:
 
 
 def _show_certificate(result: Verification, document: dict[str, Any], folder: Path) -> None:
-    say(result.sentence, bold=True)
+    say(result.sentences[0], bold=True)
+    # The doubt of the run about a given hand-eye is one of the sentences.
+    for sentence in dict.fromkeys((*result.sentences[1:], *document["doubts"])):
+        say(sentence)
     rows = [
         (
             n.number.feature.name,
@@ -108,11 +135,12 @@ def _show_certificate(result: Verification, document: dict[str, Any], folder: Pa
             f"{n.number.U:.2g}",
             f"{n.E_n:+.2f}",
             "–" if n.limit is None else f"{n.limit:g}",
+            ", ".join(n.answers_to).replace("_", "-") or "–",
         )
         for n in result.numbers
     ]
-    headings = ("feature", "error of", "calibrated", "deviation", "U", "E_n", "limit")
-    show_table(f"Calibrated numbers, {result.length_unit}", headings, rows, words=headings[:2])
+    headings = ("feature", "error of", "calibrated", "deviation", "U", "E_n", "limit", "answers to")
+    show_table(f"Calibrated numbers, {result.length_unit}", headings, rows, words=(*headings[:2], headings[-1]))
     forms = [(f.feature, f"{f.form:.2g}", "–" if f.limit is None else f"{f.limit:g}") for f in result.forms]
     show_table(f"Form, 95 % of the points, {result.length_unit}", ("feature", "form", "limit"), forms)
     until = document["valid_until"] or "not known: name the cell's history with --cell"

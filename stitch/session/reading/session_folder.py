@@ -48,7 +48,7 @@ from stitch.session.session import (
 from stitch.session.thinning import MAX_POINTS, distinct_points, points_within, thin_cloud
 from stitch.system.threads import parallel
 
-_TABLES = ("session.toml", "views.csv", "points.csv", "frames.csv", "targets.csv")
+TABLES = ("session.toml", "views.csv", "points.csv", "frames.csv", "targets.csv")
 _BLOCK = 1 << 20
 UNKNOWN = "–"
 # Fewer points span no surface.
@@ -249,7 +249,7 @@ def measured_files(folder: Path) -> list[Path]:
     Raises:
         OSError, ValueError, csv.Error: views.csv cannot be read.
     """
-    files = [folder / name for name in _TABLES if (folder / name).is_file()]
+    files = [folder / name for name in TABLES if (folder / name).is_file()]
     with open(folder / "views.csv", encoding="utf-8-sig", newline="") as file:
         rows = list(csv.DictReader(file, skipinitialspace=True))
     return files + [folder / row["cloud"].strip() for row in rows if row.get("cloud")]

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shutil
 import tomllib
 
 import numpy as np
@@ -16,6 +17,7 @@ from stitch.cli.main import build
 from stitch.errors import InputError
 from stitch.plugins.metrology.feature_file import read_features
 from stitch.plugins.metrology.planning.command import place_of
+from stitch.plugins.metrology.verification import largest_E_n
 from tests.in_browser import WAYS, require_for_everybody
 from viz.features_page import write_certificate, write_features
 
@@ -67,20 +69,75 @@ def test_measure_without_features_gives_every_point_a_sigma(cell):
     assert np.isfinite(sigma).all() and 0.001 < np.median(sigma) < 0.2
 
 
+def _artefact(cell, name, limit, factor=1.0, first_by=0.0):
+    """The artefact's features with another limit of sizes, calibrated values scaled, and the first one moved."""
+    document = tomllib.loads((cell / "artefact" / "artefact.toml").read_text())
+    document["limits"]["size"] = limit
+    for row in document["feature"]:
+        row["calibrated"] *= factor
+    document["feature"][0]["calibrated"] += first_by
+    (cell / name).write_text(tomli_w.dumps(document))
+    return cell / name
+
+
+def _verify(cell, features, run="run"):
+    done = _stitch("verify", cell / run, cell / "artefact", "--features", features, "-o", cell / "certificate")
+    return done.exit_code, json.loads((cell / "certificate" / "certificate.json").read_text())
+
+
 def test_verify_passes_a_good_cell_and_fails_a_wrong_artefact(cell):
-    done = _stitch("verify", cell / "run", cell / "artefact", "-o", cell / "good")
+    features = _artefact(cell, "good.toml", 0.15)
+    done = _stitch("verify", cell / "run", cell / "artefact", "--features", features, "-o", cell / "good")
     assert done.exit_code == 0, done.output
     good = json.loads((cell / "good" / "certificate.json").read_text())
     write_certificate(good, cell / "certificate.html")
     assert good["sentence"] in (cell / "certificate.html").read_text(encoding="utf-8").replace("\u00a0", " ")
     assert good["passed"] and good["agreeing"] >= 13 and len(good["numbers"]) == 15
-    document = tomllib.loads((cell / "artefact" / "artefact.toml").read_text())
-    for row in document["feature"]:
-        row["calibrated"] *= 1.002  # 0.2 mm on 100 mm
-    (cell / "wrong.toml").write_text(tomli_w.dumps(document))
-    wrong = _stitch("verify", cell / "run", cell / "artefact", "--features", cell / "wrong.toml", "-o", cell / "bad")
-    assert wrong.exit_code == 3
-    assert not json.loads((cell / "bad" / "certificate.json").read_text())["passed"]
+    assert good["answers_to"] == ["hand_eye", "arm", "scanner"] and good["hand_eye"]["agrees"]
+    assert all("scanner" in number["answers_to"] for number in good["numbers"])
+    code, wrong = _verify(cell, _artefact(cell, "wrong.toml", 0.15, factor=1.002))  # 0.2 mm on 100 mm
+    assert code == 3 and wrong["passed"] is False
+
+
+def test_verify_cannot_decide_where_U_is_larger_than_a_limit(cell):
+    code, open_ = _verify(cell, _artefact(cell, "open.toml", 0.03))
+    assert code == 3 and open_["passed"] is None
+    assert "U is too large for the limit of ball" in open_["sentence"]
+    assert None in [number["passes"] for number in open_["numbers"]]
+
+
+def test_verify_fails_one_number_that_is_off_however_many_agree(cell):
+    features = _artefact(cell, "one.toml", 1.0, first_by=0.25)
+    code, one = _verify(cell, features)
+    assert one["agreeing"] == 14 and [number["passes"] for number in one["numbers"]].count(False) == 1
+    assert code == 3 and one["passed"] is False and "ball 1 is off by" in one["sentence"]
+
+
+def test_verify_fails_a_hand_eye_that_its_numbers_do_not_show(cell):
+    shutil.copytree(cell / "run", cell / "moved")
+    model = tomllib.loads((cell / "moved" / "model.toml").read_text())
+    T = np.array(model["hand_eye"]["corrected"])
+    sigma = np.array(model["hand_eye"]["sigma"])
+    T[:3, 3] += T[:3, 0] * 5 * 2 * sigma[3]
+    model["hand_eye"]["corrected"] = T.tolist()
+    (cell / "moved" / "model.toml").write_text(tomli_w.dumps(model))
+    code, moved = _verify(cell, _artefact(cell, "good.toml", 0.15), run="moved")
+    assert code == 3 and moved["passed"] is False and not moved["hand_eye"]["agrees"]
+    assert moved["agreeing"] >= 13 and moved["hand_eye"]["distance"] == pytest.approx(10 * sigma[3], rel=0.5)
+    assert any("does not fit these views" in doubt for doubt in moved["doubts"])
+
+
+def test_scans_of_the_fit_verify_nothing_under_another_name(cell):
+    shutil.copytree(cell / "part", cell / "copy")
+    with pytest.raises(InputError, match="on which .* was fitted"):
+        CliRunner().invoke(build(), ["verify", str(cell / "run"), str(cell / "copy")], catch_exceptions=False)
+
+
+@pytest.mark.parametrize(("count", "largest"), [(1, 1.288), (15, 1.701), (100, 1.945)])
+def test_the_largest_E_n_that_chance_lets_grows_with_the_numbers(count, largest):
+    normal = np.abs(np.random.default_rng(0).standard_normal((200_000 // count, count))).max(axis=1) / 2
+    assert largest_E_n(count) == pytest.approx(largest, abs=1e-3)
+    assert np.mean(normal > largest_E_n(count)) == pytest.approx(0.01, abs=0.006)
 
 
 @pytest.mark.slow  # a browser

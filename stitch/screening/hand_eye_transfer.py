@@ -1,0 +1,103 @@
+"""A given hand-eye against the one that a session's own views show.
+
+Register moves each view to where the surfaces agree, so that the stitched cloud hardly answers to the hand-eye. The
+views' free-network poses do: one generalised least-squares step from the given model leads to the hand-eye that these
+views ask for, with all that arms and scanners repeat in its covariance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.model.model import Model, displacement
+from stitch.numerics import frames
+from stitch.numerics.distributions import chi2_limit, chi2_tail
+from stitch.numerics.frames import Array
+from stitch.numerics.least_squares import equilibrated
+from stitch.numerics.units import length_text
+from stitch.observations.pose_errors import prior_pose_errors
+from stitch.observations.surfaces.effect_columns import view_columns
+from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
+from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
+from stitch.session.capture import Capture
+from stitch.session.measurement import Measurement
+
+# That a hand-eye which is right is doubted.
+_CHANCE = 0.01
+# A hand-eye that is off by so many of its U would be found: else these views do not say whether it is right.
+_FOUND_FROM = 5.0
+# What another run's effects may still err by.
+_EFFECTS = "effects of the model"
+
+
+@dataclass(frozen=True)
+class HandEyeTransfer:
+    """How far a given hand-eye and the one of the views themselves put the middle of the part apart."""
+
+    turn: float  # rad, between the two
+    distance: float  # length_unit
+    ratio: float  # of the difference to the largest that 95 % of pairs which are the same show, all six numbers
+    U: float  # expanded uncertainty of the distance, both hand-eyes together
+    U_given: float  # of the given one alone
+    p_value: float  # that two hand-eyes which are the same differ by as much
+
+    @property
+    def holds(self) -> bool:
+        """True unless the views contradict the given hand-eye beyond chance."""
+        return self.p_value >= _CHANCE
+
+    @property
+    def decides(self) -> bool:
+        """True if these views would show a hand-eye that is off by five times its U."""
+        return _FOUND_FROM * self.U_given >= self.U
+
+    def sentence(self, unit: str) -> str:
+        """Return how the two compare, for people."""
+        apart = f"{length_text(self.distance, unit)} and {1e3 * self.turn:.2g} mrad apart at the part"
+        if self.holds:
+            return (
+                f"The given hand-eye agrees with these views: what they show themselves lies {apart}, within U of both."
+            )
+        return (
+            f"The given hand-eye does not fit these views: what they show lies {apart}, "
+            f"{self.ratio:.1f} times what U of both allows; to fix: find it anew, by a run without --hand-eye."
+        )
+
+
+def hand_eye_transfer(
+    measurement: Measurement, capture: Capture, unconstrained: UnconstrainedPoses, model: Model
+) -> HandEyeTransfer:
+    """Return how a model's hand-eye compares with the one that the views of a session show.
+
+    Args:
+        capture: the session's, without the model's effects.
+        unconstrained: its views moved by their overlaps alone, from the poses under the model.
+        model: with the covariance of its hand-eye and effects.
+    """
+    T_mount = fit_hand_eye([capture], [unconstrained], model.T_mount).T_mount
+    # Views that start far off have not converged, which would count as scatter: once more from there.
+    unconstrained = unconstrained_poses(capture, capture.poses(T_mount), unconstrained.overlaps.gate)
+    errors = rig_scanner_errors([measurement], [unconstrained])
+    columns = view_columns(measurement, model, unconstrained)
+    errors[_EFFECTS] = [columns @ model.effects_covariance.root(model.terms)]
+    poses = prior_pose_errors([measurement], model, [unconstrained.overlaps.gram.centre])
+    shown = fit_hand_eye([capture], [unconstrained], T_mount, scanner_errors=errors, errors=poses)
+    xi = frames.log(frames.inverse(model.T_mount) @ shown.T_mount)
+    middle = np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)
+    covariance = model.covariance + shown.covariance
+    square = _mahalanobis_square(xi, covariance)
+    return HandEyeTransfer(
+        turn=float(np.linalg.norm(xi[:3])),
+        distance=float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle))),
+        ratio=float(np.sqrt(square / chi2_limit(0.05, 6))),
+        U=displacement(covariance, middle),
+        U_given=displacement(model.covariance, middle),
+        p_value=chi2_tail(square, 6),
+    )
+
+
+def _mahalanobis_square(difference: Array, covariance: Array) -> float:
+    """dᵀ C⁻¹ d; a direction that is known exactly counts nothing."""
+    scaled, unit = equilibrated(covariance)
+    return float((difference * unit) @ np.linalg.pinv(scaled, rcond=1e-9, hermitian=True) @ (difference * unit))
