@@ -64,9 +64,8 @@ def compare_run(
 def _compare_with(program: str, run: Path, effects_file: Path | None, *, trust: bool, as_json: bool) -> None:
     """Let another program register the scans of a run, write witness.json with a picture, and print what differs."""
     from stitch.numerics.units import angle_text, length_text
+    from stitch.output import json_file, run_folder
     from stitch.output.comparison.open3d_witness import open3d_witness
-    from stitch.output.json_file import to_json, write_json
-    from stitch.output.run_folder import call_entry_points
     from stitch.system.open3d_library import import_open3d
 
     if program not in _WITNESSES:
@@ -75,10 +74,10 @@ def _compare_with(program: str, run: Path, effects_file: Path | None, *, trust: 
     with opened_run(run, effects_file, trust, "comparing: reading the scans") as state:
         with show_activity("comparing: Open3D registers the scans"):
             witness = open3d_witness(state)
-        write_json(witness.document(), run / "witness.json")
-        call_entry_points("stitch.witness_pictures", witness, state, run)
+        json_file.write_json(witness.document(), run / "witness.json")
+        run_folder.call_entry_points("stitch.witness_pictures", witness, state, run)
     if as_json:
-        emit(to_json(witness.document()))
+        emit(json_file.to_json(witness.document()))
         return
     unit = state.session.length_unit
     for sentence in witness.sentences(unit):
@@ -94,15 +93,14 @@ def _compare_with(program: str, run: Path, effects_file: Path | None, *, trust: 
 
 def write_comparison(state: RunData, run: Path) -> ResidualTables:
     """Return the comparison of a run, after compare.json and what other packages make of it are written."""
+    from stitch.output import json_file, run_folder
     from stitch.output.comparison.residual_tables import compare_surfaces, compare_targets, comparison_document
-    from stitch.output.json_file import write_json
-    from stitch.output.run_folder import call_entry_points
 
     with show_activity("comparing: residuals by view, joint, time and place"):
         comparison = compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
     with show_activity("comparing: drawing pictures and page"):
-        write_json(comparison_document(comparison), run / "compare.json")
-        call_entry_points("stitch.comparison_reports", comparison, state, run)
+        json_file.write_json(comparison_document(comparison), run / "compare.json")
+        run_folder.call_entry_points("stitch.comparison_reports", comparison, state, run)
     return comparison
 
 

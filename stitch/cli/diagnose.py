@@ -97,15 +97,13 @@ def _diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple
 
 def write_diagnosis(diagnosis: Diagnosis, state: RunData, run: Path) -> dict[str, Any]:
     """Return the diagnosis as a document, after diagnosis.json and what other packages make of it are written."""
+    from stitch.output import json_file, run_folder, stored_run
     from stitch.output.diagnosis_document import diagnosis_document
-    from stitch.output.json_file import write_json
-    from stitch.output.run_folder import call_entry_points
-    from stitch.output.stored_run import diagnosed_state
 
-    document = diagnosis_document(diagnosis) | {"of": diagnosed_state(state, run)}
+    document = diagnosis_document(diagnosis) | {"of": stored_run.diagnosed_state(state, run)}
     with show_activity("diagnosing: drawing pictures and page"):
-        write_json(document, run / "diagnosis.json")
-        call_entry_points("stitch.diagnosis_reports", diagnosis, state, run)
+        json_file.write_json(document, run / "diagnosis.json")
+        run_folder.call_entry_points("stitch.diagnosis_reports", diagnosis, state, run)
     return document
 
 

@@ -25,24 +25,22 @@ def note(
     Examples:
       stitch note runs/blade-17 "fixture shimmed after this step" --step 0
     """
-    from stitch.output.json_file import to_json, write_json
-    from stitch.output.run_folder import lock_run_folder
-    from stitch.output.stored_run import read_ledger
+    from stitch.output import json_file, run_folder, stored_run
 
     text, by = text.strip(), by.strip()
     if not text:
         raise InputError("TEXT: empty; to fix: write the remark")
     if len(text) > _LONGEST:
         raise InputError(f"TEXT: has {len(text)} characters; to fix: shorten it to {_LONGEST}")
-    with lock_run_folder(run):
-        steps = read_ledger(run)
+    with run_folder.lock_run_folder(run):
+        steps = stored_run.read_ledger(run)
         at = len(steps) - 1 if step is None else step
         if not 0 <= at < len(steps):
             raise InputError(f"--step {at}: to fix: name one of the steps 0 to {len(steps) - 1} of {run}/ledger.json")
         when = datetime.now(UTC).isoformat(timespec="seconds")
         steps[at].setdefault("notes", []).append({"at": when, "by": by, "text": text})
-        write_json(steps, run / "ledger.json")
+        json_file.write_json(steps, run / "ledger.json")
     if as_json:
-        emit(to_json(steps))
+        emit(json_file.to_json(steps))
     else:
         say(f"  step {at}, {when}{f', {by}' if by else ''}: {text}")

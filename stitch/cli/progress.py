@@ -44,12 +44,11 @@ def opened_run(run: Path, effects_file: Path | None, trust: bool, activity: str)
     Args:
         activity: what is said while it is read.
     """
-    from stitch.output.run_folder import lock_run_folder
-    from stitch.output.stored_run import load_run
+    from stitch.output import run_folder, stored_run
 
-    with lock_run_folder(run):
+    with run_folder.lock_run_folder(run):
         with show_activity(activity):
-            state = load_run(run, effects_file, trust=trust)
+            state = stored_run.load_run(run, effects_file, trust=trust)
         yield state
 
 

@@ -115,18 +115,17 @@ def _write_run_page(
     from stitch.cli.compare import write_comparison
     from stitch.cli.diagnose import write_diagnosis
     from stitch.cli.run import show_light
-    from stitch.output.run_folder import call_entry_points
-    from stitch.output.stored_run import standing_diagnosis
+    from stitch.output import run_folder, stored_run
 
     page = run / "report.html"
     activity = "report: reading the scans, writing the page"
     with opened_run(run, effects_file, trust, activity) as state:
         with show_activity(activity):
-            call_entry_points("stitch.reports", state, page, tolerance)
+            run_folder.call_entry_points("stitch.reports", state, page, tolerance)
         show_light(state, tolerance)
         # A diagnosis of this very model stays on the page.
         shows = page.is_file() and 'id="screen-data"' in page.read_text(encoding="utf-8")
-        stands = shows and standing_diagnosis(run, state)
+        stands = shows and stored_run.standing_diagnosis(run, state)
         if with_diagnosis and not (stands and (run / "compare.json").is_file()):
             write_comparison(state, run)
         if with_diagnosis and not stands:
@@ -140,9 +139,8 @@ def _write_two_run_page(
     run: Path, other: Path, output: Path | None, tolerance: float | None, effects_file: Path | None, trust: bool
 ) -> Path:
     """Return the page of what changed from one run to the other."""
+    from stitch.output import run_folder, stored_run
     from stitch.output.comparison.two_runs import compare_runs, comparison_sentence
-    from stitch.output.run_folder import call_entry_points, lock_run_folder
-    from stitch.output.stored_run import load_run
 
     if run.resolve() == other.resolve():
         raise InputError(f"{run} and {other} are one run; to fix: name two, or one alone for its own page")
@@ -154,10 +152,10 @@ def _write_two_run_page(
     folders = (run.resolve(), other.resolve())
     names = [folder.name for folder in folders]
     with show_activity("report: reading both runs"):
-        runs = [load_run(folder, effects_file, trust=trust) for folder in (run, other)]
+        runs = [stored_run.load_run(folder, effects_file, trust=trust) for folder in (run, other)]
         both = compare_runs(runs, [str(folder) for folder in folders] if names[0] == names[1] else names)
     page = output or other / "two-runs.html"
-    with nullcontext() if output else lock_run_folder(other):
-        call_entry_points("stitch.two_run_reports", both, page, tolerance)
+    with nullcontext() if output else run_folder.lock_run_folder(other):
+        run_folder.call_entry_points("stitch.two_run_reports", both, page, tolerance)
     say(comparison_sentence(both), bold=True)
     return page

@@ -120,16 +120,15 @@ def run(
     captures = [begin(partial(prepare_capture, session)) for session in loaded]
     from stitch.api.pipeline import run_rig
     from stitch.fusion.register import DEFAULT
-    from stitch.output.json_file import to_json
+    from stitch.output import json_file, run_folder
     from stitch.output.result_document import result_document
-    from stitch.output.run_folder import new_folder, preload_entry_points
 
     name = "+".join(session.name for session in loaded)
     target = output or Path("runs" if sessions else "../runs") / name
     inner = [""] if len(loaded) == 1 else [session.name for session in loaded]
     model, kept, own_effects = _given_models(hand_eye, arm, named, effects_file, trust)
-    preload_entry_points("stitch.reports")
-    with show_activity(f"{name}: reading the scans"), new_folder(target, paths, force) as scratch:
+    run_folder.preload_entry_points("stitch.reports")
+    with show_activity(f"{name}: reading the scans"), run_folder.new_folder(target, paths, force) as scratch:
         folders = [scratch / folder for folder in inner]
         recorders = [recorder_for(folder, recording) for folder in folders]
         runs = run_rig(loaded, model, recorders, named, keep, arm=kept, register=register or DEFAULT, captures=captures)
@@ -141,7 +140,7 @@ def run(
             mesh_fits = written.result()
     if as_json:
         documents = [result_document(result) for result in runs]
-        emit(to_json(documents[0] if len(documents) == 1 else documents))
+        emit(json_file.to_json(documents[0] if len(documents) == 1 else documents))
     else:
         _show_written([target / folder for folder in inner], mesh_fits)
     end_at_once()

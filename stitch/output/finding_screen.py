@@ -136,18 +136,9 @@ def _on_part(field: DisagreementField | None) -> dict[str, Any]:
 def _trend_row(trend: EffectTrend | None) -> dict[str, Any] | None:
     if trend is None:
         return None
-    return {
-        "follows": trend.follows,
-        "unit": trend.unit,
-        "of": trend.of,
-        "value_unit": trend.value_unit,
-        "views": trend.views.tolist(),
-        "at": _rounded(trend.at),
-        "measured": _rounded(trend.measured),
-        "sigma": _rounded(trend.sigma),
-        "predicted": _rounded(trend.predicted),
-        "law": [_rounded(row) for row in trend.law],
-    }
+    words = {key: getattr(trend, key) for key in ("follows", "unit", "of", "value_unit")}
+    dots = {key: _rounded(getattr(trend, key)) for key in ("at", "measured", "sigma", "predicted")}
+    return words | {"views": trend.views.tolist()} | dots | {"law": [_rounded(row) for row in trend.law]}
 
 
 def _rounded(values: Array) -> list[float]:

@@ -226,10 +226,6 @@ def _outlier_rows(run: RunData) -> list[dict[str, Any]]:
     ]
 
 
-def _labelled(run: RunData) -> bool:
-    return run.targets is not None
-
-
 def _labelled_alone(run: RunData) -> bool:
     """Return whether the rms of the run is that of labelled points; beside clouds it is that of the surfaces."""
     return run.targets is not None and run.overlaps is None
@@ -354,8 +350,8 @@ RESULT = Document(
     Key("linkage", _LINKAGE.kind(ViewLinks), "links", of=RunData, optional=True),
     Key("unsupported_points", _UNSUPPORTED.kind(Unsupported), "fit.unsupported", of=Fit, optional=True),
     Key("targets", write=_target_rows),
-    Key("position_error", _SIZES, write=_target_distances, when=_labelled),
-    Key("outliers", Kind(list_of(_OUTLIER.kind()).schema), write=_outlier_rows, when=_labelled),
+    Key("position_error", _SIZES, write=_target_distances, when=attrgetter("targets")),
+    Key("outliers", Kind(list_of(_OUTLIER.kind()).schema), write=_outlier_rows, when=attrgetter("targets")),
     Key("cloud_noise_factor", NUMBER, "measurement.capture.noise_factor", when=_labelled_beside_clouds),
     Key("rms_of", write=lambda run: "3D distances of the targets from their place", when=_labelled_alone),
     Key("heldout_position_error", _SIZES, "targets.heldout", when=_labelled_alone),
