@@ -1,5 +1,6 @@
 """The whole diagnosis: linear model, candidates, evidence, verdict, plain sentences."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from stitch.diagnosis.sensitivity import (
 from stitch.diagnosis.sentences import diagnosis_sentence
 from stitch.diagnosis.thresholds import CROSS_VALIDATED_CANDIDATES, MANY_POSES
 from stitch.diagnosis.unmodelled_joint_effects import joint_curves
-from stitch.diagnosis.unmodelled_time_effects import find_repeating_errors, reportable
+from stitch.diagnosis.unmodelled_time_effects import RepeatingError, find_repeating_errors, reportable
 from stitch.diagnosis.validation import cross_validate
 from stitch.diagnosis.verdict import Evidence
 from stitch.fit.pipelines import linearise
@@ -66,17 +67,11 @@ def _diagnose(state: RunData) -> Diagnosis:
         repeating = find_repeating_errors(linear)
     reported = reportable(repeating, evidence.implausible_scatter)
     process = reported[0].process if reported else None
-    # The views where the joint that is said to err without a name may err so.
-    with_reported = reported[0].joint_effects[0].model if reported and reported[0].joint_effects else linear
+    with_reported = _with_joint_effect(linear, reported)
+    # Of the poses beside errors said to repeat, or else all of it.
     scattering = with_reported if reported else linear.restricted(())
-    rotation, translation = np.sqrt(
-        process.flange_scatter if process else scattering.flange_scatter(scattering.null)
-    ).tolist()
-    # The effects that are missing at once, the one that is named first; else those that are named.
-    named = tuple(r.name for r in evidence.named)
-    together = tuple(r.name for r in evidence.together)
-    if evidence.verdict != "missing_effect" or together[:1] != named:
-        together = named
+    scatter = process.flange_scatter if process else scattering.flange_scatter(scattering.null)
+    rotation, translation = np.sqrt(scatter).tolist()
     diagnosis = Diagnosis(
         verdict=evidence.verdict,
         named=evidence.named,
@@ -103,7 +98,7 @@ def _diagnose(state: RunData) -> Diagnosis:
         and (evidence.scanner_error is not None or follows_field(evidence.empirical, repeating)),
         scanner_error=evidence.scanner_error or (find_scanner_error(linear) if is_unknown else None),
         doubts=state.doubts,
-        together=together,
+        together=_named_together(evidence),
         tried=state.tried,
         budget=variance_budget(with_reported, [r.score for r in evidence.named[:1]], process),
         answers=evidence.answers,
@@ -135,6 +130,19 @@ def _examine_candidates(linear: LinearModel, evidence: Evidence, matrix: Array, 
         )
 
     return list(parallel(examined, range(len(scores)), "candidate effects on views left out"))
+
+
+def _with_joint_effect(linear: LinearModel, reported: Sequence[RepeatingError]) -> LinearModel:
+    """Return the views where the joint that is said to err without a name may err so."""
+    effects = reported[0].joint_effects if reported else ()
+    return effects[0].model if effects else linear
+
+
+def _named_together(evidence: Evidence) -> tuple[str, ...]:
+    """Return the effects that are missing at once, the one that is named first; else those that are named."""
+    named = tuple(r.name for r in evidence.named)
+    together = tuple(r.name for r in evidence.together)
+    return together if evidence.verdict == "missing_effect" and together[:1] == named else named
 
 
 def _pair_beside_each_other(linear: LinearModel, evidence: Evidence) -> tuple[Ranked, Ranked] | None:

@@ -216,7 +216,7 @@ def test_a_name_that_holds_stays(monkeypatch):
 
 
 @pytest.mark.parametrize("found", [USELESS, ON_ONE_VIEW])
-def test_where_a_name_does_not_hold_the_alarm_stands(monkeypatch, found):
+def test_the_alarm_stands_where_a_name_does_not_hold(monkeypatch, found):
     verdict, notes = held(monkeypatch, found)
     assert verdict == "unknown_effect"
     assert len(notes) == 1
@@ -286,7 +286,7 @@ def test_two_effects_are_found_beside_each_other_and_hold(cell):
 
 
 @pytest.mark.parametrize(("play", "drift"), [(6e-4, 0.0), (0.0, 0.05)])
-def test_beside_one_effect_there_is_no_other(cell, play, drift):
+def test_no_second_effect_is_found_beside_one_that_is_alone(cell, play, drift):
     assert find_missing_pair(*best_of(cell, play=play, drift=drift)) is None
 
 

@@ -113,7 +113,7 @@ def test_two_joints_that_drag_each_other_are_told_by_the_two_angles(cell):
     assert {c.covariate for c in curves} <= {"j3_deg", "j5_deg"} and curves[0].covariate == "j5_deg"
 
 
-def test_what_a_joint_does_by_two_angles_is_the_mean_over_its_partners(cell):
+def test_the_effect_of_two_angles_is_the_mean_over_a_joints_partners(cell):
     """By hand from each partner's own law; and a function of two angles falls off as the product of both."""
     q = cell.measured.plan.joints
     off = np.zeros_like(q)
@@ -184,7 +184,7 @@ def test_a_joint_that_swings_in_time_does_so_at_every_pose_and_its_share_is_no_s
     assert np.sqrt(effect.model.flange_scatter(effect.model.null)[0]) < off[:, 4].std() / 3
 
 
-def test_what_a_joint_may_follow_as_well_is_said(cell):
+def test_all_that_a_joint_may_follow_is_said(cell):
     """With a slower swing the poses of these views go as time does."""
     off = np.zeros_like(cell.measured.plan.joints)
     off[:, 4] = 5e-4 * np.sin(0.5 * np.arange(14.0))
@@ -309,7 +309,7 @@ def test_only_joints_that_are_bent_have_a_law_of_their_load(cell):
         np.testing.assert_allclose(np.diag(law.kernel_of(process)), 1)
 
 
-def test_what_a_joint_may_do_in_time_and_under_load_stands_against_every_name(cell):
+def test_effects_of_a_joint_in_time_and_under_load_stand_against_every_name(cell):
     """A joint that drifts as its motor warms is likelier by a law in time than by any of its angles."""
     plan = cell.measured.plan
     warm = 1e-3 * (1 - np.exp(-np.arange(len(plan.joints)) / 4.0))

@@ -63,7 +63,7 @@ def test_a_bad_effects_file_is_one_line(tmp_path, text, expected):
     assert str(file) in str(error.value)
 
 
-def test_what_goes_wrong_in_an_effect_of_ones_own_is_one_line(tmp_path):
+def test_an_error_in_an_effect_of_ones_own_is_one_line(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text(USER.replace("    return ", "    raise KeyError('dust')\n    return "))
     try:
