@@ -110,7 +110,7 @@ def fitted_hand_eye(
 
 
 @dataclass(frozen=True)
-class Stitched:
+class Stitched(FusedCloud):
     """The stitched cloud in the reference frame: the flange (eye_to_hand) or the base (eye_in_hand).
 
     Example:
@@ -120,29 +120,8 @@ class Stitched:
         True
     """
 
-    fused: FusedCloud
     frame: str  # "flange" or "base"
     length_unit: str
-
-    @property
-    def points(self) -> Array:
-        """(N, 3) length_unit."""
-        return self.fused.points
-
-    @property
-    def normals(self) -> Array:
-        """(N, 3) unit vectors."""
-        return self.fused.normals
-
-    @property
-    def residual(self) -> Array:
-        """(N,) rms distance of the views' surfaces from this one, length_unit; NaN where one view alone saw it."""
-        return self.fused.residual
-
-    @property
-    def count(self) -> Array:
-        """(N,) number of views that see the place."""
-        return self.fused.count
 
     @property
     def colours(self) -> Colours:
@@ -264,7 +243,10 @@ class Run(RunData):
     def stitched(self) -> Stitched:
         """The stitched cloud (N, 3) with normals and residuals, reference frame."""
         frame = "flange" if self.session.mount == "eye_to_hand" else "base"
-        return Stitched(self.fused, frame, self.session.length_unit)
+        fused = self.fused
+        return Stitched(
+            fused.points, fused.normals, fused.residual, fused.count, frame=frame, length_unit=self.session.length_unit
+        )
 
     @property
     def views(self) -> tuple[RunView, ...]:

@@ -46,19 +46,15 @@ def steps(label: str, items: Iterable[Item], total: int | None = None) -> Iterat
         yield from items
         return
     for done, item in enumerate(items):
-        _notify_watchers(label, done, count)
+        announce(label, done, count)
         yield item
-    _notify_watchers(label, count, count)
+    announce(label, count, count)
 
 
-def announce(step: str) -> None:
-    """Tell watchers what is worked on next, where no loop says how far it is."""
-    _notify_watchers(step, 0, 0)
-
-
-def _notify_watchers(label: str, done: int, total: int) -> None:
+def announce(step: str, done: int = 0, total: int = 0) -> None:
+    """Tell watchers what is worked on next, and how far a loop is."""
     for watcher in _watchers:
-        watcher(label, done, total)
+        watcher(step, done, total)
 
 
 @contextmanager

@@ -24,10 +24,72 @@ from threadpoolctl import threadpool_limits
 from stitch.errors import InputError
 from stitch.system.process import steps
 
-# As mallopt(3) of glibc numbers them; allocations from the first on are mappings of their own, and what is free at the
-# top of a heap beyond the second goes back.
-_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
-_LARGE, _TOP = 2_000_000, 20_000_000
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+# As mallopt(3) of glibc numbers them: allocations from so many bytes on are mappings of their own, and what is free at
+# the top of a heap beyond so many goes back.
+_MMAP_THRESHOLD = -3
+_TRIM_THRESHOLD = -1
+_MAPPED_BYTES = 2_000_000
+_TOP_BYTES = 20_000_000
+# A mapped array is looked at in so many parts.
+_PARTS = 64
+# Of a long loop: enough of them to keep all cores busy to its end.
+_PORTIONS = 100
+_processes = 1
+
+
+def parallel(function: Callable[[Item], Result], items: Iterable[Item], label: str = "") -> Iterator[Result]:
+    """Return `map` over the cores, results in order; `function` must not call `parallel` itself.
+
+    Args:
+        label: what the items are, for whoever watches a long loop.
+    """
+    pool = _pool()
+    every = list(items)
+    if label:
+        return steps(label, pool.map(function, every), len(every))
+    # Thousands of small items would spend as long in being handed out.
+    size = max(len(every) // _PORTIONS, 1)
+    portions = (every[start : start + size] for start in range(0, len(every), size))
+    return chain.from_iterable(pool.map(lambda portion: [function(item) for item in portion], portions))
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return ThreadPoolExecutor(
+        max_workers=max(cores // _processes, 1), thread_name_prefix="stitch", initializer=library_threads_off
+    )
+
+
+def share_cores(processes: int) -> None:
+    """Leave the cores to so many processes like this one, before the first `parallel`."""
+    global _processes
+    _processes = processes
+
+
+def begin(function: Callable[[], Result]) -> Future[Result]:
+    """Begin a function in a thread of its own, and return its coming result; it may call `parallel`.
+
+    A process that ends before does not wait for it: it must not write files.
+    """
+    future = Future[Result]()
+
+    def run() -> None:
+        library_threads_off()
+        try:
+            future.set_result(function())
+        except BaseException as error:
+            future.set_exception(error)
+
+    Thread(target=run, name="stitch-beside", daemon=True).start()
+    return future
+
+
+def library_threads_off() -> Any:
+    """Limit OpenMP and BLAS to one thread; also a context manager. OpenMP counts per calling thread."""
+    return threadpool_limits(1)
 
 
 @cache
@@ -39,8 +101,8 @@ def return_large_arrays() -> None:
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
-        mallopt(_MMAP_THRESHOLD, _LARGE)
-        mallopt(_TRIM_THRESHOLD, _TOP)
+        mallopt(_MMAP_THRESHOLD, _MAPPED_BYTES)
+        mallopt(_TRIM_THRESHOLD, _TOP_BYTES)
 
 
 def map_parts(parts: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
@@ -70,13 +132,6 @@ def map_parts(parts: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[
     return {name: np.memmap(files[name], kind, "r", shape=(rows, *rest)) for name, (kind, rest) in layout.items()}
 
 
-def release_mapped(array: NDArray[Any]) -> None:
-    """Give back the memory of a mapped array that was looked at; it comes again from its file. Others stay."""
-    held = getattr(array, "_mmap", None)
-    if isinstance(array, np.memmap) and held is not None and hasattr(mmap, "MADV_DONTNEED"):
-        held.madvise(mmap.MADV_DONTNEED)
-
-
 def take_mapped(array: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
     """Return some rows of an array; of a mapped one little is in memory at a time, and nothing stays."""
     if not isinstance(array, np.memmap):
@@ -88,74 +143,11 @@ def take_mapped(array: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
     return taken
 
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-
-
-_processes = 1
-# A mapped array is looked at in so many parts.
-_PARTS = 64
-# Of a long loop: enough of them to keep all cores busy to its end.
-_PORTIONS = 100
-
-
-def share_cores(processes: int) -> None:
-    """Leave the cores to so many processes like this one, before the first `parallel`."""
-    global _processes
-    _processes = processes
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return ThreadPoolExecutor(
-        max_workers=max(cores // _processes, 1), thread_name_prefix="stitch", initializer=library_threads_off
-    )
-
-
-def parallel(function: Callable[[Item], Result], items: Iterable[Item], label: str = "") -> Iterator[Result]:
-    """`map` over the cores, results in order; `function` must not call `parallel` itself.
-
-    Args:
-        label: what the items are, for whoever watches a long loop.
-    """
-    pool, every = _pool(), list(items)
-    if label:
-        return steps(label, pool.map(function, every), len(every))
-    # Thousands of small items would spend as long in being handed out.
-    size = max(len(every) // _PORTIONS, 1)
-    portions = (every[start : start + size] for start in range(0, len(every), size))
-    return chain.from_iterable(pool.map(lambda portion: [function(item) for item in portion], portions))
-
-
-def begin(function: Callable[[], Result]) -> Future[Result]:
-    """Begin a function in a thread of its own, and return its coming result; it may call `parallel`.
-
-    A process that ends before does not wait for it: it must not write files.
-    """
-    future = Future[Result]()
-
-    def run() -> None:
-        library_threads_off()
-        try:
-            future.set_result(function())
-        except BaseException as error:
-            future.set_exception(error)
-
-    Thread(target=run, name="stitch-beside", daemon=True).start()
-    return future
-
-
-def known(result: Result) -> Future[Result]:
-    """Return a result that is there already as one that has been begun."""
-    future = Future[Result]()
-    future.set_result(result)
-    return future
-
-
-def library_threads_off() -> Any:
-    """Limit OpenMP and BLAS to one thread; also a context manager. OpenMP counts per calling thread."""
-    return threadpool_limits(1)
+def release_mapped(array: NDArray[Any]) -> None:
+    """Give back the memory of a mapped array that was looked at; it comes again from its file. Others stay."""
+    held = getattr(array, "_mmap", None)
+    if isinstance(array, np.memmap) and held is not None and hasattr(mmap, "MADV_DONTNEED"):
+        held.madvise(mmap.MADV_DONTNEED)
 
 
 class Clock:
@@ -165,7 +157,7 @@ class Clock:
         self.last = time.perf_counter()
 
     def lap(self) -> float:
-        """Seconds since the last call."""
-        now = time.perf_counter()
-        self.last, before = now, self.last
-        return now - before
+        """Return seconds since the last call."""
+        before = self.last
+        self.last = time.perf_counter()
+        return self.last - before

@@ -45,21 +45,19 @@ def cloud_of(item: Any, where: str, scale: float = 1.0) -> Cloud:
     Raises:
         InputError: a kind that is not known, another shape, no points, or points that are not finite.
     """
-    if scale == 1.0 and _is_plain(item):
+    is_plain = isinstance(item, np.ndarray) and item.dtype == np.float64 and item.ndim == 2 and item.shape[1] == 3
+    # Where nothing is changed or left out, no copy is needed.
+    if scale == 1.0 and is_plain and len(item) and np.isfinite(item).all() and item.any(axis=1).all():
         return Cloud(item)
     return cloud_of_columns(where, _columns(item, where), scale)
-
-
-def _is_plain(item: Any) -> bool:
-    """Return True of points of which nothing is changed or left out: they need no copy."""
-    fits = isinstance(item, np.ndarray) and item.ndim == 2 and item.shape[1:] == (3,) and item.dtype == np.float64
-    return fits and len(item) > 0 and bool(np.isfinite(item).all()) and bool(item.any(axis=1).all())
 
 
 def _columns(item: Any, where: str) -> Columns:
     """Return columns (N,) by name."""
     if isinstance(item, Cloud):
-        return _of_cloud(item if item.whole is None else item.whole.read())
+        cloud = item if item.whole is None else item.whole.read()
+        normals = {} if cloud.normals is None else dict(zip(_NORMALS, cloud.normals.T, strict=True))
+        return dict(zip("xyz", cloud.points.T, strict=True)) | normals | cloud.scalars
     if isinstance(item, Mapping):
         return _of_mapping(item, where)
     if isinstance(item, tuple) and len(item) == 2 and not isinstance(item[0], (int, float)):
@@ -69,36 +67,32 @@ def _columns(item: Any, where: str) -> Columns:
         return _of_open3d(item, where)
     if library == "trimesh" and hasattr(item, "vertices"):
         colours = getattr(item, "colors", None)
-        return _points(np.asarray(item.vertices), where) | (_colours(colours, where) if _any(colours) else {})
+        has_colours = colours is not None and len(colours) > 0
+        return _points(np.asarray(item.vertices), where) | (_colours(colours, where) if has_colours else {})
     array = np.asarray(item)
     if array.dtype.names is not None:
         columns = {name: array[name].ravel() for name in array.dtype.names if array[name].ndim == array.ndim}
         return measured_pixels(columns)
-    return _points(array, where)
-
-
-def _of_cloud(cloud: Cloud) -> Columns:
-    normals = {} if cloud.normals is None else dict(zip(_NORMALS, cloud.normals.T, strict=True))
-    return dict(zip("xyz", cloud.points.T, strict=True)) | normals | cloud.scalars
+    columns = _points(array, where)
+    return measured_pixels(columns) if array.ndim == 3 else columns
 
 
 def _points(points: Array, where: str) -> Columns:
-    """Return columns x, y, z of (N, 3), or of (H, W, 3) whose pixels without a measurement are NaN."""
+    """Return columns x, y, z of (N, 3), or of every pixel of (H, W, 3), measured or not."""
     if points.ndim not in (2, 3) or points.shape[-1] != 3 or points.dtype.kind not in "fiu":
         raise InputError(f"{where}: {_array_kind(points)} is no cloud that is known; to fix: pass {_KNOWN}")
-    columns = dict(zip("xyz", points.reshape(-1, 3).T, strict=True))
-    return measured_pixels(columns) if points.ndim == 3 else columns
+    return dict(zip("xyz", points.reshape(-1, 3).T, strict=True))
 
 
 def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
     """Return columns of a mapping: points, normals and colors are three each, every other entry is one."""
     rest = {str(name): np.asarray(values) for name, values in item.items()}
-    points = rest.pop("points", None)
-    columns = {} if points is None else _points_all(points, where)
-    count = len(next(iter(columns.values()), ()))
-    for name, known in (("normals", _normals), ("colors", _colours)):
-        if name in rest:
-            columns |= known(rest.pop(name), where)
+    columns = _points(rest.pop("points"), where) if "points" in rest else {}
+    count = len(columns.get("x", ()))
+    if "normals" in rest:
+        columns |= _triple(_NORMALS, rest.pop("normals"), "normals", where)
+    if "colors" in rest:
+        columns |= _colours(rest.pop("colors"), where)
     columns |= {name: values.ravel() for name, values in rest.items()}
     odd = next((name for name, column in columns.items() if len(column) != (count or len(columns[name]))), None)
     if odd is not None:
@@ -106,33 +100,18 @@ def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
     return measured_pixels(columns)
 
 
-def _points_all(points: Array, where: str) -> Columns:
-    """Return every pixel, measured or not, so that other columns stay beside it."""
-    if points.ndim == 3 and points.shape[-1] == 3:
-        points = points.reshape(-1, 3)
-    return _points(points, where)
-
-
-def _normals(normals: Any, where: str) -> Columns:
-    return _three(_NORMALS, np.asarray(normals), "normals", where)
-
-
 def _colours(colours: Any, where: str) -> Columns:
-    """0 … 255, of bytes as they are and of floats from 0 to 1; an opacity is left out."""
+    """Return red, green, blue, 0 … 255, of bytes as they are and of floats from 0 to 1; an opacity is left out."""
     values = np.asarray(colours)
     if values.dtype.kind == "f":
         values = np.round(values * 255)
-    return _three(_COLOURS, values[..., :3], "colors", where)
+    return _triple(_COLOURS, values[..., :3], "colors", where)
 
 
-def _three(names: Sequence[str], values: Array, what: str, where: str) -> Columns:
+def _triple(names: Sequence[str], values: Array, what: str, where: str) -> Columns:
     if values.ndim < 2 or values.shape[-1] != 3:
         raise InputError(f"{where}: {what} of shape {values.shape}; to fix: pass three numbers a point")
     return dict(zip(names, values.reshape(-1, 3).T, strict=True))
-
-
-def _any(values: Any) -> bool:
-    return values is not None and len(values) > 0
 
 
 def _of_open3d(item: Any, where: str) -> Columns:
@@ -141,17 +120,14 @@ def _of_open3d(item: Any, where: str) -> Columns:
         raise InputError(f"{where}: an image has no points without its lens; to fix: pass (image, intrinsics)")
     if hasattr(item, "has_normals"):
         columns = _points(np.asarray(item.points), where)
-        columns |= _normals(item.normals, where) if item.has_normals() else {}
+        columns |= _triple(_NORMALS, np.asarray(item.normals), "normals", where) if item.has_normals() else {}
         return columns | (_colours(item.colors, where) if item.has_colors() else {})
     if "positions" not in getattr(item, "point", ()):
         raise InputError(f"{where}: {type(item).__name__} is no cloud that is known; to fix: pass {_KNOWN}")
     values = {name: item.point[name].cpu().numpy() for name in item.point}
-    columns = _points(values.pop("positions"), where)
-    for name, known in (("normals", _normals), ("colors", _colours)):
-        if name in values:
-            columns |= known(values.pop(name), where)
-    one = {name: x.reshape(len(x)) for name, x in values.items() if x.size == len(x)}
-    return columns | {"intensity" if name == "intensities" else name: x for name, x in one.items()}
+    values = {"intensity" if name == "intensities" else name: x for name, x in values.items()}
+    threes = {"points": values.pop("positions")} | {k: values.pop(k) for k in ("normals", "colors") if k in values}
+    return _of_mapping(threes | {name: x for name, x in values.items() if x.size == len(x)}, where)
 
 
 def _of_depth(image: Any, intrinsics: Any, where: str) -> Columns:
@@ -163,14 +139,14 @@ def _of_depth(image: Any, intrinsics: Any, where: str) -> Columns:
             f"{where}: {_array_kind(depth)} is no depth image; to fix: pass (H, W) numbers with intrinsics"
         )
     points = lifted(where, depth.astype(float), _intrinsics(intrinsics, where)).reshape(-1, 3)
-    seen = np.isfinite(points[:, 2])
-    columns = dict(zip("xyz", points[seen].T, strict=True))
+    measured = np.isfinite(points[:, 2])
+    columns = dict(zip("xyz", points[measured].T, strict=True))
     pixels = np.zeros(0) if colour is None else _pixels(colour)
     if pixels.shape[:2] != depth.shape:
         return columns
     if pixels.ndim == 2:
-        return columns | {"intensity": pixels.ravel()[seen]}
-    return columns | {name: values[seen] for name, values in _colours(pixels, where).items()}
+        return columns | {"intensity": pixels.ravel()[measured]}
+    return columns | {name: values[measured] for name, values in _colours(pixels, where).items()}
 
 
 def _pixels(image: Any) -> Array:
@@ -188,8 +164,7 @@ def _intrinsics(item: Any, where: str) -> Intrinsics:
         size = (int(item.width), int(item.height)) if item.width > 0 else None
         K = np.asarray(item.intrinsic_matrix, float)
     elif isinstance(item, Mapping):
-        f, c = [float(item[k]) for k in ("fx", "fy")], [float(item[k]) for k in ("cx", "cy")]
-        K = np.array([[f[0], 0, c[0]], [0, f[1], c[1]], [0, 0, 1]])
+        K = np.array([[item["fx"], 0, item["cx"]], [0, item["fy"], item["cy"]], [0, 0, 1]], float)
     else:
         K = np.asarray(item.cpu().numpy() if hasattr(item, "cpu") else item, float)
     if K.shape != (3, 3) or not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
@@ -246,32 +221,27 @@ def _matrices(poses: Any, where: str) -> Array:
     if hasattr(poses, "as_matrix") and not isinstance(poses, Rotation):
         return np.asarray(poses.as_matrix(), float)
     if isinstance(poses, tuple) and len(poses) == 2 and isinstance(poses[0], Rotation):
-        return _joined(*poses, where)
+        rotations = poses[0].as_matrix()
+        shifts = np.asarray(poses[1], float)
+        if shifts.shape != rotations.shape[:-1]:
+            raise InputError(
+                f"{where}: {rotations.shape[:-2] or 'one'} rotations and translations of shape {shifts.shape}; to fix: "
+                "pass three numbers a rotation"
+            )
+        return frames.make(rotations, shifts)
     try:
         if isinstance(poses, Sequence) and not isinstance(poses, str):
-            poses = [_matrices(pose, where) if _is_object(pose) else np.asarray(pose, float) for pose in poses]
+            # Of one object a view, or of one array a view.
+            is_object = [
+                hasattr(p, "as_matrix") or (isinstance(p, tuple) and isinstance(p[0], Rotation)) for p in poses
+            ]
+            poses = [_matrices(p, where) if o else np.asarray(p, float) for p, o in zip(poses, is_object, strict=True)]
         return np.array(poses, float)
     except (TypeError, ValueError):
         raise InputError(
             f"{where}: poses are not all matrices (4, 4); to fix: pass (V, 4, 4), RigidTransform, "
             "(Rotation, translation), or a list of one a view"
         ) from None
-
-
-def _is_object(pose: Any) -> bool:
-    """Return True of a RigidTransform, or of a rotation beside a translation."""
-    return hasattr(pose, "as_matrix") or (isinstance(pose, tuple) and isinstance(pose[0], Rotation))
-
-
-def _joined(R: Rotation, t: Any, where: str) -> Array:
-    shift = np.asarray(t, float)
-    matrices = R.as_matrix()
-    if shift.shape != matrices.shape[:-1]:
-        raise InputError(
-            f"{where}: {matrices.shape[:-2] or 'one'} rotations and translations of shape {shift.shape}; to fix: pass "
-            "three numbers a rotation"
-        )
-    return frames.make(matrices, shift)
 
 
 def _no_motion(T: Array) -> str:
