@@ -184,24 +184,27 @@ def killed(command: str, share: float, try_again: bool) -> Row:
     """Kill a command after a share of its usual seconds; return whether the old run or the new one is left, whole, and
     whether the command works on, if that is tried."""
     usual, new = _whole(command)
-    with TemporaryDirectory(prefix="kill-") as name:
-        room = fresh(Path(name).resolve() / "room")
-        process = _forked(lambda: _quietly(command, room))
-        time.sleep(share * usual)
-        os.kill(process, signal.SIGKILL)
-        os.waitpid(process, 0)
-        state = _contents(room / "r")
-        left = "old" if state == _contents(material()[1] / "r") else "new" if state == new else "neither"
-        return {"left": left, "works": not try_again or _works_on(command, room)}
+    room = _kill_room(command)
+    process = _forked(lambda: _quietly(command, room))
+    time.sleep(share * usual)
+    os.kill(process, signal.SIGKILL)
+    os.waitpid(process, 0)
+    state = _contents(room / "r")
+    left = "old" if state == _contents(material()[1] / "r") else "new" if state == new else "neither"
+    return {"left": left, "works": not try_again or _works_on(command, room)}
+
+
+def _kill_room(command: str) -> Path:
+    """A fresh room at the same place for every kill of a command: some files of a run name their folder."""
+    return fresh(material()[1].with_name(f"kill-{command}"))
 
 
 @cache
 def _whole(command: str) -> tuple[float, dict[str, str]]:
     """Seconds of a command, and what it leaves."""
-    with TemporaryDirectory(prefix="kill-") as name:
-        room, begun = fresh(Path(name).resolve() / "room"), time.monotonic()
-        _must(_forked(lambda: _quietly(command, room)))
-        return time.monotonic() - begun, _contents(room / "r")
+    room, begun = _kill_room(command), time.monotonic()
+    _must(_forked(lambda: _quietly(command, room)))
+    return time.monotonic() - begun, _contents(room / "r")
 
 
 def _quietly(command: str, room: Path) -> None:
