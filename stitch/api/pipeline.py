@@ -115,11 +115,11 @@ def run_rig(
             notes, doubts = _check_common_model(screened, hand_eyes, effects, arm)
             fits = conductor.finish()
         runs = []
-        for i, (session, whole, screening) in enumerate(
-            zip(screened.sessions, sessions, screened.screenings, strict=True)
-        ):
-            left_out = tuple(sorted(screening.left_out, key=lambda item: whole.names.index(item.view)))
+        for i, screening in enumerate(screened.screenings):
+            order = sessions[i].names
+            left_out = tuple(sorted(screening.left_out, key=lambda item: order.index(item.view)))
             screening = replace(screening, left_out=left_out, doubts=(*doubts, *screening.doubts))
+            session = screened.sessions[i]
             run = _assemble_run(session, i, screened.fitted, hand_eyes[i], fits[i], screening, keep=keep, notes=notes)
             runs.append(replace(run, effects_file=model.effects_file if model else None))
         for run, recorder in zip(runs, recorders, strict=True):
@@ -239,8 +239,9 @@ def _initial_model(session: SessionData, effects: Sequence[str], arm: ModelFile 
 class _Conductor:
     """Fits the sessions of a rig, and lets their last steps go on while the views are screened.
 
-    Nearly always all views belong: they are registered and fused meanwhile, and how certain the hand-eye is is found in
-    a thread of its own. What was begun for views that are then left out ends with the next iteration.
+    Nearly always all views belong: they are registered and fused meanwhile. The statistics of the hand-eye, half a
+    second of one core, have a thread of their own. What was begun for views that are then left out ends with its next
+    iteration.
     """
 
     def __init__(
@@ -251,7 +252,10 @@ class _Conductor:
         recorders: Sequence[Recorder],
         register: str,
     ) -> None:
-        self._sessions, self._start, self._coarse, self._recorders = sessions, start, coarse, recorders
+        self._sessions = sessions
+        self._start = start
+        self._coarse = coarse
+        self._recorders = recorders
         self._register = register
         self._clock = Clock()
         self._seconds = 0.0
@@ -290,7 +294,7 @@ class _Conductor:
                 for i, session in enumerate(sessions)
             ]
 
-        self._certain = begin(lambda: None if fitted.correction is None else fitted.correction.hand_eye)
+        self._statistics = begin(lambda: None if fitted.correction is None else fitted.correction.hand_eye)
         self._finished = begin(finish)
         return fitted
 
@@ -300,7 +304,7 @@ class _Conductor:
         fits = self._finished.result()
         for memory, recorder in zip(self._memories, self._recorders, strict=True):
             memory.replay(recorder)
-        self._certain.result()
+        self._statistics.result()
         return fits
 
     def close(self) -> None:
