@@ -135,7 +135,7 @@ def test_a_folder_is_followed_as_it_fills(cell_folder, tmp_path, capfd):
     assert (tmp_path / "run" / "result.json").is_file()
 
 
-def test_counting_views_needs_follow(cell_folder, capfd):
+def test_the_number_of_views_is_stated_with_follow_alone(cell_folder, capfd):
     with pytest.raises(SystemExit) as end:
         main(["run", str(cell_folder), "--views", "3"])
     assert end.value.code == 2 and "add --follow" in capfd.readouterr().err

@@ -64,7 +64,7 @@ def test_residuals_are_those_of_the_file(found, tmp_path):
     assert found.residuals.equals(pq.read_table(tmp_path / "run" / "residuals.parquet"))
 
 
-def test_the_stitched_cloud_for_trimesh(found):
+def test_the_stitched_cloud_goes_to_trimesh_with_its_colours(found):
     cloud = found.stitched.to_trimesh()
     assert isinstance(cloud, trimesh.PointCloud) and np.array_equal(cloud.vertices, found.stitched.points)
     assert np.array_equal(cloud.colors[:, :3], found.stitched.colours)

@@ -165,7 +165,7 @@ def test_an_arm_that_came_as_urdf_is_saved_as_one(loaded, tmp_path):
     )
 
 
-def test_labelled_points_alone(tmp_path):
+def test_labelled_points_alone_make_a_session(tmp_path):
     session, _, _ = labelled_cell(0)
     points = [dict(zip(v.sighting.targets, v.sighting.points, strict=True)) for v in session.views]
     T = np.array([v.T_base_flange for v in session.views])

@@ -67,7 +67,7 @@ def test_forward_is_the_product_of_elementary_matrices(convention, order):
 
 
 @pytest.mark.parametrize("convention", ["standard", "modified"])
-def test_jacobian_against_finite_differences(convention):
+def test_the_jacobian_agrees_with_finite_differences(convention):
     arm, q, step = robot(convention), np.random.default_rng(1).uniform(-3, 3, 6), 1e-6
     J = jacobian(arm, q)
     for i in range(6):

@@ -219,7 +219,7 @@ def _off_orthonormal(R: Array) -> float:
 def _matrices(poses: Any, where: str) -> Array:
     """Return (V, 4, 4) of many poses, (4, 4) of one."""
     if hasattr(poses, "as_matrix") and not isinstance(poses, Rotation):
-        return np.asarray(poses.as_matrix(), float)
+        return poses.as_matrix()
     if isinstance(poses, tuple) and len(poses) == 2 and isinstance(poses[0], Rotation):
         rotations = poses[0].as_matrix()
         shifts = np.asarray(poses[1], float)

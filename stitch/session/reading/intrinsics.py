@@ -136,7 +136,7 @@ def _list_numbers(value: Any) -> Array:
     if isinstance(value, dict):
         value = value.get("data", [])
     try:
-        return np.asarray(value if isinstance(value, list) else [], float).ravel()
+        return np.array(value if isinstance(value, list) else [], float).ravel()
     except (TypeError, ValueError):
         return np.zeros(0)
 

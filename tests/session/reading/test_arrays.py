@@ -173,7 +173,7 @@ def test_what_is_no_pose_is_refused(poses, says):
     assert str(refused.value).startswith(says) and "\n" not in str(refused.value)
 
 
-def test_labelled_points_of_a_view():
+def test_labelled_points_of_a_view_become_a_sighting():
     found = sighting_of({"ball1": (1, 2, 3), "ball2": [4, 5, 6]}, "v")
     assert found.targets == ("ball1", "ball2") and np.array_equal(found.points, [[1, 2, 3], [4, 5, 6]])
     assert np.isnan(found.sigma).all() and sighting_of({}, "v") is None and sighting_of(None, "v") is None

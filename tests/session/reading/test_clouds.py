@@ -18,7 +18,7 @@ POINTS = np.random.default_rng(0).normal(size=(500, 3)) * 100
 
 
 @pytest.mark.parametrize(("text", "order"), [(True, "="), (False, "<"), (False, ">")])
-def test_ply(tmp_path, text, order):
+def test_ply_files_keep_points_normals_and_scalars(tmp_path, text, order):
     vertex = np.empty(
         500, [("x", "f8"), ("y", "f8"), ("z", "f8"), ("nx", "f4"), ("ny", "f4"), ("nz", "f4"), ("intensity", "u2")]
     )
@@ -34,7 +34,7 @@ def test_ply(tmp_path, text, order):
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
-def test_pcd_in_each_encoding(tmp_path, encoding):
+def test_pcd_in_each_encoding_is_read_to_the_same_numbers(tmp_path, encoding):
     """Packed by LibLZF itself; repeated rows give it something to pack."""
     points = np.vstack([POINTS, np.repeat(POINTS[:5], 60, axis=0)]).astype("<f4")
     if encoding == "ascii":
@@ -73,7 +73,7 @@ def test_pcd_with_padding_vectors_and_odd_names(tmp_path):
         read_cloud(tmp_path / "c.pcd")
 
 
-def test_real_pcd_with_padding(reghec):
+def test_a_real_pcd_with_padding_is_read(reghec):
     for name in ("david", "sphere"):
         path = reghec(name) / "clouds" / "view1.pcd"
         header, _, body = path.read_bytes().partition(b"DATA binary\n")
@@ -91,7 +91,7 @@ def test_real_pcd_with_padding(reghec):
         (".xyz", "# taken at noon\n# X Y Z intensity\n1 2 3 9\n4 5 6 8\n"),
     ],
 )
-def test_text(tmp_path, suffix, text):
+def test_text_clouds_keep_points_and_scalars(tmp_path, suffix, text):
     path = tmp_path / f"c{suffix}"
     path.write_text(text)
     cloud = read_cloud(path)
@@ -137,7 +137,7 @@ def test_broken_files_say_so(tmp_path, name, content, message):
         (0, b"", 0, "no points"),
     ],
 )
-def test_compressed_pcd_of_few_bytes(tmp_path, count, packed, size, told):
+def test_a_compressed_pcd_of_few_bytes_is_read_or_refused(tmp_path, count, packed, size, told):
     header = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS {count}\nDATA binary_compressed\n"
     (tmp_path / "c.pcd").write_bytes(header.encode() + struct.pack("<II", len(packed), size) + packed)
     if told is None:
@@ -337,7 +337,7 @@ def test_broken_files_end_in_one_line(tmp_path, name, text):
 
 
 @pytest.mark.parametrize("row", ["{} {} {} 128\n", "{}; {}; {}\n"])
-def test_commas_before_the_decimals(tmp_path, row):
+def test_a_text_cloud_with_decimal_commas_is_read(tmp_path, row):
     rows = "".join(row.format(*(f"{value + 0.25:.2f}".replace(".", ",") for value in corner)) for corner in CORNERS)
     (tmp_path / "c.txt").write_text(f"{len(CORNERS)}\n{rows}", encoding="utf-8")
     np.testing.assert_allclose(read_cloud(tmp_path / "c.txt").points, CORNERS + 0.25)

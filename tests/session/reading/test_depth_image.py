@@ -69,7 +69,7 @@ def test_intrinsics_written_by_opencv(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["d.tif", "d.tiff", "d.exr", "d.npy"])
-def test_floating_point_depth_in_metres(tmp_path, monkeypatch, name):
+def test_floating_point_depth_is_in_metres(tmp_path, monkeypatch, name):
     metres = (DEPTH / 1000).astype(np.float32)
     (tmp_path / "intrinsics.json").write_text(json.dumps(REALSENSE))
     if name.endswith(".npy"):

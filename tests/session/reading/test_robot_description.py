@@ -26,7 +26,7 @@ def test_urdf_axis_origin_and_fixed_joints(tmp_path):
 
 
 @pytest.mark.parametrize(("joint", "message"), [("prismatic", "revolute"), ("revolute", "no chain")])
-def test_urdf_that_cannot_serve(tmp_path, joint, message):
+def test_a_urdf_that_cannot_serve_is_refused_with_the_reason(tmp_path, joint, message):
     (tmp_path / "a.urdf").write_text(
         f'<robot name="a"><link name="b"/><link name="l"/><joint name="j" type="{joint}"><parent link="b"/><child link="l"/></joint></robot>'
     )

@@ -30,7 +30,7 @@ def pcd(viewpoint):
     return f"{head}VIEWPOINT {viewpoint}\nPOINTS 4\nDATA ascii\n{rows}"
 
 
-def test_ptx_and_pcd(tmp_path):
+def test_poses_in_the_headers_of_ptx_and_pcd_are_read(tmp_path):
     half = np.sqrt(0.5)
     samples = {".ptx": (ptx(AS_IT_IS), ptx(TURNED)), ".pcd": (pcd("0 0 0 1 0 0 0"), pcd(f"1 2 3 {half} 0 0 {half}"))}
     for suffix, texts in samples.items():
@@ -42,7 +42,7 @@ def test_ptx_and_pcd(tmp_path):
     assert poses_in_scans([tmp_path / "a.ptx", tmp_path / "b.pcd"]) is None
 
 
-def test_e57(tmp_path):
+def test_poses_in_the_headers_of_e57_are_read(tmp_path):
     pye57 = needs("pye57", "formats")
     columns = {f"cartesian{axis}": np.arange(4.0) + k for k, axis in enumerate("XYZ")}
     files = [tmp_path / f"{name}.e57" for name in "ab"]

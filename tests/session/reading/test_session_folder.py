@@ -32,7 +32,7 @@ from stitch.session.reading.target_tables import read_frames, read_points
 from stitch.session.reading.views_table import read_views
 
 
-def test_good_session(session):
+def test_a_good_session_is_read_whole(session):
     loaded = load_session(session)
     assert [view.name for view in loaded.views] == ["v000", "v001", "v002"]
     assert loaded.mount == "eye_to_hand"
@@ -326,6 +326,16 @@ def read_or_refused():
         assert str(error) and "\n" not in str(error)
 
 
+def test_nominal_targets_are_left_alone_where_only_the_arm_is_asked_for(tmp_path):
+    session = labelled_cell(3, views=5)[0]
+    folder = write_labelled(tmp_path / "s", session)
+    sighting = session.views[0].sighting
+    rows = [f"{name},{x},{y},{z}" for name, (x, y, z) in zip(sighting.targets, sighting.points, strict=True)]
+    (folder / "targets.csv").write_text("\n".join(["target,x,y,z", *rows]) + "\n")
+    assert load_session(folder).nominal.targets == sighting.targets
+    assert load_session(folder, scans=False).nominal is None
+
+
 def any_table(header, rows):
     def cell(text):
         return '"' + text.replace('"', '""') + '"'
@@ -336,7 +346,7 @@ def any_table(header, rows):
 @pytest.mark.parametrize("suffix", ["ply", "pcd", "xyz", "csv"])
 @quick
 @given(data=st.data())
-def test_bytes_that_are_no_cloud(tmp_path, suffix, data):
+def test_bytes_that_are_no_cloud_are_refused_in_one_line(tmp_path, suffix, data):
     start = {"ply": b"ply\nformat ", "pcd": b"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n"}.get(suffix, b"")
     file = tmp_path / f"c.{suffix}"
     file.write_bytes(start * data.draw(st.booleans()) + data.draw(st.binary(max_size=300)))
@@ -352,7 +362,7 @@ def test_bytes_that_are_no_cloud(tmp_path, suffix, data):
     body=st.binary(max_size=200),
     sizes=st.lists(st.integers(-1, 9), min_size=3, max_size=3),
 )
-def test_headers_that_promise_anything(tmp_path, count, encoding, body, sizes):
+def test_any_header_of_a_cloud_is_read_or_refused_in_one_line(tmp_path, count, encoding, body, sizes):
     told = " ".join(map(str, sizes))
     header = f"FIELDS x y z\nSIZE {told}\nTYPE F U I\nCOUNT 1 1 1\nPOINTS {count}\nDATA {encoding}\n"
     (tmp_path / "c.pcd").write_bytes(header.encode() + body)
@@ -366,7 +376,7 @@ def test_headers_that_promise_anything(tmp_path, count, encoding, body, sizes):
 
 @quick
 @given(rows=st.lists(st.lists(CELL, min_size=9, max_size=9), max_size=4), width=st.integers(1, 9))
-def test_tables_of_anything(tmp_path, rows, width):
+def test_any_table_is_read_or_refused_in_one_line(tmp_path, rows, width):
     pose = ["x", "y", "z", "qx", "qy", "qz", "qw"]
     readers = {
         "views.csv": (["view", "cloud", *pose], lambda file: read_views(file, None)),
@@ -383,7 +393,7 @@ def test_tables_of_anything(tmp_path, rows, width):
 
 @quick
 @given(text=st.text(max_size=200), value=JSON, key=st.sampled_from(["name", "scanner", "robot", "part", "sphere"]))
-def test_descriptions_of_anything(tmp_path, text, value, key):
+def test_any_session_toml_is_read_or_refused_in_one_line(tmp_path, text, value, key):
     file = tmp_path / "session.toml"
     file.write_text(f'format = "stitch-session/1"\n{text}', encoding="utf-8")
     with read_or_refused():
@@ -406,7 +416,7 @@ def test_descriptions_of_anything(tmp_path, text, value, key):
 
 @quick
 @given(value=JSON, key=st.sampled_from(["session", "views", "stages", "hand_eye", "effects", "notes", "convergence"]))
-def test_results_of_anything(tmp_path, value, key):
+def test_any_result_of_a_run_is_read_or_refused_in_one_line(tmp_path, value, key):
     for name, read in (("result.json", read_result), ("ledger.json", read_ledger)):
         for told in (value, {key: value}, [{key: value}]):
             (tmp_path / name).write_text(json.dumps(told))

@@ -84,13 +84,13 @@ def test_what_may_not_be_read_says_so(session, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["..", ".", "../x", "/abs", "a/b", "a\\b", "", " ", ".hidden", " a", "µ" * 150])
-def test_names_that_are_no_folder(name):
+def test_names_that_cannot_name_a_folder_are_refused(name):
     with pytest.raises(InputError, match=r"session.toml: name .*; to fix: "):
         require_folder_name("session.toml", name, "name")
 
 
 @pytest.mark.parametrize("name", ["a\0b", "a\nb", "\x1b[31m", "x" * 201])
-def test_names_that_nobody_can_print(name):
+def test_names_that_nobody_can_print_are_refused(name):
     with pytest.raises(InputError) as error:
         require_name("views.csv line 3", name, "view")
     assert str(error.value).isprintable() and len(str(error.value)) < 250
