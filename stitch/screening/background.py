@@ -5,9 +5,7 @@ did. A cable, a clamp or an operator's arm belongs to nothing: it stands where o
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 from pykdtree.kdtree import KDTree
@@ -115,29 +113,13 @@ def _surrounded(rays: Array, looks: Array) -> Mask:
     return gaps.max(axis=1, initial=0.0) < np.pi
 
 
-@dataclass(frozen=True)
-class StaticBackground:
-    """Points at one place before the scanner in all views: a wall, a table, a bracket."""
-
-    share: float  # of the points of all scans
-    views: tuple[int, ...]  # that show it
-    box: Array  # (2, 3) lowest and highest corner, scanner frame
-    within: Array | None  # (2, 3) corners of a box with the part and without it, where one side of a box parts them
-
-    def words(self, length_unit: str) -> dict[str, Any]:
-        """Return the words of "background" in the list of mistakes."""
-        sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *self.box, strict=True))
-        how = f"cut {', '.join(sides)} {length_unit} out of the scans"
-        if self.within is not None:
-            low, high = (", ".join(f"{side:.4g}" for side in corner) for corner in self.within)
-            how = f"state within = [[{low}], [{high}]] under [scanner] in session.toml"
-        return {"share": self.share, "count": len(self.views), "how": how}
-
-
 def find_static_background(
     scans: Sequence[Scan], poses: Array, tolerance: float, size: float
-) -> StaticBackground | None:
+) -> tuple[float, tuple[int, ...], Array, Array | None] | None:
     """Return what the scans show at one place before the scanner whatever the arm did; None if it is too little.
+
+    Its share of the points of all scans, the views that show it, its lowest and highest corner (2, 3) in the scanner's
+    frame, and the corners of a box with the part and without it, where one side of a box parts them.
 
     Where scanner or part are carried around, what belongs to the part changes its place before the scanner with every
     view. What does not belongs to the scanner, and every view puts it elsewhere in the stitched cloud. A panel that
@@ -153,8 +135,11 @@ def find_static_background(
     points = [scan.points[index] for scan, index in zip(scans, probes, strict=True)]
     stays = []
     for v, scan in enumerate(scans):
+        # Points that most of the others show at the same place before the scanner.
         others = [scans[w] for w in _views_moving_points(points[v], poses, v, size)]
-        stays.append(_static_points(scan, probes[v], others, tolerance))
+        normals = scan.normals[probes[v]]
+        shown = [points_in_place(other, points[v], normals, tolerance) for other in others]
+        stays.append(np.mean(shown, axis=0) > 0.5 if len(others) >= _LEAST else np.zeros(len(points[v]), bool))
     still = np.concatenate(stays)
     if still.mean() < _BACKGROUND_MIN_SHARE:
         return None
@@ -165,12 +150,10 @@ def find_static_background(
     if np.sum(still & through & ~on_part) < max(_THROUGH, _ODDS * np.sum(still & on_part)):
         return None
     every = np.concatenate(points)
-    return StaticBackground(
-        share=float(np.mean(still & ~on_part)),
-        views=tuple(v for v, mask in enumerate(stays) if mask.any()),
-        box=_bounding_box(every[still & ~on_part]),
-        within=_box_beyond_part(every[on_part & ~still], every[still & ~on_part], _bounding_box(every), size),
-    )
+    views = tuple(v for v, mask in enumerate(stays) if mask.any())
+    background = every[still & ~on_part]
+    within = _box_beyond_part(every[on_part & ~still], background, _bounding_box(every), size)
+    return float(np.mean(still & ~on_part)), views, _bounding_box(background), within
 
 
 def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> list[int]:
@@ -180,14 +163,6 @@ def _views_moving_points(points: Array, poses: Array, v: int, size: float) -> li
     there = frames.transform(frames.inverse(poses) @ poses[v], points[None])
     far = np.flatnonzero(np.median(np.linalg.norm(there - points, axis=2), axis=1) > _MOVED * size)
     return _evenly(far.tolist(), _BACKGROUND_VIEWS)
-
-
-def _static_points(scan: Scan, index: Indices, others: Sequence[Scan], tolerance: float) -> Mask:
-    """(n,) points that most of the others show at the same place before the scanner."""
-    if len(others) < _LEAST:
-        return np.zeros(len(index), bool)
-    points, normals = scan.points[index], scan.normals[index]
-    return np.mean([points_in_place(other, points, normals, tolerance) for other in others], axis=0) > 0.5
 
 
 def _under_model(

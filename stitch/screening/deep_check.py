@@ -34,7 +34,7 @@ from stitch.screening.plausibility import (
     suspicion_in_words,
 )
 from stitch.screening.pose_tests import length_problem
-from stitch.screening.problems import SessionProblem, likeliest_text, list_views, names_of_views
+from stitch.screening.problems import SessionProblem, likeliest_text, list_views
 from stitch.screening.snooping import Snooping, snoop_views
 from stitch.screening.target_checks import check_targets, target_problems
 from stitch.screening.view_model import UsualEffects
@@ -78,7 +78,7 @@ def _check_clouds(session: SessionData) -> list[SessionProblem]:
     try:
         problems, contradicted = _check_views(session, capture, ranked)
     except NoResultError:
-        undone = _mistake_from_surfaces(session, capture, ranked) or _mistake_from_motions(session, ranked)
+        undone = _likely_mistake(session, capture, ranked)
         if undone is None:
             raise
         return [undone]
@@ -89,7 +89,7 @@ def _check_clouds(session: SessionData) -> list[SessionProblem]:
         return problems
     if proven and contradicted:
         return [_convention_problem(session, proven)]
-    undone = _mistake_from_surfaces(session, capture, ranked) or _mistake_from_motions(session, ranked)
+    undone = _likely_mistake(session, capture, ranked)
     return problems if undone is None else [undone]
 
 
@@ -139,29 +139,28 @@ def _snoop_from_start(session: SessionData, capture: Capture, T_mount: Array, ga
     return T_mount, apply_displacement_limits(session, snooping)
 
 
-def _mistake_from_surfaces(
-    session: SessionData, capture: Capture, ranked: Sequence[MotionFit]
-) -> SessionProblem | None:
-    """Return the mistake that, undone, lets the surfaces agree without contradiction; None if there is none."""
-    fits = hypotheses_by_surface(capture, ranked)
-    if not fits:
-        return None
-    best = fits[0].hypothesis
-    used = range(len(session.views)) if best.used is None else best.used
-    views = tuple(replace(session.views[v], T_base_flange=best.T_base_flange[v], joints=None) for v in used)
-    right = replace(session, mount=best.mount, views=views)
-    gate = _GATE * part_size([capture])
-    try:
-        _, snooping = _snoop_from_start(right, thin_session(right, _POINTS)[1], fits[0].T_mount, gate)
-    except NoResultError:
-        return None
-    return None if poses_contradict_scans(right, snooping) else _convention_problem(session, fits)
-
-
-def _mistake_from_motions(session: SessionData, ranked: Sequence[MotionFit]) -> SessionProblem | None:
-    """Return the mistake that the motions show short of proof; None if there is none."""
+def _likely_mistake(session: SessionData, capture: Capture, ranked: Sequence[MotionFit]) -> SessionProblem | None:
+    """Return the mistake that, undone, lets the surfaces agree without contradiction; else the one that the motions
+    show short of proof; None if there is neither."""
+    by_surface = hypotheses_by_surface(capture, ranked)
+    if by_surface and _surfaces_agree(session, capture, by_surface[0]):
+        return _convention_problem(session, by_surface)
     likely = likeliest_hypotheses(ranked)
     return _convention_problem(session, likely) if likely else None
+
+
+def _surfaces_agree(session: SessionData, capture: Capture, fit: SurfaceFit) -> bool:
+    """Return True if nothing contradicts the poses any more once a mistake is undone."""
+    h = fit.hypothesis
+    used = range(len(session.views)) if h.used is None else h.used
+    views = tuple(replace(session.views[v], T_base_flange=h.T_base_flange[v], joints=None) for v in used)
+    right = replace(session, mount=h.mount, views=views)
+    gate = _GATE * part_size([capture])
+    try:
+        _, snooping = _snoop_from_start(right, thin_session(right, _POINTS)[1], fit.T_mount, gate)
+    except NoResultError:
+        return False
+    return not poses_contradict_scans(right, snooping)
 
 
 def _convention_problem(session: SessionData, fits: Sequence[MotionFit | SurfaceFit]) -> SessionProblem:
@@ -170,7 +169,7 @@ def _convention_problem(session: SessionData, fits: Sequence[MotionFit | Surface
     fixes = [fit.hypothesis.fix for fit in fits]
     if best.kind == "unit" and isinstance(fits[0], MotionFit):
         fixes = _depth_scale_fix(session, fits[0].scale) or fixes
-    return SessionProblem(best.kind, names_of_views(best.rows, session.names), likeliest_text(fixes))
+    return SessionProblem(best.kind, tuple(session.names[v] for v in best.rows), likeliest_text(fixes))
 
 
 def _depth_scale_fix(session: SessionData, scale: float) -> list[str]:

@@ -276,8 +276,8 @@ def hypotheses(
     stated = stated_hypothesis(session, every)
     if exchangeable is None:
         exchangeable = range(len(every)) if len(every) <= MOST_EXCHANGED else ()
-    out = [stated, *_joint_mistakes(session, stated, every), *_pose_mistakes(stated)]
-    return [*out, *_row_mistakes(session, stated, every), *_exchanges(stated, exchangeable)]
+    of_rows = _row_mistakes(session, stated, every, exchangeable)
+    return [stated, *_joint_mistakes(session, stated, every), *_pose_mistakes(stated), *of_rows]
 
 
 def _joint_mistakes(session: SessionData, stated: Hypothesis, rows: Indices) -> Iterator[Hypothesis]:
@@ -401,8 +401,10 @@ def _other_positions(position: Array) -> Iterator[tuple[str, Array, dict[str, st
             yield "column", right, {"axis": axis, "units": units}
 
 
-def _row_mistakes(session: SessionData, stated: Hypothesis, rows: Indices) -> Iterator[Hypothesis]:
-    """Yield poses that belong to other rows, for all views alike."""
+def _row_mistakes(
+    session: SessionData, stated: Hypothesis, rows: Indices, exchangeable: Sequence[int]
+) -> Iterator[Hypothesis]:
+    """Yield poses that belong to other rows: for all views alike, then with two of some views exchanged."""
     T = stated_hypothesis(session).T_base_flange
     count = len(T)
     yield stated.undone("reversed", T[::-1][rows])
@@ -416,10 +418,6 @@ def _row_mistakes(session: SessionData, stated: Hypothesis, rows: Indices) -> It
         where = "below" if shift > 0 else "above"
         shifted = stated.undone("shifted", np.roll(T, -shift, axis=0)[rows], rows=named, where=where)
         yield replace(shifted, used=tuple(used.tolist()))
-
-
-def _exchanges(stated: Hypothesis, exchangeable: Sequence[int]) -> Iterator[Hypothesis]:
-    """Yield the poses with two of some views exchanged."""
     for a, b in combinations(exchangeable, 2):
         order = np.arange(len(stated.T_base_flange))
         order[[a, b]] = [b, a]

@@ -140,8 +140,9 @@ def _what_does_not_hold(there: TargetModelFit, here: TargetModelFit, unit: str) 
         parts.append(f"{names}{more} {lie} elsewhere than in the other run, by up to {farthest}")
     if not parts:
         return None
-    off, fitted_off = (length_text(float(np.sqrt(np.nanmean(fit.view_squares))), unit) for fit in (there, here))
-    return sentence("model does not hold", what="; ".join(parts), off=off, fitted=fitted_off)
+    off = length_text(_rms(there.view_squares), unit)
+    fitted = length_text(_rms(here.view_squares), unit)
+    return sentence("model does not hold", what="; ".join(parts), off=off, fitted=fitted)
 
 
 def _displaced_targets(there: TargetModelFit, here: TargetModelFit) -> dict[str, float]:
@@ -171,19 +172,19 @@ def check_arm_transfer(fit: FitWithArm, arm: ModelFile, fitted: FittedRig, unit:
     """
     squares = view_mean_squares(fitted)
     nominal = view_mean_squares(fit(None))
-    leaves = _rms_text(squares, unit)
-    nominal_leaves = _rms_text(nominal, unit)
+    leaves = length_text(_rms(squares), unit)
+    nominal_leaves = length_text(_rms(nominal), unit)
     effects = ", ".join(arm.effects)
     if len(arm.effects) > 1:
         without = {}
         for name in arm.effects:
-            rest = {effect: values for effect, values in arm.effects.items() if effect != name}
-            without[name] = view_mean_squares(fit(replace(arm, effects=rest)))
+            others = {effect: values for effect, values in arm.effects.items() if effect != name}
+            without[name] = view_mean_squares(fit(replace(arm, effects=others)))
         best = min(without, key=lambda name: _rms(without[name]))
         if significantly_smaller(without[best], squares, _ARM_CHANCE / len(without)):
-            rest_leaves = _rms_text(without[best], unit)
-            words = {"leaves": leaves, "nominal": nominal_leaves, "effect": best, "rest": rest_leaves}
-            return False, sentence("effect of the arm", effects=effects, **words)
+            rest = length_text(_rms(without[best]), unit)
+            words = {"effects": effects, "leaves": leaves, "nominal": nominal_leaves}
+            return False, sentence("effect of the arm", effect=best, rest=rest, **words)
     if significantly_smaller(nominal, squares, _ARM_CHANCE):
         return False, sentence("arm does not hold", effects=effects, leaves=leaves, nominal=nominal_leaves)
     return True, f"The arm of the other run leaves {leaves} where the nominal arm leaves {nominal_leaves}."
@@ -191,10 +192,6 @@ def check_arm_transfer(fit: FitWithArm, arm: ModelFile, fitted: FittedRig, unit:
 
 def _rms(squares: Array) -> float:
     return float(np.sqrt(np.nanmean(squares)))
-
-
-def _rms_text(squares: Array, unit: str) -> str:
-    return length_text(_rms(squares), unit)
 
 
 def view_mean_squares(fitted: FittedRig) -> Array:

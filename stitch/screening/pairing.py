@@ -17,7 +17,7 @@ from stitch.screening.placement import (
     shows_no_surface,
     surface_of,
 )
-from stitch.screening.problems import SessionProblem, displacement_text, list_views, names_of_views
+from stitch.screening.problems import SessionProblem, displacement_text, list_views
 from stitch.screening.scan_faults import find_copies, find_same_poses, scale_fault, scan_fault
 from stitch.screening.snooping import MisplacedView, Snooping, end_runs
 from stitch.session.capture import Capture, part_size
@@ -51,7 +51,7 @@ def explain_misplaced(
     out = list[SessionProblem]()
 
     def explain(mistake: str, views: Sequence[int], **words: Any) -> None:
-        out.append(problem(mistake, names_of_views(views, names), **words))
+        out.append(problem(mistake, [names[v] for v in views], **words))
         for v in views:
             unexplained.pop(v, None)
 
@@ -78,7 +78,7 @@ def explain_misplaced(
         side = range(step.start) if step.start <= snooping.largest_segment.start else range(step.start, len(names))
         explain("moved", side, **_between(side, step.moved if step.distinguishable else "either", names))
     if len(snooping.disconnected) > 1:
-        shown = " | ".join(list_views(names_of_views(group, names), names) for group in snooping.disconnected)
+        shown = " | ".join(list_views([names[v] for v in group], names) for group in snooping.disconnected)
         explain("groups", [v for group in snooping.disconnected[1:] for v in group], groups=shown)
     return out
 

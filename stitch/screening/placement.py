@@ -184,12 +184,6 @@ def starts_about(T: Array, scan: Scan, size: float) -> Array:
     return np.array([T] + [frames.inverse(to) @ move @ to @ T for move in (*turns, *shifts)])
 
 
-def _starts_anywhere(surface: ReferenceSurface, scan: Scan) -> Array:
-    """(S, 4, 4) the scan's centre on the surface's centre, turned every way."""
-    R = Rotation.random(_TURNS_ANYWHERE, rng=np.random.default_rng(0)).as_matrix()
-    return frames.make(R, surface.points.mean(axis=0) - R @ scan.points.mean(axis=0))
-
-
 def needed_closure(capture: Capture, poses: Array, linked: Linkage, tolerance: float) -> float:
     """Return the share of a scan on the surface of the others at which it counts as placed."""
     core = linked.core
@@ -267,7 +261,10 @@ def _place_alone(
     """Return where a scan closes by itself, None if nowhere, and True if it does elsewhere too, but not at its row."""
     _, size = limits
     scan = capture.scans[view]
-    starts = [starts_about(model_poses[view], scan, size), model_poses, _starts_anywhere(surface, scan)]
+    # The scan's centre on the surface's centre, turned every way.
+    R = Rotation.random(_TURNS_ANYWHERE, rng=np.random.default_rng(0)).as_matrix()
+    anywhere = frames.make(R, surface.points.mean(axis=0) - R @ scan.points.mean(axis=0))
+    starts = [starts_about(model_poses[view], scan, size), model_poses, anywhere]
     placements = place_scan(scan, surface, np.concatenate(starts), size)
     # A part clamped anew lies near: a wide gate would lead past it.
     placements += place_scan(scan, surface, model_poses[view][None], _NEAR_GATE * size)

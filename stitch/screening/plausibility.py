@@ -16,7 +16,7 @@ from stitch.observations.pose_errors import usual_twist
 from stitch.screening.background import find_occluder, find_static_background
 from stitch.screening.hypotheses import BOTH_ORDERS, euler_angles, problem, sentence
 from stitch.screening.pose_tests import FEWEST_DEGREES
-from stitch.screening.problems import SessionProblem, displacement_text, list_views, names_of_views
+from stitch.screening.problems import SessionProblem, displacement_text, list_views
 from stitch.screening.snooping import MisplacedView, Snooping
 from stitch.session.capture import Capture, part_size
 from stitch.session.session import SessionData
@@ -109,7 +109,13 @@ def background_problems(
     names = session.names
     still = find_static_background(capture.scans, capture.poses(T_mount), snooping.tolerance, size)
     if still is not None:
-        return [problem("background", names_of_views(still.views, names), **still.words(session.length_unit))]
+        share, views, box, within = still
+        sides = (f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", *box, strict=True))
+        how = f"cut {', '.join(sides)} {session.length_unit} out of the scans"
+        if within is not None:
+            low, high = (", ".join(f"{side:.4g}" for side in corner) for corner in within)
+            how = f"state within = [[{low}], [{high}]] under [scanner] in session.toml"
+        return [problem("background", [names[v] for v in views], share=share, count=len(views), how=how)]
     if snooping.left_out or snooping.steps:
         # The part itself stands elsewhere where a view is off; without that view it is asked again.
         return []
@@ -117,7 +123,7 @@ def background_problems(
     if occluder is None:
         return []
     views, share = occluder
-    named = names_of_views(views, names)
+    named = [names[v] for v in views]
     show = "shows" if len(views) == 1 else "show"
     return [problem("in the way", named, share=share, where=list_views(named, names), show=show)]
 

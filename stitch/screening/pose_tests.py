@@ -12,7 +12,7 @@ is no step, so the scatter holds all by which poses of a good session may err, i
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -115,24 +115,18 @@ class Blunder:
 
 @dataclass(frozen=True)
 class BlunderSearch:
-    """What the tests say, and the scatter of the poses without the blunders."""
+    """What the poses of the views say by themselves, and their scatter without the blunders."""
 
-    blunders: tuple[Blunder, ...]
+    blunders: tuple[Blunder, ...]  # single views, under the scatter of the others
     fit: VarianceFit
     mean_columns: Array | None  # (n, K) columns of blunders and steps in the mean
     null_projector: Projector  # null hypothesis with those columns in it
-
-
-@dataclass(frozen=True)
-class PoseTests:
-    """What the poses of the views say by themselves."""
-
-    unplaced: list[int]
-    displaced: list[Blunder]  # stand off whatever the others scatter
-    blunder_search: BlunderSearch  # the rest of them, under the scatter of the others
-    steps: tuple[PoseStep, ...]
-    # Displaced views that effects of the arm do not explain in sizes that the others show.
-    sure: set[int] = field(default_factory=set)
+    unplaced: Sequence[int] = ()  # views that nothing holds
+    displaced: Sequence[Blunder] = ()  # views that were placed by their surfaces, and stand off whatever others scatter
+    steps: tuple[PoseStep, ...] = ()
+    sure: frozenset[int] = (
+        frozenset()
+    )  # displaced views that effects of the arm do not explain in sizes that others show
 
     @property
     def excluded(self) -> list[int]:
@@ -142,7 +136,7 @@ class PoseTests:
     @property
     def standing_off(self) -> list[int]:
         """These, and single blunders under the scatter of the others."""
-        return [*self.excluded, *(b.view for b in self.blunder_search.blunders)]
+        return [*self.excluded, *(b.view for b in self.blunders)]
 
 
 def pose_tests(
@@ -151,7 +145,7 @@ def pose_tests(
     unlinked: tuple[list[int], list[int]],
     usual: UsualEffects | None,
     chance: float = STEP_CHANCE,
-) -> PoseTests:
+) -> BlunderSearch:
     """Find single views that are off and steps; where there is a step, single views once more beside it.
 
     Args:
@@ -172,7 +166,8 @@ def pose_tests(
         off = _find_unlinked_blunders(model, unplaced, placed, steps)
         search = find_blunders(model, [*unplaced, *(b.view for b in off)], steps)
     sure = _find_unlinked_blunders(erring, unplaced, [b.view for b in off], steps)
-    return PoseTests(unplaced, off, search, steps, {b.view for b in sure})
+    certain = frozenset(b.view for b in sure)
+    return replace(search, unplaced=unplaced, displaced=off, steps=steps, sure=certain)
 
 
 def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequence[PoseStep] = ()) -> BlunderSearch:
@@ -356,7 +351,9 @@ def _akaike_criterion(model: ViewModel, columns: Array | None) -> float:
     return model.deviance(columns) + 2 * taken * count / (count - taken - 1) if count > taken + 1 else np.inf
 
 
-def expected_poses(model: ViewModel, model_poses: Array, unconstrained: UnconstrainedPoses, tests: PoseTests) -> Array:
+def expected_poses(
+    model: ViewModel, model_poses: Array, unconstrained: UnconstrainedPoses, tests: BlunderSearch
+) -> Array:
     """Return where views are expected: hand-eye and steps estimated together, without the views that stand off.
 
     Across a step the hand-eye alone is a compromise, and every view stands off from it by its share of the step.
@@ -369,16 +366,15 @@ def expected_poses(model: ViewModel, model_poses: Array, unconstrained: Unconstr
         (V, 4, 4) T_reference_scanner.
     """
     alone = tests.standing_off
-    fit = tests.blunder_search.fit
     moved = []
     for step in tests.steps:
         # The least that it may have moved, rotations in 1/lever: along itself a part slides unseen.
         others = _free_view_columns(model, alone, [other for other in tests.steps if other is not step])
-        under = projector(model, fit, others)
+        under = projector(model, tests.fit, others)
         moved.append(displacement_lower_bound(test_alternative(under, step.columns(model)), under.degrees))
     z = model.z - sum(step.columns(model) @ by for step, by in zip(tests.steps, moved, strict=True))
     X = hstack_columns(model.hand_eye, model.columns(alone))
-    CX = np.linalg.solve(model.mixed().covariance(fit.variances)[0], X)
+    CX = np.linalg.solve(model.mixed().covariance(tests.fit.variances)[0], X)
     twists = model.mount_twists @ least_squares(X.T @ CX, -CX.T @ z)[:6]
     for step, by in zip(tests.steps, moved, strict=True):
         carried = model.mount_twists[step.start :] if step.moved == "scanner" else np.eye(6)[None]

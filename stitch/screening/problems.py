@@ -1,6 +1,6 @@
 """Problems of a session in words: their kind, size and views, and what to do."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,11 +80,6 @@ def list_views(names: Sequence[str], order: Sequence[str]) -> str:
     listed = ", ".join(f"{part[0]}–{part[-1]}" if len(part) > 1 else part[0] for part in parts[:_LISTED])
     rest = sum(map(len, parts[_LISTED:]))
     return listed + (f" … and {rest} more" if rest else "")
-
-
-def names_of_views(indices: Iterable[int], names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of some views."""
-    return tuple(names[int(v)] for v in indices)
 
 
 def likeliest_text(fixes: Sequence[str]) -> str:

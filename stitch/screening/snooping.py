@@ -27,7 +27,6 @@ from stitch.screening.placement import (
 from stitch.screening.pose_tests import (
     BlunderSearch,
     PoseStep,
-    PoseTests,
     expected_poses,
     find_blunders,
     least_displacement,
@@ -168,7 +167,7 @@ def snoop_views(
         steps=tests.steps,
         disconnected=tuple(group for group in groups if not set(group) <= {m.view for m in foreign}),
         model=model,
-        blunder_search=tests.blunder_search,
+        blunder_search=tests,
         unconstrained=located.unconstrained,
         expected=expected,
         tolerance=located.tolerance,
@@ -285,12 +284,11 @@ def end_runs(views: Collection[int], count: int) -> list[range]:
 
 
 def _displaced_views(
-    capture: Capture, model: ViewModel, expected: Array, located: PlacedViews, tests: PoseTests
+    capture: Capture, model: ViewModel, expected: Array, located: PlacedViews, tests: BlunderSearch
 ) -> list[MisplacedView]:
     """Return views that stand off and torn ones, with where the surface of the others puts them."""
     unconstrained = located.unconstrained
-    search = tests.blunder_search
-    off = sorted((*tests.displaced, *search.blunders), key=lambda b: b.view)
+    off = sorted((*tests.displaced, *tests.blunders), key=lambda b: b.view)
     places = [(b.view, b.p_value, _refine_pose(capture, unconstrained, b.view, located.tolerance)) for b in off]
     known = {b.view for b in off} | set(located.unplaced)
     places += [(v, 0.0, unconstrained.poses[v]) for v in located.torn if v not in known]
@@ -299,7 +297,7 @@ def _displaced_views(
         middle = capture.scans[v].points.mean(axis=0)[None]
         there = frames.transform(unconstrained.poses[v], middle)[0]
         others = [w for w in tests.standing_off if w != v]
-        least = least_displacement(model, search, others, tests.steps, v, there)
+        least = least_displacement(model, tests, others, tests.steps, v, there)
         turn = float(frames.angle_between(expected[v], T))
         shift = float(np.linalg.norm(frames.transform(T, middle) - frames.transform(expected[v], middle)))
         displaced.append(MisplacedView(v, "displaced", turn, shift, p, T, least))

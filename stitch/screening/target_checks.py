@@ -5,7 +5,7 @@ judges it: millimetres and less where the convention is right, decimetres where 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from stitch.screening.conventions import rank_hypotheses
 from stitch.screening.hypotheses import UNITS, Hypothesis, distinct, hypotheses, problem, stated_hypothesis
 from stitch.screening.motions import RelativeScans
 from stitch.screening.moved_targets import find_moved_targets
-from stitch.screening.problems import SessionProblem, likeliest_text, names_of_views
+from stitch.screening.problems import SessionProblem, likeliest_text
 from stitch.session.capture import Capture, Sightings, build_capture, sightings_of
 from stitch.session.session import SessionData
 
@@ -34,15 +34,9 @@ _TRIED, _IN_A_ROW = 60, 6
 # Views that a side of a common displacement has at least, and the share of views that must be on their side of it.
 _SIDE_VIEWS, _ON_ITS_SIDE = 5, 0.9
 
-
-@dataclass(frozen=True)
-class ConventionFit:
-    """One hypothesis, with how far apart it leaves the sightings of one target."""
-
-    hypothesis: Hypothesis
-    spread: float  # median distance from the target's middle, length_unit
-    T_mount: Array  # (4, 4)
-    middles: Array  # (K, 3) of the targets, reference frame; NaN where fewer than two views show one
+# How far poses leave the sightings of one target apart: median distance from its middle (length_unit); the hand-eye
+# (4, 4); and the middles (K, 3) in the reference frame, NaN where fewer than two views show one.
+TargetSpread = tuple[float, Array, Array]
 
 
 def target_problems(session: SessionData, sightings: Sightings | None) -> list[SessionProblem]:
@@ -54,7 +48,7 @@ def target_problems(session: SessionData, sightings: Sightings | None) -> list[S
     mixed_up = find_mislabelled(every)
     out = [problem("names of targets", [names[m.view]], message=m.message(names[m.view])) for m in mixed_up]
     for moved in find_moved_targets(drop_mislabelled(every) or every):
-        views = () if moved.drifts else names_of_views(range(moved.start, len(names)), names)
+        views = () if moved.drifts else tuple(names[moved.start :])
         length = length_text(moved.distance, session.length_unit)
         out.append(SessionProblem("displaced", views, moved.describe(names[moved.start], length)))
     return out
@@ -72,7 +66,7 @@ def check_targets(session: SessionData) -> list[SessionProblem]:
     capture = _capture_of(session, rows)
     limit = _LIMIT_M / METRES[session.length_unit]
     as_stated = _fit_hypothesis(capture, stated)
-    most_agree = as_stated is not None and as_stated.spread < limit
+    most_agree = as_stated is not None and as_stated[0] < limit
     if as_stated is not None and most_agree:
         off = _distances_from_middles(capture, as_stated) > limit
         if np.mean(off) < 1 - _ON_ITS_SIDE:
@@ -80,17 +74,17 @@ def check_targets(session: SessionData) -> list[SessionProblem]:
     moved = _find_common_move(session, rows, limit)
     if moved is not None or most_agree:
         return [moved] if moved is not None else []
-    fits = [fit for h in _hypotheses_to_try(session, rows, capture, limit) if (fit := _fit_hypothesis(capture, h))]
-    best = min(fits, key=lambda fit: fit.spread, default=None)
-    before = np.inf if as_stated is None else as_stated.spread
-    if best is None or best.spread > _CLEARER * before or best.spread > limit:
+    tried = _hypotheses_to_try(session, rows, capture, limit)
+    spreads = [(h, fit[0]) for h in tried if (fit := _fit_hypothesis(capture, h)) is not None]
+    best, spread = min(spreads, key=lambda pair: pair[1], default=(stated, np.inf))
+    before = np.inf if as_stated is None else as_stated[0]
+    if not spreads or spread > _CLEARER * before or spread > limit:
         if as_stated is None:
             return []
-        return [problem("unexplained targets", session.names, by=f"{as_stated.spread:.3g} {session.length_unit}")]
-    h = best.hypothesis
-    others = [fit.hypothesis.fix for fit in fits if fit.spread < 2 * best.spread and fit.hypothesis.fix != h.fix]
-    views = names_of_views(rows[list(h.rows)], session.names)
-    return [SessionProblem(h.kind, views, likeliest_text([h.fix, *others[:2]]))]
+        return [problem("unexplained targets", session.names, by=f"{as_stated[0]:.3g} {session.length_unit}")]
+    others = [h.fix for h, other in spreads if other < 2 * spread and h.fix != best.fix]
+    views = tuple(session.names[v] for v in rows[list(best.rows)])
+    return [SessionProblem(best.kind, views, likeliest_text([best.fix, *others[:2]]))]
 
 
 def _tried_rows(views: int) -> Indices:
@@ -144,17 +138,18 @@ def _find_common_move(session: SessionData, rows: Indices, limit: float) -> Sess
     return None
 
 
-def _fit_some(session: SessionData, rows: Indices, limit: float) -> ConventionFit | None:
+def _fit_some(session: SessionData, rows: Indices, limit: float) -> TargetSpread | None:
     """Return the fit to some rows; None where they do not hold together."""
     fit = _fit_hypothesis(_capture_of(session, rows), stated_hypothesis(session, rows))
-    return None if fit is None or fit.spread > limit else fit
+    return None if fit is None or fit[0] > limit else fit
 
 
-def _distances_from_middles(capture: Capture, fit: ConventionFit) -> Array:
+def _distances_from_middles(capture: Capture, fit: TargetSpread) -> Array:
     """(V,) median distance of what a view shows from where a fit of other views has it; 0 where that has nothing."""
     s = capture.sightings
     assert s is not None
-    apart = np.linalg.norm(frames.transform(capture.poses(fit.T_mount), s.points) - fit.middles[s.target], axis=2)
+    _, T_mount, middles = fit
+    apart = np.linalg.norm(frames.transform(capture.poses(T_mount), s.points) - middles[s.target], axis=2)
     return np.nan_to_num(nan_median(np.where(s.used, apart, np.nan).T))
 
 
@@ -191,7 +186,7 @@ def _sensor_motions(capture: Capture) -> RelativeScans:
     return RelativeScans(tuple(pairs), np.array(T).reshape(-1, 4, 4))
 
 
-def _fit_hypothesis(capture: Capture, hypothesis: Hypothesis) -> ConventionFit | None:
+def _fit_hypothesis(capture: Capture, hypothesis: Hypothesis) -> TargetSpread | None:
     """Return the closed form under a hypothesis; None where it has none."""
     s = capture.sightings
     assert s is not None
@@ -211,4 +206,4 @@ def _fit_hypothesis(capture: Capture, hypothesis: Hypothesis) -> ConventionFit |
         if len(places) > 1:
             middles[k] = np.median(places, axis=0)
             apart.append(np.linalg.norm(places - middles[k], axis=1))
-    return ConventionFit(hypothesis, float(np.median(np.concatenate(apart))), T_mount, middles) if apart else None
+    return (float(np.median(np.concatenate(apart))), T_mount, middles) if apart else None

@@ -67,10 +67,6 @@ class ViewScreening:
         views = {why: [item.view for item in self.left_out if item.why == why] for why in reasons}
         return "; ".join(f"{list_views(views[why], order)}: {why}" for why in reasons)
 
-    def indices(self, session: SessionData) -> list[int]:
-        """Return the indices of the views that are left out."""
-        return [v for v, view in enumerate(session.views) if view.name in self.names]
-
 
 @dataclass(frozen=True)
 class ScreenedFit:
@@ -116,12 +112,14 @@ def fit_screened_views(
             break
         for session, screening in zip(sessions, taken, strict=True):
             require_majority(session, screening.left_out)
-        measured = [m.without(new.indices(s)) for m, new, s in zip(measured, screenings, left, strict=True)]
+        for i, (session, screening) in enumerate(zip(left, screenings, strict=True)):
+            gone = [v for v, name in enumerate(session.names) if name in screening.names]
+            measured[i] = measured[i].without(gone)
         left = [session.without(screening.names) for session, screening in zip(left, screenings, strict=True)]
         short = next((i for i, session in enumerate(left) if len(session.views) < 2), None)
         if short is not None:
-            gone = taken[short].line(sessions[short].names)
-            raise NoResultError(f"{left[short].path}: fewer than two views belong together ({gone}); to fix: add views")
+            why = taken[short].line(sessions[short].names)
+            raise NoResultError(f"{left[short].path}: fewer than two views belong together ({why}); to fix: add views")
     else:
         # The last round has left views out too: what is returned is the fit of those that are left.
         fitted = fit(left, measured)
@@ -177,13 +175,17 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
     if not any(beyond_any_arm(session, *step.at_least) for step in snooping.steps):
         # A slip of the part, or a knock of the mount, within what a model can hold: said, and left to the diagnosis.
         snooping = replace(snooping, steps=())
+    names = session.names
     poses = capture.poses(T_mount)
     return ViewScreening(
         left_out=_misplaced_views(session, capture, T_mount, snooping),
         suspected=tuple(
             _excluded_view(session, m.view, suspicion_in_words(session, m), poses) for m in snooping.suspected
         ),
-        links=_view_links(session, snooping),
+        links=ViewLinks(
+            components=tuple(tuple(names[v] for v in part) for part in snooping.linkage.components),
+            weak=tuple((names[v], names[w]) for v, w in snooping.linkage.single),
+        ),
         doubts=(*target_warnings(session, capture.sightings), *warnings),
     )
 
@@ -205,14 +207,6 @@ def _misplaced_views(
 def _excluded_view(session: SessionData, v: int, why: str, poses: Array) -> ExcludedView:
     view = session.views[v]
     return ExcludedView(view.name, why, poses[v], 0 if view.cloud is None else view.cloud.count)
-
-
-def _view_links(session: SessionData, snooping: Snooping) -> ViewLinks:
-    names = session.names
-    return ViewLinks(
-        components=tuple(tuple(names[v] for v in part) for part in snooping.linkage.components),
-        weak=tuple((names[v], names[w]) for v, w in snooping.linkage.single),
-    )
 
 
 def screen_targets(session: SessionData, targets: TargetModelFit) -> ViewScreening:

@@ -21,7 +21,6 @@ from stitch.output.comparison.model_history import model_history
 from stitch.output.comparison.run_verdict import run_verdict
 from stitch.screening import pose_tests
 from stitch.screening.pose_tests import (
-    PoseTests,
     expected_poses,
     find_blunders,
     find_steps,
@@ -236,8 +235,8 @@ def test_of_six_views_every_start_of_a_step_may_be_taken():
 
 def test_what_a_view_is_off_by_beside_a_step_is_its_own():
     model = with_one_off(stepped(wandering(12), 9), 4, times=50.0)
-    tests = PoseTests([], [], find_blunders(replace(model, errors=None), [4], steps(model)), steps(model))
-    tests = replace(tests, unplaced=[4])
+    search = find_blunders(replace(model, errors=None), [4], steps(model))
+    tests = replace(search, unplaced=[4], steps=steps(model))
     freed = UnconstrainedPoses(np.empty((STEP_VIEWS, 4, 4)), model.z.reshape(STEP_VIEWS, 6), None)
     expected = frames.log(
         expected_poses(replace(model, errors=None), np.tile(np.eye(4), (STEP_VIEWS, 1, 1)), freed, tests)
