@@ -325,8 +325,8 @@ class LiveSession:
             return {}
         measurement = measurement_of(self._session_of(members), fit.capture)
         usual = UsualEffects(measurement, Model(fit.T_mount)).twists(fit.unconstrained)
-        sure = {b.view for b in find_blunders(model.with_usual(usual)).blunders}
-        off = [b.view for b in search.blunders if b.view in sure]
+        sure = find_blunders(model.with_usual(usual)).blunders
+        off = [v for v in search.blunders if v in sure]
         return {v: self._displacement(fit, model, search, v, [w for w in off if w != v]) for v in off}
 
     def _displacement(self, fit: LiveFit, model: ViewModel, search: BlunderSearch, view: int, others: list[int]) -> str:

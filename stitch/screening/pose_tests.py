@@ -106,23 +106,15 @@ def step_columns(model: ViewModel, start: int, moved: str) -> Array:
 
 
 @dataclass(frozen=True)
-class Blunder:
-    """One view whose pose contradicts the others."""
-
-    view: int
-    p_value: float  # family-wise
-
-
-@dataclass(frozen=True)
 class BlunderSearch:
     """What the poses of the views say by themselves, and their scatter without the blunders."""
 
-    blunders: tuple[Blunder, ...]  # single views, under the scatter of the others
+    blunders: tuple[int, ...]  # single views that contradict the others, under the scatter of these
     fit: VarianceFit
     mean_columns: Array | None  # (n, K) columns of blunders and steps in the mean
     null_projector: Projector  # null hypothesis with those columns in it
     unplaced: Sequence[int] = ()  # views that nothing holds
-    displaced: Sequence[Blunder] = ()  # views that were placed by their surfaces, and stand off whatever others scatter
+    displaced: Sequence[int] = ()  # views that were placed by their surfaces, and stand off whatever others scatter
     steps: tuple[PoseStep, ...] = ()
     sure: frozenset[int] = (
         frozenset()
@@ -131,12 +123,12 @@ class BlunderSearch:
     @property
     def excluded(self) -> list[int]:
         """Views that take no part in the tests of the others."""
-        return [*self.unplaced, *(b.view for b in self.displaced)]
+        return [*self.unplaced, *self.displaced]
 
     @property
     def standing_off(self) -> list[int]:
         """These, and single blunders under the scatter of the others."""
-        return [*self.excluded, *(b.view for b in self.blunders)]
+        return [*self.excluded, *self.blunders]
 
 
 def pose_tests(
@@ -155,7 +147,7 @@ def pose_tests(
     """
     unplaced, placed = unlinked
     off = _find_unlinked_blunders(model, unplaced, placed)
-    search = find_blunders(model, [*unplaced, *(b.view for b in off)])
+    search = find_blunders(model, [*unplaced, *off])
     erring = model
     if usual is not None and model.count < MAX_VIEWS_WITH_EFFECTS:
         erring = model.with_errors(usual.errors(unconstrained))
@@ -164,10 +156,9 @@ def pose_tests(
     if steps:
         # A view at the step may stand for one of its sides.
         off = _find_unlinked_blunders(model, unplaced, placed, steps)
-        search = find_blunders(model, [*unplaced, *(b.view for b in off)], steps)
-    sure = _find_unlinked_blunders(erring, unplaced, [b.view for b in off], steps)
-    certain = frozenset(b.view for b in sure)
-    return replace(search, unplaced=unplaced, displaced=off, steps=steps, sure=certain)
+        search = find_blunders(model, [*unplaced, *off], steps)
+    sure = _find_unlinked_blunders(erring, unplaced, off, steps)
+    return replace(search, unplaced=unplaced, displaced=off, steps=steps, sure=frozenset(sure))
 
 
 def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequence[PoseStep] = ()) -> BlunderSearch:
@@ -177,7 +168,7 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
         excluded: views that are known to be off: they stay free and are not counted.
         steps: what all views from one on have in common.
     """
-    freed = list[Blunder]()
+    freed = list[int]()
     states = list[tuple[VarianceFit, Array | None, Projector]]()
     columns = _free_view_columns(model, excluded, steps)
     most = max(int(_MAX_BLUNDER_SHARE * model.count) - len(excluded), 0)
@@ -186,7 +177,7 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
         fit = model.fit(columns)
         under = projector(model, fit, columns)
         states.append((fit, columns, under))
-        rest = [v for v in range(model.count) if v not in excluded and v not in [b.view for b in freed]]
+        rest = [v for v in range(model.count) if v not in excluded and v not in freed]
         if len(freed) >= most or len(freed) >= significant + _MASKING_DEPTH or under.degrees < FEWEST_DEGREES:
             break
         tests = {v: test_alternative(under, model.views[v]) for v in rest}
@@ -194,9 +185,8 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
         # Either test alone holds its level; together they were seen to stay below it (docs/integrity.md).
         chance = {v: min(tests[v].p_value, leave_one_out_test(model, columns, v)[1]) for v in likely}
         worst = min(likely, key=lambda v: chance[v])
-        p = min(1.0, chance[worst] * len(rest))
-        freed.append(Blunder(worst, p))
-        if p < FAMILY_WISE:
+        freed.append(worst)
+        if chance[worst] * len(rest) < FAMILY_WISE:
             significant = len(freed)
         columns = hstack_columns(columns, model.views[worst])
     return BlunderSearch(tuple(freed[:significant]), *states[significant])
@@ -204,14 +194,14 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
 
 def _find_unlinked_blunders(
     model: ViewModel, excluded: Sequence[int], unlinked: Sequence[int], steps: Sequence[PoseStep] = ()
-) -> list[Blunder]:
+) -> list[int]:
     """Return the unlinked views that the scatter of all others does not explain."""
     blunders = []
     for v in unlinked:
         others = [*excluded, *(w for w in unlinked if w != v)]
         p = model.count * leave_one_out_test(model, _free_view_columns(model, others, steps), v)[1]
         if p < FAMILY_WISE:
-            blunders.append(Blunder(v, p))
+            blunders.append(v)
     return blunders
 
 

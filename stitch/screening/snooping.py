@@ -52,7 +52,6 @@ class MisplacedView:
     kind: str
     rotation: float  # rad; NaN for a foreign scan
     distance: float  # length_unit, of the middle of its points; NaN for a foreign scan
-    p_value: float  # family-wise, 0 where it is not even linked
     T: Array | None  # (4, 4) T_reference_scanner where the surface puts it
     at_least: tuple[float, float] = (0.0, 0.0)  # rotation and distance of the smallest displacement that is likely
 
@@ -151,11 +150,11 @@ def snoop_views(
         # Those that stand out beside what usually happens to all of them too.
         with_usual = model.with_usual(usual.twists(located.unconstrained))
         again = find_blunders(with_usual, tests.excluded, tests.steps)
-        sure &= {b.view for b in again.blunders} | tests.sure | torn
+        sure &= set(again.blunders) | tests.sure | torn
     silent = {*located.lines, *(v for v in located.torn if v in located.unplaced)}
     groups = linkage(located.unconstrained.overlaps, silent).components
     foreign = [
-        MisplacedView(v, "several" if v in located.several else "foreign", np.nan, np.nan, 0.0, None)
+        MisplacedView(v, "several" if v in located.several else "foreign", np.nan, np.nan, None)
         for v in located.unplaced
         if (v,) in groups
     ]
@@ -288,19 +287,18 @@ def _displaced_views(
 ) -> list[MisplacedView]:
     """Return views that stand off and torn ones, with where the surface of the others puts them."""
     unconstrained = located.unconstrained
-    off = sorted((*tests.displaced, *tests.blunders), key=lambda b: b.view)
-    places = [(b.view, b.p_value, _refine_pose(capture, unconstrained, b.view, located.tolerance)) for b in off]
-    known = {b.view for b in off} | set(located.unplaced)
-    places += [(v, 0.0, unconstrained.poses[v]) for v in located.torn if v not in known]
+    off = sorted((*tests.displaced, *tests.blunders))
+    places = {v: _refine_pose(capture, unconstrained, v, located.tolerance) for v in off}
+    places |= {v: unconstrained.poses[v] for v in located.torn if v not in {*off, *located.unplaced}}
     displaced = []
-    for v, p, T in places:
+    for v, T in places.items():
         middle = capture.scans[v].points.mean(axis=0)[None]
         there = frames.transform(unconstrained.poses[v], middle)[0]
         others = [w for w in tests.standing_off if w != v]
         least = least_displacement(model, tests, others, tests.steps, v, there)
         turn = float(frames.angle_between(expected[v], T))
         shift = float(np.linalg.norm(frames.transform(T, middle) - frames.transform(expected[v], middle)))
-        displaced.append(MisplacedView(v, "displaced", turn, shift, p, T, least))
+        displaced.append(MisplacedView(v, "displaced", turn, shift, T, least))
     return displaced
 
 

@@ -13,7 +13,7 @@ NAMES = [f"v{v:03d}" for v in range(104)]
 
 
 def standing(view, T):
-    return MisplacedView(view, "displaced", 0.1, 5.0, 0.0, T)
+    return MisplacedView(view, "displaced", 0.1, 5.0, T)
 
 
 @pytest.mark.parametrize("views", [range(2, 5), range(3)])
@@ -42,7 +42,7 @@ def test_two_views_or_views_in_the_middle_are_no_step(blade_capture):
 
 
 def misplaced(*views):
-    return [MisplacedView(v, "displaced", 0.1, 5.0, 0.0, np.eye(4)) for v in views]
+    return [MisplacedView(v, "displaced", 0.1, 5.0, np.eye(4)) for v in views]
 
 
 def test_scans_in_each_others_rows_are_closed_rounds():
