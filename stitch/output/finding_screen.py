@@ -26,7 +26,7 @@ from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.output.comparison.disagreement_field import DisagreementField, Patches, patches_of
 from stitch.output.plain_finding import open_doubts
 from stitch.output.plain_words import DESCRIPTIONS, JOINT_DESCRIPTIONS, plain_covariate
-from stitch.output.remembered import remembered
+from stitch.system.threads import remembered
 
 # Candidate effects that a screen compares: so many, and those that take 3 % of the rms on views left out (mean square).
 _BEST = 3

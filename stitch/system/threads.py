@@ -12,9 +12,9 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache
+from functools import cache, wraps
 from itertools import chain
-from threading import Thread
+from threading import RLock, Thread
 from typing import Any, TypeVar
 
 import numpy as np
@@ -161,3 +161,22 @@ class Clock:
         before = self.last
         self.last = time.perf_counter()
         return self.last - before
+
+
+def remembered(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
+    """Return the function with its result kept on what it is asked of, as `cached_property` keeps one.
+
+    For what rooms work out of an object of a room below, which cannot name them. Another thread that asks waits.
+    """
+    key = f"{function.__module__}.{function.__qualname__}"
+    lock = RLock()
+
+    @wraps(function)
+    def kept(subject: Item) -> Result:
+        with lock:
+            values = vars(subject)
+            if key not in values:
+                values[key] = function(subject)
+            return values[key]
+
+    return kept

@@ -13,10 +13,10 @@ from stitch.numerics.frames import Array
 from stitch.observations.surfaces.matching import signed_distances
 from stitch.observations.targets.target_model import rms_of
 from stitch.output.comparison.disagreement_field import DisagreementField, Patches, patches_of
-from stitch.output.remembered import remembered
 from stitch.run_data import LedgerStep, RunData
 from stitch.session.capture import Sightings
 from stitch.session.measurement import Measurement
+from stitch.system.threads import remembered
 
 COARSE, HAND_EYE_ONLY, REGISTER = "coarse", "hand-eye alone", "register"
 
