@@ -30,7 +30,7 @@ from stitch.model.model_toml import ModelFile
 from stitch.numerics.units import length_text
 from stitch.output.result_document import model_of
 from stitch.output.run_folder import write_with_page
-from stitch.plugins.watch import tracking
+from stitch.plugins.watch import control_charts, state_bank
 from stitch.plugins.watch.history import HISTORY_FILE, open_history, read_record
 from stitch.plugins.watch.report import CellReport, cell_report, cell_trend
 from stitch.plugins.watch.update import DAY_SECONDS, RUN_LENGTH, append_runs, regressor_prior_sigmas, regressors
@@ -79,21 +79,25 @@ def _alarms(hall: int, thermal: float, cells_of_hall: int) -> int:
     values = np.hstack([c.found for c in cells])
     sigma = np.concatenate([c.sigma for c in cells])
     covariates = regressors(times, (air - air[0])[:, None], _CHANNELS)
-    still = (tracking.MEMBERS[tracking.STILL], tracking.MEMBERS[tracking.STEADY])
-    bank = tracking.with_parameters(
-        tracking.empty_bank(covariates.shape[1], still), values[0], sigma, regressor_prior_sigmas(_CHANNELS), still
+    still = (state_bank.MEMBERS[state_bank.STILL], state_bank.MEMBERS[state_bank.STEADY])
+    bank = state_bank.with_parameters(
+        state_bank.empty_bank(covariates.shape[1], still), values[0], sigma, regressor_prior_sigmas(_CHANNELS), still
     )
-    charts, limit, alarms = tracking.empty_charts(values.shape[1]), tracking.chart_limits(RUN_LENGTH, _PARAMETERS), 0
+    charts, limit, alarms = (
+        control_charts.empty_charts(values.shape[1]),
+        control_charts.chart_limits(RUN_LENGTH, _PARAMETERS),
+        0,
+    )
     sloped = np.zeros(values.shape[1], bool)
     days = np.diff(times, prepend=times[0]) / DAY_SECONDS
     for k in range(len(times)):
-        bank, innovations = tracking.updated_bank(
-            tracking.predicted_bank(bank, days[k]), values[k], sigma, covariates[k]
+        bank, innovations = state_bank.updated_bank(
+            state_bank.predicted_bank(bank, days[k]), values[k], sigma, covariates[k]
         )
-        charts = tracking.updated_charts(charts, innovations)
-        odds = tracking.slope_odds(bank, 0, 1) / tracking.odds_limit(_PARAMETERS)
+        charts = control_charts.updated_charts(charts, innovations)
+        odds = state_bank.slope_odds(bank, 0, 1) / state_bank.odds_limit(_PARAMETERS)
         new, sloped = (odds >= 1) & ~sloped, sloped | (odds >= 1)
-        hit = (tracking.limit_shares(charts, limit).max(axis=1) >= 1) | new
+        hit = (control_charts.limit_shares(charts, limit).max(axis=1) >= 1) | new
         alarms += int(hit.reshape(cells_of_hall, -1).any(axis=1).sum())
         charts = type(charts)(np.where(hit[:, None, None], 0.0, charts.cusums), np.where(hit, 0.0, charts.ewma))
     return alarms

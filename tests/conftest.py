@@ -50,7 +50,7 @@ LONGEST = (
     "test_window.py",
     "test_correct.py",
     "test_sphere.py",
-    "test_cell_outputs.py",
+    "test_commands.py",
 )
 
 

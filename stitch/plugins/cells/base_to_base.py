@@ -42,6 +42,13 @@ from stitch.system.process import console
 
 # A distance that differs by more than this many sigmas is a wrong reading, not noise (one in two million).
 CONTRADICTION_SIGMAS = 5.0
+STAND_FORMAT = "stitch-base/1"
+# Sigmas of a careful operator where the file states none: the source sees 0.1 to 0.2 mm as the smallest distance
+# that an eye can tell, and calls its distance and angle sensors better than that.
+_POINT, _SLIDE, _LENGTH, _ANGLE, _LEVEL = 1e-4, 1e-4, 1e-4, 1e-4, 1e-3
+_KEYS = {"format", "length_unit", "angle_unit", "main", "second", "rod", "level"}
+_TURN = {"clockwise": 1.0, "anticlockwise": -1.0}
+_CYLINDER = ("joint1", "radius", "height")
 
 
 @dataclass(frozen=True)
@@ -133,9 +140,6 @@ def base_document(result: BaseResult) -> dict[str, Any]:
     }
 
 
-# The rod's readings as a points session: the stand measures a cup, the second robot says where its tip touches it.
-
-
 def rod_session(stand: Stand, result: BaseResult) -> SessionFiles:
     """One view for each rod setting; the sensor's frame is the stand's.
 
@@ -156,18 +160,6 @@ def rod_session(stand: Stand, result: BaseResult) -> SessionFiles:
         points=points_table(names, ["tip"] * len(names), stand.cups, sigma),
         targets={"tip": np.zeros(3)},
     )
-
-
-# A stand file (TOML) -> `Stand`; every check of the input is made here.
-
-STAND_FORMAT = "stitch-base/1"
-# Sigmas of a careful operator where the file states none: the source sees 0.1 to 0.2 mm as the smallest distance
-# that an eye can tell, and calls its distance and angle sensors better than that.
-_POINT, _SLIDE, _LENGTH, _ANGLE, _LEVEL = 1e-4, 1e-4, 1e-4, 1e-4, 1e-3
-
-_KEYS = {"format", "length_unit", "angle_unit", "main", "second", "rod", "level"}
-_TURN = {"clockwise": 1.0, "anticlockwise": -1.0}
-_CYLINDER = ("joint1", "radius", "height")
 
 
 def read_stand(file: Path | str) -> Stand:
@@ -325,9 +317,6 @@ def _check_geometry(file: Path, stand: Stand) -> None:
         raise InputError(
             f"{file}: the rail stands upright in the main base; to fix: correct its points, for a rail lies level"
         )
-
-
-# What `stitch base` does: a stand solved, shown, drawn, and as a session.
 
 
 def run_base(file: Path, wanted: Wanted) -> None:

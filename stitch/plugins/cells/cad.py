@@ -1,4 +1,11 @@
-"""The CAD surface: nearest places for scanned points, told apart by the side they look to."""
+"""The CAD surface: nearest places for scanned points, told apart by the side they look to.
+
+Tukey's biweight: 95 % efficient on normal noise, no pull at all beyond its limit (Huber & Ronchetti 2009).
+
+Points that look all ways: normal-space sampling (Rusinkiewicz & Levoy 2001).
+
+On a large smooth sheet the few points of its flanks alone hold it in its plane.
+"""
 
 from bisect import bisect_right
 from dataclasses import dataclass, field
@@ -21,6 +28,13 @@ from stitch.session.reading.text_files import reason_of
 _SAME_SIDE = np.cos(np.radians(45.0))
 _FAR_SIDE = -0.5
 _MOST_SAMPLES = 400_000
+# Limit of the weights in 1-sigma scales, and a normal sigma per median absolute deviation.
+TUKEY, MAD = 4.685, 1.4826
+# Cells with fewer points have no mean worth judging; their points keep their own weights.
+_MIN_CELL_POINTS = 5
+_SAMPLED_POINTS = 20_000
+# Normals are sorted into cells of a quarter of their unit length: about 15°.
+_DIRECTIONS = 4
 
 
 @dataclass(frozen=True)
@@ -123,9 +137,6 @@ def _accept_partners(off: Array, normal: Array, scan_normals: Array, loose: floa
     return distance, same & (aside <= 0.5 * np.abs(distance) + loose)
 
 
-# Boxes of the part frame: where the scan must show the part, and where nothing of it may be believed.
-
-
 @dataclass(frozen=True)
 class Box:
     """An axis-parallel box of the part frame."""
@@ -172,26 +183,14 @@ def coverage(box: Box, cad: CadSurface, points: Array, normals: Array) -> float:
     return len(wanted & seen) / max(len(wanted), 1)
 
 
-# Tukey's biweight: 95 % efficient on normal noise, no pull at all beyond its limit (Huber & Ronchetti 2009).
-
-# Limit of the weights in 1-sigma scales, and a normal sigma per median absolute deviation.
-TUKEY, MAD = 4.685, 1.4826
-
-
 def biweight(u: Array) -> Array:
     """(...,) Tukey's weights, 1 at zero and 0 from |u| = 1 on."""
-    return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0))
+    return np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0)
 
 
 def biweight_slope(u: Array) -> Array:
     """(...,) change of weight · u with u, for the normal matrix of a robust fit's covariance (Huber & Ronchetti)."""
-    return np.asarray(np.where(np.abs(u) < 1, (1 - u**2) * (1 - 5 * u**2), 0.0))
-
-
-# Robust weights of whole cells of the surface: a cell's mean shows a shift that no single point can.
-
-# Cells with fewer points have no mean worth judging; their points keep their own weights.
-_MIN_CELL_POINTS = 5
+    return np.where(np.abs(u) < 1, (1 - u**2) * (1 - 5 * u**2), 0.0)
 
 
 def cell_weights(points: Array, partners: NearestPartners, used: NDArray[np.bool_], cell: float, scale: float) -> Array:
@@ -211,16 +210,7 @@ def cell_weights(points: Array, partners: NearestPartners, used: NDArray[np.bool
     floor = scale / np.sqrt(np.median(count[full]))
     spread = max(MAD * float(np.median(np.abs(mean[full]))), float(floor))
     weight = np.where(full, biweight(mean / (TUKEY * spread)), 1.0)
-    return np.asarray(weight[where])
-
-
-# Points that look all ways: normal-space sampling (Rusinkiewicz & Levoy 2001).
-#
-# On a large smooth sheet the few points of its flanks alone hold it in its plane.
-
-_SAMPLED_POINTS = 20_000
-# Normals are sorted into cells of a quarter of their unit length: about 15°.
-_DIRECTIONS = 4
+    return weight[where]
 
 
 def sample_normal_space(scan: JoinedScans, T_base_part: Array) -> Indices:

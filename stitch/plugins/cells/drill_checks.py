@@ -1,4 +1,8 @@
-"""What a drilling cell shows of itself: the plate's place by its locating holes, and trial drives to the holes."""
+"""What a drilling cell shows of itself: the plate's place by its locating holes, and trial drives to the holes.
+
+Trial drives: what camera and rangers see at a hole, before and after the correction, and what a pin that is driven
+into it bounds (tables 4, 6 and 7 of the source).
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,9 +17,8 @@ from stitch.numerics.frames import Array
 from stitch.plugins.cells.drilling_sensors import RangerFit
 from stitch.plugins.cells.job_files import JobTable, on_a_line, read_columns
 
-# The calibration plate against the flange: its holes' mean height is h, their spread says how parallel it is.
-
 MIN_LOCATING = 3
+STAGES = ("drawing", "corrected", "levelled")  # driven by the drawing, by the correction, and then along the normal
 
 
 @dataclass(frozen=True)
@@ -53,12 +56,6 @@ def plate_place(plate_xyz: Array, stated: float, locating_rms: float | None) -> 
     """Height and parallelism of holes (N, 3) in the flange frame."""
     z = plate_xyz[:, 2]
     return PlatePlace(float(z.mean()), stated, float(np.abs(z - z.mean()).max()), locating_rms)
-
-
-# Trial drives: what camera and rangers see at a hole, before and after the correction, and what a pin that is driven
-# into it bounds (tables 4, 6 and 7 of the source).
-
-STAGES = ("drawing", "corrected", "levelled")  # driven by the drawing, by the correction, and then along the normal
 
 
 @dataclass(frozen=True)

@@ -64,14 +64,13 @@ from stitch.plugins.cells.job_files import (
 from stitch.session.reading.csv_files import read_csv_lines
 from stitch.system.process import console
 
-# A drilling job on disk (TOML and CSV) -> `Job`; every check of the input is made here.
-
 DRILL_FORMAT = "stitch-drill/1"
 _FILES = {"plate", "plate_image", "holes", "placed", "rangers", "joint1", "joint6", "checks", "locating", "trials"}
 _KEYS = {"format", "length_unit", "height", "image_size", "home", "joint6_height", "pin", *_FILES}
 # Cosine of the largest angle between tool and hole that a small error explains.
 _ALONG = float(np.cos(np.radians(30)))
 _NEEDED = ("plate", "holes", "placed")
+_ABSENT_EFFECTS = {"plate_height": "No error of the plate's height", "k1": "No distortion of the lens"}
 
 
 @dataclass(frozen=True)
@@ -329,7 +328,7 @@ def _measured_hole(job: DrillJob, H: Array, effects: EffectSelection | None, nam
     """Drive coordinate (3,) of a reference hole from where the robot ended and what it saw there."""
     placed = job.placed[name]
     offset = np.append(hole_in_plane(job, H, effects, name), placed.height - job.height)
-    return np.asarray(placed.T_base_tool[:3, 3] + placed.T_base_tool[:3, :3] @ offset)
+    return placed.T_base_tool[:3, 3] + placed.T_base_tool[:3, :3] @ offset
 
 
 def hole_in_plane(job: DrillJob, H: Array, effects: EffectSelection | None, name: str) -> Array:
@@ -344,11 +343,8 @@ def hole_in_plane(job: DrillJob, H: Array, effects: EffectSelection | None, name
 
 def _in_plane(H: Array, effects: EffectSelection | None, uv: Array, height: float) -> Array:
     if effects is not None:
-        return np.asarray(effects.camera.plane(uv[None], height)[0])
-    return np.asarray(to_plane(H, uv[None])[0])
-
-
-# What a drilling job found, as a document and as a table that a person or a controller can read.
+        return effects.camera.plane(uv[None], height)[0]
+    return to_plane(H, uv[None])[0]
 
 
 def write_drives(result: DrillResult, file: Path) -> None:
@@ -412,11 +408,6 @@ def _trial_document(t: TrialError) -> dict[str, Any]:
         **{key: value for key, value in vars(t).items() if not key.endswith("tilt")},
         **{key: None if angle is None else float(np.degrees(angle)) for key, angle in angles.items()},
     }
-
-
-# What a drilling job found, in sentences: the same on the terminal, on the page and in the recording.
-
-_ABSENT_EFFECTS = {"plate_height": "No error of the plate's height", "k1": "No distortion of the lens"}
 
 
 def correction_sentence(result: DrillResult, length_unit: str) -> str:
@@ -505,9 +496,6 @@ def _tool_tilt_sentence(tool: ToolAxis) -> str:
     return f"{np.degrees(tool.tilt):.2f} ± {np.degrees(tool.sigma):.2f}°"
 
 
-# The reference holes as a points session: sensors on the flange see holes that are fixed in the cell.
-
-
 def hole_session(job: DrillJob, result: DrillResult) -> SessionFiles:
     """One view for each reference hole; the sensors' frame is the flange's, and the drawing gives the targets.
 
@@ -529,9 +517,6 @@ def hole_session(job: DrillJob, result: DrillResult) -> SessionFiles:
         points=points_table(views, names, np.array(places), sigma),
         targets={hole.name: hole.position for hole in job.holes if hole.name in names},
     )
-
-
-# What `stitch drill` does: a job solved, shown, drawn, as a table of drives and as a session.
 
 
 def run_drill(file: Path, wanted: Wanted) -> None:

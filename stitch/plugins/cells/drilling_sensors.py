@@ -1,4 +1,15 @@
-"""What drilling needs of its sensors: base frame, camera, range sensors, the tool's axis, and groups of holes."""
+"""What drilling needs of its sensors: base frame, camera, range sensors, the tool's axis, and groups of holes.
+
+The camera beyond one plane: a 3x4 projection near the work plane, with radial distortion and a plate height error.
+
+On one plane all three are hidden: a homography takes up a wrong height completely, and distortion partly. A hole
+seen at many places and heights, which robot and rangers measure, shows them.
+
+The tool's true axis in its own frame, from how the robot reports to stand when the tool is upright on a hole.
+
+The rigid motion of hole positions cannot see a tool frame that is turned against the tool; the reference holes can:
+there the rangers made the tool upright, so the hole's direction in the reported tool frame is the tool's axis.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +27,16 @@ from stitch.numerics.frames import Array
 from stitch.plugins.cells.job_files import on_a_line
 from stitch.session.reading.text_files import import_extra
 
-# The robot's base frame from outside: a marker's path while one joint turns is a circle about that joint's axis.
-
 # Axes closer than this (rad) to parallel leave the y axis to noise.
 _PARALLEL = np.radians(5.0)
+# Effects by the names that a report uses.
+CAMERA_EFFECTS = ("k1", "plate_height")
+_UNDISTORT_STEPS = 20
+# An effect enters when chance would do as well in less than one of a thousand cases, and the BIC agrees.
+_EFFECT_P_LIMIT = 1e-3
+# With half a dozen reference holes a smaller limit would hide tilts of a degree.
+_TILT_P_LIMIT = 0.01
+_MIN_HOLES = 4
 
 
 @dataclass(frozen=True)
@@ -81,9 +98,6 @@ def base_frame(joint6_path: Array, joint1_path: Array, height_joint6: float = 0.
     return frames.make(np.column_stack([x, y, z]), origin)
 
 
-# Hand-eye as a homography between the work plane (x, y of the flange frame at height h) and the image.
-
-
 def fit_homography(xy: Array, uv: Array) -> Array:
     """H (3, 3) with s·[u v 1]ᵀ = H·[x y 1]ᵀ, from N ≥ 4 points (N, 2) each; source, formula 5.
 
@@ -104,11 +118,11 @@ def fit_homography(xy: Array, uv: Array) -> Array:
     p, q = _project(to_xy, xy), _project(to_uv, uv)
 
     def matrix_of(x: Array) -> Array:
-        return np.asarray(np.append(x, 1.0).reshape(3, 3))
+        return np.append(x, 1.0).reshape(3, 3)
 
     refined = least_squares(lambda x: (_project(matrix_of(x), p) - q).ravel(), start, method="lm").x
     H = np.linalg.inv(to_uv) @ matrix_of(refined) @ to_xy
-    return np.asarray(H / H[2, 2])
+    return H / H[2, 2]
 
 
 def to_plane(H: Array, uv: Array) -> Array:
@@ -151,17 +165,7 @@ def _direct_linear_transform(points: Array, uv: Array, to_points: Array, to_uv: 
 def _project(P: Array, points: Array) -> Array:
     """Points (..., N, d) through a projective map (k+1, d+1)."""
     mapped = points @ P[:, :-1].T + P[:, -1]
-    return np.asarray(mapped[..., :-1] / mapped[..., -1:])
-
-
-# The camera beyond one plane: a 3x4 projection near the work plane, with radial distortion and a plate height error.
-#
-# On one plane all three are hidden: a homography takes up a wrong height completely, and distortion partly. A hole
-# seen at many places and heights, which robot and rangers measure, shows them.
-
-# Effects by the names that a report uses.
-CAMERA_EFFECTS = ("k1", "plate_height")
-_UNDISTORT_STEPS = 20
+    return mapped[..., :-1] / mapped[..., -1:]
 
 
 @dataclass(frozen=True)
@@ -208,13 +212,13 @@ class CameraFit:
         # Rows of u·(P3 X) = P1 X and v·(P3 X) = P2 X, solved for x and y.
         rows = self.P[:2] - ideal[..., None] * self.P[2]
         right = -(rows[..., 2] * z[:, None] + rows[..., 3])
-        return np.asarray(np.linalg.solve(rows[..., :2], right[..., None])[..., 0])
+        return np.linalg.solve(rows[..., :2], right[..., None])[..., 0]
 
 
 def distort(uv: Array, k1: float, centre: Array, corner: float) -> Array:
     """Ideal to real image points (..., 2): away from the centre by k1·(r/corner)² of their distance r."""
     arm = uv - centre
-    return np.asarray(centre + arm * (1 + k1 * ((arm / corner) ** 2).sum(axis=-1, keepdims=True)))
+    return centre + arm * (1 + k1 * ((arm / corner) ** 2).sum(axis=-1, keepdims=True))
 
 
 def undistort(uv: Array, k1: float, centre: Array, corner: float) -> Array:
@@ -222,7 +226,7 @@ def undistort(uv: Array, k1: float, centre: Array, corner: float) -> Array:
     arm = real = uv - centre
     for _ in range(_UNDISTORT_STEPS):
         arm = real / (1 + k1 * ((arm / corner) ** 2).sum(axis=-1, keepdims=True))
-    return np.asarray(centre + arm)
+    return centre + arm
 
 
 def fit_camera(observations: HoleObservations, effects: tuple[str, ...] = ()) -> CameraFit:
@@ -275,12 +279,6 @@ def _check_enough(observations: HoleObservations, effects: tuple[str, ...]) -> N
         raise NoResultError(
             "a plate height error shows only against a hole seen at several other heights; to fix: measure some"
         )
-
-
-# What the homography hides: effects of the camera by forward selection with F-test and BIC.
-
-# An effect enters when chance would do as well in less than one of a thousand cases, and the BIC agrees.
-_EFFECT_P_LIMIT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -339,9 +337,6 @@ def _test_effect(smaller: CameraFit, bigger: CameraFit) -> CameraEffectTest:
     )
 
 
-# Correct a group of holes by the rigid motion that its reference holes show.
-
-
 @dataclass(frozen=True)
 class GroupCompensation:
     """Nominal to actual drive coordinates of one group."""
@@ -368,9 +363,6 @@ def compensate_group(nominal: Array, actual: Array) -> GroupCompensation:
     return GroupCompensation(T, actual - frames.transform(T, nominal), actual - nominal)
 
 
-# Frames and Euler angles of holes.
-
-
 def hole_rotation(direction: Array) -> Array:
     """R_base_hole (..., 3, 3): z = hole direction, x = (z2, −z1, 0)/norm, y = z × x (source, formulas 6 to 9).
 
@@ -381,16 +373,13 @@ def hole_rotation(direction: Array) -> Array:
     x = np.stack([z[..., 1], -z[..., 0], np.zeros_like(z[..., 0])], axis=-1)
     size = np.linalg.norm(x, axis=-1, keepdims=True)
     x = np.where(size > 1e-9, x / np.maximum(size, 1e-9), [1.0, 0.0, 0.0])
-    return np.asarray(np.stack([x, np.cross(z, x), z], axis=-1))
+    return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
 def euler_zyx(R: Array) -> Array:
     """Angles (..., 3) in rad about z, y', x'' (A, B, C of a KUKA controller): R = Rz(A) Ry(B) Rx(C)."""
     R = np.asarray(R, float)
-    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_euler("ZYX").reshape(*R.shape[:-2], 3))
-
-
-# Holes in a camera image, found with OpenCV (the extra `vision`).
+    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_euler("ZYX").reshape(*R.shape[:-2], 3)
 
 
 def holes_of_plate(picture: Path) -> Array:
@@ -415,7 +404,7 @@ def hole_at_tool(picture: Path, H: Array) -> Array:
     if not len(centres):
         raise InputError(f"{picture}: no hole is found; to fix: light the part evenly, or write u, v in the CSV")
     middle = _project(H, np.zeros((1, 2)))
-    return np.asarray(centres[np.linalg.norm(centres - middle, axis=1).argmin()])
+    return centres[np.linalg.norm(centres - middle, axis=1).argmin()]
 
 
 def _read_picture(file: Path) -> NDArray[np.uint8]:
@@ -488,9 +477,6 @@ def _centroid(image: NDArray[np.uint8], box: tuple[int, int, int, int]) -> Array
     return np.asarray([(weight * u_index).sum() / weight.sum(), (weight * v_index).sum() / weight.sum()], float)
 
 
-# Laser rangers on the flange: where each beam starts and points.
-
-
 @dataclass(frozen=True)
 class RangerFit:
     """One beam in the flange frame."""
@@ -524,23 +510,13 @@ def fit_ranger(planes: Array, readings: Array) -> RangerFit:
 
     def direction(x: Array) -> Array:
         n = n0 + x[3:] @ across
-        return np.asarray(n / np.linalg.norm(n))
+        return n / np.linalg.norm(n)
 
     def distances(x: Array) -> Array:
-        return np.asarray(((x[:3] + readings[:, None] * direction(x)) * normals).sum(axis=1) + offsets)
+        return ((x[:3] + readings[:, None] * direction(x)) * normals).sum(axis=1) + offsets
 
     x = least_squares(distances, np.append(start[:3], [0.0, 0.0]), method="lm", x_scale=[100, 100, 100, 1, 1]).x
     return RangerFit(x[:3], direction(x), float(np.sqrt(np.mean(distances(x) ** 2))))
-
-
-# The tool's true axis in its own frame, from how the robot reports to stand when the tool is upright on a hole.
-#
-# The rigid motion of hole positions cannot see a tool frame that is turned against the tool; the reference holes can:
-# there the rangers made the tool upright, so the hole's direction in the reported tool frame is the tool's axis.
-
-# With half a dozen reference holes a smaller limit would hide tilts of a degree.
-_TILT_P_LIMIT = 0.01
-_MIN_HOLES = 4
 
 
 @dataclass(frozen=True)
@@ -559,7 +535,7 @@ class ToolAxis:
             return R_base_hole
         turn = np.cross([0.0, 0.0, 1.0], self.axis)
         turn *= self.tilt / np.linalg.norm(turn)
-        return np.asarray(R_base_hole @ Rotation.from_rotvec(turn).as_matrix().T)
+        return R_base_hole @ Rotation.from_rotvec(turn).as_matrix().T
 
 
 def find_tool_axis(reported: Array, directions: Array) -> ToolAxis | None:

@@ -1,4 +1,10 @@
-"""A cell's job file: its format, and checks of tables, words, numbers and file names."""
+"""A cell's job file: its format, and checks of tables, words, numbers and file names.
+
+What every cell's command hands out beside its result: a Rerun recording, a page, a session folder.
+
+Recording, page and pictures come from whoever offers them under the entry points `stitch.cell_recordings`,
+`stitch.cell_reports` and `stitch.cell_pictures`, by the command's name.
+"""
 
 import csv
 import math
@@ -26,6 +32,9 @@ from stitch.system.files import whole_file
 
 # No length, angle or sigma of a cell lies outside; beyond, squares overflow or vanish.
 LOWEST_VALUE, HIGHEST_VALUE = 1e-12, 1e9
+# Points that lie within this share of their extent of one line leave the turn about it open.
+_FLAT = 1e-3
+POSE_COLUMNS = "x y z a_deg b_deg c_deg"
 
 
 @dataclass(frozen=True)
@@ -134,9 +143,6 @@ def checked_table(file: Path, place: str, entries: Any, known: Collection[str]) 
     return JobTable(file, entries, place)
 
 
-# CSV tables with named columns, as a person edits them.
-
-
 @dataclass(frozen=True)
 class CsvColumns:
     """The wanted columns of a CSV file, row by row."""
@@ -194,12 +200,6 @@ def _number(file: Path, line: int, name: str, cell: str) -> float:
     return value
 
 
-# What every cell's command hands out beside its result: a Rerun recording, a page, a session folder.
-#
-# Recording, page and pictures come from whoever offers them under the entry points `stitch.cell_recordings`,
-# `stitch.cell_reports` and `stitch.cell_pictures`, by the command's name.
-
-
 @dataclass(frozen=True)
 class Wanted:
     """What a person asks a cell's command for."""
@@ -241,19 +241,10 @@ def fixed_digits(values: Array, digits: int) -> str:
     return " ".join(f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0)
 
 
-# Points that lie within this share of their extent of one line leave the turn about it open.
-_FLAT = 1e-3
-
-
 def on_a_line(points: Array) -> bool:
     """Whether points (N, 3) lie on one line, or all in one place."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(len(points) < 2 or spread[1] <= _FLAT * max(spread[0], 1e-12))
-
-
-# Poses as CSV rows: x, y, z and the angles a, b, c in degrees, turned about z, y', x'' in this order.
-
-POSE_COLUMNS = "x y z a_deg b_deg c_deg"
 
 
 def poses_from_rows(numbers: Array) -> Array:
@@ -288,9 +279,6 @@ def write_columns(file: Path, columns: Mapping[str, Sequence[object] | Array]) -
         writer.writerow(columns)
         for row in zip(*columns.values(), strict=True):
             writer.writerow([f"{value:.9g}" if isinstance(value, float) else value for value in row])
-
-
-# Columns of points.csv from labelled points, as a session of `stitch run` and `diagnose` wants them.
 
 
 def points_table(views: Sequence[str], targets: Sequence[str], places: Array, sigma: Array | None) -> TableColumns:

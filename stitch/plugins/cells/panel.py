@@ -57,10 +57,21 @@ from stitch.plugins.cells.panel_model import (
 )
 from stitch.system.process import console
 
-# The CSV files of a panel job, checked.
-
 # Twice a triangle's area against the sum of two squared sides: below, it is a line.
 _FLAT = 1e-3
+PANEL_FORMAT = "stitch-panel/1"
+_KEYS = {"format", "robots", "master", "target", "layout", "tracker", "shape", "legs", "limits", "files"}
+_AXES = ("rx", "ry", "rz", "x", "y", "z")
+_FILES = {"calibration", "flanges", "targets", "control", "forces", "world"}
+_LAYOUT = ("radius", "clamp_width", "spacing", "clamp_height", "edge", "length")
+# A panel that follows its clamps needs one or two.
+_MOST_CORRECTIONS = 10
+# The source moves 100 mm and turns 2°.
+_DISTANCES = np.linspace(0.0, 100.0, 11)
+_ANGLES = np.radians(np.linspace(0.0, 2.0, 11))
+# A likelihood ratio of 100 is a chi-square of 9.2.
+_CLEAR = 9.2
+_REFLECTORS = ("r1", "r2", "r3")
 
 
 @dataclass(frozen=True)
@@ -159,15 +170,6 @@ def _read_robots(file: Path, names: tuple[str, ...], texts: str, numbers: str) -
                 f"{file}: robot {name!r} is not in the job's robots {', '.join(names)}; to fix: correct its name"
             )
     return columns
-
-
-# A panel job (TOML) and its CSV files -> `Job`; every check of the input is made here.
-
-PANEL_FORMAT = "stitch-panel/1"
-_KEYS = {"format", "robots", "master", "target", "layout", "tracker", "shape", "legs", "limits", "files"}
-_AXES = ("rx", "ry", "rz", "x", "y", "z")
-_FILES = {"calibration", "flanges", "targets", "control", "forces", "world"}
-_LAYOUT = ("radius", "clamp_width", "spacing", "clamp_height", "edge", "length")
 
 
 @dataclass(frozen=True)
@@ -288,13 +290,6 @@ def _file_paths(entries: JobTable) -> dict[str, Path]:
                 f"{entries.file}: files.{name} is without files.flanges; to fix: add where the robots stood then"
             )
     return {key: entries.path(key) for key in entries.entries}
-
-
-# A panel that follows its clamps needs one or two.
-_MOST_CORRECTIONS = 10
-# The source moves 100 mm and turns 2°.
-_DISTANCES = np.linspace(0.0, 100.0, 11)
-_ANGLES = np.radians(np.linspace(0.0, 2.0, 11))
 
 
 @dataclass(frozen=True)
@@ -420,9 +415,6 @@ def _commands_for(job: PanelJob, offsets: tuple[LegOffset, ...], target_flanges:
     return _flanges_with_offsets(job, offsets, target_flanges, sign=-1.0)
 
 
-# What a panel job found, as a document and as files that a person or a controller can read.
-
-
 def panel_document(job: PanelJob, result: PanelResult) -> dict[str, Any]:
     """Plain data for JSON. mm, degrees, N."""
     out: dict[str, Any] = {
@@ -510,12 +502,6 @@ def _write_model(file: Path, job: PanelJob, result: PanelResult) -> None:
     write_columns(file, columns)
 
 
-# What a panel job found, in sentences.
-
-# A likelihood ratio of 100 is a chi-square of 9.2.
-_CLEAR = 9.2
-
-
 def leg_sentence(o: LegOffset) -> str:
     """A leg whose length its controller does not know."""
     doubt = "" if o.chi_square_drop - o.runner_up_drop > _CLEAR else f"; leg {o.runner_up} explains it nearly as well"
@@ -535,11 +521,6 @@ def shape_sentence(job: PanelJob, result: PanelResult) -> str | None:
         f"Its shape is {result.shape_largest[worst]:.2f} mm off at clamp {job.robots[worst]}, {verdict} the "
         f"{job.tolerance:g} mm allowed."
     )
-
-
-# Each robot's calibration as a points session: a tracker in the cell sees three reflectors on the flange.
-
-_REFLECTORS = ("r1", "r2", "r3")
 
 
 def robot_sessions(job: PanelJob, result: PanelResult) -> list[SessionFiles]:
@@ -576,9 +557,6 @@ def _robot_session(readings: ReflectorReadings, model: RobotModel, legs: Legs | 
         },
         points=points,
     )
-
-
-# What `stitch panel` does: a job solved, shown, drawn, as a folder of commands and as sessions.
 
 
 def control_shape(file: Path, drive: str, folder: Path) -> tuple[PanelJob, PanelResult, list[float]]:

@@ -2,6 +2,20 @@
 
 T_world_base · T_base_flange · T_flange_contact = T_world_contact. The clamp's pads are replaced by three reflectors
 that the tracker measures while the robot moves; base and clamp are both unknown.
+
+Error of the slaves against the master along a motion: what the global model's uncertainty makes of it.
+
+For a pure translation d the slave errs by (δR)·d, so the position error grows with the distance and the direction
+error does not change; for a pure turn the relative positions of the flanges enter too (source, eqs. 19-24).
+
+Where the clamps touch the panel: six (or more) clamps of three pads each on the equivalent cylinder.
+
+The source prints its formulas as pictures; these are rebuilt from its text and its figures' captions.
+
+A hidden offset of one leg of a six-legged robot, found in the tracker's data.
+
+The controller turns a flange pose into six leg lengths; a leg that is δ longer than it believes moves the flange by
+the twist J⁻¹·e·δ. What of that is the same in all poses hides in base and clamp; the rest stays in the residuals.
 """
 
 from collections.abc import Sequence
@@ -18,7 +32,16 @@ from stitch.numerics.frames import Array, Indices
 from stitch.numerics.hand_eye import park_martin
 from stitch.plugins.cells.job_files import on_a_line
 
-# The contact frame of a clamp from its three pads (three-point method).
+_MINIMUM = 4  # poses: 12 reflectors, 36 readings for 15 unknowns
+# Chance of naming an offset that is not there, over all legs of all robots.
+_FALSE_ALARM = 1e-3
+# A leg whose effect base and clamp swallow to this share cannot be judged.
+_SWALLOWED = 1e-6
+# Legs in mm: 1e3 or so comes from mm against rad, more is a robot near a singular pose.
+_SINGULAR = 1e7
+# Of a contact frame's twist (rotation first): the panel is shaped by its z and by turns about x and y; the other axes
+# give way to force control, because the panel is stiff in its plane.
+SHAPE_AXES = np.array([True, True, False, False, False, True])
 
 
 def contact_frame(points: Array) -> Array:
@@ -35,10 +58,7 @@ def contact_frame(points: Array) -> Array:
 
 
 def _unit(v: Array) -> Array:
-    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
-
-
-# Commands of the six robots: pre-positioning, master and slaves, pose adjustment.
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
 def preposition(T_world_base: Array, T_world_panel: Array, T_panel_contact: Array, T_flange_contact: Array) -> Array:
@@ -46,7 +66,7 @@ def preposition(T_world_base: Array, T_world_panel: Array, T_panel_contact: Arra
 
     T_Bi_Fi = T_W_Bi⁻¹ · T_W_P · T_P_CPi · T_Fi_CPi⁻¹.
     """
-    return np.asarray(frames.inverse(T_world_base) @ T_world_panel @ T_panel_contact @ frames.inverse(T_flange_contact))
+    return frames.inverse(T_world_base) @ T_world_panel @ T_panel_contact @ frames.inverse(T_flange_contact)
 
 
 def follow(T_world_base: Array, T_base_flange: Array, master: int, T_base_flange_master: Array) -> Array:
@@ -60,7 +80,7 @@ def follow(T_world_base: Array, T_base_flange: Array, master: int, T_base_flange
     T_flange_master = frames.inverse(T_world_flange) @ T_world_flange[master]
     moved = T_slave_master @ T_base_flange_master @ frames.inverse(T_flange_master)
     moved[master] = T_base_flange_master
-    return np.asarray(moved)
+    return moved
 
 
 def adjust_pose(
@@ -74,11 +94,6 @@ def adjust_pose(
     motion = T_world_target @ frames.inverse(T_world_panel)
     T_master = frames.inverse(base) @ motion @ base @ T_base_flange[master]
     return follow(T_world_base, T_base_flange, master, T_master)
-
-
-# Where each robot stands and how its clamp sits, from poses of the robot and three reflectors on its flange.
-
-_MINIMUM = 4  # poses: 12 reflectors, 36 readings for 15 unknowns
 
 
 @dataclass(frozen=True)
@@ -153,7 +168,7 @@ def calibrate_robot(readings: ReflectorReadings) -> RobotModel:
     def residuals(x: Array) -> Array:
         moved = T_base @ frames.exp(x[:6]) @ readings.T_base_flange
         fitted = frames.transform(moved, points + x[6:].reshape(3, 3))
-        return np.asarray(((fitted - readings.reflectors) / readings.sigma[..., None]).ravel())
+        return ((fitted - readings.reflectors) / readings.sigma[..., None]).ravel()
 
     solution = least_squares(residuals, np.zeros(15), jac="3-point", x_scale="jac", xtol=1e-12, ftol=1e-12)
     spread = np.linalg.inv(solution.jac.T @ solution.jac)
@@ -178,13 +193,7 @@ def _contact_jacobian(points: Array) -> Array:
     step, T_inverse = 1e-3, frames.inverse(contact_frame(points))
     changes = step * np.eye(9).reshape(9, 3, 3)
     ahead, back = (frames.log(T_inverse @ contact_frame(points + sign * changes)) for sign in (1, -1))
-    return np.asarray((ahead - back).T / (2 * step))
-
-
-# Error of the slaves against the master along a motion: what the global model's uncertainty makes of it.
-#
-# For a pure translation d the slave errs by (δR)·d, so the position error grows with the distance and the direction
-# error does not change; for a pure turn the relative positions of the flanges enter too (source, eqs. 19-24).
+    return (ahead - back).T / (2 * step)
 
 
 @dataclass(frozen=True)
@@ -216,7 +225,7 @@ def errors_along_motion(
 
     def relative(flanges: Array) -> Array:
         contact = true_base @ flanges @ true_contact
-        return np.asarray(frames.inverse(contact[:, master : master + 1]) @ contact)
+        return frames.inverse(contact[:, master : master + 1]) @ contact
 
     before = frames.inverse(relative(T_base_flange))
     out = np.zeros((2, 3, len(steps), len(models)))
@@ -242,9 +251,6 @@ def errors_by_master(models: Sequence[RobotModel], T_base_flange: Array, distanc
     )
 
 
-# What a laser tracker's points are worth.
-
-
 @dataclass(frozen=True)
 class LaserTracker:
     """Lengths in mm. The maker's 10 µm + 5 µm/m is taken as one sigma of every coordinate, which is cautious."""
@@ -255,12 +261,7 @@ class LaserTracker:
 
     def sigma(self, points: Array) -> Array:
         """Sigma of each coordinate of points (..., 3) in the world frame -> (...)."""
-        return np.asarray(self.constant + self.per_length * np.linalg.norm(points - self.position, axis=-1))
-
-
-# Where the clamps touch the panel: six (or more) clamps of three pads each on the equivalent cylinder.
-#
-# The source prints its formulas as pictures; these are rebuilt from its text and its figures' captions.
+        return self.constant + self.per_length * np.linalg.norm(points - self.position, axis=-1)
 
 
 @dataclass(frozen=True)
@@ -328,19 +329,6 @@ def _pads(radius: float, angle: float, width: float, x_base: float, x_third: flo
     return np.column_stack([x, radius * np.sin(at), radius * (np.cos(at) - 1)])
 
 
-# A hidden offset of one leg of a six-legged robot, found in the tracker's data.
-#
-# The controller turns a flange pose into six leg lengths; a leg that is δ longer than it believes moves the flange by
-# the twist J⁻¹·e·δ. What of that is the same in all poses hides in base and clamp; the rest stays in the residuals.
-
-# Chance of naming an offset that is not there, over all legs of all robots.
-_FALSE_ALARM = 1e-3
-# A leg whose effect base and clamp swallow to this share cannot be judged.
-_SWALLOWED = 1e-6
-# Legs in mm: 1e3 or so comes from mm against rad, more is a robot near a singular pose.
-_SINGULAR = 1e7
-
-
 @dataclass(frozen=True)
 class Legs:
     """Joints of the six legs, mm."""
@@ -366,7 +354,7 @@ class LegOffset:
 def leg_lengths(legs: Legs, T_base_flange: Array) -> Array:
     """(M, 6) lengths, mm, that a controller sets for flange poses (M, 4, 4)."""
     ends = frames.transform(T_base_flange, legs.platform)
-    return np.asarray(np.linalg.norm(ends - legs.base, axis=-1))
+    return np.linalg.norm(ends - legs.base, axis=-1)
 
 
 def leg_jacobian(legs: Legs, T_base_flange: Array) -> Array:
@@ -424,7 +412,7 @@ def true_flanges(legs: Legs, T_base_flange: Array, offsets: Sequence[tuple[int, 
     """
     twists = _twists_per_leg(legs, T_base_flange)
     xi = sum((twists[..., leg - 1] * size for leg, size in offsets), np.zeros((len(T_base_flange), 6)))
-    return np.asarray(T_base_flange @ frames.exp(np.asarray(xi)))
+    return T_base_flange @ frames.exp(np.asarray(xi))
 
 
 def _twists_per_leg(legs: Legs, T_base_flange: Array) -> Array:
@@ -439,10 +427,7 @@ def _twists_per_leg(legs: Legs, T_base_flange: Array) -> Array:
             f"the legs leave the flange loose at {x:.1f} {y:.1f} {z:.1f} mm; to fix: correct that pose, or the "
             "joints in [legs]"
         )
-    return np.asarray(np.linalg.inv(lengths))
-
-
-# A rigid body's pose from measured points, with covariance.
+    return np.asarray(np.linalg.inv(lengths), float)
 
 
 @dataclass(frozen=True)
@@ -474,13 +459,6 @@ def rigid_fit(nominal: Array, measured: Array, sigma: Array) -> RigidFit:
     arms = nominal - nominal.mean(axis=0)
     gain = np.linalg.pinv(_motion_of_points(arms).reshape(-1, 6)) * np.repeat(np.asarray(sigma, float), 3)
     return RigidFit(T, gain @ gain.T, measured - frames.transform(T, nominal))
-
-
-# Shape control: each clamp's control points against the CAD, turned into a motion of its flange.
-
-# Of a contact frame's twist (rotation first): the panel is shaped by its z and by turns about x and y; the other axes
-# give way to force control, because the panel is stiff in its plane.
-SHAPE_AXES = np.array([True, True, False, False, False, True])
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,10 @@
-"""Scans of a part from several robot poses, joined in the robot's base frame, and how their places may err."""
+"""Scans of a part from several robot poses, joined in the robot's base frame, and how their places may err.
+
+How far scans may lie from where the robot and the hand-eye put them.
+
+Each source is a sum of modes of unit variance: a small motion of points. A fit that answers a motion linearly takes
+up the covariance of all modes as the sum of its squared answers, whatever it fits.
+"""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -20,6 +26,11 @@ from stitch.session.session import SessionData
 
 # Fewer points have no neighbourhoods from which normals could be taken.
 _MIN_SCAN_POINTS = 50
+# Columns of views.csv: the flange's velocity in the base (length_unit/s) while a line scanner sweeps without turning.
+SWEEP = ("sweep_x", "sweep_y", "sweep_z")
+SOURCES = ("hand_eye", "robot", "scanner")
+# Smooth errors along the ray: products of Legendre polynomials over the field up to this degree, without a constant.
+_FIELD_DEGREE = 2
 
 
 @dataclass(frozen=True)
@@ -37,7 +48,7 @@ class PlacedScans:
     @property
     def T_base_scanner(self) -> Array:
         """(V, 4, 4)."""
-        return np.asarray(self.T_base_flange @ self.T_flange_scanner)
+        return self.T_base_flange @ self.T_flange_scanner
 
 
 @dataclass(frozen=True)
@@ -140,10 +151,6 @@ def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
     return PlacedScans(names, tuple(points), poses, T_flange_scanner, unit, carried, errors)
 
 
-# Columns of views.csv: the flange's velocity in the base (length_unit/s) while a line scanner sweeps without turning.
-SWEEP = ("sweep_x", "sweep_y", "sweep_z")
-
-
 def _sweeps(session: SessionData) -> tuple[Array, ...]:
     """How far the flange had moved when each point was seen, (N, 3) a view; empty where no view is a sweep.
 
@@ -199,16 +206,6 @@ def read_hand_eye(file: Path, length_unit: str, T_base_flange: Array) -> tuple[A
     return T, PlacingErrors(T_base_flange, T, hand_eye, rotation=turn, translation=shift * scale)
 
 
-# How far scans may lie from where the robot and the hand-eye put them.
-#
-# Each source is a sum of modes of unit variance: a small motion of points. A fit that answers a motion linearly takes
-# up the covariance of all modes as the sum of its squared answers, whatever it fits.
-
-SOURCES = ("hand_eye", "robot", "scanner")
-# Smooth errors along the ray: products of Legendre polynomials over the field up to this degree, without a constant.
-_FIELD_DEGREE = 2
-
-
 @dataclass(frozen=True)
 class PlacingErrors:
     """1-sigmas; rotations in rad, lengths in the length unit of the scans."""
@@ -261,7 +258,7 @@ def _moved(T: Array, points: Array, xi: Array) -> Array:
     """(M, 3) motion in the base frame of points (M, 3) when frames T (4, 4) or (M, 4, 4) become T · exp(ξ)."""
     R, t = T[..., :3, :3], T[..., :3, 3]
     local = np.einsum("...ji,...j->...i", R, points - t)
-    return np.asarray(np.einsum("...ij,...j->...i", R, np.cross(xi[:3], local) + xi[3:]))
+    return np.einsum("...ij,...j->...i", R, np.cross(xi[:3], local) + xi[3:])
 
 
 def stated_errors(document: JobTable, placed: PlacedScans) -> PlacingErrors | None:

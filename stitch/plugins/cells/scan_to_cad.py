@@ -1,4 +1,13 @@
-"""Scan onto CAD: point to plane, robustly weighted, on points that look all ways."""
+"""Scan onto CAD: point to plane, robustly weighted, on points that look all ways.
+
+The allowance beside the pose: scale, shrinkage, what can be told, and the result.
+
+From mean(d²) = Var(d) + mean(d)² a cost Var(d) + λ·mean(d)² can be chosen; the ordinary fit has λ = 1. With an
+unknown allowance λ = 0: only the variance of the distances is made small (variance-minimisation matching), and their
+mean is the allowance. A column of ones beside the six of the pose does the same and gives its sigma. Distances above
+and below the allowance are two classes, plus and minus, each with its own scale, and the cleaner one counts for
+both: gates, risers and flash all stand on one side.
+"""
 
 from dataclasses import dataclass, replace
 from itertools import permutations, product
@@ -33,14 +42,40 @@ from stitch.session.reading.csv_files import is_number
 from stitch.session.scan import even_indices
 from stitch.system.ply_file import write_ply
 
-# Stock on a casting: how far the scan stands off the CAD, even or slowly varying. Positive is outside: stock on it.
-
 FREE, VARYING = "free", "varying"
 # Below this share told from a motion, an error of form enters more than threefold; that is said.
 FAINT = 0.1
 # Products of Legendre polynomials over the part's box up to this degree: what varies slowly.
 _DEGREE = 3
 _ORDERS = tuple(order for order in product(range(_DEGREE + 1), repeat=3) if 0 < sum(order) <= _DEGREE)
+# Share of an even allowance that no motion of the part imitates. Below, an error of the part's form would enter the
+# allowance more than thirtyfold.
+_MIN_SEPARABLE_SHARE = 1e-3
+# A class of fewer than this share of the points has no scale of its own.
+_CLASS = 0.1
+# A field this far below the scatter of the points is none.
+_MIN_FIELD_SHARE = 1e-3
+_MIN_FIT_POINTS = 50
+_ROUNDS = 80
+# A step below this share of the part is none; and cells along the part for the second kind of weight.
+_STILL, _CELLS = 1e-7, 40
+# A surface that leaves a direction open by this share of the best one fixes no pose.
+_OPEN = 1e-6
+_MIN_START_POINTS = 50
+_START_POINTS = 1500  # of the scan that judge a candidate
+_KEEP = 6  # candidates that are refined
+_REFINE = 20  # steps of a candidate's refinement
+_FEATURE_RUNS, _FEATURE_DRAWS, _FEATURE_SAMPLES = 3, 50_000, 6000
+# A start of which less than a third of the scan meets the CAD is none.
+_LEAST_SHARE = 1 / 3
+# A pose that so much of the scan agrees with needs no second opinion.
+_CERTAIN = 0.95
+# A cell with fewer points has no mean worth a verdict.
+_MIN_MAP_POINTS = 5
+# Parts stand apart by more than this many point spacings, or this share of the part where the spacing is finer.
+_GAP_SPACINGS, _GAP_SHARE = 6.0, 1 / 40
+# A heap of points smaller than this share of the part's surface is no part.
+_MIN_INSTANCE_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -127,23 +162,6 @@ def allowance_sentence(allowance: Allowance, length_unit: str | None) -> str:
     return size + "."
 
 
-# The allowance beside the pose: scale, shrinkage, what can be told, and the result.
-#
-# From mean(d²) = Var(d) + mean(d)² a cost Var(d) + λ·mean(d)² can be chosen; the ordinary fit has λ = 1. With an
-# unknown allowance λ = 0: only the variance of the distances is made small (variance-minimisation matching), and their
-# mean is the allowance. A column of ones beside the six of the pose does the same and gives its sigma. Distances above
-# and below the allowance are two classes, plus and minus, each with its own scale, and the cleaner one counts for
-# both: gates, risers and flash all stand on one side.
-
-# Share of an even allowance that no motion of the part imitates. Below, an error of the part's form would enter the
-# allowance more than thirtyfold.
-_MIN_SEPARABLE_SHARE = 1e-3
-# A class of fewer than this share of the points has no scale of its own.
-_CLASS = 0.1
-# A field this far below the scatter of the points is none.
-_MIN_FIELD_SHARE = 1e-3
-
-
 def robust_spread(rest: Array, prior: AllowancePrior) -> float:
     """Robust sigma of distances (N,) less their allowance: of the cleaner class where one is to be found."""
     if prior.free:
@@ -218,12 +236,6 @@ def summarise_allowance(
     )
 
 
-_MIN_FIT_POINTS = 50
-_ROUNDS = 80
-# A step below this share of the part is none; and cells along the part for the second kind of weight.
-_STILL, _CELLS = 1e-7, 40
-# A surface that leaves a direction open by this share of the best one fixes no pose.
-_OPEN = 1e-6
 NO_ALLOWANCE = AllowancePrior()
 
 
@@ -243,7 +255,7 @@ class CadFit:
     @property
     def sigma(self) -> Array:
         """(6,) sigmas of rotation (rad) and translation, about the CAD's centre and axes."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.sqrt(np.diag(self.covariance))
 
 
 def fit_cad(
@@ -307,7 +319,7 @@ def fit_cad(
 
 def moved_about(T_base_part: Array, step: Array, centre: Array) -> Array:
     """The pose (4, 4) after a Gauss-Newton step, a twist (6,) about a centre (3,) of the part."""
-    return np.asarray(T_base_part @ frames.inverse(frames.moved_about(centre, step, np.eye(4))))
+    return T_base_part @ frames.inverse(frames.moved_about(centre, step, np.eye(4)))
 
 
 def _covariances(
@@ -381,20 +393,7 @@ def _normal_matrix(design: Array, weight: Array, cad: CadSurface) -> Array:
         )
     if len(N) > 6:
         separable_share(N)
-    return np.asarray(N)
-
-
-# Where the part lies, without a guess: principal axes and features give candidates, the surface decides.
-
-_MIN_START_POINTS = 50
-_START_POINTS = 1500  # of the scan that judge a candidate
-_KEEP = 6  # candidates that are refined
-_REFINE = 20  # steps of a candidate's refinement
-_FEATURE_RUNS, _FEATURE_DRAWS, _FEATURE_SAMPLES = 3, 50_000, 6000
-# A start of which less than a third of the scan meets the CAD is none.
-_LEAST_SHARE = 1 / 3
-# A pose that so much of the scan agrees with needs no second opinion.
-_CERTAIN = 0.95
+    return N
 
 
 @dataclass(frozen=True)
@@ -514,12 +513,6 @@ def _refine(T_base_part: Array, points: Array, normals: Array, cad: CadSurface, 
     return T_base_part
 
 
-# The deviation map: signed distances of scanned points from the CAD with its stock, and cells out of tolerance.
-
-# A cell with fewer points has no mean worth a verdict.
-_MIN_MAP_POINTS = 5
-
-
 @dataclass(frozen=True)
 class DeviationCells:
     """C cells of the map: points of one cube that look the same way, averaged."""
@@ -542,7 +535,7 @@ class Deviations:
     @property
     def outside(self) -> NDArray[np.bool_]:
         """(C,) cells whose mean is beyond the tolerance."""
-        return np.asarray(np.abs(self.cells.mean) > self.tolerance)
+        return np.abs(self.cells.mean) > self.tolerance
 
 
 def measure_deviations(
@@ -570,7 +563,7 @@ def measure_deviations(
     where = where.ravel()
 
     def mean(values: Array) -> Array:
-        return np.asarray(np.bincount(where, values, len(count)) / count)
+        return np.bincount(where, values, len(count)) / count
 
     average = mean(distance)
     middle = np.column_stack([mean(points[:, k]) for k in range(3)])
@@ -601,14 +594,6 @@ def write_deviation_csv(file: Path, deviations: Deviations) -> None:
     columns |= {"deviation": c.mean[order], "spread": c.spread[order]}
     verdicts = ["bad" if bad else "good" for bad in deviations.outside[order]]
     write_columns(file, {**columns, "points": c.count[order].tolist(), "verdict": verdicts})
-
-
-# Several parts of the same kind in one scan.
-
-# Parts stand apart by more than this many point spacings, or this share of the part where the spacing is finer.
-_GAP_SPACINGS, _GAP_SHARE = 6.0, 1 / 40
-# A heap of points smaller than this share of the part's surface is no part.
-_MIN_INSTANCE_SHARE = 0.1
 
 
 def split_instances(scan: JoinedScans, cad: CadSurface, count: int) -> list[JoinedScans]:

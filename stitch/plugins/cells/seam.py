@@ -11,14 +11,15 @@ from stitch.numerics.frames import Array
 from stitch.plugins.cells.cad import MAD, TUKEY, biweight, biweight_slope
 from stitch.plugins.cells.placed_scans import SOURCES, JoinedScans, PlacingErrors
 
-# One edge across a seam: where the outer surface and the flank meet.
-
 # Fewer points of a surface or flank fix no edge to a twentieth of a millimetre.
 _FEWEST = 25
 # Edge of the cubes whose points share what the model leaves, mm.
 _CUBE = 3.0
 # Points further from the edge than this say nothing about it that the surface's bend does not blur, mm.
 _REACH = 22.0
+# Width of the strip along the seam that is fitted, and how far across and down it reaches, mm.
+_ALONG, _ACROSS, _DEPTH = 12.0, 40.0, 20.0
+VERDICTS = ("good", "bad", "open", "not measured")
 
 
 @dataclass(frozen=True)
@@ -112,11 +113,6 @@ def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array, 
         np.asarray(few * inverse @ scores.T @ scores @ inverse),
         inverse @ (design * slope[:, None]).T,
     )
-
-
-# Width of the strip along the seam that is fitted, and how far across and down it reaches, mm.
-_ALONG, _ACROSS, _DEPTH = 12.0, 40.0, 20.0
-VERDICTS = ("good", "bad", "open", "not measured")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,21 @@
 
 Stand frame S: origin at slide zero, x along the rail away from P1, z the pivot axis of the rod, y = z × x.
 At angle 0 the rod lies on the rail and points back to P1, towards −x.
+
+Distances that two instruments give independently: where they differ, one of them is wrong.
+
+The distance between two settings of the rod follows from slide, angle and length alone, whatever the bases are; the
+second robot measures the same distance by its joints. So the comparison needs no fit and names its pair of points.
+
+The source's solution: project the polyhedron of points and origins onto X-Y, X-Z and Y-Z (formulas 5 to 11).
+
+The X-Y plane is solved by the cosine rule, letter for letter but for two misprints: |O2R2| is printed with the
+coordinates of R1, and |O1e| with |O1P1| where its triangle has the side |O1P2|. Both pairs are equal in the
+source's experiments. The source's γ counts clockwise; `project` returns right-handed angles, so its γ is −γz.
+
+For X-Z and Y-Z the source says "likewise". `Projection.likewise` has the same rules there, 0/0 in its experiments,
+where P1 and P2 fall on one point of the X-Z plane. So T takes these planes from the vectors R1R2 that rod and second
+robot give, which is the same triangle; an angle whose R1R2 falls on a point of its plane is taken as level.
 """
 
 from dataclasses import dataclass, field
@@ -18,6 +33,16 @@ from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session.robot import elementary
+
+_TOLERANCES = {"xtol": 1e-10, "ftol": 1e-10, "gtol": 1e-10}
+# The formulas hold for the source's arrangement only, and elsewhere give any number without a sign of it. So the
+# solution must carry R1 and R2 onto the rod's cup within this share of the rod's length: far above all noise.
+_GAP = 0.05
+# The same in a plane that T does not take, where other arrangements come near: a millimetre of the rod.
+_CLOSED = 2e-4
+# R1R2 or P1P2 shorter in a plane than this share of its length gives no angle there.
+_SHORT = 0.05
+_ARRANGEMENT = "check the rod and joint readings, and that the stand is placed as the source places it"
 
 
 @dataclass(frozen=True)
@@ -68,7 +93,7 @@ def cylinder_covariance(joint1: float, radius: float, sigma: tuple[float, float,
     """Covariance (3, 3) of one of `cylinder_points` from the sigmas of joint 1 (rad), radius and height."""
     c, s = np.cos(joint1), np.sin(joint1)
     jacobian = np.array([[-radius * s, c, 0.0], [radius * c, s, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(jacobian @ np.diag(np.square(sigma)) @ jacobian.T)
+    return jacobian @ np.diag(np.square(sigma)) @ jacobian.T
 
 
 @dataclass(frozen=True)
@@ -103,7 +128,7 @@ class DhArm:
 
     def _tips(self, joints: Array) -> Array:
         T = self.flange(joints)
-        return np.asarray(T[..., :3, 3] + T[..., :3, :3] @ self.tip)
+        return T[..., :3, 3] + T[..., :3, :3] @ self.tip
 
 
 def rod_points(slide: Array, angle: Array, length: Array, turn: float) -> Array:
@@ -128,13 +153,7 @@ def level_stand(rail: Array, rail_slide: Array) -> Array:
 def rail_direction(rail: Array) -> Array:
     """(3,) unit direction of growing slide, in which the points (N, 3) are listed."""
     line = np.linalg.svd(rail - rail.mean(axis=0), full_matrices=False)[2][0]
-    return np.asarray(line * np.sign(line @ (rail[-1] - rail[0])))
-
-
-# Distances that two instruments give independently: where they differ, one of them is wrong.
-#
-# The distance between two settings of the rod follows from slide, angle and length alone, whatever the bases are; the
-# second robot measures the same distance by its joints. So the comparison needs no fit and names its pair of points.
+    return line * np.sign(line @ (rail[-1] - rail[0]))
 
 
 @dataclass(frozen=True)
@@ -191,11 +210,6 @@ def _distance_comparison(
     return DistanceComparison((touched.names[i], touched.names[j]), by_stand, by_robot, float(np.sqrt(variance)))
 
 
-# All readings of the stand as one least-squares problem, every reading with its own sigma.
-
-_TOLERANCES = {"xtol": 1e-10, "ftol": 1e-10, "gtol": 1e-10}
-
-
 @dataclass(frozen=True)
 class BaseFit:
     """T_base1_base2 with its uncertainty about the axes of base 1."""
@@ -216,7 +230,7 @@ class BaseFit:
     @property
     def sigma(self) -> Array:
         """(6,) sigmas of rotation (rad) and translation."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.sqrt(np.diag(self.covariance))
 
 
 def fit_stand(stand: Stand) -> BaseFit:
@@ -231,7 +245,7 @@ def fit_stand(stand: Stand) -> BaseFit:
     def jacobian_at(x: Array) -> Array:
         """Central differences, all columns in one evaluation; a step is a hundredth of a typical error."""
         ahead, back = _residuals(stand, start, x + np.stack([steps, -steps]))
-        return np.asarray((ahead - back).T / (2e-2 * scales))
+        return (ahead - back).T / (2e-2 * scales)
 
     solution = least_squares(
         lambda x: _residuals(stand, start, x),
@@ -326,27 +340,7 @@ def _residuals(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
 
 def _whiten(residuals: Array, covariance: Array) -> Array:
     white = np.linalg.solve(np.linalg.cholesky(covariance), residuals[..., None])
-    return np.asarray(white.reshape(*residuals.shape[:-2], -1))
-
-
-# The source's solution: project the polyhedron of points and origins onto X-Y, X-Z and Y-Z (formulas 5 to 11).
-#
-# The X-Y plane is solved by the cosine rule, letter for letter but for two misprints: |O2R2| is printed with the
-# coordinates of R1, and |O1e| with |O1P1| where its triangle has the side |O1P2|. Both pairs are equal in the
-# source's experiments. The source's γ counts clockwise; `project` returns right-handed angles, so its γ is −γz.
-#
-# For X-Z and Y-Z the source says "likewise". `Projection.likewise` has the same rules there, 0/0 in its experiments,
-# where P1 and P2 fall on one point of the X-Z plane. So T takes these planes from the vectors R1R2 that rod and second
-# robot give, which is the same triangle; an angle whose R1R2 falls on a point of its plane is taken as level.
-
-# The formulas hold for the source's arrangement only, and elsewhere give any number without a sign of it. So the
-# solution must carry R1 and R2 onto the rod's cup within this share of the rod's length: far above all noise.
-_GAP = 0.05
-# The same in a plane that T does not take, where other arrangements come near: a millimetre of the rod.
-_CLOSED = 2e-4
-# R1R2 or P1P2 shorter in a plane than this share of its length gives no angle there.
-_SHORT = 0.05
-_ARRANGEMENT = "check the rod and joint readings, and that the stand is placed as the source places it"
+    return white.reshape(*residuals.shape[:-2], -1)
 
 
 @dataclass(frozen=True)
@@ -472,7 +466,7 @@ def _cosine_rules(
 
 def _angles_between(a: Array, b: Array) -> Array:
     """(N,) angles of vectors b (N, 2) against a (2,), without sign."""
-    return np.asarray(np.abs(np.arctan2(a[0] * b[:, 1] - a[1] * b[:, 0], b @ a)))
+    return np.abs(np.arctan2(a[0] * b[:, 1] - a[1] * b[:, 0], b @ a))
 
 
 def _third_side(a: float, b: float, between: float) -> float:
@@ -503,4 +497,4 @@ def _plane(R_base1: Array, R_turned: Array, axes: tuple[int, int], normal: int) 
 def _rotation(axis: int, angle: float) -> Array:
     """(3, 3); of an angle that a plane does not show, no turn."""
     angle = 0.0 if np.isnan(angle) else angle
-    return np.asarray(frames.exp(np.concatenate([angle * np.eye(3)[axis], np.zeros(3)]))[:3, :3])
+    return frames.exp(np.concatenate([angle * np.eye(3)[axis], np.zeros(3)]))[:3, :3]

@@ -55,7 +55,12 @@ from stitch.plugins.cells.seam import VERDICTS, Limits, Seam, Station, measure_s
 from stitch.session.session import Cloud
 from stitch.system.process import console
 
-# A robot path moved along with the part.
+FIT_FORMAT, SEAM_FORMAT = "stitch-fit/1", "stitch-seam/1"
+_SCANS = {"scans", "session", "hand_eye", "errors"}
+_FIT_KEYS = {"format", *_SCANS, "cad", "length_unit"}
+_SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma"}
+NO_UNIT = "Lengths in the unit of the CAD, whose file names none; length_unit in the job states it."
+_SOURCE_WORDS = {"scan": "the scan's noise", "hand_eye": "the hand-eye", "robot": "the robot", "scanner": "the scanner"}
 
 
 def correct_path(T_base_tool: Array, T_base_part_nominal: Array, T_base_part: Array) -> Array:
@@ -66,13 +71,7 @@ def correct_path(T_base_tool: Array, T_base_part_nominal: Array, T_base_part: Ar
     return T_base_part @ frames.inverse(T_base_part_nominal) @ T_base_tool
 
 
-# Job files of `stitch fit` and `stitch seam` (TOML); every check of the input is made here.
-
-FIT_FORMAT, SEAM_FORMAT = "stitch-fit/1", "stitch-seam/1"
-_SCANS = {"scans", "session", "hand_eye", "errors"}
-_FIT_KEYS = {"format", *_SCANS, "cad", "length_unit"}
 _FIT_KEYS |= {"instances", "tolerance", "cell", "region", "nominal", "path", "coverage"}
-_SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma"}
 
 
 @dataclass(frozen=True)
@@ -365,11 +364,6 @@ def write_seam(seams: list[Seam], file: Path) -> None:
     write_columns(file, {name: [getattr(seam, name) for seam in seams] for name in names})
 
 
-# What a fit found, in sentences: the same on the terminal, on the page and in the recording.
-
-NO_UNIT = "Lengths in the unit of the CAD, whose file names none; length_unit in the job states it."
-
-
 def with_unit(job: FitJob, size: str) -> str:
     """A length with its unit, where that is known."""
     return f"{size} {job.length_unit}" if job.length_unit else size
@@ -416,9 +410,6 @@ def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
             yield f"{count} points in forbidden region {name} did not count."
 
 
-_SOURCE_WORDS = {"scan": "the scan's noise", "hand_eye": "the hand-eye", "robot": "the robot", "scanner": "the scanner"}
-
-
 def _sigma_sentence(job: FitJob, part: FittedPart) -> str:
     """What the ± of the place counts, largest first."""
     sizes = {name: float(np.sqrt(np.diag(C)[3:].max())) for name, C in part.fit.parts.items()}
@@ -427,9 +418,6 @@ def _sigma_sentence(job: FitJob, part: FittedPart) -> str:
     ranked = sorted((name for name, size in sizes.items() if size), key=lambda name: -sizes[name])
     told = ", ".join(with_unit(job, f"{_SOURCE_WORDS[name]} {uncertainty_text(sizes[name])}") for name in ranked)
     return f"± of the place by source: {told}."
-
-
-# The scans of a part or a seam as a cloud session, with the hand-eye that placed them and their CAD.
 
 
 def scan_session(name: str, placed: PlacedScans, cad: Path | None = None) -> SessionFiles:
@@ -447,9 +435,6 @@ def scan_session(name: str, placed: PlacedScans, cad: Path | None = None) -> Ses
         clouds={file: Cloud(points) for file, points in zip(files, placed.clouds, strict=True)},
         copies=() if cad is None else (cad,),
     )
-
-
-# What `stitch fit` does: parts fitted, shown, drawn, as map and path and as a session.
 
 
 def run_fit(file: Path, allowance: str | None, wanted: Wanted) -> None:
@@ -475,9 +460,6 @@ def run_fit(file: Path, allowance: str | None, wanted: Wanted) -> None:
         print(f"{wanted.output}/{name}")
 
 
-# What a seam's stations say, in sentences: the same on the terminal, on the page and in the recording.
-
-
 def limits_text(limits: Limits) -> str:
     """What is allowed."""
     flush, gap = f"{limits.flush:g} ± {limits.flush_tolerance:g}", f"{limits.gap:g} ± {limits.gap_tolerance:g}"
@@ -489,9 +471,6 @@ def stations_sentence(limits: Limits, seams: list[Seam]) -> str:
     counts = {verdict: sum(s.verdict == verdict for s in seams) for verdict in VERDICTS}
     found = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
     return f"{len(seams)} stations: {found}. Allowed: {limits_text(limits)}."
-
-
-# What `stitch seam` does: stations measured, shown, drawn, as a table and as a session.
 
 
 def run_seam(file: Path, wanted: Wanted) -> None:

@@ -228,7 +228,7 @@ def _nearby_joints(near: str | None, arm: ArmModel) -> Array | None:
     told: Array = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
     if len(told) != arm.robot.n_joints or not np.isfinite(told).all():
         raise InputError(f"--near {near}: to fix: write {arm.robot.n_joints} angles in degrees with commas")
-    return np.asarray(np.radians(told))
+    return np.radians(told)
 
 
 def _is_j3_coupled(program: Program, j3: str | None) -> bool:

@@ -25,6 +25,8 @@ _PARENTS = {"eye_to_hand": "base_link", "eye_in_hand": "flange"}
 _PARENT_WORDS = {"eye_to_hand": "base", "eye_in_hand": "flange"}
 # Characters that a frame's name may have in every format: those of a link in URDF and of a name in YAML.
 _PLAIN_LETTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_")
+_DEGREES = ("mm", "mm", "mm", "°", "°", "°")
+_QUATERNION = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,6 @@ class ControllerFrame:
     place: dict[str, str]  # mount → where it is entered
 
 
-_DEGREES = ("mm", "mm", "mm", "°", "°", "°")
 _CONTROLLERS = {
     "kuka": ControllerFrame(
         tuple("XYZABC"),
@@ -199,10 +200,7 @@ def _frame_numbers(T: Array, controller: str, near: Array | None = None) -> Arra
     """Of a pose (4, 4) in m; the controllers' functions take mm."""
     T = T.copy()
     T[:3, 3] *= 1000
-    return np.asarray(NUMBERS[controller](T, near))
-
-
-_QUATERNION = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    return NUMBERS[controller](T, near)
 
 
 def ros_yaml(eye: ExportedHandEye) -> str:
@@ -289,7 +287,7 @@ def _quaternion_head(eye: ExportedHandEye) -> list[str]:
 def _roll_pitch_yaw(T: Array, near: Array | None = None) -> Array:
     """FANUC's angles are those of URDF, in degrees."""
     turned = np.repeat([1.0, 180 / np.pi], 3)
-    return np.asarray(fixed_xyz_numbers(T, None if near is None else near * turned) / turned)
+    return fixed_xyz_numbers(T, None if near is None else near * turned) / turned
 
 
 def _matrix_head(eye: ExportedHandEye, unit: str) -> list[str]:

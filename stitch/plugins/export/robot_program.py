@@ -26,6 +26,30 @@ _NEWTON_STEPS = 100
 # Largest step of a joint (rad): the arm stays on its way to the nearest solution.
 _LONGEST = 0.3
 _CLOSE = 1e-11
+_COMPENSATION_STEPS = 30
+_STEP_TOLERANCE = 1e-13
+# Motions that a unit of joint angles turns into less than this part of the largest are not asked of the arm: at a
+# singular pose whole turns would bring micrometres.
+_SINGULAR = 1e-3
+# From the target before, an arm goes on in the same configuration while no joint turns by more than this (rad).
+_SAME = np.radians(90.0)
+# Poses of the run from which a first target is looked for.
+_STARTS = 40
+# Joints and pose of one waypoint agree within the calibration of an arm and the rounding of both (m).
+_AGREE = 0.02
+# Decimals of positions, of rotations and of joint angles: what each controller stores, so that a moved target is not
+# rounded away where its number was written short. FANUC listings have three, whatever they show.
+_DECIMALS = {"kuka": (4, 5, 5), "fanuc": (3, 3, 3), "abb": (4, 9, 5), "ur": (7, 7, 7)}
+# A move below this (mm and rad together) is none: numbers are not written anew for rounding's sake.
+_NEGLIGIBLE_CHANGE = 1e-9
+# The rotation that goes with that, mrad for each mm: what moves a hand of half a metre by so much.
+_MRAD_PER_MM = 2.0
+# Largest turn of one joint, rad: near a singular pose joints turn far for a small move.
+_LARGEST_TURN = np.radians(3.0)
+# Joint angles this far beyond those of the run's views are worth a word (rad).
+_MAX_JOINT_EXCESS = np.radians(15.0)
+# Effects that hang on where a joint comes from.
+_HISTORY_EFFECTS = ("backlash", "settling")
 
 
 def joint_solutions(robot: Robot, T_base_flange: Array, near: Array) -> Array:
@@ -53,13 +77,6 @@ def joint_solutions(robot: Robot, T_base_flange: Array, near: Array) -> Array:
         if all(np.abs(np.angle(np.exp(1j * (solution - other)))).max() > 1e-4 for other in found):
             found.append(solution)
     return np.array(found).reshape(-1, robot.n_joints)
-
-
-_COMPENSATION_STEPS = 30
-_STEP_TOLERANCE = 1e-13
-# Motions that a unit of joint angles turns into less than this part of the largest are not asked of the arm: at a
-# singular pose whole turns would bring micrometres.
-_SINGULAR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -115,9 +132,7 @@ def _uncertainty(arm: ArmModel, q: Array, approach: Array, T_flange_tool: Array)
     """Return (K,) 2·√tr(J·Σ·Jᵀ), Σ of all fitted parameters together: errors of one make up for errors of another."""
 
     def place(terms: tuple[Term, ...]) -> Array:
-        return np.asarray(
-            (replace(arm, terms=terms).true_flange(q, _previous_joints(q), approach) @ T_flange_tool)[:, :3, 3]
-        )
+        return (replace(arm, terms=terms).true_flange(q, _previous_joints(q), approach) @ T_flange_tool)[:, :3, 3]
 
     here, values = place(arm.terms), values_of(arm.terms)
     # Columns of the root are steps of about one sigma: J·L by differences, column by column.
@@ -125,15 +140,7 @@ def _uncertainty(arm: ArmModel, q: Array, approach: Array, T_flange_tool: Array)
     moved = np.array([place(with_parameter_values(arm.terms, values + step)) - here for step in steps]).reshape(
         -1, *here.shape
     )
-    return np.asarray(COVERAGE_FACTOR * np.sqrt(np.einsum("pki,pki->k", moved, moved)))
-
-
-# From the target before, an arm goes on in the same configuration while no joint turns by more than this (rad).
-_SAME = np.radians(90.0)
-# Poses of the run from which a first target is looked for.
-_STARTS = 40
-# Joints and pose of one waypoint agree within the calibration of an arm and the rounding of both (m).
-_AGREE = 0.02
+    return COVERAGE_FACTOR * np.sqrt(np.einsum("pki,pki->k", moved, moved))
 
 
 @dataclass(frozen=True)
@@ -213,7 +220,7 @@ def _nearest_solution(
     if before is not None:
         onward = joint_solutions(arm.robot, T, before[None])
         if len(onward) and np.abs(onward[0] - before).max() < _SAME:
-            return np.asarray(onward[0])
+            return onward[0]
     found = joint_solutions(arm.robot, T, starts if before is None else np.vstack([before[None], starts]))
     if not len(found):
         raise InputError(
@@ -222,7 +229,7 @@ def _nearest_solution(
         )
     reference = starts if before is None else before[None]
     turn = np.linalg.norm(found[:, None] - reference, axis=2).min(axis=1)
-    return np.asarray(found[turn.argmin()])
+    return found[turn.argmin()]
 
 
 def _require_agreement(program: Program, arm: ArmModel, point: TaughtPoint, T_joints: Array, T_pose: Array) -> None:
@@ -232,9 +239,6 @@ def _require_agreement(program: Program, arm: ArmModel, point: TaughtPoint, T_jo
             f"{program.file} line {point.line}: joints and pose of {point.name} are {off * 1e3:.0f} mm apart; to fix: "
             "check --tool, --frame, and that the session's [robot] is this arm"
         )
-
-
-# A program moved along with a part that `stitch fit` found beside its nominal place.
 
 
 @dataclass(frozen=True)
@@ -297,13 +301,6 @@ def moved_program(program: Program, T_base: Array) -> MovedProgram:
     return MovedProgram(program, np.array(moves), compensated_texts(program, np.array(moves), turns))
 
 
-# Decimals of positions, of rotations and of joint angles: what each controller stores, so that a moved target is not
-# rounded away where its number was written short. FANUC listings have three, whatever they show.
-_DECIMALS = {"kuka": (4, 5, 5), "fanuc": (3, 3, 3), "abb": (4, 9, 5), "ur": (7, 7, 7)}
-# A move below this (mm and rad together) is none: numbers are not written anew for rounding's sake.
-_NEGLIGIBLE_CHANGE = 1e-9
-
-
 def compensated_texts(program: Program, moves: Array, turns: Array, j2_in_j3: bool = False) -> dict[Path, str]:
     """Return the program's texts with its targets moved: their numbers change, every other byte stays.
 
@@ -357,16 +354,6 @@ def _edits(text: str, spans: Sequence[Span], new: Array, decimals: Sequence[int]
         (span, number_text(text[slice(*span)], float(value), places))
         for span, value, places in zip(spans, new, decimals, strict=True)
     ]
-
-
-# The rotation that goes with that, mrad for each mm: what moves a hand of half a metre by so much.
-_MRAD_PER_MM = 2.0
-# Largest turn of one joint, rad: near a singular pose joints turn far for a small move.
-_LARGEST_TURN = np.radians(3.0)
-# Joint angles this far beyond those of the run's views are worth a word (rad).
-_MAX_JOINT_EXCESS = np.radians(15.0)
-# Effects that hang on where a joint comes from.
-_HISTORY_EFFECTS = ("backlash", "settling")
 
 
 @dataclass(frozen=True)

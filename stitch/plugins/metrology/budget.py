@@ -20,6 +20,9 @@ from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors, Resp
 # whatever the degrees of freedom. These are told for who compares with a factor of Student's t.
 COVERAGE_FACTOR = 2.0
 OWN_NOISE = "noise of the feature's own points"
+# Points of a feature that a trial fits; what views share does not average out among them.
+_TRIAL_POINTS = 300
+_TRIAL_BLOCK = 200
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class MeasuredFeatures:
     def correlation(self) -> Array:
         """(Q, Q)."""
         sigma = np.maximum(np.sqrt(np.diag(self.covariance)), 1e-300)
-        return np.asarray(self.covariance / np.outer(sigma, sigma))
+        return self.covariance / np.outer(sigma, sigma)
 
 
 def measure_features(places: PlaceErrors, wanted: FeatureList) -> MeasuredFeatures:
@@ -144,7 +147,7 @@ def _unit_of(quantity: str, length_unit: str) -> str:
 
 def _root_of(covariance: Array) -> Array:
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def stack_responses(parts: Sequence[Responses]) -> Responses:
@@ -204,10 +207,10 @@ def distance_between(a: Feature, of_a: Array, b: Feature, of_b: Array) -> Array:
     if a.kind == "plane" and b.kind != "plane":
         return distance_between(b, of_b, a, of_a)
     if b.kind != "plane":
-        return np.asarray(np.linalg.norm(position_of(a, of_a) - position_of(b, of_b), axis=-1))
+        return np.linalg.norm(position_of(a, of_a) - position_of(b, of_b), axis=-1)
     x, y, z = np.moveaxis((position_of(a, of_a) - b.at) @ b.R, -1, 0)
     h, su, sv = np.moveaxis(of_b, -1, 0)
-    return np.asarray(np.abs(z - h - su * x - sv * y) / np.sqrt(1 + su**2 + sv**2))
+    return np.abs(z - h - su * x - sv * y) / np.sqrt(1 + su**2 + sv**2)
 
 
 def _distance_slopes(a: FittedFeature, b: FittedFeature) -> tuple[float, Array, Array]:
@@ -233,13 +236,6 @@ def _stated_loadings(stated: Contribution, table: FeatureNumbers) -> Array:
     return np.column_stack([stated.relative * table.values * lengths, np.diag(own)])
 
 
-# Monte Carlo (JCGM 101): every source drawn, the points moved by it, every feature fitted again.
-
-# Points of a feature that a trial fits; what views share does not average out among them.
-_TRIAL_POINTS = 300
-_TRIAL_BLOCK = 200
-
-
 @dataclass(frozen=True)
 class MonteCarlo:
     """Trials beside the linear propagation of the same fits, to at most so many points of each feature."""
@@ -252,7 +248,7 @@ class MonteCarlo:
     @property
     def ratio(self) -> Array:
         """(Q,) of the trials over the propagation; its own standard deviation is 1/√(2 · trials)."""
-        return np.asarray(self.u / np.maximum(self.propagated, 1e-300))
+        return self.u / np.maximum(self.propagated, 1e-300)
 
 
 def monte_carlo(

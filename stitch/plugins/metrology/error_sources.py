@@ -57,6 +57,9 @@ NOT_INCLUDED = (
 _MANY = 1e6
 # Directions with a smaller share of a component's largest variance are rounding.
 _ROUNDING = 1e-12
+# A source of one name: its modes as errors of views and of fitted parameters, how well its size is known, and of the
+# scanner's smooth errors which one it is.
+_Modes = tuple[str, tuple[Array, Array], float, int | None]
 
 
 def place_errors(run: RunData, chain: "ErrorChain | None" = None) -> PlaceErrors:
@@ -161,14 +164,7 @@ def _follow_overlaps(run: RunData, own: Capture, found: HandEyeSolution, centre:
         held[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] = precision
     shift = np.kron(np.eye(len(run.poses)), frames.adjoint(frames.make(np.eye(3), centre - about)))
     K = np.eye(len(H)) - np.linalg.solve(H, held)
-    return np.asarray(np.linalg.solve(shift, K @ shift))
-
-
-# Sources with their modes; those of one name are one line of a budget.
-
-# A source of one name: its modes as errors of views and of fitted parameters, how well its size is known, and of the
-# scanner's smooth errors which one it is.
-_Modes = tuple[str, tuple[Array, Array], float, int | None]
+    return np.linalg.solve(shift, K @ shift)
 
 
 def _sources(run: RunData, chain: ErrorChain) -> Iterator[ErrorSource]:
@@ -249,4 +245,4 @@ def _root(covariance: Array) -> Array:
     """(n, m) L with L·Lᵀ the covariance (n, n)."""
     values, vectors = np.linalg.eigh(covariance)
     keep = values > _ROUNDING * max(values[-1], 1e-300)
-    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
+    return vectors[:, keep] * np.sqrt(values[keep])

@@ -35,6 +35,7 @@ _SAME_NORMAL, _OUTLYING = np.cos(np.radians(45.0)), 4.0
 _FEWEST = 12
 # Of Gauss and Newton from a fit to the same points moved a little: each leaves a thousandth of what is missing.
 _STEPS = 3
+_Surface = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class FittedFeature:
         """(3, q) of `position_of` in the values."""
         if "x" in NUMBERS[self.feature.kind]:
             return np.eye(4)[1:]
-        return np.asarray(np.outer(self.feature.axis, np.eye(len(self.values))[0]))
+        return np.outer(self.feature.axis, np.eye(len(self.values))[0])
 
     @property
     def form(self) -> float:
@@ -92,7 +93,7 @@ class FittedFeature:
     @property
     def gradient(self) -> Array:
         """(q, N, 3) of the values in the points."""
-        return np.asarray(self.slopes[:, :, None] * self.normal)
+        return self.slopes[:, :, None] * self.normal
 
     def refit(self, points: Array) -> Array:
         """Return the values (q,) where the points that count lie at (N, 3)."""
@@ -107,11 +108,6 @@ class FittedFeature:
         """The same fitted to at most so many of its points."""
         keep = np.unique(np.linspace(0, len(self.residual) - 1, most).astype(np.int64))
         return fit_points(self.feature, self.at.take(keep), self.parameters)
-
-
-# Surfaces in the frame of a feature, its axis along z: residuals (N,), slopes in the parameters (N, k), normals (N, 3).
-
-_Surface = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 def _sphere(theta: Array, p: Array) -> tuple[Array, Array, Array]:
@@ -249,7 +245,7 @@ def _on_surface(feature: Feature, at: RunPoints, theta: Array, within: float) ->
     else:
         bounded = np.linalg.norm(local[:, :2], axis=1) <= feature.radius
     same = np.abs(np.einsum("ni,ni->n", normal, at.normals @ feature.R)) > _SAME_NORMAL
-    return np.asarray(bounded & same & (np.abs(residual) <= within))
+    return bounded & same & (np.abs(residual) <= within)
 
 
 def _solve(surface: _Surface, local: Array, start: Array) -> Array:
@@ -257,13 +253,13 @@ def _solve(surface: _Surface, local: Array, start: Array) -> Array:
     found = least_squares(
         lambda x: surface(x, local)[0], start, jac=lambda x: surface(x, local)[1], method="lm", x_scale="jac"
     )
-    return np.asarray(found.x)
+    return found.x
 
 
 def _values(feature: Feature, theta: Array) -> Array:
     """(q,) numbers of a feature from its parameters (k,)."""
     if "x" not in NUMBERS[feature.kind]:
-        return np.asarray(theta[: len(NUMBERS[feature.kind])])
+        return theta[: len(NUMBERS[feature.kind])]
     centre = np.zeros(3)
     centre[: min(len(theta) - 1, 3 if feature.kind == "sphere" else 2)] = theta[: 3 if feature.kind == "sphere" else 2]
     return np.append(2 * theta[-1], feature.at + feature.R @ centre)
@@ -272,8 +268,8 @@ def _values(feature: Feature, theta: Array) -> Array:
 def position_of(feature: Feature, values: Array) -> Array:
     """Return the place (..., 3) of a feature with the values (..., q): a centre, or where its axis meets it."""
     if "x" in NUMBERS[feature.kind]:
-        return np.asarray(values[..., 1:])
-    return np.asarray(feature.at + values[..., :1] * feature.axis)
+        return values[..., 1:]
+    return feature.at + values[..., :1] * feature.axis
 
 
 def _value_slopes(feature: Feature, count: int) -> Array:

@@ -17,6 +17,9 @@ from stitch.system.ply_file import vertex_columns, write_ply
 
 # What is seen at more than 60° errs most with incidence, and other views see it better.
 _LEAST_COSINE = 0.5
+# A view has a part in a fused point where it has one of its own within so many cells.
+_WITHIN = 1.5
+_BLOCK = 200_000
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Responses:
 
     def loadings(self, source: ErrorSource) -> Array:
         """(q, m) what each mode of a source does to the numbers."""
-        return np.asarray(self.views @ source.views + self.parameters @ source.parameters + self.field @ source.field)
+        return self.views @ source.views + self.parameters @ source.parameters + self.field @ source.field
 
     def combined(self, slopes: Array) -> "Responses":
         """The same of numbers with slopes (p, q) in these."""
@@ -147,13 +150,6 @@ class PlaceErrors:
         scan = self.capture.scans[v]
         cosine = self.measurement.scan_views[v].cosine[index]
         return -smooth_corrections(scan.points[index] - scan.eye, cosine, self.half)
-
-
-# The standard uncertainty of every point of the stitched cloud along its normal.
-
-# A view has a part in a fused point where it has one of its own within so many cells.
-_WITHIN = 1.5
-_BLOCK = 200_000
 
 
 def point_sigmas(places: PlaceErrors, cloud: FusedCloud) -> Array:

@@ -11,26 +11,6 @@ from stitch.plugins.watch.history import History
 from stitch.plugins.watch.report import CellReport, Change, ParameterReport, calibration_in_use, headline
 from stitch.plugins.watch.update import sessions_from
 
-# The history of a cell as a Q-DAS file: a characteristic a parameter, a row a session.
-
-
-def dfq_text(history: History, report: CellReport) -> str:
-    """All sessions of a cell as the text of a DFQ file; nominal is the calibration in use."""
-    rows = history.sql("SELECT id, time FROM runs ORDER BY time, id")
-    sessions = sessions_from(history, [run for run, _ in rows])
-    in_use = calibration_in_use(history, len(report.parameters))
-    characteristics = [
-        dfq_file.Characteristic(p.name, p.unit, middle, middle - p.limit, middle + p.limit)
-        if np.isfinite(middle) and np.isfinite(p.limit)
-        else dfq_file.Characteristic(p.name, p.unit)
-        for p, middle in zip(report.parameters, in_use, strict=True)
-    ]
-    times = [time for _, time in rows]
-    return dfq_file.dfq_text(report.name, characteristics, zip(times, sessions.values, strict=True))
-
-
-# Cells as OpenMetrics text: for the text file collector of a Prometheus node exporter, or any scraper.
-
 _OF_PARAMETERS: tuple[tuple[str, str, Callable[[ParameterReport], float]], ...] = (
     ("stitch_parameter", "Smoothed value of a parameter, in the unit that its label names.", lambda p: p.value),
     ("stitch_parameter_sigma", "Standard deviation of the smoothed value.", lambda p: p.sigma),
@@ -46,6 +26,22 @@ _OF_CELLS: tuple[tuple[str, str, Callable[[CellReport], float]], ...] = (
     ("stitch_cell_sessions", "Sessions in the history of a cell.", lambda r: float(r.sessions)),
     ("stitch_cell_last_session_seconds", "Time of the last session, seconds since 1970.", lambda r: r.last),
 )
+REPORT_FORMAT = "stitch-watch/1"
+
+
+def dfq_text(history: History, report: CellReport) -> str:
+    """All sessions of a cell as the text of a DFQ file; nominal is the calibration in use."""
+    rows = history.sql("SELECT id, time FROM runs ORDER BY time, id")
+    sessions = sessions_from(history, [run for run, _ in rows])
+    in_use = calibration_in_use(history, len(report.parameters))
+    characteristics = [
+        dfq_file.Characteristic(p.name, p.unit, middle, middle - p.limit, middle + p.limit)
+        if np.isfinite(middle) and np.isfinite(p.limit)
+        else dfq_file.Characteristic(p.name, p.unit)
+        for p, middle in zip(report.parameters, in_use, strict=True)
+    ]
+    times = [time for _, time in rows]
+    return dfq_file.dfq_text(report.name, characteristics, zip(times, sessions.values, strict=True))
 
 
 def openmetrics(reports: Sequence[CellReport]) -> str:
@@ -76,11 +72,6 @@ def _number(value: float) -> str:
     if np.isnan(value):
         return "NaN"
     return repr(float(value)) if np.isfinite(value) else ("+Inf" if value > 0 else "-Inf")
-
-
-# What a cell has to say, as JSON.
-
-REPORT_FORMAT = "stitch-watch/1"
 
 
 def report_document(report: CellReport) -> dict[str, Any]:

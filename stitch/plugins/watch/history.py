@@ -3,6 +3,12 @@
 Write-ahead logging lets pages be read while a run is appended; whoever appends holds the file from reading the last
 state to writing the next. Tables are plain, for those who ask by SQL: runs, estimates (a row per run and parameter),
 covariates, alarms; `states` are the filter's own.
+
+The hand-eye of a run as six numbers that can be compared from day to day: a twist about the part.
+
+About the scanner's own origin, a turn of the mount and a shift of it are hardly told apart: their errors go together.
+About the middle of what the scanner looks at they are: the shift is what moves there. So the mount's motion since the
+first run is counted about that point, in the axes of the frame that carries the scanner (base or flange).
 """
 
 import hashlib
@@ -26,10 +32,29 @@ from stitch.plugins.watch.run_record import Estimate, RunRecord
 from stitch.session.reading.csv_files import is_number, read_csv_lines
 from stitch.session.reading.views_table import covariate_names
 
-# When a session was measured, and under which conditions: the means of its covariates.
-
 # A time_s beyond counts seconds since 1970 (this is 2001); below, since the session began.
 _EPOCH = 1e9
+TWIST_NAMES = ("rx", "ry", "rz", "x", "y", "z")
+# Tables by which a session is known again; its clouds may be gigabytes.
+_TABLES = ("session.toml", "views.csv", "points.csv", "frames.csv", "targets.csv")
+HISTORY_FILE = "history.sqlite"
+HISTORY_FORMAT = "stitch-history/1"
+_WAIT = 60.0  # s for another process to finish its append
+_SCHEMA = """
+CREATE TABLE cell (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE runs (id INTEGER PRIMARY KEY, time REAL NOT NULL, time_from TEXT NOT NULL, name TEXT NOT NULL,
+    run TEXT NOT NULL, session TEXT NOT NULL, run_hash TEXT NOT NULL UNIQUE, session_hash TEXT NOT NULL UNIQUE,
+    numbers_hash TEXT NOT NULL UNIQUE, hand_eye TEXT NOT NULL, covariance TEXT NOT NULL, numbers TEXT NOT NULL);
+CREATE INDEX runs_in_time ON runs (time, id);
+CREATE TABLE parameters (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, unit TEXT NOT NULL);
+CREATE TABLE estimates (run INTEGER NOT NULL, parameter INTEGER NOT NULL, value REAL NOT NULL, sigma REAL NOT NULL,
+    PRIMARY KEY (run, parameter)) WITHOUT ROWID;
+CREATE TABLE covariates (run INTEGER NOT NULL, name TEXT NOT NULL, value REAL NOT NULL,
+    PRIMARY KEY (run, name)) WITHOUT ROWID;
+CREATE TABLE alarms (id INTEGER PRIMARY KEY, parameter INTEGER NOT NULL, onset INTEGER NOT NULL,
+    raised INTEGER NOT NULL, chart TEXT NOT NULL);
+CREATE TABLE states (run INTEGER PRIMARY KEY, time REAL NOT NULL, number INTEGER NOT NULL, data BLOB NOT NULL);
+"""
 
 
 def session_conditions(session: Path, result: Path) -> tuple[float, str, dict[str, float]]:
@@ -58,15 +83,6 @@ def session_conditions(session: Path, result: Path) -> tuple[float, str, dict[st
     return file.stat().st_mtime, "file time of views.csv", covariates
 
 
-# The hand-eye of a run as six numbers that can be compared from day to day: a twist about the part.
-#
-# About the scanner's own origin, a turn of the mount and a shift of it are hardly told apart: their errors go together.
-# About the middle of what the scanner looks at they are: the shift is what moves there. So the mount's motion since the
-# first run is counted about that point, in the axes of the frame that carries the scanner (base or flange).
-
-TWIST_NAMES = ("rx", "ry", "rz", "x", "y", "z")
-
-
 def mount_twist(T_mount: Array, T_mount_first: Array, centre_scanner: Array) -> Array:
     """(6,) log of the mount's motion since the first run: rad, length_unit; axes of the mount frame, about the centre.
 
@@ -74,13 +90,13 @@ def mount_twist(T_mount: Array, T_mount_first: Array, centre_scanner: Array) -> 
         centre_scanner: (3,) the middle of what the first run saw, scanner frame.
     """
     about = _watch_frame(T_mount_first, centre_scanner)
-    return np.asarray(frames.log(frames.inverse(about) @ T_mount @ frames.inverse(T_mount_first) @ about))
+    return frames.log(frames.inverse(about) @ T_mount @ frames.inverse(T_mount_first) @ about)
 
 
 def twist_covariance(covariance: Array, T_mount: Array, T_mount_first: Array, centre_scanner: Array) -> Array:
     """(6, 6) of `mount_twist` from that of the right perturbation T_mount·exp(ξ), to first order."""
     J = frames.adjoint(frames.inverse(_watch_frame(T_mount_first, centre_scanner)) @ T_mount)
-    return np.asarray(J @ covariance @ J.T)
+    return J @ covariance @ J.T
 
 
 def middle_in_scanner(poses: Array, middle: Array) -> Array:
@@ -90,19 +106,12 @@ def middle_in_scanner(poses: Array, middle: Array) -> Array:
         poses: (V, 4, 4) T_reference_scanner.
         middle: (3,) of the part, reference frame.
     """
-    return np.asarray(frames.transform(frames.inverse(poses), middle[None])[:, 0].mean(axis=0))
+    return frames.transform(frames.inverse(poses), middle[None])[:, 0].mean(axis=0)
 
 
 def _watch_frame(T_mount_first: Array, centre_scanner: Array) -> Array:
     """(4, 4) axes of the mount frame at the centre."""
     return frames.make(np.eye(3), frames.transform(T_mount_first, centre_scanner[None])[0])
-
-
-# A run folder as the record of its cell's history: parameters with sigmas, when, under which conditions, of what.
-
-
-# Tables by which a session is known again; its clouds may be gigabytes.
-_TABLES = ("session.toml", "views.csv", "points.csv", "frames.csv", "targets.csv")
 
 
 def read_record(folder: Path, at: float | None = None) -> RunRecord:
@@ -182,26 +191,6 @@ def _points(record: RunRecord) -> Array:
     from stitch.output.stored_run import fused_cloud
 
     return fused_cloud(record.path / "stitched.ply").points
-
-
-HISTORY_FILE = "history.sqlite"
-HISTORY_FORMAT = "stitch-history/1"
-_WAIT = 60.0  # s for another process to finish its append
-_SCHEMA = """
-CREATE TABLE cell (key TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE runs (id INTEGER PRIMARY KEY, time REAL NOT NULL, time_from TEXT NOT NULL, name TEXT NOT NULL,
-    run TEXT NOT NULL, session TEXT NOT NULL, run_hash TEXT NOT NULL UNIQUE, session_hash TEXT NOT NULL UNIQUE,
-    numbers_hash TEXT NOT NULL UNIQUE, hand_eye TEXT NOT NULL, covariance TEXT NOT NULL, numbers TEXT NOT NULL);
-CREATE INDEX runs_in_time ON runs (time, id);
-CREATE TABLE parameters (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, unit TEXT NOT NULL);
-CREATE TABLE estimates (run INTEGER NOT NULL, parameter INTEGER NOT NULL, value REAL NOT NULL, sigma REAL NOT NULL,
-    PRIMARY KEY (run, parameter)) WITHOUT ROWID;
-CREATE TABLE covariates (run INTEGER NOT NULL, name TEXT NOT NULL, value REAL NOT NULL,
-    PRIMARY KEY (run, name)) WITHOUT ROWID;
-CREATE TABLE alarms (id INTEGER PRIMARY KEY, parameter INTEGER NOT NULL, onset INTEGER NOT NULL,
-    raised INTEGER NOT NULL, chart TEXT NOT NULL);
-CREATE TABLE states (run INTEGER PRIMARY KEY, time REAL NOT NULL, number INTEGER NOT NULL, data BLOB NOT NULL);
-"""
 
 
 class History:
@@ -338,9 +327,6 @@ def insert_run(history: History, record: RunRecord, numbers_hash: str) -> int:
     columns = "time, time_from, name, run, session, run_hash, session_hash, numbers_hash, hand_eye, covariance, numbers"
     text = f"INSERT INTO runs ({columns}) VALUES ({', '.join('?' * 11)}) RETURNING id"
     return int(history.sql(text, *row, json.dumps(record.numbers))[0][0])
-
-
-# What people state of a cell: which calibration it uses, and when a run was measured.
 
 
 def use_calibration(history: History, run_hash: str) -> None:

@@ -12,7 +12,9 @@ from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, covariate_unit, display_unit, length_text
 from stitch.plugins.watch.history import History
-from stitch.plugins.watch.tracking import COVARIATES, SLOPE, Alarm, Bank, find_onset, predicted_bank, smoothed_states
+from stitch.plugins.watch.onset import find_onset
+from stitch.plugins.watch.state_bank import COVARIATES, SLOPE, Bank, predicted_bank
+from stitch.plugins.watch.tracking import Alarm, smoothed_states
 from stitch.plugins.watch.update import (
     DAY_SECONDS,
     SessionColumns,
@@ -24,11 +26,22 @@ from stitch.plugins.watch.update import (
     stored_alarms,
 )
 
-# Until when a calibration holds: the first time at which a parameter may have left its limits with 5 % probability.
-
 HORIZON = 180.0  # days that are looked ahead
 _RISK = 0.05
 _STEPS = 720
+# Sessions before and after an onset that tell what began there, and how few tell nothing.
+_AROUND, _FEWEST = 300, 3
+# A slope or a share of a channel that is so unlikely by chance is named (per parameter and channel).
+_FOLLOWS_P_LIMIT = 1e-4
+# Expanded uncertainty: within which a calibration claims to be right.
+_COVERAGE_FACTOR = 2.0
+# Sessions that a page shows: a month of 20 a day.
+MAX_SESSIONS = 600
+# Steps of several parameters that begin within so many seconds are one event.
+_TOGETHER = 24 * 3600.0
+# Sessions that scatter by more than so many stated sigmas are remarked.
+_WIDE = 2.0
+_PLACES = {"hand_eye": "the mount"}
 
 
 def days_valid(bank: Bank, conditions: Array, in_use: Array, limits: Array) -> Array:
@@ -53,12 +66,6 @@ def days_valid(bank: Bank, conditions: Array, in_use: Array, limits: Array) -> A
         risk[k] = ndtr((off - limits) / sigma) + ndtr((-limits - off) / sigma)
     late = np.nan_to_num(risk) > _RISK
     return np.where(late.any(axis=0), ahead[np.argmax(late, axis=0)], np.inf)
-
-
-# What happened to a parameter: its alarms with kind, size and onset, as all sessions since tell them.
-
-# Sessions before and after an onset that tell what began there, and how few tell nothing.
-_AROUND, _FEWEST = 300, 3
 
 
 @dataclass(frozen=True)
@@ -197,14 +204,6 @@ class CellReport:
         return sorted(found, key=lambda p: p.limit / max(p.own_sigma, 1e-300))
 
 
-# A history judged: where the parameters of the cell are, what stands, what may still be used.
-
-# A slope or a share of a channel that is so unlikely by chance is named (per parameter and channel).
-_FOLLOWS_P_LIMIT = 1e-4
-# Expanded uncertainty: within which a calibration claims to be right.
-_COVERAGE_FACTOR = 2.0
-
-
 def cell_report(history: History, tolerance: float | None = None) -> CellReport:
     """What is known after the last session.
 
@@ -315,12 +314,6 @@ def _parameter_limits(history: History, names: SessionColumns, sigmas: Array, to
     return np.asarray(limits, float)
 
 
-# The course of a cell as a page shows it: what its last sessions found, and where the parameters were.
-
-# Sessions that a page shows: a month of 20 a day.
-MAX_SESSIONS = 600
-
-
 @dataclass(frozen=True)
 class CellTrend:
     """n sessions, P parameters of the report, in its units."""
@@ -380,13 +373,6 @@ def _channels(history: History, runs: list[int]) -> dict[str, Array]:
     return out
 
 
-# What moves in a cell, in one sentence an event.
-
-# Steps of several parameters that begin within so many seconds are one event.
-_TOGETHER = 24 * 3600.0
-# Sessions that scatter by more than so many stated sigmas are remarked.
-_WIDE = 2.0
-_PLACES = {"hand_eye": "the mount"}
 _Alarmed = tuple[ParameterReport, Change]
 
 
@@ -497,9 +483,6 @@ def _recalibration_note(report: CellReport) -> str:
     if end <= report.last:
         return "the calibration in use does not hold: recalibrate now"
     return f"recalibrate before {day_text(end)}"
-
-
-# Units in which parameters are told in tables and drawings: those with digits before the point.
 
 
 def table_unit(unit: str, length_unit: str) -> tuple[float, str]:

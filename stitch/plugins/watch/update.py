@@ -1,4 +1,10 @@
-"""A run joins the history of its cell: stored, then followed from the last state on."""
+"""A run joins the history of its cell: stored, then followed from the last state on.
+
+What a parameter may follow where nothing moves: the channels, how fast temperatures change, and the hour.
+
+Arms and mounts lag behind the air by hours. A temperature and its lag together span every delayed response, whatever
+the weather does to the swing of the day; the hour spans what nobody has a thermometer for.
+"""
 
 import hashlib
 import io
@@ -10,6 +16,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
+from stitch.plugins.watch.control_charts import Charts
 from stitch.plugins.watch.history import (
     TWIST_NAMES,
     History,
@@ -20,22 +27,16 @@ from stitch.plugins.watch.history import (
     twist_covariance,
 )
 from stitch.plugins.watch.run_record import Estimate, RunRecord
+from stitch.plugins.watch.state_bank import Bank
 from stitch.plugins.watch.tracking import (
     Alarm,
-    Bank,
     CellState,
-    Charts,
     Sessions,
     alarming_parameters,
     first_state,
     next_state,
     raise_alarm,
 )
-
-# What a parameter may follow where nothing moves: the channels, how fast temperatures change, and the hour.
-#
-# Arms and mounts lag behind the air by hours. A temperature and its lag together span every delayed response, whatever
-# the weather does to the swing of the day; the hour spans what nobody has a thermometer for.
 
 DAY_SECONDS = 86400.0
 # Every channel costs sessions until its share is known.
@@ -46,6 +47,13 @@ LOOK_BACK = _LAG * _GONE
 # How far, in sigmas, a parameter may follow a degree, or the hour; of other channels nothing is believed.
 _BELIEVED = 10.0
 _HOURS = 2
+# So many rows are asked for by their numbers; of more the table is read.
+_MANY = 2000
+# A state is kept at every so many sessions, the last few hundred sessions long, and beyond at longer intervals.
+_STEP, _FAR, _LATE = 32, 512, 640
+# One false alarm of the whole cell in so many sessions where nothing happens: two hundred months of 600, so that one in
+# a hundred remains where parameters follow temperatures in ways that the regressors do not quite have.
+RUN_LENGTH = 120_000.0
 
 
 def chosen_channels(covariates: Iterable[str]) -> list[str]:
@@ -92,12 +100,6 @@ def _lagged_means(times: Array, values: Array) -> Array:
         total, weight = total * fade[k] + value, weight * fade[k] + 1.0
         out[k] = total / weight
     return out
-
-
-# The sessions of a history as arrays, in the order of time.
-
-# So many rows are asked for by their numbers; of more the table is read.
-_MANY = 2000
 
 
 @dataclass(frozen=True)
@@ -168,12 +170,6 @@ def _rows_of_runs(history: History, table: str, runs: Sequence[int]) -> list[tup
         known = set(runs)
         return [row for row in history.sql(f"SELECT * FROM {table}") if row[0] in known]
     return history.sql(f"SELECT * FROM {table} WHERE run IN ({', '.join('?' * len(runs))})", *runs)
-
-
-# The states of a history brought up to its last session; one that comes late is followed from its time on.
-
-# A state is kept at every so many sessions, the last few hundred sessions long, and beyond at longer intervals.
-_STEP, _FAR, _LATE = 32, 512, 640
 
 
 def catch_up(history: History, since: float) -> None:
@@ -287,11 +283,6 @@ def _unpack_state(data: bytes) -> CellState:
         bank = Bank(**{field.name: stored[field.name] for field in fields(Bank)})
         charts = Charts(**{field.name: stored[field.name] for field in fields(Charts)})
         return CellState(bank, charts, float(stored["day"]))
-
-
-# One false alarm of the whole cell in so many sessions where nothing happens: two hundred months of 600, so that one in
-# a hundred remains where parameters follow temperatures in ways that the regressors do not quite have.
-RUN_LENGTH = 120_000.0
 
 
 def append_runs(history: History, records: Sequence[RunRecord]) -> int:

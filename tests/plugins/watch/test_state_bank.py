@@ -4,17 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from stitch.plugins.watch.tracking import (
-    MEMBERS,
-    Sessions,
-    empty_bank,
-    first_state,
-    next_state,
-    predicted_bank,
-    smoothed_states,
-    updated_bank,
-    with_parameters,
-)
+from stitch.plugins.watch.state_bank import MEMBERS, empty_bank, predicted_bank, updated_bank, with_parameters
+from stitch.plugins.watch.tracking import Sessions, first_state, next_state, smoothed_states
 
 
 def random_sessions(seed: int, n: int, P: int = 2, steps: float = 0.05) -> Sessions:

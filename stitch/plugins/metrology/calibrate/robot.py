@@ -1,4 +1,13 @@
-"""Kinematic calibration of a robot: the nominal arm with what a model found, and the poses that would tell more."""
+"""Kinematic calibration of a robot: the nominal arm with what a model found, and the poses that would tell more.
+
+An arm as a table of links: fitted for what such a table can hold, and proved by reading it back.
+
+Offsets and links of a model are right beside its compliance and its gears, which no table holds; without these they
+may leave more than the nominal arm does. So the table is fitted alone: all offsets and links, each with a prior of
+what makers' tolerances are. How far they are trusted is told by whole ends of the joints' ranges that are left out,
+since what imitates a gear where it was measured errs elsewhere. The proof: fitted without such an end, it is written
+and read back, and that end is run with it and with the nominal arm, base and tool fitted anew for either.
+"""
 
 import tempfile
 import tomllib
@@ -31,6 +40,15 @@ from stitch.session.session import SessionData, View
 # The effects that DH rows can express.
 GEOMETRY = ("joint_offset", "link_geometry")
 _PROPOSED, _TRIED = 6, 250
+# Sizes of the prior that are tried, in plausible sizes of each parameter.
+LINK_TRUSTS = tuple(2.0**k for k in range(-6, 3))
+# Of the views, how many an end holds; joints that turn less than this, rad, have none. The table is proved at ends of
+# the joints that turn farthest.
+_END, _STILL, _ENDS_PROVED = 1 / 3, 0.05, 6
+_CHANCE = 0.01  # that a table which is no better than the nominal arm is said to be
+_FEWEST_VIEWS, _NUMBERS_EACH = 12, 3
+_UNSEEN = 1e-9  # of the largest eigenvalue: what these views do not show of hand-eye and targets
+_HEADER = "The [robot] table of session.toml: put it there in place of the nominal one."
 
 
 @dataclass(frozen=True)
@@ -119,25 +137,7 @@ def poses_to_add(run: RunData) -> Array:
         gains = [np.linalg.slogdet(known + w.T @ w)[1] if k not in chosen else -np.inf for k, w in enumerate(white)]
         chosen.append(int(np.argmax(gains)))
         known = known + white[chosen[-1]].T @ white[chosen[-1]]
-    return np.asarray(np.degrees(joints[chosen]))
-
-
-# An arm as a table of links: fitted for what such a table can hold, and proved by reading it back.
-#
-# Offsets and links of a model are right beside its compliance and its gears, which no table holds; without these they
-# may leave more than the nominal arm does. So the table is fitted alone: all offsets and links, each with a prior of
-# what makers' tolerances are. How far they are trusted is told by whole ends of the joints' ranges that are left out,
-# since what imitates a gear where it was measured errs elsewhere. The proof: fitted without such an end, it is written
-# and read back, and that end is run with it and with the nominal arm, base and tool fitted anew for either.
-
-# Sizes of the prior that are tried, in plausible sizes of each parameter.
-LINK_TRUSTS = tuple(2.0**k for k in range(-6, 3))
-# Of the views, how many an end holds; joints that turn less than this, rad, have none. The table is proved at ends of
-# the joints that turn farthest.
-_END, _STILL, _ENDS_PROVED = 1 / 3, 0.05, 6
-_CHANCE = 0.01  # that a table which is no better than the nominal arm is said to be
-_FEWEST_VIEWS, _NUMBERS_EACH = 12, 3
-_UNSEEN = 1e-9  # of the largest eigenvalue: what these views do not show of hand-eye and targets
+    return np.degrees(joints[chosen])
 
 
 @dataclass(frozen=True)
@@ -227,14 +227,14 @@ class SeenLinks:
         whole, unit = equilibrated(self.products[views].sum(axis=0))
         a = self.unknowns
         rest = whole[a:, a:] - whole[a:, :a] @ np.linalg.pinv(whole[:a, :a], _UNSEEN, hermitian=True) @ whole[:a, a:]
-        return np.asarray(rest / np.outer(unit[a:], unit[a:]))
+        return rest / np.outer(unit[a:], unit[a:])
 
     def fit(self, views: Mask, scale: float) -> Array:
         """(P,) in plausible sizes, with a prior of so many of them."""
         rest = self._without_base(views)
         if not scale:
             return np.zeros(len(rest) - 1)
-        return np.asarray(np.linalg.solve(rest[:-1, :-1] + np.eye(len(rest) - 1) / scale**2, rest[:-1, -1]))
+        return np.asarray(np.linalg.solve(rest[:-1, :-1] + np.eye(len(rest) - 1) / scale**2, rest[:-1, -1]), float)
 
     def left_at(self, end: Mask, scale: float) -> float:
         """The sum of squares there under what the other views tell."""
@@ -291,7 +291,7 @@ def _judge(session: SessionData, names: Sequence[str], proof: Sequence[tuple[Mas
     except (InputError, NoResultError):
         return None
     with np.errstate(invalid="ignore"):
-        return np.asarray(total / count)
+        return total / count
 
 
 def _read_back(robot: Robot, unit: str) -> Robot:
@@ -318,11 +318,6 @@ def _with_reported_arm(session: SessionData, robot: Robot) -> SessionData:
         return replace(view, T_base_flange=view.T_base_flange @ frames.inverse(before) @ after)
 
     return replace(session, robot=robot, views=tuple(map(moved, session.views)))
-
-
-# What `stitch calibrate robot` writes: robot.toml, robot.urdf and one JSON document.
-
-_HEADER = "The [robot] table of session.toml: put it there in place of the nominal one."
 
 
 def write_robot(table: LinkTable, run: RunData, folder: Path) -> None:

@@ -31,6 +31,11 @@ _VIEWS_FOR_RADIUS = 6
 _OTHER_RADIUS, _RADIUS_SIGMAS = 0.02, 4.0
 # Column of views.csv: the side of the laser plane, along the arc's normal, on which the centre lies.
 SIDE_COLUMN = "sphere_side"
+# A view's points are off by more than their noise beyond this ratio.
+_BEYOND_NOISE = 3.0
+_FREE_RADIUS_SIGMAS = 3.0
+# A view that counts less than this is named.
+_DOUBTED = 0.5
 
 
 @dataclass(frozen=True)
@@ -136,15 +141,6 @@ def find_sphere_start(G: Array, views: tuple[SphereView, ...], coarse: Array | N
             first = refine_start(G, views, SphereStart(T, said, np.inf, np.inf))
             return first, "decoupled: rotation from equal orientations, translation from different ones"
     return global_start(G, views, coarse), "global: the best of many rotations"
-
-
-# What a sphere calibration says: sentences for people, a document for programs.
-
-# A view's points are off by more than their noise beyond this ratio.
-_BEYOND_NOISE = 3.0
-_FREE_RADIUS_SIGMAS = 3.0
-# A view that counts less than this is named.
-_DOUBTED = 0.5
 
 
 def sphere_weak_components(result: SphereCalibration, unit: str) -> list[str]:

@@ -8,6 +8,22 @@ averages out: a shift σ_p per axis of the sphere (the robot), an error σ_ρ of
 error of the points σ_c that is one over the view (both the scanner). Near the equator of the sphere a
 radius off by σ_ρ puts the centre ρ/h·σ_ρ off, h its distance from the laser plane. All three are found by
 restricted maximum likelihood (Patterson & Thompson 1971).
+
+Each scan of the known sphere on its own: where the centre can be, in the scanner frame.
+
+A laser line on the sphere is a circle of radius ρ; the centre lies √(R² − ρ²) off the laser plane, to
+one side or the other. The sense of the arc gives the plane's normal a sign that a person can name: the
+cross product of the vectors through its upper, middle and lower points in the order of the file, the
+same for every line of one scanner. It cannot say on which side of the plane the sphere lies.
+
+How the views of a sphere scatter: σ_p of the sphere's place, σ_ρ of its apparent radius, σ_c of the points.
+
+All three are found by restricted maximum likelihood (Patterson & Thompson 1971).
+
+First hand-eye from sphere centres: decoupled where the poses allow it, else from many rotations.
+
+G (V, 4, 4) is T_reference_mount: T_base_flange with the scanner on the robot, T_flange_base with the
+sphere on it. The centre is fixed in the reference frame: c = G_v X q_v for the centres q_v seen.
 """
 
 from collections.abc import Sequence
@@ -23,13 +39,6 @@ from stitch.numerics.frames import Array
 from stitch.plugins.intake.detection.balls import fit_ball
 from stitch.plugins.metrology.calibrate.tracker import Jackknife, jackknife
 
-# Each scan of the known sphere on its own: where the centre can be, in the scanner frame.
-#
-# A laser line on the sphere is a circle of radius ρ; the centre lies √(R² − ρ²) off the laser plane, to
-# one side or the other. The sense of the arc gives the plane's normal a sign that a person can name: the
-# cross product of the vectors through its upper, middle and lower points in the order of the file, the
-# same for every line of one scanner. It cannot say on which side of the plane the sphere lies.
-
 # Points whose rms distance from a plane is below this share of their extent are a laser line.
 _FLAT = 1e-3
 # A circle may come out larger than the sphere by noise, not by this share.
@@ -37,6 +46,25 @@ _TOO_LARGE = 0.05
 _FEWEST = 20
 # A surface whose own radius is this much off the sphere's is something else.
 _OTHER = 0.2
+# Step of the central differences (rad and lengths).
+_STEP = 1e-5
+# Mean square over the numbers of a view, in sigmas: beyond it a view counts less (a view in 150 by chance).
+_OUTLYING = 4.0
+# Views whose 21 numbers leave as many as the fit has unknowns, and a few more.
+_FEWEST_TRUSTED = 7
+# Recorded "equal" orientations differ by up to 0.08° in real logs.
+_EQUAL = np.radians(0.1)
+_ROTATIONS = 600
+_REFINED = 24
+# Two hand-eyes further apart than this (rad) are two answers.
+_DISTINCT = 0.2
+# Singular values below this share of the first give no direction.
+_RANK = 0.02
+_ROUNDS = 20
+# Numbers that the views must leave over for their scatter.
+_FREE = 6
+# Relative change of the scatters that ends the search.
+_SMALL = 0.01
 
 
 @dataclass(frozen=True)
@@ -124,18 +152,12 @@ def arc_normal(arc: Array, normal: Array) -> Array:
     """The plane's unit normal (3,), signed by the sense in which the arc (N, 3) is run through."""
     third = max(1, len(arc) // 3)
     upper, middle, lower = arc[:third].mean(axis=0), arc[third:-third].mean(axis=0), arc[-third:].mean(axis=0)
-    return np.asarray(normal * (np.sign(np.cross(middle - upper, lower - middle) @ normal) or 1.0))
+    return normal * (np.sign(np.cross(middle - upper, lower - middle) @ normal) or 1.0)
 
 
 def centres(views: Sequence[SphereView], signs: Array) -> Array:
     """Centres (V, 3) of the sphere in the scanner frame for one choice of sides (V,)."""
     return np.array([v.foot + s * v.offset * v.normal for v, s in zip(views, signs, strict=True)])
-
-
-# What each view says of one sphere, predicted less measured, as residuals, Jacobians and one weighted solve.
-
-# Step of the central differences (rad and lengths).
-_STEP = 1e-5
 
 
 @dataclass(frozen=True)
@@ -192,16 +214,6 @@ def linearise_sphere(
     return e, jacobian, response
 
 
-# How the views of a sphere scatter: σ_p of the sphere's place, σ_ρ of its apparent radius, σ_c of the points.
-#
-# All three are found by restricted maximum likelihood (Patterson & Thompson 1971).
-
-# Mean square over the numbers of a view, in sigmas: beyond it a view counts less (a view in 150 by chance).
-_OUTLYING = 4.0
-# Views whose 21 numbers leave as many as the fit has unknowns, and a few more.
-_FEWEST_TRUSTED = 7
-
-
 def view_covariances(
     views: Sequence[SphereView], response: Sequence[Array], scatter: Array, shares: Array
 ) -> list[Array]:
@@ -226,7 +238,7 @@ def find_shares(e: Sequence[Array], whole: Sequence[Array]) -> Array:
     """
     square = np.array([r @ np.linalg.solve(V, r) / len(r) for r, V in zip(e, whole, strict=True)])
     limit = max(_OUTLYING, np.sort(square)[trusted_views(len(square)) - 1])
-    return np.asarray(np.minimum(1.0, limit / np.maximum(square, 1e-12)) ** 2)
+    return np.minimum(1.0, limit / np.maximum(square, 1e-12)) ** 2
 
 
 def trusted_views(views: int) -> int:
@@ -260,22 +272,7 @@ def find_scatter(
     floor = np.log(1e-3 * np.median([v.sigma for v in views]))
     bounds = [(max(x - 2, floor), max(x + 2, floor + 1)) for x in start]
     found = minimize(cost, np.maximum(start, floor), method="L-BFGS-B", bounds=bounds).x
-    return np.asarray(np.exp(found))
-
-
-# First hand-eye from sphere centres: decoupled where the poses allow it, else from many rotations.
-#
-# G (V, 4, 4) is T_reference_mount: T_base_flange with the scanner on the robot, T_flange_base with the
-# sphere on it. The centre is fixed in the reference frame: c = G_v X q_v for the centres q_v seen.
-
-# Recorded "equal" orientations differ by up to 0.08° in real logs.
-_EQUAL = np.radians(0.1)
-_ROTATIONS = 600
-_REFINED = 24
-# Two hand-eyes further apart than this (rad) are two answers.
-_DISTINCT = 0.2
-# Singular values below this share of the first give no direction.
-_RANK = 0.02
+    return np.exp(found)
 
 
 @dataclass(frozen=True)
@@ -394,7 +391,7 @@ def refine_start(G: Array, views: Sequence[SphereView], start: SphereStart) -> S
 
     def off(x: Array) -> Array:
         T = G @ start.T_mount @ frames.exp(x[:6])
-        return np.asarray((soft @ (q - frames.transform(frames.inverse(T), x[None, 6:])[:, 0])[..., None])[..., 0])
+        return (soft @ (q - frames.transform(frames.inverse(T), x[None, 6:])[:, 0])[..., None])[..., 0]
 
     place = np.median(frames.transform(G @ start.T_mount, q[:, None])[:, 0], axis=0)
     begin = np.concatenate([np.zeros(6), place])
@@ -411,13 +408,6 @@ def _offset_weight(view: SphereView) -> float:
         return 1.0
     radius = float(np.linalg.norm(view.points - view.foot, axis=1).mean())
     return min(1.0, view.offset / radius)
-
-
-_ROUNDS = 20
-# Numbers that the views must leave over for their scatter.
-_FREE = 6
-# Relative change of the scatters that ends the search.
-_SMALL = 0.01
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,16 @@
 Probe on the flange, sensor in the cell (eye_to_hand): T_base_flange · T_flange_probe =
 T_base_sensor · T_sensor_probe. Camera on the flange, board in the cell (eye_in_hand):
 T_base_flange · T_flange_camera = T_base_board · T_camera_board⁻¹. Both are A·X = Z·B.
+
+Covariance counted in views: leaving one out at a time, from normal equations alone.
+
+A covariance from single points or coordinates takes every one as independent. The robot's pose errs
+once per view, so views are the samples. Leaving a view out is one Newton step from the solution.
+
+Nonlinear least squares for A·X = Z·B, with covariance in views.
+
+Residual of a view: the twist log((A X)⁻¹ Z B) in the probe's frame.
+Rotations and translations scatter by σ_r and σ_t, both found from the residuals unless given.
 """
 
 from collections.abc import Sequence
@@ -21,10 +31,25 @@ from stitch.numerics.least_squares import grouped_inflation
 from stitch.session.reading.target_tables import read_frames
 from stitch.session.session import SessionData
 
-# Covariance counted in views: leaving one out at a time, from normal equations alone.
-#
-# A covariance from single points or coordinates takes every one as independent. The robot's pose errs
-# once per view, so views are the samples. Leaving a view out is one Newton step from the solution.
+_STEPS = 30
+# A step below this share of the sigmas changes nothing.
+_SMALL = 1e-6
+# Beyond this many sigmas a robust fit counts a residual by its size, not its square (Huber).
+_HUBER = 2.0
+# Numbers of X and Z.
+_UNKNOWNS = 12
+# A component is weak where it is this many times worse known than one view is measured.
+_WEAK = 3.0
+# Wrists that turn less than this between any two views hardly turn (rad).
+_LITTLE = np.radians(45.0)
+# Views to compare in pairs; more are thinned out evenly.
+_VIEWS = 60
+# Second opinions further off than this many sigmas speak against independent errors.
+_SURE = 3.0
+# Rotations (rad) that scatter more than this do not belong to one base and tool.
+_UNRELATED = 0.3
+# Enough places for a spread among them, enough views in each to lose it without loss of rank.
+_PLACES, _VIEWS_PER_PLACE = 25, 6
 
 
 @dataclass(frozen=True)
@@ -57,20 +82,6 @@ def jackknife(information: Array, gradient: Array, model: Array | None = None) -
     # Steps of few views hardly span the parameters: they say nothing about the spread.
     inflation = grouped_inflation(steps, model) if count > n / 2 + 2 else 1.0
     return Jackknife(model * inflation, inflation, steps)
-
-
-# Nonlinear least squares for A·X = Z·B, with covariance in views.
-#
-# Residual of a view: the twist log((A X)⁻¹ Z B) in the probe's frame.
-# Rotations and translations scatter by σ_r and σ_t, both found from the residuals unless given.
-
-_STEPS = 30
-# A step below this share of the sigmas changes nothing.
-_SMALL = 1e-6
-# Beyond this many sigmas a robust fit counts a residual by its size, not its square (Huber).
-_HUBER = 2.0
-# Numbers of X and Z.
-_UNKNOWNS = 12
 
 
 @dataclass(frozen=True)
@@ -162,16 +173,6 @@ def _residual_scatter(e: Array, robust: bool) -> tuple[float, float]:
     return max(rotation / np.sqrt(free), 1e-12), max(translation / np.sqrt(free), 1e-9)
 
 
-# What a calibrated hand-eye's covariance says: which components are weak, and how little the wrist turned.
-
-# A component is weak where it is this many times worse known than one view is measured.
-_WEAK = 3.0
-# Wrists that turn less than this between any two views hardly turn (rad).
-_LITTLE = np.radians(45.0)
-# Views to compare in pairs; more are thinned out evenly.
-_VIEWS = 60
-
-
 def hand_eye_document(
     kind: str, session: SessionData, T_mount: Array, covariance: Array, inflation: float, G: Array
 ) -> dict[str, Any]:
@@ -238,14 +239,6 @@ def weak_components(covariance: Array, view_sigma: float, lever: float, unit: st
     return out
 
 
-# Second opinions further off than this many sigmas speak against independent errors.
-_SURE = 3.0
-# Rotations (rad) that scatter more than this do not belong to one base and tool.
-_UNRELATED = 0.3
-# Enough places for a spread among them, enough views in each to lose it without loss of rank.
-_PLACES, _VIEWS_PER_PLACE = 25, 6
-
-
 @dataclass(frozen=True)
 class TrackerCalibration:
     """X (on the flange), Z (in the base) and what is left."""
@@ -294,7 +287,7 @@ def _neighbourhoods(A: Array) -> Array | None:
     """Labels (V,) of places in the workspace: what base and tool do not explain errs alike in one place."""
     if len(A) < _VIEWS_PER_PLACE * _PLACES:
         return None
-    return np.asarray(kmeans2(A[:, :3, 3], _PLACES, minit="++", rng=0)[1])
+    return kmeans2(A[:, :3, 3], _PLACES, minit="++", rng=0)[1]
 
 
 def tracker_document(result: TrackerCalibration, session: SessionData) -> dict[str, Any]:

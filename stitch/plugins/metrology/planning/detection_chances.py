@@ -5,6 +5,16 @@ candidate effect is then judged as a diagnosis judges it (`diagnosis.evidence`),
 p, Bayes factor, and odds over every rival in the model in which neither of the two is among the errors that remain, and
 over joints that follow by no law; not over a flange that errs in time by no law.
 What a diagnosis asks of views left out is not drawn.
+
+One candidate beside a model of planned views: its log Bayes factor and its F test on whatever these may see.
+
+The variances are the expected ones and stay as they are, so that a test is a few small matrices and thousands of
+draws cost nothing.
+
+From which size on planned views would tell one effect from another, pair by pair.
+
+Two effects are told apart by what of one's pattern the other cannot imitate, λ in units of the scatter; it grows with
+the square of the size. The other may take all its parameters, each up to about ten times its plausible size.
 """
 
 from collections.abc import Sequence
@@ -37,13 +47,9 @@ from stitch.plugins.metrology.planning.expected_model import (
 from stitch.session.session import SessionData
 from stitch.system.process import steps
 
-# One candidate beside a model of planned views: its log Bayes factor and its F test on whatever these may see.
-#
-# The variances are the expected ones and stay as they are, so that a test is a few small matrices and thousands of
-# draws cost nothing.
-
 # Combinations that views see less than this share of a sigma, at plausible size, count in no p-value.
 _MIN_INFORMATION = 1e-2
+DRAWS = 100
 
 
 @dataclass(frozen=True)
@@ -118,12 +124,6 @@ def _form_test(linear: LinearModel, columns: Array, weight: float, tests: int, s
     )
 
 
-# From which size on planned views would tell one effect from another, pair by pair.
-#
-# Two effects are told apart by what of one's pattern the other cannot imitate, λ in units of the scatter; it grows with
-# the square of the size. The other may take all its parameters, each up to about ten times its plausible size.
-
-
 @dataclass(frozen=True)
 class EffectPair:
     """Two effects, and the multiple of its usual size from which each is told from the other."""
@@ -175,11 +175,6 @@ def _median(values: Array, weights: Array) -> float:
     order = np.argsort(values)
     share = np.cumsum(weights[order]) / weights.sum()
     return float(values[order][np.searchsorted(share, 0.5)])
-
-
-# What a diagnosis would say of one effect, over draws of what planned views may see.
-
-DRAWS = 100
 
 
 @dataclass(frozen=True)
@@ -256,12 +251,12 @@ class ExpectedDiagnosis:
         # Of each law the log Bayes factor at the likeliest of its sizes.
         factors = [[np.max([size.evaluate(numbers)[0] for size in law], axis=0) for law in kind] for kind in kinds]
         rival = log_posterior_of_any(np.array([log_mean_exp(np.array(kind)) for kind in factors]))
-        return np.asarray(own.evaluate(numbers)[0] + np.log(limits.PRIOR_PHYSICAL / self.tests) > rival + limits.ODDS)
+        return own.evaluate(numbers)[0] + np.log(limits.PRIOR_PHYSICAL / self.tests) > rival + limits.ODDS
 
     def _ahead(self, k: int, other: int, numbers: Array) -> Mask:
         pair = [self.candidates[k], self.candidates[other]]
         own, rival = (self._test({c.name for c in pair}, c).evaluate(numbers)[0] for c in pair)
-        return np.asarray(own > rival + limits.ODDS)
+        return own > rival + limits.ODDS
 
 
 def _is_visible(linear: LinearModel, candidate: Candidate) -> bool:
@@ -281,9 +276,6 @@ def usual_shifts(candidate: Candidate, rng: np.random.Generator, draws: int = DR
         form = candidate.forms[k]
         out.append(form.columns @ (form.sizes * rng.choice([-1.0, 1.0], len(form.sizes))))
     return np.array(out).T
-
-
-# What some views would tell: the hand-eye's U, what could be detected and named, what could not be told apart.
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,10 @@
-"""Planned views as a linear model: what their scans would say, with the scatter that is expected of them."""
+"""Planned views as a linear model: what their scans would say, with the scatter that is expected of them.
+
+How large errors of planned views would be found: what they would see is drawn, and fitted as a run fits it.
+
+No number of views excludes that an arm errs by a little more than its scatter; how much they leave open is what the
+covariance of a run counts. It is the posterior mean of the variances, averaged over draws.
+"""
 
 from __future__ import annotations
 
@@ -36,14 +42,27 @@ from stitch.session.session import SessionData
 if TYPE_CHECKING:
     import trimesh
 
-# Few diagnoses look at a mesh: trimesh is loaded where one is read or made.
-
-# The surface of a part that views would see: of a mesh, of a cloud with normals, or a block as large as the part.
 
 # Points on the whole surface: a view sees a third of them, and a few thousand say what millions would.
 _POINTS = 9_000
 # Sides of a block that stands for a part of which only the size is known.
 _SIDES = np.array([1.0, 0.7, 0.5])
+# A ray is as wide as so many distances between the points; what lies so many rays' widths behind another is hidden.
+_RAY, _BEHIND = 2.0, 4.0
+# Cosine to the optical axis beyond which no scanner sees.
+_AHEAD = 0.3
+# Scatter of a good arm's flange, sigma per axis (rad, mm), and an area scanner's noise along the ray (mm): where nobody
+# states them. EN ISO 9283 repeatabilities of 0.05 to 0.1 mm are sigmas of 14 to 28 µm.
+USUAL_ROTATION, USUAL_TRANSLATION, USUAL_NOISE = 20e-6, 0.02, 0.02
+_SPACINGS, _SIGMAS = 1.5, 6.0  # of the gate
+# Fewer points of a view say nothing of six directions.
+FEWEST = 60
+# Full angle of the field where nobody states it, and how far it reaches about the standoff.
+USUAL_FIELD_DEG, _DEPTH = 30.0, 0.3
+# Of what a run's scanner saw, the share that counts as its field, and what is added to it.
+_SEEN, _MARGIN = 0.99, 0.1
+# Draws among so many numbers at the most; a fit among more takes seconds, and the expected variances must do.
+_DRAWS = ((150, 3), (400, 1))
 
 
 @dataclass(frozen=True)
@@ -56,7 +75,7 @@ class PlannedPart:
     @property
     def centre(self) -> Array:
         """(3,) middle of its box."""
-        return np.asarray((self.points.min(axis=0) + self.points.max(axis=0)) / 2)
+        return (self.points.min(axis=0) + self.points.max(axis=0)) / 2
 
     @property
     def size(self) -> float:
@@ -119,14 +138,6 @@ def surface_of_mesh(mesh: trimesh.Trimesh) -> PlannedPart:
     return PlannedPart(np.asarray(points), np.asarray(mesh.face_normals[faces]))
 
 
-# What a scanner would see of a surface from a pose: points in its field that face it, and nothing before them.
-
-# A ray is as wide as so many distances between the points; what lies so many rays' widths behind another is hidden.
-_RAY, _BEHIND = 2.0, 4.0
-# Cosine to the optical axis beyond which no scanner sees.
-_AHEAD = 0.3
-
-
 @dataclass(frozen=True)
 class FieldOfView:
     """Where a scanner sees: slopes x/z and y/z up to `half` (2,), distances from `near` to `far`, along `axis` (3,)."""
@@ -155,7 +166,7 @@ def expected_scan(part: PlannedPart, T_reference_scanner: Array, field: FieldOfV
     slopes, reach = points[:, :2] / (points @ field.axis)[:, None], np.linalg.norm(points, axis=1)
     cosine = -np.einsum("ij,ij->i", points, normals) / reach
     inside = (np.abs(slopes) <= field.half).all(axis=1) & (reach > field.near) & (reach < field.far)
-    return np.asarray(ahead[inside & (cosine > GRAZING_COSINE) & ~_is_occluded(slopes, reach)])
+    return ahead[inside & (cosine > GRAZING_COSINE) & ~_is_occluded(slopes, reach)]
 
 
 def _is_occluded(slopes: Array, reach: Array) -> Mask:
@@ -167,14 +178,7 @@ def _is_occluded(slopes: Array, reach: Array) -> Mask:
     number = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
     nearest = np.full(number.max() + 1, np.inf)
     np.minimum.at(nearest, number, reach)
-    return np.asarray(reach > nearest[number] + _BEHIND * ray * nearest[number])
-
-
-# How much poses and scanner are expected to scatter: as stated, as a run found, or as is usual.
-
-# Scatter of a good arm's flange, sigma per axis (rad, mm), and an area scanner's noise along the ray (mm): where nobody
-# states them. EN ISO 9283 repeatabilities of 0.05 to 0.1 mm are sigmas of 14 to 28 µm.
-USUAL_ROTATION, USUAL_TRANSLATION, USUAL_NOISE = 20e-6, 0.02, 0.02
+    return reach > nearest[number] + _BEHIND * ray * nearest[number]
 
 
 @dataclass(frozen=True)
@@ -233,13 +237,6 @@ def mean_scatter(linear: LinearModel, noise: float, variances: Sequence[tuple[Ar
     return FittedScatter(*both)
 
 
-# What planned views would see, as a measurement and as a linear model.
-
-_SPACINGS, _SIGMAS = 1.5, 6.0  # of the gate
-# Fewer points of a view say nothing of six directions.
-FEWEST = 60
-
-
 @dataclass(frozen=True)
 class CellModel:
     """Everything about a cell but its views."""
@@ -276,9 +273,9 @@ class SimulatedViews:
     def field_middle(self, feature: Array | None = None) -> Array:
         """(3,) scanner frame: mean place of a feature (3,) of the reference frame; None: of all that the views see."""
         if feature is None:
-            return np.asarray(np.mean([p.mean(axis=0) for p in self.measurement.capture.point_sets], axis=0))
+            return np.mean([p.mean(axis=0) for p in self.measurement.capture.point_sets], axis=0)
         poses = self.unconstrained.poses
-        return np.asarray(np.einsum("vji,vj->vi", poses[:, :3, :3], feature - poses[:, :3, 3]).mean(axis=0))
+        return np.einsum("vji,vj->vi", poses[:, :3, :3], feature - poses[:, :3, 3]).mean(axis=0)
 
 
 def expected_scans(cell: CellModel, T_reference_scanner: Array) -> list[Indices]:
@@ -346,14 +343,6 @@ def expected_model(simulated: SimulatedViews, cell: CellModel) -> ExpectedModel:
         cell.scatter.variances,
     )
     return ExpectedModel(**{f.name: getattr(linear, f.name) for f in fields(linear)})
-
-
-# What is known of a cell before measuring, from a session without scans; and what a finished run knows of its cell.
-
-# Full angle of the field where nobody states it, and how far it reaches about the standoff.
-USUAL_FIELD_DEG, _DEPTH = 30.0, 0.3
-# Of what a run's scanner saw, the share that counts as its field, and what is added to it.
-_SEEN, _MARGIN = 0.99, 0.1
 
 
 @dataclass(frozen=True)
@@ -457,9 +446,6 @@ def _part_of_session(session: SessionData, part: Path | None, size_mm: float | N
     )
 
 
-# The uncertainty that planned views would give the hand-eye, and where it would come from.
-
-
 @dataclass(frozen=True)
 class ExpectedHandEye:
     """What a fit of the hand-eye would state of itself."""
@@ -508,15 +494,6 @@ def _shares_of(sources: dict[str, Array], covariance: Array) -> dict[str, float]
     scaled, unit = equilibrated(covariance[:6, :6])
     weight = np.linalg.inv(scaled) * np.outer(unit, unit)
     return {name: float(np.sum(weight * own[:6, :6])) / 6 for name, own in sources.items()}
-
-
-# How large errors of planned views would be found: what they would see is drawn, and fitted as a run fits it.
-#
-# No number of views excludes that an arm errs by a little more than its scatter; how much they leave open is what the
-# covariance of a run counts. It is the posterior mean of the variances, averaged over draws.
-
-# Draws among so many numbers at the most; a fit among more takes seconds, and the expected variances must do.
-_DRAWS = ((150, 3), (400, 1))
 
 
 def expected_scatter(linear: ExpectedModel, noise: float) -> FittedScatter:

@@ -31,7 +31,7 @@ class TwistChannel:
     def normal(self, chosen: Sequence[int]) -> Array:
         """(q, q) normal matrix of some views."""
         white = self._white(chosen)[1]
-        return np.asarray(white.T @ white)
+        return white.T @ white
 
     def with_each(self, chosen: Sequence[int], others: Sequence[int]) -> Array:
         """(K, q, q) normal matrices of some views and one more."""
@@ -42,7 +42,7 @@ class TwistChannel:
         left = own - np.einsum("rki,rkj->kij", B, B)
         columns = self.columns[more].reshape(len(others), 6, -1) - np.einsum("rki,rq->kiq", B, white)
         fresh = np.linalg.solve(np.linalg.cholesky(left), columns)
-        return np.asarray(white.T @ white + fresh.transpose(0, 2, 1) @ fresh)
+        return white.T @ white + fresh.transpose(0, 2, 1) @ fresh
 
     def _white(self, chosen: Sequence[int]) -> tuple[Array, Array]:
         """Cholesky factor of the chosen rows' covariance, and their columns in units of it."""

@@ -32,10 +32,28 @@ from stitch.plugins.metrology.planning.planned_views import candidate_joints, wi
 from stitch.session.session import SessionData
 from stitch.system.threads import library_threads_off
 
-# All views that a plan may hold, with what they would say of the hand-eye and of rival effects.
-
 # Points on the part and correspondences of a view are few here: there are many pairs, and noise is not what limits.
 _SAMPLES, _POINTS, _MIN_VIEW_SAMPLES = 250, 4000, 25
+# Keeps what too few views leave open finite: a radian, and many times any part.
+_OPEN = 1e-8
+# Of a feature so small a share of U is asked for that every view counts that brings something.
+_MUCH = 0.1
+# Whatever the unit, no logarithm of a length comes near.
+_NEVER = -50.0
+# Reached, but for rounding; and what a view must bring to be worth taking.
+_REACHED, _WORTH = 1 - 1e-6, 0.01
+# Among views that bring nearly the same the nearest is taken.
+_NEARLY = 0.95
+_SWEEPS = 2
+# Fewer views give no hand-eye: two motions about different axes are the least (Tsai & Lenz 1989).
+_MIN_PRESENT_VIEWS = 3
+# Views that are tried; and proposed, beside present ones or where there are none, unless a number is asked for.
+_TRIED, _MORE, _ALL = 40, 6, 12
+# For one feature as many are tried again, so many times, close to those that were chosen.
+_CLOSER = 2
+# Effects that would be detected so often at usual size are worth telling apart; so many hard pairs are looked at, and
+# what a single view must bring to one of them.
+_DETECTED, _PAIRS, _BETTER = 0.5, 6, 0.02
 
 
 @dataclass(frozen=True)
@@ -102,16 +120,6 @@ class PossibleViews:
         return out.reshape(6 * len(carried), -1)
 
 
-# What further views are for: a hand-eye known twice as well, two effects told apart; how far some views get.
-
-# Keeps what too few views leave open finite: a radian, and many times any part.
-_OPEN = 1e-8
-# Of a feature so small a share of U is asked for that every view counts that brings something.
-_MUCH = 0.1
-# Whatever the unit, no logarithm of a length comes near.
-_NEVER = -50.0
-
-
 @dataclass(frozen=True)
 class KnownPlace:
     """U of a place, down to a share of what the present views give it."""
@@ -126,13 +134,13 @@ class KnownPlace:
         scaled, unit = equilibrated(normal)
         inverse = np.linalg.inv(scaled + _OPEN * np.eye(normal.shape[-1]))
         lever = self.lever * unit[..., None, :]
-        return np.asarray(COVERAGE_FACTOR * np.sqrt(np.einsum("...ia,...ab,...ib->...", lever, inverse, lever)))
+        return COVERAGE_FACTOR * np.sqrt(np.einsum("...ia,...ab,...ib->...", lever, inverse, lever))
 
     def progress(self, normal: Array) -> Array:
         """(...) 1 where U has come down to that share; without a present U what its logarithm falls by, never 1."""
         if not np.isfinite(self.now):
-            return np.asarray(_NEVER - np.log(self.U(normal)))
-        return np.asarray(np.clip(np.log(self.U(normal) / self.now) / np.log(self.share), 0.0, 1.0))
+            return _NEVER - np.log(self.U(normal))
+        return np.clip(np.log(self.U(normal) / self.now) / np.log(self.share), 0.0, 1.0)
 
 
 def place_lever(place: Array, width: int, start: int = 0) -> Array:
@@ -159,7 +167,7 @@ class SplitPair:
         for own, rival, effect in ((a, b, self.effects[0]), (b, a, self.effects[1])):
             apart = separations(normal, own, rival) @ effect.forms.T
             both.append(np.minimum(apart / SEPARATION_LAMBDA, 1.0) @ effect.weights)
-        return np.asarray(np.minimum(*both))
+        return np.minimum(*both)
 
 
 Goal = KnownPlace | SplitPair
@@ -167,21 +175,12 @@ Goal = KnownPlace | SplitPair
 
 def mean_progress(goals: Sequence[Goal], chosen: Sequence[int], others: Sequence[int]) -> Array:
     """(K,) mean progress of all goals with each of some more views."""
-    return np.asarray(np.mean([goal.progress(goal.channel.with_each(chosen, others)) for goal in goals], axis=0))
+    return np.mean([goal.progress(goal.channel.with_each(chosen, others)) for goal in goals], axis=0)
 
 
 def present_progress(goals: Sequence[Goal], chosen: Sequence[int]) -> float:
     """Return the mean progress of the chosen views alone."""
     return float(np.mean([goal.progress(goal.channel.normal(chosen)) for goal in goals]))
-
-
-# Few views, then little travel: greedy choice, exchange, what is not needed left out, driven the short way round.
-
-# Reached, but for rounding; and what a view must bring to be worth taking.
-_REACHED, _WORTH = 1 - 1e-6, 0.01
-# Among views that bring nearly the same the nearest is taken.
-_NEARLY = 0.95
-_SWEEPS = 2
 
 
 def choose_views(goals: Sequence[Goal], joints: Array, present: int, most: int) -> list[int]:
@@ -246,19 +245,6 @@ def travel_order(joints: Array, last: int, chosen: Sequence[int]) -> list[int]:
         left.remove(at)
         out.append(at)
     return out
-
-
-# What a plan rests on: how many views are tried and proposed, and for which pairs of effects.
-
-# Fewer views give no hand-eye: two motions about different axes are the least (Tsai & Lenz 1989).
-_MIN_PRESENT_VIEWS = 3
-# Views that are tried; and proposed, beside present ones or where there are none, unless a number is asked for.
-_TRIED, _MORE, _ALL = 40, 6, 12
-# For one feature as many are tried again, so many times, close to those that were chosen.
-_CLOSER = 2
-# Effects that would be detected so often at usual size are worth telling apart; so many hard pairs are looked at, and
-# what a single view must bring to one of them.
-_DETECTED, _PAIRS, _BETTER = 0.5, 6, 0.02
 
 
 @dataclass(frozen=True)

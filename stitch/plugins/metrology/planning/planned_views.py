@@ -62,4 +62,4 @@ def candidate_joints(session: SessionData, cell: CellModel, count: int, chosen: 
     joints = reachable(driven, poses_of, seen_from, cell.part.centre, chosen)
     least = max(FEWEST, _SHARE * np.median([len(index) for index in expected_scans(cell, seen_from)]))
     seen = (len(index) >= least for index in expected_scans(cell, poses_of(joints[: _TRIES * count])))
-    return np.asarray(joints[: _TRIES * count][list(seen)][:count])
+    return joints[: _TRIES * count][list(seen)][:count]

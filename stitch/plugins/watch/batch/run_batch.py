@@ -25,6 +25,19 @@ from stitch.session.reading.text_files import read_toml
 from stitch.system.files import claim_folder, whole_file
 from stitch.system.threads import share_cores
 
+MARK = "batch-mark.json"
+_FORMAT = "stitch-batch-mark/1"
+# A worker that was given up may still be at work on a session: its successor waits for it, this long (s).
+LOCK_WAIT_SECONDS = 3600.0
+_RETRY_SECONDS = 0.5
+DOCUMENT, PAGE = "batch.json", "batch.html"  # beside the runs: for programs, and for people
+BATCH_FORMAT = "stitch-batch/1"
+_WORKERS_DIED = NoResultError(
+    "workers died over it, also when it ran alone; to fix: give it more memory, or thin its scans, and start the batch "
+    "again"
+)
+_SCHEDULER_GONE = NoResultError("the scheduler has gone; to fix: start the same batch again")
+
 
 @dataclass(frozen=True)
 class BatchJob:
@@ -36,10 +49,6 @@ class BatchJob:
     force: bool = False  # run it although it is finished, and replace the run of another session
     recording: bool = True
     at_once: int = 1  # sessions that share the cores of the machine
-
-
-MARK = "batch-mark.json"
-_FORMAT = "stitch-batch-mark/1"
 
 
 def session_content_hash(session: Path) -> str | None:
@@ -168,11 +177,6 @@ def failed_row(session: Path, run: Path, error: BaseException) -> SessionRow:
     return SessionRow(str(session), run.name, error=told, bad_input=isinstance(error, InputError))
 
 
-# A worker that was given up may still be at work on a session: its successor waits for it, this long (s).
-LOCK_WAIT_SECONDS = 3600.0
-_RETRY_SECONDS = 0.5
-
-
 def run_session(job: BatchJob) -> SessionRow:
     """Run a session into its folder unless its run stands there; what goes wrong becomes part of the answer."""
     share_cores(job.at_once)
@@ -209,10 +213,6 @@ def _locked_folder(folder: Path) -> Iterator[None]:
         yield
 
 
-DOCUMENT, PAGE = "batch.json", "batch.html"  # beside the runs: for programs, and for people
-BATCH_FORMAT = "stitch-batch/1"
-
-
 def batch_document(rows: Sequence[SessionRow]) -> dict[str, Any]:
     """Return batch.json as a dictionary: how many, and a row a session; lengths in µm."""
     failed = sum(row.error is not None for row in rows)
@@ -239,13 +239,6 @@ def batch_sentence(rows: Sequence[SessionRow]) -> str:
     words = {"done": "run", "skipped": "finished before", "failed": "without a result"}
     told = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
     return f"{len(rows)} {'session' if len(rows) == 1 else 'sessions'}: {', '.join(told) or 'nothing to do'}."
-
-
-_WORKERS_DIED = NoResultError(
-    "workers died over it, also when it ran alone; to fix: give it more memory, or thin its scans, and start the batch "
-    "again"
-)
-_SCHEDULER_GONE = NoResultError("the scheduler has gone; to fix: start the same batch again")
 
 
 def run_jobs(

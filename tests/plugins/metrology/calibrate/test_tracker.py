@@ -1,4 +1,4 @@
-"""Frames sessions: base and tool from a real tracker, both mounts, and refusals."""
+"""Base and tool from a tracker and its probe: closed form, refinement, document."""
 
 import json
 
@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from stitch.cli import main as cli
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
-from stitch.plugins.metrology.calibrate.tracker import calibrate_tracker, tracker_document
+from stitch.numerics.hand_eye import shah
+from stitch.plugins.metrology.calibrate.tracker import calibrate_tracker, refine_axzb, tracker_document
 from stitch.session.reading.session_folder import load_session
 
 HEADER = "view,x,y,z,qx,qy,qz,qw"
@@ -112,3 +113,126 @@ def test_bad_frames_name_line_and_mend(spoil, message, tmp_path):
     file.write_text(spoil(file.read_text()))
     with pytest.raises(InputError, match=message):
         calibrate_tracker(load_session(tmp_path / "s"))
+
+
+NOISE = np.array([1e-3] * 3 + [0.2] * 3)
+SCALE = np.array([300, 300, 300, 1, 1, 1])
+
+
+def cell(seed, count=12, noise=0.0):
+    """X, Z, A, B of a random cell; B carries the noise."""
+    rng = np.random.default_rng(seed)
+    X, Z = (frames.make(Rotation.random(rng=rng).as_matrix(), rng.normal(0, s, 3)) for s in (100, 1000))
+    A = frames.make(Rotation.random(count, rng=rng).as_matrix(), rng.normal(0, 400, (count, 3)))
+    B = frames.inverse(Z) @ A @ X @ frames.exp(rng.normal(0, 1, (count, 6)) * noise * NOISE)
+    return X, Z, A, B
+
+
+def error(truth, found):
+    return float(np.linalg.norm(frames.log(frames.inverse(truth) @ found) * SCALE))
+
+
+def test_exact_without_noise():
+    for seed in range(20):
+        X, Z, A, B = cell(seed, count=4)
+        x, z = shah(A, B)
+        assert error(X, x) < 1e-5 and error(Z, z) < 1e-5
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.slow
+def test_two_hundred_cells_no_worse_than_opencv():
+    cv2 = pytest.importorskip("cv2")
+    ours, theirs, closed = [], {"SHAH": [], "LI": []}, []
+    for seed in range(200):
+        X, Z, A, B = cell(seed, noise=1.0)
+        x, z = refine_axzb(A, B).transforms
+        ours.append([error(X, x), error(Z, z)])
+        closed.append([error(T, t) for T, t in zip((X, Z), shah(A, B), strict=True)])
+        inside = frames.inverse(A)
+        for name, errors in theirs.items():
+            # OpenCV: A_cv X_cv = Z_cv B_cv with A_cv = T_cam_world, X_cv = T_world_base, B_cv = T_gripper_base.
+            R1, t1, R2, t2 = cv2.calibrateRobotWorldHandEye(
+                frames.inverse(B)[:, :3, :3], frames.inverse(B)[:, :3, 3], inside[:, :3, :3], inside[:, :3, 3],
+                method=getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{name}"),
+            )  # fmt: skip
+            world_base, camera_gripper = frames.make(R1, t1.ravel()), frames.make(R2, t2.ravel())
+            errors.append([error(X, frames.inverse(camera_gripper)), error(Z, frames.inverse(world_base))])
+    for k in range(2):
+        best = min(rms(np.array(e)[:, k]) for e in theirs.values())
+        assert rms(np.array(ours)[:, k]) <= best
+        assert rms(np.array(closed)[:, k]) <= rms(np.array(theirs["SHAH"])[:, k])
+
+
+@pytest.mark.slow
+def test_two_hundred_hand_eyes_no_worse_than_opencv():
+    cv2 = pytest.importorskip("cv2")
+    names = ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
+    ours, theirs = [], {name: [] for name in names}
+    for seed in range(200):
+        X, Z, A, B = cell(seed, noise=1.0)
+        ours.append(error(X, refine_axzb(A, B).transforms[0]))
+        target = frames.inverse(B)
+        for name in names:
+            R, t = cv2.calibrateHandEye(
+                A[:, :3, :3], A[:, :3, 3], target[:, :3, :3], target[:, :3, 3],
+                method=getattr(cv2, f"CALIB_HAND_EYE_{name}"),
+            )  # fmt: skip
+            theirs[name].append(error(X, frames.make(R, t.ravel())))
+    assert rms(ours) <= min(rms(errors) for errors in theirs.values())
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_covariance_predicts_the_error(robust):
+    """Mean squared Mahalanobis distance over cells: 12 if the covariance is the error's."""
+    squares = []
+    for seed in range(60):
+        X, Z, A, B = cell(seed, count=30, noise=1.0)
+        fit = refine_axzb(A, B, robust=robust)
+        xi = np.concatenate([frames.log(frames.inverse(t) @ f) for t, f in zip((X, Z), fit.transforms, strict=True)])
+        squares.append(-xi @ np.linalg.solve(fit.covariance, -xi))
+    assert 0.75 * 12 < np.mean(squares) < 1.3 * 12
+
+
+def test_scatter_and_heldout_are_those_of_the_noise():
+    _, _, A, B = cell(4, count=400, noise=1.0)
+    fit = refine_axzb(A, B)
+    assert fit.sigma == pytest.approx((1e-3, 0.2), rel=0.1)
+    assert rms(fit.heldout[:, 3:]) > rms(fit.residual[:, 3:])
+    assert rms(fit.heldout[:, 3:]) == pytest.approx(0.2, rel=0.1)
+
+
+def test_heldout_is_the_error_of_a_fit_without_the_view():
+    _, _, A, B = cell(7, count=10, noise=1.0)
+    fit = refine_axzb(A, B, sigma=(1e-3, 0.2))
+    X, Z = refine_axzb(A[1:], B[1:], sigma=(1e-3, 0.2)).transforms
+    left_out = frames.log(frames.inverse(A[0] @ X) @ Z @ B[0])
+    assert fit.heldout[0] / NOISE == pytest.approx(left_out / NOISE, abs=0.02)
+
+
+def test_robust_fit_ignores_gross_errors():
+    X, Z, A, B = cell(2, count=40, noise=1.0)
+    B[:4] = B[:4] @ frames.exp(np.array([0.05, 0, 0, 20, 0, 0]))
+    x, z = refine_axzb(A, B, robust=True).transforms
+    assert error(X, x) < 0.5 and error(Z, z) < 1.0
+    assert error(X, x) < 0.2 * error(X, refine_axzb(A, B).transforms[0])
+
+
+def test_weights_of_zero_remove_views():
+    _, _, A, B = cell(9, count=12, noise=1.0)
+    weights = np.array([0.0] * 3 + [1.0] * 9)
+    X, _ = refine_axzb(A, B, (1e-3, 0.2), weights).transforms
+    assert error(refine_axzb(A[3:], B[3:], (1e-3, 0.2)).transforms[0], X) < 1e-3
+    assert error(shah(A[3:], B[3:])[0], shah(A, B, weights)[0]) < 1e-6
+
+
+@pytest.mark.parametrize("solver", [shah, refine_axzb])
+def test_parallel_axes_are_refused_with_the_reason(solver):
+    turns = frames.exp(np.array([[0, 0, a, 10 * a, 0, 0.0] for a in (0.1, 0.3, 0.6, 1.0)]))
+    with pytest.raises(NoResultError, match="one axis"):
+        solver(turns, turns)
+    with pytest.raises(NoResultError, match="poses"):
+        solver(turns[:2], turns[:2])

@@ -1,8 +1,9 @@
-"""`stitch plan` on a session without scans, and what it refuses."""
+"""Views are planned: searched, held against random ones, and written."""
 
 import json
 import shutil
 from dataclasses import replace
+from itertools import combinations
 from unittest.mock import patch
 
 import numpy as np
@@ -11,18 +12,130 @@ import pytest
 from data_synth import kinematics
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.labelled_arm import Growth, labelled_cell
 from data_synth.write import write_session
 from stitch.cli.main import main
+from stitch.diagnosis import next_view
+from stitch.diagnosis.candidate_views import candidate_measurement
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.evidence import gather_evidence
+from stitch.diagnosis.next_view import separations
 from stitch.diagnosis.score import scatter_limit
+from stitch.effects.contract import EFFECTS
 from stitch.numerics import frames
 from stitch.observations.surfaces.surface_model import surface_model
 from stitch.plugins.metrology.planning import plan
 from stitch.plugins.metrology.planning.expected_model import cell_of_session, simulate_views
-from stitch.plugins.metrology.planning.plan import PlanRequest, plan_further_views
+from stitch.plugins.metrology.planning.information import TwistChannel, noise_of
+from stitch.plugins.metrology.planning.plan import (
+    KnownPlace,
+    PlanRequest,
+    choose_views,
+    place_lever,
+    plan_further_views,
+    travel_order,
+)
 from stitch.plugins.metrology.planning.planned_views import with_views
+from stitch.session.capture import prepare_capture
+from stitch.session.measurement import measurement_of
 from stitch.session.reading.session_folder import load_session
+
+
+@pytest.fixture
+def channel():
+    rng = np.random.default_rng(0)
+    half = rng.standard_normal((60, 60))
+    return TwistChannel(half @ half.T + np.eye(60), rng.standard_normal((60, 9)))
+
+
+def test_one_more_view_is_worth_what_the_whole_says(channel):
+    rows = np.r_[0:12, 24:30, 48:54]
+    inverse = np.linalg.inv(channel.covariance[np.ix_(rows, rows)])
+    whole = channel.columns[rows].T @ inverse @ channel.columns[rows]
+    np.testing.assert_allclose(channel.normal([0, 1, 4, 8]), whole, rtol=1e-9)
+    np.testing.assert_allclose(channel.with_each([0, 1, 4], [2, 8])[1], whole, rtol=1e-9)
+
+
+def test_a_pattern_keeps_what_its_rival_cannot_imitate(channel):
+    """Least squares with a weak prior on the rival, column by column."""
+    X = channel.columns
+    left = separations(X.T @ X, slice(7, 9), slice(5, 7))
+    rows = np.vstack([X[:, :7], np.hstack([np.zeros((2, 5)), 0.1 * np.eye(2)])])
+    for k, y in enumerate(X[:, 7:].T):
+        y = np.append(y, [0.0, 0.0])
+        rest = y - rows @ np.linalg.lstsq(rows, y, rcond=None)[0]
+        assert left[k] == pytest.approx(rest @ rest, rel=1e-6)
+
+
+def test_what_a_view_does_not_see_is_as_good_as_unknown():
+    information = np.diag([4.0, 4.0, 0.0, 1.0, 1.0, 1.0])[None]
+    noise = np.diag(noise_of(information, variance=0.01, lever=2.0))
+    np.testing.assert_allclose(noise[[0, 1, 3, 4, 5]], [0.0025, 0.0025, 0.01, 0.01, 0.01])
+    assert noise[2] > 1e3
+
+
+def test_the_chosen_views_are_the_best_there_are(channel):
+    """Against all pairs of ten views beside the first; and driven the short way round."""
+    joints = np.random.default_rng(1).uniform(-1, 1, (10, 6))
+    goal = KnownPlace(channel, place_lever(np.array([0.0, 0.0, 1.0]), 9), now=1e3, share=1e-9)
+    chosen = choose_views([goal], joints, present=3, most=2)
+    best = min(float(goal.U(channel.normal([0, 1, 2, *pair]))) for pair in combinations(range(3, 10), 2))
+    assert float(goal.U(channel.normal([0, 1, 2, *chosen]))) == pytest.approx(best, rel=0.02)
+    assert travel_order(np.array([[0.0], [5.0], [1.0], [3.0]]), 0, [1, 2, 3]) == [2, 3, 1]
+
+
+def test_the_lever_of_a_place_is_what_a_twist_moves_it_by():
+    place, twist = np.array([40.0, -25.0, 300.0]), 1e-6 * np.array([3.0, -1.0, 2.0, 500.0, 100.0, -300.0])
+    moved = frames.transform(frames.exp(twist), place[None])[0] - place
+    np.testing.assert_allclose(place_lever(place, 15, 6)[:, 6:12] @ twist, moved, rtol=1e-4)
+    assert not place_lever(place, 15, 6)[:, [*range(6), *range(12, 15)]].any()
+
+
+def test_no_view_is_chosen_that_is_not_needed(channel):
+    joints = np.zeros((10, 6))
+    reached = float(
+        np.min(KnownPlace(channel, place_lever(np.zeros(3), 9), 1.0).U(channel.with_each([0, 1, 2], range(3, 10))))
+    )
+    goal = KnownPlace(channel, place_lever(np.zeros(3), 9), now=reached / 0.5 * 1.001)
+    assert len(choose_views([goal], joints, present=3, most=6)) == 1
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_where_there_is_no_hand_eye_yet_as_many_views_are_chosen_as_are_asked_for(channel, unit):
+    """In any unit of length."""
+    goal = KnownPlace(channel, place_lever(np.array([0.0, 0.0, unit]), 9), now=float("nan"))
+    assert len(choose_views([goal], np.zeros((10, 6)), present=1, most=4)) == 4
+
+
+def test_views_not_taken_yet_come_after_those_that_were():
+    """Temperatures count from the session's first view, an event before them has happened, a scan at rest has no delay."""
+    session, *_ = labelled_cell(2, views=9, grown=Growth(0.0, 0.0))
+    speeds = {f"j{i + 1}_velocity_deg_s": 5.0 for i in range(6)}
+    session = replace(session, views=tuple(replace(v, covariates=v.covariates | speeds) for v in session.views))
+    measurement = measurement_of(session, prepare_capture(session))
+    later = candidate_measurement(measurement, measurement.views.joints[:3] + 0.1).views
+    warmth = [v.covariates["part_temperature_c"] for v in session.views]
+    np.testing.assert_allclose(later.since_first("part_temperature_c"), warmth[-1] - warmth[0])
+    assert EFFECTS["part_slip"].function(later, xi=np.ones(6), v=8.0).all()
+    assert not (EFFECTS["latency"].function(later.joints, later, dt=1.0) - later.joints).any()
+
+
+def test_the_next_view_serves_the_two_that_stay_most_alike(monkeypatch):
+    """Of three suspects no two may stay together, however well others come apart."""
+    gains = {"ab": [9, 2, 0], "ac": [0, 2, 9], "bc": [0, 3, 9]}
+
+    class CandidateEffect:
+        def __init__(self, name):
+            self.name = name
+
+    def of_two(evidence, a, b):
+        return np.radians([[10.0], [20.0], [30.0]]), 0.4, np.array(gains[a.name + b.name], float)
+
+    monkeypatch.setattr(next_view, "_gains", of_two)
+    joints, count, separated = next_view._best_pose(None, [CandidateEffect(name) for name in "abc"])
+    assert joints == pytest.approx([20.0])
+    assert count == 3 and separated == ("a", "b", "c")  # (5.4 − 0.4)/2
+
 
 VIEWS = 6
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stitch.plugins.watch.tracking import (
+from stitch.plugins.watch.control_charts import (
     CUSUM_REFERENCES,
     EWMA_WEIGHT,
     chart_limits,
