@@ -132,8 +132,10 @@ def test_what_smooth_errors_make_of_the_overlaps_is_not_called_noise(cell):
     chain = error_chain(state)
     smooth = 0.1 * error_sources._smooth_errors(state, chain)[0]  # mm, five times the noise
     rig = chain.solution.rig
-    bent = replace(rig, z=rig.z + rig.reduce([smooth]) @ np.random.default_rng(0).standard_normal(smooth.shape[1]))
-    bent = replace(chain, solution=replace(chain.solution, rig=bent))
+    drawn = rig.reduce([smooth]) @ np.random.default_rng(0).standard_normal(smooth.shape[1])
+    moved = replace(rig)
+    vars(moved)["z"] = rig.z + drawn  # the cached property
+    bent = replace(chain, solution=replace(chain.solution, rig=moved))
     modes = list(error_sources._pose_modes(state, bent, smooth))
     noise, scanner = (sum(np.sum(m[1][0] ** 2) for m in modes if m[0] == name) for name in (OVERLAPS, SCANNER))
     before = sum(np.sum(source.views**2) for source in places.sources if source.name == OVERLAPS)
