@@ -19,6 +19,9 @@ PIN := { $(PYTHON) -c '$(OLD_LINUX)' && sed '/^open3d/,/[^\]$$/d' constraints.tx
 # What Open3D lacks of the system: packages to standard output, a sentence to standard error.
 LACKING := $(PYTHON) -m stitch.system.open3d_library
 
+# What stitch-scans was called in environments made before; of two that hold the same modules none would be whole.
+FORMER := stitch
+
 export RERUN_ANALYTICS ?= off
 
 .PHONY: install demo test lint check docs lock clean
@@ -33,6 +36,7 @@ ifdef UV
 		{ echo "stitch needs Python 3.11, 3.12 or 3.13: none was found" >&2; exit 2; }
 	@$(PIN)
 	uv pip install --quiet --compile-bytecode --python $(PYTHON) --require-hashes -r $(PINNED)
+	@uv pip uninstall --quiet --python $(PYTHON) $(FORMER) 2>/dev/null || true
 	uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e .
 else
 	@test -n "$(BASE)" || { echo "stitch needs Python 3.11, 3.12 or 3.13: none is on the path; on Debian 12 or \
@@ -42,6 +46,7 @@ else
 	@{ $(PYTHON) $(SERVES) && $(PIP) --version >/dev/null 2>&1; } || $(BASE) -m venv --clear $(VENV)
 	@$(PIN)
 	$(PIP) install --require-hashes -r $(PINNED)
+	@$(PIP) uninstall --yes $(FORMER) 2>/dev/null || true
 	$(PIP) install --no-deps --no-build-isolation -e .
 endif
 	@lacking=$$($(LACKING) 2>/dev/null); test -z "$$lacking" || { $(ROOT_APT) && \

@@ -46,7 +46,7 @@ def __getattr__(name: str) -> Any:
     if name == "__all__":
         return list(_modules())
     if name == "__version__":
-        return _metadata().version("stitch")
+        return import_module("stitch.system.packages").stitch_version()
     if not name.startswith("_") and name in _modules():
         return getattr(import_module(_modules()[name]), name)
     raise AttributeError(f"module 'stitch' has no attribute {name!r}")

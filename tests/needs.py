@@ -2,12 +2,12 @@
 
 import pytest
 
+from stitch.system.packages import command_for
+
 
 def needs(name, extra):
     """The package, or a skip that says with which command the test runs."""
-    reason = (
-        f"{name} is not installed, and without it nothing reads or writes such files: pip install 'stitch[{extra}]'"
-    )
+    reason = f"{name} is not installed, and without it nothing reads or writes such files: {command_for(extra)}"
     return pytest.importorskip(name, reason=reason)
 
 

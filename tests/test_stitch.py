@@ -258,7 +258,7 @@ def wheel(tmp_path_factory):
     source = shutil.copytree(ROOT, folder / "source", ignore=left_out)
     pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", folder, source]
     subprocess.run(pip, check=True, cwd=folder, capture_output=True)
-    (built,) = folder.glob("stitch-*.whl")
+    (built,) = folder.glob("stitch_scans-*.whl")
     return built
 
 

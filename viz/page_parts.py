@@ -18,6 +18,7 @@ from stitch.run_data import RunData
 from stitch.session.reading.session_folder import session_hash
 from stitch.session.session import SessionData
 from stitch.system.files import whole_file
+from stitch.system.packages import stitch_version
 
 # Numbers and their units stay on one line.
 
@@ -97,7 +98,7 @@ def page_written() -> Row:
 
 def versions() -> Row:
     """Return the versions of the programs that computed it."""
-    return "stitch", f"{version('stitch')}, Python {platform.python_version()}, numpy {version('numpy')}"
+    return "stitch", f"{stitch_version()}, Python {platform.python_version()}, numpy {version('numpy')}"
 
 
 def _points(session: SessionData) -> str:

@@ -5,7 +5,6 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +16,7 @@ from stitch.cli.terminal import say, speak_any_terminal
 from stitch.errors import StitchError
 from stitch.session.reading.text_files import shortened
 from stitch.system import process, time_limit
+from stitch.system.packages import stitch_version
 from stitch.system.process import watched
 
 _LONGEST = 2000
@@ -36,7 +36,7 @@ _FIXES = {
 
 def _version(requested: bool) -> None:
     if requested:
-        print(f"stitch {version('stitch')}")
+        print(f"stitch {stitch_version()}")
         raise typer.Exit
 
 

@@ -38,8 +38,9 @@ from stitch.output.schema import (
 from stitch.run_data import ExcludedView, Fit, LedgerStep, Note, RunData, StageResult, Unsupported, ViewLinks
 from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData, View
+from stitch.system.packages import stitch_version
 
-_PACKAGES = ("stitch", "numpy", "scipy", "pykdtree", "libigl", "rerun-sdk", "kiss-icp", "trimesh")
+_PACKAGES = ("numpy", "scipy", "pykdtree", "libigl", "rerun-sdk", "kiss-icp", "trimesh")
 
 
 class ViewRow(NamedTuple):
@@ -263,7 +264,7 @@ def _disagreement(run: RunData) -> dict[str, Any] | None:
 
 
 def _versions() -> dict[str, str]:
-    versions = {}
+    versions = {"stitch": stitch_version()}
     for package in _PACKAGES:
         try:
             versions[package] = version(package)

@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from importlib.metadata import entry_points, version
+from importlib.metadata import entry_points
 from itertools import chain
 from pathlib import Path
 from threading import Thread
@@ -29,6 +29,7 @@ from stitch.run_data import FusedCloud, RunData
 from stitch.session.reading.session_folder import measured_files
 from stitch.session.session import SessionData
 from stitch.system.files import claim_folder, rewrite_folder
+from stitch.system.packages import stitch_version
 from stitch.system.ply_file import ply_header
 from stitch.system.threads import release_mapped
 
@@ -209,7 +210,7 @@ def _place_of_fit(path: Path, effects: Collection[str]) -> Path | None:
     known = {effect.name for effect in EFFECTS.values() if effect.tier != "user"}
     if max(edited, *(time for _, _, time in marks)) > fitted or not known.issuperset(effects):
         return None
-    made_of = json.dumps([version("stitch"), sorted(effects), marks])
+    made_of = json.dumps([stitch_version(), sorted(effects), marks])
     return path / FITS / hashlib.sha256(made_of.encode()).hexdigest()[:16]
 
 

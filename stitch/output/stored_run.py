@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,7 @@ from stitch.session.measurement import measurement_of, with_part_origin
 from stitch.session.reading.scan_files import require_room
 from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, session_hash
 from stitch.session.reading.text_files import shortened
+from stitch.system.packages import stitch_version
 from stitch.system.ply_file import vertex_columns
 from stitch.system.threads import library_threads_off
 
@@ -181,7 +181,7 @@ def diagnosed_state(run: RunData, folder: Path) -> str:
     result = content_hash(folder, [folder / "model.toml", folder / "result.json"])
     file = None if run.effects_file is None else Path(run.effects_file)
     effects = "" if file is None else content_hash(file.parent, [file])
-    return " ".join((version("stitch"), session_hash(run.session), result, effects)).strip()
+    return " ".join((stitch_version(), session_hash(run.session), result, effects)).strip()
 
 
 def fused_cloud(path: Path) -> FusedCloud:

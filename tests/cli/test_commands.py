@@ -7,7 +7,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ import typer
 from data_synth.fixtures.run_folders import bare_run
 from stitch.cli.main import build, main
 from stitch.effects import EFFECTS
+from stitch.system.packages import stitch_version
 
 
 def commands(group, words=()):
@@ -74,7 +74,7 @@ def test_the_cheap_examples_run(line, session, tmp_path, monkeypatch):
 def test_version_is_the_package_s(capsys):
     with pytest.raises(SystemExit):
         main(["--version"])
-    assert capsys.readouterr().out == f"stitch {version('stitch')}\n"
+    assert capsys.readouterr().out == f"stitch {stitch_version()}\n"
 
 
 @pytest.mark.parametrize(

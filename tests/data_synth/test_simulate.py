@@ -116,7 +116,7 @@ def bunny():
     """The Stanford bunny as pymeshfix brings it: 100,000 triangles with holes in its base."""
     found = find_spec("pymeshfix")
     if found is None:
-        pytest.skip("pymeshfix, which brings the mesh, is not installed: pip install 'stitch[dev]'")
+        pytest.skip("pymeshfix, which brings the mesh, is not installed: pip install 'stitch-scans[dev]'")
     return trimesh.load_mesh(Path(found.origin).parent / "examples" / "StanfordBunny.ply")
 
 

@@ -11,7 +11,6 @@ import pytest
 from stitch.api.run import Stitched
 from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.run_data import FusedCloud
 from stitch.system import open3d_library
 from tests.needs import needs_open3d
 
@@ -88,7 +87,7 @@ def test_a_command_says_what_is_missing_before_the_work(words, line, said, sessi
 
 @pytest.mark.parametrize("tensor", [False, True])
 def test_a_stitched_cloud_says_what_is_missing(tensor, said):
-    cloud = Stitched(FusedCloud(np.eye(3), np.eye(3), np.zeros(3), np.ones(3, int)), "base", "mm")
+    cloud = Stitched(np.eye(3), np.eye(3), np.zeros(3), np.ones(3, int), "base", "mm")
     with pytest.raises(InputError) as refusal:
         cloud.to_open3d(tensor)
     assert str(refusal.value).startswith(f"to_open3d: {said}")

@@ -1,7 +1,6 @@
 """The page of a cell over days: one sentence, until when the calibration holds, every parameter over time."""
 
 from collections.abc import Sequence
-from importlib.metadata import version
 from os.path import relpath
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from stitch.plugins.watch.report import (
     uncertainty_note,
 )
 from stitch.system.files import whole_file
+from stitch.system.packages import stitch_version
 from viz import captions
 from viz.page_parts import render
 from viz.watch.small_multiples import channel_drawing, drawings
@@ -88,7 +88,7 @@ def _identity(report: CellReport) -> list[tuple[str, str]]:
         ("Last", f"{day_text(report.last)} UTC"),
         ("Calibration in use", report.in_use),
         ("False alarms", f"limits for one of the whole cell in {report.run_length:,.0f} sessions"),
-        ("stitch", version("stitch")),
+        ("stitch", stitch_version()),
     ]
 
 

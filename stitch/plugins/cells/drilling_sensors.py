@@ -25,7 +25,7 @@ from stitch.numerics import frames
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array
 from stitch.plugins.cells.job_files import on_a_line
-from stitch.session.reading.text_files import import_extra
+from stitch.system.packages import import_extra
 
 # Axes closer than this (rad) to parallel leave the y axis to noise.
 _PARALLEL = np.radians(5.0)

@@ -3,7 +3,6 @@
 Frame: that of the run, the flange or the base. Unit: metres where the format says so (E57, glTF), else the session's.
 """
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +20,7 @@ from stitch.output.stored_run import fused_cloud
 from stitch.run_data import FusedCloud
 from stitch.session.reading.text_files import shortened
 from stitch.system import ply_file
+from stitch.system.packages import import_extra
 
 # LAS counts places in whole steps of 32 bits, which hold so many on either side of the middle.
 _LAS_STEPS = 1e9
@@ -98,7 +98,7 @@ def write_pcd(cloud: ColouredCloud, path: Path) -> None:
 
 def write_las(cloud: ColouredCloud, path: Path, packed: bool = False) -> None:
     """Write LAS 1.4, or LAZ, by laspy: colours, and residual and normals as extra dimensions; the session's unit."""
-    laspy = _package("laspy")
+    laspy = import_extra("laspy", path, "formats")
     las = laspy.create(point_format=7, file_version="1.4")
     middle = np.floor((cloud.fused.points.min(axis=0) + cloud.fused.points.max(axis=0)) / 2)
     farthest = max(float(np.abs(cloud.fused.points - middle).max()), 1e-6)
@@ -121,7 +121,7 @@ def write_e57(cloud: ColouredCloud, path: Path) -> None:
     columns = {f"cartesian{axis}": column.copy() for axis, column in zip("XYZ", points.T, strict=True)}
     names = ("colorRed", "colorGreen", "colorBlue")
     columns |= {name: column.copy() for name, column in zip(names, cloud.colours.T, strict=True)}
-    with _package("pye57").E57(str(path), mode="w") as file:
+    with import_extra("pye57", path, "formats").E57(str(path), mode="w") as file:
         file.write_scan_raw(columns)
 
 
@@ -149,10 +149,3 @@ CLOUD_FORMATS: dict[str, tuple[Callable[[ColouredCloud, Path], None], str]] = {
     "e57": (write_e57, "normals, nor residuals but as colours"),
     "glb": (write_glb, "residuals but as colours"),
 }
-
-
-def _package(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise InputError(f"this format needs the package {name}; to fix: pip install 'stitch[formats]'") from None

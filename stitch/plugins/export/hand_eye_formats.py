@@ -4,7 +4,6 @@ import json
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -20,6 +19,7 @@ from stitch.numerics.units import METRES, length_text
 from stitch.output.stored_run import read_diagnosis, read_result
 from stitch.output.urdf_file import roll_pitch_yaw, xml_comment
 from stitch.plugins.intake.controllers.taught_points import NUMBERS, fixed_xyz_numbers, quaternion_w_first_numbers
+from stitch.system.packages import stitch_version
 
 _PARENTS = {"eye_to_hand": "base_link", "eye_in_hand": "flange"}
 _PARENT_WORDS = {"eye_to_hand": "base", "eye_in_hand": "flange"}
@@ -60,7 +60,7 @@ class ExportedHandEye:
         U = [f"{label} {size:.2g} {unit}".rstrip() for label, size, unit in sizes]
         return [
             f"{self.name} of session {self.session}: maps coordinates of {self.child} into {self.parent}; "
-            f"stitch {version('stitch')}",
+            f"stitch {stitch_version()}",
             f"U (k = 2), in the frame {self.parent}: {', '.join(U)}",
             *self.notes,
         ]

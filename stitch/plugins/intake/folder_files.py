@@ -27,7 +27,8 @@ from stitch.session.reading.clouds import CLOUD_SUFFIXES
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
 from stitch.session.reading.scan_files import ptx_scans
 from stitch.session.reading.scan_headers import poses_in_scans
-from stitch.session.reading.text_files import WORKBOOKS, import_extra, readable
+from stitch.session.reading.text_files import WORKBOOKS, readable
+from stitch.system.packages import import_extra
 
 # Which files of a folder are scans, and which of them are the scans of its campaign.
 

@@ -28,8 +28,9 @@ from stitch.screening.motions import register_scan_pairs
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.robot_description import moving_joints, robot_from_urdf
 from stitch.session.reading.session_toml import SESSION_FORMAT
-from stitch.session.reading.text_files import import_extra, shortened
+from stitch.session.reading.text_files import shortened
 from stitch.session.robot import forward
+from stitch.system.packages import import_extra
 
 # Frames of ROS chained: what tf recorded between parents and children, interpolated in time.
 

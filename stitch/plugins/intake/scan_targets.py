@@ -17,9 +17,9 @@ from stitch.plugins.intake.layouts import MM
 from stitch.screening.motions import RelativeScans
 from stitch.session.reading.range_image import read_range_image
 from stitch.session.reading.session_toml import read_session_document
-from stitch.session.reading.text_files import import_extra
 from stitch.session.reading.views_table import read_views
 from stitch.session.session import SessionData, Sighting
+from stitch.system.packages import import_extra
 
 # How the scanner moved between views, from targets that both show: a flat board tells as much as any.
 

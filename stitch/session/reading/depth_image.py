@@ -11,7 +11,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.session.reading.intrinsics import Intrinsics, find_intrinsics
-from stitch.session.reading.text_files import import_extra
+from stitch.system.packages import import_extra
 
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 # A table of points has fewer columns, an image more.

@@ -14,7 +14,8 @@ from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.session.reading.csv_files import is_number
 from stitch.session.reading.depth_image import is_depth_image, read_depth_columns
-from stitch.session.reading.text_files import import_extra, require_file
+from stitch.session.reading.text_files import require_file
+from stitch.system.packages import import_extra
 from stitch.system.ply_file import vertex_columns
 
 MESHES = (".stl", ".obj", ".off", ".glb", ".gltf")

@@ -11,7 +11,7 @@ import numpy as np
 
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.session.reading.text_files import import_extra
+from stitch.system.packages import import_extra
 
 _HEAD = 4096
 # From here E57 counts seconds (ASTM E2807).

@@ -5,7 +5,6 @@ What it holds as TOML, JSON or sheets; names that people write there; and values
 
 import codecs
 import csv
-import importlib
 import io
 import json
 import tomllib
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from stitch.errors import InputError
+from stitch.system.packages import import_extra
 
 # Tables and descriptions are far smaller; a larger one is another file.
 LARGEST_MB = 200
@@ -234,22 +234,6 @@ def workbook_sheets(file: Path) -> dict[str, str]:
             csv.writer(text, lineterminator="\n").writerows(rows)
             texts[name] = text.getvalue()
     return texts
-
-
-def import_extra(name: str, where: Path | str, extra: str) -> Any:
-    """Return a package by its name of import; only some files need it, and an extra of this package installs it.
-
-    Args:
-        where: the file, or the flag, that needs it.
-        extra: of this package.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise InputError(f"{where}: needs the package {name}; to fix: pip install 'stitch[{extra}]'") from None
 
 
 def require_name(where: str, name: str, what: str) -> str:

@@ -271,7 +271,7 @@ def test_nine_holes_in_a_rendered_image():
 
 def test_without_opencv_the_image_finder_says_what_to_do(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(InputError, match=r"to fix: pip install 'stitch\[vision\]'"):
+    with pytest.raises(InputError, match=r"to fix: pip install 'stitch-scans\[vision\]'"):
         drilling_sensors.find_holes(np.zeros((10, 10), np.uint8))
 
 

@@ -130,7 +130,7 @@ def test_glb_of_a_run_with_a_mesh_is_the_mesh(cloud, tmp_path):
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
             "r/stitched.ply: damaged",
         ),
-        ("las", "c.las", "cloud", "needs the package laspy; to fix: pip install 'stitch[formats]'"),
+        ("las", "c.las", "cloud", "needs the package laspy; to fix: pip install 'stitch-scans[formats]'"),
     ],
 )
 def test_clouds_that_cannot_be_written(kind, output, content, message, tmp_path, monkeypatch, capsys):

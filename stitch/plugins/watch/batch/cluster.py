@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import Any
 
 from stitch.errors import InputError
+from stitch.system.packages import command_for
 
 _ANSWER_SECONDS = 10.0  # seconds within which a scheduler has to answer
 _SETTINGS = {
@@ -131,6 +132,6 @@ def _package() -> Any:
 
 def _missing_package_error(package: str) -> InputError:
     return InputError(
-        f"more than one process needs the package {package}; to fix: pip install 'stitch[cluster]', or leave out "
+        f"more than one process needs the package {package}; to fix: {command_for('cluster')}, or leave out "
         "--workers and --scheduler"
     )

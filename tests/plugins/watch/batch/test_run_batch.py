@@ -161,7 +161,7 @@ def test_where_nothing_can_be_read_nothing_is_left(tmp_path, batch):
 def test_without_the_package_one_process_works(sessions, monkeypatch, capsys, batch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     batch(sessions[0], "--workers", "2", code=2)
-    assert "pip install 'stitch[cluster]'" in capsys.readouterr().err
+    assert "pip install 'stitch-scans[cluster]'" in capsys.readouterr().err
     batch(sessions[0])
 
 

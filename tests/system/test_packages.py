@@ -1,0 +1,72 @@
+"""The distribution has a name of its own; no message, page or error names another that is not among its packages."""
+
+import re
+import tomllib
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+import stitch
+from stitch.errors import InputError
+from stitch.system.packages import DISTRIBUTION, command_for, import_extra, stitch_version
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+WRITTEN = [
+    *(ROOT / name for name in ("Makefile", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "mkdocs.yml")),
+    *(
+        f
+        for room in ("stitch", "viz", "data_synth", "bench", "tests", "docs", "examples")
+        for f in (ROOT / room).rglob("*")
+    ),
+]
+
+
+def name_of(requirement):
+    """The distribution that a requirement asks for."""
+    return re.match(r"[\w.-]+", requirement)[0].lower()
+
+
+def installed_by(text):
+    """What commands of a text install, as they name it, and what they do it with."""
+    for words in re.findall(r"\bpip install\s+((?:--?[\w-]+\s+)*)'?([\w.{}()-]+(?:\[[^\]]*\])?)", text):
+        yield words[1]
+
+
+def test_the_name_is_that_of_the_project():
+    assert PROJECT["name"] == DISTRIBUTION
+    assert stitch.__version__ == stitch_version() == PROJECT["version"]
+    assert {entry.dist.name for entry in entry_points(group="stitch.commands") if entry.name == "watch"} == {
+        DISTRIBUTION
+    }
+
+
+def test_no_text_names_a_distribution_that_is_neither_ours_nor_a_dependency():
+    asked = {name_of(r) for requirements in (PROJECT["dependencies"], *EXTRAS.values()) for r in requirements}
+    strangers = []
+    for file in WRITTEN:
+        if file.suffix not in (".py", ".md", ".ipynb", ".j2", ".js", ".toml", ".yml", "") or not file.is_file():
+            continue
+        text = file.read_text("utf-8")
+        for name in installed_by(text):
+            own, _, extra = name.partition("[")
+            if own == DISTRIBUTION:
+                assert extra.rstrip("]") in ("", *EXTRAS, "{extra}"), f"{file}: {name}"
+            elif own not in asked and not own.startswith(("{", "-")):
+                strangers.append(f"{file.relative_to(ROOT)}: {name}")
+        assert not re.search(r"""\bversion\(["']stitch["']\)|['" ]stitch\[[a-z]""", text), file
+    assert strangers == []
+
+
+def test_a_missing_package_is_one_line_with_the_command():
+    with pytest.raises(
+        InputError, match=re.escape(f"a.las: needs the package no_such; to fix: {command_for('formats')}")
+    ):
+        import_extra("no_such", "a.las", "formats")
+
+
+def test_papers_name_version_and_licence():
+    citation = (ROOT / "CITATION.cff").read_text("utf-8")
+    assert f"version: {PROJECT['version']}\n" in citation and f"license: {PROJECT['license']}\n" in citation
