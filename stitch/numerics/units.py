@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 METRES = {"mm": 1e-3, "m": 1.0}  # in one length_unit
+CLOUD_METRES = METRES | {"cm": 1e-2, "inch": 0.0254}  # in one unit of the files of clouds
 MICROMETRES = {"mm": 1e3, "m": 1e6}  # in one length_unit
 
 

@@ -118,6 +118,18 @@ def rows_by_time(
     """Per cloud the row nearest in time, and the farthest of them, s; None where times do not tell it.
 
     Args:
+        labels, numbers: as of `times_of_both`.
+    """
+    times = times_of_both(clouds, labels, numbers)
+    return None if times is None else _nearest_rows(*times)
+
+
+def times_of_both(
+    clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None = None
+) -> tuple[Array, Array, float | None] | None:
+    """Return the times of clouds (N,) and rows (V,) by one calendar, s; and a day where no row bears a date.
+
+    Args:
         labels: per row the texts beside it: times of day, for clouds that have date and time in their names.
         numbers: (V, C) of the table: a column of seconds since 1970, for clouds that have these.
     """
@@ -126,19 +138,19 @@ def rows_by_time(
         # Times of day without a date are of any day.
         dated = clock.first_s >= DAY_S
         poses = clock.first_s + clock.seconds
-        return _nearest_rows(own, poses if dated else poses % DAY_S, None if dated else DAY_S)
+        scans = np.array(own, float)
+        day = None if dated else DAY_S
+        return None if np.isnan(scans).any() else (scans, poses, None) if dated else (scans % DAY_S, poses % DAY_S, day)
     columns = [] if numbers is None else [t for c in numbers.T if (t := since_1970(c)) is not None]
-    return (
-        _nearest_rows([_unix_seconds(cloud.stem) for cloud in clouds], columns[0], None) if len(columns) == 1 else None
-    )
+    scans = np.array([_unix_seconds(cloud.stem) for cloud in clouds], float)
+    return (scans, columns[0], None) if len(columns) == 1 and not np.isnan(scans).any() else None
 
 
-def _nearest_rows(own: Sequence[float | None], poses: Array, day: float | None) -> tuple[list[int], float] | None:
+def _nearest_rows(scans: Array, poses: Array, day: float | None) -> tuple[list[int], float] | None:
     """Rows and the farthest of them, unless one is too far away or belongs to two."""
-    if len(own) < 2 or None in own:
+    if len(scans) < 2:
         return None
-    scans: Array = np.array(own, float)
-    away = np.abs((scans if day is None else scans % day)[:, None] - poses)
+    away = np.abs(scans[:, None] - poses)
     rows = away.argmin(axis=1)
     farthest = float(away.min(axis=1).max())
     usual = float(np.median(np.diff(np.sort(scans))))

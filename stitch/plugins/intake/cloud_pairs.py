@@ -51,7 +51,9 @@ def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
     N, M = len(clouds), len(labels)
     numbered = _by_row(clouds, M)
     if numbered:
-        return numbered
+        # A row too many is none of a cloud's number.
+        gaps = _incomplete_pairings(N, M) if M - N <= LACKING else []
+        return numbered + [pair for pair in gaps if all(pair.rows != other.rows for other in numbered)]
     if abs(N - M) > LACKING or min(N, M) < 3:
         raise InputError(
             f"{clouds[0].parent}: {N} clouds and {M} poses, and their names do not tell which belong together; to fix: "
@@ -69,8 +71,24 @@ def named_pairing(
     clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None = None
 ) -> Pairing | None:
     """Return the pairing that names, times or numbers tell; None where they do not."""
-    named = _by_text(clouds, labels) or _by_time(clouds, labels, numbers)
-    return named or _by_number(clouds, labels) or _by_column(clouds, numbers)
+    ways = (
+        _by_text(clouds, labels),
+        _by_time(clouds, labels, numbers),
+        _by_number(clouds, labels),
+        _by_column(clouds, numbers),
+    )
+    # Names of which some are alike by chance pair fewer.
+    return max((way for way in ways if way is not None), key=lambda way: len(way.used), default=None)
+
+
+def clouds_served(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None = None) -> int:
+    """Return how many clouds a list of poses can serve; of a recording all but one, as a table is the surer list."""
+    named = named_pairing(clouds, labels, numbers)
+    if named is not None:
+        return len(named.used)
+    if len(labels) > len(clouds) + LACKING:
+        return len(clouds) - 1
+    return len(labels) if len(labels) >= len(clouds) - LACKING else 0
 
 
 def _by_row(clouds: Sequence[Path], rows: int) -> list[Pairing]:

@@ -14,7 +14,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.cloud_pairs import Pairing
-from stitch.plugins.intake.folder_files import Guess
+from stitch.plugins.intake.folder_files import Because, Guess
 from stitch.plugins.intake.layouts import MM, POSE_UNITS
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading
 from stitch.screening.background import find_standing_scene
@@ -193,7 +193,9 @@ def choose_convention(
     first = _choose_interpretation(capture, ways, None)
     if not first.determined:
         first = _choose_interpretation(capture, ways, motions())
-    if first.determined or len(pairs) == 1:
+    rows = {row for pairing in pairs for row in pairing.rows}
+    nothing_left = len({*pairs[0].rows}) == len(rows | {*pairs[0].rows})
+    if len(pairs) == 1 or (first.determined and nothing_left):
         return first
     every = _choose_interpretation(
         capture, _with_confirmed_unit(motions(), all_interpretations(readings, pairs, units, directions)), motions()
@@ -341,6 +343,7 @@ def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool 
         f"under it the scanner lies {scanner} from the origin of its frame and the part {part} from that of its own"
     )
     told = True
+    by: Because = "file"
     if mount is not None:
         chosen, reason = mount, "stated with --mount"
     elif reading.layout.turntable:
@@ -351,6 +354,7 @@ def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool 
     elif decided.determined and max(away) > _NEARER * min(away):
         chosen = "eye_in_hand" if min(away) == decided.scanner_away else "eye_to_hand"
         reason = f"{placed}: what lies nearer sits at the flange"
+        by = "usual"
     elif decided.determined:
         chosen, reason, told = direct, f"{placed}; poses are usually those of the flange in the base", False
     else:
@@ -359,7 +363,7 @@ def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool 
     value = f"{chosen}, {_WORDS[chosen]}; the poses are {'T_flange_base' if inverted else 'T_base_flange'}"
     rest = other if chosen == direct else direct
     runner_up = f"{rest} with poses {'inverted' if not inverted else 'as they are'}" if mount is None else None
-    return Mounting(chosen, inverted, Guess("mount", value, reason, told, "--mount", runner_up))
+    return Mounting(chosen, inverted, Guess("mount", value, reason, told, "--mount", runner_up, by))
 
 
 # Scans that lie in one frame already: moved there by the scanner's software, so that no pose is left to tell.

@@ -27,9 +27,18 @@ from stitch.plugins.intake.convention_choice import (
     require_own_frames,
     weigh_doubts,
 )
-from stitch.plugins.intake.folder_files import FolderFiles, Guess, angles_in_names, find_folder_files
-from stitch.plugins.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, cloud_units, covariate_columns, size_words
-from stitch.plugins.intake.raw_poses import RawPoses, header_poses, is_program, program_poses, read_raw_poses
+from stitch.plugins.intake.folder_files import Because, FolderFiles, Guess, angles_in_names, find_folder_files
+from stitch.plugins.intake.layouts import (
+    CLOUD_UNITS,
+    MM,
+    POSE_UNITS,
+    cloud_units,
+    covariate_columns,
+    kept_column,
+    size_words,
+    unit_pairs,
+)
+from stitch.plugins.intake.raw_poses import RawPoses, header_poses
 from stitch.plugins.intake.readings import (
     Reading,
     StatedTable,
@@ -42,6 +51,7 @@ from stitch.plugins.intake.readings import (
 )
 from stitch.plugins.intake.scan_targets import TargetSearch, find_folder_targets, target_motions
 from stitch.plugins.intake.stops import rows_with_scans
+from stitch.plugins.intake.sudden_change import require_no_change
 from stitch.screening.motions import RelativeScans, register_scan_pairs
 from stitch.session.capture import Capture
 from stitch.session.reading.clouds import read_cloud
@@ -81,6 +91,10 @@ class StatedFolder(StatedTable):
         """The corners (2, 3) of the box that counts; (0, 3) where everything does."""
         return np.array(self.within, float).reshape(-1, 3)
 
+    def accepts(self, raw: RawPoses) -> bool:
+        """Whether the columns or the orientation stated make poses of rows that no layout accepts."""
+        return len(self.columns) == raw.numbers.shape[1] or (len(self.orientation) > 0 and raw.numbers.shape[1] >= 3)
+
     @property
     def carries(self) -> bool | None:
         """Whether the poses as written carry the mount's frame, where mount and direction are both stated."""
@@ -107,7 +121,7 @@ def session_guesses(
         _columns_guess(raw, decided, stated),
         _rotation_guess(decided, stated),
         _length_unit_guess(decided, stated),
-        _cloud_unit_guess(files, clouds, own_units, stated),
+        _cloud_unit_guess(files, decided, clouds, own_units, stated),
     )
 
 
@@ -134,18 +148,22 @@ def _pairing_guess(decided: ConventionChoice) -> Guess:
     if pairing.by_name:
         return Guess("pairing", pairing.words, "cloud and pose bear the same name, time or number", True, "--poses")
     reason = f"names do not tell it; under it {score_words(decided.best)}"
-    return Guess("pairing", pairing.words, reason, decided.determined, "a column with the cloud's file name")
+    flag = "a column with the cloud's file name"
+    return Guess("pairing", pairing.words, reason, decided.determined, flag, by="scans")
 
 
 def _columns_guess(raw: RawPoses, decided: ConventionChoice, stated: StatedFolder) -> Guess:
     layout = decided.best.interpretation.reading.layout
     beside = list(covariate_columns(layout, range(len(raw.numbers)), raw.time_s))
     words = f"; beside the poses {', '.join(beside)}" if beside else ""
+    taken = ", ".join(f"{x:.10g}" for x in layout.offset)
+    words += f"; {taken} taken off all positions, as they are those of a site" if taken else ""
     words += f"; {raw.clock.words}" if raw.clock is not None and raw.clock.words else ""
     if stated.columns:
         return Guess("columns", ", ".join(stated.columns), f"stated with --columns{words}", True, "--columns")
     reason = ("the file names them" if layout.named else "told by their values") + words
-    return Guess("columns", layout.words, reason, layout.named or decided.determined, "--columns")
+    by: Because = "file" if layout.named else "scans"
+    return Guess("columns", layout.words, reason, layout.named or decided.determined, "--columns", by=by)
 
 
 def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
@@ -155,7 +173,7 @@ def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
     if decided.overruled:
         named = ", as the columns are named" * best.layout.named
         reason = f"the scans contradict {decided.overruled}{named}; {score_words(decided.best)}"
-        return Guess("rotation", best.words, reason, decided.determined, "--rotation")
+        return Guess("rotation", best.words, reason, decided.determined, "--rotation", by="scans")
     if best.layout.convention is not None:
         sure = best.layout.sure or (decided.determined and not decided.only_believed)
         reason = f"only the names say so; {decided.only_believed or 'others'} would fit too"
@@ -170,7 +188,9 @@ def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
     if other is not None:
         direction = "poses as they are" if other.interpretation.carries else "poses inverted"
         words = f"{other.interpretation.reading.words}, {direction}, {score_words(other)}"
-    return Guess("rotation", best.words, reason, decided.determined, "--rotation", words)
+    worse = None if other is None or not decided.best.misfit else other.misfit / decided.best.misfit
+    worse_by = None if worse is None or not np.isfinite(worse) else round(worse, 3)
+    return Guess("rotation", best.words, reason, decided.determined, "--rotation", words, "scans", worse_by)
 
 
 def _length_unit_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
@@ -182,18 +202,27 @@ def _length_unit_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess
         return Guess("length_unit", way.length_unit, "told by the file", True, "--unit")
     metres = reach * POSE_UNITS[way.length_unit]
     reason = f"positions reach {reach:.4g}, that is {metres:.2f} m, as robots do; {score_words(decided.best)}"
-    return Guess("length_unit", way.length_unit, reason, decided.determined, "--unit")
+    # The motions of the scans have a scale only where the unit of the clouds is known.
+    by: Because = "scans" if stated.cloud_unit else "usual"
+    return Guess("length_unit", way.length_unit, reason, decided.determined, "--unit", by=by)
 
 
 def _cloud_unit_guess(
-    files: FolderFiles, clouds: Sequence[Array], own_units: Sequence[str], stated: StatedFolder
+    files: FolderFiles,
+    decided: ConventionChoice,
+    clouds: Sequence[Array],
+    own_units: Sequence[str],
+    stated: StatedFolder,
 ) -> Guess:
     if stated.cloud_unit:
         return Guess("cloud_unit", stated.cloud_unit, "stated with --cloud-unit", True, "--cloud-unit")
     other = own_units[1] if len(own_units) > 1 else None
     counted = files.clouds[0].suffix.lower() in (".png", ".tif", ".tiff")
     words = "; whole numbers of depth are mm unless the intrinsics state depth_scale" * counted
-    return Guess("cloud_unit", own_units[0], f"{size_words(clouds)}{words}", other is None, "--cloud-unit", other)
+    known = stated.length_unit or decided.best.interpretation.reading.layout.length_unit
+    by: Because = "scans" if known and decided.determined else "usual"
+    reason = f"{size_words(clouds)}{words}"
+    return Guess("cloud_unit", own_units[0], reason, other is None, "--cloud-unit", other, by)
 
 
 # Enough points a view to tell conventions.
@@ -215,6 +244,7 @@ class FirstSession:
     sightings: tuple[Sighting, ...] = ()  # mm, of every cloud, where targets are looked for
     sphere_mm: float | None = None  # radius, where the clouds are profiles of a sphere
     box: Array = field(default_factory=lambda: np.empty((0, 3)))  # corners, of the box that counts, unit of the clouds
+    not_used: tuple[str, ...] = ()  # files, lists, rows and columns that were read or seen and left aside, and why
 
     @property
     def pairing(self) -> Pairing:
@@ -228,7 +258,7 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     Raises:
         InputError: no clouds or poses, or one that cannot be read; names the file and what to do.
     """
-    found = find_folder_files(folder, stated.poses)
+    found = find_folder_files(folder, stated.poses, stated.accepts)
     raw = _read_table(found, stated)
     clouds, kept, lost = _read_clouds(found.clouds, stated.box)
     pairs = [pairing.of(kept, raw.without_pose) for pairing in pairings(found.clouds, raw.labels, raw.numbers)]
@@ -243,15 +273,44 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     seen, of_targets = find_folder_targets(found, points, CLOUD_UNITS[own_units[0]], stated.targets)
     shown = target_motions(seen) if seen else None
     capture = capture_of(clouds, CLOUD_UNITS[own_units[0]] / MM)
-    decided = _decide(
+    decided, scale = _decide(
         found, raw, ways_to_read, (capture, CLOUD_UNITS[own_units[0]] / MM), (pairs, units), stated, shown
     )
+    if alike := _units_of_scale(scale, decided, points, own_units[0], stated):
+        again = first_session(folder, replace(stated, length_unit=alike[0][0], cloud_unit=alike[0][1]))
+        return replace(again, guesses=tuple(_unit_of_pairs(guess, alike, stated) for guess in again.guesses))
+    require_scale(found, scale, stated)
     axis, axis_guess = guess_optical_axis(clouds)
     settled = choose_mounting(decided, stated.mount, stated.inverse)
     told = session_guesses(found, raw, decided, points, own_units, stated)
     beside = (*of_targets, *_codes_guess(clouds), *_left_out_guess(found, decided, lost))
     guesses = (*told, settled.guess, axis_guess, *beside)
-    return FirstSession(found, raw, own_units[0], decided, settled, guesses, axis, sightings=seen, box=stated.box)
+    aside = _not_used(found, raw, decided, lost)
+    return FirstSession(
+        found, raw, own_units[0], decided, settled, guesses, axis, sightings=seen, box=stated.box, not_used=aside
+    )
+
+
+def _not_used(files: FolderFiles, raw: RawPoses, decided: ConventionChoice, lost: Sequence[str]) -> tuple[str, ...]:
+    """Return what was read or seen and is no part of the session: lists, clouds, rows and columns, each with why."""
+    pairing, layout = decided.best.interpretation.pairing, decided.best.interpretation.reading.layout
+    lists = [found.words for found in files.inventory if not found.taken_for]
+    listed = {file for found in files.inventory for file in found.files}
+    others = [
+        f"{file.name}: of another kind than {files.clouds[0].name}" for file in files.unused if file not in listed
+    ]
+    unposed = [f"{files.clouds[i].name}: no pose for it" for i, row in enumerate(pairing.rows) if row is None]
+    rows = [_row_words(raw, row) for row in range(len(raw.numbers)) if row not in pairing.rows]
+    kept = covariate_columns(layout, range(len(raw.numbers)), raw.time_s)
+    columns = [f"column {name}: counts or runs backwards" for name in layout.rest if not kept_column(name, kept)]
+    return (*lists, *others, *lost, *unposed, *rows, *columns)
+
+
+def _row_words(raw: RawPoses, row: int) -> str:
+    """A row of a table by its number and its texts."""
+    why = "without a pose" if row in raw.without_pose else "no cloud for it"
+    label = f" ({', '.join(raw.labels[row])})" if raw.labels[row] else ""
+    return f"row {row + 1} of {Path(raw.source).name}{label}: {why}"
 
 
 def _decide(
@@ -262,8 +321,10 @@ def _decide(
     open_: tuple[Sequence[Pairing], Sequence[str]],
     stated: StatedFolder,
     shown: RelativeScans | None,
-) -> ConventionChoice:
+) -> tuple[ConventionChoice, float | None]:
     """Let the scans choose among the readings, and among those that the names of columns deny.
+
+    Returns the choice, and how many times larger than the robot's motions the scans are; None where they do not say.
 
     Args:
         scans: made light, mm, and the unit of their files in mm.
@@ -271,7 +332,7 @@ def _decide(
         shown: motions that targets show.
 
     Raises:
-        InputError: scans that stand still, lie in one frame or have another scale.
+        InputError: scans that stand still, or lie in one frame.
     """
     (capture, mm), (pairs, units) = scans, open_
 
@@ -286,8 +347,12 @@ def _decide(
 
     decided = choose(ways_to_read)
     require_own_frames(found.folder, motions, decided)
-    if not decided.determined:
-        require_scale(found, fitted_scale(motions(), decided), stated)
+    if not decided.determined and len(pairs[0].used) == len(found.clouds):
+        ways = all_interpretations(ways_to_read, pairs[:1], units, (True, False))
+        require_no_change(found.clouds, motions(), ways)
+    scale = None if decided.determined else fitted_scale(motions(), decided)
+    if scale is not None and abs(np.log(scale)) >= _SCALE:
+        return decided, scale
     layout = decided.best.interpretation.reading.layout
     doubted = [] if layout.turntable else doubted_readings(raw, found.urdf, stated)
     if not decided.determined:
@@ -298,8 +363,37 @@ def _decide(
         decided = weigh_doubts(decided, choose_by_surfaces(capture, doubted, decided.best.interpretation))
     if not decided.determined and found.clouds[0].suffix.lower() in DEPTH_SUFFIXES:
         # Where counts are far too large or small the motions close less well.
-        require_scale(found, fitted_scale(motions(), decided, (10.0, 0.1)), stated)
-    return decided
+        return decided, fitted_scale(motions(), decided, (10.0, 0.1))
+    return decided, None
+
+
+def _units_of_scale(
+    scale: float | None, decided: ConventionChoice, clouds: Sequence[Array], cloud_unit: str, stated: StatedFolder
+) -> list[tuple[str, str]]:
+    """Units of poses and clouds under which the motions of both are alike; none where those tried are, or nothing is.
+
+    Args:
+        scale: of the scans against the robot's motions, in the units tried.
+        cloud_unit: the one tried.
+    """
+    if scale is None or abs(np.log(scale)) < _SCALE:
+        return []
+    way = decided.best.interpretation
+    factor = CLOUD_UNITS[cloud_unit] / POSE_UNITS[way.length_unit] / scale
+    known = stated.length_unit or way.reading.layout.length_unit
+    pairs = unit_pairs(way.reading.T[:, :3, 3], clouds, factor)
+    return [pair for pair in pairs if known in (None, pair[0]) and stated.cloud_unit in (None, pair[1])]
+
+
+def _unit_of_pairs(guess: Guess, alike: Sequence[tuple[str, str]], stated: StatedFolder) -> Guess:
+    """A guess of a unit with the pairs of units that fit as well: a scale common to both is shown by nothing."""
+    side = {"length_unit": 0, "cloud_unit": 1}.get(guess.what)
+    if side is None or (stated.length_unit, stated.cloud_unit)[side]:
+        return guess
+    others = ", ".join(f"{pose} with clouds in {cloud}" for pose, cloud in alike[1:])
+    reason = f"motions of scans and robot are alike with poses in {alike[0][0]} and clouds in {alike[0][1]}"
+    reason += "; only the usual size of a cell tells it from others" if others else ""
+    return replace(guess, reason=reason, determined=not others, runner_up=others or None)
 
 
 # Of the width of a profile: how far its points lie from a plane through the scanner.
@@ -429,7 +523,7 @@ def require_scale(files: FolderFiles, scale: float | None, stated: StatedFolder)
 
 
 def _read_folder_poses(files: FolderFiles) -> RawPoses:
-    if not files.poses:
+    if files.raw is None:
         angles = angles_in_names(files.clouds)
         if angles is not None and poses_in_scans(list(files.clouds)) is None:
             labels = tuple((cloud.name,) for cloud in files.clouds)
@@ -438,10 +532,7 @@ def _read_folder_poses(files: FolderFiles) -> RawPoses:
                 source, ("turntable_deg",), np.array(angles)[:, None], labels, "angles in the names of the clouds"
             )
         return header_poses(files.clouds)
-    first = files.poses[0]
-    if is_program(first):
-        return program_poses(first)
-    return read_raw_poses(files.poses)
+    return files.raw
 
 
 def capture_of(clouds: Sequence[Cloud], scale: float) -> Capture:
@@ -466,4 +557,4 @@ def guess_optical_axis(clouds: Sequence[Cloud]) -> tuple[str, Guess]:
     told = abs(middle[2]) > np.linalg.norm(middle[:2])
     where = ", ".join(f"{x:.3g}" for x in middle)
     reason = f"the middle of the scans lies at ({where}) in the scanner's frame"
-    return axis, Guess("optical_axis", axis, reason, bool(told), "optical_axis in session.toml")
+    return axis, Guess("optical_axis", axis, reason, bool(told), "optical_axis in session.toml", by="scans")

@@ -1,30 +1,25 @@
 """What a folder holds: clouds, files of poses, a robot's description."""
 
+import codecs
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from natsort import natsorted, ns
 
 from stitch.errors import InputError
-from stitch.plugins.intake.layouts import possible_layouts
-from stitch.plugins.intake.raw_poses import (
-    PROGRAMS,
-    STRUCTURED,
-    TABLES,
-    is_program,
-    read_by_its_program,
-    read_raw_poses,
-)
+from stitch.plugins.intake.inventory import FoundList, choose_list, take_inventory
+from stitch.plugins.intake.raw_poses import RawPoses, read_by_its_program, read_lists, read_raw_poses
 from stitch.session.reading.clouds import CLOUD_SUFFIXES
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
+from stitch.session.reading.intrinsics import find_intrinsics
 from stitch.session.reading.scan_files import ptx_scans
 from stitch.session.reading.scan_headers import poses_in_scans
 from stitch.session.reading.text_files import WORKBOOKS, readable
@@ -78,6 +73,9 @@ def _is_cloud_array(file: Path) -> bool:
 # What was guessed about a folder: each guess with its reason, how sure it is, and the flag that overrules it.
 
 
+Because = Literal["file", "scans", "usual"]
+
+
 @dataclass(frozen=True)
 class Guess:
     """One thing that the files do not say, or say only in a name."""
@@ -88,10 +86,21 @@ class Guess:
     determined: bool  # the files or the scans tell it; False: it cannot be told from these views
     flag: str  # that overrules it
     runner_up: str | None = None
+    by: Because = "file"  # what decides it; a guess that is not determined is only usual
+    worse_by: float | None = None  # how many times worse the runner-up fits the scans
+
+    @property
+    def because(self) -> Because:
+        """What decides it: a file or a person says so, the scans say so, or it is only usual."""
+        return self.by if self.determined else "usual"
 
     @property
     def line(self) -> str:
-        """For a comment or a terminal."""
+        """For a comment or a terminal; what is only usual with a question mark."""
+        return f"{'? ' if self.because == 'usual' else ''}{self._words}"
+
+    @property
+    def _words(self) -> str:
         untold = "" if self.determined else f" cannot be told from these views, {self.flag} overrules it;"
         other = f"; next best: {self.runner_up}" if self.runner_up else ""
         return f"{self.what}: {self.value};{untold} {self.reason}{other}"
@@ -105,6 +114,8 @@ class Guess:
             "told": self.determined,
             "flag": self.flag,
             "runner_up": self.runner_up,
+            "because": self.because,
+            "against": [{"what": self.runner_up, "worse_by": self.worse_by}] if self.runner_up else [],
         }
 
 
@@ -112,7 +123,11 @@ _DEEPEST = 3
 _LARGEST_TABLE_MB = 5.0
 _PACKED = (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz", ".xz", ".bz2", ".zst")
 # What this program writes itself.
-_OWN = {"views.csv", "session.toml", "points.csv", "frames.csv", "targets.csv"}
+_OWN = {"session.toml": b"stitch-session", "targets.csv": b"target,"}
+_OWN |= dict.fromkeys(("views.csv", "points.csv", "frames.csv"), b"view,")
+# Robots, pictures and documents.
+_NO_POSES = (".urdf", ".xacro", ".md", ".html", ".pdf", ".py", ".toml", ".mtl")
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
 
 @dataclass(frozen=True)
@@ -124,23 +139,29 @@ class FolderFiles:
     poses: tuple[Path, ...]  # one table, or a file for each pose; none: they stand in the headers of the scans
     urdf: Path | None
     unused: tuple[Path, ...]  # clouds of another kind and other files of poses, not used
+    raw: RawPoses | None = None  # the rows of the poses; None: they stand in the headers of the scans
+    inventory: tuple[FoundList, ...] = ()  # every list of numbers beside the scans
 
 
 @readable()
-def find_folder_files(folder: Path, poses: Path | None = None) -> FolderFiles:
+def find_folder_files(
+    folder: Path, poses: Path | None = None, accepts: Callable[[RawPoses], bool] = lambda _: False
+) -> FolderFiles:
     """Find clouds and poses in a folder and below it.
 
     Args:
-        poses: file or folder of the poses, where a person names it.
+        poses: file or folder of the poses, where a person names it; FILE#LIST for one list of a file.
+        accepts: whether what a person has stated makes poses of a list that no layout accepts.
 
     Raises:
-        InputError: no clouds, no poses, or several tables of poses.
+        InputError: no clouds, no poses, or several lists of poses.
     """
     _require_folder(folder)
-    if poses is not None and not poses.exists():
-        raise InputError(f"{poses}: no such file; to fix: name the file of the poses")
+    file, part = _file_and_part(poses)
+    if file is not None and not file.exists():
+        raise InputError(f"{file}: no such file; to fix: name the file of the poses")
     files = list_files(folder)
-    named = {poses, *(poses.iterdir() if poses is not None and poses.is_dir() else ())}
+    named = {file, *(file.iterdir() if file is not None and file.is_dir() else ())}
     clouds, other_clouds = clouds_among([f for f in files if f not in named])
     if not clouds:
         raise InputError(_no_clouds_message(folder, files))
@@ -148,20 +169,44 @@ def find_folder_files(folder: Path, poses: Path | None = None) -> FolderFiles:
     texts = [f for f in other_clouds if f.suffix.lower() in _EITHER]
     taken = {*clouds, *(other_clouds if len(texts) > _RECORDINGS else set(other_clouds) - {*texts})}
     candidates = [f for f in files if f not in taken and _may_hold_poses(f) and not read_by_its_program(f)]
-    chosen: list[Path] = []
-    rest: list[Path] = []
-    if poses is not None:
-        chosen, rest = _stated_pose_files(poses, taken)
+    chosen: FoundList | None = None
+    inventory: list[FoundList] = []
+    if file is not None:
+        chosen = _stated_list(file, part, taken)
+        inventory = [chosen]
     elif candidates or (poses_in_scans(clouds) is None and angles_in_names(clouds) is None):
-        chosen, rest = _choose_pose_files(folder, candidates, len(clouds))
+        inventory = take_inventory(candidates, accepts)
+        if inventory or (poses_in_scans(clouds) is None and angles_in_names(clouds) is None):
+            chosen, inventory = choose_list(folder, inventory, clouds)
     urdfs = [f for f in files if f.suffix.lower() == ".urdf"]
+    used = (*(chosen.files if chosen else ()), *_lenses(clouds))
+    aside = (*other_clouds, *(f for found in inventory for f in found.files))
     return FolderFiles(
         folder=folder,
         clouds=tuple(clouds),
-        poses=tuple(chosen),
+        poses=chosen.files if chosen else (),
         urdf=urdfs[0] if len(urdfs) == 1 else None,
-        unused=tuple(dict.fromkeys((*(f for f in other_clouds if f not in chosen), *rest))),
+        unused=tuple(dict.fromkeys(f for f in aside if f not in used)),
+        raw=chosen.raw if chosen else None,
+        inventory=tuple(inventory),
     )
+
+
+def _file_and_part(poses: Path | None) -> tuple[Path | None, str]:
+    """FILE and LIST of FILE#LIST; a file whose own name has a # in it is one."""
+    if poses is None or poses.exists() or "#" not in poses.name:
+        return poses, ""
+    name, part = poses.name.rsplit("#", 1)
+    return poses.with_name(name), part
+
+
+def _lenses(clouds: Sequence[Path]) -> list[Path]:
+    """The file of the camera of depth images, which is used though it holds no pose."""
+    if clouds[0].suffix.lower() not in DEPTH_SUFFIXES:
+        return []
+    with suppress(InputError):
+        return [Path(find_intrinsics(clouds[0]).source)]
+    return []
 
 
 # Angles of a turntable in names: scan_020deg, angle_45.5, 120°.
@@ -208,7 +253,7 @@ def list_files(folder: Path, depth: int = 0) -> list[Path]:
     """Return files in a folder and below, hidden ones and folders of runs left out."""
     out = []
     for entry in natsorted(folder.iterdir(), alg=ns.IGNORECASE):
-        if entry.name.startswith(".") or entry.name in _OWN:
+        if entry.name.startswith((".", "~$")) or _is_own(entry):
             continue
         if entry.is_file():
             out.append(entry)
@@ -217,55 +262,43 @@ def list_files(folder: Path, depth: int = 0) -> list[Path]:
     return out
 
 
-def _may_hold_poses(file: Path) -> bool:
-    kinds = (*STRUCTURED, *TABLES, *PROGRAMS, *WORKBOOKS)
-    return file.suffix.lower() in kinds and file.stat().st_size < _LARGEST_TABLE_MB * 1e6
-
-
-def _stated_pose_files(poses: Path, clouds: set[Path]) -> tuple[list[Path], list[Path]]:
-    if poses.is_dir():
-        inside = [f for f in poses.iterdir() if f.is_file() and f not in clouds and _may_hold_poses(f)]
-        if not inside:
-            raise InputError(f"{poses}: no files of poses there; to fix: name the file or the folder of the poses")
-        return natsorted(inside, alg=ns.IGNORECASE), []
-    return [poses], []
-
-
-_NAMES_POSE = re.compile(r"pose|robot|flange|tcp|joint|trajector", re.IGNORECASE)
-
-
-def _choose_pose_files(folder: Path, candidates: Sequence[Path], clouds: int) -> tuple[list[Path], list[Path]]:
-    """The one table, or the files that are named alike and are about as many as the clouds."""
-    alike: dict[tuple[Path, str, str], list[Path]] = {}
-    for file in candidates:
-        alike.setdefault((file.parent, re.sub(r"\d+", "#", file.stem), file.suffix.lower()), []).append(file)
-    sets = [files for files in alike.values() if len(files) > 2 and abs(len(files) - clouds) <= 2]
-    single = [files for files in alike.values() if len(files) == 1]
-    groups = sets or [g for g in single if _NAMES_POSE.search(g[0].stem)]
-    groups = groups or (len(single) > 1 and [g for g in single if _holds_poses(g[0])]) or single
-    if not groups and alike:
-        most = max(alike.values(), key=len)
-        raise InputError(
-            f"{folder}: {clouds} clouds but {len(most)} files that may hold a pose each, {most[0].name} … "
-            f"{most[-1].name}; to fix: leave out what does not belong, or name the file of the poses with --poses FILE"
-        )
-    if not groups:
-        raise InputError(f"{folder}: no file of poses there; to fix: name it with --poses FILE")
-    if len(groups) > 1:
-        shown = ", ".join(str(g[0].relative_to(folder)) for g in groups[:4])
-        raise InputError(f"{folder}: several files may hold the poses ({shown}); to fix: name it with --poses FILE")
-    return groups[0], [f for f in candidates if f not in groups[0]]
-
-
-def _holds_poses(file: Path) -> bool:
-    """Several, whatever the file is called; what a camera's file or a remark holds is none."""
-    if is_program(file):
-        return True
-    try:
-        raw = read_raw_poses([file])
-        return len(raw.numbers) > 1 and bool(possible_layouts(raw))
-    except InputError:
+def _is_own(entry: Path) -> bool:
+    """Whether this program wrote a file, as name and beginning say."""
+    begins = _OWN.get(entry.name)
+    if begins is None or not entry.is_file():
         return False
+    with entry.open("rb") as stream:
+        return begins in stream.readline(_HEADER)
+
+
+def _may_hold_poses(file: Path) -> bool:
+    """Small files that are arrays, workbooks or text, whatever their ending; a robot's description holds none."""
+    suffix = file.suffix.lower()
+    if file.stat().st_size > _LARGEST_TABLE_MB * 1e6 or suffix in _NO_POSES:
+        return False
+    if suffix in (*WORKBOOKS, ".npy", ".npz"):
+        return True
+    with file.open("rb") as stream:
+        start = stream.read(_HEADER)
+    return bool(start) and (b"\0" not in start or start.startswith(_UTF16))
+
+
+def _stated_list(poses: Path, part: str, clouds: set[Path]) -> FoundList:
+    """The list that a person names, of a file or of the files of a folder that hold a pose each."""
+    if not poses.is_dir():
+        if not part:
+            return FoundList((poses,), read_raw_poses([poses]), "poses")
+        lists = read_lists(poses)
+        raw = next((raw for raw in lists if raw.part == part), None)
+        if raw is None:
+            parts = ", ".join(f"{poses.name}#{raw.part}" for raw in lists if raw.part)
+            raise InputError(f"{poses}: has no list {part}; to fix: name one of {parts or poses.name}")
+        return FoundList((poses,), raw, "poses")
+    inside = [f for f in poses.iterdir() if f.is_file() and f not in clouds and _may_hold_poses(f)]
+    if not inside:
+        raise InputError(f"{poses}: no files of poses there; to fix: name the file or the folder of the poses")
+    files = tuple(natsorted(inside, alg=ns.IGNORECASE))
+    return FoundList(files, read_raw_poses(files), "poses")
 
 
 # Files that hold the scans of a whole campaign, E57 and Leica's PTX, as one file a scan.

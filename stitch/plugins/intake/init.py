@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,13 +17,15 @@ import typer
 from stitch.cli.options import split_names
 from stitch.cli.progress import show_activity
 from stitch.cli.terminal import emit, say, show_next, stdout_for_results
-from stitch.errors import InputError
+from stitch.errors import InputError, NoResultError
 from stitch.plugins.intake.detect import BallOption, BoardOption, parse_target_options
 
 if TYPE_CHECKING:
     from stitch.plugins.intake.first_session import FirstSession, StatedFolder
     from stitch.plugins.intake.folder_files import Guess
 
+# Lines of what is left aside on a terminal.
+_SHOWN = 8
 # Guesses that are asked for one by one; the fields of `StatedFolder` bear the same names.
 _QUESTIONS = ("rotation", "length_unit", "cloud_unit", "mount")
 
@@ -41,7 +44,7 @@ _Rotation = Annotated[
 ]
 _Angles = Annotated[str | None, typer.Option("--angles", help="deg or rad.")]
 _Unit = Annotated[str | None, typer.Option("--unit", help="Of the poses: mm, m, cm or inch.")]
-_CloudUnit = Annotated[str | None, typer.Option("--cloud-unit", help="Of the clouds: mm or m.")]
+_CloudUnit = Annotated[str | None, typer.Option("--cloud-unit", help="Of the clouds: mm, m, cm or inch.")]
 _Orientation = Annotated[
     str | None,
     typer.Option("--orientation", help="Of all poses, for a table of x, y, z alone: 180,0,0 or qx,qy,qz,qw."),
@@ -148,7 +151,7 @@ def _init_from_scans(folder: Path, out: Path, stated: StatedFolder, yes: bool, f
 
     if not force:
         require_free(out, draft_files(not stated.targets.is_empty))
-    with one_scan_a_file(folder) as scans:
+    with one_scan_a_file(folder) as scans, _named_as(scans, folder):
         first = _judge_folder(scans, stated)
         if not yes:
             first = _ask_uncertain(scans, out, first, stated)
@@ -156,7 +159,13 @@ def _init_from_scans(folder: Path, out: Path, stated: StatedFolder, yes: bool, f
             _require_fit(scans, first)
         write_draft(out, first, force=force, unpacked=scans != folder)
     command = "run" if first.sphere_mm is None else "calibrate sphere"
-    _report_session(out, len(first.pairing.used), first.guesses, as_json, command)
+    for words in first.not_used[:_SHOWN]:
+        say(f"not used: {words}", hang=2)
+    if len(first.not_used) > _SHOWN:
+        say(f"not used: {len(first.not_used) - _SHOWN} more, which --json lists", hang=2)
+    inventory = [found.as_dict() for found in first.files.inventory]
+    document = {"inventory": inventory, "not_used": list(first.not_used), "question": _question(first.guesses)}
+    _report_session(out, len(first.pairing.used), first.guesses, as_json, command, document)
 
 
 def _init_from_points(folder: Path, out: Path, stated: StatedFolder, yes: bool, force: bool, as_json: bool) -> bool:
@@ -179,6 +188,17 @@ def _init_from_points(folder: Path, out: Path, stated: StatedFolder, yes: bool, 
     return True
 
 
+@contextmanager
+def _named_as(scratch: Path, folder: Path) -> Iterator[None]:
+    """Name a folder in refusals in place of a passing one, which is gone when they are read."""
+    try:
+        yield
+    except (InputError, NoResultError) as error:
+        if scratch == folder or str(scratch) not in str(error):
+            raise
+        raise type(error)(str(error).replace(str(scratch), str(folder))) from None
+
+
 def _judge_folder(folder: Path, stated: StatedFolder) -> FirstSession:
     """Return the session that files and scans tell of, after its guesses are printed."""
     from stitch.plugins.intake.first_session import first_session
@@ -199,7 +219,6 @@ def _require_fit(folder: Path, first: FirstSession) -> None:
     Raises:
         InputError: what the deep check finds wrong for certain.
     """
-    from stitch.errors import NoResultError
     from stitch.plugins.intake.session_draft import write_draft
     from stitch.screening.deep_check import deep_check
     from stitch.session.reading.session_folder import load_session
@@ -207,7 +226,8 @@ def _require_fit(folder: Path, first: FirstSession) -> None:
     choice = first.choice
     if choice.determined or first.sphere_mm is not None or (choice.best.closed or 0.0) >= _WORTH_A_GUESS:
         return
-    with TemporaryDirectory() as draft, show_activity("no reading fits clearly: trying the usual mistakes"):
+    trying = show_activity("no reading fits clearly: trying the usual mistakes")
+    with TemporaryDirectory() as draft, _named_as(Path(draft), folder), trying:
         write_draft(Path(draft), first)
         session = load_session(Path(draft))
         try:
@@ -217,7 +237,7 @@ def _require_fit(folder: Path, first: FirstSession) -> None:
                 p.line(session.names) for p in sorted(certain, key=lambda p: 0 < len(p.views) < len(session.views))
             ]
         except NoResultError as error:
-            found = [str(error)]
+            found = [str(error).replace(draft, str(folder))]
     if found:
         raise InputError(f"{folder}: no session was written, as no reading of the poses fits the scans. {found[0]}")
 
@@ -270,10 +290,20 @@ def _flag_value(guess: Guess) -> str:
 
 def _print_guesses(guesses: Sequence[Guess]) -> None:
     for guess in guesses:
-        say(f"{'' if guess.determined else '? '}{guess.line}", hang=2)
+        say(guess.line, hang=2)
 
 
-def _report_session(out: Path, views: int, guesses: Sequence[Guess], as_json: bool, command: str) -> None:
+def _question(guesses: Sequence[Guess]) -> dict[str, Any] | None:
+    """What a person would be asked first, as JSON; None where files and measurements tell all that is asked."""
+    guess = next((guess for guess in guesses if not guess.determined), None)
+    if guess is None:
+        return None
+    return {"what": guess.what, "flag": guess.flag, "answers": [guess.value, *filter(None, [guess.runner_up])]}
+
+
+def _report_session(
+    out: Path, views: int, guesses: Sequence[Guess], as_json: bool, command: str, beside: dict[str, Any] | None = None
+) -> None:
     """Print the files, what may be wrong in them, and the next command."""
     untold = [guess for guess in guesses if not guess.determined]
     if as_json:
@@ -282,7 +312,10 @@ def _report_session(out: Path, views: int, guesses: Sequence[Guess], as_json: bo
             "views": views,
             "told": not untold,
             "guesses": [guess.as_dict() for guess in guesses],
-        }
+            "inventory": [],
+            "not_used": [],
+            "question": None,
+        } | (beside or {})
         emit(json.dumps(document, indent=1))
     say(f"{out / 'session.toml'} and views.csv: {views} views")
     folder = shlex.quote(str(out))

@@ -1,13 +1,14 @@
 """Which columns of a table hold the position, the rotation or the joint angles: by name, by count, by their values."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
+from stitch.numerics.units import CLOUD_METRES
 from stitch.plugins.intake.clock_times import EPOCH_S, since_1970
 from stitch.plugins.intake.pose_tables import read_names
 from stitch.plugins.intake.raw_poses import RawPoses
@@ -37,6 +38,7 @@ class ColumnLayout:
     named: bool = False  # the file names its columns
     sure: bool = True  # names that tell the convention cannot mean another
     turntable: bool = False  # the part turns before the scanner
+    offset: tuple[float, ...] = ()  # taken off all positions, unit of the file
     rest: dict[str, Array] = field(default_factory=dict)  # other named columns (V,): times, temperatures
 
     @property
@@ -54,7 +56,7 @@ def possible_layouts(raw: RawPoses) -> list[ColumnLayout]:
     if raw.header is not None:
         found = _layout_by_name(raw) or _turntable_layout(raw)
         if found is not None:
-            return [found]
+            return [_without_offset(found)]
         _require_rotation(raw)
     x, rest = _without_time(_without_index(raw.numbers))
     count = x.shape[1]
@@ -67,7 +69,19 @@ def possible_layouts(raw: RawPoses) -> list[ColumnLayout]:
             "hold no pose that is known; to fix: name each with --columns, for example --columns x,y,z,rx,ry,rz "
             "(qx,qy,qz,qw for a quaternion, j1,j2 … for joint angles, - for one to leave out)"
         )
-    return [replace(layout, rest=rest) for layout in found_all]
+    return [_without_offset(replace(layout, rest=rest)) for layout in found_all]
+
+
+def _without_offset(layout: ColumnLayout) -> ColumnLayout:
+    """The layout without what all positions have in common, where they are those of a site: eastings, northings."""
+    p = layout.position
+    middle = np.median(p, axis=0)
+    spread = float(np.abs(p - middle).max(initial=0.0))
+    if not spread or np.abs(p).max() * POSE_UNITS["mm"] < _REACH_M["mm"][1] or np.abs(p).max() < _SITE * spread:
+        return layout
+    step = 10.0 ** np.ceil(np.log10(spread))
+    offset = np.round(middle / step) * step
+    return replace(layout, position=p - offset, offset=tuple(offset.tolist()))
 
 
 def _layout_by_name(raw: RawPoses) -> ColumnLayout | None:
@@ -83,9 +97,12 @@ def _layout_by_name(raw: RawPoses) -> ColumnLayout | None:
     if not posed and not named.joints:
         return None
     nothing = np.zeros((len(x), 0))
+    rotation = x[:, named.rotation]
+    if len(named.rotation) == 1:
+        rotation = np.column_stack([np.zeros((len(x), 2)), rotation])
     return ColumnLayout(
         position=x[:, named.position] if posed else nothing,
-        rotation=x[:, named.rotation] if posed else nothing,
+        rotation=rotation if posed else nothing,
         joints=x[:, named.joints] if named.joints else None,
         words="columns by their names",
         convention=named.convention,
@@ -230,6 +247,12 @@ def covariate_columns(layout: ColumnLayout, rows: Sequence[int], time_s: Array |
     return out
 
 
+def kept_column(name: str, columns: Mapping[str, Sequence[str]]) -> bool:
+    """Whether a named column of a table is among those that `covariate_columns` returned."""
+    plain = _plain_name(name)
+    return plain in columns or (_TIMES.fullmatch(plain) is not None and "time_s" in columns)
+
+
 def recorded_times(layout: ColumnLayout) -> Array | None:
     """Return the column of times (V,) in s since its first row; None where there is none that never falls."""
     for name, values in layout.rest.items():
@@ -260,13 +283,16 @@ def _is_row_count(values: Array) -> bool:
 # Scans are judged in millimetres.
 MM = 1e-3
 # Metres per unit in which people write poses.
-POSE_UNITS = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "inch": 0.0254}
-CLOUD_UNITS = {"mm": 1e-3, "m": 1.0}
+POSE_UNITS = CLOUD_UNITS = CLOUD_METRES
+# How many times farther from the origin than from each other positions of a site lie.
+_SITE = 100.0
 # Of the flange from the base, metres: from a desktop arm to one on a rail; in units that few robots count in, an
 # arm's own.
 _REACH_M = {"mm": (0.08, 12.0), "m": (0.08, 12.0), "cm": (0.25, 2.5), "inch": (0.25, 2.5)}
 # Longest side of a scan, metres, and its distance from the scanner.
 _SIZE_M, _RANGE_M = (5e-3, 10.0), 12.0
+# Of most arms at work; motions of scans and robot that agree within this share have the same scale.
+_USUAL_REACH_M, _SAME_SCALE = 0.9, 0.05
 
 
 def pose_units(position: Array) -> list[str]:
@@ -277,14 +303,45 @@ def pose_units(position: Array) -> list[str]:
 
 def cloud_units(clouds: Sequence[Array]) -> list[str]:
     """Units that clouds (N, 3) can have, the usual first; mm if none is plausible."""
+    size, away = _scan_size(clouds)
+    return [u for u in ("mm", "m") if _is_scan(size, away, u)] or ["mm"]
+
+
+def unit_pairs(position: Array, clouds: Sequence[Array], factor: float) -> list[tuple[str, str]]:
+    """Units of positions (V, 3) and of clouds (N, 3) that fit both their sizes, the likely pair first.
+
+    Args:
+        factor: metres per unit of the clouds over those of the positions, as motions of scans and robot say.
+    """
+    size, away = _scan_size(clouds)
+    reach = float(np.linalg.norm(position, axis=1).max(initial=0.0))
+    pairs = [
+        (pose, cloud)
+        for pose in pose_units(position)
+        for cloud in CLOUD_UNITS
+        if abs(np.log(CLOUD_UNITS[cloud] / POSE_UNITS[pose] / factor)) < _SAME_SCALE and _is_scan(size, away, cloud)
+    ]
+    return sorted(
+        pairs,
+        key=lambda pair: (
+            *(u not in ("mm", "m") for u in pair),
+            abs(np.log(reach * POSE_UNITS[pair[0]] / _USUAL_REACH_M)),
+        ),
+    )
+
+
+def _scan_size(clouds: Sequence[Array]) -> tuple[float, float]:
+    """The longest side of a scan and its distance, in the middle of all."""
     size = float(np.median([np.ptp(np.percentile(c, (5, 95), axis=0), axis=0).max() for c in clouds]))
-    away = float(np.median([np.median(np.linalg.norm(c, axis=1)) for c in clouds]))
-    fits = [u for u, m in CLOUD_UNITS.items() if _SIZE_M[0] <= size * m <= _SIZE_M[1] and away * m <= _RANGE_M]
-    return fits or ["mm"]
+    return size, float(np.median([np.median(np.linalg.norm(c, axis=1)) for c in clouds]))
+
+
+def _is_scan(size: float, away: float, unit: str) -> bool:
+    metres = CLOUD_UNITS[unit]
+    return _SIZE_M[0] <= size * metres <= _SIZE_M[1] and away * metres <= _RANGE_M
 
 
 def size_words(clouds: Sequence[Array]) -> str:
     """How large the scans are, in the file's own numbers."""
-    size = float(np.median([np.ptp(np.percentile(c, (5, 95), axis=0), axis=0).max() for c in clouds]))
-    away = float(np.median([np.median(np.linalg.norm(c, axis=1)) for c in clouds]))
+    size, away = _scan_size(clouds)
     return f"scans are {size:.3g} long and {away:.3g} away"

@@ -15,7 +15,7 @@ from stitch.numerics.frames import Array
 from stitch.plugins.intake.first_session import StatedFolder
 from stitch.plugins.intake.layouts import POSE_UNITS, possible_layouts
 from stitch.plugins.intake.pose_tables import bare_name, parse_number_table, read_names, with_one_header
-from stitch.plugins.intake.raw_poses import STRUCTURED, RawPoses, is_program, program_poses, read_raw_poses
+from stitch.plugins.intake.raw_poses import STRUCTURED, RawPoses, is_program, read_raw_poses
 from stitch.plugins.intake.readings import Reading, joint_readings, readings, with_joints_of
 from stitch.session.reading.robot_description import robot_from_dh
 from stitch.session.reading.text_files import WORKBOOKS, read_any_text, workbook_sheets
@@ -121,7 +121,7 @@ def read_tables(file: Path) -> list[Table]:
         InputError: a workbook that cannot be read.
     """
     if file.suffix.lower() in STRUCTURED or is_program(file):
-        return [Table(file, file.name, program_poses(file) if is_program(file) else read_raw_poses([file]))]
+        return [Table(file, file.name, read_raw_poses([file]))]
     if file.suffix.lower() in WORKBOOKS:
         texts = {f"{file.name}, sheet {name}": text for name, text in workbook_sheets(file).items()}
     else:

@@ -20,13 +20,15 @@ _NUMBER = r"[+-]?(?:\d+(?:\.\d*|,\d+)?|\.\d+)(?:[eE][+-]?\d+)?"
 _POINTED = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 
 
-def read_pose_text(text: str) -> tuple[list[PoseRow], str] | None:
-    """Return the poses of the first format that a text is of, and its name; None for plain tables."""
+def read_pose_text(text: str) -> dict[str, tuple[list[PoseRow], str]]:
+    """Return lists of poses by name, each with its format: several of XML, else one; none of plain tables."""
+    if tagged := _tagged_lists(text):
+        return {tag: (rows, f"elements {tag} of XML") for tag, rows in tagged.items()}
     for words, read in _FORMATS:
         rows = read(text)
         if rows:
-            return rows, words
-    return None
+            return {"": (rows, words)}
+    return {}
 
 
 def posed(T: Array, unit: str = "") -> dict[str, float]:
@@ -57,11 +59,14 @@ def _labelled(text: str, spans: Sequence[tuple[int, int]], rows: Iterable[dict[s
     starts = [*(start for start, _ in spans), len(text)]
     # Of what stands between two poses the line of the next one, and the one above it.
     gaps = [re.findall(r"[\w.:/\\+-]*\d[\w.:/\\+-]*", text[a:b]) for a, b in zip(ends, starts, strict=True)]
-    gaps = [[word.strip(".:") for word in gap] for gap in (gaps[:-1] if gaps[0] or not gaps[-1] else gaps[1:])]
+    behind = bool(gaps[-1]) and not gaps[0]
+    gaps = [list(dict.fromkeys(word.strip(".:") for word in gap)) for gap in (gaps[1:] if behind else gaps[:-1])]
     same = set.intersection(*map(set, gaps)) if len(gaps) > 1 else set()
     kept = [tuple(word for word in gap if word not in same) for gap in gaps]
     width = min(len(labels) for labels in kept)
-    return [(labels[:width], row) for labels, row in zip(kept, rows, strict=True)]
+    # The word next to a pose is its name: the last before it, the first behind it.
+    near = [labels[:width] if behind else labels[len(labels) - width :] for labels in kept]
+    return list(zip(near, rows, strict=True))
 
 
 # X 837.75, Y 184.59 … in any layout of lines: KUKA's $POS_ACT and E6POS, FANUC's position pages, pendants of others.
@@ -70,8 +75,10 @@ _KEYED = re.compile(
     rf"(?<![\w.$])(?:([A-Za-z_]+\d)[ \t]*[\s:=][ \t]*|([A-Za-z_]+)[ \t]*[:=]?[ \t]*)({_NUMBER})"
     r"[ \t]*(mm|cm|m|deg|rad|°)?(?![\w.])"
 )
-_KUKA = re.compile(r"E6POS|E3POS|POS_ACT|\bFRAME\b", re.IGNORECASE)
-_KUKA_AXES = re.compile(r"E6AXIS|AXIS_ACT", re.IGNORECASE)
+_KUKA = re.compile(r"E6POS|E3POS|POS_ACT|\bFRAME\b|KUKA|<RIst\b", re.IGNORECASE)
+_KUKA_AXES = re.compile(r"E6AXIS|AXIS_ACT|<AIPos\b", re.IGNORECASE)
+_ELEMENT = re.compile(r"<([\w:.-]+)((?:\s+[\w:.-]+\s*=\s*[\"'][^\"'<>]*[\"'])+)\s*/?>")
+_ATTRIBUTE = re.compile(r"([\w:.-]+)\s*=\s*[\"']([^\"'<>]*)[\"']")
 _TURNS: tuple[tuple[str, ...], ...] = (
     ("qx", "qy", "qz", "qw"),
     ("q0", "q1", "q2", "q3"),
@@ -97,7 +104,7 @@ def _keyed_rows(text: str) -> list[PoseRow]:
         record: dict[str, re.Match[str]] = {}
         for name, match in zip(names[begin:end], pairs[begin:end], strict=True):
             record.setdefault(name, match)
-        row = _record_numbers(record, text)
+        row = _record_numbers({name: (match[3], match[4]) for name, match in record.items()}, text)
         if row is not None:
             rows.append(row)
             spans.append((pairs[begin].start(), pairs[end - 1].end()))
@@ -107,9 +114,13 @@ def _keyed_rows(text: str) -> list[PoseRow]:
     return _labelled(text, spans, rows) if rows else []
 
 
-def _record_numbers(record: dict[str, re.Match[str]], text: str) -> dict[str, float] | None:
-    """Return the numbers of one pose, with units in their names; None where it has neither pose nor joint angles."""
-    value = {name: float(match[3].replace(",", ".")) for name, match in record.items()}
+def _record_numbers(record: dict[str, tuple[str, str | None]], text: str) -> dict[str, float] | None:
+    """Return the numbers of one pose, with units in their names; None where it has neither pose nor joint angles.
+
+    Args:
+        record: number and unit by name.
+    """
+    value = {name: float(number.replace(",", ".")) for name, (number, _) in record.items()}
     turn = next((turn for turn in _TURNS if all(name in value for name in turn)), None)
     joints = next((j for j in _JOINTS if all(name in value for name in j)), None)
     out: dict[str, float] = {}
@@ -117,13 +128,25 @@ def _record_numbers(record: dict[str, re.Match[str]], text: str) -> dict[str, fl
         if turn in _DEFINED and (turn == ("o", "a", "t") or _KUKA.search(text)):
             names = [*(f"{axis} [mm]" for axis in "xyz"), *(f"{name} [deg]" for name in _DEFINED[turn])]
         else:
-            units = [(record[name][4] or "").replace("°", "deg") for name in (*"xyz", *turn)]
+            units = [(record[name][1] or "").replace("°", "deg") for name in (*"xyz", *turn)]
             names = [f"{name} [{unit}]" if unit else name for name, unit in zip((*"xyz", *turn), units, strict=True)]
         out = dict(zip(names, [value[name] for name in (*"xyz", *turn)], strict=True))
     if joints is not None:
-        unit = " [deg]" if _KUKA_AXES.search(text) else f" [{record[joints[0]][4]}]" if record[joints[0]][4] else ""
-        out |= {f"j{i}{unit}": value[name] for i, name in enumerate(joints, 1)}
+        unit = "deg" if _KUKA_AXES.search(text) else record[joints[0]][1]
+        out |= {f"j{i} [{unit}]" if unit else f"j{i}": value[name] for i, name in enumerate(joints, 1)}
     return out | {name: value[name] for name in _EXTERNAL if name in value} if out else None
+
+
+def _tagged_lists(text: str) -> dict[str, list[PoseRow]]:
+    """Return rows by the element of XML whose attributes hold them: RIst, RSol and AIPos of KUKA's RSI."""
+    out: dict[str, list[PoseRow]] = {}
+    for tag, attributes in _ELEMENT.findall(text) if text.lstrip().startswith("<") else ():
+        cells = {name.lower(): cell for name, cell in _ATTRIBUTE.findall(attributes)}
+        numbers = {name: cell for name, cell in cells.items() if re.fullmatch(_NUMBER, cell)}
+        row = _record_numbers({name: (cell, None) for name, cell in numbers.items()}, text)
+        if row is not None:
+            out.setdefault(tag, []).append((tuple(cell for n, cell in cells.items() if n not in numbers), row))
+    return out
 
 
 # Poses in brackets: ABB's robtargets, p[…] of Universal Robots, tf_echo of ROS.
@@ -183,21 +206,19 @@ def _halcon_rows(text: str) -> list[PoseRow]:
 
 # Cameras of reconstruction programs.
 
-_ID_LINE = re.compile(r"\d+\s+\d+\s+\d+")
+_FOUR_NUMBERS = rf"[ \t]*\[*[ \t]*{_POINTED}(?:[ \t,;]+{_POINTED}){{3}}[ \t]*\]*[,;]?[ \t]*(?:\r?\n|$)"
+_BLOCK = re.compile(rf"^(?:{_FOUR_NUMBERS}){{4}}", re.MULTILINE)
 
 
-def _trajectory_rows(text: str) -> list[PoseRow]:
-    """Rows of Redwood's and Open3D's trajectory.log: three whole numbers, then a 4×4 matrix, for each pose."""
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    if not lines or len(lines) % 5 or not all(_ID_LINE.fullmatch(line) for line in lines[::5]):
+def _matrix_rows(text: str) -> list[PoseRow]:
+    """Rows of 4×4 matrices over four lines each, with words or other numbers before each: Open3D's trajectory.log."""
+    blocks = list(_BLOCK.finditer(text))
+    T = np.array([_floats(re.findall(_POINTED, block[0])) for block in blocks]).reshape(-1, 4, 4)
+    words = _BLOCK.sub("", text).strip()
+    # A plain table of matrices is read as one: a matrix of it without a number is a view without a pose.
+    if not len(T) or not np.allclose(T[:, 3], [0, 0, 0, 1]) or not words or re.search("nan|inf|null", words, re.I):
         return []
-    try:
-        T = np.array([[_floats(line.split()) for line in lines[i + 1 : i + 5]] for i in range(0, len(lines), 5)])
-    except ValueError:
-        return []
-    if T.shape[1:] != (4, 4):
-        return []
-    return [((head.split()[0],), _matrix_row(M)) for head, M in zip(lines[::5], T, strict=True)]
+    return _labelled(text, [block.span() for block in blocks], [_matrix_row(M) for M in T])
 
 
 def _colmap_rows(text: str) -> list[PoseRow]:
@@ -252,7 +273,7 @@ def joint_state_rows(documents: Any) -> list[PoseRow] | None:
 # By what only they have; names with numbers behind them come last, as logs hold many.
 _FORMATS: tuple[tuple[str, Callable[[str], list[PoseRow]]], ...] = (
     ("a pose file of HALCON", _halcon_rows),
-    ("a trajectory of Open3D", _trajectory_rows),
+    ("4×4 matrices with words between", _matrix_rows),
     ("images of COLMAP, inverted to T_world_camera", _colmap_rows),
     ("tf_echo of ROS", _tf_echo_rows),
     ("robtargets of ABB", _robtarget_rows),

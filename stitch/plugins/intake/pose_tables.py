@@ -131,6 +131,8 @@ _ANGLES = {"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": 
 # In German degrees, elsewhere a four-hundredth of a turn: the unit of an angle, whichever.
 _ANGULAR = {*_ANGLES, "grad"}
 _UNIT = re.compile(r"[\[(]\s*([^\])]*)\s*[\])]|[_\s](mm|cm|deg|rad|inch|°|grad|(?<=\s)m)$")
+# The one angle of a SCARA, or of a vehicle: a turn about z.
+_HEADING = re.compile(r"(?:u|a|c|w|r|rz|rot_?z|yaw|heading|theta|phi)(?:[ _]*[\[(]?(?:deg|rad|°)[\])]?)?")
 _COUNTED = re.compile(r".*tcp_?pose[_\[. ]*([0-6])\]?")
 _JOINT = re.compile(r"(?:j|joint|axis|theta|jt)_?([1-9])")
 
@@ -189,6 +191,9 @@ def read_names(header: Sequence[str]) -> NamedColumns:
         where = {name: plain.index(name) for name in plain}
     position = tuple(where[a] for a in "xyz") if all(a in where for a in "xyz") else ()
     rotation, convention = _rotation_columns(where, set(position) | set(joints))
+    if position and not rotation:
+        heading = tuple(i for i, name in enumerate(header) if _HEADING.fullmatch(name.strip().lower()))
+        rotation, convention = (heading, "rotation-vector") if len(heading) == 1 else ((), None)
     matrix = _matrix_columns(header) if not rotation else ()
     if matrix:
         rotation, position, convention = matrix, (), None
@@ -198,7 +203,7 @@ def read_names(header: Sequence[str]) -> NamedColumns:
         rotation=rotation,
         joints=joints,
         convention=convention,
-        sure=convention is None or {plain[i] for i in rotation} in _SURE,
+        sure=convention is None or len(rotation) == 1 or {plain[i] for i in rotation} in _SURE,
         length_unit=next((_LENGTHS[units[i]] for i in position if units[i] in _LENGTHS), None),
         angle_unit=next((_ANGLES[units[i]] for i in (*rotation, *joints) if units[i] in _ANGLES), None),
         rest={header[i]: i for i in range(len(header)) if i not in used and header[i] not in ("", "-")},
@@ -222,6 +227,8 @@ def bare_name(name: str) -> tuple[str, str]:
     if not kept:
         return (words[-1] if len(words) == 1 else ""), unit
     last = re.sub(r"^(?:[pt]|pos)_?([xyz])$", r"\1", kept[-1])
+    if kept[0] == "q" and last in ("w", "x", "y", "z"):
+        return f"q{last}", unit
     order = next((w for w in words if w in ("xyzw", "wxyz")), None)
     if order and last in ("0", "1", "2", "3"):
         return f"q{order[int(last)]}", unit

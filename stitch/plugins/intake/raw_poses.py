@@ -21,7 +21,6 @@ from stitch.session.reading.scan_headers import poses_in_scans, times_in_scans
 from stitch.session.reading.text_files import (
     WORKBOOKS,
     read_any_text,
-    read_text,
     reason_of,
     require_file,
     workbook_sheets,
@@ -32,30 +31,34 @@ from stitch.session.reading.yaml_file import parse_yaml
 
 # Sizes of a bare list of numbers that can be a pose or joint angles.
 _SIZES = (5, 6, 7, 8, 9, 12, 16)
+# An axis of rotation has length 1 within this; a larger angle is in degrees.
+_UNIT_AXIS, _TURN = 1e-3, 2 * np.pi + 1e-3
 _MATRICES = ((3, 3), (3, 4), (4, 4), (1, 3), (3, 1), (1, 4), (4, 1))
 
 
-def nested_rows(document: Any) -> list[PoseRow]:
-    """Rows of a document; numbers without names are called 0, 1, 2 … Empty if it holds no poses.
+def nested_lists(document: Any, texts: tuple[str, ...] = ()) -> dict[str, list[PoseRow]]:
+    """Return lists of rows by their path in a document; numbers without names are called 0, 1, 2 …
 
-    A pose may be a list of numbers, a matrix, or a mapping; poses may stand in a list, or in a mapping by name.
+    A pose may be a list of numbers, a matrix, or a mapping; poses may stand in a list, or in a mapping by name. Texts
+    beside a pose, or above it, belong to its row.
     """
-    if isinstance(document, dict):
-        named = [((str(key), *_texts(value)), _pose_numbers(value)) for key, value in document.items()]
-        direct = [(texts, row) for texts, row in named if row is not None]
-        if len(direct) > 1 and len({tuple(row) for _, row in direct}) == 1:
-            return direct
+    out: dict[str, list[PoseRow]] = {}
     own = _pose_numbers(document)
     if own is not None:
-        return [(_texts(document), own)]
-    if isinstance(document, list):
-        rows: list[PoseRow] = []
+        out[""] = [((*texts, *_texts(document)), own)]
+    if isinstance(document, list) and own is None:
         for item in document:
-            row = _pose_numbers(item)
-            rows += [(_texts(item), row)] if row is not None else nested_rows(item)
-        return rows
-    deeper = [nested_rows(value) for value in document.values()] if isinstance(document, dict) else []
-    return max(deeper, key=len, default=[])
+            for path, rows in nested_lists(item, texts).items():
+                out.setdefault(path, []).extend(rows)
+    if isinstance(document, dict):
+        named = [((str(key), *texts, *_texts(value)), _pose_numbers(value)) for key, value in document.items()]
+        direct = [(words, row) for words, row in named if row is not None]
+        if len(direct) > 1 and len({tuple(row) for _, row in direct}) == 1:
+            out[""] = direct
+        for key, value in document.items():
+            below = nested_lists(value, (*texts, *_texts(document)))
+            out |= {f"{key}.{path}".strip("."): rows for path, rows in below.items()}
+    return out
 
 
 def _pose_numbers(value: Any) -> dict[str, float] | None:
@@ -74,8 +77,20 @@ def _pose_numbers(value: Any) -> dict[str, float] | None:
         unnamed = all(name.isdigit() for name in inner)
         beside = _ros_stamp(value) | {k: float(x) for k, x in value.items() if _is_number(x)}
         return inner if unnamed else beside | inner
-    out = _named_numbers(value)
+    out = _axis_times_angle(_named_numbers(value))
     return out if len(out) >= _SIZES[0] else None
+
+
+def _axis_times_angle(numbers: dict[str, float]) -> dict[str, float]:
+    """Return numbers with an axis of length 1 and the angle about it, rad or degrees, as one vector of rotation."""
+    axis = [name for name in numbers if re.search(r"axis[._]?[0-2xyz]$", name, re.IGNORECASE)]
+    angle = [name for name in numbers if re.search(r"angle(_?(rad|deg))?$", name, re.IGNORECASE)]
+    if len(axis) != 3 or len(angle) != 1 or abs(np.linalg.norm([numbers[name] for name in axis]) - 1) > _UNIT_AXIS:
+        return numbers
+    in_degrees = angle[0].lower().endswith("deg") or abs(numbers[angle[0]]) > _TURN
+    size = np.radians(numbers[angle[0]]) if in_degrees else numbers[angle[0]]
+    kept = {name: x for name, x in numbers.items() if name not in (*axis, *angle)}
+    return kept | {f"rv{k} [rad]": size * numbers[name] for k, name in zip("xyz", axis, strict=True)}
 
 
 def _ros_stamp(value: dict[str, Any]) -> dict[str, float]:
@@ -159,6 +174,7 @@ class RawPoses:
     labels: tuple[tuple[str, ...], ...]  # per row the texts beside it, such as a view's name or its cloud's
     words: str  # how it was read
     without_pose: frozenset[int] = frozenset()  # rows without a number where one belongs; they repeat another row
+    part: str = ""  # its name among the lists of its file: a path in a document, an element, a sheet
 
     @property
     def clock(self) -> ClockTimes | None:
@@ -249,38 +265,59 @@ def _read_each(files: Sequence[Path]) -> tuple[list[RawPoses], frozenset[int]]:
 
 
 def _read_file(file: Path) -> RawPoses:
+    """Return the longest list of a file, the first of such; of several sheets of a workbook the only one.
+
+    Raises:
+        InputError: no list of numbers.
+    """
+    lists = read_lists(file)
+    if file.suffix.lower() in WORKBOOKS and len(lists) > 1:
+        raise InputError(
+            f"{file}: {len(lists)} sheets hold rows of numbers; to fix: leave the sheet of the poses alone"
+        )
+    return max(lists, key=lambda raw: len(raw.numbers))
+
+
+def read_lists(file: Path) -> list[RawPoses]:
+    """Return every list of rows of numbers in a file; `RawPoses.part` names each.
+
+    Raises:
+        InputError: none, or a file that cannot be read; names file and line.
+    """
     require_file(file, "name a file of poses")
     suffix = file.suffix.lower()
+    if is_program(file):
+        return [program_poses(file)]
     if suffix in (".npy", ".npz"):
         return _from_numpy(file)
-    if suffix in (".json", ".yaml", ".yml"):
-        told = read_text(file, "name a file of poses", _MAX_POSES_MB)
-        documents = [_from_json(file, told)] if suffix == ".json" else parse_yaml(file, told)
-        document = documents[0] if len(documents) == 1 else documents
-        rows = open3d_rows(document) or joint_state_rows(document) or nested_rows(document)
-        return _from_rows(file, rows, suffix[1:].upper())
     if suffix in WORKBOOKS:
         return _from_workbook(file)
-    text = read_any_text(file, "name a table of poses", _MAX_POSES_MB)
-    found = read_pose_text(text)
-    if found is not None:
-        return _from_rows(file, *found)
+    text = read_any_text(file, "name a file of poses", _MAX_POSES_MB)
+    if suffix in (".json", ".yaml", ".yml"):
+        documents = [_from_json(file, text)] if suffix == ".json" else parse_yaml(file, text)
+        document = documents[0] if len(documents) == 1 else documents
+        rows = open3d_rows(document) or joint_state_rows(document)
+        kind = suffix[1:].upper()
+        lists = {"": (rows, kind)} if rows else {path: (rows, kind) for path, rows in nested_lists(document).items()}
+    else:
+        lists = read_pose_text(text)
+    if lists or suffix in (".json", ".yaml", ".yml"):
+        return _from_lists(file, lists)
     table = parse_number_table(file, text)
-    return _matrix_blocks(table) or _raw_poses(str(file), table.header, table.numbers, table.labels, table.words)
+    return [_matrix_blocks(table) or _raw_poses(str(file), table.header, table.numbers, table.labels, table.words)]
 
 
-def _from_workbook(file: Path) -> RawPoses:
-    """Return the one sheet that holds rows of numbers."""
-    found = []
+def _from_workbook(file: Path) -> list[RawPoses]:
+    """Return the sheets that hold rows of numbers."""
+    found: list[RawPoses] = []
     for name, text in workbook_sheets(file).items():
         with suppress(InputError):
-            found.append((name, parse_number_table(file, with_one_header(text))))
-    if len(found) != 1:
-        raise InputError(
-            f"{file}: {len(found)} sheets hold rows of numbers; to fix: leave the sheet of the poses alone"
-        )
-    name, table = found[0]
-    return _raw_poses(f"{file}, sheet {name}", table.header, table.numbers, table.labels, f"sheet {name}")
+            table = parse_number_table(file, with_one_header(text))
+            sheet = _raw_poses(f"{file}, sheet {name}", table.header, table.numbers, table.labels, f"sheet {name}")
+            found.append(replace(sheet, part=name))
+    if not found:
+        raise InputError(f"{file}: no sheet holds rows of numbers; to fix: name the table of poses")
+    return found
 
 
 def _raw_poses(
@@ -333,30 +370,43 @@ def _from_json(file: Path, text: str) -> Any:
         raise InputError(f"{file}: not valid JSON ({reason_of(error)}); to fix: correct it there") from None
 
 
-def _from_numpy(file: Path) -> RawPoses:
+def _from_numpy(file: Path) -> list[RawPoses]:
     try:
         loaded = np.load(file, allow_pickle=False)
         arrays = {file.stem: loaded} if isinstance(loaded, np.ndarray) else {k: loaded[k] for k in loaded.files}
     except (ValueError, OSError, EOFError) as error:
         raise InputError(f"{file}: cannot be read ({reason_of(error)}); to fix: save plain numbers") from None
-    fitting = [a for a in arrays.values() if a.dtype.kind in "fiu" and a.ndim in (2, 3) and a.size]
+    fitting = [(name, a) for name, a in arrays.items() if a.dtype.kind in "fiu" and a.ndim in (2, 3) and a.size]
+    fitting.sort(key=lambda item: -item[1].ndim)
     if not fitting:
         raise InputError(f"{file}: holds no array (V, C) or (V, 4, 4); to fix: save the poses as one of these")
-    x = np.asarray(max(fitting, key=lambda a: a.ndim), float)
-    flat = x.reshape(1, 16) if x.shape == (4, 4) else x.reshape(len(x), -1)
-    return _raw_poses(str(file), None, flat, ((),) * len(flat), f"an array {'×'.join(map(str, x.shape))}")
+    out: list[RawPoses] = []
+    for name, array in fitting:
+        x = np.asarray(array, float)
+        flat = x.reshape(1, 16) if x.shape == (4, 4) else x.reshape(len(x), -1)
+        raw = _raw_poses(str(file), None, flat, ((),) * len(flat), f"an array {'×'.join(map(str, x.shape))}")
+        out.append(replace(raw, part=name))
+    return out
 
 
-def _from_rows(file: Path, rows: Sequence[PoseRow], kind: str) -> RawPoses:
-    if not rows:
-        raise InputError(f"{file}: holds no poses that are known; to fix: write a table or 4×4 matrices")
-    names = tuple(rows[0][1])
-    for i, (_, row) in enumerate(rows, 1):
-        if tuple(row) != names:
-            raise InputError(f"{file}: pose {i} is written otherwise than the first; to fix: write all alike")
-    numbers = np.array([list(row.values()) for _, row in rows], float)
-    header = None if all(re.fullmatch(r"\d+", name) for name in names) else names
-    return _raw_poses(str(file), header, numbers, [labels for labels, _ in rows], kind)
+def _from_lists(file: Path, lists: dict[str, tuple[list[PoseRow], str]]) -> list[RawPoses]:
+    """Return the lists all of whose rows have the same names."""
+    refused = InputError(f"{file}: holds no poses that are known; to fix: write a table or 4×4 matrices")
+    out: list[RawPoses] = []
+    for part, (rows, kind) in lists.items():
+        names = tuple(rows[0][1])
+        odd = next((i for i, (_, row) in enumerate(rows, 1) if tuple(row) != names), None)
+        if odd is not None:
+            refused = InputError(f"{file}: pose {odd} is written otherwise than the first; to fix: write all alike")
+            continue
+        numbers = np.array([list(row.values()) for _, row in rows], float)
+        header = None if all(re.fullmatch(r"\d+", name) for name in names) else names
+        width = min(len(labels) for labels, _ in rows)
+        raw = _raw_poses(str(file), header, numbers, [labels[:width] for labels, _ in rows], kind)
+        out.append(replace(raw, part=part))
+    if not out:
+        raise refused
+    return out
 
 
 # Poses of a folder without a table: those in the headers of its scans.

@@ -9,6 +9,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
+from stitch.plugins.intake.clock_times import times_of_both
 from stitch.plugins.intake.cloud_pairs import LACKING, named_pairing
 from stitch.plugins.intake.layouts import POSE_UNITS, pose_units, recorded_times
 from stitch.plugins.intake.raw_poses import RawPoses
@@ -23,6 +24,8 @@ _SAME_TURN, _SAME_SHIFT = 2e-3, 1e-3
 _LONGER = 3.0
 # Of a longer recording every second, third … row is read.
 _MOST_ROWS = 4_000
+# Offsets of two clocks are tried in such parts of a rest.
+_OFFSET_STEPS = 20.0
 # Stops that make a session, and rows a scan of what can only be a recording.
 _FEWEST, _MANY = 3, 5
 _TRUE = {"true", "on", "yes", "high", "trigger", "triggered", "1"}
@@ -35,6 +38,8 @@ def rows_with_scans(raw: RawPoses, clouds: Sequence[Path], urdf: Path | None, st
         InputError: more or fewer stops of the arm than scans, and no trigger.
     """
     count, rows = len(clouds), len(raw.numbers)
+    if rows >= 2 * count and (times := times_of_both(clouds, raw.labels, raw.numbers)) is not None:
+        return _rows_by_clocks(raw, *times[:2], all_readings(raw, urdf, stated))
     if rows <= count + LACKING or named_pairing(clouds, raw.labels, raw.numbers) is not None:
         return raw
     triggered = _triggered_rows(raw, count)
@@ -52,6 +57,41 @@ def rows_with_scans(raw: RawPoses, clouds: Sequence[Path], urdf: Path | None, st
             "keep one row for each cloud, with the cloud's file name beside it"
         )
     return _picked(thin, stops, f"{len(stops)} stops of the arm in {rows} rows")
+
+
+def _rows_by_clocks(raw: RawPoses, scans: Array, poses: Array, found: Sequence[Reading]) -> RawPoses:
+    """Return the rows at which the arm stands, by the one offset of clocks that puts all scans into its rests.
+
+    The table as it is where the clocks agree, or no offset does it.
+
+    Args:
+        scans, poses: times (N,) and (V,), s.
+    """
+    T = _metric_poses(found[0])
+    still = stationary_scans(
+        T[np.maximum(np.arange(len(T)) - 1, 0)], T, T[np.minimum(np.arange(len(T)) + 1, len(T) - 1)]
+    )
+    rests = [poses[[stop[0], stop[-1]]] for stop in _stops(T, still) if len(stop) > 1]
+    if len(rests) < len(scans) or (np.diff(poses) < 0).any():
+        return raw
+    first, last = np.array(rests).T
+    shortest = float(np.median(last - first))
+    usual = float(np.median(np.diff(np.sort(scans))))
+    offsets = np.arange(-usual, usual, shortest / _OFFSET_STEPS)
+    moved = scans[:, None] + offsets
+    inside = ((moved[..., None] >= first) & (moved[..., None] <= last)).any(axis=-1).all(axis=0)
+    if not inside.any() or inside[np.argmin(np.abs(offsets))]:
+        return raw
+    # Of offsets side by side the middle one, of the run nearest to none.
+    runs = np.split(np.flatnonzero(inside), np.flatnonzero(np.diff(np.flatnonzero(inside)) > 1) + 1)
+    middle = [float(offsets[run].mean()) for run in runs]
+    offset = min(middle, key=abs)
+    rows = np.abs((scans + offset)[:, None] - poses).argmin(axis=1)
+    if len(set(rows.tolist())) < len(scans):
+        return raw
+    side = "ahead of" if offset < 0 else "behind"
+    words = f"the clock of the scans is {abs(offset):.2g} s {side} the robot's: only then was each taken at a rest"
+    return _picked(raw, np.asarray(rows, np.int64), words)
 
 
 def _picked(raw: RawPoses, rows: Indices, words: str) -> RawPoses:
@@ -91,9 +131,7 @@ def _rows_at_stops(found: Sequence[Reading], count: int) -> Indices:
     found = sorted(found, key=lambda reading: -reading.rank)
     usual = {(r.layout.words, r.angle_unit, r.rotation == "rotation-vector"): r for r in found}
     for reading in usual.values():
-        unit = reading.layout.length_unit or pose_units(reading.T[:, :3, 3])[0]
-        metres = 1e-3 if reading.rotation == JOINT_ANGLES else POSE_UNITS[unit]
-        T = frames.make(reading.T[:, :3, :3], reading.T[:, :3, 3] * metres)
+        T = _metric_poses(reading)
         times = recorded_times(reading.layout)
         at = np.arange(len(T), dtype=float) if times is None else times
         around = 1.0 if times is None else AROUND
@@ -107,6 +145,13 @@ def _rows_at_stops(found: Sequence[Reading], count: int) -> Indices:
     if len(best) > count and len(best[count - 1]) >= _LONGER * len(best[count]):
         best = best[:count]
     return np.array(sorted(stop[len(stop) // 2] for stop in best), np.int64)
+
+
+def _metric_poses(reading: Reading) -> Array:
+    """Poses (V, 4, 4) in m, by the usual unit where the file says none."""
+    unit = reading.layout.length_unit or pose_units(reading.T[:, :3, 3])[0]
+    metres = 1e-3 if reading.rotation == JOINT_ANGLES else POSE_UNITS[unit]
+    return frames.make(reading.T[:, :3, :3], reading.T[:, :3, 3] * metres)
 
 
 def stationary_scans(before: Array, at: Array, after: Array) -> Mask:

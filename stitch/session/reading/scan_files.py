@@ -19,6 +19,7 @@ from stitch.system.packages import import_extra
 from stitch.system.ply_file import vertex_columns
 
 MESHES = (".stl", ".obj", ".off", ".glb", ".gltf")
+_COMMENTS = ("#", "//")  # CloudCompare writes the second
 TEXTS = (".xyz", ".csv", ".txt", ".asc", ".pts")
 # Headers of PCD and PLY are shorter.
 _HEADER_BYTES = 65536
@@ -81,7 +82,7 @@ def read_text_columns(path: Path) -> dict[str, Array]:
     """
     text = path.read_text(encoding="utf-8-sig")
     filled = [line for line in text.splitlines() if line.strip()]
-    lines = [line for line in filled if not line.lstrip().startswith("#")]
+    lines = [line for line in filled if not line.lstrip().startswith(_COMMENTS)]
     # Leica's .pts and others write the number of points above them.
     if len(lines) > 1 and lines[0].strip().isdigit() and int(lines[0]) == len(lines) - 1:
         lines = lines[1:]
@@ -93,8 +94,8 @@ def read_text_columns(path: Path) -> dict[str, Array]:
     separator = next((s for s in ",;" if s in lines[0]), None)
     first = _column_names(lines[0], separator)
     header = any(not is_number(cell) for cell in first)
-    above = filled[: filled.index(lines[0])]
-    names = first if header or not above else _column_names(above[-1].lstrip(" #"), separator)
+    above = [line for line in filled[: filled.index(lines[0])] if not line.strip().isdigit()]
+    names = first if header or not above else _column_names(above[-1].lstrip(" #/"), separator)
     if not header and not (len(names) == len(first) and {*"xyz"} <= {*names}):
         names = ["x", "y", "z", *(f"scalar_{i}" for i in range(len(first) - 3))][: len(first)]
     if len(lines) == header:

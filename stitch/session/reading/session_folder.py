@@ -15,7 +15,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
-from stitch.numerics.units import METRES
+from stitch.numerics.units import CLOUD_METRES, METRES
 from stitch.session.moving_scanner import stand_still
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.scale_checks import check_scale, require_near
@@ -84,7 +84,7 @@ def load_session(
     robot = read_robot(file, document.get("robot"), unit)
     rows = read_views(path / "views.csv", robot) if start is None else [row_at(file, robot, start)]
     rows = [row for row in rows if only is None or row.view.name == only]
-    cloud_unit = table_choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(METRES))
+    cloud_unit = table_choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(CLOUD_METRES))
     scanner = read_scanner(file, document.get("scanner", {}))
     # A scan that is moved point by point cannot be read once more from its file.
     at_most = None if scanner.moving else at_most
@@ -178,7 +178,7 @@ def read_scans(
         if not row.cloud:
             return None
         file = path / row.cloud
-        read = partial(_read_cropped, file, METRES[cloud_unit] / metres, within)
+        read = partial(_read_cropped, file, CLOUD_METRES[cloud_unit] / metres, within)
         try:
             return checked_scan(row.view.name, str(file), read, metres=metres, scanner=scanner, at_most=at_most)
         except InputError as error:

@@ -51,7 +51,7 @@ def test_order_direction_unit_and_mount_are_told_by_four_small_scans(still_cells
     first, read, true, T = as_read(tmp_path / "cell", folder)
     assert read.mount == "eye_in_hand" and first.choice.determined
     assert np.abs(T - true).max() < 1e3 * DIGITS
-    assert "# mount: eye_in_hand, the scanner sits at the flange; the poses are T_flange_base" in (
+    assert "# ? mount: eye_in_hand, the scanner sits at the flange; the poses are T_flange_base" in (
         (folder / "session.toml").read_text(encoding="utf-8")
     )
 

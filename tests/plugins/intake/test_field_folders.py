@@ -38,7 +38,7 @@ def made(tmp_path, name, campaign, **stated):
 
 QUICK = ["kuka-e6pos", "halcon-abg", "pose-graph", "colmap", "one-ptx", "pts-with-count", "ply-blank-lines"]
 QUICK += ["joint-states-yaml", "label-colon", "units-in-cells", "empty-cloud", "row-of-minus-inf", "code-minus-9999"]
-QUICK += ["code-z-32.768-m", "trigger-words", "rtde-125hz"]
+QUICK += ["clouds-in-cm", "code-z-32.768-m", "trigger-words", "rtde-125hz"]
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -77,7 +77,7 @@ def test_the_scans_overrule_the_names_of_columns(tmp_path, campaign, name):
     [
         ("joint-states-no-urdf", "joint angles"),
         ("xyz-alone", "--orientation"),
-        ("clouds-in-cm", "multiply x, y, z of the clouds by 10"),
+        ("xyz-alone", "--columns"),
         pytest.param("depth-quarter-mm", '"depth_scale": 4000', marks=pytest.mark.slow),
     ],
 )

@@ -110,13 +110,13 @@ def test_a_text_gives_the_poses_that_it_was_written_of(tmp_path, kind):
     ],
 )
 def test_what_stands_beside_a_pose_names_it(kind, labels):
-    rows, _ = read_pose_text(TEXTS[kind])
+    ((rows, _),) = read_pose_text(TEXTS[kind]).values()
     assert [words for words, _ in rows] == labels
 
 
 def test_a_name_behind_each_pose_belongs_to_it():
     text = "".join(f"X {x} Y {y} Z {z} RX 1 RY 2 RZ 3 -> scan_{i}.ply\n" for i, (x, y, z) in enumerate(P))
-    rows, _ = read_pose_text(text)
+    ((rows, _),) = read_pose_text(text).values()
     assert [words for words, _ in rows] == [(f"scan_{i}.ply",) for i in range(3)]
 
 

@@ -1,0 +1,155 @@
+"""Every list of numbers in the files of a folder, what each is taken for, and which of them are the robot's poses.
+
+A list is one of poses only if a layout accepts its numbers. Lists are ranked by how many clouds they serve, then by
+their names; two that rank alike are asked for.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from stitch.errors import InputError, NoResultError
+from stitch.plugins.intake.cloud_pairs import clouds_served
+from stitch.plugins.intake.layouts import possible_layouts
+from stitch.plugins.intake.raw_poses import RawPoses, read_lists, read_raw_poses
+
+_NAMES_POSE = re.compile(r"pose|robot|flange|tcp|joint|trajector|actual|ist\b", re.IGNORECASE)
+_NAMES_OTHER = re.compile(r"marker|board|target|tag|camera|soll?\b|rsol|edges|nominal|command", re.IGNORECASE)
+_FEWEST_ALIKE = 3  # files named alike, with a pose each
+_SHOWN = 6
+
+
+@dataclass(frozen=True)
+class FoundList:
+    """One list of rows in a file, or in several files that hold a row each; or a file without one."""
+
+    files: tuple[Path, ...]
+    raw: RawPoses | None
+    taken_for: str = ""
+    why_not: str = ""
+
+    @property
+    def name(self) -> str:
+        """As --poses takes it: FILE, or FILE#LIST."""
+        part = self.raw.part if self.raw is not None else ""
+        ends = " … ".join(file.name for file in dict.fromkeys((self.files[0], self.files[-1])))
+        count = f" ({len(self.files)} files)" if len(self.files) > 1 else ""
+        return f"{ends}#{part}" if part else f"{ends}{count}"
+
+    @property
+    def words(self) -> str:
+        """What stands there, for a message."""
+        if self.raw is None:
+            return f"{self.name}: {self.why_not}"
+        rows, columns = self.raw.numbers.shape
+        names = f" ({', '.join(self.raw.header[:8])})" if self.raw.header else ""
+        reason = f", {self.why_not}" if self.why_not else ""
+        return f"{self.name}: {rows} row{'s' * (rows > 1)} of {columns} numbers{names}{reason}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """As `stitch init --json` prints it."""
+        raw = self.raw
+        return {
+            "file": " … ".join(str(file) for file in dict.fromkeys((self.files[0], self.files[-1]))),
+            "list": raw.part if raw is not None else "",
+            "rows": len(raw.numbers) if raw is not None else 0,
+            "columns": list(raw.header or map(str, range(1, raw.numbers.shape[1] + 1))) if raw is not None else [],
+            "taken_for": self.taken_for,
+            "why_not": self.why_not,
+        }
+
+
+def take_inventory(files: Sequence[Path], accepts: Callable[[RawPoses], bool]) -> list[FoundList]:
+    """Return every list of the files; those without `why_not` can be poses.
+
+    Args:
+        accepts: whether what a person has stated makes poses of a list that no layout accepts.
+    """
+    alike: dict[tuple[Path, str, str], list[Path]] = {}
+    for file in files:
+        alike.setdefault((file.parent, re.sub(r"\d+", "#", file.stem), file.suffix.lower()), []).append(file)
+    out: list[FoundList] = []
+    for group in alike.values():
+        if len(group) >= _FEWEST_ALIKE:
+            with suppress(InputError):
+                found = _judged(FoundList(tuple(group), read_raw_poses(group)), accepts)
+                if not found.why_not:
+                    out.append(found)
+                    continue
+        refused: list[FoundList] = []
+        for file in group:
+            try:
+                out += [_judged(FoundList((file,), raw), accepts) for raw in read_lists(file)]
+            except (InputError, NoResultError) as error:
+                refused.append(FoundList((file,), None, why_not=_reason(error, file)))
+        # What is wrong with files that are named alike is said once.
+        out += [replace(refused[0], files=tuple(group))] if len(refused) == len(group) else refused
+    return out
+
+
+def _judged(found: FoundList, accepts: Callable[[RawPoses], bool]) -> FoundList:
+    assert found.raw is not None
+    try:
+        if accepts(found.raw) or possible_layouts(found.raw):
+            return found
+        reason = "no pose is known that has such columns"
+    except InputError as error:
+        reason = _reason(error, found.files[0])
+    return replace(found, why_not=reason)
+
+
+def _reason(error: Exception, file: Path) -> str:
+    """What is wrong, without the file's name and the advice."""
+    return str(error).split("; to fix")[0].removeprefix(str(file)).lstrip(": ")
+
+
+def choose_list(
+    folder: Path, inventory: Sequence[FoundList], clouds: Sequence[Path]
+) -> tuple[FoundList, list[FoundList]]:
+    """Return the list of the robot's poses, and the inventory with what became of every other list.
+
+    Raises:
+        InputError: no list that can be poses, or several that serve as many clouds; shows the inventory.
+    """
+    open_ = [found for found in inventory if found.raw is not None and not found.why_not]
+    rows = [found for found in inventory if found.raw is not None]
+    if not open_ and len(rows) == 1:
+        open_ = rows  # what is wrong with it is said by name when its columns are read
+    if not open_:
+        raise InputError(
+            f"{folder}: no list of poses there{_shown(inventory)}; to fix: name the file of the poses with --poses "
+            "FILE, or a list of it with --poses FILE#LIST, and its columns with --columns x,y,z,rx,ry,rz"
+        )
+    ranked = sorted(open_, key=lambda found: _rank(found, clouds))
+    best = [found for found in ranked if _rank(found, clouds) == _rank(ranked[0], clouds)]
+    if len(best) > 1 and not all(found.files == best[0].files for found in best):
+        names = ", ".join(found.name for found in best[:4])
+        raise InputError(
+            f"{folder}: several files may hold the poses ({names}){_shown(inventory)}; to fix: name it with "
+            f"--poses {best[0].files[0].relative_to(folder)}"
+        )
+    chosen = replace(ranked[0], taken_for="poses", why_not="")
+    others = [
+        replace(found, why_not=found.why_not or f"{chosen.name} serves the clouds")
+        for found in inventory
+        if found is not ranked[0]
+    ]
+    return chosen, [chosen, *others]
+
+
+def _rank(found: FoundList, clouds: Sequence[Path]) -> tuple[int, bool, bool]:
+    """Less is better: clouds without a row, and what the names of file and list say."""
+    assert found.raw is not None
+    served = clouds_served(clouds, found.raw.labels, found.raw.numbers)
+    named = f"{found.files[0].stem} {found.raw.part}"
+    return len(clouds) - served, bool(_NAMES_OTHER.search(named)), not _NAMES_POSE.search(named)
+
+
+def _shown(inventory: Sequence[FoundList]) -> str:
+    """The first few lists of an inventory, for a message."""
+    shown = "; ".join(found.words for found in inventory[:_SHOWN])
+    more = f"; {len(inventory) - _SHOWN} more" if len(inventory) > _SHOWN else ""
+    return f" ({shown}{more})" if shown else ""
