@@ -4,11 +4,10 @@ Write-ahead logging lets pages be read while a run is appended; whoever appends 
 state to writing the next. Tables are plain, for those who ask by SQL: runs, estimates (a row per run and parameter),
 covariates, alarms; `states` are the filter's own.
 
-The hand-eye of a run as six numbers that can be compared from day to day: a twist about the part.
-
-About the scanner's own origin, a turn of the mount and a shift of it are hardly told apart: their errors go together.
-About the middle of what the scanner looks at they are: the shift is what moves there. So the mount's motion since the
-first run is counted about that point, in the axes of the frame that carries the scanner (base or flange).
+The hand-eye of a run stands there as six numbers that can be compared from day to day, a twist about the part: about
+the scanner's own origin a turn of the mount and a shift of it are hardly told apart, since their errors go together;
+about the middle of what the scanner looks at they are, since the shift is what moves there. So the mount's motion since
+the first run is counted about that point, in the axes of the frame that carries the scanner (base or flange).
 """
 
 import hashlib
@@ -16,6 +15,7 @@ import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,11 +24,10 @@ import numpy as np
 
 from stitch.errors import InputError, NoResultError
 from stitch.fit.coarse import REUSED
-from stitch.model.model_toml import ModelFile, read_model
+from stitch.model.model_toml import read_model
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.stored_run import read_result
-from stitch.plugins.watch.run_record import Estimate, RunRecord
 from stitch.session.reading.csv_files import is_number, read_csv_lines
 from stitch.session.reading.views_table import covariate_names
 
@@ -55,6 +54,37 @@ CREATE TABLE alarms (id INTEGER PRIMARY KEY, parameter INTEGER NOT NULL, onset I
     raised INTEGER NOT NULL, chart TEXT NOT NULL);
 CREATE TABLE states (run INTEGER PRIMARY KEY, time REAL NOT NULL, number INTEGER NOT NULL, data BLOB NOT NULL);
 """
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter of an effect as one run found it."""
+
+    name: str  # effect.parameter
+    unit: str
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """One run; lengths in length_unit, angles in rad."""
+
+    path: Path  # of the run
+    session: str  # path of the session
+    name: str
+    run_hash: str  # SHA-256 of model.toml and result.json
+    session_hash: str  # of the session's tables; of the run where these have gone
+    time: float  # s since 1970, UTC
+    time_from: str  # how that is known
+    length_unit: str
+    mount: str
+    T_mount: Array  # (4, 4)
+    covariance: Array  # (6, 6) of T·exp(ξ), scanner frame
+    estimates: tuple[Estimate, ...]
+    covariates: dict[str, float]
+    numbers: dict[str, float]  # residual, held-out error, noise floor, repeatability
+    document: dict[str, Any]  # result.json
 
 
 def session_conditions(session: Path, result: Path) -> tuple[float, str, dict[str, float]]:
@@ -99,16 +129,6 @@ def twist_covariance(covariance: Array, T_mount: Array, T_mount_first: Array, ce
     return J @ covariance @ J.T
 
 
-def middle_in_scanner(poses: Array, middle: Array) -> Array:
-    """(3,) where on average the scanner has the middle of the part before it.
-
-    Args:
-        poses: (V, 4, 4) T_reference_scanner.
-        middle: (3,) of the part, reference frame.
-    """
-    return frames.transform(frames.inverse(poses), middle[None])[:, 0].mean(axis=0)
-
-
 def _watch_frame(T_mount_first: Array, centre_scanner: Array) -> Array:
     """(4, 4) axes of the mount frame at the centre."""
     return frames.make(np.eye(3), frames.transform(T_mount_first, centre_scanner[None])[0])
@@ -133,21 +153,27 @@ def read_record(folder: Path, at: float | None = None) -> RunRecord:
     session = Path(document["session"])
     time, time_from, covariates = session_conditions(session, folder / "result.json")
     run_hash = _files_hash([folder / "model.toml", folder / "result.json"])
-    own = [session / name for name in _TABLES if (session / name).is_file()]
+    tables = [session / name for name in _TABLES if (session / name).is_file()]
     repeatability = document["repeatability"]
+    estimates = (
+        Estimate(f"{effect}.{name}", p.unit, p.value, p.sigma)
+        for effect, parameters in model.effects.items()
+        for name, p in parameters.items()
+        if np.isfinite(p.value) and np.isfinite(p.sigma) and p.sigma > 0
+    )
     return RunRecord(
         path=folder.resolve(),
         session=document["session"],
         name=document.get("name") or session.name,
         run_hash=run_hash,
-        session_hash=_files_hash(own) if own else run_hash,
+        session_hash=_files_hash(tables) if tables else run_hash,
         time=time if at is None else at,
         time_from=time_from if at is None else "stated",
         length_unit=model.length_unit,
         mount=model.mount,
         T_mount=model.T_mount,
         covariance=model.covariance,
-        estimates=tuple(_estimates(model)),
+        estimates=tuple(estimates),
         covariates=covariates,
         numbers={name: document[name] for name in ("residual_rms", "noise_floor")}
         | {f"repeatability_{name}": repeatability[name] for name in ("rotation", "translation")},
@@ -155,32 +181,23 @@ def read_record(folder: Path, at: float | None = None) -> RunRecord:
     )
 
 
-def _estimates(model: ModelFile) -> list[Estimate]:
-    return [
-        Estimate(f"{effect}.{name}", p.unit, p.value, p.sigma)
-        for effect, own in model.effects.items()
-        for name, p in own.items()
-        if np.isfinite(p.value) and np.isfinite(p.sigma) and p.sigma > 0
-    ]
-
-
 def _files_hash(files: Sequence[Path]) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for file in files:
-        found.update(file.name.encode() + b"\0" + file.read_bytes())
-    return found.hexdigest()
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
 
 
 def scanned_middle(record: RunRecord) -> tuple[Array, float]:
-    """(3,) middle of what a run saw, scanner frame, and how far its points lie from there, rms."""
-    points = _points(record)
+    """(3,) where on average the scanner has the middle of what a run saw, and how far the points lie from it, rms."""
+    points = _seen_points(record)
     middle = points.mean(axis=0)
     poses = np.array([view["pose"] for view in record.document["views"]], float)
-    centre = middle_in_scanner(poses, middle) if len(poses) else np.zeros(3)
-    return centre, float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1))))
+    in_scanner = frames.transform(frames.inverse(poses), middle[None])[:, 0].mean(axis=0) if len(poses) else np.zeros(3)
+    return in_scanner, float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1))))
 
 
-def _points(record: RunRecord) -> Array:
+def _seen_points(record: RunRecord) -> Array:
     """(n, 3) of the stitched cloud, or the targets; reference frame."""
     targets = record.document.get("targets") or []
     if targets:
@@ -308,8 +325,8 @@ def _require_history(file: Path, connection: sqlite3.Connection) -> None:
     tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
     if not tables:
         return
-    own = connection.execute("SELECT value FROM cell WHERE key = 'format'").fetchall() if "states" in tables else []
-    if own != [(json.dumps(HISTORY_FORMAT),)]:
+    stated = connection.execute("SELECT value FROM cell WHERE key = 'format'").fetchall() if "states" in tables else []
+    if stated != [(json.dumps(HISTORY_FORMAT),)]:
         raise InputError(
             f"{file}: is no history in the form {HISTORY_FORMAT}; to fix: name another folder for the cell"
         )
@@ -327,12 +344,6 @@ def insert_run(history: History, record: RunRecord, numbers_hash: str) -> int:
     columns = "time, time_from, name, run, session, run_hash, session_hash, numbers_hash, hand_eye, covariance, numbers"
     text = f"INSERT INTO runs ({columns}) VALUES ({', '.join('?' * 11)}) RETURNING id"
     return int(history.sql(text, *row, json.dumps(record.numbers))[0][0])
-
-
-def use_calibration(history: History, run_hash: str) -> None:
-    """From now on the cell uses the calibration of this run."""
-    with history.writing():
-        history.state({"in_use": run_hash})
 
 
 def known_run_hash(history: History, run: Path, added: Sequence[RunRecord]) -> str:

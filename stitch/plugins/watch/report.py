@@ -17,20 +17,20 @@ from stitch.plugins.watch.state_bank import COVARIATES, SLOPE, Bank, predicted_b
 from stitch.plugins.watch.tracking import Alarm, smoothed_states
 from stitch.plugins.watch.update import (
     DAY_SECONDS,
-    SessionColumns,
     last_state,
-    session_columns,
     sessions_after,
     sessions_from,
-    state_or_first,
     stored_alarms,
+    stored_parameters,
 )
 
 HORIZON = 180.0  # days that are looked ahead
+# A parameter has left its limits where that is more probable; it is asked for so often within the horizon.
 _RISK = 0.05
 _STEPS = 720
 # Sessions before and after an onset that tell what began there, and how few tell nothing.
-_AROUND, _FEWEST = 300, 3
+_AROUND = 300
+_FEWEST = 3
 # A slope or a share of a channel that is so unlikely by chance is named (per parameter and channel).
 _FOLLOWS_P_LIMIT = 1e-4
 # Expanded uncertainty: within which a calibration claims to be right.
@@ -42,30 +42,6 @@ _TOGETHER = 24 * 3600.0
 # Sessions that scatter by more than so many stated sigmas are remarked.
 _WIDE = 2.0
 _PLACES = {"hand_eye": "the mount"}
-
-
-def days_valid(bank: Bank, conditions: Array, in_use: Array, limits: Array) -> Array:
-    """(P,) days from the last session until a parameter may have left its limits; inf beyond `HORIZON`, 0 where it has.
-
-    What all sessions have in common is in the calibration too, and does not count.
-
-    Args:
-        bank: after the last session, one member a parameter.
-        conditions: (c,) covariates of the calibration in use.
-        in_use: (P,) values in use; NaN where it has none.
-        limits: (P,) how far a parameter may be off.
-    """
-    x = np.concatenate([[1.0, 0.0], conditions])
-    ahead = np.linspace(0.0, HORIZON, _STEPS + 1)
-    risk = np.zeros((len(ahead), len(in_use)))
-    for k, days in enumerate(ahead):
-        then = predicted_bank(bank, float(days))
-        off = bank.origin + bank.unit * (then.mean[:, 0] @ x) - in_use
-        sigma = bank.unit * np.sqrt(np.maximum(x @ then.covariance[:, 0] @ x, 0.0) * bank.scatter[:, 0])
-        sigma = np.maximum(sigma, 1e-12 * limits)
-        risk[k] = ndtr((off - limits) / sigma) + ndtr((-limits - off) / sigma)
-    late = np.nan_to_num(risk) > _RISK
-    return np.where(late.any(axis=0), ahead[np.argmax(late, axis=0)], np.inf)
 
 
 @dataclass(frozen=True)
@@ -81,56 +57,6 @@ class Change:
     sigma: float
     p_value: float
     chart: str
-
-
-def find_changes(history: History) -> list[Change]:
-    """All events in the order in which they were raised; a drift that goes on is one."""
-    alarms, out = stored_alarms(history), list[Change]()
-    order = {run: k for k, (run,) in enumerate(history.sql("SELECT id FROM runs ORDER BY time, id"))}
-    for parameter in sorted({a.parameter for a in alarms}):
-        own = sorted((a for a in alarms if a.parameter == parameter), key=lambda a: order[a.raised])
-        drifting = False
-        for i in range(len(own)):
-            found = _assess_change(history, own, i, order, drifting)
-            if not (drifting and found.kind == "drift"):
-                out.append(found)
-            drifting = found.kind == "drift"
-    return sorted(out, key=lambda c: (order[c.raised], c.parameter))
-
-
-def _assess_change(history: History, own: Sequence[Alarm], i: int, order: dict[int, int], drifting: bool) -> Change:
-    """Judged from the event before until the next was seen.
-
-    Args:
-        drifting: it moved steadily before; what comes on top is asked for.
-    """
-    alarm, at = own[i], order[own[i].onset]
-    begin = max(order[own[i - 1].onset] if i else 0, at - _AROUND)
-    end = min(order[own[i + 1].raised] if i + 1 < len(own) else len(order), max(at + _AROUND, order[alarm.raised] + 1))
-    runs = list(order)[begin:end]
-    sessions, found = sessions_from(history, runs), None
-    values = sessions.values[:, alarm.parameter]
-    if np.isfinite(values).sum() >= _FEWEST:
-        base = [sessions.covariates, sessions.days[:, None]] if drifting else [sessions.covariates]
-        found = find_onset(
-            values=values,
-            sigmas=sessions.sigmas[:, alarm.parameter],
-            days=sessions.days,
-            covariates=np.hstack(base),
-            channels=sessions.channels,
-        )
-    shape = "step" if found is None else found.shape
-    return Change(
-        parameter=alarm.parameter,
-        since=alarm.onset if found is None else runs[found.session],
-        raised=alarm.raised,
-        kind="step" if shape == "step" else "drift",
-        channel=None if shape in ("step", "drift") else shape,
-        size=np.nan if found is None else found.size,
-        sigma=np.nan if found is None else found.sigma,
-        p_value=np.nan if found is None else found.p_value,
-        chart=alarm.chart,
-    )
 
 
 @dataclass(frozen=True)
@@ -200,8 +126,8 @@ class CellReport:
     @property
     def too_uncertain(self) -> list[ParameterReport]:
         """Those of which nobody can say whether they are within their limits, the worst first."""
-        found = [p for p in self.parameters if p.too_uncertain]
-        return sorted(found, key=lambda p: p.limit / max(p.own_sigma, 1e-300))
+        uncertain = [p for p in self.parameters if p.too_uncertain]
+        return sorted(uncertain, key=lambda p: p.limit / max(p.own_sigma, 1e-300))
 
 
 def cell_report(history: History, tolerance: float | None = None) -> CellReport:
@@ -214,87 +140,81 @@ def cell_report(history: History, tolerance: float | None = None) -> CellReport:
     Raises:
         InputError: the history is empty.
     """
-    found = last_state(history)
-    if found is None:
+    state = last_state(history)
+    if not state.number:
         raise InputError(f"{history.folder}: has no sessions yet; to fix: append one with --add RUN")
-    names, bank, events = session_columns(history), found.state.bank, find_changes(history)
+    events = find_changes(history)
     last_run, last = history.sql("SELECT id, time FROM runs ORDER BY time DESC, id DESC LIMIT 1")[0]
     calibration = history.stated("in_use")
     used, in_use, used_time = history.sql("SELECT id, name, time FROM runs WHERE run_hash = ?", calibration)[0]
     ends = sessions_from(history, [used, last_run])
-    at = {run: k for k, run in enumerate(ends.ids)}
-    limits = _parameter_limits(history, names, ends.sigmas[at[used]], tolerance)
-    best = bank.chosen(bank.best)
-    days = days_valid(best, ends.covariates[at[used]], ends.values[at[used]], limits)
+    at_used = ends.ids.index(used)
+    conditions = ends.covariates[ends.ids.index(last_run)]
+    limits = _parameter_limits(history, ends.sigmas[at_used], tolerance)
+    best = state.bank.chosen(state.bank.best)
+    sloped = _likeliest_sloped(state.bank)
+    days = days_valid(best, ends.covariates[at_used], ends.values[at_used], limits)
     # As the last session states them that shows a parameter, else the first.
     stated = np.where(np.isfinite(ends.sigmas[-1]), ends.sigmas[-1], best.unit)
     common = np.sqrt(np.maximum(1 - best.scatter[:, 0], 0.0)) * stated
     named = {run for change in events for run in (change.since, change.raised)}
     rows = [history.sql("SELECT id, name, time FROM runs WHERE id = ?", run)[0] for run in named]
     times = {run: float(time) for run, _, time in rows}
-    parameters = [
-        _assess_parameter(p, names, best, _likeliest_sloped(bank), ends.covariates[at[last_run]], common[p])
-        | {"in_use": float(ends.values[at[used], p]), "limit": float(limits[p])}
-        | {"valid_until": float(last + DAY_SECONDS * days[p]) if np.isfinite(days[p]) else None}
-        | _standing_events(p, events, times, used_time, _likeliest_sloped(bank))
-        for p in range(len(names.parameters))
-    ]
+    x = np.concatenate([[1.0, 0.0], conditions])
+    parameters = []
+    for p, (name, unit) in enumerate(stored_parameters(history)):
+        scale = best.unit[p]
+        scatter = best.scatter[p, 0]
+        own_sigma = scale * np.sqrt(max(x @ best.covariance[p, 0] @ x, 0.0) * scatter)
+        slope, slope_sigma, slope_p_value = _significance(sloped, p, SLOPE)
+        changes = tuple(c for c in events if c.parameter == p)
+        # An alarm stands until a calibration after it is in use, a drift as long as it goes on.
+        moves = slope_p_value < _FOLLOWS_P_LIMIT
+        standing = [c for c in changes if times[c.since] > used_time or (c.kind == "drift" and moves)]
+        parameters.append(
+            ParameterReport(
+                name=name,
+                unit=unit,
+                value=float(best.origin[p] + scale * (best.mean[p, 0] @ x)),
+                sigma=float(np.hypot(own_sigma, common[p])),
+                common_sigma=float(common[p]),
+                scatter=float(np.sqrt(scatter)),
+                drift_per_day=float(scale * slope),
+                drift_sigma=float(scale * slope_sigma),
+                process_noise=float(scale * np.sqrt(best.noise[p, 0, 0] * scatter)),
+                follows=_followed_channels(p, ends.channels, best),
+                in_use=float(ends.values[at_used, p]),
+                limit=float(limits[p]),
+                valid_until=float(last + DAY_SECONDS * days[p]) if np.isfinite(days[p]) else None,
+                own_sigma=float(own_sigma),
+                changes=changes,
+                alarm=max(standing, key=lambda c: times[c.raised], default=None),
+            )
+        )
     return CellReport(
         name=history.folder.resolve().name,
         length_unit=str(history.stated("length_unit")),
-        sessions=found.number,
+        sessions=state.number,
         first=float(history.sql("SELECT min(time) FROM runs")[0][0]),
         last=float(last),
         in_use=str(in_use),
-        parameters=tuple(ParameterReport(**p) for p in parameters),  # type: ignore[arg-type]
+        parameters=tuple(parameters),
         run_names={run: str(name) for run, name, _ in rows},
         run_times=times,
         run_length=float(history.stated("run_length")),
     )
 
 
-def _assess_parameter(
-    p: int, names: SessionColumns, best: Bank, sloped: Bank, conditions: Array, common: float
-) -> dict[str, object]:
-    x = np.concatenate([[1.0, 0.0], conditions])
-    unit, scatter = best.unit[p], best.scatter[p, 0]
-    own = unit * np.sqrt(max(x @ best.covariance[p, 0] @ x, 0.0) * scatter)
-    slope, variance = sloped.mean[p, 0, SLOPE], sloped.covariance[p, 0, SLOPE, SLOPE] * sloped.scatter[p, 0]
-    return {
-        "name": names.parameters[p],
-        "unit": names.units[p],
-        "value": float(best.origin[p] + unit * (best.mean[p, 0] @ x)),
-        "sigma": float(np.hypot(own, common)),
-        "own_sigma": float(own),
-        "common_sigma": float(common),
-        "scatter": float(np.sqrt(scatter)),
-        "drift_per_day": float(unit * slope),
-        "drift_sigma": float(unit * np.sqrt(max(variance, 0.0))),
-        "process_noise": float(unit * np.sqrt(best.noise[p, 0, 0] * scatter)),
-        "follows": tuple(_followed_channels(p, names, best)),
-    }
-
-
-def _followed_channels(p: int, names: SessionColumns, best: Bank) -> list[FollowedChannel]:
-    out = []
-    for c, channel in enumerate(names.channels):
-        size = best.mean[p, 0, COVARIATES + c]
-        sigma = np.sqrt(best.covariance[p, 0, COVARIATES + c, COVARIATES + c] * best.scatter[p, 0])
-        p_value = 2 * float(stdtr(max(best.count[p] - 4, 1), -abs(size) / max(sigma, 1e-300)))
-        if p_value < _FOLLOWS_P_LIMIT:
-            out.append(FollowedChannel(channel, float(best.unit[p] * size), float(best.unit[p] * sigma), p_value))
-    return out
-
-
-def _standing_events(
-    p: int, events: list[Change], times: dict[int, float], used: float, sloped: Bank
-) -> dict[str, object]:
-    """Changes of a parameter; an alarm stands until a calibration after it is in use, a drift as long as it goes on."""
-    own = tuple(c for c in events if c.parameter == p)
-    slope, sigma = sloped.mean[p, 0, SLOPE], np.sqrt(sloped.covariance[p, 0, SLOPE, SLOPE] * sloped.scatter[p, 0])
-    moves = 2 * stdtr(max(sloped.count[p] - 4, 1), -abs(slope) / max(sigma, 1e-300)) < _FOLLOWS_P_LIMIT
-    standing = [c for c in own if times[c.since] > used or (c.kind == "drift" and moves)]
-    return {"changes": own, "alarm": max(standing, key=lambda c: times[c.raised], default=None)}
+def _parameter_limits(history: History, sigmas: Array, tolerance: float | None) -> Array:
+    """(P,) how far a parameter may be from the calibration in use; NaN where that does not have it."""
+    limits = _COVERAGE_FACTOR * sigmas
+    if tolerance is None:
+        return limits
+    radius = float(history.stated("radius"))
+    of_mount = {f"hand_eye.{axis}": tolerance for axis in "xyz"}
+    of_mount |= {f"hand_eye.r{axis}": tolerance / radius if radius > 0 else np.inf for axis in "xyz"}
+    names = [name for name, _ in stored_parameters(history)]
+    return np.array([of_mount.get(name, limit) for name, limit in zip(names, limits, strict=True)], float)
 
 
 def _likeliest_sloped(bank: Bank) -> Bank:
@@ -303,15 +223,99 @@ def _likeliest_sloped(bank: Bank) -> Bank:
     return bank.chosen(believes[np.argmax(bank.log_likelihood[:, believes], axis=1)])
 
 
-def _parameter_limits(history: History, names: SessionColumns, sigmas: Array, tolerance: float | None) -> Array:
-    """(P,) how far a parameter may be from the calibration in use; NaN where that does not have it."""
-    limits = _COVERAGE_FACTOR * sigmas
-    if tolerance is not None:
-        radius = float(history.stated("radius"))
-        own = {f"hand_eye.{axis}": tolerance for axis in "xyz"}
-        own |= {f"hand_eye.r{axis}": tolerance / radius if radius > 0 else np.inf for axis in "xyz"}
-        limits = np.array([own.get(name, limit) for name, limit in zip(names.parameters, limits, strict=True)])
-    return np.asarray(limits, float)
+def days_valid(bank: Bank, conditions: Array, in_use: Array, limits: Array) -> Array:
+    """(P,) days from the last session until a parameter may have left its limits; inf beyond `HORIZON`, 0 where it has.
+
+    What all sessions have in common is in the calibration too, and does not count.
+
+    Args:
+        bank: after the last session, one member a parameter.
+        conditions: (c,) covariates of the calibration in use.
+        in_use: (P,) values in use; NaN where it has none.
+        limits: (P,) how far a parameter may be off.
+    """
+    x = np.concatenate([[1.0, 0.0], conditions])
+    ahead = np.linspace(0.0, HORIZON, _STEPS + 1)
+    risk = np.zeros((len(ahead), len(in_use)))
+    for k, days in enumerate(ahead):
+        then = predicted_bank(bank, float(days))
+        off = bank.origin + bank.unit * (then.mean[:, 0] @ x) - in_use
+        sigma = bank.unit * np.sqrt(np.maximum(x @ then.covariance[:, 0] @ x, 0.0) * bank.scatter[:, 0])
+        sigma = np.maximum(sigma, 1e-12 * limits)
+        risk[k] = ndtr((off - limits) / sigma) + ndtr((-limits - off) / sigma)
+    late = np.nan_to_num(risk) > _RISK
+    return np.where(late.any(axis=0), ahead[np.argmax(late, axis=0)], np.inf)
+
+
+def _significance(bank: Bank, p: int, number: int) -> tuple[float, float, float]:
+    """A number of a parameter, its sigma, both in the parameter's first sigma, and the p-value of its being zero."""
+    size = bank.mean[p, 0, number]
+    sigma = np.sqrt(max(bank.covariance[p, 0, number, number] * bank.scatter[p, 0], 0.0))
+    return size, sigma, 2 * float(stdtr(max(bank.count[p] - 4, 1), -abs(size) / max(sigma, 1e-300)))
+
+
+def _followed_channels(p: int, channels: Sequence[str], best: Bank) -> tuple[FollowedChannel, ...]:
+    followed = []
+    for c, channel in enumerate(channels):
+        size, sigma, p_value = _significance(best, p, COVARIATES + c)
+        if p_value < _FOLLOWS_P_LIMIT:
+            followed.append(FollowedChannel(channel, float(best.unit[p] * size), float(best.unit[p] * sigma), p_value))
+    return tuple(followed)
+
+
+def find_changes(history: History) -> list[Change]:
+    """All events in the order in which they were raised; a drift that goes on is one."""
+    alarms = stored_alarms(history)
+    changes = list[Change]()
+    order = {run: k for k, (run,) in enumerate(history.sql("SELECT id FROM runs ORDER BY time, id"))}
+    for parameter in sorted({a.parameter for a in alarms}):
+        of_parameter = sorted((a for a in alarms if a.parameter == parameter), key=lambda a: order[a.raised])
+        drifting = False
+        for i in range(len(of_parameter)):
+            change = _assess_change(history, of_parameter, i, order, drifting)
+            if not (drifting and change.kind == "drift"):
+                changes.append(change)
+            drifting = change.kind == "drift"
+    return sorted(changes, key=lambda c: (order[c.raised], c.parameter))
+
+
+def _assess_change(history: History, alarms: Sequence[Alarm], i: int, order: dict[int, int], drifting: bool) -> Change:
+    """The change of alarm i of a parameter, judged from the event before until the next was seen.
+
+    Args:
+        drifting: it moved steadily before; what comes on top is asked for.
+    """
+    alarm = alarms[i]
+    at = order[alarm.onset]
+    begin = max(order[alarms[i - 1].onset] if i else 0, at - _AROUND)
+    next_raised = order[alarms[i + 1].raised] if i + 1 < len(alarms) else len(order)
+    runs = list(order)[begin : min(next_raised, max(at + _AROUND, order[alarm.raised] + 1))]
+    sessions = sessions_from(history, runs)
+    values = sessions.values[:, alarm.parameter]
+    onset = None
+    if np.isfinite(values).sum() >= _FEWEST:
+        base = [sessions.covariates, sessions.days[:, None]] if drifting else [sessions.covariates]
+        onset = find_onset(
+            values=values,
+            sigmas=sessions.sigmas[:, alarm.parameter],
+            days=sessions.days,
+            covariates=np.hstack(base),
+            channels=sessions.channels,
+        )
+    if onset is None:
+        nan = float("nan")
+        return Change(alarm.parameter, alarm.onset, alarm.raised, "step", None, nan, nan, nan, alarm.chart)
+    return Change(
+        parameter=alarm.parameter,
+        since=runs[onset.session],
+        raised=alarm.raised,
+        kind="step" if onset.shape == "step" else "drift",
+        channel=None if onset.shape in ("step", "drift") else onset.shape,
+        size=onset.size,
+        sigma=onset.sigma,
+        p_value=onset.p_value,
+        chart=alarm.chart,
+    )
 
 
 @dataclass(frozen=True)
@@ -331,15 +335,20 @@ class CellTrend:
 def cell_trend(history: History, report: CellReport, max_sessions: int = MAX_SESSIONS) -> CellTrend:
     """The last sessions of a cell, smoothed."""
     rows = history.sql("SELECT time FROM runs ORDER BY time DESC, id DESC LIMIT ?", max_sessions)
-    kept, last = last_state(history, before=rows[-1][0]), last_state(history)
-    assert last is not None
-    sessions, moved = sessions_after(history, kept), defaultdict(list)
+    kept = last_state(history, before=rows[-1][0])
+    sessions = sessions_after(history, kept)
+    moved = defaultdict(list)
     for alarm in stored_alarms(history):
         moved[alarm.onset].append(alarm.parameter)
-    smoothed, own_sigmas = smoothed_states(state_or_first(history, kept), sessions, moved, last.state)
+    smoothed, own_sigmas = smoothed_states(kept, sessions, moved, last_state(history))
     part = slice(max(len(sessions.ids) - max_sessions, 0), None)
     common = np.array([p.common_sigma for p in report.parameters])
     times = dict(history.sql("SELECT id, time FROM runs"))
+    place = {run: k for k, run in enumerate(sessions.ids[part])}
+    channels = {name: np.full(len(place), np.nan) for name in history.stated("channels")}
+    for run, name, value in history.sql("SELECT run, name, value FROM covariates"):
+        if run in place and name in channels:
+            channels[name][place[run]] = value
     return CellTrend(
         report=report,
         times=np.array([times[run] for run in sessions.ids[part]]),
@@ -348,29 +357,17 @@ def cell_trend(history: History, report: CellReport, max_sessions: int = MAX_SES
         smoothed=smoothed[part],
         smoothed_sigmas=np.hypot(own_sigmas[part], common),
         in_use=calibration_in_use(history, len(report.parameters)),
-        channels=_channels(history, list(sessions.ids[part])),
+        channels=channels,
     )
 
 
 def calibration_in_use(history: History, parameters: int) -> Array:
     """(P,) values in the calibration in use; NaN where it has none."""
-    out = np.full(parameters, np.nan)
-    found = history.sql(
-        "SELECT parameter, value FROM estimates WHERE run = (SELECT id FROM runs WHERE run_hash = ?)",
-        history.stated("in_use"),
-    )
-    for parameter, value in found:
-        out[parameter - 1] = value
-    return out
-
-
-def _channels(history: History, runs: list[int]) -> dict[str, Array]:
-    place = {run: k for k, run in enumerate(runs)}
-    out = {name: np.full(len(runs), np.nan) for name in history.stated("channels")}
-    for run, name, value in history.sql("SELECT run, name, value FROM covariates"):
-        if run in place and name in out:
-            out[name][place[run]] = value
-    return out
+    values = np.full(parameters, np.nan)
+    query = "SELECT parameter, value FROM estimates WHERE run = (SELECT id FROM runs WHERE run_hash = ?)"
+    for parameter, value in history.sql(query, history.stated("in_use")):
+        values[parameter - 1] = value
+    return values
 
 
 _Alarmed = tuple[ParameterReport, Change]
@@ -378,8 +375,8 @@ _Alarmed = tuple[ParameterReport, Change]
 
 def headline(report: CellReport) -> str:
     """The verdict on a cell in one line."""
-    told = event_sentences(report) or [f"nothing moves in {sessions_text(report)}"]
-    return f"{report.name}: {'; '.join(told)}; {_recalibration_note(report)}."
+    events = event_sentences(report) or [f"nothing moves in {sessions_text(report)}"]
+    return f"{report.name}: {'; '.join(events)}; {_recalibration_note(report)}."
 
 
 def sessions_text(report: CellReport) -> str:
@@ -389,7 +386,8 @@ def sessions_text(report: CellReport) -> str:
 
 def event_sentences(report: CellReport) -> list[str]:
     """One for every event that stands, in the order of their onsets."""
-    left, groups = sorted(report.alarms, key=lambda item: _significance_rank(item[1])), list[list[_Alarmed]]()
+    left = sorted(report.alarms, key=lambda alarmed: _significance_rank(alarmed[1]))
+    groups = list[list[_Alarmed]]()
     while left:
         # Small steps are dated by the large one beside them.
         groups.append([item for item in left if _is_same_event(report, left[0], item)])
@@ -414,11 +412,12 @@ def report_notes(report: CellReport) -> list[str]:
 
 def size_text(value: float, unit: str, sigma: float | None = None) -> str:
     """A value with its unit for people: lengths in µm or mm, the rest as everywhere."""
-    told = value if sigma is None or not np.isfinite(sigma) else float(f"{value:.{_digits(value, sigma)}g}")
+    if sigma is not None and np.isfinite(sigma):
+        value = float(f"{value:.{_digits(value, sigma)}g}")
     if unit in ("mm", "m"):
-        return length_text(told, unit)
+        return length_text(value, unit)
     factor, name = display_unit(unit)
-    return f"{factor * told:.4g} {name}"
+    return f"{factor * value:.4g} {name}"
 
 
 def day_text(time: float | None) -> str:

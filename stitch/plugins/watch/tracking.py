@@ -57,11 +57,14 @@ class Sessions:
 
 @dataclass(frozen=True)
 class CellState:
-    """What is known after a session."""
+    """What is known after a session; by default before the first."""
 
     bank: Bank
     charts: Charts
-    day: float  # of the session
+    day: float  # of the session, since the first
+    run: int = -1  # id of the session
+    time: float = -1e300  # s since 1970
+    number: int = 0  # of sessions so far
 
 
 @dataclass(frozen=True)
@@ -85,28 +88,33 @@ def next_state(state: CellState, sessions: Sessions, k: int, moved: Collection[i
     Args:
         moved: parameters to which something happened just before this session.
     """
-    values, sigmas = sessions.values[k], sessions.sigmas[k]
-    bank, charts = state.bank, state.charts
+    values = sessions.values[k]
+    bank = state.bank
+    charts = state.charts
     known = len(bank.origin)
     if len(values) > known:
-        bank = with_parameters(bank, *_first_values(sessions, known), sessions.prior_sigmas)
+        first_values, first_sigmas = _first_values(sessions, known)
+        bank = with_parameters(bank, first_values, first_sigmas, sessions.prior_sigmas)
         more = empty_charts(len(values) - known)
         charts = Charts(np.concatenate([charts.cusums, more.cusums]), np.concatenate([charts.ewma, more.ewma]))
     bank = predicted_bank(bank, max(sessions.days[k] - state.day, 0.0))
     if moved:
         mask = np.isin(np.arange(len(values)), list(moved))
-        bank, charts = reset_moved(bank, mask), restarted(charts, mask)
-    bank, innovations = updated_bank(bank, values, sigmas, sessions.covariates[k])
+        bank = reset_moved(bank, mask)
+        charts = restarted(charts, mask)
+    bank, innovations = updated_bank(bank, values, sessions.sigmas[k], sessions.covariates[k])
     return CellState(bank, updated_charts(charts, innovations), float(sessions.days[k]))
 
 
 def _first_values(sessions: Sessions, known: int) -> tuple[Array, Array]:
     """First value and first sigma of the parameters from number `known` on."""
-    values, sigmas = sessions.values[:, known:], sessions.sigmas[:, known:]
-    seen = np.isfinite(values) & (sigmas > 0)
-    first, own = np.argmax(seen, axis=0), np.arange(values.shape[1])
-    told = seen.any(axis=0)
-    return np.where(told, values[first, own], 0.0), np.where(told, sigmas[first, own], 1.0)
+    values = sessions.values[:, known:]
+    sigmas = sessions.sigmas[:, known:]
+    is_shown = np.isfinite(values) & (sigmas > 0)
+    first = np.argmax(is_shown, axis=0)
+    column = np.arange(values.shape[1])
+    ever = is_shown.any(axis=0)
+    return np.where(ever, values[first, column], 0.0), np.where(ever, sigmas[first, column], 1.0)
 
 
 def alarming_parameters(state: CellState, run_length: float) -> list[tuple[int, str]]:
@@ -127,14 +135,14 @@ def raise_alarm(sessions: Sessions, k: int, parameter: int, chart: str, before: 
     last = max((ids.index(a.raised) for a in before if a.parameter == parameter and a.raised in ids), default=0)
     last = min(last, k - 1) if k else 0
     part = slice(last, k + 1)
-    found = find_onset(
+    change = find_onset(
         values=sessions.values[part, parameter],
         sigmas=sessions.sigmas[part, parameter],
         days=sessions.days[part],
         covariates=sessions.covariates[part],
         channels=sessions.channels,
     )
-    onset = k if found is None else last + max(found.session, 1 if last < k else 0)
+    onset = k if change is None else last + max(change.session, 1 if last < k else 0)
     return Alarm(parameter, ids[onset], ids[k], chart)
 
 
@@ -154,20 +162,22 @@ def smoothed_states(
     filtered = list[Bank]()
     for k, run in enumerate(sessions.ids):
         state = next_state(state, sessions, k, moved.get(run, ()))
-        own = state.bank
-        filtered.append(own.chosen(members[: len(own.origin)]))
+        filtered.append(state.bank.chosen(members[: len(state.bank.origin)]))
     return _smooth_backwards(filtered, sessions, moved, last.bank.chosen(members))
 
 
 def _smooth_backwards(
     filtered: Sequence[Bank], sessions: Sessions, moved: Mapping[int, Sequence[int]], last: Bank
 ) -> tuple[Array, Array]:
-    n, P, d = len(filtered), len(last.origin), last.mean.shape[2]
-    means, covariances = np.full((n, P, d), np.nan), np.full((n, P, d, d), np.nan)
-    mean, covariance = filtered[-1].mean[:, 0], filtered[-1].covariance[:, 0]
-    means[-1], covariances[-1] = mean, covariance
+    n = len(filtered)
+    P, _, d = last.mean.shape
+    means = np.full((n, P, d), np.nan)
+    covariances = np.full((n, P, d, d), np.nan)
+    mean = means[-1] = filtered[-1].mean[:, 0]
+    covariance = covariances[-1] = filtered[-1].covariance[:, 0]
     for k in range(n - 2, -1, -1):
-        now, known = filtered[k], len(filtered[k].origin)
+        now = filtered[k]
+        known = len(now.origin)
         days = sessions.days[k + 1] - sessions.days[k]
         ahead = predicted_bank(now, max(days, 0.0))
         if happened := moved.get(sessions.ids[k + 1], ()):
@@ -177,7 +187,8 @@ def _smooth_backwards(
         gain = now.covariance[:, 0] @ F.T @ _inverse(P_ahead)
         mean = now.mean[:, 0] + np.einsum("pij,pj->pi", gain, mean[:known] - ahead.mean[:, 0])
         covariance = now.covariance[:, 0] + gain @ (covariance[:known] - P_ahead) @ np.swapaxes(gain, -1, -2)
-        means[k, :known], covariances[k, :known] = mean, covariance
+        means[k, :known] = mean
+        covariances[k, :known] = covariance
     x = np.column_stack([np.ones(n), np.zeros(n), sessions.covariates])
     variance = np.einsum("ni,npij,nj->np", x, covariances, x) * last.scatter[:, 0]
     values = last.origin + last.unit * np.einsum("npi,ni->np", means, x)
@@ -189,6 +200,5 @@ def _inverse(covariance: Array) -> Array:
     diagonal = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
     scale = np.where(diagonal > 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0)
     unit = covariance * scale[:, :, None] * scale[:, None, :]
-    return np.asarray(
-        np.linalg.pinv(unit, rcond=_SINGULAR, hermitian=True) * scale[:, :, None] * scale[:, None, :], float
-    )
+    inverse = np.asarray(np.linalg.pinv(unit, rcond=_SINGULAR, hermitian=True), float)
+    return inverse * scale[:, :, None] * scale[:, None, :]

@@ -1,15 +1,14 @@
 """A run joins the history of its cell: stored, then followed from the last state on.
 
-What a parameter may follow where nothing moves: the channels, how fast temperatures change, and the hour.
-
-Arms and mounts lag behind the air by hours. A temperature and its lag together span every delayed response, whatever
-the weather does to the swing of the day; the hour spans what nobody has a thermometer for.
+Where nothing moves, a parameter may follow the channels, how fast temperatures change, and the hour. Arms and mounts
+lag behind the air by hours: a temperature and its lag together span every delayed response, whatever the weather does
+to the swing of the day; the hour spans what nobody has a thermometer for.
 """
 
 import hashlib
 import io
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -19,14 +18,15 @@ from stitch.numerics.frames import Array
 from stitch.plugins.watch.control_charts import Charts
 from stitch.plugins.watch.history import (
     TWIST_NAMES,
+    Estimate,
     History,
+    RunRecord,
     insert_run,
     matrix_json,
     mount_twist,
     scanned_middle,
     twist_covariance,
 )
-from stitch.plugins.watch.run_record import Estimate, RunRecord
 from stitch.plugins.watch.state_bank import Bank
 from stitch.plugins.watch.tracking import (
     Alarm,
@@ -42,15 +42,17 @@ DAY_SECONDS = 86400.0
 # Every channel costs sessions until its share is known.
 _MOST_CHANNELS = 4
 # Time over which a temperature is averaged for its lag, s; after so many of them an older session counts nothing.
-_LAG, _GONE = 3 * 3600.0, 16.0
-LOOK_BACK = _LAG * _GONE
+_LAG = 3 * 3600.0
+_LOOK_BACK = 16 * _LAG
 # How far, in sigmas, a parameter may follow a degree, or the hour; of other channels nothing is believed.
 _BELIEVED = 10.0
 _HOURS = 2
 # So many rows are asked for by their numbers; of more the table is read.
 _MANY = 2000
 # A state is kept at every so many sessions, the last few hundred sessions long, and beyond at longer intervals.
-_STEP, _FAR, _LATE = 32, 512, 640
+_STEP, _FAR_STEP = 32, 512
+# Sessions that an onset is sought in, and over which states are kept at short intervals.
+_RECENT = 640
 # One false alarm of the whole cell in so many sessions where nothing happens: two hundred months of 600, so that one in
 # a hundred remains where parameters follow temperatures in ways that the regressors do not quite have.
 RUN_LENGTH = 120_000.0
@@ -63,8 +65,8 @@ def chosen_channels(covariates: Iterable[str]) -> list[str]:
 
 def regressor_prior_sigmas(channels: Sequence[str]) -> Array:
     """(c,) how far, in sigmas, a parameter may follow each regressor by one unit; inf: anything."""
-    own = [_BELIEVED if _is_temperature(name) else np.inf for name in channels]
-    return np.array(own + [_BELIEVED] * (sum(map(_is_temperature, channels)) + _HOURS))
+    of_channels = [_BELIEVED if _is_temperature(name) else np.inf for name in channels]
+    return np.array(of_channels + [_BELIEVED] * (sum(map(_is_temperature, channels)) + _HOURS))
 
 
 def regressors(times: Array, channels: Array, names: Sequence[str]) -> Array:
@@ -75,7 +77,10 @@ def regressors(times: Array, channels: Array, names: Sequence[str]) -> Array:
         channels: (n, len(names)) less their references; NaN where a session does not tell, which counts as the last
             that did.
     """
-    known = np.array([_filled_gaps(column) for column in channels.T]).reshape(len(names), len(times)).T
+    rows = np.arange(len(times))[:, None]
+    last_known = np.maximum.accumulate(np.where(np.isfinite(channels), rows, -1), axis=0)
+    filled = np.take_along_axis(channels, np.maximum(last_known, 0), axis=0)
+    known = np.where(last_known >= 0, filled, 0.0)
     warm = [c for c, name in enumerate(names) if _is_temperature(name)]
     rates = known[:, warm] - _lagged_means(times, known[:, warm])
     angle = 2 * np.pi * times / DAY_SECONDS
@@ -84,12 +89,6 @@ def regressors(times: Array, channels: Array, names: Sequence[str]) -> Array:
 
 def _is_temperature(channel: str) -> bool:
     return channel.endswith("temperature_c")
-
-
-def _filled_gaps(column: Array) -> Array:
-    seen = np.isfinite(column)
-    last = np.maximum.accumulate(np.where(seen, np.arange(len(column)), -1))
-    return np.where(last >= 0, column[np.maximum(last, 0)], 0.0)
 
 
 def _lagged_means(times: Array, values: Array) -> Array:
@@ -102,67 +101,53 @@ def _lagged_means(times: Array, values: Array) -> Array:
     return out
 
 
-@dataclass(frozen=True)
-class SessionColumns:
-    """What the columns of `Sessions` are."""
-
-    parameters: Sequence[str]
-    units: Sequence[str]
-    channels: Sequence[str]
-    first: float  # time of the first session, s since 1970
-
-
-def session_columns(history: History) -> SessionColumns:
-    """Parameters in the order in which they came, channels as `chosen_channels` says."""
-    parameters = history.sql("SELECT name, unit FROM parameters ORDER BY id")
-    return SessionColumns(
-        parameters=[name for name, _ in parameters],
-        units=[unit for _, unit in parameters],
-        channels=history.stated("channels") or [],
-        first=float(history.stated("first_time") or 0.0),
-    )
+def stored_parameters(history: History) -> list[tuple[str, str]]:
+    """Name and unit of all parameters, in the order in which they came."""
+    return history.sql("SELECT name, unit FROM parameters ORDER BY id")
 
 
 def sessions_from(history: History, ids: Sequence[int]) -> Sessions:
     """Sessions by their numbers."""
-    names, wanted = session_columns(history), set(ids)
+    parameters = stored_parameters(history)
+    channels = history.stated("channels") or []
     if len(ids) > _MANY:
+        wanted = set(ids)
         rows = [row for row in history.sql("SELECT id, time FROM runs ORDER BY time, id") if row[0] in wanted]
     else:
         marks = ", ".join("?" * len(ids))
         rows = history.sql(f"SELECT id, time FROM runs WHERE id IN ({marks}) ORDER BY time, id", *ids)
     place = {run: k for k, (run, _) in enumerate(rows)}
     times = np.array([time for _, time in rows], float)
-    values = np.full((len(rows), len(names.parameters)), np.nan)
+    values = np.full((len(rows), len(parameters)), np.nan)
     sigmas = values.copy()
     for run, parameter, value, sigma in _rows_of_runs(history, "estimates", list(place)):
-        values[place[run], parameter - 1], sigmas[place[run], parameter - 1] = value, sigma
+        values[place[run], parameter - 1] = value
+        sigmas[place[run], parameter - 1] = sigma
     return Sessions(
         ids=list(place),
-        days=(times - names.first) / DAY_SECONDS,
+        days=(times - float(history.stated("first_time") or 0.0)) / DAY_SECONDS,
         values=values,
         sigmas=sigmas,
-        covariates=_regressors(history, names, rows),
-        prior_sigmas=regressor_prior_sigmas(names.channels),
-        channels=names.channels,
+        covariates=_regressors_of(history, channels, rows),
+        prior_sigmas=regressor_prior_sigmas(channels),
+        channels=channels,
     )
 
 
-def _regressors(history: History, names: SessionColumns, rows: Sequence[tuple[int, float]]) -> Array:
+def _regressors_of(history: History, names: Sequence[str], rows: Sequence[tuple[int, float]]) -> Array:
     """(n, c) of some sessions; those before them tell what a temperature lags behind."""
     if not rows:
-        return np.zeros((0, len(regressor_prior_sigmas(names.channels))))
-    span = (rows[0][1] - LOOK_BACK, rows[-1][1])
+        return np.zeros((0, len(regressor_prior_sigmas(names))))
+    span = (rows[0][1] - _LOOK_BACK, rows[-1][1])
     around = history.sql("SELECT id, time FROM runs WHERE time BETWEEN ? AND ? ORDER BY time, id", *span)
     place = {run: k for k, (run, _) in enumerate(around)}
     reference = history.stated("channel_references") or {}
-    channels = np.full((len(around), len(names.channels)), np.nan)
-    column = {name: c for c, name in enumerate(names.channels)}
+    channels = np.full((len(around), len(names)), np.nan)
     for run, name, value in _rows_of_runs(history, "covariates", list(place)):
-        if name in column:
-            channels[place[run], column[name]] = value - reference[name]
-    found = regressors(np.array([time for _, time in around], float), channels, names.channels)
-    return found[[place[run] for run, _ in rows]]
+        if name in names:
+            channels[place[run], names.index(name)] = value - reference[name]
+    times = np.array([time for _, time in around], float)
+    return regressors(times, channels, names)[[place[run] for run, _ in rows]]
 
 
 def _rows_of_runs(history: History, table: str, runs: Sequence[int]) -> list[tuple[Any, ...]]:
@@ -172,117 +157,30 @@ def _rows_of_runs(history: History, table: str, runs: Sequence[int]) -> list[tup
     return history.sql(f"SELECT * FROM {table} WHERE run IN ({', '.join('?' * len(runs))})", *runs)
 
 
-def catch_up(history: History, since: float) -> None:
-    """Follow all sessions from a time on (s since 1970), and what comes after them.
-
-    An alarm with an onset in the past is followed anew from there; each has its onset after the one before, so that
-    this ends.
-    """
-    forget_since(history, since)
-    while (onset := _follow_remaining(history)) is not None:
-        forget_states(history, onset)
-
-
-def forget_since(history: History, time: float) -> None:
-    """Drop what was concluded at a time or later: states, and alarms that were raised."""
-    forget_states(history, time)
-    history.sql("DELETE FROM alarms WHERE raised IN (SELECT id FROM runs WHERE time >= ?)", max(time, -1e300))
-
-
-def forget_states(history: History, time: float) -> None:
-    """Drop the states of a time (s since 1970) or later."""
-    history.sql("DELETE FROM states WHERE time >= ?", max(time, -1e300))
-
-
-@dataclass(frozen=True)
-class StoredState:
-    """A state that is kept."""
-
-    run: int
-    time: float
-    number: int  # of sessions so far
-    state: CellState
-
-
-def last_state(history: History, before: float = np.inf) -> StoredState | None:
-    """The last state that is kept before a time (s since 1970)."""
+def last_state(history: History, before: float = np.inf) -> CellState:
+    """The last state that is kept before a time (s since 1970); without one, that before the first session."""
     rows = history.sql(
         "SELECT run, time, number, data FROM states WHERE time < ? ORDER BY time DESC, run DESC LIMIT 1",
         min(before, 1e300),
     )
     if not rows:
-        return None
+        return first_state(len(regressor_prior_sigmas(history.stated("channels") or [])))
     run, time, number, data = rows[0]
-    return StoredState(run, time, number, _unpack_state(data))
+    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+        bank = Bank(**{field.name: stored[field.name] for field in fields(Bank)})
+        charts = Charts(**{field.name: stored[field.name] for field in fields(Charts)})
+        return CellState(bank, charts, float(stored["day"]), run, time, number)
 
 
-def sessions_after(history: History, kept: StoredState | None) -> Sessions:
-    """The sessions after a state; all of them without one."""
-    time, run = (kept.time, kept.run) if kept else (-1e300, -1)
-    rows = history.sql("SELECT id FROM runs WHERE (time, id) > (?, ?) ORDER BY time, id", time, run)
+def sessions_after(history: History, state: CellState) -> Sessions:
+    """The sessions after a state."""
+    rows = history.sql("SELECT id FROM runs WHERE (time, id) > (?, ?) ORDER BY time, id", state.time, state.run)
     return sessions_from(history, [run for (run,) in rows])
-
-
-def state_or_first(history: History, kept: StoredState | None) -> CellState:
-    """The state itself, or that before the first session."""
-    return kept.state if kept else first_state(len(regressor_prior_sigmas(session_columns(history).channels)))
 
 
 def stored_alarms(history: History) -> list[Alarm]:
     """All alarms, in the order in which they were raised; parameters count from 0."""
     return [Alarm(p - 1, *rest) for p, *rest in history.sql("SELECT parameter, onset, raised, chart FROM alarms")]
-
-
-def _follow_remaining(history: History) -> float | None:
-    """Follow what is not followed yet; the time of the earliest onset as soon as something alarms."""
-    kept, run_length, alarms = last_state(history), float(history.stated("run_length")), stored_alarms(history)
-    state, number, sessions = state_or_first(history, kept), kept.number if kept else 0, sessions_after(history, kept)
-    times = dict(history.sql("SELECT id, time FROM runs WHERE time >= ?", kept.time if kept else -1e300))
-    for k, run in enumerate(sessions.ids):
-        state = next_state(state, sessions, k, [a.parameter for a in alarms if a.onset == run])
-        number += 1
-        _store_state(history, run, times[run], number, state, last=k == len(sessions.ids) - 1)
-        if found := alarming_parameters(state, run_length):
-            recent = recent_sessions(history, run)
-            at = list(recent.ids).index(run)
-            new = [raise_alarm(recent, at, parameter, chart, alarms) for parameter, chart in found]
-            history.many(
-                "INSERT INTO alarms (parameter, onset, raised, chart) VALUES (?, ?, ?, ?)",
-                [(a.parameter + 1, a.onset, a.raised, a.chart) for a in new],
-            )
-            return min(float(history.sql("SELECT time FROM runs WHERE id = ?", a.onset)[0][0]) for a in new)
-    return None
-
-
-def recent_sessions(history: History, run: int) -> Sessions:
-    """The sessions up to one, 640 at most."""
-    rows = history.sql(
-        "SELECT id FROM runs WHERE (time, id) <= (SELECT time, id FROM runs WHERE id = ?) "
-        "ORDER BY time DESC, id DESC LIMIT 640",
-        run,
-    )
-    return sessions_from(history, [run for (run,) in rows])
-
-
-def _store_state(history: History, run: int, time: float, number: int, state: CellState, last: bool) -> None:
-    """Keep a state where one is wanted; the one before goes unless it is."""
-    if last or number % _STEP == 0:
-        history.sql("DELETE FROM states WHERE number % ? != 0 AND number < ?", _STEP, number)
-        history.sql("DELETE FROM states WHERE number % ? != 0 AND number < ?", _FAR, number - _LATE)
-        history.sql("INSERT OR REPLACE INTO states VALUES (?, ?, ?, ?)", run, time, number, _pack_state(state))
-
-
-def _pack_state(state: CellState) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **vars(state.bank), **vars(state.charts), day=np.array(state.day))
-    return buffer.getvalue()
-
-
-def _unpack_state(data: bytes) -> CellState:
-    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-        bank = Bank(**{field.name: stored[field.name] for field in fields(Bank)})
-        charts = Charts(**{field.name: stored[field.name] for field in fields(Charts)})
-        return CellState(bank, charts, float(stored["day"]))
 
 
 def append_runs(history: History, records: Sequence[RunRecord]) -> int:
@@ -292,11 +190,71 @@ def append_runs(history: History, records: Sequence[RunRecord]) -> int:
         InputError: a run of another cell, or one that repeats the numbers of another session.
     """
     with history.writing():
-        begun = [_store_run(history, record) for record in sorted(records, key=lambda r: r.time)]
-        new = [time for time in begun if time is not None]
+        stored = [_store_run(history, record) for record in sorted(records, key=lambda r: r.time)]
+        new = [time for time in stored if time is not None]
         if new:
-            catch_up(history, min(new))
+            _follow_since(history, min(new))
         return len(new)
+
+
+def _follow_since(history: History, time: float) -> None:
+    """Follow all sessions from a time on (s since 1970), and what comes after them.
+
+    An alarm with an onset in the past is followed anew from there; each has its onset after the one before, so that
+    this ends.
+    """
+    _forget_since(history, time)
+    while (onset := _follow_remaining(history)) is not None:
+        _forget_states(history, onset)
+
+
+def _forget_since(history: History, time: float) -> None:
+    """Drop what was concluded at a time or later: states, and alarms that were raised."""
+    _forget_states(history, time)
+    history.sql("DELETE FROM alarms WHERE raised IN (SELECT id FROM runs WHERE time >= ?)", max(time, -1e300))
+
+
+def _forget_states(history: History, time: float) -> None:
+    """Drop the states of a time (s since 1970) or later."""
+    history.sql("DELETE FROM states WHERE time >= ?", max(time, -1e300))
+
+
+def _follow_remaining(history: History) -> float | None:
+    """Follow what is not followed yet; the time of the earliest onset as soon as something alarms."""
+    state = last_state(history)
+    alarms = stored_alarms(history)
+    sessions = sessions_after(history, state)
+    run_length = float(history.stated("run_length"))
+    times = dict(history.sql("SELECT id, time FROM runs WHERE time >= ?", state.time))
+    for k, run in enumerate(sessions.ids):
+        followed = next_state(state, sessions, k, [a.parameter for a in alarms if a.onset == run])
+        state = replace(followed, run=run, time=times[run], number=state.number + 1)
+        if k == len(sessions.ids) - 1 or state.number % _STEP == 0:
+            _store_state(history, state)
+        if alarming := alarming_parameters(state, run_length):
+            recent = history.sql(
+                "SELECT id FROM runs WHERE (time, id) <= (?, ?) ORDER BY time DESC, id DESC LIMIT ?",
+                *(state.time, run, _RECENT),
+            )
+            recent_sessions = sessions_from(history, [run for (run,) in recent])
+            at = list(recent_sessions.ids).index(run)
+            new = [raise_alarm(recent_sessions, at, parameter, chart, alarms) for parameter, chart in alarming]
+            history.many(
+                "INSERT INTO alarms (parameter, onset, raised, chart) VALUES (?, ?, ?, ?)",
+                [(a.parameter + 1, a.onset, a.raised, a.chart) for a in new],
+            )
+            return min(float(history.sql("SELECT time FROM runs WHERE id = ?", a.onset)[0][0]) for a in new)
+    return None
+
+
+def _store_state(history: History, state: CellState) -> None:
+    """Keep a state; the one before goes unless its number is one at which states are kept."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **vars(state.bank), **vars(state.charts), day=np.array(state.day))
+    history.sql("DELETE FROM states WHERE number % ? != 0 AND number < ?", _STEP, state.number)
+    history.sql("DELETE FROM states WHERE number % ? != 0 AND number < ?", _FAR_STEP, state.number - _RECENT)
+    row = (state.run, state.time, state.number, buffer.getvalue())
+    history.sql("INSERT OR REPLACE INTO states VALUES (?, ?, ?, ?)", *row)
 
 
 def _store_run(history: History, record: RunRecord) -> float | None:
@@ -305,39 +263,31 @@ def _store_run(history: History, record: RunRecord) -> float | None:
         return None
     if history.stated("length_unit") is None:
         _begin_cell(history, record)
-    _require_same_cell(history, record)
+    for key, value in (("length_unit", record.length_unit), ("mount", record.mount)):
+        if (stated := history.stated(key)) != value:
+            raise InputError(
+                f"{record.path}: has {key} {value}, the cell {history.folder} {stated}; to fix: name the cell of this "
+                "run"
+            )
     begun = min(record.time, _replace_former_run(history, record))
-    numbers = _numbers_hash(record)
-    for (other,) in history.sql("SELECT run FROM runs WHERE numbers_hash = ?", numbers):
+    values = repr([(e.name, e.value) for e in record.estimates])
+    numbers = matrix_json(record.T_mount) + matrix_json(record.covariance) + values
+    numbers_hash = hashlib.sha256(numbers.encode()).hexdigest()
+    for (other,) in history.sql("SELECT run FROM runs WHERE numbers_hash = ?", numbers_hash):
         raise InputError(
             f"{record.path}: has the very numbers of {other}: one fit, not two; to fix: run its session for itself"
         )
-    run = insert_run(history, record, numbers)
+    run = insert_run(history, record, numbers_hash)
     estimates = [*_hand_eye_estimates(history, record), *record.estimates]
     _insert_parameters(history, record, estimates)
-    known = dict(history.sql("SELECT name, id FROM parameters"))
-    rows = [(run, known[e.name], e.value, e.sigma) for e in estimates if np.isfinite(e.sigma) and e.sigma > 0]
+    ids = dict(history.sql("SELECT name, id FROM parameters"))
+    rows = [(run, ids[e.name], e.value, e.sigma) for e in estimates if np.isfinite(e.sigma) and e.sigma > 0]
     if not rows:
         raise InputError(f"{record.path}: states no sigma of anything; to fix: run its session again")
     history.many("INSERT INTO estimates VALUES (?, ?, ?, ?)", rows)
     history.many("INSERT INTO covariates VALUES (?, ?, ?)", [(run, *item) for item in record.covariates.items()])
     if _update_channels(history, record):
         return -np.inf
-    return begun
-
-
-def _replace_former_run(history: History, record: RunRecord) -> float:
-    """A session that was run again counts once, as it was run last; the time of the former run, inf without."""
-    begun = np.inf
-    for run, time, run_hash in history.sql(
-        "SELECT id, time, run_hash FROM runs WHERE session_hash = ?", record.session_hash
-    ):
-        begun = min(begun, float(time))
-        forget_since(history, time)
-        for table, key in (("runs", "id"), ("estimates", "run"), ("covariates", "run")):
-            history.sql(f"DELETE FROM {table} WHERE {key} = ?", run)
-        if history.stated("in_use") == run_hash:
-            history.state({"in_use": record.run_hash})
     return begun
 
 
@@ -360,21 +310,29 @@ def _begin_cell(history: History, record: RunRecord) -> None:
     )
 
 
-def _require_same_cell(history: History, record: RunRecord) -> None:
-    for key, own in (("length_unit", record.length_unit), ("mount", record.mount)):
-        if (stated := history.stated(key)) != own:
-            raise InputError(
-                f"{record.path}: has {key} {own}, the cell {history.folder} {stated}; to fix: name the cell of this run"
-            )
+def _replace_former_run(history: History, record: RunRecord) -> float:
+    """A session that was run again counts once, as it was run last; the time of the former run, inf without."""
+    begun = np.inf
+    for run, time, run_hash in history.sql(
+        "SELECT id, time, run_hash FROM runs WHERE session_hash = ?", record.session_hash
+    ):
+        begun = min(begun, float(time))
+        _forget_since(history, time)
+        for table, key in (("runs", "id"), ("estimates", "run"), ("covariates", "run")):
+            history.sql(f"DELETE FROM {table} WHERE {key} = ?", run)
+        if history.stated("in_use") == run_hash:
+            history.state({"in_use": record.run_hash})
+    return begun
 
 
 def _hand_eye_estimates(history: History, record: RunRecord) -> list[Estimate]:
-    first, centre = np.array(history.stated("hand_eye_first")), np.array(history.stated("centre_scanner"))
+    first = np.array(history.stated("hand_eye_first"))
+    centre = np.array(history.stated("centre_scanner"))
     values = mount_twist(record.T_mount, first, centre)
     sigmas = np.sqrt(np.maximum(np.diag(twist_covariance(record.covariance, record.T_mount, first, centre)), 0.0))
     units = ["rad"] * 3 + [record.length_unit] * 3
-    own = zip(TWIST_NAMES, units, values, sigmas, strict=True)
-    return [Estimate(f"hand_eye.{name}", unit, float(value), float(sigma)) for name, unit, value, sigma in own]
+    rows = zip(TWIST_NAMES, units, values, sigmas, strict=True)
+    return [Estimate(f"hand_eye.{name}", unit, float(value), float(sigma)) for name, unit, value, sigma in rows]
 
 
 def _insert_parameters(history: History, record: RunRecord, estimates: Sequence[Estimate]) -> None:
@@ -391,16 +349,11 @@ def _insert_parameters(history: History, record: RunRecord, estimates: Sequence[
 
 def _update_channels(history: History, record: RunRecord) -> bool:
     """Whether what parameters may follow is another now: then all is followed anew."""
-    before, references = history.stated("channels"), history.stated("channel_references")
+    before = history.stated("channels")
+    references = history.stated("channel_references")
     if record.covariates.keys() <= references.keys():
         return False
     references = record.covariates | references
-    own = chosen_channels(references)
-    history.state({"channels": own, "channel_references": references})
-    return bool(before != own)
-
-
-def _numbers_hash(record: RunRecord) -> str:
-    values = repr([(e.name, e.value) for e in record.estimates])
-    told = matrix_json(record.T_mount) + matrix_json(record.covariance) + values
-    return hashlib.sha256(told.encode()).hexdigest()
+    channels = chosen_channels(references)
+    history.state({"channels": channels, "channel_references": references})
+    return bool(before != channels)

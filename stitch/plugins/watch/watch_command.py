@@ -47,7 +47,7 @@ def watch(
     """
     from stitch.output.json_file import to_json
     from stitch.plugins.watch.exported import dfq_text, report_document
-    from stitch.plugins.watch.history import known_run_hash, measured_at, open_history, read_record, use_calibration
+    from stitch.plugins.watch.history import known_run_hash, measured_at, open_history, read_record
     from stitch.plugins.watch.report import cell_report
     from stitch.plugins.watch.update import append_runs
     from stitch.system.process import steps
@@ -62,7 +62,8 @@ def watch(
         used = None if in_use is None else known_run_hash(histories[0], in_use, records)
         added = append_runs(histories[0], records) if add else None
         if used is not None:
-            use_calibration(histories[0], used)
+            with histories[0].writing():
+                histories[0].state({"in_use": used})
         reports = [cell_report(history, tolerance) for history in histories]
         if page:
             _write_pages(histories, reports, folders)
