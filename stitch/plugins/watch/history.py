@@ -15,7 +15,6 @@ import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from stitch.model.model_toml import read_model
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.stored_run import read_result
+from stitch.plugins.watch.run_record import Estimate, RunRecord
 from stitch.session.reading.csv_files import is_number, read_csv_lines
 from stitch.session.reading.views_table import covariate_names
 
@@ -54,37 +54,6 @@ CREATE TABLE alarms (id INTEGER PRIMARY KEY, parameter INTEGER NOT NULL, onset I
     raised INTEGER NOT NULL, chart TEXT NOT NULL);
 CREATE TABLE states (run INTEGER PRIMARY KEY, time REAL NOT NULL, number INTEGER NOT NULL, data BLOB NOT NULL);
 """
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A parameter of an effect as one run found it."""
-
-    name: str  # effect.parameter
-    unit: str
-    value: float
-    sigma: float
-
-
-@dataclass(frozen=True)
-class RunRecord:
-    """One run; lengths in length_unit, angles in rad."""
-
-    path: Path  # of the run
-    session: str  # path of the session
-    name: str
-    run_hash: str  # SHA-256 of model.toml and result.json
-    session_hash: str  # of the session's tables; of the run where these have gone
-    time: float  # s since 1970, UTC
-    time_from: str  # how that is known
-    length_unit: str
-    mount: str
-    T_mount: Array  # (4, 4)
-    covariance: Array  # (6, 6) of T·exp(ξ), scanner frame
-    estimates: tuple[Estimate, ...]
-    covariates: dict[str, float]
-    numbers: dict[str, float]  # residual, held-out error, noise floor, repeatability
-    document: dict[str, Any]  # result.json
 
 
 def session_conditions(session: Path, result: Path) -> tuple[float, str, dict[str, float]]:

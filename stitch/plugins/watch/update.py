@@ -18,15 +18,14 @@ from stitch.numerics.frames import Array
 from stitch.plugins.watch.control_charts import Charts
 from stitch.plugins.watch.history import (
     TWIST_NAMES,
-    Estimate,
     History,
-    RunRecord,
     insert_run,
     matrix_json,
     mount_twist,
     scanned_middle,
     twist_covariance,
 )
+from stitch.plugins.watch.run_record import Estimate, RunRecord
 from stitch.plugins.watch.state_bank import Bank
 from stitch.plugins.watch.tracking import (
     Alarm,
