@@ -97,8 +97,8 @@ def _plate() -> trimesh.Trimesh:
     return build_plate(PLATE)
 
 
-def cell(kind: str, seed: int) -> Measured:
-    """Return a session of a sphere plate in a cell of one kind."""
+def cell(kind: str, seed: int, day: int = 0) -> Measured:
+    """Return a session of a sphere plate in a cell of one kind, at other poses every day."""
     scene = load_scene("spheres")
     scanner = replace(scene.scanner, columns=PIXELS, rows=PIXELS)
     hidden = {"joint_compliance": 1.0} if kind == "effect in the model" else {}
@@ -108,13 +108,13 @@ def cell(kind: str, seed: int) -> Measured:
     part = replace(scene.part, labelled=False, parameters={"radius": PLATE.radius})
     scene = replace(scene, scanner=scanner, plan=replace(scene.plan, views=VIEWS), part=part)
     scene = replace(scene, repeatability=REPEATABILITY)
-    plan, rail = plan_for(scene, seed)
+    plan, rail = plan_for(scene, seed + 100_000 * day)
     if kind != "ordinary arm":
-        return simulate(scene, hidden, seed, planned=(plan, rail))
+        return simulate(scene, hidden, seed, planned=(plan, rail), day=day)
     arm = draw_arm(scene.arm.joints, ARM, np.random.default_rng([seed, 77]))
     q = plan.joints + arm.offset + arm.sine * np.sin(plan.joints) + arm.cosine * np.cos(plan.joints)
     wrong = replace(scene.arm, a=scene.arm.a + arm.a, d=scene.arm.d + arm.d, alpha=scene.arm.alpha + arm.alpha)
-    measured = simulate(replace(scene, arm=wrong), {}, seed, planned=(replace(plan, joints=q), rail))
+    measured = simulate(replace(scene, arm=wrong), {}, seed, planned=(replace(plan, joints=q), rail), day=day)
     return replace(measured, scene=scene, plan=plan, T_base_flange=kinematics.flange(scene.arm, plan.joints))
 
 

@@ -19,6 +19,7 @@ TABLES = {
     "base-to-base": "base_to_base:TABLE",
     "batch-speed": "watch:SPEED",
     "blind": "blind:TABLE",
+    "certificate": "certificate:TABLE",
     "conventions": "intake:CONVENTIONS",
     "diagnose-time": "speed:DIAGNOSE",
     "drilling": "drilling:TABLE",

@@ -11,7 +11,7 @@ from viz.page_parts import page_written, render, versions
 
 # Sources of a budget that a row shows by name.
 _SHOWN = 3
-_WORDS = ("error", "verdict", "what brings U", "answers to", "kept or not")
+_WORDS = ("error", "verdict", "what brings U", "answers to")
 # Classes of a verdict: kept, not kept, and undecided.
 _MARKS = {True: "good", False: "bad", None: "check"}
 
@@ -70,8 +70,8 @@ def write_certificate(document: Mapping[str, Any], path: Path) -> None:
         for f in document["forms"]
     ]
     unit = document["length_unit"]
-    headings = ("feature", "error", "calibrated", "measured", "deviation", "U", "U calibrated", "Eₙ")
-    limits = ("limit", "kept or not")
+    headings = ("feature", "error", "calibrated", "measured", "off", "U", "U cal.", "Eₙ")
+    limits = ("limit", "verdict")
     hand_eye = document["hand_eye"]
     apart = [_rounded(hand_eye[key], hand_eye["U"]) for key in ("distance", "U", "U_given")]
     verdict = "agrees" if hand_eye["agrees"] else "does not agree"
@@ -107,7 +107,7 @@ def write_certificate(document: Mapping[str, Any], path: Path) -> None:
             ("Model", document["run"]),
             ("Artefact", document["session"]),
             ("Answers to", ", ".join(document["answers_to"]).replace("_", "-") or "nothing of the cell"),
-            *(("Doubt", doubt) for doubt in document["doubts"]),
+            *(("Doubt", doubt) for doubt in document["doubts"] if doubt not in document["sentence"]),
             *(("Left out", f"{item['view']}: {item['why']}") for item in document["left_out"]),
             ("Valid until", document["valid_until"] or "not known: the cell's history was not named"),
             ("In the manner of", f"{standards}; these exclude scanners that an arm positions"),

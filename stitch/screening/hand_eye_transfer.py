@@ -54,13 +54,11 @@ class HandEyeTransfer:
 
     def sentence(self, unit: str) -> str:
         """Return how the two compare, for people."""
-        apart = f"{length_text(self.distance, unit)} and {1e3 * self.turn:.2g} mrad apart at the part"
+        away = f"{length_text(self.distance, unit)} and {1e3 * self.turn:.2g} mrad away at the part"
         if self.holds:
-            return (
-                f"The given hand-eye agrees with these views: what they show themselves lies {apart}, within U of both."
-            )
+            return f"The given hand-eye agrees with these views: the one that they show lies {away}, within U of both."
         return (
-            f"The given hand-eye does not fit these views: what they show lies {apart}, "
+            f"The given hand-eye does not fit these views: the one that they show lies {away}, "
             f"{self.ratio:.1f} times what U of both allows; to fix: find it anew, by a run without --hand-eye."
         )
 
@@ -83,13 +81,14 @@ def hand_eye_transfer(
     errors[_EFFECTS] = [columns @ model.effects_covariance.root(model.terms)]
     poses = prior_pose_errors([measurement], model, [unconstrained.overlaps.gram.centre])
     shown = fit_hand_eye([capture], [unconstrained], T_mount, scanner_errors=errors, errors=poses)
+    turn, distance = hand_eye_difference(capture, model.T_mount, shown.T_mount)
     xi = frames.log(frames.inverse(model.T_mount) @ shown.T_mount)
-    middle = np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)
+    middle = _middle_of(capture)
     covariance = model.covariance + shown.covariance
-    square = _mahalanobis_square(xi, covariance)
+    square = mahalanobis_square(xi, covariance)
     return HandEyeTransfer(
-        turn=float(np.linalg.norm(xi[:3])),
-        distance=float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle))),
+        turn=turn,
+        distance=distance,
         ratio=float(np.sqrt(square / chi2_limit(0.05, 6))),
         U=displacement(covariance, middle),
         U_given=displacement(model.covariance, middle),
@@ -97,7 +96,19 @@ def hand_eye_transfer(
     )
 
 
-def _mahalanobis_square(difference: Array, covariance: Array) -> float:
-    """dᵀ C⁻¹ d; a direction that is known exactly counts nothing."""
+def hand_eye_difference(capture: Capture, T_mount: Array, other: Array) -> tuple[float, float]:
+    """Return the angle (rad) between two hand-eyes, and how far they put the middle of the part from each other."""
+    xi = frames.log(frames.inverse(T_mount) @ other)
+    return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:] + np.cross(xi[:3], _middle_of(capture))))
+
+
+def mahalanobis_square(difference: Array, covariance: Array) -> float:
+    """Return dᵀ C⁻¹ d of a difference d (n,); a direction that is known exactly counts nothing."""
     scaled, unit = equilibrated(covariance)
     return float((difference * unit) @ np.linalg.pinv(scaled, rcond=1e-9, hermitian=True) @ (difference * unit))
+
+
+def _middle_of(capture: Capture) -> Array:
+    """(3,) middle of what the views see, scanner frame."""
+    middle: Array = np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)
+    return middle

@@ -18,14 +18,14 @@ from stitch.model.model_toml import ModelFile
 from stitch.numerics import frames
 from stitch.numerics.distributions import chi2_limit, chi2_tail, f_tail
 from stitch.numerics.frames import Array
-from stitch.numerics.least_squares import equilibrated, significantly_smaller
+from stitch.numerics.least_squares import significantly_smaller
 from stitch.numerics.units import length_text
 from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
 from stitch.observations.surfaces.view_poses import unconstrained_poses
 from stitch.observations.targets.target_model import TargetModelFit
+from stitch.screening.hand_eye_transfer import hand_eye_difference, mahalanobis_square
 from stitch.screening.hypotheses import sentence
 from stitch.screening.plausibility import beyond_any_arm
-from stitch.session.capture import Capture
 from stitch.session.session import SessionData
 
 # A hand-eye that differs by chance alone is refused once in a million.
@@ -57,24 +57,17 @@ def require_matching_hand_eye(session: SessionData, correction: Correction, inde
     capture = correction.captures[index]
     T_mount = correction.model.T_mount
     fitted = fit_hand_eye([capture], [correction.unconstrained[index]], T_mount)
-    if not beyond_any_arm(session, *_hand_eye_difference(capture, T_mount, fitted.T_mount)):
+    if not beyond_any_arm(session, *hand_eye_difference(capture, T_mount, fitted.T_mount)):
         return
     # Unconstrained views that start far off have not converged, which would count as scatter: once more from there.
     unconstrained = unconstrained_poses(capture, capture.poses(fitted.T_mount), correction.overlaps[index].gate)
     fitted = fit_hand_eye([capture], [unconstrained], fitted.T_mount)
-    turn, shift = _hand_eye_difference(capture, T_mount, fitted.T_mount)
+    turn, shift = hand_eye_difference(capture, T_mount, fitted.T_mount)
     xi = frames.log(frames.inverse(T_mount) @ fitted.T_mount)
     distance = xi @ np.linalg.solve(fitted.covariance + correction.model.covariance, xi)
     if distance > chi2_limit(_HAND_EYE_CHANCE, 6) and beyond_any_arm(session, turn, shift):
         by = f"{shift:.3g} {session.length_unit} and {1e3 * turn:.3g} mrad"
         raise NoResultError(f"{session.path}: {sentence('hand-eye of another set-up', by=by)}")
-
-
-def _hand_eye_difference(capture: Capture, T_mount: Array, other: Array) -> tuple[float, float]:
-    """Return the angle (rad) between two hand-eyes, and how far they put the part from each other."""
-    xi = frames.log(frames.inverse(T_mount) @ other)
-    middle = np.mean([scan.points.mean(axis=0) for scan in capture.scans], axis=0)
-    return float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:] + np.cross(xi[:3], middle)))
 
 
 def check_model_transfer(
@@ -120,9 +113,7 @@ def _what_does_not_hold(there: TargetModelFit, here: TargetModelFit, unit: str) 
     if not significantly_smaller(here.view_squares, there.view_squares, _MODEL_CHANCE):
         return None
     apart = frames.log(frames.inverse(there.model.T_mount) @ here.model.T_mount)
-    # dᵀ C⁻¹ d; a direction that is known exactly counts nothing.
-    scaled, scale = equilibrated(there.model.covariance + here.model.covariance)
-    distance = float((apart * scale) @ np.linalg.pinv(scaled, rcond=1e-9, hermitian=True) @ (apart * scale))
+    distance = mahalanobis_square(apart, there.model.covariance + here.model.covariance)
     parts = []
     if chi2_tail(distance, 6) < _MODEL_CHANCE / 2:
         turned = 1e3 * float(np.linalg.norm(apart[:3]))
