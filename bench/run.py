@@ -17,6 +17,7 @@ from bench import harness  # noqa: E402
 # By name: the module of bench and the table in it.
 TABLES = {
     "base-to-base": "base_to_base:TABLE",
+    "bad-arms": "real_arms:BAD_ARMS",
     "batch-speed": "watch:SPEED",
     "blind": "blind:TABLE",
     "certificate": "certificate:TABLE",
@@ -47,6 +48,7 @@ TABLES = {
     "real-scans": "hand_eye_sigmas:REAL_SCANS",
     "results": "results:TABLE",
     "scanner-laws": "foreign_laws:SCANNER",
+    "turning": "real_arms:TURNING",
     "unknown-laws": "unknown_laws:TABLE",
     "watch": "watch:TABLE",
     "window": "window:TABLE",

@@ -76,7 +76,7 @@ def andreff(A: Array, B: Array, weights: Array | None = None) -> Array:
     system, target, shift = np.vstack(turned), np.concatenate(right), np.linalg.qr(np.vstack(moved))[0]
     # The translation is eliminated; what it cannot explain is left for the rotation.
     system, target = system - shift @ (shift.T @ system), target - shift @ (shift.T @ target)
-    vec = _on_sphere(system.T @ system, system.T @ target, np.sqrt(3.0)).reshape(3, 3)
+    vec = minimise_on_sphere(system.T @ system, system.T @ target, np.sqrt(3.0)).reshape(3, 3)
     # Without t_A both signs of vec R solve the system; a rotation has determinant +1.
     R = frames.nearest_rotation(vec * np.sign(np.linalg.det(vec)))
     return frames.make(R, _hand_eye_translation(A, B, R, weights))
@@ -150,6 +150,21 @@ def weight_roots(A: Array, weights: Array | None) -> Array:
     return np.ones(len(A)) if weights is None else np.sqrt(np.asarray(weights, float))
 
 
+def minimise_on_sphere(H: Array, g: Array, radius: float) -> Array:
+    """Return the minimiser of xᵀHx − 2gᵀx with |x| = radius (Gander, Golub & von Matt 1989)."""
+    n = len(H)
+    block = np.block([[H, -np.eye(n)], [-np.outer(g, g) / radius**2, H]])
+    values, vectors = np.linalg.eigh(H)
+    real = np.linalg.eigvals(block).real
+    gap = np.maximum(values - min(float(real.min()), values[0]), 0)
+    along = vectors.T @ g
+    x = np.where(gap > 1e-12 * values[-1], along / np.maximum(gap, 1e-300), 0.0)
+    # Where g has no part along the first eigenvector, the rest of the length lies there.
+    if gap[0] <= 1e-12 * values[-1]:
+        x[0] = np.sqrt(max(radius**2 - float(x @ x), 0.0))
+    return vectors @ x
+
+
 def _hand_eye_translation(A: Array, B: Array, R: Array, weights: Array | None = None) -> Array:
     """Return t (3,) of X from (R_A − 1) t = R t_B − t_A, weighted least squares over all motions."""
     return _solve_translation(A[:, :3, :3] - np.eye(3), B[:, :3, 3] @ R.T - A[:, :3, 3], weights)
@@ -218,21 +233,6 @@ def _misfit(A: Array, B: Array, R: Array) -> float:
     shift = (A[:, :3, :3] - np.eye(3)) @ t - B[:, :3, 3] @ R.T + A[:, :3, 3]
     unit = float(np.abs(np.concatenate([A[:, :3, 3], B[:, :3, 3]])).max()) or 1.0
     return float((rotation**2).sum() + (shift**2).sum() / unit**2)
-
-
-def _on_sphere(H: Array, g: Array, radius: float) -> Array:
-    """Return the minimiser of xᵀHx − 2gᵀx with |x| = radius (Gander, Golub & von Matt 1989)."""
-    n = len(H)
-    block = np.block([[H, -np.eye(n)], [-np.outer(g, g) / radius**2, H]])
-    values, vectors = np.linalg.eigh(H)
-    real = np.linalg.eigvals(block).real
-    gap = np.maximum(values - min(float(real.min()), values[0]), 0)
-    along = vectors.T @ g
-    x = np.where(gap > 1e-12 * values[-1], along / np.maximum(gap, 1e-300), 0.0)
-    # Where g has no part along the first eigenvector, the rest of the length lies there.
-    if gap[0] <= 1e-12 * values[-1]:
-        x[0] = np.sqrt(max(radius**2 - float(x @ x), 0.0))
-    return vectors @ x
 
 
 AXXB_SOLVERS: dict[str, Callable[..., Array]] = {"Park-Martin": park_martin, "Andreff": andreff}

@@ -109,16 +109,28 @@ def unobservable(
     """Return one phrase per direction of the hand-eye that these motions cannot show."""
     gains, directions = motion_gain(captures, T_mount, *seen_part(captures))
     axes = _named_axes(captures, robot, joints)
-    hidden = _split(directions[:, gains < _VISIBLE])
+    hidden = _split(directions[:, gains < _VISIBLE], _reach(captures, T_mount))
     return tuple(f"{kind} {_name(T_mount[:3, :3] @ direction, axes)}" for kind, direction in hidden)
 
 
-def _split(hidden: Array) -> list[tuple[str, Array]]:
-    """Unit directions (scanner frame): translations first, then rotations, of the hidden space."""
+def _reach(captures: Sequence[Capture], T_mount: Array) -> float:
+    """Return how far from the part a joint's axis may stand: the longest way through the cell, length_unit."""
+    ways = [np.linalg.norm(frames.inverse(c.poses(T_mount))[:, :3, 3], axis=1).max() for c in captures]
+    return float(max(ways)) + float(np.linalg.norm(T_mount[:3, 3])) + float(np.linalg.norm(seen_part(captures)[0]))
+
+
+def _split(hidden: Array, reach: float) -> list[tuple[str, Array]]:
+    """Return unit directions (scanner frame): translations first, then rotations, of the hidden space.
+
+    Args:
+        hidden: (6, k) twists about the part.
+        reach: a turn about an axis that stands farther off, or a screw of a longer pitch, is a translation.
+    """
     if hidden.shape[1] == 0:
         return []
-    U, s, Vt = np.linalg.svd(hidden[:3])
-    rank = int((s > 1e-6 * np.linalg.norm(hidden[:3]) + 1e-12).sum()) if np.abs(hidden[:3]).max() > 1e-9 else 0
+    U, turned, Vt = np.linalg.svd(hidden[:3])
+    shifted = np.linalg.norm(hidden[3:] @ Vt[: len(turned)].T, axis=0)
+    rank = int(np.sum(turned * reach > shifted))
     kinds = [("translation along", v) for v in (hidden[3:] @ Vt[rank:].T).T]
     kinds += [("rotation about", U[:, i]) for i in range(rank)]
     return [(kind, v / np.linalg.norm(v)) for kind, v in kinds]

@@ -12,10 +12,9 @@ import numpy as np
 from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.distributions import nan_median
-from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.units import METRES, length_text
-from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
+from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye, sensor_motions
 from stitch.observations.targets.outliers import drop_mislabelled, find_mislabelled
 from stitch.screening.conventions import rank_hypotheses
 from stitch.screening.hypotheses import UNITS, Hypothesis, distinct, hypotheses, problem, stated_hypothesis
@@ -27,8 +26,8 @@ from stitch.session.session import SessionData
 
 # No arm is off by more; a better hypothesis must leave a fifth of what the stated one leaves.
 _LIMIT_M, _CLEARER = 0.005, 0.2
-# Hypotheses that are fitted in full, and targets in one line.
-_MAX_HYPOTHESES, _LINE = 12, 0.02
+# Hypotheses that are fitted in full.
+_MAX_HYPOTHESES = 12
 # Views that are tried, of more of them so many in a row all over the session: what is wrong with all shows in these.
 _TRIED, _IN_A_ROW = 60, 6
 # Views that a side of a common displacement has at least, and the share of views that must be on their side of it.
@@ -155,7 +154,10 @@ def _distances_from_middles(capture: Capture, fit: TargetSpread) -> Array:
 
 def _hypotheses_to_try(session: SessionData, rows: Indices, capture: Capture, length: float) -> Iterator[Hypothesis]:
     """Yield hypotheses to try: where targets show how the sensor moved, those that explain its motions best."""
-    ranked = rank_hypotheses(session, _sensor_motions(capture), rows)
+    assert capture.sightings is not None
+    pairs, T_first_second = sensor_motions(capture.sightings)
+    motions = RelativeScans(tuple((int(v), int(w)) for v, w in pairs), T_first_second)
+    ranked = rank_hypotheses(session, motions, rows)
     if ranked:
         yield from (fit.hypothesis for fit in ranked[:_MAX_HYPOTHESES] if fit.scale == 1.0)
     else:
@@ -165,25 +167,6 @@ def _hypotheses_to_try(session: SessionData, rows: Indices, capture: Capture, le
         T = np.array(stated.T_base_flange)
         T[:, :3, 3] *= factor
         yield stated.undone("sightings", T, factor=factor, units=units)
-
-
-def _sensor_motions(capture: Capture) -> RelativeScans:
-    """Return motions of the sensor between views that share three targets or more, by least squares."""
-    s = capture.sightings
-    assert s is not None
-    count = len(s.points)
-    pairs = []
-    T = []
-    for v, w in ((v, v + step) for step in (1, 2) for v in range(count - step)):
-        common = np.intersect1d(s.target[v][s.used[v]], s.target[w][s.used[w]])
-        if len(common) < 3:
-            continue
-        a, b = (np.array([s.points[i][s.used[i] & (s.target[i] == k)][0] for k in common]) for i in (v, w))
-        spread = np.linalg.svd(a - a.mean(axis=0), compute_uv=False)
-        if spread[1] > _LINE * spread[0]:
-            pairs.append((v, w))
-            T.append(align_points(b, a))
-    return RelativeScans(tuple(pairs), np.array(T).reshape(-1, 4, 4))
 
 
 def _fit_hypothesis(capture: Capture, hypothesis: Hypothesis) -> TargetSpread | None:

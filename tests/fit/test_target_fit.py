@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from data_synth.fixtures.labelled_arm import PROBE_TURN, TARGETS, Growth, flange, labelled_cell, random_pose
 from data_synth.fixtures.labelled_files import write_labelled
-from stitch.api.pipeline import run, run_rig
+from stitch.api.pipeline import diagnose, run, run_rig
 from stitch.cli.main import main
 from stitch.effects.contract import EFFECTS
 from stitch.errors import InputError
@@ -247,3 +247,16 @@ def test_a_parameter_that_goes_to_zero_is_made_up_for_in_the_same_step():
         ends.append(step.model.T_mount)
     moved_by_it = 1e-5 * 1000
     assert np.abs(ends[0] - ends[1]).max() < 1e-2 * moved_by_it
+
+
+def test_a_view_whose_sightings_are_all_out_leaves_the_terminal_empty(capfd):
+    """Its block has no size, of which LAPACK complained on file descriptor 2."""
+    session, *_ = labelled_cell(3, views=90)
+    far = session.views[5].sighting
+    off = 8 * np.random.default_rng(0).normal(size=far.points.shape)
+    views = list(session.views)
+    views[5] = replace(views[5], sighting=replace(far, points=far.points + off))
+    fit = run(replace(session, views=tuple(views)))
+    assert not fit.measurement.capture.sightings.used[5].any()
+    assert diagnose(fit).sentence
+    assert capfd.readouterr() == ("", "")

@@ -1,21 +1,34 @@
-"""A first hand-eye from labelled points alone, in closed form.
+"""A first hand-eye from labelled points alone: closed forms, each improved a little, of which the likeliest counts.
 
-left·(R p + t) = P is linear in R (9), t (3) and P (3 a target): solved by weighted least squares with weights
-1/|residual| (which end at the least sum of distances, so that a wrong label pulls little), R projected to a
-rotation, t and P solved again. A measured probe adds the turns: A·X = Z·B (Shah 2013).
+left·(R p + t) = P is linear in R (9), t (3) and P (3 a target). The targets' means and t are eliminated; what is left
+is solved with |vec R|² = 3 imposed (`numerics.hand_eye`). Without that length R = 0 solves it wherever the flange
+stands at one place and only turns: noise of the points then shrinks R to nothing. Where views share three targets their
+relative turns say more, A·X = X·B. From each start R and t go on by weighted least squares with weights 1/|residual|
+(which end at the least sum of distances, so that a wrong label pulls little), and the least sum counts.
+A measured probe adds the turns: A·X = Z·B (Shah 2013).
 """
 
+from collections.abc import Iterator
+
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
+from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array, Indices
-from stitch.numerics.hand_eye import shah
-from stitch.session.capture import Capture
+from stitch.numerics.hand_eye import AXXB_SOLVERS, minimise_on_sphere, shah
+from stitch.session.capture import Capture, Sightings
 
-_REWEIGHTED = 12
-# Singular values of the equilibrated system below this share of the largest: the motions do not show it all.
+# Reweighted solutions on the way to a start, and steps from it at the most; one that turns or shifts by less than this
+# share of the points' spread is the last.
+_REWEIGHTED, _STEPS, _STEP_ENDS = 6, 60, 1e-9
+# Singular values of the system below this share of the largest: the motions do not show it all.
 _DEGENERATE = 1e-6
+# A start whose R has a singular value this far from 1 is no rotation: the system says little of it.
+_NO_ROTATION = 0.5
+# Targets in one line do not show how the sensor turned; neighbours of a view that its motions are asked to.
+_LINE, _NEXT = 0.02, (1, 2)
 
 
 def closed_form_hand_eye(capture: Capture) -> Array:
@@ -31,51 +44,131 @@ def closed_form_hand_eye(capture: Capture) -> Array:
         used = s.used.any(axis=1)
         A = frames.inverse(capture.T_reference_mount[used])
         return shah(A, frames.make(s.rotation[used], s.points[used, 0]))[1]
-    v, slot = np.nonzero(s.used)
-    L = capture.T_reference_mount[v]
-    p, target = s.points[v, slot], s.target[v, slot]
-    offset = p.mean(axis=0)
-    scale = float(np.linalg.norm(p - offset, axis=1).mean()) or 1.0
-    R = _solve_rotation_translation(L, (p - offset) / scale, target, len(s.targets), None)
-    t = _solve_rotation_translation(L, p - offset, target, len(s.targets), R)[:, 0]
-    return frames.make(R, t - R @ offset)
+    points = _PointEquations(capture, s)
+    ends = [points.improved(R) for R in [*points.linear_starts(), *_starts_from_motions(capture, s)]]
+    return min(ends, key=lambda end: end[1])[0]
 
 
-def _solve_rotation_translation(L: Array, p: Array, target: Indices, targets: int, R: Array | None) -> Array:
-    """Return the rotation (3, 3) from all unknowns, or the translation (3, 1) with the rotation known.
+def sensor_motions(s: Sightings) -> tuple[Indices, Array]:
+    """Return pairs of views (M, 2) that share three targets or more, and T_first_second (M, 4, 4) of the sensor.
 
-    Args:
-        L: (N, 4, 4) what stands left of the hand-eye, per sighting.
-        p: (N, 3) sensor frame.
-        target: (N,) which target.
+    Least squares (Kabsch); of each view with the next two.
     """
-    N, size = len(p), 9 if R is None else 0
-    rows = np.zeros((N, 3, size + 3 + 3 * targets))
-    right = -L[:, :3, 3]
-    if R is None:
-        rows[:, :, :9] = np.einsum("nij,nk->nijk", L[:, :3, :3], p).reshape(N, 3, 9)
-    else:
-        right = right - np.einsum("nij,jk,nk->ni", L[:, :3, :3], R, p)
-    rows[:, :, size : size + 3] = L[:, :3, :3]
-    for axis in range(3):
-        rows[np.arange(N), axis, size + 3 + 3 * target + axis] = -1.0
-    used = np.abs(rows).max(axis=(0, 1)) > 0
-    weight, x = np.ones(N), np.zeros(rows.shape[2])
-    for _ in range(_REWEIGHTED):
-        A = (np.sqrt(weight)[:, None, None] * rows[:, :, used]).reshape(3 * N, -1)
-        length = np.linalg.norm(A, axis=0)
-        U, sv, Vt = np.linalg.svd(A / length, full_matrices=False)
-        if R is None and sv[-1] < _DEGENERATE * sv[0]:
-            raise NoResultError(
-                "these views do not show the hand-eye: turn the flange about two axes at least and show three targets "
-                "that are not in one line, or give scanner.pose in session.toml"
-            )
-        keep = sv > _DEGENERATE * sv[0]
-        b = (np.sqrt(weight)[:, None] * right).ravel()
-        x[used] = (Vt[keep].T @ ((U[:, keep].T @ b) / sv[keep])) / length
-        left = np.linalg.norm(rows @ x - right, axis=1)
-        weight = 1 / np.maximum(left, 1e-3 * np.median(left) + 1e-12)
-        weight /= weight.mean()
-    if R is None:
-        return frames.nearest_rotation(x[:9].reshape(3, 3))
-    return x[:3, None]
+    pairs = []
+    T = []
+    views = len(s.points)
+    for v, w in ((v, v + step) for step in _NEXT for v in range(views - step)):
+        common, first, second = np.intersect1d(s.target[v][s.used[v]], s.target[w][s.used[w]], return_indices=True)
+        if len(common) < 3:
+            continue
+        a, b = s.points[v][s.used[v]][first], s.points[w][s.used[w]][second]
+        spread = np.linalg.svd(a - a.mean(axis=0), compute_uv=False)
+        if spread[1] > _LINE * spread[0]:
+            pairs.append((v, w))
+            T.append(align_points(b, a))
+    return np.array(pairs, int).reshape(-1, 2), np.array(T).reshape(-1, 4, 4)
+
+
+def _starts_from_motions(capture: Capture, s: Sightings) -> Iterator[Array]:
+    """Yield rotations (3, 3) of the hand-eye from how the sensor turned between views."""
+    pairs, B = sensor_motions(s)
+    if not len(B):
+        return
+    v, w = pairs.T
+    A = frames.inverse(capture.T_reference_mount[v]) @ capture.T_reference_mount[w]
+    for solve in AXXB_SOLVERS.values():
+        try:
+            yield solve(A, B)[:3, :3]
+        except (NoResultError, np.linalg.LinAlgError):
+            continue
+
+
+class _PointEquations:
+    """left·(R p + t) − P = 0 of N sightings, with the targets' means eliminated."""
+
+    def __init__(self, capture: Capture, s: Sightings) -> None:
+        v, slot = np.nonzero(s.used)
+        self.left = capture.T_reference_mount[v]
+        self.offset = s.points[v, slot].mean(axis=0)
+        off = s.points[v, slot] - self.offset
+        self.scale = float(np.linalg.norm(off, axis=1).mean()) or 1.0
+        self.p = off / self.scale
+        target: Indices = s.target[v, slot]
+        self.target = target
+        self.of_target = csr_matrix((np.ones(len(target)), (target, np.arange(len(target)))))
+
+    def linear_starts(self) -> list[Array]:
+        """Return rotations (3, 3) of the linear system, |vec R| imposed and not; those that are near none only alone.
+
+        Raises:
+            NoResultError: motions or targets that cannot show it.
+        """
+        L = self.left[:, :3, :3]
+        columns = np.concatenate([np.einsum("nij,nk->nijk", L, self.p).reshape(-1, 3, 9), L], axis=2)
+        ends = []
+        for on_sphere in (True, False):
+            weight = np.ones(len(L))
+            for _ in range(_REWEIGHTED):
+                C, b = self._centred(columns, weight), self._centred(self.left[:, :3, 3:] / self.scale, weight)
+                root = np.sqrt(weight)[:, None, None]
+                A, right = (root * C).reshape(-1, 12), -(root * b).ravel()
+                Q, of_t = np.linalg.qr(A[:, 9:])
+                shown, said = A[:, :9] - Q @ (Q.T @ A[:, :9]), right - Q @ (Q.T @ right)
+                values = np.linalg.svd(shown, compute_uv=False)
+                if values[-1] < _DEGENERATE * values[0] or len(A) < 12:
+                    raise NoResultError(
+                        "these views do not show the hand-eye: turn the flange about two axes at least and show three "
+                        "targets that are not in one line, or give scanner.pose in session.toml"
+                    )
+                if on_sphere:
+                    vec = minimise_on_sphere(shown.T @ shown, shown.T @ said, np.sqrt(3.0))
+                else:
+                    vec = np.linalg.lstsq(shown, said, rcond=None)[0].astype(float)
+                t = np.linalg.lstsq(of_t, Q.T @ (right - A[:, :9] @ vec), rcond=_DEGENERATE)[0]
+                rest = np.linalg.norm(C @ np.append(vec, t) + b[..., 0], axis=1)
+                weight = _weights(rest)
+            R = vec.reshape(3, 3)
+            ends.append(R * np.sign(np.linalg.det(R)) if on_sphere else R)
+        return [frames.nearest_rotation(R) for R in ends if _is_near_rotation(R)] or [
+            frames.nearest_rotation(R) for R in ends
+        ]
+
+    def improved(self, R: Array) -> tuple[Array, float]:
+        """Return T_mount_sensor (4, 4) from a rotation to begin with, and the sum of distances that it leaves."""
+        L = self.left[:, :3, :3]
+        weight = np.ones(len(L))
+        t = np.zeros(3)
+        # The first solution is of t alone.
+        for step in range(_STEPS):
+            turned = self.p @ R.T
+            seen = L @ (turned + t)[..., None] + self.left[:, :3, 3:] / self.scale
+            columns = self._centred(np.concatenate([-L @ frames.skew(turned), L], axis=2), weight)
+            rest = self._centred(seen, weight)
+            free = slice(3 if step == 0 else 0, 6)
+            root = np.sqrt(weight)[:, None, None]
+            x = np.zeros(6)
+            rows, right = (root * columns[..., free]).reshape(3 * len(L), -1), -(root * rest).ravel()
+            x[free] = np.linalg.lstsq(rows, right, rcond=_DEGENERATE)[0]
+            left = np.linalg.norm(rest[..., 0] + columns @ x, axis=1)
+            weight = _weights(left)
+            R = frames.exp(np.append(x[:3], np.zeros(3)))[:3, :3] @ R
+            t = t + x[3:]
+            if step and np.abs(x).max() < _STEP_ENDS:
+                break
+        return frames.make(R, self.scale * t - R @ self.offset), float(left.sum())
+
+    def _centred(self, rows: Array, weight: Array) -> Array:
+        """Return rows (N, 3, c) less the weighted mean of their target's."""
+        flat = rows.reshape(len(rows), -1)
+        means = (self.of_target @ (weight[:, None] * flat)) / np.maximum(self.of_target @ weight, 1e-300)[:, None]
+        return (flat - means[self.target]).reshape(rows.shape)
+
+
+def _is_near_rotation(R: Array) -> bool:
+    return bool(np.abs(np.linalg.svd(R, compute_uv=False) - 1).max() < _NO_ROTATION)
+
+
+def _weights(left: Array) -> Array:
+    """Return 1/|residual| (N,), of mean 1."""
+    weight = 1 / np.maximum(left, 1e-3 * np.median(left) + 1e-12)
+    return weight / weight.mean()
