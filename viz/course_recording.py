@@ -26,23 +26,25 @@ def log_no_course(recording: rr.RecordingStream, told: str) -> None:
 
 
 def log_course(recording: rr.RecordingStream, course: dict[str, Any], names: list[str], um: float) -> None:
-    """Draw a course of diagnosis.json: dots measured with two sigmas, the line predicted; colour the arms by the dots.
+    """Draw a course of diagnosis.json, dots and line between two sigmas; colour the arms by the dots.
 
     Args:
         um: micrometres in one length_unit.
     """
     factor, unit = (1e3, "mrad") if course["value_unit"] == "rad" else (um, "µm")
-    at, measured, sigma, predicted = (np.array(course[key]) for key in ("at", "measured", "sigma", "predicted"))
-    measured, sigma, predicted = measured * factor, sigma * factor, predicted * factor
-    law = np.array(course.get("law", [])) * np.array([[1.0], [factor]]) if course.get("law") else np.zeros((2, 0))
-    to_x, to_y = _scales(np.append(at, law[0]), measured, sigma, np.append(predicted, law[1]))
+    at = np.array(course["at"])
+    values = ("measured", "sigma", "predicted", "predicted_sigma")
+    measured, sigma, predicted, band = (np.array(course[key]) * factor for key in values)
+    to_x, to_y = _scales(at, measured, sigma, predicted)
     x = to_x(at)
     order = np.argsort(x, kind="stable")
-    line = np.column_stack([to_x(law[0]), to_y(law[1])] if law.size else [x[order], to_y(predicted[order])])
-    recording.log(f"{WHERE}/line", rr.LineStrips2D([line], colors=[_LINE], radii=rr.Radius.ui_points(1.5)), static=True)
+    lines = [np.column_stack([x, to_y(predicted + s * 2 * band)])[order] for s in (0, -1, 1)]
+    for name, strips, width in (("line", lines[:1], 1.5), ("band", lines[1:], 0.5)):
+        drawn = rr.LineStrips2D(strips, colors=[_LINE], radii=rr.Radius.ui_points(width))
+        recording.log(f"{WHERE}/{name}", drawn, static=True)
     ends = np.stack([np.column_stack([x, to_y(measured + s * 2 * sigma)]) for s in (-1, 1)], axis=1)
     recording.log(
-        f"{WHERE}/sigma", rr.LineStrips2D(ends, colors=[_WHISKER], radii=rr.Radius.ui_points(0.7)), static=True
+        f"{WHERE}/sigma", rr.LineStrips2D(list(ends), colors=[_WHISKER], radii=rr.Radius.ui_points(0.7)), static=True
     )
     dots = rr.Points2D(np.column_stack([x, to_y(measured)]), colors=[_DOTS], radii=rr.Radius.ui_points(4.0))
     recording.log(f"{WHERE}/dots", dots, static=True)

@@ -1,12 +1,16 @@
 """How far every view lies off along what an effect does, over what the effect lives on: the effect, to the eye.
 
-A view's value is its displacement at the part along its unit motion: that of one joint where an effect is in a joint,
-that of the mount or the part along the fitted twist, else the direction in which the effect displaces the views most.
-The line is what the effect predicts; a dot is the line and what the whole model with the effect leaves, so that dots
-off the line are what the effect does not explain. Effects of points are read along the rays, in bins of points.
+The dots are measurements: the displacement of each view from where the model without any candidate puts it, along
+one direction, with the standard deviation of what is independent between views. They are the same whatever candidate
+is drawn. The direction and the axis are those of the candidate that is named first: the turn of one joint where the
+effect is in a joint, the fitted twist of the mount, else the direction in which the effect displaces the views most.
+A candidate's line is by how much it moves what the model predicts for these views, hand-eye and effects in use fitted
+anew beside it, with its standard deviation. Effects of points are read along the rays, in bins of points.
 """
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -20,9 +24,12 @@ from stitch.effects.contract import EFFECTS, Effect, parameters_in, twist
 from stitch.model.forward import moves_points, point_correction, scan_points
 from stitch.model.model import Term
 from stitch.numerics import frames
-from stitch.numerics.frames import Array, Indices
+from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.least_squares import fit_columns
+from stitch.numerics.reml import NOISE, at_variances
 from stitch.numerics.units import covariate_text
 from stitch.observations.linear_model import LinearModel
+from stitch.observations.pose_errors import JOINT_SCATTER
 from stitch.observations.surfaces.surface_model import SurfaceObservation, surfaces_of
 from stitch.session.measurement import ScanView, Views
 
@@ -48,54 +55,62 @@ _Axis = tuple[str, str, Array]
 
 @dataclass(frozen=True)
 class EffectTrend:
-    """The trend of one effect over what it lives on; lengths in length_unit, angles in rad."""
+    """The trend of one effect over what is drawn of it; lengths in length_unit, angles in rad."""
 
-    follows: str  # what it lives on: view order, time_s, angle of joint 2, …
+    follows: str  # what is drawn along: view order, time_s, angle of joint 2, …
     unit: str  # of `at`: "", s, °, N m, °C, length_unit
     of: str  # what is off: the part, the mount, joint 2, …
     value_unit: str  # of measured, sigma and predicted: rad, or length_unit
     at: Array  # (D,)
     views: Indices  # (D,) number of the view of each dot; empty where dots are bins of points
-    measured: Array  # (D,)
-    sigma: Array  # (D,) standard deviation of a dot, by the scatter about the line
-    predicted: Array  # (D,)
-    # The effect between the dots, (2, G): places and values; empty where the dots alone are known.
-    law: Array = field(default_factory=lambda: np.zeros((2, 0)))
+    measured: Array  # (D,) with no candidate in the model
+    sigma: Array  # (D,) standard deviation of a dot, by what is independent between views
+    predicted: Array  # (D,) by how much the effect moves what the model predicts
+    predicted_sigma: Array  # (D,) standard deviation of that
+    moves: str  # what the effect itself moves: `of` where the plot is its own
+    effect: Array  # (D,) what it does there itself, whatever hand-eye and effects in use take of it
 
     def only(self, dots: Indices) -> "EffectTrend":
         """Return the trend with some of its dots."""
-        numbers = {name: getattr(self, name)[dots] for name in ("at", "views", "measured", "sigma", "predicted")}
-        return replace(self, **numbers)
+        names = ("at", "views", "measured", "sigma", "predicted", "predicted_sigma", "effect")
+        return replace(self, **{name: getattr(self, name)[dots] for name in names})
 
 
-def trend_of_candidate(linear: LinearModel, scored: Score) -> EffectTrend | None:
-    """Return the trend of a candidate's best form; None where nothing of it was fitted."""
-    if not scored.fitted:
-        return None
-    fitted = linear.restricted(())
+def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[str, EffectTrend]:
+    """Return the trends of the candidates of which something was fitted, over the dots of the first of them."""
     # As the field of the part predicts it: beside scatter alone, hand-eye and effects in use fitted anew.
-    if fitted is not linear:
-        scored = score(fitted, scored.candidate)
-        if not scored.fitted:
-            return None
-    form = scored.form
-    points = scored.candidate.points
-    X = np.hstack([fitted.design, form.response])
-    solution = fitted.trial(X, None if points is None else points.select(form.keep)).solve()
-    values = solution[len(solution) - len(scored.values) :]
-    term = form.at(values)
-    if moves_points([term]):
-        return _trend_of_points(fitted, scored, term)
-    return _trend_of_views(fitted, term, form, values, X @ solution)
+    fitted = linear.restricted(())
+    asked = [scored for scored in scores if scored.fitted]
+    anew = [scored if fitted is linear else score(fitted, scored.candidate) for scored in asked]
+    pairs = [(first, again) for first, again in zip(asked, anew, strict=True) if again.fitted]
+    if not pairs:
+        return {}
+    effects = [_fit_effect(fitted, again) for _, again in pairs]
+    if moves_points([effects[0].term]):
+        return _trends_of_points(fitted, effects, [again for _, again in pairs])
+    plot = _plot(fitted, _beside(linear, pairs[0][0]), *_direction(fitted, effects[0]))
+    return {} if plot is None else {effect.term.name: _trend_on(plot, effect) for effect in effects}
 
 
 def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
-    """Return the trend of an effect that is in the model, as it was fitted; None for one that changes points."""
+    """Return the trend of an effect that is in the model, over what these views show without it.
+
+    None for one that changes points.
+    """
     if moves_points([term]) or not (~term.gridded & (term.values != 0)).any():
         return None
     fitted = linear.restricted(())
     form = candidate_as_fitted(fitted, term).forms[0]
-    return _trend_of_views(fitted, term, form, term.values[form.keep], fitted.design @ fitted.baseline_trial.solve())
+    norms = np.linalg.norm(fitted.design, axis=0)
+    others = [j for j in range(len(norms)) if not _is_among(fitted.design[:, j], form.response, 1e-6 * norms[j])]
+    without = replace(fitted, design=fitted.design[:, others])
+    effect = _Effect(term, form, _change(without, form.columns, fitted))
+    plot = _plot(without, linear, *_direction(without, effect))
+    return None if plot is None else _trend_on(plot, effect)
+
+
+def _is_among(column: Array, columns: Array, tolerance: float) -> bool:
+    return bool((np.linalg.norm(columns - column[:, None], axis=0) <= tolerance).any())
 
 
 def trend_of_curve(linear: LinearModel, curve: JointCurve) -> EffectTrend | None:
@@ -104,12 +119,13 @@ def trend_of_curve(linear: LinearModel, curve: JointCurve) -> EffectTrend | None
     joint = curve.joint - 1
     error = np.interp(curve.view_values, curve.at, curve.error)
     turned = _joint_columns(fitted)[:, joint : joint + 1]
-    X = np.hstack([fitted.design, turned * _of_rows(fitted, error[:, None], len(turned))])
-    solution = fitted.trial(X).solve()
+    response = turned * _of_rows(fitted, error[:, None], len(turned))
     columns = _displacements(fitted, turned)[..., 0]
-    motion = _Motion(f"joint {curve.joint}", "rad", columns, solution[-1] * error[:, None] * columns, joint)
+    motion = _Motion(f"joint {curve.joint}", "rad", columns, error[:, None] * columns, joint)
     name, unit = (covariate_text(curve.covariate), "") if curve.covariate != "time_s" else ("time", "s")
-    return _along_motion(fitted, motion, X @ solution, 1, (name, unit, curve.view_values))
+    plot = _plot(fitted, linear, motion, (name, unit, curve.view_values))
+    change = _change(fitted, fitted.reduce(response), fitted)
+    return None if plot is None else plot.trend(change, motion.of, error * change.values[0])
 
 
 def trend_of_dependence(linear: LinearModel, dependence: Dependence) -> EffectTrend:
@@ -126,6 +142,9 @@ def trend_of_dependence(linear: LinearModel, dependence: Dependence) -> EffectTr
         measured=dependence.moved,
         sigma=np.full(len(predicted), sigma),
         predicted=predicted,
+        predicted_sigma=np.interp(dependence.at, dependence.bins, dependence.sigma),
+        moves="the views",
+        effect=predicted,
     )
     return trend.only(_shown(len(predicted)))
 
@@ -151,84 +170,151 @@ class _Motion:
         return np.sum(self.columns * self.response, axis=1)
 
 
-def _trend_of_views(linear: LinearModel, term: Term, form: Form, values: Array, explained: Array) -> EffectTrend | None:
-    """Return the trend of an effect of views.
+@dataclass(frozen=True)
+class _Change:
+    """What an effect changes in what the model predicts of the reduced observations."""
+
+    per_unit: Array  # (n, p) per unit of each parameter, hand-eye and effects in use fitted anew beside it
+    values: Array  # (p,)
+    covariance: Array  # (p, p)
+
+
+def _change(linear: LinearModel, columns: Array, beside: LinearModel) -> _Change:
+    """Return what further columns (n, p) change.
 
     Args:
-        values: (p,) of the form's free parameters.
-        explained: response of the whole model with the effect.
+        beside: the same with the variances that are left beside them.
     """
-    motion = _motion(linear, term, form, values)
-    views = linear.measurement.views
-    # Where the part sat at first is nobody's error.
-    from_first = term.effect.place == "part"
-    trend = _along_motion(linear, motion, explained, len(values), _axis(views, term, motion), from_first=from_first)
-    if trend is None or motion.joint is None or not trend.follows.startswith("angle"):
-        return trend
-    return replace(trend, law=_over_a_turn(views, form.at(values), motion.joint))
+    white = linear.whiten(columns)
+    absorbed = np.column_stack([fit_columns(linear.white_design, column) for column in white.T]).astype(float)
+    own = beside.residual(columns)
+    values = fit_columns(linear.residual(columns), linear.white_residual)
+    covariance = np.linalg.pinv(own.T @ own).astype(float)
+    return _Change(columns - linear.reduce(linear.design) @ absorbed, values, covariance)
 
 
-def _over_a_turn(views: Views, fitted: Term, joint: int) -> Array:
-    """Return what an effect does to a joint over its whole turn (2, G), ° and rad: over the angles seen alone, a gear
-    that runs out of true looks like a slope. Empty where it takes more than this joint's angle, or does not vary.
-    """
-    turn = np.radians(np.linspace(-180, 180, 121))
-    asked = np.concatenate([turn, views.joints[:, joint]])
-    others_still = np.tile(views.joints[0], (len(asked), 1))
-    others_still[:, joint] = asked
-    errors = _joint_errors(replace(views.only([0] * len(asked)), joints=others_still), fitted)[:, joint]
-    over_turn, in_views = errors[: len(turn)], errors[len(turn) :]
-    alone = np.allclose(in_views, _joint_errors(views, fitted)[:, joint], rtol=1e-6, atol=1e-12)
-    if alone and np.ptp(over_turn) > 1e-6 * np.abs(over_turn).max():
-        return np.stack([np.degrees(turn), over_turn])
-    return np.zeros((2, 0))
+@dataclass(frozen=True)
+class _Effect:
+    """An effect as these views fit it."""
+
+    term: Term  # with the fitted values
+    form: Form
+    change: _Change
 
 
-def _along_motion(
-    linear: LinearModel, motion: _Motion, explained: Array, free: int, axis: _Axis, *, from_first: bool = False
-) -> EffectTrend | None:
-    """Return every view along its unit motion: the line, and beside it what the model with the effect leaves.
+def _fit_effect(linear: LinearModel, scored: Score) -> _Effect:
+    beside = linear if scored.variances is None else replace(linear, null=at_variances(linear.mixed, scored.variances))
+    change = _change(linear, scored.form.columns, beside)
+    return _Effect(scored.form.at(change.values), scored.form, change)
 
-    Args:
-        explained: response of the whole model with the effect.
-        free: number of fitted parameters of the effect.
-        from_first: count from where the first view is.
-    """
+
+def _beside(linear: LinearModel, scored: Score) -> LinearModel:
+    """Return the model with the variances that are left beside a candidate."""
+    if scored.base_model is not None or scored.variances is None:
+        return scored.base_model or linear
+    base = linear.restricted(linear.causes - {scored.name})
+    return replace(base, null=at_variances(base.mixed, scored.variances))
+
+
+def _direction(linear: LinearModel, effect: _Effect) -> tuple[_Motion, _Axis]:
+    """Return the motion that an effect is drawn along, and what it is drawn over."""
+    motion = _motion(linear, effect)
+    line = motion.line
+    if motion.joint is None and line[np.argmax(np.abs(line))] < 0:
+        motion = replace(motion, columns=-motion.columns)
+    return motion, _axis(linear.measurement.views, effect.term, motion)
+
+
+def _trend_on(plot: "_Plot", effect: _Effect) -> EffectTrend:
+    """Return an effect over the dots of a plot."""
+    motion = _motion(plot.linear, effect)
     square = np.sum(motion.columns**2, axis=1)
-    if not (square > 0).any():
+    line = motion.line / np.maximum(square, 1e-2 * np.median(square))
+    if effect.term.effect.place == "part":
+        # Where the part sat at first is nobody's error.
+        line = line - line[np.argmin(plot.axis[2])]
+    return plot.trend(effect.change, motion.of, line)
+
+
+@dataclass(frozen=True)
+class _Plot:
+    """Dots along one direction, for every candidate."""
+
+    linear: LinearModel  # without any
+    motion: _Motion
+    axis: _Axis
+    measured: Array  # (V,)
+    sigma: Array  # (V,)
+
+    @cached_property
+    def square(self) -> Array:
+        """(V,) squared length of a unit motion; where it moves a view by next to nothing, the view says nothing."""
+        square = np.sum(self.motion.columns**2, axis=1)
+        return np.maximum(square, 1e-2 * np.median(square))
+
+    def along(self, numbers: Array) -> Array:
+        """(V, P) what reduced observations (n, P) displace along the direction."""
+        moved = _displacements(self.linear, self.linear.observation.expand(numbers))
+        return np.einsum("vk,vkp->vp", self.motion.columns, moved) / self.square[:, None]
+
+    def trend(self, change: _Change, moves: str, effect: Array) -> EffectTrend:
+        """Return the line of an effect over the dots.
+
+        Args:
+            effect: (V,) what it does itself.
+        """
+        per_unit = self.along(change.per_unit)
+        follows, unit, at = self.axis
+        trend = EffectTrend(
+            follows,
+            unit,
+            self.motion.of,
+            self.motion.unit,
+            at,
+            np.arange(len(at)),
+            self.measured,
+            self.sigma,
+            predicted=per_unit @ change.values,
+            predicted_sigma=np.sqrt(np.einsum("vp,pq,vq->v", per_unit, change.covariance, per_unit).clip(0)),
+            moves=moves,
+            effect=effect,
+        )
+        return trend.only(_shown(len(at)))
+
+
+def _plot(linear: LinearModel, scatter: LinearModel, motion: _Motion, axis: _Axis) -> _Plot | None:
+    """Return the dots of a direction: what the model leaves of each view; None where nothing moves along it.
+
+    Args:
+        scatter: with the variances of what is independent between views.
+    """
+    if not motion.columns.any():
         return None
-    # Where a unit moves a view by next to nothing, the view says nothing of it.
-    square = np.maximum(square, 1e-2 * np.median(square))
-    left = linear.mixed.z.ravel() - linear.reduce(explained[:, None])[:, 0]
-    line = motion.line / square
-    off = np.sum(motion.columns * _displacements(linear, linear.observation.expand(left[:, None]))[..., 0], axis=1)
-    scatter = float(np.sqrt(np.mean(off**2 / square) * len(line) / max(len(line) - free, 1)))
-    follows, unit, at = axis
-    if from_first:
-        line = line - line[np.argmin(at)]
-    sign = 1.0 if motion.joint is not None or line[np.argmax(np.abs(line))] >= 0 else -1.0
-    trend = EffectTrend(
-        follows,
-        unit,
-        motion.of,
-        motion.unit,
-        at,
-        np.arange(len(line)),
-        measured=sign * (line + off / square),
-        sigma=scatter / np.sqrt(square),
-        predicted=sign * line,
-    )
-    return trend.only(_shown(len(line)))
+    plot = _Plot(linear, motion, axis, np.zeros(0), np.zeros(0))
+    left = linear.mixed.z.ravel() - linear.reduce((linear.design @ linear.baseline_trial.solve())[:, None])[:, 0]
+    # Each number of a block moves views of its own block alone, but for the mean of all.
+    half = np.linalg.cholesky(_independent(scatter)).reshape(len(left), -1).astype(float)
+    sigma = np.sqrt(np.sum(plot.along(half) ** 2, axis=1))
+    return replace(plot, measured=plot.along(left[:, None])[:, 0], sigma=sigma)
 
 
-def _motion(linear: LinearModel, term: Term, form: Form, values: Array) -> _Motion:
+def _independent(linear: LinearModel) -> Array:
+    """Return (B, m, m) covariance of what is independent between views: scatter of flange and joints, and noise."""
+    names = linear.component_names
+    some = [*range(NOISE + 1), *(NOISE + 1 + k for k, name in enumerate(names) if name == JOINT_SCATTER)]
+    covariance = np.einsum("c,cbij->bij", linear.null.variances[some], linear.mixed.components[some])
+    size = np.einsum("bii->b", covariance) / covariance.shape[1]
+    return covariance + 1e-12 * size[:, None, None] * np.eye(covariance.shape[1])
+
+
+def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
     """Return what an effect moves, by its place in the chain of frames."""
-    response = _displacements(linear, form.response @ values[:, None])[..., 0]
+    term = effect.term
+    response = _displacements(linear, effect.form.response @ effect.change.values[:, None])[..., 0]
     unit = linear.measurement.length_unit
-    fitted = form.at(values)
     if term.effect.place == "robot":
         turned = _joint_columns(linear)
-        errors = _joint_errors(linear.measurement.views, fitted)
+        errors = _joint_errors(linear.measurement.views, term)
         reduced = linear.reduce(turned * _of_rows(linear, errors, len(turned)))
         joint = int(np.argmax(np.sum(reduced**2, axis=0)))
         columns = _displacements(linear, turned[:, joint : joint + 1])[..., 0]
@@ -238,7 +324,7 @@ def _motion(linear: LinearModel, term: Term, form: Form, values: Array) -> _Moti
         constant = Effect(
             "constant", "mount", specs, lambda views, xi: np.tile(xi, (views.count, 1)), (), (), "empirical"
         )
-        twists = fitted.effect.function(linear.measurement.views, **fitted.arguments)
+        twists = term.effect.function(linear.measurement.views, **term.arguments)
         along = (twists - twists.mean(axis=0))[np.argmax(np.sum(response**2, axis=1))]
         at_constant = linear.responses([Term(constant, parameters_in(linear.measurement, constant))])[0].columns
         columns = _displacements(linear, at_constant @ along[:, None])[..., 0]
@@ -320,17 +406,20 @@ def _joint_axis(views: Views, term: Term, joint: int) -> _Axis:
     return f"angle of joint {number}", "°", np.degrees(views.joints[:, joint])
 
 
-def _trend_of_points(linear: LinearModel, scored: Score, term: Term) -> EffectTrend | None:
-    """Return means over bins of points, each the effect and what the model with it leaves along its motion."""
+def _trends_of_points(
+    linear: LinearModel, effects: Sequence[_Effect], scores: Sequence[Score]
+) -> dict[str, EffectTrend]:
+    """Return means over bins of points of what the model without any candidate leaves along the motion of the first,
+    and of what each candidate takes of it."""
     surfaces = surfaces_of(linear)
-    distances = predicted_distances(linear, scored)
-    if distances is None or surfaces is None:
-        return None
-    rows = _points_of_matches(linear, surfaces, term, distances)
-    dots = _binned(*rows)
-    if dots is None:
-        return None
-    at, measured, sigma, predicted = dots
+    left = predicted_distances(linear)
+    if surfaces is None or left is None:
+        return {}
+    term = effects[0].term
+    at, cosine, row, view_of = _points_of_matches(linear, surfaces, term, len(left))
+    bins = _bins(at, cosine)
+    if not bins:
+        return {}
     views = linear.measurement.views
     length = linear.measurement.length_unit
     temperature = _TEMPERATURES.get(term.name)
@@ -339,50 +428,69 @@ def _trend_of_points(linear: LinearModel, scored: Score, term: Term) -> EffectTr
         follows, unit = (temperature, "°C") if temperature in views.covariates else ("time", "s")
     else:
         follows, unit = _POINT_AXES.get(term.name, ("angle from the middle of the field", "°"))
-    return EffectTrend(
-        follows=follows,
-        unit=length if unit is None else unit,
-        of="the part" if term.effect.place == "shape" else "the scanner",
-        value_unit=length,
-        at=at,
-        views=np.zeros(0, np.int64),
-        measured=measured,
-        sigma=sigma,
-        predicted=predicted,
-    )
+    places = np.array([at[inside].mean() for inside in bins])
+    plots = [predicted_distances(linear, scored) for scored in scores]
+    if plots[0] is None:
+        return {}
+    sigma = _scatter(bins, cosine, plots[0][row], view_of)
+    trends = {}
+    for effect, remaining in zip(effects, plots, strict=True):
+        if remaining is None:
+            continue
+        predicted = _means(bins, cosine, (left - remaining)[row])
+        change = effect.change
+        wald = float(change.values @ np.linalg.pinv(change.covariance) @ change.values)
+        trends[effect.term.name] = EffectTrend(
+            follows=follows,
+            unit=length if unit is None else unit,
+            of=_owner(term),
+            value_unit=length,
+            at=places,
+            views=np.zeros(0, np.int64),
+            measured=_means(bins, cosine, left[row]),
+            sigma=sigma,
+            predicted=predicted,
+            predicted_sigma=np.abs(predicted) / np.sqrt(max(wald, 1e-300)),
+            moves=_owner(effect.term),
+            effect=predicted,
+        )
+    return trends
 
 
-def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: Term, distances: Array) -> list[Any]:
-    """Return of points (N,) of some correspondences: where each stands along what the effect lives on, how far the
-    effect moves it, the cosine of that motion to the normal, the distance that is left, and its view."""
+def _owner(term: Term) -> str:
+    """Return what an effect of points belongs to."""
+    return "the part" if term.effect.place == "shape" else "the scanner"
+
+
+def _points_of_matches(linear: LinearModel, surfaces: SurfaceObservation, term: Term, count: int) -> list[Any]:
+    """Return of points (N,) of some of `count` correspondences: where each stands along what the effect lives on, the
+    cosine of the effect's motion to the normal, the number of the correspondence, and the point's view."""
     poses = surfaces.capture.poses(linear.model.T_mount)
     matches = surfaces.unconstrained.overlaps.matches
-    step = max(sum(len(m.residual) for m in matches) // _ASKED, 1)
-    rows = list[tuple[Array, ...]]()
+    step = max(count // _ASKED, 1)
+    rows = list[tuple[Any, ...]]()
     start = 0
     for m in matches:
         some = np.arange(0, len(m.residual), step)
-        left = distances[start + some]
+        number = start + some
         start += len(m.residual)
         for v, index, sign in ((m.v, m.index_v[some], 1.0), (m.w, m.index_w[some], -1.0)):
             points, view = scan_points(linear.measurement, v, index)
-            size, direction = _sizes(term, points, view, poses[v])
+            direction = _directions(term, points, view, poses[v])
             facing = np.einsum("ni,ni->n", frames.rotate(poses[v], direction), m.normal[some])
-            place = _place_of(term.name, points, view, poses[v])
-            rows.append((place, size, sign * facing, left, np.full(len(some), v)))
+            rows.append((_place_of(term.name, points, view, poses[v]), sign * facing, number, np.full(len(some), v)))
     return [np.concatenate(column) for column in zip(*rows, strict=True)]
 
 
-def _sizes(term: Term, points: Array, view: ScanView, pose: Array) -> tuple[Array, Array]:
-    """Return (N,) how far an effect moves points, and (N, 3) where to, scanner frame: along the rays where it does
-    so."""
+def _directions(term: Term, points: Array, view: ScanView, pose: Array) -> Array:
+    """Return (N, 3) where an effect moves points to, scanner frame: along the rays where it does so."""
     moved = -point_correction([term], points, view, pose)
-    rays = view.along(points)
+    rays: Array = view.along(points)
     along = np.einsum("ni,ni->n", moved, rays)
     length = np.linalg.norm(moved, axis=1)
     if np.sum(along**2) > 0.9 * np.sum(length**2):
-        return along, rays
-    return length, moved / np.maximum(length, 1e-300)[:, None]
+        return rays
+    return moved / np.maximum(length, 1e-300)[:, None]
 
 
 def _place_of(name: str, points: Array, view: ScanView, pose: Array) -> Array:
@@ -403,24 +511,23 @@ def _place_of(name: str, points: Array, view: ScanView, pose: Array) -> Array:
     return np.degrees(np.arctan(np.sqrt(view.rho2(points))))
 
 
-def _binned(at: Array, size: Array, cosine: Array, left: Array, view_of: Indices) -> Array | None:
-    """Return (4, D) place, measured value, sigma and prediction of a dot for each of equal counts of points; its sigma
-    is the scatter of the views' own means about it."""
+def _bins(at: Array, cosine: Array) -> list[Mask]:
+    """Return masks (N,) of bins of equal counts of points in which the effect can be seen; [] where all stand alike."""
     edges = np.unique(np.quantile(at, np.linspace(0, 1, _BINS + 1)))
-    if len(edges) < 3:
-        return None
-    dots = []
-    for low, high in pairwise(edges):
-        inside = (at >= low) & (at <= high)
-        weight = np.sum(cosine[inside] ** 2)
-        if weight <= 0:
-            continue
-        off = float(np.sum(cosine[inside] * left[inside]) / weight)
-        of_views = view_of[inside]
-        top = np.bincount(of_views, (cosine * left)[inside])
-        below = np.bincount(of_views, (cosine**2)[inside])
-        known = below > 0
-        spread = np.sqrt(np.sum((top[known] - off * below[known]) ** 2)) / weight
-        predicted = float(size[inside].mean())
-        dots.append((float(at[inside].mean()), predicted + off, float(spread), predicted))
-    return np.array(dots).T
+    inside = [(at >= low) & (at <= high) for low, high in pairwise(edges)]
+    return [some for some in inside if np.sum(cosine[some] ** 2) > 0] if len(edges) > 2 else []
+
+
+def _means(bins: Sequence[Mask], cosine: Array, distances: Array) -> Array:
+    """Return (D,) motion of the points of each bin that makes distances (N,)."""
+    return np.array([np.sum(cosine[b] * distances[b]) / np.sum(cosine[b] ** 2) for b in bins])
+
+
+def _scatter(bins: Sequence[Mask], cosine: Array, remaining: Array, view_of: Indices) -> Array:
+    """Return (D,) standard deviation of the means by the scatter of the views' own, where an effect leaves no more."""
+    sigma = []
+    for b, off in zip(bins, _means(bins, cosine, remaining), strict=True):
+        top = np.bincount(view_of[b], (cosine * remaining)[b])
+        below = np.bincount(view_of[b], cosine[b] ** 2)
+        sigma.append(np.sqrt(np.sum((top - off * below) ** 2)) / below.sum())
+    return np.array(sigma)

@@ -12,9 +12,9 @@ from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.effect_trend import (
     EffectTrend,
     trend_in_model,
-    trend_of_candidate,
     trend_of_curve,
     trend_of_dependence,
+    trends_of_candidates,
 )
 from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.diagnosis.sentences import odds_text
@@ -43,16 +43,16 @@ def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the screen of a diagnosis; lengths in length_unit, angles in rad."""
     candidates = compared(diagnosis)
     patches, present, if_added = _fields(diagnosis, candidates)
-    trends = {c.name: trend_of_candidate(diagnosis.linear, c.ranked.score) for c in candidates}
+    trends = trends_of_candidates(diagnosis.linear, [c.ranked.score for c in candidates])
     why = _why(diagnosis, trends)
     return {
-        "headline": _headline(diagnosis, why),
+        "headline": _headline(diagnosis, trends),
         "proof": _proof(diagnosis, why),
         "certainty": certainty(diagnosis),
         "now": {"heldout": diagnosis.heldout_rms} | _on_part(present),
         "noise": diagnosis.noise_floor,
         "why": _trend_row(why),
-        "candidates": [_candidate_row(diagnosis, c, if_added.get(c.name), trends[c.name]) for c in candidates],
+        "candidates": [_candidate_row(diagnosis, c, if_added.get(c.name), trends.get(c.name)) for c in candidates],
         "places": None if patches is None else np.round(patches.points, 2).tolist(),
         "doubts": list(open_doubts(diagnosis)),
     }
@@ -98,7 +98,7 @@ def compared(diagnosis: Diagnosis) -> list[CandidateEffect]:
     return helping[:_BEST]
 
 
-def _why(diagnosis: Diagnosis, trends: dict[str, EffectTrend | None]) -> EffectTrend | None:
+def _why(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> EffectTrend | None:
     """Return the trend of what is named, of the last effect in a model that lacks nothing, or of what has no name."""
     linear = diagnosis.linear
     if diagnosis.verdict in _NAMING:
@@ -137,15 +137,16 @@ def _trend_row(trend: EffectTrend | None) -> dict[str, Any] | None:
     if trend is None:
         return None
     words = {key: getattr(trend, key) for key in ("follows", "unit", "of", "value_unit")}
-    dots = {key: _rounded(getattr(trend, key)) for key in ("at", "measured", "sigma", "predicted")}
-    return words | {"views": trend.views.tolist()} | dots | {"law": [_rounded(row) for row in trend.law]}
+    numbers = ("at", "measured", "sigma", "predicted", "predicted_sigma")
+    dots = {key: _rounded(getattr(trend, key)) for key in numbers}
+    return words | {"views": trend.views.tolist()} | dots
 
 
 def _rounded(values: Array) -> list[float]:
     return [float(f"{x:.4g}") for x in values]
 
 
-def _headline(diagnosis: Diagnosis, why: EffectTrend | None) -> str:
+def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
     """Return what is missing, in one sentence."""
     match diagnosis.verdict:
         case "adequate":
@@ -161,7 +162,7 @@ def _headline(diagnosis: Diagnosis, why: EffectTrend | None) -> str:
             elif diagnosis.depends_on and diagnosis.depends_on[0].p_value < CLEAR_DEPENDENCE:
                 follows = f": the error follows {plain_covariate(diagnosis.depends_on[0].covariate)}"
             return f"Something is missing that no known effect explains{follows}."
-    causes = [_cause(c, why) for c in compared(diagnosis) if c.name in diagnosis.effects]
+    causes = [_cause(c, trends.get(c.name)) for c in compared(diagnosis) if c.name in diagnosis.effects]
     if len(causes) > 1:
         rivals = " or ".join([causes[0], *(cause[:1].lower() + cause[1:] for cause in causes[1:])])
         return f"{rivals}: these views cannot tell which."
@@ -175,8 +176,8 @@ def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
     view = next((p.view for p in term.parameters if p.discrete), "")
     if view:
         return f"The part slipped before view {view}" if name == "part_slip" else f"{name} at {view}"
-    if trend is not None and name in JOINT_DESCRIPTIONS and trend.of.startswith("joint"):
-        return f"{trend.of.capitalize()} {JOINT_DESCRIPTIONS[name]}"
+    if trend is not None and name in JOINT_DESCRIPTIONS and trend.moves.startswith("joint"):
+        return f"{trend.moves.capitalize()} {JOINT_DESCRIPTIONS[name]}"
     description = DESCRIPTIONS.get(name, name)
     return description[:1].upper() + description[1:]
 
@@ -202,14 +203,14 @@ def _proof(diagnosis: Diagnosis, why: EffectTrend | None) -> str:
 
 def _size(why: EffectTrend, unit: str) -> str:
     """Return how far off an effect puts things, as a sentence."""
-    largest = float(np.abs(why.predicted).max())
+    largest = float(np.abs(why.effect).max())
     size = angle_text(largest, 2) if why.value_unit == "rad" else length_text(largest, unit, 2)
     if why.follows == "view order" and len(why.views):
-        away = int(np.sum(np.abs(why.predicted) > largest / 2))
+        away = int(np.sum(np.abs(why.effect) > largest / 2))
         return f"{away} of {len(why.views)} views sit {size} away from the others."
     follows = plain_covariate(why.follows).partition(":")[0]
     article = "" if follows == "time" or follows.startswith("the ") else "the "
-    if np.ptp(why.predicted) < _FLAT * largest:
+    if np.ptp(why.effect) < _FLAT * largest:
         return f"{why.of.capitalize()} is off by {size}, whatever {article}{follows} is."
     goes_with = "" if follows == "view order" else f"; it goes with {article}{follows}"
     return f"{why.of.capitalize()} is off by up to {size}{goes_with}."

@@ -91,6 +91,7 @@ def test_why_is_drawn_to_scale_and_colours_the_arms(tmp_path):
         "measured": [0.0, 0.1, 0.2],
         "sigma": [0.01] * 3,
         "predicted": [0.0, 0.1, 0.2],
+        "predicted_sigma": [0.01] * 3,
     }
     file = RecordingFile("stitch", tmp_path / "d.rrd")
     log_course(file.stream, course, ["a", "b", "c"], 1e3)

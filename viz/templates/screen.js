@@ -142,19 +142,18 @@ function coursePlot(course, names, um, line = "what the effect predicts") {
   const inOrder = course.follows === "view order", seconds = course.unit === "s";
   const span = seconds ? Math.max(...course.at) : 0, [per, named] = span > 7200 ? [3600, "h"] : span > 120 ? [60, "min"] : [1, "s"];
   const x = course.at.map(a => seconds ? a / per : a), scaled = values => values.map(v => v * factor);
-  const law = course.law && course.law[0].length ? { x: course.law[0], y: scaled(course.law[1]) } : null;
-  const [measured, sigma, predicted] = [course.measured, course.sigma, course.predicted].map(scaled);
+  const [measured, sigma, predicted, about] = [course.measured, course.sigma, course.predicted, course.predicted_sigma || course.predicted.map(() => 0)].map(scaled);
   const label = inOrder ? "views in their order" : course.follows.replace(/^j(\d+)(_deg| \(°\))$/, "angle of joint $1 (°)").replace(/_c$/, " (°C)").replaceAll("_", " ") + (seconds ? ` (${named})` : course.unit ? ` (${course.unit})` : "");
-  const named_ = course.views.map(v => names ? names[v] : String(v)), most = Math.max(...predicted.map(Math.abs));
-  const first = inOrder ? predicted.findIndex(p => Math.abs(p) > most / 2) : -1;
-  const jumps = inOrder && first > 0 && predicted.slice(first).every(p => Math.abs(p) > most / 2);
-  const said = measured.map((m, i) => `${course.views.length ? `${named_[i]}, ` : ""}${shortNumber(x[i])}: measured ${shortNumber(m)} ± ${shortNumber(2 * sigma[i])} ${unit}, predicted ${shortNumber(predicted[i])} ${unit}`);
+  const named_ = course.views.map(v => names ? names[v] : String(v)), middle = (Math.max(...predicted) + Math.min(...predicted)) / 2;
+  const side = predicted.map(p => p > middle), first = inOrder ? side.findIndex(s => s !== side[0]) : -1;
+  const jumps = first > 0 && side.slice(first).every(s => s !== side[0]);
+  const said = measured.map((m, i) => `${course.views.length ? `${named_[i]}, ` : ""}${shortNumber(x[i])}: measured ${shortNumber(m)} ± ${shortNumber(2 * sigma[i])} ${unit}, predicted ${shortNumber(predicted[i])} ± ${shortNumber(2 * about[i])} ${unit}`);
   return {
-    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are" : "is"} off (${unit}). Dots: measured ± 2σ. Line: ${course.of.endsWith("views") ? "means" : line}`,
+    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are" : "is"} off without it in the model (${unit}), ± 2σ. Dots: measured. Line: ${course.of.endsWith("views") ? "means" : line}`,
     spec: {
       x: { label, names: inOrder && course.views.length === (names || []).length ? named_ : undefined }, y: { label: unit },
       shaded: jumps ? { from: (x[first - 1] + x[first]) / 2, said: `from ${named_[first]} on` } : undefined,
-      series: [{ kind: "line", ...(law || { x, y: predicted }), step: jumps, tint: "predicted" }, { kind: "dots", x, y: measured, sigma, names: course.views.length > 0, said, tint: "dot" }],
+      series: [{ kind: "band", x, y: predicted, sigma: about, tint: "predicted" }, { kind: "line", x, y: predicted, step: jumps, tint: "predicted" }, { kind: "dots", x, y: measured, sigma, names: course.views.length > 0, said, tint: "dot" }],
     },
   };
 }
