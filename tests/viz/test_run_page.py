@@ -170,6 +170,7 @@ def diagnosed_page(recorded, tmp_path_factory):
         "measured": [0.0, 0.002, 0.1, 0.104, 0.098],
         "sigma": [0.003] * 5,
         "predicted": [0.0, 0.0, 0.1, 0.1, 0.1],
+        "predicted_sigma": [0.001] * 5,
     }
     mean, worst = float(np.nanmean(field)), float(np.nanmax(field))
     half = {
@@ -226,7 +227,7 @@ def test_why_has_a_dot_for_every_view_and_a_line_that_jumps(screen, diagnosed_pa
     dots = screen.locator("[data-why] .dot")
     assert dots.count() == len(diagnosed_page.views)
     said = dots.nth(3).get_attribute("aria-label").replace("\u00a0", " ")
-    assert said == f"{diagnosed_page.views[3]}, 3: measured 104 ± 6 µm, predicted 100 µm"
+    assert said == f"{diagnosed_page.views[3]}, 3: measured 104 ± 6 µm, predicted 100 ± 2 µm"
     assert screen.locator("[data-why] text", has_text=f"from {diagnosed_page.views[2]} on").count() == 1
 
 

@@ -142,7 +142,7 @@ function coursePlot(course, names, um, line = "what the effect predicts") {
   const inOrder = course.follows === "view order", seconds = course.unit === "s";
   const span = seconds ? Math.max(...course.at) : 0, [per, named] = span > 7200 ? [3600, "h"] : span > 120 ? [60, "min"] : [1, "s"];
   const x = course.at.map(a => seconds ? a / per : a), scaled = values => values.map(v => v * factor);
-  const [measured, sigma, predicted, about] = [course.measured, course.sigma, course.predicted, course.predicted_sigma || course.predicted.map(() => 0)].map(scaled);
+  const [measured, sigma, predicted, about] = [course.measured, course.sigma, course.predicted, course.predicted_sigma].map(scaled);
   const label = inOrder ? "views in their order" : course.follows.replace(/^j(\d+)(_deg| \(°\))$/, "angle of joint $1 (°)").replace(/_c$/, " (°C)").replaceAll("_", " ") + (seconds ? ` (${named})` : course.unit ? ` (${course.unit})` : "");
   const named_ = course.views.map(v => names ? names[v] : String(v)), middle = (Math.max(...predicted) + Math.min(...predicted)) / 2;
   const side = predicted.map(p => p > middle), first = inOrder ? side.findIndex(s => s !== side[0]) : -1;
