@@ -85,7 +85,7 @@ def fitted_case(case: str, seed: int) -> tuple[JoinedScans, Array, CadFit]:
     kind, weld, (overview, close), regions = CASES[case]
     mesh, surface = part_of(kind)
     scan = scanned(mesh if weld is None else window_scans.warp(mesh, weld), kind, seed, overview, close)
-    start = find_cad_start(scan, surface).T_base_part
+    start = find_cad_start(scan, surface)[0]
     return scan, start, fit_cad(scan, surface, start, regions)
 
 

@@ -11,7 +11,7 @@ from stitch.numerics.frames import Array
 
 MAD_TO_SIGMA = 1.4826
 # Tukey's biweight at 4.685 σ keeps 95 % efficiency for normal errors (Holland & Welsch 1977).
-_TUKEY = 4.685
+TUKEY = 4.685
 
 
 def mad_sigma(e: Array) -> float:
@@ -29,7 +29,7 @@ def nan_median(values: Array) -> Array:
 
 def tukey(e: Array, scale: float) -> Array:
     """Biweight of residuals at a robust sigma."""
-    return np.clip(1 - (e / (_TUKEY * scale)) ** 2, 0, None) ** 2
+    return np.clip(1 - (e / (TUKEY * scale)) ** 2, 0, None) ** 2
 
 
 def chi2_tail(x: float, degrees: float) -> float:

@@ -40,7 +40,7 @@ def deviation_map(found: Deviations, unit: str) -> Figure:
     order = pick[np.argsort(np.abs(found.distance[pick]))]
     colours = {"c": found.distance[order], "cmap": colormap(SIGNED), "vmin": -found.tolerance, "vmax": found.tolerance}
     drawn = ax.scatter(found.points[order, i], found.points[order, j], s=5, lw=0, **colours)
-    bad = found.cells.middle[found.outside]
+    bad = found.middle[found.outside]
     if len(bad):
         ringed = f"ringed: beyond the tolerance of ±{found.tolerance:g} {unit}"
         ax.plot(bad[:, i], bad[:, j], "o", mfc="none", mec="k", mew=0.6, ms=5, label=ringed)
@@ -126,7 +126,7 @@ def _tables(job: FitJob, parts: list[FittedPart]) -> list[Table]:
         sigma = part.fit.sigma
         place = (f"{x:.3f}" for x in part.fit.T_base_part[:3, 3])
         sizes = f"{sigma[3:].max():.4f}", f"{np.degrees(sigma[:3]).max():.5f}", f"{part.fit.rms:.3f}"
-        shares = f"{part.start.share:.0%}", f"{part.start.runner_up:.0%}"
+        shares = f"{part.start_share:.0%}", f"{part.start_runner_up:.0%}"
         poses.append((str(i + 1), *place, *sizes, *shares))
     in_unit = f" ({job.length_unit})" if job.length_unit else ""
     x, y, z = (f"{axis}{in_unit}" for axis in "xyz")
@@ -136,7 +136,7 @@ def _tables(job: FitJob, parts: list[FittedPart]) -> list[Table]:
     ]
     tables += _allowances(parts)
     for i, part in enumerate(parts):
-        worst = np.argsort(-np.abs(part.deviations.cells.mean))[:_WORST]
+        worst = np.argsort(-np.abs(part.deviations.mean))[:_WORST]
         rows = [_cell_row(part.deviations, k) for k in worst]
         title = "Worst cells of the map" + (f" of part {i + 1}" if len(parts) > 1 else "") + ", in the part's frame"
         tables.append(Table(title, (x, y, z, f"deviation{in_unit}", "points", "verdict"), rows))
@@ -156,8 +156,8 @@ def _allowances(parts: list[FittedPart]) -> list[Table]:
 
 
 def _cell_row(found: Deviations, k: int) -> tuple[str, ...]:
-    cells, verdict = found.cells, "bad" if found.outside[k] else "good"
-    return *(f"{x:.0f}" for x in cells.middle[k]), f"{cells.mean[k]:+.3f}", str(cells.count[k]), verdict
+    verdict = "bad" if found.outside[k] else "good"
+    return *(f"{x:.0f}" for x in found.middle[k]), f"{found.mean[k]:+.3f}", str(found.count[k]), verdict
 
 
 def record(job: FitJob, parts: list[FittedPart], path: Path) -> None:
@@ -177,7 +177,7 @@ def record(job: FitJob, parts: list[FittedPart], path: Path) -> None:
                 signed_colours(found.distance[pick], found.tolerance),
             )
             stage.points(recording, f"part {i + 1}/deviation", places, colours, size / 1200)
-            bad = frames.transform(T, found.cells.middle[found.outside])
+            bad = frames.transform(T, found.middle[found.outside])
             stage.points(recording, f"part {i + 1}/out of tolerance", bad, [(20, 20, 20)], size / 300)
             if part.path is not None and job.path is not None:
                 stage.line(recording, "path/programmed", job.path[1][:, :3, 3], stage.GREY, size / 500)

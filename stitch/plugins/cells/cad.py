@@ -1,10 +1,9 @@
-"""The CAD surface: nearest places for scanned points, told apart by the side they look to.
+"""The CAD surface: partners of scanned points, regions of the part, and what points count in a fit.
 
-Tukey's biweight: 95 % efficient on normal noise, no pull at all beyond its limit (Huber & Ronchetti 2009).
-
-Points that look all ways: normal-space sampling (Rusinkiewicz & Levoy 2001).
-
-On a large smooth sheet the few points of its flanks alone hold it in its plane.
+The two sides of a thin sheet are told apart by the way they look. Points are drawn evenly over the directions they
+look to (normal-space sampling, Rusinkiewicz & Levoy 2001): on a large smooth sheet the few points of its flanks alone
+hold it in its plane. Points and whole cells of the surface are weighted by Tukey's biweight, which is 95 % efficient on
+normal noise and lets nothing pull beyond its limit (Huber & Ronchetti 2009).
 """
 
 from bisect import bisect_right
@@ -20,6 +19,7 @@ from pykdtree.kdtree import KDTree
 
 from stitch.errors import InputError
 from stitch.numerics import frames
+from stitch.numerics.distributions import TUKEY, mad_sigma, tukey
 from stitch.numerics.frames import Array, Indices
 from stitch.plugins.cells.placed_scans import JoinedScans
 from stitch.session.reading.text_files import reason_of
@@ -28,8 +28,6 @@ from stitch.session.reading.text_files import reason_of
 _SAME_SIDE = np.cos(np.radians(45.0))
 _FAR_SIDE = -0.5
 _MOST_SAMPLES = 400_000
-# Limit of the weights in 1-sigma scales, and a normal sigma per median absolute deviation.
-TUKEY, MAD = 4.685, 1.4826
 # Cells with fewer points have no mean worth judging; their points keep their own weights.
 _MIN_CELL_POINTS = 5
 _SAMPLED_POINTS = 20_000
@@ -50,15 +48,6 @@ class CadSurface:
     normals: Array  # (S, 3) outwards
     tree: Any  # KDTree over (samples, reach · normals)
     reach: float  # distance that counts as much as normals one radian apart
-
-
-@dataclass(frozen=True)
-class NearestPartners:
-    """For N points: signed distance along the CAD's normal, that normal, and whether the place is a partner."""
-
-    distance: Array  # (N,) positive outside
-    normal: Array  # (N, 3)
-    accept: NDArray[np.bool_]  # (N,)
 
 
 def read_cad(file: Path) -> CadSurface:
@@ -86,7 +75,8 @@ def cad_surface(mesh: Any) -> CadSurface:
     boxes.init(*_arrays(mesh))
     count = int(min(_MOST_SAMPLES, max(5000, mesh.area / (size / 800) ** 2)))
     samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)
-    normals, reach = np.asarray(mesh.face_normals[faces]), size / 30
+    normals = np.asarray(mesh.face_normals[faces])
+    reach = size / 30
     return CadSurface(
         mesh,
         boxes,
@@ -100,11 +90,14 @@ def cad_surface(mesh: Any) -> CadSurface:
     )
 
 
-def nearest_partners(cad: CadSurface, points: Array, normals: Array) -> NearestPartners:
-    """Partners of points (N, 3) with normals (N, 3), part frame.
+def nearest_partners(cad: CadSurface, points: Array, normals: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return partners on the CAD of points (N, 3) with normals (N, 3), part frame.
 
     First the nearest triangle; where that is a thin sheet's far side, the nearest of samples that look the same way.
     A normal that lies between is smeared over an edge and has no partner.
+
+    Returns:
+        Distance (N,) along the CAD's normal, positive outside; that normal (N, 3); whether the place is a partner (N,).
     """
     _, face, place = cad.boxes.squared_distance(*_arrays(cad.mesh), np.ascontiguousarray(points, float))
     normal = np.array(cad.mesh.face_normals[face])
@@ -115,22 +108,22 @@ def nearest_partners(cad: CadSurface, points: Array, normals: Array) -> NearestP
         normal[other] = cad.normals[index]
         off = points[other] - cad.samples[index]
         distance[other], accept[other] = _accept_partners(off, normal[other], normals[other], 2 * cad.spacing)
-    return NearestPartners(distance, normal, accept)
+    return distance, normal, accept
 
 
 def _arrays(mesh: Any) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices and faces as libigl takes them."""
+    """Return vertices (V, 3) and faces (F, 3) as libigl takes them."""
     return np.ascontiguousarray(mesh.vertices, float), np.ascontiguousarray(mesh.faces, np.int64)
 
 
 def sample_partners(cad: CadSurface, points: Array, normals: Array) -> NDArray[np.int64]:
-    """Index of the sample nearest in place and direction to each point (N, 3) with normal (N, 3)."""
+    """Return the index of the sample nearest in place and direction to each point (N, 3) with normal (N, 3)."""
     query = np.ascontiguousarray(np.hstack([points, cad.reach * normals]))
     return np.asarray(cad.tree.query(query, k=1)[1], np.int64)
 
 
 def _accept_partners(off: Array, normal: Array, scan_normals: Array, loose: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Distance along the normal; a partner lies straight below its point, not beyond an edge of the surface."""
+    """Return distances along the normal, and which count: a partner lies straight below its point, not past an edge."""
     distance = np.einsum("ij,ij->i", off, normal)
     aside = np.linalg.norm(off - distance[:, None] * normal, axis=1)
     same = np.einsum("ij,ij->i", normal, scan_normals) > _SAME_SIDE
@@ -168,9 +161,9 @@ class Regions:
 
 
 def coverage(box: Box, cad: CadSurface, points: Array, normals: Array) -> float:
-    """Share of the CAD in the box, on its better seen side, that has a scanned point (N, 3) close by; part frame.
+    """Return the share of the CAD in a box (part frame) that has a scanned point (N, 3) close by.
 
-    Of a thin sheet only one side can be seen, so samples that look the way the scan's points in the box look count.
+    Of a thin sheet only one side can be seen, so the samples that look the way the scan's points in the box look count.
     """
     inside = box.holds(points)
     samples = np.flatnonzero(box.holds(cad.samples))
@@ -178,43 +171,40 @@ def coverage(box: Box, cad: CadSurface, points: Array, normals: Array) -> float:
         return 0.0
     facing = cad.normals[samples] @ normals[inside].mean(axis=0) > 0.5
     cell = max(3 * cad.spacing, float(np.ptp(cad.samples[samples], axis=0).max()) / 20)
-    wanted = {tuple(c) for c in np.floor(cad.samples[samples[facing]] / cell).astype(int)}
-    seen = {tuple(c) for c in np.floor(points[inside] / cell).astype(int)}
-    return len(wanted & seen) / max(len(wanted), 1)
+    visible = {tuple(c) for c in np.floor(cad.samples[samples[facing]] / cell).astype(int)}
+    scanned = {tuple(c) for c in np.floor(points[inside] / cell).astype(int)}
+    return len(visible & scanned) / max(len(visible), 1)
 
 
-def biweight(u: Array) -> Array:
-    """(...,) Tukey's weights, 1 at zero and 0 from |u| = 1 on."""
-    return np.where(np.abs(u) < 1, (1 - u**2) ** 2, 0.0)
-
-
-def biweight_slope(u: Array) -> Array:
-    """(...,) change of weight · u with u, for the normal matrix of a robust fit's covariance (Huber & Ronchetti)."""
+def tukey_slope(e: Array, scale: float) -> Array:
+    """Return the change (...) of weight · residual with the residual e (...), for the covariance of a robust fit."""
+    u = e / (TUKEY * scale)
     return np.where(np.abs(u) < 1, (1 - u**2) * (1 - 5 * u**2), 0.0)
 
 
-def cell_weights(points: Array, partners: NearestPartners, used: NDArray[np.bool_], cell: float, scale: float) -> Array:
-    """(N,) weight of each point's cell: a cube of edge `cell` (part frame) and a side that its points look to.
+def surface_cells(points: Array, normals: Array, cell: float) -> Indices:
+    """Return the cell (N,) of each point: a cube of edge `cell` (part frame) and a side that its points look to."""
+    key = np.hstack([np.floor(points / cell), np.round(normals)]).astype(np.int64)
+    return np.unique(key, axis=0, return_inverse=True)[1].ravel()
+
+
+def cell_weights(cells: Indices, distance: Array, used: NDArray[np.bool_], scale: float) -> Array:
+    """Return the weight (N,) of each point's cell (N,) by its mean distance.
 
     The scale is the cells' own spread (median), at least what the points' `scale` leaves in a mean: where a scan is
     only as good as its robot, all cells are off a little and none is thrown out for it.
     """
-    key = np.hstack([np.floor(points / cell), np.round(partners.normal)]).astype(np.int64)
-    _, where = np.unique(key, axis=0, return_inverse=True)
-    where = where.ravel()
-    count = np.bincount(where, used)
-    mean = np.bincount(where, used * partners.distance) / np.maximum(count, 1)
+    count = np.bincount(cells, used)
+    mean = np.bincount(cells, used * distance) / np.maximum(count, 1)
     full = count >= _MIN_CELL_POINTS
     if not full.any():
-        return np.ones(len(points))
-    floor = scale / np.sqrt(np.median(count[full]))
-    spread = max(MAD * float(np.median(np.abs(mean[full]))), float(floor))
-    weight = np.where(full, biweight(mean / (TUKEY * spread)), 1.0)
-    return weight[where]
+        return np.ones(len(cells))
+    spread = max(mad_sigma(mean[full]), float(scale / np.sqrt(np.median(count[full]))))
+    return np.where(full, tukey(mean, spread), 1.0)[cells]
 
 
 def sample_normal_space(scan: JoinedScans, T_base_part: Array) -> Indices:
-    """(n,) indices of at most 20,000 usable points, as many of each direction as there are to share out.
+    """Return indices (n,) of at most 20,000 usable points, as many of each direction as there are to share out.
 
     Args:
         T_base_part: (4, 4) near where the part lies: directions count in its frame.
@@ -222,12 +212,10 @@ def sample_normal_space(scan: JoinedScans, T_base_part: Array) -> Indices:
     usable = np.flatnonzero(scan.usable)
     directions = np.round(frames.rotate(frames.inverse(T_base_part), scan.normals[usable]) * _DIRECTIONS)
     _, bucket, counts = np.unique(directions.astype(int), axis=0, return_inverse=True, return_counts=True)
-    bucket = bucket.ravel()
     # The largest share per direction that keeps the sum within the points to draw.
     shares = range(1, _SAMPLED_POINTS + 1)
     quota = max(1, bisect_right(shares, _SAMPLED_POINTS, key=lambda share: np.minimum(counts, share).sum()))
-    order = np.argsort(bucket, kind="stable")
+    order = np.argsort(bucket.ravel(), kind="stable")
     first = np.cumsum(counts) - counts
     picked = [order[f + np.linspace(0, c - 1, min(quota, c)).astype(int)] for f, c in zip(first, counts, strict=True)]
-    chosen: Indices = usable[np.sort(np.concatenate(picked))] if picked else usable
-    return chosen
+    return usable[np.sort(np.concatenate(picked))] if picked else usable

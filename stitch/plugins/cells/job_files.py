@@ -1,18 +1,20 @@
-"""A cell's job file: its format, and checks of tables, words, numbers and file names.
+"""What the commands of all cells share: reading of job files and tables, and what they hand out.
 
-What every cell's command hands out beside its result: a Rerun recording, a page, a session folder.
+A job file is TOML with a format; its tables, words, numbers and file names are checked key by key. Handed out are
+tables of poses and columns, a session folder, a Rerun recording, a page, pictures and JSON.
 
 Recording, page and pictures come from whoever offers them under the entry points `stitch.cell_recordings`,
 `stitch.cell_reports` and `stitch.cell_pictures`, by the command's name.
 """
 
 import csv
+import json
 import math
 import reprlib
 import shlex
 import subprocess
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.metadata import entry_points
@@ -20,18 +22,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.output.session_files import TableColumns
+from stitch.output.session_files import SessionFiles, TableColumns, write_session, write_sessions
 from stitch.session.reading.csv_files import finite_number, read_csv_lines
 from stitch.session.reading.text_files import read_toml
 from stitch.system.files import whole_file
+from stitch.system.process import console
 
 # No length, angle or sigma of a cell lies outside; beyond, squares overflow or vanish.
-LOWEST_VALUE, HIGHEST_VALUE = 1e-12, 1e9
+LOWEST_VALUE = 1e-12
+HIGHEST_VALUE = 1e9
 # Points that lie within this share of their extent of one line leave the turn about it open.
 _FLAT = 1e-3
 POSE_COLUMNS = "x y z a_deg b_deg c_deg"
@@ -152,7 +157,7 @@ class CsvColumns:
     rows: int
 
     def stack(self, names: str) -> Array:
-        """Number columns (N, k) by their names, separated by blanks."""
+        """Return number columns (N, k) by their names, separated by blanks."""
         return np.column_stack([self.numbers[name] for name in names.split()])
 
 
@@ -236,44 +241,73 @@ def write_recording_and_page(command: str, recording: Path | None, report: Path 
                 writer.load()(*results, scratch)
 
 
+def hand_out(
+    command: str,
+    wanted: Wanted,
+    session: Callable[[], SessionFiles | list[SessionFiles]],
+    document: Callable[[], Any],
+    *results: Any,
+) -> Console | None:
+    """Write session, recording and page of a command's job and result (`results`), and its JSON, as far as wanted.
+
+    Args:
+        session, document: make the session or sessions, and the plain data for JSON.
+
+    Returns:
+        The terminal for people; None where JSON was wanted alone.
+
+    Raises:
+        InputError: as `write_recording_and_page`.
+    """
+    if wanted.session is not None:
+        files = session()
+        if isinstance(files, list):
+            write_sessions(wanted.session, files)
+        else:
+            write_session(wanted.session, files)
+    write_recording_and_page(command, wanted.recording, wanted.report, *results)
+    if not wanted.as_json:
+        return console()
+    print(json.dumps(document(), indent=1))
+    return None
+
+
 def fixed_digits(values: Array, digits: int) -> str:
-    """Numbers in a row of a table, without a negative zero."""
+    """Return numbers in a row of a table, without a negative zero."""
     return " ".join(f"{value:.{digits}f}" for value in np.round(values, digits) + 0.0)
 
 
 def on_a_line(points: Array) -> bool:
-    """Whether points (N, 3) lie on one line, or all in one place."""
+    """Return whether points (N, 3) lie on one line, or all in one place."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(len(points) < 2 or spread[1] <= _FLAT * max(spread[0], 1e-12))
 
 
 def poses_from_rows(numbers: Array) -> Array:
-    """Poses (..., 4, 4) from rows (..., 6)."""
-    numbers = np.asarray(numbers, float)
+    """Return poses (..., 4, 4) from rows (..., 6): x y z, and degrees about z, y', x''."""
     R = Rotation.from_euler("ZYX", numbers[..., 3:].reshape(-1, 3), degrees=True).as_matrix()
     return frames.make(R.reshape(*numbers.shape[:-1], 3, 3), numbers[..., :3])
 
 
 def rows_from_poses(poses: Array) -> Array:
-    """Rows (N, 6) from poses (N, 4, 4)."""
-    poses = np.asarray(poses, float)
+    """Return rows (N, 6) from poses (N, 4, 4), as `poses_from_rows` takes them."""
     return np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZYX", degrees=True)])
 
 
 def poses_from_columns(table: CsvColumns) -> Array:
-    """Poses (N, 4, 4) of a table that holds the six columns."""
+    """Return poses (N, 4, 4) of a table that holds the six columns."""
     return poses_from_rows(table.stack(POSE_COLUMNS))
 
 
 def write_poses(file: Path, key: str, names: Sequence[str], poses: Array) -> None:
-    """A CSV of named poses (N, 4, 4)."""
+    """Write a CSV of named poses (N, 4, 4)."""
     rows = np.round(rows_from_poses(poses), 6) + 0.0
     columns = {name: rows[:, i] for i, name in enumerate(POSE_COLUMNS.split())}
     write_columns(file, {key: list(names), **columns})
 
 
 def write_columns(file: Path, columns: Mapping[str, Sequence[object] | Array]) -> None:
-    """A CSV with a header; numbers keep nine digits."""
+    """Write a CSV with a header; numbers keep nine digits."""
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow(columns)
@@ -282,7 +316,7 @@ def write_columns(file: Path, columns: Mapping[str, Sequence[object] | Array]) -
 
 
 def points_table(views: Sequence[str], targets: Sequence[str], places: Array, sigma: Array | None) -> TableColumns:
-    """Columns view, target, x, y, z and, where it is known, sigma.
+    """Return the columns view, target, x, y, z and, where it is known, sigma.
 
     Args:
         views: N names, one for each point.
@@ -308,8 +342,8 @@ def call_machines(drive: str) -> None:
         raise InputError(f"--drive {drive}: {error}; to fix: write a program and its arguments") from None
     print(done.stdout, end="", file=sys.stderr)
     if done.returncode:
-        told = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        message = (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise NoResultError(
-            f"--drive {drive}: exit code {done.returncode}, {told}. The robots stand where it left them; to fix: see "
-            "its message, then call again"
+            f"--drive {drive}: exit code {done.returncode}, {message}. The robots stand where it left them; to fix: "
+            "see its message, then call again"
         )

@@ -1,14 +1,14 @@
 """Scans of a part from several robot poses, joined in the robot's base frame, and how their places may err.
 
-How far scans may lie from where the robot and the hand-eye put them.
-
-Each source is a sum of modes of unit variance: a small motion of points. A fit that answers a motion linearly takes
-up the covariance of all modes as the sum of its squared answers, whatever it fits.
+Scans lie where the robot and the hand-eye put them, and each of these errs (`PlacingErrors`). An error is a sum of
+modes of unit variance: small motions of points. A fit that answers a motion linearly takes up the covariance of all
+modes as the sum of its squared answers, whatever it fits.
 """
 
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +79,7 @@ class JoinedScans:
 
 
 def join_scans(scans: Sequence[Scan], T_base_scanner: Array) -> JoinedScans:
-    """One cloud of scans in their scanner frames and their poses (V, 4, 4)."""
+    """Return one cloud of scans in their scanner frames and their poses (V, 4, 4)."""
     pairs = list(zip(scans, T_base_scanner, strict=True))
     return JoinedScans(
         np.vstack([frames.transform(T, scan.points) for scan, T in pairs]),
@@ -93,14 +93,14 @@ def join_scans(scans: Sequence[Scan], T_base_scanner: Array) -> JoinedScans:
 
 
 def assemble_scans(placed: PlacedScans) -> JoinedScans:
-    """Normals, edges and noise of each scan, then one cloud."""
+    """Return one cloud of all scans, after normals, edges and noise of each."""
     pairs = zip(placed.names, placed.clouds, strict=True)
     joined = join_scans([prepare_scan(name, points) for name, points in pairs], placed.T_base_scanner)
     return replace(joined, carried=np.vstack(placed.carried)) if placed.carried else joined
 
 
 def read_scan_table(file: Path) -> PlacedScans:
-    """A table of scans: `file` and the scanner's pose in the base, x y z a_deg b_deg c_deg.
+    """Read a table of scans: `file` and the scanner's pose in the base, x y z a_deg b_deg c_deg.
 
     Raises:
         InputError: the table or a cloud is missing or malformed, or a cloud has too few points.
@@ -121,7 +121,7 @@ def read_scan_table(file: Path) -> PlacedScans:
 
 
 def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
-    """Scans of a session (scanner on the flange) placed by its reported poses and a hand-eye from a JSON file.
+    """Read a session's scans (scanner on the flange), placed by its reported poses and a hand-eye from a JSON file.
 
     With the columns of SWEEP in views.csv each scan is a sweep: points lie in the scanner's frame at their own time.
 
@@ -146,20 +146,20 @@ def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
     points = [cloud.points for cloud in clouds]
     if carried:
         back = (poses @ T_flange_scanner)[:, :3, :3]
-        points = [own + moved @ R for own, moved, R in zip(points, carried, back, strict=True)]
-    names, unit = tuple(session.names), session.length_unit
-    return PlacedScans(names, tuple(points), poses, T_flange_scanner, unit, carried, errors)
+        points = [cloud + moved @ R for cloud, moved, R in zip(points, carried, back, strict=True)]
+    names = tuple(session.names)
+    return PlacedScans(names, tuple(points), poses, T_flange_scanner, session.length_unit, carried, errors)
 
 
 def _sweeps(session: SessionData) -> tuple[Array, ...]:
-    """How far the flange had moved when each point was seen, (N, 3) a view; empty where no view is a sweep.
+    """Return how far the flange had moved when each point was seen, (N, 3) a view; empty where no view is a sweep.
 
     Raises:
         InputError: a sweep whose points have no time.
     """
     if not all(name in session.views[0].covariates for name in SWEEP):
         return ()
-    out = []
+    carried = []
     for view in session.views:
         times = {} if view.cloud is None else view.cloud.scalars
         if "time" not in times:
@@ -167,8 +167,8 @@ def _sweeps(session: SessionData) -> tuple[Array, ...]:
                 f"{session.path / 'views.csv'}: view {view.name} is a sweep, and the points of its cloud have no time; "
                 "to fix: write the scalar time, s after the pose of the view, or leave out sweep_x, sweep_y, sweep_z"
             )
-        out.append(times["time"][:, None] * np.array([view.covariates[name] for name in SWEEP]))
-    return tuple(out)
+        carried.append(times["time"][:, None] * np.array([view.covariates[name] for name in SWEEP]))
+    return tuple(carried)
 
 
 def read_hand_eye(file: Path, length_unit: str, T_base_flange: Array) -> tuple[Array, "PlacingErrors"]:
@@ -218,9 +218,10 @@ class PlacingErrors:
     scanner: float = 0.0  # rms over the field of the scanner's smooth error along the ray, the same in all views
 
     def modes(self, scan: JoinedScans, source: str) -> Iterator[tuple[Indices, Array]]:
-        """Modes of one of SOURCES: which points move (M,), and by how much in the base frame (M, 3)."""
+        """Yield the modes of one of SOURCES: which points move (M,), and by how much in the base frame (M, 3)."""
         # Where a sweep's points would lie had the flange not moved: what errs, errs about the flange then.
-        everything, still = np.arange(len(scan.points)), scan.points - scan.carried
+        still = scan.points - scan.carried
+        everything = np.arange(len(scan.points))
         if source == "hand_eye":
             T = self.T_base_flange @ self.T_flange_scanner
             values, vectors = np.linalg.eigh(self.hand_eye)
@@ -229,33 +230,32 @@ class PlacingErrors:
                     yield everything, _moved(T[scan.view], still, xi)
         elif source == "robot":
             for view in np.unique(scan.view):
-                own = np.flatnonzero(scan.view == view)
+                index = np.flatnonzero(scan.view == view)
                 for xi in np.diag(np.repeat([self.rotation, self.translation], 3)):
                     if xi.any():
-                        yield own, _moved(self.T_base_flange[view], still[own], xi)
+                        yield index, _moved(self.T_base_flange[view], still[index], xi)
         elif self.scanner:
             yield from ((everything, self.scanner * mode) for mode in self._field_modes(scan))
 
     def _field_modes(self, scan: JoinedScans) -> Iterator[Array]:
         T = (self.T_base_flange @ self.T_flange_scanner)[scan.view]
         ray = scan.points - scan.carried - T[:, :3, 3]
-        seen = np.einsum("nji,nj->ni", T[:, :3, :3], ray)
-        image = seen[:, :2] / seen[:, 2:]
+        local = np.einsum("nji,nj->ni", T[:, :3, :3], ray)
+        image = local[:, :2] / local[:, 2:]
         # From −1 to 1 over what was scanned of the field.
-        low, high = image.min(axis=0), image.max(axis=0)
+        low = image.min(axis=0)
+        high = image.max(axis=0)
         scaled = 2 * (image - low) / np.maximum(high - low, 1e-12) - 1
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         u, v = (np.polynomial.legendre.legvander(axis, _FIELD_DEGREE) for axis in scaled.T)
-        orders = [
-            (i, j) for i in range(_FIELD_DEGREE + 1) for j in range(_FIELD_DEGREE + 1) if 0 < i + j <= _FIELD_DEGREE
-        ]
+        orders = [order for order in product(range(_FIELD_DEGREE + 1), repeat=2) if 0 < sum(order) <= _FIELD_DEGREE]
         for i, j in orders:
             size = np.sqrt((2 * i + 1) * (2 * j + 1) / len(orders))
             yield ray * (size * u[:, i] * v[:, j])[:, None]
 
 
 def _moved(T: Array, points: Array, xi: Array) -> Array:
-    """(M, 3) motion in the base frame of points (M, 3) when frames T (4, 4) or (M, 4, 4) become T · exp(ξ)."""
+    """Return the motion (M, 3), base frame, of points (M, 3) when frames T (4, 4) or (M, 4, 4) become T · exp(ξ)."""
     R, t = T[..., :3, :3], T[..., :3, 3]
     local = np.einsum("...ji,...j->...i", R, points - t)
     return np.einsum("...ij,...j->...i", R, np.cross(xi[:3], local) + xi[3:])

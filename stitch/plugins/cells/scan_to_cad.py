@@ -1,6 +1,7 @@
-"""Scan onto CAD: point to plane, robustly weighted, on points that look all ways.
+"""Scan onto CAD: a start without a guess, the fit with its covariance, an allowance, and the map of deviations.
 
-The allowance beside the pose: scale, shrinkage, what can be told, and the result.
+The fit is point to plane, robustly weighted, on points that look all ways. Beside the pose it finds the allowance: the
+stock that a casting has on its CAD.
 
 From mean(d²) = Var(d) + mean(d)² a cost Var(d) + λ·mean(d)² can be chosen; the ordinary fit has λ = 1. With an
 unknown allowance λ = 0: only the variance of the distances is made small (variance-minimisation matching), and their
@@ -9,7 +10,7 @@ and below the allowance are two classes, plus and minus, each with its own scale
 both: gates, risers and flash all stand on one side.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import permutations, product
 from pathlib import Path
 
@@ -22,19 +23,17 @@ from scipy.spatial import cKDTree
 
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import feature_matching, frames
+from stitch.numerics.distributions import TUKEY, mad_sigma, tukey
 from stitch.numerics.frames import Array, Indices
 from stitch.plugins.cells.cad import (
-    MAD,
-    TUKEY,
     CadSurface,
-    NearestPartners,
     Regions,
-    biweight,
-    biweight_slope,
     cell_weights,
     nearest_partners,
     sample_normal_space,
     sample_partners,
+    surface_cells,
+    tukey_slope,
 )
 from stitch.plugins.cells.job_files import write_columns
 from stitch.plugins.cells.placed_scans import SOURCES, JoinedScans, PlacingErrors
@@ -112,7 +111,7 @@ class Allowance:
 
 
 def read_allowance(text: str | None) -> AllowancePrior:
-    """What `--allowance` asks for: `free`, `varying` or a number.
+    """Return what `--allowance` asks for: `free`, `varying` or a number.
 
     Raises:
         InputError: neither.
@@ -130,7 +129,7 @@ def read_allowance(text: str | None) -> AllowancePrior:
 
 
 def allowance_columns(points: Array, cad: CadSurface, prior: AllowancePrior) -> Array:
-    """(N, K) allowance at points (N, 3), part frame, per unit of each number that is to be found."""
+    """Return the allowance (N, K) at points (N, 3), part frame, per unit of each number that is to be found."""
     if not prior.free:
         return np.zeros((len(points), 0))
     ones = np.ones((len(points), 1))
@@ -144,7 +143,7 @@ def allowance_columns(points: Array, cad: CadSurface, prior: AllowancePrior) -> 
 
 
 def allowance_sentence(allowance: Allowance, length_unit: str | None) -> str:
-    """Its size with sigma, and what the sign means; None: nobody says in which unit."""
+    """Say its size with sigma, and what the sign means; None: nobody says in which unit."""
     unit = f" {length_unit}" if length_unit else ""
     if not allowance.prior.free:
         return f"Allowance {allowance.value:+.4g}{unit} as stated (plus: stock outside the CAD)."
@@ -163,16 +162,16 @@ def allowance_sentence(allowance: Allowance, length_unit: str | None) -> str:
 
 
 def robust_spread(rest: Array, prior: AllowancePrior) -> float:
-    """Robust sigma of distances (N,) less their allowance: of the cleaner class where one is to be found."""
+    """Return the robust sigma of distances (N,) less their allowance: of the cleaner class where one is to be found."""
     if prior.free:
-        sides = [np.abs(rest[rest >= 0]), np.abs(rest[rest < 0])]
+        sides = [rest[rest >= 0], rest[rest < 0]]
         if min(map(len, sides)) >= _CLASS * len(rest):
-            return MAD * min(float(np.median(side)) for side in sides)
-    return MAD * float(np.median(np.abs(rest)))
+            return min(map(mad_sigma, sides))
+    return mad_sigma(rest)
 
 
 def separable_share(N: Array) -> float:
-    """Share of an even allowance that no motion of the part imitates, from the normal matrix (6 + K, 6 + K).
+    """Return the share of an even allowance that no motion of the part imitates, from the normal matrix (6 + K, 6 + K).
 
     Raises:
         NoResultError: next to nothing; says which motion does.
@@ -190,7 +189,7 @@ def separable_share(N: Array) -> float:
 
 
 def varying_ridge(N: Array, coefficients: Array, scale: float, before: float) -> tuple[Array, float]:
-    """(6 + K,) what shrinks the varying part, in units of N, and its size τ by MacKay's evidence (1992).
+    """Return what shrinks the varying part (6 + K,), in units of N, and its size τ by MacKay's evidence (1992).
 
     Pose and mean are free. Of a flat field the evidence lets τ fall to nothing.
 
@@ -213,7 +212,7 @@ def varying_ridge(N: Array, coefficients: Array, scale: float, before: float) ->
 def summarise_allowance(
     points: Array, cad: CadSurface, prior: AllowancePrior, coefficients: Array, covariance: Array, N: Array
 ) -> Allowance | None:
-    """The allowance as people want it, over the fit's points (N, 3), part frame; None where none was spoken of.
+    """Return the allowance as people want it, over the fit's points (N, 3), part frame; None where none was spoken of.
 
     Args:
         covariance: of pose and coefficients, (6 + K, 6 + K).
@@ -222,7 +221,9 @@ def summarise_allowance(
     if prior == AllowancePrior():
         return None
     B = allowance_columns(points, cad, prior)
-    local, C, mean = prior.known + B @ coefficients, covariance[6:, 6:], B.mean(axis=0)
+    local = prior.known + B @ coefficients
+    C = covariance[6:, 6:]
+    mean = B.mean(axis=0)
     return Allowance(
         value=prior.known + float(mean @ coefficients),
         sigma=float(np.sqrt(mean @ C @ mean)),
@@ -234,9 +235,6 @@ def summarise_allowance(
         coefficients=coefficients,
         cad=cad,
     )
-
-
-NO_ALLOWANCE = AllowancePrior()
 
 
 @dataclass(frozen=True)
@@ -263,7 +261,7 @@ def fit_cad(
     cad: CadSurface,
     T_base_part: Array,
     regions: Regions | None = None,
-    prior: AllowancePrior = NO_ALLOWANCE,
+    prior: AllowancePrior | None = None,
     errors: PlacingErrors | None = None,
 ) -> CadFit:
     """Refine a coarse T_base_part (4, 4) until it stands still, and with it the allowance if it is wanted.
@@ -279,110 +277,93 @@ def fit_cad(
     Raises:
         NoResultError: too few points meet the CAD, or the surface leaves a direction or the allowance open.
     """
+    prior = prior or AllowancePrior()
     scan = scan.take(sample_normal_space(scan, T_base_part))
     noise = scan.noise if np.isfinite(scan.noise) else 0.0
-    scale, by_cell = cad.size / 100, False
-    numbers, size = np.zeros(prior.columns), cad.size / 100
+    scale = size = cad.size / 100
+    by_cell = False
+    numbers = np.zeros(prior.columns)
     for _ in range(_ROUNDS):
-        seen = _find_correspondences(scan, cad, T_base_part, regions, prior)
-        rest = seen.partners.distance - prior.known - seen.stock @ numbers
+        T = frames.inverse(T_base_part)
+        local = frames.transform(T, scan.points)
+        distance, normal, used = nearest_partners(cad, local, frames.rotate(T, scan.normals))
+        used = used if regions is None else used & regions.used(local)
+        if used.sum() < _MIN_FIT_POINTS:
+            raise NoResultError(
+                f"{used.sum()} points meet the CAD; to fix: check the start, the regions and the CAD's unit"
+            )
+        stock = allowance_columns(local, cad, prior)
+        design = np.hstack([frames.plane_rows(local - cad.centre, normal), -stock])
+        rest = distance - prior.known - stock @ numbers
         # The gate closes by half a round at most, so that a bad start can still be pulled in.
-        spread = robust_spread(rest[seen.used], prior)
+        spread = robust_spread(rest[used], prior)
         scale = max(spread, 0.5 * scale, noise)
-        weight = np.asarray(seen.used * biweight(rest / (TUKEY * scale)))
+        weight = used * tukey(rest, scale)
         if by_cell:
-            left = replace(seen.partners, distance=rest)
-            weight = weight * cell_weights(seen.local, left, seen.used, cad.size / _CELLS, scale)
-        N = _normal_matrix(seen.design, weight, cad)
+            weight = weight * cell_weights(surface_cells(local, normal, cad.size / _CELLS), rest, used, scale)
+        N = _normal_matrix(design, weight, cad)
         shrink, size = varying_ridge(N, numbers, scale, size)
         pull = np.concatenate([np.zeros(6), numbers]) * shrink
-        step = np.asarray(np.linalg.solve(N + np.diag(shrink), -seen.design.T @ (weight * rest) - pull), np.float64)
-        T_base_part, numbers = moved_about(T_base_part, step[:6], cad.centre), numbers + step[6:]
+        step: Array = np.linalg.solve(N + np.diag(shrink), -design.T @ (weight * rest) - pull)
+        T_base_part = moved_about(T_base_part, step[:6], cad.centre)
+        numbers = numbers + step[6:]
         if np.abs(step[3:]).max() < _STILL * cad.size and scale <= 1.05 * max(spread, noise):
             if by_cell:
                 break
             by_cell = True
-    parts = _covariances(scan, seen, rest, weight, scale=scale, shrink=shrink, T_base_part=T_base_part, errors=errors)
+    modes = {} if errors is None else {source: list(errors.modes(scan, source)) for source in SOURCES}
+    normals = frames.rotate(T_base_part, normal)
+    parts = _covariances(design, rest, weight, scale=scale, shrink=shrink, normals=normals, modes=modes)
     covariance = sum(parts.values(), np.zeros_like(N))
-    used = rest[seen.used]
+    allowance = summarise_allowance(local[used], cad, prior, numbers, covariance, N)
+    rest = rest[used]
     return CadFit(
         T_base_part,
         covariance=covariance[:6, :6],
         parts={name: part[:6, :6] for name, part in parts.items()},
         scale=scale,
-        rms=float(np.sqrt((used**2).mean())),
-        inliers=float(np.mean(np.abs(used) < 0.54 * TUKEY * scale)),
-        points=len(used),
-        allowance=summarise_allowance(seen.local[seen.used], cad, prior, numbers, covariance, N),
+        rms=float(np.sqrt((rest**2).mean())),
+        inliers=float(np.mean(np.abs(rest) < 0.54 * TUKEY * scale)),
+        points=len(rest),
+        allowance=allowance,
     )
 
 
 def moved_about(T_base_part: Array, step: Array, centre: Array) -> Array:
-    """The pose (4, 4) after a Gauss-Newton step, a twist (6,) about a centre (3,) of the part."""
+    """Return the pose (4, 4) after a Gauss-Newton step, a twist (6,) about a centre (3,) of the part."""
     return T_base_part @ frames.inverse(frames.moved_about(centre, step, np.eye(4)))
 
 
 def _covariances(
-    scan: JoinedScans,
-    seen: "_Correspondences",
+    design: Array,
     rest: Array,
     weight: Array,
     *,
     scale: float,
     shrink: Array,
-    T_base_part: Array,
-    errors: PlacingErrors | None,
+    normals: Array,
+    modes: dict[str, list[tuple[Indices, Array]]],
 ) -> dict[str, Array]:
-    """Covariances (6 + K, 6 + K) by source.
+    """Return covariances (6 + K, 6 + K) by source: of the scan's noise, and of the `modes` in which points move.
 
     Of the noise a sandwich: the weights are not the inverse variances (Huber & Ronchetti 2009, ch. 7). What is shrunk
     is as large as believed, which is an error of its own. Of misplaced scans the sum of the fit's squared answers.
     """
-    design, u = seen.design, rest / (TUKEY * scale)
-    slope = np.where(weight > 0, weight / np.maximum(biweight(u), 1e-12) * biweight_slope(u), 0.0)
+    robust = np.maximum(tukey(rest, scale), 1e-12)
+    slope = np.where(weight > 0, weight / robust * tukey_slope(rest, scale), 0.0)
     inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, slope, design) + np.diag(shrink))
     meat = np.einsum("ni,n,nj->ij", design, (weight * rest) ** 2, design) + np.diag(shrink) * scale**2
-    out = {"scan": np.asarray(inverse @ meat @ inverse)}
-    if errors is not None:
-        normals = frames.rotate(T_base_part, seen.partners.normal)
-        for source in SOURCES:
-            answers = [
-                inverse @ (design[own].T @ (slope[own] * np.einsum("ni,ni->n", normals[own], moved)))
-                for own, moved in errors.modes(scan, source)
-            ]
-            out[source] = sum((np.outer(a, a) for a in answers), np.zeros_like(inverse))
-    return out
-
-
-@dataclass(frozen=True)
-class _Correspondences:
-    """N points at one pose: part frame, partners, which may count, and how distances answer."""
-
-    local: Array  # (N, 3)
-    partners: NearestPartners
-    used: NDArray[np.bool_]  # (N,)
-    stock: Array  # (N, K) columns of the allowance
-    design: Array  # (N, 6 + K) of the twist about the CAD's centre and the allowance
-
-
-def _find_correspondences(
-    scan: JoinedScans, cad: CadSurface, T_base_part: Array, regions: Regions | None, prior: AllowancePrior
-) -> _Correspondences:
-    T = frames.inverse(T_base_part)
-    local = frames.transform(T, scan.points)
-    found = nearest_partners(cad, local, frames.rotate(T, scan.normals))
-    used = found.accept if regions is None else found.accept & regions.used(local)
-    if used.sum() < _MIN_FIT_POINTS:
-        raise NoResultError(
-            f"{used.sum()} points meet the CAD; to fix: check the start, the regions and the CAD's unit"
-        )
-    stock = allowance_columns(local, cad, prior)
-    design = np.hstack([frames.plane_rows(local - cad.centre, found.normal), -stock])
-    return _Correspondences(local, found, used, stock, design)
+    covariances = {"scan": inverse @ meat @ inverse}
+    for source, motions in modes.items():
+        covariances[source] = np.zeros_like(inverse)
+        for index, moved in motions:
+            answer = inverse @ (design[index].T @ (slope[index] * np.einsum("ni,ni->n", normals[index], moved)))
+            covariances[source] = covariances[source] + np.outer(answer, answer)
+    return covariances
 
 
 def _normal_matrix(design: Array, weight: Array, cad: CadSurface) -> Array:
-    """(6 + K, 6 + K) of a Gauss-Newton step: a twist about the CAD's centre, and the numbers of the allowance."""
+    """Return the matrix (6 + K, 6 + K) of a step: a twist about the CAD's centre, and the numbers of the allowance."""
     N = np.einsum("ni,n,nj->ij", design, weight, design)
     units = np.repeat([cad.size / 2, 1.0], 3)
     values = np.linalg.eigvalsh(N[:6, :6] / np.outer(units, units))
@@ -396,20 +377,16 @@ def _normal_matrix(design: Array, weight: Array, cad: CadSurface) -> Array:
     return N
 
 
-@dataclass(frozen=True)
-class CadStart:
-    """A coarse pose and how well it stands against the next best different one."""
+def find_cad_start(scan: JoinedScans, cad: CadSurface) -> tuple[Array, float, float]:
+    """Return a coarse pose, and how well it stands against the next best different one.
 
-    T_base_part: Array  # (4, 4)
-    share: float  # of the scan's points that meet the CAD
-    runner_up: float  # the same of the best pose elsewhere; close to `share` means a symmetric part
+    Tried are the 24 ways to lay principal axes on principal axes, and feature matches where none of them meets.
+    Features are FPFH with RANSAC (Rusu et al. 2009): they serve where the scan shows only a piece of the part,
+    principal axes where it is too smooth for features.
 
-
-def find_cad_start(scan: JoinedScans, cad: CadSurface) -> CadStart:
-    """Try the 24 ways to lay principal axes on principal axes, and feature matches where none of them meets; refine.
-
-    Features are FPFH with RANSAC (Rusu et al. 2009): they serve where the scan shows only a piece of
-    the part, principal axes where it is too smooth for features.
+    Returns:
+        T_base_part (4, 4); the share of the scan's points that meet the CAD there; the same of the best pose elsewhere,
+        which is close to the first for a symmetric part.
 
     Raises:
         NoResultError: no candidate brings a third of the scan onto the CAD.
@@ -420,7 +397,8 @@ def find_cad_start(scan: JoinedScans, cad: CadSurface) -> CadStart:
         )
     index = _spread_sample(scan)
     points, normals = scan.points[index], scan.normals[index]
-    gate, fine = cad.size / 25, cad.size / 250
+    gate = cad.size / 25
+    fine = cad.size / 250
     ranked = sorted(_axis_candidates(points, cad), key=lambda T: -_inlier_share(T, points, normals, cad, gate))
     refined = [_refine(T, points, normals, cad, gate) for T in ranked[:_KEEP]]
     shares = [_inlier_share(T, points, normals, cad, fine) for T in refined]
@@ -437,11 +415,11 @@ def find_cad_start(scan: JoinedScans, cad: CadSurface) -> CadStart:
             f"scan and CAD do not meet: {shares[best]:.0%} of the points at best; to fix: check the CAD's unit, "
             "or cut away what is not the part"
         )
-    return CadStart(refined[best], shares[best], max(elsewhere, default=0.0))
+    return refined[best], shares[best], max(elsewhere, default=0.0)
 
 
 def _spread_sample(scan: JoinedScans) -> Indices:
-    """Indices of points evenly over the surface: one per voxel, then evenly thinned."""
+    """Return indices of points evenly over the surface: one per voxel, then evenly thinned."""
     usable = np.flatnonzero(scan.usable)
     size = np.ptp(scan.points[usable], axis=0).max() / 70
     _, first = np.unique(np.floor(scan.points[usable] / size).astype(int), axis=0, return_index=True)
@@ -450,56 +428,49 @@ def _spread_sample(scan: JoinedScans) -> Indices:
         raise NoResultError(
             f"the scans reach over {70 * size:.3g}, mostly empty; to fix: correct a scanner's pose, or cut them"
         )
-    picked: Indices = kept[even_indices(len(kept), _START_POINTS)]
-    return picked
+    return kept[even_indices(len(kept), _START_POINTS)]
 
 
 def _axis_candidates(points: Array, cad: CadSurface) -> list[Array]:
-    """The 24 turns that lay the scan's principal axes onto the CAD's."""
+    """Return poses (4, 4) by the 24 turns that lay the scan's principal axes onto the CAD's."""
     clouds = (points, cad.samples[::20])
     scan_axes, cad_axes = (np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2] for p in clouds)
     turns = [np.eye(3)[list(p)] * signs for p in permutations(range(3)) for signs in product((1, -1), repeat=3)]
-    found = []
-    for turn in turns:
-        R = scan_axes.T @ turn @ cad_axes
-        if np.linalg.det(R) > 0:
-            found.append(frames.make(R, points.mean(axis=0) - R @ cad.samples.mean(axis=0)))
-    return found
+    rotations = [scan_axes.T @ turn @ cad_axes for turn in turns]
+    middles = points.mean(axis=0), cad.samples.mean(axis=0)
+    return [frames.make(R, middles[0] - R @ middles[1]) for R in rotations if np.linalg.det(R) > 0]
 
 
 def _feature_candidates(points: Array, normals: Array, cad: CadSurface) -> list[Array]:
-    """Poses (4, 4) from feature matching, one per seed."""
+    """Return poses (4, 4) from feature matching, one per seed."""
     size = cad.size / 60
     step = max(1, len(cad.samples) // _FEATURE_SAMPLES)
     scan = feature_matching.compute_fpfh(points, normals, 5 * size)
     part = feature_matching.compute_fpfh(cad.samples[::step], cad.normals[::step], 5 * size)
-    found = []
-    for seed in range(_FEATURE_RUNS):
-        T_part_base = feature_matching.register_ransac(scan, part, reach=1.5 * size, draws=_FEATURE_DRAWS, seed=seed)
-        found.append(frames.inverse(T_part_base))
-    return found
-
-
-def _partners(T_base_part: Array, points: Array, normals: Array, cad: CadSurface) -> tuple[Array, Array, Array]:
-    """Points in the part frame, their samples and the samples' normals."""
-    T = frames.inverse(T_base_part)
-    local = frames.transform(T, points)
-    index = sample_partners(cad, local, frames.rotate(T, normals))
-    return local, cad.samples[index], cad.normals[index]
+    return [
+        frames.inverse(feature_matching.register_ransac(scan, part, reach=1.5 * size, draws=_FEATURE_DRAWS, seed=seed))
+        for seed in range(_FEATURE_RUNS)
+    ]
 
 
 def _inlier_share(T_base_part: Array, points: Array, normals: Array, cad: CadSurface, gate: float) -> float:
-    local, samples, directions = _partners(T_base_part, points, normals, cad)
-    seen = frames.rotate(frames.inverse(T_base_part), normals)
-    same = np.einsum("ij,ij->i", seen, directions) > 0.8
-    return float(np.mean(same & (np.linalg.norm(local - samples, axis=1) < gate)))
+    """Return the share of the points whose nearest sample is nearer than the gate and looks the same way."""
+    T = frames.inverse(T_base_part)
+    local = frames.transform(T, points)
+    directions = frames.rotate(T, normals)
+    index = sample_partners(cad, local, directions)
+    same = np.einsum("ij,ij->i", directions, cad.normals[index]) > 0.8
+    return float(np.mean(same & (np.linalg.norm(local - cad.samples[index], axis=1) < gate)))
 
 
 def _refine(T_base_part: Array, points: Array, normals: Array, cad: CadSurface, gate: float) -> Array:
-    """Point-to-plane steps with a gate that closes to a tenth."""
+    """Return the pose (4, 4) after point-to-plane steps with a gate that closes to a tenth."""
     for width in gate * np.geomspace(4.0, 0.1, _REFINE):
-        local, samples, directions = _partners(T_base_part, points, normals, cad)
-        off = local - samples
+        T = frames.inverse(T_base_part)
+        local = frames.transform(T, points)
+        index = sample_partners(cad, local, frames.rotate(T, normals))
+        off = local - cad.samples[index]
+        directions = cad.normals[index]
         near = np.linalg.norm(off, axis=1) < max(width, 3 * cad.spacing)
         if near.sum() < 12:
             break
@@ -514,28 +485,26 @@ def _refine(T_base_part: Array, points: Array, normals: Array, cad: CadSurface, 
 
 
 @dataclass(frozen=True)
-class DeviationCells:
-    """C cells of the map: points of one cube that look the same way, averaged."""
-
-    middle: Array  # (C, 3) part frame
-    mean: Array  # (C,) deviation, positive outside
-    spread: Array  # (C,) 1-sigma of the points
-    count: NDArray[np.int64]  # (C,)
-
-
-@dataclass(frozen=True)
 class Deviations:
-    """N points that have a place on the CAD, part frame."""
+    """N points that have a place on the CAD, part frame, and C cells: points of one cube that look the same way."""
 
     points: Array  # (N, 3)
     distance: Array  # (N,) positive outside
     tolerance: float
-    cells: DeviationCells
+    middle: Array  # (C, 3) of a cell
+    mean: Array  # (C,) deviation of a cell
+    spread: Array  # (C,) 1-sigma of its points
+    count: NDArray[np.int64]  # (C,)
 
     @property
     def outside(self) -> NDArray[np.bool_]:
         """(C,) cells whose mean is beyond the tolerance."""
-        return np.abs(self.cells.mean) > self.tolerance
+        return np.abs(self.mean) > self.tolerance
+
+    @property
+    def worst(self) -> int:
+        """Index of the cell that is out most."""
+        return int(np.argmax(np.abs(self.mean)))
 
 
 def measure_deviations(
@@ -546,7 +515,7 @@ def measure_deviations(
     cell: float,
     allowance: Allowance | None = None,
 ) -> Deviations:
-    """Distances of all usable points from the CAD, or from the CAD with its allowance; cells average the noise away.
+    """Return distances of all usable points from the CAD with its allowance; cells average the noise away.
 
     Args:
         T_base_part: (4, 4) where the part lies.
@@ -554,13 +523,13 @@ def measure_deviations(
     """
     T = frames.inverse(T_base_part)
     local = frames.transform(T, scan.points[scan.usable])
-    found = nearest_partners(cad, local, frames.rotate(T, scan.normals[scan.usable]))
-    points, distance, normal = local[found.accept], found.distance[found.accept], found.normal[found.accept]
+    distance, normal, accept = nearest_partners(cad, local, frames.rotate(T, scan.normals[scan.usable]))
+    points = local[accept]
+    distance = distance[accept]
     if allowance is not None:
         distance = distance - allowance.at(points)
-    key = np.hstack([np.floor(points / cell), np.round(normal)]).astype(np.int64)
-    _, where, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    where = where.ravel()
+    where = surface_cells(points, normal[accept], cell)
+    count = np.bincount(where)
 
     def mean(values: Array) -> Array:
         return np.bincount(where, values, len(count)) / count
@@ -569,12 +538,11 @@ def measure_deviations(
     middle = np.column_stack([mean(points[:, k]) for k in range(3)])
     spread = np.sqrt(np.maximum(mean((distance - average[where]) ** 2), 0.0))
     full = count >= _MIN_MAP_POINTS
-    cells = DeviationCells(middle[full], average[full], spread[full], count[full].astype(np.int64))
-    return Deviations(points, distance, tolerance, cells)
+    return Deviations(points, distance, tolerance, middle[full], average[full], spread=spread[full], count=count[full])
 
 
 def write_deviation_ply(file: Path, deviations: Deviations) -> None:
-    """Points with the scalar `deviation` and a colour: blue inside, red outside, full at the tolerance."""
+    """Write points with the scalar `deviation` and a colour: blue inside, red outside, full at the tolerance."""
     share = np.clip(deviations.distance / deviations.tolerance, -1, 1)
     vertex = np.empty(
         len(share), [(n, "f4") for n in ("x", "y", "z", "deviation")] + [(n, "u1") for n in ("red", "green", "blue")]
@@ -588,16 +556,16 @@ def write_deviation_ply(file: Path, deviations: Deviations) -> None:
 
 
 def write_deviation_csv(file: Path, deviations: Deviations) -> None:
-    """One row per cell, the worst first."""
-    c, order = deviations.cells, np.argsort(-np.abs(deviations.cells.mean))
-    columns = {axis: c.middle[order, k] for k, axis in enumerate("xyz")}
-    columns |= {"deviation": c.mean[order], "spread": c.spread[order]}
+    """Write one row per cell, the worst first."""
+    order = np.argsort(-np.abs(deviations.mean))
+    columns = {axis: deviations.middle[order, k] for k, axis in enumerate("xyz")}
+    columns |= {"deviation": deviations.mean[order], "spread": deviations.spread[order]}
     verdicts = ["bad" if bad else "good" for bad in deviations.outside[order]]
-    write_columns(file, {**columns, "points": c.count[order].tolist(), "verdict": verdicts})
+    write_columns(file, {**columns, "points": deviations.count[order].tolist(), "verdict": verdicts})
 
 
 def split_instances(scan: JoinedScans, cad: CadSurface, count: int) -> list[JoinedScans]:
-    """The scan's heaps of points, linked where nearer than the gap between parts, largest first.
+    """Return the scan's heaps of points, linked where nearer than the gap between parts, largest first.
 
     Raises:
         NoResultError: fewer heaps of a part's size than wanted.

@@ -7,8 +7,9 @@ import numpy as np
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
+from stitch.numerics.distributions import mad_sigma, tukey
 from stitch.numerics.frames import Array
-from stitch.plugins.cells.cad import MAD, TUKEY, biweight, biweight_slope
+from stitch.plugins.cells.cad import tukey_slope
 from stitch.plugins.cells.placed_scans import SOURCES, JoinedScans, PlacingErrors
 
 # Fewer points of a surface or flank fix no edge to a twentieth of a millimetre.
@@ -22,24 +23,17 @@ _ALONG, _ACROSS, _DEPTH = 12.0, 40.0, 20.0
 VERDICTS = ("good", "bad", "open", "not measured")
 
 
-@dataclass(frozen=True)
-class SeamEdge:
-    """In the station's frame: across the seam, height over the surface."""
-
-    across: float
-    height: float
-    covariance: Array  # (2, 2) of (across, height)
-    moved: Array  # (2, P) of it by each of P motions of the points
-
-
-def find_edge(points: Array, normals: Array, facing: float, moves: Array | None = None) -> SeamEdge:
-    """Fit the outer surface (bent both ways) and the flank (straight down, bent along), intersect them at the station.
+def find_edge(points: Array, normals: Array, facing: float, moves: Array | None = None) -> tuple[Array, Array, Array]:
+    """Return where outer surface (bent both ways) and flank (straight down, bent along) meet at the station.
 
     Args:
         points: (N, 3) across, along and height in the station's frame, of one side of the seam only; length in mm.
         normals: (N, 3) in the same frame.
         facing: +1 if the flank looks towards positive `across`, else −1.
         moves: (P, N, 3) small motions of the points to which the edge's answer is wanted.
+
+    Returns:
+        The edge (2,) across the seam and in height over the surface, its covariance (2, 2), its answers (2, P).
 
     Raises:
         NoResultError: the surface or the flank was not seen; names which.
@@ -76,11 +70,11 @@ def find_edge(points: Array, normals: Array, facing: float, moves: Array | None 
     change = np.vstack(
         [surface_gain @ (along[:, top] / up[top]).T, wall_gain @ (along[:, flank] / normals[flank, 0]).T]
     )
-    return SeamEdge(float(place[0]), float(place[1]), J @ spread @ J.T, J @ change)
+    return place, J @ spread @ J.T, J @ change
 
 
 def _meet(surface: Array, wall: Array, rim: float) -> Array:
-    """(across, height) where both hold at the station itself (along = 0)."""
+    """Return (across, height) where both hold at the station itself (along = 0)."""
     a = rim
     for _ in range(50):
         h = surface[0] + surface[1] * (a - rim) + surface[3] * (a - rim) ** 2
@@ -89,7 +83,7 @@ def _meet(surface: Array, wall: Array, rim: float) -> Array:
 
 
 def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Coefficients, their covariance and their change per value, of a linear fit with Tukey weights, 20 rounds.
+    """Return coefficients, their covariance and their change per value, of a linear fit with Tukey weights, 20 rounds.
 
     What a facet or a bend leaves is shared by neighbours, so the covariance counts cubes of points (N, 3) and not
     points as independent (cluster-robust sandwich, Liang & Zeger 1986).
@@ -97,22 +91,18 @@ def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array, 
     weight = np.ones(len(values))
     for _ in range(20):
         root = np.sqrt(weight)
-        found = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
-        residual = values - design @ found
-        scale = max(MAD * float(np.median(np.abs(residual))), 1e-9)
-        weight = biweight(residual / (TUKEY * scale))
-    slope = biweight_slope(residual / (TUKEY * scale))
+        coefficients: Array = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
+        residual = values - design @ coefficients
+        scale = max(mad_sigma(residual), 1e-9)
+        weight = tukey(residual, scale)
+    slope = tukey_slope(residual, scale)
     inverse = np.linalg.inv(np.einsum("ni,n,nj->ij", design, slope, design))
     _, cube = np.unique(np.floor(points / _CUBE).astype(int), axis=0, return_inverse=True)
     scores = np.zeros((cube.max() + 1, design.shape[1]))
     np.add.at(scores, cube.ravel(), design * (weight * residual)[:, None])
     cubes, unknowns = scores.shape
     few = cubes / max(cubes - unknowns, 1)
-    return (
-        np.asarray(found),
-        np.asarray(few * inverse @ scores.T @ scores @ inverse),
-        inverse @ (design * slope[:, None]).T,
-    )
+    return coefficients, few * inverse @ scores.T @ scores @ inverse, inverse @ (design * slope[:, None]).T
 
 
 @dataclass(frozen=True)
@@ -166,7 +156,7 @@ def measure_seam(
     pose_sigma: float = 0.0,
     errors: PlacingErrors | None = None,
 ) -> list[Seam]:
-    """Flush and gap at each station.
+    """Return flush and gap at each station.
 
     Both edges are measured in the same cloud, so the fit of the part only says where to look and which way is across:
     an error of 1° in it changes a gap of 16 mm by 2.4 µm.
@@ -194,19 +184,19 @@ def _measure(
     points = frames.transform(T_station_base, scan.points)
     near = scan.usable & (np.abs(points) < np.array([_ACROSS, _ALONG, _DEPTH])).all(axis=1)
     points, normals = points[near], frames.rotate(T_station_base, scan.normals[near])
-    found = [mode for source in sources if errors for mode in errors.modes(scan.take(near), source)]
-    moves = np.zeros((len(found), *points.shape))
-    for k, (own, moved) in enumerate(found):
-        moves[k, own] = frames.rotate(T_station_base, moved)
+    modes = [mode for source in sources if errors for mode in errors.modes(scan.take(near), source)]
+    moves = np.zeros((len(modes), *points.shape))
+    for k, (index, moved) in enumerate(modes):
+        moves[k, index] = frames.rotate(T_station_base, moved)
     try:
-        inner = _side(points, normals, -1.0, "inner part", moves)
-        outer = _side(points, normals, 1.0, "outer part", moves)
+        inner, inner_spread, inner_moved = _side(points, normals, -1.0, "inner part", moves)
+        outer, outer_spread, outer_moved = _side(points, normals, 1.0, "outer part", moves)
     except NoResultError as error:
         return Seam(station.name, reason=str(error))
-    gap, flush = outer.across - inner.across, inner.height - outer.height
-    apart = ((outer.moved - inner.moved) ** 2).sum(axis=1)
-    variance = np.diag(inner.covariance) + np.diag(outer.covariance) + pose_sigma**2 + apart
-    sigma_gap, sigma_flush = np.sqrt(variance)
+    gap = float(outer[0] - inner[0])
+    flush = float(inner[1] - outer[1])
+    apart = ((outer_moved - inner_moved) ** 2).sum(axis=1)
+    sigma_gap, sigma_flush = np.sqrt(np.diag(inner_spread) + np.diag(outer_spread) + pose_sigma**2 + apart)
     verdict = _verdict(
         (abs(flush - limits.flush) - limits.flush_tolerance, sigma_flush),
         (abs(gap - limits.gap) - limits.gap_tolerance, sigma_gap),
@@ -218,13 +208,13 @@ def _measure(
         sigma_flush=float(sigma_flush),
         sigma_gap=float(sigma_gap),
         verdict=verdict,
-        inner=(inner.across, inner.height),
-        outer=(outer.across, outer.height),
+        inner=(float(inner[0]), float(inner[1])),
+        outer=(float(outer[0]), float(outer[1])),
     )
 
 
-def _side(points: Array, normals: Array, side: float, name: str, moves: Array) -> SeamEdge:
-    """The edge on one side of the gap's middle: the inner part lies on its negative side, its flank looks to +."""
+def _side(points: Array, normals: Array, side: float, name: str, moves: Array) -> tuple[Array, Array, Array]:
+    """Return the edge on one side of the gap's middle: the inner part lies on the negative, its flank looks to +."""
     here = side * points[:, 0] > 0
     try:
         return find_edge(points[here], normals[here], -side, moves[:, here])

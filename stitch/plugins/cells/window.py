@@ -1,6 +1,7 @@
-"""Both window jobs from their readings to their results and files."""
+"""`stitch fit` and `stitch seam`: both window jobs from their readings to their results and files."""
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -13,13 +14,14 @@ from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import uncertainty_text
-from stitch.output.session_files import SessionFiles, pose_columns, write_session
+from stitch.output.session_files import SessionFiles, pose_columns
 from stitch.plugins.cells.cad import Box, CadSurface, Regions, coverage, read_cad
 from stitch.plugins.cells.job_files import (
     POSE_COLUMNS,
     JobTable,
     Wanted,
     checked_table,
+    hand_out,
     poses_from_columns,
     read_columns,
     read_job_file,
@@ -27,7 +29,6 @@ from stitch.plugins.cells.job_files import (
     rows_from_poses,
     write_columns,
     write_poses,
-    write_recording_and_page,
 )
 from stitch.plugins.cells.placed_scans import (
     JoinedScans,
@@ -40,7 +41,6 @@ from stitch.plugins.cells.placed_scans import (
 from stitch.plugins.cells.scan_to_cad import (
     AllowancePrior,
     CadFit,
-    CadStart,
     Deviations,
     allowance_sentence,
     find_cad_start,
@@ -53,25 +53,15 @@ from stitch.plugins.cells.scan_to_cad import (
 )
 from stitch.plugins.cells.seam import VERDICTS, Limits, Seam, Station, measure_seam
 from stitch.session.session import Cloud
-from stitch.system.process import console
 
-FIT_FORMAT, SEAM_FORMAT = "stitch-fit/1", "stitch-seam/1"
+FIT_FORMAT = "stitch-fit/1"
+SEAM_FORMAT = "stitch-seam/1"
 _SCANS = {"scans", "session", "hand_eye", "errors"}
-_FIT_KEYS = {"format", *_SCANS, "cad", "length_unit"}
+_FIT_KEYS = {"format", *_SCANS, "cad", "length_unit", "instances", "tolerance", "cell", "region", "nominal", "path"}
+_FIT_KEYS |= {"coverage"}
 _SEAM_KEYS = {"format", *_SCANS, "stations", "fit", "part", "limits", "pose_sigma"}
 NO_UNIT = "Lengths in the unit of the CAD, whose file names none; length_unit in the job states it."
 _SOURCE_WORDS = {"scan": "the scan's noise", "hand_eye": "the hand-eye", "robot": "the robot", "scanner": "the scanner"}
-
-
-def correct_path(T_base_tool: Array, T_base_part_nominal: Array, T_base_part: Array) -> Array:
-    """Poses (N, 4, 4) that stand to the found part as the programmed ones stand to the nominal part.
-
-    T_base_tool' = T_base_part · T_base_part_nominal⁻¹ · T_base_tool.
-    """
-    return T_base_part @ frames.inverse(T_base_part_nominal) @ T_base_tool
-
-
-_FIT_KEYS |= {"instances", "tolerance", "cell", "region", "nominal", "path", "coverage"}
 
 
 @dataclass(frozen=True)
@@ -128,7 +118,8 @@ def read_fit_job(file: Path | str) -> FitJob:
     if not isinstance(instances, int) or isinstance(instances, bool) or instances < 1:
         raise document.refusal("instances", "write how many parts are in the scan, 1 or more")
     cad_file = document.path("cad")
-    cad, placed = read_cad(cad_file), _read_scans(document)
+    cad = read_cad(cad_file)
+    placed = _read_scans(document)
     unit = placed.length_unit if "session" in document else None  # else neither scans nor CAD name it
     if "length_unit" in document:
         unit = document.choice("length_unit", (unit,) if unit else ("mm", "m"))
@@ -174,7 +165,7 @@ def read_seam_job(file: Path | str) -> SeamJob:
 
 
 def _read_scans(document: JobTable) -> PlacedScans:
-    """From a table of scanner poses, or from a session and a hand-eye."""
+    """Read scans from a table of scanner poses, or from a session and a hand-eye."""
     file = document.file
     if ("scans" in document) == ("session" in document):
         raise InputError(f"{file}: no scans; to fix: give scans = a table of them, or session = a session folder")
@@ -211,7 +202,7 @@ def _read_regions(document: JobTable) -> Regions:
 
 
 def _fitted_pose(file: Path) -> Array:
-    """T_base_part (4, 4) of the first part of a fit.json."""
+    """Read T_base_part (4, 4) of the first part of a fit.json."""
     try:
         T = np.array(json.loads(file.read_text(encoding="utf-8"))["parts"][0]["T_base_part"], float)
     except FileNotFoundError:
@@ -228,43 +219,41 @@ def _fitted_pose(file: Path) -> Array:
 def _read_stations(file: Path) -> tuple[Station, ...]:
     columns = read_columns(file, "station", "x y z across_x across_y across_z out_x out_y out_z")
     names = columns.texts["station"]
-    middle = columns.stack("x y z")
-    across, out = columns.stack("across_x across_y across_z"), columns.stack("out_x out_y out_z")
+    across = columns.stack("across_x across_y across_z")
+    out = columns.stack("out_x out_y out_z")
     require_unique(file, "station", names)
     for i, name in enumerate(names):
         if np.linalg.norm(np.cross(across[i], out[i])) < 0.5 or abs(np.linalg.norm(out[i]) - 1) > 0.05:
             raise InputError(
                 f"{file}: station {name}: across and out are not unit vectors at right angles; to fix: correct them"
             )
-    return tuple(Station(n, m, a, o) for n, m, a, o in zip(names, middle, across, out, strict=True))
+    return tuple(map(Station, names, columns.stack("x y z"), across, out))
 
 
 @dataclass(frozen=True)
 class FittedPart:
     """One part found in the scan."""
 
-    start: CadStart
     fit: CadFit
+    start_share: float  # of the scan that met the CAD before the fit
+    start_runner_up: float  # the same of the best pose elsewhere
     deviations: Deviations
     coverage: dict[str, float]  # of expected regions
     forbidden: dict[str, int]  # usable points in forbidden regions
     path: Array | None  # (N, 4, 4) corrected T_base_tool
 
 
-def fit_parts(job: FitJob) -> list[FittedPart]:
-    """Start, fit and map every part; largest first.
+def fit_part(job: FitJob, scan: JoinedScans) -> FittedPart:
+    """Find, fit and map one part in its own scan.
 
     Raises:
-        NoResultError: a part is not found, or an expected region is not covered.
+        NoResultError: the part is not found, or an expected region is not covered.
     """
-    return [_fit_part(job, scan) for scan in split_instances(job.scan, job.cad, job.instances)]
-
-
-def _fit_part(job: FitJob, scan: JoinedScans) -> FittedPart:
-    start = find_cad_start(scan, job.cad)
-    found = fit_cad(scan, job.cad, start.T_base_part, job.regions, job.allowance_prior, job.placed.errors)
-    T = frames.inverse(found.T_base_part)
-    local, normals = frames.transform(T, scan.points[scan.usable]), frames.rotate(T, scan.normals[scan.usable])
+    T_start, share_there, runner_up = find_cad_start(scan, job.cad)
+    fit = fit_cad(scan, job.cad, T_start, job.regions, job.allowance_prior, job.placed.errors)
+    T = frames.inverse(fit.T_base_part)
+    local = frames.transform(T, scan.points[scan.usable])
+    normals = frames.rotate(T, scan.normals[scan.usable])
     covered = {box.name: coverage(box, job.cad, local, normals) for box in job.regions.expected}
     for name, share in covered.items():
         if share < job.coverage:
@@ -275,15 +264,21 @@ def _fit_part(job: FitJob, scan: JoinedScans) -> FittedPart:
     forbidden = {box.name: int(box.holds(local).sum()) for box in job.regions.forbidden}
     path = None
     if job.path is not None and job.T_base_part_nominal is not None:
-        path = correct_path(job.path[1], job.T_base_part_nominal, found.T_base_part)
-    mapped = measure_deviations(
-        scan, job.cad, found.T_base_part, tolerance=job.tolerance, cell=job.cell, allowance=found.allowance
-    )
-    return FittedPart(start, found, mapped, coverage=covered, forbidden=forbidden, path=path)
+        path = correct_path(job.path[1], job.T_base_part_nominal, fit.T_base_part)
+    deviations = measure_deviations(scan, job.cad, fit.T_base_part, job.tolerance, job.cell, fit.allowance)
+    return FittedPart(fit, share_there, runner_up, deviations, coverage=covered, forbidden=forbidden, path=path)
+
+
+def correct_path(T_base_tool: Array, T_base_part_nominal: Array, T_base_part: Array) -> Array:
+    """Return poses (N, 4, 4) that stand to the found part as the programmed ones stand to the nominal part.
+
+    T_base_tool' = T_base_part · T_base_part_nominal⁻¹ · T_base_tool.
+    """
+    return T_base_part @ frames.inverse(T_base_part_nominal) @ T_base_tool
 
 
 def fit_document(job: FitJob, parts: list[FittedPart]) -> dict[str, Any]:
-    """Plain data for JSON; length_unit of the CAD, degrees."""
+    """Return plain data for JSON; length_unit of the CAD, degrees."""
     nominal = job.T_base_part_nominal
     return {
         "format": "stitch-fit-result/1",
@@ -295,8 +290,10 @@ def fit_document(job: FitJob, parts: list[FittedPart]) -> dict[str, Any]:
 
 
 def _part_document(part: FittedPart) -> dict[str, Any]:
-    cells = part.deviations.cells
-    worst = int(np.argmax(np.abs(cells.mean))) if len(cells.mean) else None
+    cells = part.deviations
+    worst = None
+    if len(cells.mean):
+        worst = {"at": cells.middle[cells.worst].tolist(), "deviation": float(cells.mean[cells.worst])}
     pose = rows_from_poses(part.fit.T_base_part[None])[0].tolist()
     document = {
         "T_base_part": part.fit.T_base_part.tolist(),
@@ -308,11 +305,11 @@ def _part_document(part: FittedPart) -> dict[str, Any]:
         "rms": part.fit.rms,
         "inliers": part.fit.inliers,
         "points": part.fit.points,
-        "start_share": part.start.share,
-        "start_runner_up": part.start.runner_up,
+        "start_share": part.start_share,
+        "start_runner_up": part.start_runner_up,
         "cells": len(cells.mean),
-        "cells_outside": int(part.deviations.outside.sum()),
-        "worst": None if worst is None else {"at": cells.middle[worst].tolist(), "deviation": float(cells.mean[worst])},
+        "cells_outside": int(cells.outside.sum()),
+        "worst": worst,
         "coverage": part.coverage,
         "points_in_forbidden": part.forbidden,
     }
@@ -330,7 +327,7 @@ def _part_document(part: FittedPart) -> dict[str, Any]:
 
 
 def write_fit(job: FitJob, parts: list[FittedPart], folder: Path) -> list[str]:
-    """fit.json, and for each part its map and path; returns the files' names."""
+    """Write fit.json, and for each part its map and path; returns the files' names."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "fit.json").write_text(json.dumps(fit_document(job, parts), indent=1) + "\n", encoding="utf-8")
     written = ["fit.json"]
@@ -347,7 +344,7 @@ def write_fit(job: FitJob, parts: list[FittedPart], folder: Path) -> list[str]:
 
 
 def solve_seam(job: SeamJob) -> list[Seam]:
-    """Flush and gap at every station.
+    """Return flush and gap at every station.
 
     Raises:
         NoResultError: no station could be measured.
@@ -359,31 +356,38 @@ def solve_seam(job: SeamJob) -> list[Seam]:
 
 
 def write_seam(seams: list[Seam], file: Path) -> None:
-    """One row per station."""
+    """Write one row per station."""
     names = ("station", "flush", "gap", "sigma_flush", "sigma_gap", "verdict", "reason")
     write_columns(file, {name: [getattr(seam, name) for seam in seams] for name in names})
 
 
+def seam_document(seams: list[Seam]) -> list[dict[str, Any]]:
+    """Return plain data for JSON, null where a station could not be measured; mm."""
+    return [{k: None if isinstance(v, float) and np.isnan(v) else v for k, v in asdict(s).items()} for s in seams]
+
+
 def with_unit(job: FitJob, size: str) -> str:
-    """A length with its unit, where that is known."""
+    """Return a length with its unit, where that is known."""
     return f"{size} {job.length_unit}" if job.length_unit else size
 
 
 def agreement_sentence(job: FitJob, part: FittedPart, name: str) -> str:
-    """How well the part lies on its CAD, and how many cells of the map are out."""
-    bad, cells = part.deviations.outside, part.deviations.cells
+    """Say how well the part lies on its CAD, and how many cells of the map are out."""
+    cells = part.deviations
+    bad = cells.outside
     where = f"its points scatter about the CAD by {with_unit(job, f'{part.fit.scale:.3f}')} (1 σ)"
     if not bad.any():
-        limit = with_unit(job, f"{part.deviations.tolerance:g}")
+        limit = with_unit(job, f"{cells.tolerance:g}")
         return f"{name} is found; {where}, and all {len(bad)} cells of the map are within {limit}."
-    worst = with_unit(job, f"{cells.mean[int(np.argmax(np.abs(cells.mean)))]:+.2f}")
+    worst = with_unit(job, f"{cells.mean[cells.worst]:+.2f}")
     return f"{name} is found; {where}, but {bad.sum()} of {len(bad)} cells of the map are out, by {worst} at most."
 
 
 def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
-    """Pose with its sigma, stock, doubt, the worst cell and what did not count."""
+    """Say the pose with its sigma, stock, a second pose that fits too, the worst cell and what did not count."""
     x, y, z, a, b, c = rows_from_poses(part.fit.T_base_part[None])[0]
-    shift, turn = part.fit.sigma[3:].max(), np.degrees(part.fit.sigma[:3]).max()
+    shift = part.fit.sigma[3:].max()
+    turn = np.degrees(part.fit.sigma[:3]).max()
     place = with_unit(job, f"x {x:.3f}, y {y:.3f}, z {z:.3f}")
     yield (
         f"T_base_part: {place}, ± {uncertainty_text(shift)} at most; a {a:.4f}, b {b:.4f}, c {c:.4f}° about z, y', "
@@ -392,18 +396,17 @@ def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
     yield _sigma_sentence(job, part)
     if part.fit.allowance is not None:
         yield allowance_sentence(part.fit.allowance, job.length_unit)
-    if part.start.runner_up > 0.9 * part.start.share:
+    if part.start_runner_up > 0.9 * part.start_share:
         yield (
-            f"Another pose meets {part.start.runner_up:.0%} of the scan, this one {part.start.share:.0%}: the part is "
+            f"Another pose meets {part.start_runner_up:.0%} of the scan, this one {part.start_share:.0%}: the part is "
             "nearly symmetric, or too little of it was scanned."
         )
-    if part.deviations.outside.any():
-        cells = part.deviations.cells
-        worst = int(np.argmax(np.abs(cells.mean)))
-        at = ", ".join(f"{axis} {value:.0f}" for axis, value in zip("xyz", cells.middle[worst], strict=True))
+    cells = part.deviations
+    if cells.outside.any():
+        at = ", ".join(f"{axis} {value:.0f}" for axis, value in zip("xyz", cells.middle[cells.worst], strict=True))
         yield (
-            f"Worst cell: {with_unit(job, f'{cells.mean[worst]:+.2f}')} at {with_unit(job, at)} of the part's frame "
-            "(plus: outside the CAD)."
+            f"Worst cell: {with_unit(job, f'{cells.mean[cells.worst]:+.2f}')} at {with_unit(job, at)} of the part's "
+            "frame (plus: outside the CAD)."
         )
     for name, count in part.forbidden.items():
         if count:
@@ -411,17 +414,17 @@ def detail_sentences(job: FitJob, part: FittedPart) -> Iterator[str]:
 
 
 def _sigma_sentence(job: FitJob, part: FittedPart) -> str:
-    """What the ± of the place counts, largest first."""
+    """Say what the ± of the place counts, largest first."""
     sizes = {name: float(np.sqrt(np.diag(C)[3:].max())) for name, C in part.fit.parts.items()}
     if len(sizes) == 1:
         return "± counts the scan's noise alone; [errors] in the job states those of robot and scanner."
-    ranked = sorted((name for name, size in sizes.items() if size), key=lambda name: -sizes[name])
-    told = ", ".join(with_unit(job, f"{_SOURCE_WORDS[name]} {uncertainty_text(sizes[name])}") for name in ranked)
-    return f"± of the place by source: {told}."
+    names = sorted((name for name, size in sizes.items() if size), key=lambda name: -sizes[name])
+    sources = (with_unit(job, f"{_SOURCE_WORDS[name]} {uncertainty_text(sizes[name])}") for name in names)
+    return f"± of the place by source: {', '.join(sources)}."
 
 
 def scan_session(name: str, placed: PlacedScans, cad: Path | None = None) -> SessionFiles:
-    """One view for each scan; where the job knew only the scanner's poses, the scanner itself counts as the flange."""
+    """Return one view for each scan; where only the scanner's poses were known, the scanner counts as the flange."""
     files = [f"clouds/{view}.ply" for view in placed.names]
     tables = {"scanner": {"pose": placed.T_flange_scanner.tolist()}}
     if cad is not None:
@@ -441,15 +444,18 @@ def run_fit(file: Path, allowance: str | None, wanted: Wanted) -> None:
     """Fit the parts of a job and hand out what was asked for; `InputError` and `NoResultError` end it."""
     prior = read_allowance(allowance)
     job = replace(read_fit_job(file), allowance_prior=prior)
-    parts = fit_parts(job)
+    parts = [fit_part(job, scan) for scan in split_instances(job.scan, job.cad, job.instances)]
     written = write_fit(job, parts, wanted.output) if wanted.output is not None else []
-    if wanted.session is not None:
-        write_session(wanted.session, scan_session(file.stem, job.placed, job.cad_file))
-    write_recording_and_page("fit", wanted.recording, wanted.report, job, parts)
-    if wanted.as_json:
-        print(json.dumps(fit_document(job, parts), indent=1))
+    terminal = hand_out(
+        "fit",
+        wanted,
+        lambda: scan_session(file.stem, job.placed, job.cad_file),
+        lambda: fit_document(job, parts),
+        job,
+        parts,
+    )
+    if terminal is None:
         return
-    terminal = console()
     for i, part in enumerate(parts):
         terminal.print(agreement_sentence(job, part, f"Part {i + 1}" if len(parts) > 1 else "The part"))
         for line in detail_sentences(job, part):
@@ -461,16 +467,16 @@ def run_fit(file: Path, allowance: str | None, wanted: Wanted) -> None:
 
 
 def limits_text(limits: Limits) -> str:
-    """What is allowed."""
-    flush, gap = f"{limits.flush:g} ± {limits.flush_tolerance:g}", f"{limits.gap:g} ± {limits.gap_tolerance:g}"
-    return f"flush {flush} mm, gap {gap} mm"
+    """Say what is allowed."""
+    flush = f"flush {limits.flush:g} ± {limits.flush_tolerance:g} mm"
+    return f"{flush}, gap {limits.gap:g} ± {limits.gap_tolerance:g} mm"
 
 
 def stations_sentence(limits: Limits, seams: list[Seam]) -> str:
-    """How many stations are good."""
-    counts = {verdict: sum(s.verdict == verdict for s in seams) for verdict in VERDICTS}
-    found = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)
-    return f"{len(seams)} stations: {found}. Allowed: {limits_text(limits)}."
+    """Say how many stations are good."""
+    counts = Counter(seam.verdict for seam in seams)
+    verdicts = ", ".join(f"{counts[verdict]} {verdict}" for verdict in VERDICTS if counts[verdict])
+    return f"{len(seams)} stations: {verdicts}. Allowed: {limits_text(limits)}."
 
 
 def run_seam(file: Path, wanted: Wanted) -> None:
@@ -479,12 +485,10 @@ def run_seam(file: Path, wanted: Wanted) -> None:
     seams = solve_seam(job)
     if wanted.output is not None:
         write_seam(seams, wanted.output)
-    if wanted.session is not None:
-        write_session(wanted.session, scan_session(file.stem, job.placed))
-    write_recording_and_page("seam", wanted.recording, wanted.report, job, seams)
-    if wanted.as_json:
-        rows = [{k: None if isinstance(v, float) and np.isnan(v) else v for k, v in asdict(s).items()} for s in seams]
-        print(json.dumps(rows, indent=1))
+    terminal = hand_out(
+        "seam", wanted, lambda: scan_session(file.stem, job.placed), lambda: seam_document(seams), job, seams
+    )
+    if terminal is None:
         return
     table = Table("station", "flush / mm", "gap / mm", "verdict", title="Stations, ± 1 σ", title_justify="left")
     for s in seams:
@@ -493,7 +497,6 @@ def run_seam(file: Path, wanted: Wanted) -> None:
         else:
             flush, gap = f"{s.flush:+.3f} ± {s.sigma_flush:.3f}", f"{s.gap:.3f} ± {s.sigma_gap:.3f}"
             table.add_row(s.station, flush, gap, s.verdict)
-    terminal = console()
     terminal.print(stations_sentence(job.limits, seams))
     terminal.print(table)
     if wanted.output is not None:

@@ -17,8 +17,9 @@ from data_synth.shapes.casting import around, with_stock
 from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
+from stitch.numerics.distributions import tukey
 from stitch.output.session_files import SessionFiles, pose_columns, write_session
-from stitch.plugins.cells.cad import TUKEY, biweight, cad_surface, cell_weights, nearest_partners
+from stitch.plugins.cells.cad import cad_surface, cell_weights, nearest_partners, surface_cells
 from stitch.plugins.cells.job_files import JobTable
 from stitch.plugins.cells.placed_scans import (
     SOURCES,
@@ -104,17 +105,16 @@ def test_the_fit_makes_the_variance_smallest(casting, blade_cad):
     T = frames.inverse(found.T_base_part)
     usable = joined.take(joined.usable)
     local = frames.transform(T, usable.points)
-    seen = nearest_partners(blade_cad, local, frames.rotate(T, usable.normals))
-    d = seen.distance
-    rest = d - found.allowance.value
-    w = seen.accept * biweight(rest / (TUKEY * found.scale))
-    w *= cell_weights(local, replace(seen, distance=rest), seen.accept, blade_cad.size / 40, found.scale)
-    A = np.hstack([np.cross(local - blade_cad.centre, seen.normal), seen.normal])
-    A, d = A - np.average(A, axis=0, weights=w), d - np.average(d, weights=w)
+    distance, normal, accept = nearest_partners(blade_cad, local, frames.rotate(T, usable.normals))
+    rest = distance - found.allowance.value
+    w = accept * tukey(rest, found.scale)
+    w *= cell_weights(surface_cells(local, normal, blade_cad.size / 40), rest, accept, found.scale)
+    A = np.hstack([np.cross(local - blade_cad.centre, normal), normal])
+    A, d = A - np.average(A, axis=0, weights=w), distance - np.average(distance, weights=w)
     step = -np.linalg.solve((A * w[:, None]).T @ A, (A * w[:, None]).T @ d)
     assert len(usable.points) < 20_000  # the fit took all of them
     assert np.abs(step / found.sigma).max() < 0.01
-    total = np.average((seen.distance) ** 2, weights=w)
+    total = np.average(distance**2, weights=w)
     assert total == pytest.approx(np.average(d**2, weights=w) + found.allowance.value**2, rel=1e-4)
 
 

@@ -68,19 +68,19 @@ def test_distances_are_those_of_trimesh(pane, pane_cad):
     points, faces = trimesh.sample.sample_surface(pane, 60, seed=1)
     normals = pane.face_normals[faces]
     off = points + rng.uniform(-1.5, 1.5, (60, 1)) * normals
-    found = nearest_partners(pane_cad, off, normals)
+    distance, _, accept = nearest_partners(pane_cad, off, normals)
     count = len(pane.faces)
     place = trimesh.triangles.closest_point(np.tile(pane.triangles, (60, 1, 1)), np.repeat(off, count, axis=0))
     wanted = np.linalg.norm(place.reshape(60, count, 3) - off[:, None], axis=2).min(axis=1)
-    assert found.accept.mean() > 0.8
-    assert np.abs(np.abs(found.distance) - wanted)[found.accept].max() < 2e-3
+    assert accept.mean() > 0.8
+    assert np.abs(np.abs(distance) - wanted)[accept].max() < 2e-3
 
 
 def test_fit_without_a_guess(pane, pane_cad):
     seed, T = 3, truth(3)
     scan = scan_pane(pane, T, seed)
-    start = find_cad_start(scan, pane_cad)
-    found = fit_cad(scan, pane_cad, start.T_base_part)
+    T_start, *_ = find_cad_start(scan, pane_cad)
+    found = fit_cad(scan, pane_cad, T_start)
     assert furthest(found.T_base_part, T, pane) < 0.05
     # The truth lies within the stated covariance: chi-square of 6, chance 1e-4, with the sandwich's own doubt.
     shift = frames.make(np.eye(3), pane_cad.centre)
@@ -104,13 +104,13 @@ def test_weld_dent_shows_in_the_map_and_does_not_pull_the_fit(door):
     slope = np.gradient(car_door.outer_surface(CarDoor(**DOOR), np.full(3, 170.0), np.array([88.0, 90.0, 92.0])), 2.0)[
         1
     ]
-    middle = shown.cells.middle
-    at = (np.hypot(middle[:, 0] - weld.x, middle[:, 2] - weld.z) < 25) & (shown.cells.mean < -1)
+    middle = shown.middle
+    at = (np.hypot(middle[:, 0] - weld.x, middle[:, 2] - weld.z) < 25) & (shown.mean < -1)
     assert at.sum() >= 4
     expected = -window_scans.dent(weld, middle[at, 0], middle[at, 2]) / np.hypot(1, slope)
-    assert shown.cells.mean[at] == pytest.approx(expected, abs=0.2)
+    assert shown.mean[at] == pytest.approx(expected, abs=0.2)
     far_off = np.hypot(middle[:, 0] - weld.x, middle[:, 2] - weld.z) > 4 * weld.reach
-    assert np.median(np.abs(shown.cells.mean[far_off])) < 0.05
+    assert np.median(np.abs(shown.mean[far_off])) < 0.05
     assert shown.outside[at].all()
 
 
@@ -162,11 +162,11 @@ def test_edge_of_two_planes():
     flank = np.column_stack([-8 + 0.2 * h + 0.02 * rng.standard_normal(3000), s[3000:], h])
     normals = np.vstack([np.tile([-0.1, 0, 1.0], (3000, 1)), np.tile([1.0, 0, -0.2], (3000, 1))])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    edge = find_edge(np.vstack([top, flank]), normals, 1.0)
+    (across, up), covariance, _ = find_edge(np.vstack([top, flank]), normals, 1.0)
     height = (2 + 0.1 * -8) / (1 - 0.1 * 0.2)
-    sigma = np.sqrt(np.diag(edge.covariance))
-    assert abs(edge.height - height) < 4 * sigma[1] < 0.02
-    assert abs(edge.across - (-8 + 0.2 * height)) < 4 * sigma[0] < 0.02
+    sigma = np.sqrt(np.diag(covariance))
+    assert abs(up - height) < 4 * sigma[1] < 0.02
+    assert abs(across - (-8 + 0.2 * height)) < 4 * sigma[0] < 0.02
 
 
 def test_seam_at_eight_stations(door, pane):
