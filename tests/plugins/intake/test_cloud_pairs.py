@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stitch.errors import InputError
-from stitch.plugins.intake.cloud_pairs import pairings
+from stitch.plugins.intake.cloud_pairs import clouds_served, pairings
 
 CLOUDS = [Path(f"scans/view_{i:02d}.ply") for i in (1, 2, 3, 10)]
 
@@ -76,3 +76,21 @@ def test_a_trajectory_at_a_hundred_hertz_is_met_where_a_scan_was_taken(scale):
     assert pairing.rows == tuple(round((t - times[0]) / 0.01) for t in taken) and pairing.by_name
     with pytest.raises(InputError, match="3 clouds and 2500 poses"):
         pairings(clouds, [()] * len(table), table + 3600 * scale)
+
+
+def test_of_numbered_clouds_a_row_too_many_may_stand_anywhere():
+    clouds = [Path(f"scan_{i:02d}.ply") for i in range(1, 6)]
+    rows = {pairing.rows for pairing in pairings(clouds, [()] * 6)}
+    assert {(0, 1, 2, 3, 4), (1, 2, 3, 4, 5), (0, 1, 3, 4, 5)} <= rows
+
+
+def test_names_that_pair_most_clouds_tell():
+    clouds = [Path(f"p{i:02d}.ply") for i in range(1, 13)]
+    labels = [(f"P{i}",) for i in range(1, 13)]
+    (pairing,) = pairings(clouds, labels)
+    assert pairing.rows == tuple(range(12))
+
+
+@pytest.mark.parametrize(("rows", "served"), [(1, 0), (3, 3), (5, 4), (4, 4), (400, 3)])
+def test_a_list_serves_the_clouds_that_it_can_be_paired_with(rows, served):
+    assert min(clouds_served(CLOUDS, [()] * rows), 4) == served

@@ -43,6 +43,9 @@ def test_what_is_stated_is_taken(raw, session, tmp_path, capsys):
     assert code == 0, err
     document = json.loads(out)
     assert document["views"] == 3 and {g["what"] for g in document["guesses"]} >= {"rotation", "mount", "pairing"}
+    assert all(g["because"] in ("file", "scans", "usual") for g in document["guesses"])
+    (poses,) = [entry for entry in document["inventory"] if entry["taken_for"] == "poses"]
+    assert poses["rows"] == 3 and document["question"] is None and document["not_used"] == []
     made, true = load_session(tmp_path / "made"), load_session(session)
     for a, b in zip(made.views, true.views, strict=True):
         assert abs(a.T_base_flange - b.T_base_flange).max() < 1e-3

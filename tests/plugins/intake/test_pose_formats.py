@@ -190,3 +190,28 @@ def test_a_row_without_a_pose_is_told_and_the_others_stay(tmp_path, word):
     for i, matrix in enumerate([*matrices, "\n".join([f"{word} " * 4] * 4)]):
         (tmp_path / f"frame-{i}.pose.txt").write_text(matrix)
     assert read_raw_poses(sorted(tmp_path.glob("frame*"))).without_pose == {3}
+
+
+def test_elements_of_xml_are_a_list_each(tmp_path):
+    text = fill(
+        '<Rob Type="KUKA"><RIst X="{:.9f}" Y="{:.9f}" Z="{:.9f}" A="{:.9f}" B="{:.9f}" C="{:.9f}"/>'
+        '<AIPos A1="1" A2="2" A3="3" A4="4" A5="5" A6="6"/></Rob>',
+        P,
+        ABC,
+    )
+    lists = read_pose_text(text)
+    assert list(lists) == ["RIst", "AIPos"] and lists["AIPos"][0][0][1]["j6 [deg]"] == 6.0
+    (tmp_path / "log.xml").write_text(text)
+    assert np.abs(poses(read_raw_poses([tmp_path / "log.xml"])) - T).max() < 1e-6
+
+
+def test_a_matrix_below_a_heading_of_single_words_is_the_pose():
+    text = "VERSION\n=\n1\n\nMATRIX\n=\n" + "\n".join("  ".join(map(str, row)) for row in T[0])
+    ((rows, _),) = read_pose_text(text).values()
+    assert np.allclose(list(rows[0][1].values()), T[0].ravel())
+
+
+def test_the_word_next_to_a_pose_is_its_name():
+    rows = ["# cell 3, 2024-03-11 10:00", *(f"scan_{i} p[0.{i}, 0.2, 0.3, 0.1, 0.2, 0.3]" for i in range(3))]
+    ((found, _),) = read_pose_text("\n".join(rows)).values()
+    assert [labels for labels, _ in found] == [("scan_0",), ("scan_1",), ("scan_2",)]

@@ -1,0 +1,47 @@
+"""A tool or a base that changed at one view is named with its size, where the poses fit with it undone."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.plugins.intake.cloud_pairs import Pairing
+from stitch.plugins.intake.convention_choice import Interpretation
+from stitch.plugins.intake.layouts import possible_layouts
+from stitch.plugins.intake.raw_poses import RawPoses
+from stitch.plugins.intake.readings import readings
+from stitch.plugins.intake.sudden_change import require_no_change
+from stitch.screening.motions import RelativeScans
+
+X = frames.make(Rotation.from_rotvec([0.08, -0.12, 0.75]).as_matrix(), np.array([62.0, -38.0, 95.0]))
+CLOUDS = [Path(f"cell/scan_{i:02d}.ply") for i in range(10)]
+
+
+def campaign(tool=None, base=None):
+    """Ways to read ten poses, changed from the sixth on, and the exact motions of the scans."""
+    random = np.random.default_rng(5)
+    T = frames.make(Rotation.random(10, random).as_matrix(), random.uniform(-400, 400, (10, 3)))
+    pairs = [(v, v + step) for step in (1, 2) for v in range(10 - step)]
+    motions = np.array([frames.inverse(T[v] @ X) @ T[w] @ X for v, w in pairs])
+    written = T.copy()
+    written[5:] = (np.eye(4) if base is None else base) @ T[5:] @ (np.eye(4) if tool is None else tool)
+    raw = RawPoses("poses", None, written.reshape(-1, 16), ((),) * 10, "")
+    (layout,) = possible_layouts(raw)
+    pairing = Pairing(tuple(range(10)), "", True)
+    ways = [Interpretation(readings(layout)[0], pairing, "mm", carries) for carries in (True, False)]
+    return RelativeScans(tuple(pairs), motions), ways
+
+
+def test_poses_without_a_change_are_let_through():
+    require_no_change(CLOUDS, *campaign())
+
+
+@pytest.mark.parametrize("side", ["tool", "base"])
+def test_a_change_is_named_with_its_view_and_its_size(side):
+    change = frames.make(np.eye(3), np.array([0.0, 0.0, 150.0]))
+    with pytest.raises(InputError, match="changed at scan_05.ply") as refused:
+        require_no_change(CLOUDS, *campaign(**{side: change}))
+    assert "150.0) mm and 0.00°" in str(refused.value) and "100% of the scanner's motions close" in str(refused.value)
