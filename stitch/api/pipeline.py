@@ -1,7 +1,7 @@
 """Stitch sessions (coarse → correct → fit → register → fuse), change a run's effects, diagnose what is missing.
 
-The steps stand in `fit`: `surface_steps` for clouds, `target_steps` for labelled points alone. What runs beside the
-main thread is started here, by `_Conductor`.
+The steps stand in `fit`: `surface_steps` for clouds, `target_steps` for labelled points alone. What of a
+run's steps goes on beside the screening is started here, by `_Conductor`.
 """
 
 from __future__ import annotations

@@ -108,7 +108,10 @@ def candidate_of(linear: LinearModel, effect: Effect) -> Candidate | None:
 
 
 def candidate_as_fitted(linear: LinearModel, term: Term) -> Candidate:
-    """Return an effect with those of its parameters that a fit left in use, as the one form it may have."""
+    """Return an effect with those of its parameters that a fit left in use, as the one form it may have.
+
+    Gridded parameters, time constants and times of events, keep their values; a parameter at 0 was not fitted.
+    """
     zero = term.at(np.where(term.gridded, term.values, 0.0))
     keep = ~term.gridded & (term.values != 0)
     response = linear.responses([zero])[0].columns

@@ -226,8 +226,10 @@ def _gains_at_null(base: LinearModel, at: LinearModel, candidate: Candidate) -> 
 
 
 def _information_by_form(linear: LinearModel, candidate: Candidate) -> Iterator[tuple[Array, Array]]:
-    """Yield per form what the views tell of its parameters (p,) beside the model, in plausible sizes (`log_evidence`):
-    those of one joint are among those of all."""
+    """Yield per form I (p, p) and v (p,) of its log likelihood vᵀθ − ½ θᵀ I θ, θ its parameters in plausible sizes.
+
+    They are selected from those of the whole effect: the parameters of one joint are among those of all.
+    """
     of_terms = [list(forms) for _, forms in groupby(candidate.forms, key=lambda form: id(form.term))]
     sums = linear.information([whole.selected for whole, *_ in of_terms])
     for forms, (information, vector) in zip(of_terms, sums, strict=True):

@@ -84,7 +84,11 @@ class FurtherPrior:
 
 
 def log_prior(log_variances: Array, further: FurtherPrior | None) -> tuple[float, Array]:
-    """Return −2 log prior of the log variances (c,), and its slope."""
+    """Return −2 log prior of the log variances (c,), and its slope.
+
+    Of the scatter, before NOISE, a gamma(2, 0) prior on σ; of the noise factor at NOISE a normal one of its logarithm
+    about the usual; of each further variance v, with scale s and shape a, v^(a/2) / (1 + v/s²)^((1 + a)/2).
+    """
     off = (log_variances[NOISE] - np.log(USUAL_NOISE_FACTOR)) / FACTOR_SPREAD
     value = -float(log_variances[:NOISE].sum()) + off**2
     slope = -np.ones(len(log_variances))

@@ -97,7 +97,11 @@ def fit_hypotheses(
 
 
 def equivalent_hypotheses(fits: Sequence[MotionFit]) -> list[MotionFit]:
-    """Return the hypotheses that these motions cannot tell from the best, best first; empty if none explains them."""
+    """Return the hypotheses that these motions cannot tell from the best, best first; empty if none explains them.
+
+    `open` of a fit is the mean truncated square, 0 to 1, of what its motions leave: one that leaves no more than
+    1/_CLEARER of the best, and a floor for rounding, is no clearer than that.
+    """
     ranked = sorted(fits, key=lambda fit: fit.open)
     if not ranked or ranked[0].closed < _MIN_CLOSED_SHARE:
         return []

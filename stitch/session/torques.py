@@ -26,7 +26,9 @@ class Torques:
 
 
 def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Torques:
-    """Return gravity torques at joint angles (V, n); which ones there are is the arm's own, whatever the angles.
+    """Return gravity torques, N·m, at joint angles (V, n), rad; of 1 kg a link where masses are not known.
+
+    Which torques are listed depends on the arm alone, not on the angles.
 
     Args:
         payload: (V,) kg, in place of the mass in [robot] payload.
@@ -53,7 +55,10 @@ def _each_joint(values: Array) -> Torques:
 
 
 def _unit_link_torques(robot: Robot, joints: Array) -> Torques:
-    """Return those of 1 kg at each link's frame, as far as they differ: without masses their shapes alone are known."""
+    """Return torques, N·m, of 1 kg at the frame of link k about joint i, named i_k, one for each independent pair.
+
+    Without masses their shapes over the views alone are known.
+    """
     n = robot.n_joints
     shapes = kinematics.unit_torques(robot, _sample_joints(robot))
     keep = [(i, k) for i in range(n) for k in _independent_links(shapes[:, i], range(i, n))]

@@ -95,6 +95,10 @@ def initial_landmarks(capture: Capture, T_mount: Array, drawing: Drawing | None 
 
     Args:
         capture: without the effects in use.
+
+    Returns:
+        Rows in length_unit (coordinates) and rad (orientations), `noise` in their squares. What a view does not show
+        has noise 0, so that it counts nothing, and variance 1, so that its block can be inverted.
     """
     s = capture.sightings
     assert s is not None
