@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -132,9 +132,8 @@ def _export_cloud(run: Path, to: str, output: Path | None) -> None:
         cloud = coloured_cloud(run)
         write(cloud, file)
     span = cloud.span * MICROMETRES[cloud.length_unit]
-    told = [f"{output}: coloured by residual, from dark at 0 to yellow at {span:.3g} µm; grey: one view alone"]
-    told += [f"{to} does not hold {lost}"] if lost else []
-    say("; ".join(told))
+    colours = f"coloured by residual, from dark at 0 to yellow at {span:.3g} µm; grey: one view alone"
+    say(f"{output}: {colours}{f'; {to} does not hold {lost}' if lost else ''}")
 
 
 def _export_program(
@@ -160,7 +159,19 @@ def _export_program(
     copy = compensated_program(program, arm, limit, _nearby_joints(near, arm), _is_j3_coupled(program, j3))
     places = _write_program(program, copy.texts, output)
     if as_json:
-        emit(to_json(_program_document(copy, places, limit)))
+        document = {
+            "format": "stitch-program/1",
+            "program": str(copy.program.file),
+            "controller": copy.program.controller,
+            "session": copy.arm.session,
+            "effects": [term.name for term in copy.arm.terms],
+            "not_compensated": list(copy.beyond),
+            "limit_mm": limit,
+            "targets": copy.rows(),
+            "notes": list(copy.notes),
+            "files": [str(place) for place in places],
+        }
+        emit(to_json(document))
     else:
         _show_moves(copy, places)
 
@@ -175,12 +186,12 @@ def _export_moved_program(
     from stitch.plugins.intake.controllers.program import read_program
 
     T_base = part_motion(fit, part)
-    copy = moved_program(read_program(file, frame, any_tool=True), T_base)
-    places = _write_program(copy.program, copy.texts, output)
-    rows = copy.rows()
+    program = read_program(file, frame, any_tool=True)
+    texts, rows = moved_program(program, T_base)
+    places = _write_program(program, texts, output)
     if as_json:
-        told = {"format": "stitch-program/1", "program": str(file), "controller": copy.program.controller}
-        emit(to_json(told | {"targets": rows, "files": [str(place) for place in places]}))
+        head = {"format": "stitch-program/1", "program": str(file), "controller": program.controller}
+        emit(to_json(head | {"targets": rows, "files": [str(place) for place in places]}))
         return
     say(f"Moved with the part to where it was found: {len(rows)} of the program's targets.", bold=True)
     show_table(
@@ -196,8 +207,8 @@ def _export_moved_program(
             for row in rows[:_LISTED_TARGETS]
         ],
     )
-    if copy.program.unread:
-        lines = ", ".join(map(str, copy.program.unread))
+    if program.unread:
+        lines = ", ".join(map(str, program.unread))
         say(f"Not moved, since these motions are not read (arcs, registers, computed targets): lines {lines}.")
     for place in places:
         say(f"  {place}")
@@ -210,7 +221,13 @@ def _write_program(program: Program, texts: dict[Path, str], output: Path | None
 
     if output is None:
         raise InputError(f"{program.file}: no output file; to fix: name the copy with -o FILE")
-    places = _output_files(program, output)
+    # A KUKA's data list goes beside the copy, under the same name.
+    if output.suffix.lower() != program.file.suffix.lower():
+        raise InputError(f"{output}: to fix: end the copy's name in {program.file.suffix}, as the program's does")
+    places = {program.file: output}
+    places |= {file: output.with_suffix(file.suffix) for file in program.texts if file != program.file}
+    for place in places.values():
+        require_new(place)
     with ExitStack() as stack:
         for source, text in texts.items():
             stack.enter_context(whole_file(places[source])).write_bytes(program_bytes(text))
@@ -225,10 +242,10 @@ def _nearby_joints(near: str | None, arm: ArmModel) -> Array | None:
     if near is None:
         return None
     cells = near.split(",")
-    told: Array = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
-    if len(told) != arm.robot.n_joints or not np.isfinite(told).all():
+    angles: Array = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
+    if len(angles) != arm.robot.n_joints or not np.isfinite(angles).all():
         raise InputError(f"--near {near}: to fix: write {arm.robot.n_joints} angles in degrees with commas")
-    return np.radians(told)
+    return np.radians(angles)
 
 
 def _is_j3_coupled(program: Program, j3: str | None) -> bool:
@@ -244,37 +261,12 @@ def _is_j3_coupled(program: Program, j3: str | None) -> bool:
     return program.controller == "fanuc" and j3 == "j2+j3"
 
 
-def _output_files(program: Program, output: Path) -> dict[Path, Path]:
-    """Where each file of the program goes: a KUKA's data list beside the copy, under the same name."""
-    if output.suffix.lower() != program.file.suffix.lower():
-        raise InputError(f"{output}: to fix: end the copy's name in {program.file.suffix}, as the program's does")
-    places = {program.file: output}
-    places |= {file: output.with_suffix(file.suffix) for file in program.texts if file != program.file}
-    for place in places.values():
-        require_new(place)
-    return places
-
-
-def _program_document(copy: CompensatedProgram, places: list[Path], limit: float) -> dict[str, Any]:
-    return {
-        "format": "stitch-program/1",
-        "program": str(copy.program.file),
-        "controller": copy.program.controller,
-        "session": copy.arm.session,
-        "effects": [term.name for term in copy.arm.terms],
-        "not_compensated": list(copy.beyond),
-        "limit_mm": limit,
-        "targets": copy.rows(),
-        "notes": list(copy.notes),
-        "files": [str(place) for place in places],
-    }
-
-
 def _show_moves(copy: CompensatedProgram, places: list[Path]) -> None:
     from stitch.numerics.units import angle_text, length_text
 
     rows = copy.rows()
-    far, left = max(rows, key=lambda row: row["moved_mm"]), max(row["left_mm"] for row in rows)
+    far = max(rows, key=lambda row: row["moved_mm"])
+    left = max(row["left_mm"] for row in rows)
     remains = f"up to {length_text(left, 'mm')} remain" if left > _NEGLIGIBLE_MOVE else "nothing remains"
     say(
         f"{far['target']} moves farthest, by {length_text(far['moved_mm'], 'mm')}, to undo "

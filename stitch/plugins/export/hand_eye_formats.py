@@ -81,21 +81,26 @@ def hand_eye_of_run(folder: Path, parent: str | None = None, child: str = "scann
     Raises:
         InputError: no run, a damaged one, or a name that a frame cannot have.
     """
-    result, model, told = read_result(folder), read_model(folder), read_diagnosis(folder)
+    result = read_result(folder)
+    model = read_model(folder)
     if model.mount not in _PARENTS:
         raise InputError(f"{folder}/model.toml: mount is {model.mount!r}; to fix: eye_to_hand or eye_in_hand")
-    return hand_eye_from(result, model, told, parent, child)
+    return hand_eye_from(result, model, read_diagnosis(folder), parent, child)
 
 
 def hand_eye_from(
-    result: dict[str, Any], model: ModelFile, told: dict[str, Any], parent: str | None = None, child: str = "scanner"
+    result: dict[str, Any],
+    model: ModelFile,
+    diagnosis: dict[str, Any],
+    parent: str | None = None,
+    child: str = "scanner",
 ) -> ExportedHandEye:
     """Return the corrected hand-eye of a result and its model.
 
     Args:
         result: as result.json.
-        told: as diagnosis.json; {} where there is none.
-        parent, child: names of frames, as `hand_eye_of` takes them.
+        diagnosis: as diagnosis.json; {} where there is none.
+        parent, child: names of frames, as `hand_eye_of_run` takes them.
 
     Raises:
         InputError: a name that a frame cannot have, or numbers that the views do not show and nobody states.
@@ -108,9 +113,19 @@ def hand_eye_from(
             "other axes, or state [scanner] pose in session.toml"
         )
     metres = METRES[model.length_unit]
-    T, scale = model.T_mount.copy(), np.repeat([1.0, metres], 3)
+    scale = np.repeat([1.0, metres], 3)
+    T = model.T_mount.copy()
     T[:3, 3] *= metres
-    notes = [uncertainty_scope(told.get("verdict")).rstrip("."), *_undetectable_notes(told, model.length_unit)]
+    notes = [uncertainty_scope(diagnosis.get("verdict")).rstrip(".")]
+    candidates = diagnosis.get("candidates", [])
+    missed = [(c["hand_eye_if_missed"], c["effect"]) for c in candidates if c.get("hand_eye_if_missed") is not None]
+    if missed:
+        # U is that of the model.
+        size, name = max(missed)
+        pushed = length_text(size, model.length_unit, 2)
+        notes.append(
+            f"Not in U: an effect too small to be seen could displace it, at the part, by as much as {pushed} ({name})"
+        )
     notes += [f"Not observable from these motions, left at the coarse value: {axis}" for axis in result["unobservable"]]
     notes += [f"As stated in session.toml, not measured: {', '.join(unknown)}"] if unknown else []
     if model.effects:
@@ -131,17 +146,6 @@ def _require_plain_name(flag: str, name: str) -> str:
     if not name or not set(name) <= _PLAIN_LETTERS or name[0].isdigit():
         raise InputError(f"{flag} {name!r}: to fix: a name of letters, digits and _, as links in URDF have it")
     return name
-
-
-def _undetectable_notes(diagnosis: dict[str, Any], length_unit: str) -> list[str]:
-    """Return how far an effect that the views do not show could push the hand-eye: U is that of the model."""
-    candidates = diagnosis.get("candidates", [])
-    known = [(c["hand_eye_if_missed"], c["effect"]) for c in candidates if c.get("hand_eye_if_missed") is not None]
-    if not known:
-        return []
-    size, name = max(known)
-    pushed = length_text(size, length_unit, 2)
-    return [f"Not in U: an effect too small to be seen could displace it, at the part, by as much as {pushed} ({name})"]
 
 
 @dataclass(frozen=True)

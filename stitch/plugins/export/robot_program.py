@@ -70,26 +70,16 @@ def joint_solutions(robot: Robot, T_base_flange: Array, near: Array) -> Array:
         longest = np.abs(step).max(axis=1, keepdims=True)
         q = q + step * np.minimum(1.0, _LONGEST / np.maximum(longest, 1e-300))
     off = weight * frames.log(frames.inverse(kinematics.forward(robot, q)) @ T_base_flange)
-    found: list[Array] = []
+    solutions: list[Array] = []
     # A singular pose is closed in slowly; a nanometre and a nanoradian are far below any arm.
     for solution in q[np.linalg.norm(off, axis=1) < 1e-9]:
         # Whole turns apart they are the same.
-        if all(np.abs(np.angle(np.exp(1j * (solution - other)))).max() > 1e-4 for other in found):
-            found.append(solution)
-    return np.array(found).reshape(-1, robot.n_joints)
+        if all(np.abs(np.angle(np.exp(1j * (solution - other)))).max() > 1e-4 for other in solutions):
+            solutions.append(solution)
+    return np.array(solutions).reshape(-1, robot.n_joints)
 
 
-@dataclass(frozen=True)
-class ProgramCompensation:
-    """K targets, commanded anew; lengths in length_unit, angles in rad."""
-
-    joints: Array  # (K, n) commanded
-    move: Array  # (K, 4, 4) of the tool, T_meant_commanded of the nominal arm: what a Cartesian target moves by
-    residual: Array  # (K, 6) twist of the tool by which the true arm still misses the meant pose under the model
-    U: Array  # (K,) expanded uncertainty (k = 2) of the tool's position, parameters as independent
-
-
-def compensate_targets(arm: ArmModel, joints: Array, T_flange_tool: Array) -> ProgramCompensation:
+def compensate_targets(arm: ArmModel, joints: Array, T_flange_tool: Array) -> tuple[Array, Array, Array, Array]:
     """Solve true_flange(commanded) = forward(nominal) for targets one after the other.
 
     Newton steps with the nominal arm's Jacobian: the true one differs from it by thousandths, and so does the error
@@ -98,6 +88,11 @@ def compensate_targets(arm: ArmModel, joints: Array, T_flange_tool: Array) -> Pr
     Args:
         joints: (K, n) rad that the nominal arm would take.
         T_flange_tool: (4, 4) of the place that matters, length_unit.
+
+    Returns:
+        Commanded joints (K, n); by what a Cartesian target moves, T_meant_commanded of the nominal arm's tool
+        (K, 4, 4); the twist of the tool by which the true arm still misses the meant pose under the model (K, 6); and
+        the expanded uncertainty (k = 2) of the tool's position (K,).
     """
     meant = kinematics.forward(arm.robot, joints)
     # How the joints come from the targets before: 0 where nobody knows or nothing moves.
@@ -120,7 +115,7 @@ def compensate_targets(arm: ArmModel, joints: Array, T_flange_tool: Array) -> Pr
     T_tool_flange = frames.inverse(T_flange_tool)
     move = T_tool_flange @ frames.inverse(meant) @ kinematics.forward(arm.robot, q) @ T_flange_tool
     left = missed(q) @ frames.adjoint(T_tool_flange).T
-    return ProgramCompensation(q, move, left, _uncertainty(arm, q, approach, T_flange_tool))
+    return q, move, left, _uncertainty(arm, q, approach, T_flange_tool)
 
 
 def _previous_joints(q: Array) -> Array:
@@ -134,22 +129,14 @@ def _uncertainty(arm: ArmModel, q: Array, approach: Array, T_flange_tool: Array)
     def place(terms: tuple[Term, ...]) -> Array:
         return (replace(arm, terms=terms).true_flange(q, _previous_joints(q), approach) @ T_flange_tool)[:, :3, 3]
 
-    here, values = place(arm.terms), values_of(arm.terms)
+    here = place(arm.terms)
+    values = values_of(arm.terms)
     # Columns of the root are steps of about one sigma: J·L by differences, column by column.
     steps = arm.covariance.root(arm.terms).T
     moved = np.array([place(with_parameter_values(arm.terms, values + step)) - here for step in steps]).reshape(
         -1, *here.shape
     )
     return COVERAGE_FACTOR * np.sqrt(np.einsum("pki,pki->k", moved, moved))
-
-
-@dataclass(frozen=True)
-class ProgramTargets:
-    """K targets of a program. Lengths in the session's length_unit."""
-
-    joints: Array  # (K, n) rad, of the session's arm
-    T_flange_tool: Array  # (4, 4)
-    cartesian: tuple[bool, ...]  # the joint angles are those of the inverse kinematics
 
 
 def couple_j2_j3(joints: Array, sign: float = 1.0) -> Array:
@@ -165,8 +152,9 @@ def couple_j2_j3(joints: Array, sign: float = 1.0) -> Array:
 
 def program_targets(
     program: Program, arm: ArmModel, near: Array | None = None, j2_in_j3: bool = False
-) -> ProgramTargets:
-    """Return joint angles that the nominal arm takes at each target.
+) -> tuple[Array, Array]:
+    """Return joint angles (K, n) in rad that the nominal arm takes at each target, and T_flange_tool (4, 4); the
+    session's length_unit.
 
     Those of a pose are found from the target before, the first from `near` or from the poses of the run: that arm
     configuration is taken which needs the least turn.
@@ -179,21 +167,27 @@ def program_targets(
         InputError: joints of another arm, a pose out of reach, a waypoint whose joints and pose contradict each other.
     """
     unit = 1e-3 / arm.robot.metres_per_unit
-    T_base_frame, T_flange_tool = (_scaled_pose(T, unit) for T in (program.T_base_frame, program.T_flange_tool))
+    T_base_frame = _scaled_pose(program.T_base_frame, unit)
+    T_flange_tool = _scaled_pose(program.T_flange_tool, unit)
     starts = arm.joints[:: max(1, len(arm.joints) // _STARTS)] if near is None else near[None]
-    found: list[Array] = []
+    joints: list[Array] = []
     for point in program.points:
+        if point.joints is None and point.T_frame_tool is not None:
+            T = T_base_frame @ _scaled_pose(point.T_frame_tool, unit) @ frames.inverse(T_flange_tool)
+            joints.append(_nearest_solution(program, arm, point, T, joints[-1] if joints else None, starts))
+            continue
+        joints.append(_taught_joints(program, arm, point, j2_in_j3))
         if point.T_frame_tool is None:
-            found.append(_taught_joints(program, arm, point, j2_in_j3))
             continue
         T = T_base_frame @ _scaled_pose(point.T_frame_tool, unit) @ frames.inverse(T_flange_tool)
-        if point.joints is not None:
-            found.append(_taught_joints(program, arm, point, j2_in_j3))
-            _require_agreement(program, arm, point, kinematics.forward(arm.robot, found[-1]), T)
-        else:
-            found.append(_nearest_solution(program, arm, point, T, found[-1] if found else None, starts))
-    cartesian = tuple(point.joints is None for point in program.points)
-    return ProgramTargets(np.array(found), T_flange_tool, cartesian)
+        off = kinematics.forward(arm.robot, joints[-1])[:3, 3] - T[:3, 3]
+        metres = float(np.linalg.norm(off)) * arm.robot.metres_per_unit
+        if metres > _AGREE:
+            raise InputError(
+                f"{program.file} line {point.line}: joints and pose of {point.name} are {metres * 1e3:.0f} mm apart; "
+                "to fix: check --tool, --frame, and that the session's [robot] is this arm"
+            )
+    return np.array(joints), T_flange_tool
 
 
 def _scaled_pose(T: Array, unit: float) -> Array:
@@ -221,41 +215,15 @@ def _nearest_solution(
         onward = joint_solutions(arm.robot, T, before[None])
         if len(onward) and np.abs(onward[0] - before).max() < _SAME:
             return onward[0]
-    found = joint_solutions(arm.robot, T, starts if before is None else np.vstack([before[None], starts]))
-    if not len(found):
+    solutions = joint_solutions(arm.robot, T, starts if before is None else np.vstack([before[None], starts]))
+    if not len(solutions):
         raise InputError(
             f"{program.file} line {point.line}: {point.name} is out of reach of the arm of session {arm.session}; to "
             "fix: check --frame and --tool, or state joint angles nearby with --near"
         )
     reference = starts if before is None else before[None]
-    turn = np.linalg.norm(found[:, None] - reference, axis=2).min(axis=1)
-    return found[turn.argmin()]
-
-
-def _require_agreement(program: Program, arm: ArmModel, point: TaughtPoint, T_joints: Array, T_pose: Array) -> None:
-    off = float(np.linalg.norm(T_joints[:3, 3] - T_pose[:3, 3])) * arm.robot.metres_per_unit
-    if off > _AGREE:
-        raise InputError(
-            f"{program.file} line {point.line}: joints and pose of {point.name} are {off * 1e3:.0f} mm apart; to fix: "
-            "check --tool, --frame, and that the session's [robot] is this arm"
-        )
-
-
-@dataclass(frozen=True)
-class MovedProgram:
-    """The copy, and how far the tool moves at each target."""
-
-    program: Program
-    moves: Array  # (K, 4, 4) mm, T_meant_commanded of the tool
-    texts: dict[Path, str]
-
-    def rows(self) -> list[dict[str, Any]]:
-        """Return a row a target: how far it moves and turns."""
-        sizes = _move_sizes(frames.log(self.moves), 1.0)
-        return [
-            {"target": point.name, "line": point.line, "moved_mm": float(mm), "moved_mrad": float(mrad)}
-            for point, (mm, mrad) in zip(self.program.points, sizes, strict=True)
-        ]
+    turn = np.linalg.norm(solutions[:, None] - reference, axis=2).min(axis=1)
+    return solutions[turn.argmin()]
 
 
 def part_motion(file: Path, part: int = 1) -> Array:
@@ -267,20 +235,21 @@ def part_motion(file: Path, part: int = 1) -> Array:
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
         nominal, unit = document["T_base_part_nominal"], document["length_unit"]
-        found = [np.array(own["T_base_part"], float).reshape(4, 4) for own in document["parts"]]
+        places = [np.array(entry["T_base_part"], float).reshape(4, 4) for entry in document["parts"]]
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(f"{file}: is no fit.json of this version; to fix: run stitch fit again with -o") from None
     if nominal is None or unit not in METRES:
         missing = "[nominal], the place for which the program was taught" if nominal is None else 'length_unit = "mm"'
         raise InputError(f"{file}: the job of this fit states no {missing}; to fix: state it, and run stitch fit again")
-    if not 1 <= part <= len(found):
-        raise InputError(f"{file}: has {len(found)} parts, no part {part}; to fix: name one of them with --part")
-    T = found[part - 1] @ frames.inverse(np.array(nominal))
+    if not 1 <= part <= len(places):
+        raise InputError(f"{file}: has {len(places)} parts, no part {part}; to fix: name one of them with --part")
+    T = places[part - 1] @ frames.inverse(np.array(nominal))
     return _scaled_pose(T, METRES[unit] * 1e3)
 
 
-def moved_program(program: Program, T_base: Array) -> MovedProgram:
-    """Return the copy whose targets stand to the moved part as the program's own do to the nominal one.
+def moved_program(program: Program, T_base: Array) -> tuple[dict[Path, str], list[dict[str, Any]]]:
+    """Return the texts of a copy whose targets stand to the moved part as the program's own do to the nominal one, and
+    a row a target: how far it moves and turns.
 
     Args:
         T_base: (4, 4) mm, motion of the part in the base frame.
@@ -297,8 +266,11 @@ def moved_program(program: Program, T_base: Array) -> MovedProgram:
             )
         meant = program.T_base_frame @ point.T_frame_tool
         moves.append(frames.inverse(meant) @ T_base @ meant)
-    turns = np.zeros((len(moves), 1))
-    return MovedProgram(program, np.array(moves), compensated_texts(program, np.array(moves), turns))
+    rows = [
+        {"target": point.name, "line": point.line, "moved_mm": float(mm), "moved_mrad": float(mrad)}
+        for point, (mm, mrad) in zip(program.points, _move_sizes(frames.log(np.array(moves)), 1.0), strict=True)
+    ]
+    return compensated_texts(program, np.array(moves), np.zeros((len(moves), 1))), rows
 
 
 def compensated_texts(program: Program, moves: Array, turns: Array, j2_in_j3: bool = False) -> dict[Path, str]:
@@ -322,22 +294,22 @@ def compensated_texts(program: Program, moves: Array, turns: Array, j2_in_j3: bo
                 new[3:] = np.where(np.abs(old[3:]) <= 180, (new[3:] + 180) % 360 - 180, new[3:])
             edits[file] += _edits(text, point.pose_at, new, [place] * 3 + [turn] * (len(new) - 3))
         if point.joints is not None and np.abs(step).max() > _NEGLIGIBLE_CHANGE:
-            own = couple_j2_j3(step, -1.0) if j2_in_j3 else step
-            angles = own if program.controller == "ur" else np.degrees(own)
+            taught_step = couple_j2_j3(step, -1.0) if j2_in_j3 else step
+            angles = taught_step if program.controller == "ur" else np.degrees(taught_step)
             new = _span_values(text, point.joints_at) + angles
             edits[file] += _edits(text, point.joints_at, new, [joint] * len(new))
-    out = dict(program.texts)
+    texts = dict(program.texts)
     for file, changes in edits.items():
         # From behind, so that places before a change stay.
         for (begin, end), new_text in sorted(changes, reverse=True):
-            out[file] = out[file][:begin] + new_text + out[file][end:]
-    return out
+            texts[file] = texts[file][:begin] + new_text + texts[file][end:]
+    return texts
 
 
 def number_text(old: str, value: float, decimals: int) -> str:
     """Return a number in the manner of the one that it replaces; the same text where it says the same."""
-    own = len(old.lower().split("e")[0].partition(".")[2])
-    text = f"{value:.{max(own, decimals)}f}"
+    written = len(old.lower().split("e")[0].partition(".")[2])
+    text = f"{value:.{max(written, decimals)}f}"
     if float(text) == float(old):
         return old
     if old.lstrip("+-").startswith("."):
@@ -358,33 +330,32 @@ def _edits(text: str, spans: Sequence[Span], new: Array, decimals: Sequence[int]
 
 @dataclass(frozen=True)
 class CompensatedProgram:
-    """The copy and the table of its moves; lengths in mm."""
+    """The copy, K targets commanded anew, and the table of their moves."""
 
     program: Program
     arm: ArmModel
-    targets: ProgramTargets
-    compensation: ProgramCompensation
+    meant_joints: Array  # (K, n) rad, that the nominal arm would take
+    joints: Array  # (K, n) rad, commanded
+    move: Array  # (K, 4, 4) length_unit, of the tool: T_meant_commanded
+    residual: Array  # (K, 6) twist by which the true arm still misses the meant pose under the model
+    U: Array  # (K,) expanded uncertainty (k = 2) of the tool's position, length_unit
     texts: dict[Path, str]
     beyond: tuple[str, ...]  # effects of the arm that a program's targets do not decide
     notes: tuple[str, ...]
 
-    @property
-    def mm(self) -> float:
-        """Return millimetres in one length_unit."""
-        return self.arm.robot.metres_per_unit * 1e3
-
     def rows(self) -> list[dict[str, Any]]:
         """Return a row a target: moved, left under the model, U (k = 2)."""
-        sizes = _move_sizes(frames.log(self.compensation.move), self.mm)
-        left = _move_sizes(self.compensation.residual, self.mm)
-        turned = np.degrees(self.compensation.joints - self.targets.joints)
+        mm = self.arm.robot.metres_per_unit * 1e3
+        sizes = _move_sizes(frames.log(self.move), mm)
+        left = _move_sizes(self.residual, mm)
+        turned = np.degrees(self.joints - self.meant_joints)
         return [
             {
                 "target": point.name,
                 "line": point.line,
                 "moved_mm": float(sizes[k, 0]),
                 "moved_mrad": float(sizes[k, 1]),
-                "U_mm": float(self.compensation.U[k] * self.mm),
+                "U_mm": float(self.U[k] * mm),
                 "left_mm": float(left[k, 0]),
                 "left_mrad": float(left[k, 1]),
                 "joints_deg": turned[k].tolist(),
@@ -417,15 +388,24 @@ def compensated_program(
             + (f" but {', '.join(beyond)}, which hangs on more than the targets" if beyond else "")
             + ", so that a copy would be the same; to fix: diagnose, and add what is missing"
         )
-    targets = program_targets(program, arm, near, j2_in_j3)
-    found = compensate_targets(still, targets.joints, targets.T_flange_tool)
+    meant, T_flange_tool = program_targets(program, arm, near, j2_in_j3)
+    joints, move, residual, U = compensate_targets(still, meant, T_flange_tool)
     mm = arm.robot.metres_per_unit * 1e3
-    _require_believable(program, targets, found, limit_mm, mm)
-    moves = found.move.copy()
-    moves[:, :3, 3] *= mm
-    texts = compensated_texts(program, moves, found.joints - targets.joints, j2_in_j3)
-    notes = _program_notes(program, arm, targets, found, beyond)
-    return CompensatedProgram(program, still, targets, found, texts, beyond, notes)
+    _require_believable(program, _move_sizes(frames.log(move), mm), np.abs(joints - meant), limit_mm)
+    moves_mm = move.copy()
+    moves_mm[:, :3, 3] *= mm
+    return CompensatedProgram(
+        program=program,
+        arm=still,
+        meant_joints=meant,
+        joints=joints,
+        move=move,
+        residual=residual,
+        U=U,
+        texts=compensated_texts(program, moves_mm, joints - meant, j2_in_j3),
+        beyond=beyond,
+        notes=_program_notes(program, arm, meant, joints, beyond),
+    )
 
 
 def _move_sizes(twists: Array, mm: float) -> Array:
@@ -433,10 +413,8 @@ def _move_sizes(twists: Array, mm: float) -> Array:
     return np.column_stack([np.linalg.norm(twists[:, 3:], axis=1) * mm, np.linalg.norm(twists[:, :3], axis=1) * 1e3])
 
 
-def _require_believable(
-    program: Program, targets: ProgramTargets, compensation: ProgramCompensation, limit: float, mm: float
-) -> None:
-    sizes, turned = _move_sizes(frames.log(compensation.move), mm), np.abs(compensation.joints - targets.joints)
+def _require_believable(program: Program, sizes: Array, turned: Array, limit: float) -> None:
+    """Refuse targets that move (K, 2) mm and mrad, or turn (K, n) rad of a joint, farther than an arm is off."""
     for k, point in enumerate(program.points):
         where = f"{program.file} line {point.line}: {point.name}"
         if not (sizes[k] <= (limit, _MRAD_PER_MM * limit)).all():
@@ -453,7 +431,7 @@ def _require_believable(
 
 
 def _program_notes(
-    program: Program, arm: ArmModel, targets: ProgramTargets, compensation: ProgramCompensation, beyond: tuple[str, ...]
+    program: Program, arm: ArmModel, meant: Array, joints: Array, beyond: tuple[str, ...]
 ) -> tuple[str, ...]:
     notes = []
     if beyond:
@@ -461,26 +439,30 @@ def _program_notes(
     if arm.other_effects:
         notes.append(f"not in a program's targets: {', '.join(arm.other_effects)}")
     if program.unread:
-        told = ", ".join(str(line) for line in program.unread)
-        notes.append(f"not moved, since these motions are not read (arcs, registers, computed targets): lines {told}")
+        lines = ", ".join(str(line) for line in program.unread)
+        notes.append(f"not moved, since these motions are not read (arcs, registers, computed targets): lines {lines}")
     if program.other:
         notes.append(f"no targets of a motion, left as they are: {', '.join(program.other)}")
     sided = [term.name for term in arm.terms if term.name in _HISTORY_EFFECTS]
     if sided and program.repeated:
-        told = f"moved to more than once, {' and '.join(sided)} undone for the first time alone"
-        notes.append(f"{told}: {', '.join(program.repeated)}")
-    low, high = arm.joints.min(axis=0) - _MAX_JOINT_EXCESS, arm.joints.max(axis=0) + _MAX_JOINT_EXCESS
-    outside = (targets.joints < low) | (targets.joints > high)
+        undone = f"{' and '.join(sided)} undone for the first time alone"
+        notes.append(f"moved to more than once, {undone}: {', '.join(program.repeated)}")
+    low = arm.joints.min(axis=0) - _MAX_JOINT_EXCESS
+    high = arm.joints.max(axis=0) + _MAX_JOINT_EXCESS
+    outside = (meant < low) | (meant > high)
     names = [point.name for point, out in zip(program.points, outside.any(axis=1), strict=True) if out]
     if names:
-        told = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        listed = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
         notes.append(
             "beyond the joint angles on which the model was fitted, by more than "
-            f"{np.degrees(_MAX_JOINT_EXCESS):.0f}°: {told}"
+            f"{np.degrees(_MAX_JOINT_EXCESS):.0f}°: {listed}"
         )
     # Configurations count quadrants, signs and half turns.
-    before, after = (np.floor(q / (np.pi / 2)) for q in (targets.joints, compensation.joints))
-    crosses = (before != after).any(axis=1) & np.array(targets.cartesian)
-    if crossing := ", ".join(point.name for point, own in zip(program.points, crosses, strict=True) if own):
-        notes.append(f"a joint passes a multiple of 90°, so that its configuration may have to be set anew: {crossing}")
+    crosses = (np.floor(meant / (np.pi / 2)) != np.floor(joints / (np.pi / 2))).any(axis=1)
+    crossing = [p.name for p, crossed in zip(program.points, crosses, strict=True) if crossed and p.joints is None]
+    if crossing:
+        notes.append(
+            "a joint passes a multiple of 90°, so that its configuration may have to be set anew: "
+            f"{', '.join(crossing)}"
+        )
     return tuple(notes)

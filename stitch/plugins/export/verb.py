@@ -47,7 +47,13 @@ def export_run(
     """
     path = None if file is None else Path(file)
     if to in CLOUD_FORMATS:
-        _write_cloud(run, to, path)
+        if path is None or path.suffix.lower() != f".{to}":
+            raise InputError(f"{to}: where to? to fix: name the file NAME.{to}")
+        if not len(run.fused.points):
+            raise InputError(f"{run.session.name}: labelled points alone give no cloud; there is none to export")
+        write, _ = CLOUD_FORMATS[to]
+        with whole_file(path) as out:
+            write(coloured(stored_cloud(run), run.session.length_unit), out)
         return None
     if to in ARM_FORMATS:
         session = run.measured if isinstance(run, Run) and run.measured is not None else run.session
@@ -63,13 +69,3 @@ def export_run(
         with whole_file(path) as out:
             out.write_text(text, encoding="utf-8")
     return text
-
-
-def _write_cloud(run: RunData, to: str, file: Path | None) -> None:
-    if file is None or file.suffix.lower() != f".{to}":
-        raise InputError(f"{to}: where to? to fix: name the file NAME.{to}")
-    if not len(run.fused.points):
-        raise InputError(f"{run.session.name}: labelled points alone give no cloud; there is none to export")
-    write, _ = CLOUD_FORMATS[to]
-    with whole_file(file) as out:
-        write(coloured(stored_cloud(run), run.session.length_unit), out)
