@@ -1,5 +1,6 @@
 """The arm of a run as its model has it: where the flange truly goes; and as DH rows or URDF for other programs."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from stitch.numerics.frames import Array
 from stitch.output.session_files import robot_toml
 from stitch.output.stored_run import read_result, trusted_model
 from stitch.output.urdf_file import to_urdf, xml_comment
-from stitch.plugins.metrology.calibrate.robot import CalibratedRobot, beyond_sentence, calibrated_robot
+from stitch.plugins.metrology.calibrate.robot import arm_effects, beyond_sentence, with_geometry
 from stitch.session import robot as kinematics
 from stitch.session.capture import build_capture
 from stitch.session.measurement import Measurement, Views, gravity_of, views_of
@@ -82,8 +83,8 @@ def arm_from(session: SessionData, file: ModelFile) -> ArmModel:
         raise InputError(f"{session.path}: no joint angles or no [robot]; to fix: state both, which an arm needs")
     T_base_flange = np.array([view.T_base_flange for view in session.views])
     measurement = _arm_measurement(session.name, session.robot, T_base_flange, views, session.length_unit)
-    own = {name: values for name, values in file.effects.items() if find_effect(name).place in ARM_PLACES}
-    model = bind_to_session(convert_unit(replace(file, effects=own), session.length_unit), measurement)
+    of_arm = {name: values for name, values in file.effects.items() if find_effect(name).place in ARM_PLACES}
+    model = bind_to_session(convert_unit(replace(file, effects=of_arm), session.length_unit), measurement)
     return ArmModel(
         session=session.name,
         robot=session.robot,
@@ -93,7 +94,7 @@ def arm_from(session: SessionData, file: ModelFile) -> ArmModel:
         torques_measured=views.torques.measured,
         length_unit=session.length_unit,
         joints=views.joints,
-        other_effects=tuple(name for name in file.effects if name not in own),
+        other_effects=tuple(name for name in file.effects if name not in of_arm),
     )
 
 
@@ -134,8 +135,9 @@ def arm_dh(arm: ArmModel) -> str:
     Raises:
         InputError: an arm that came as URDF has no DH rows.
     """
-    found = calibrated_robot(arm.robot, arm.terms)
-    table = robot_toml(found.robot, ["The [robot] table of session.toml", *_comment_lines(found)])
+    table = robot_toml(
+        with_geometry(arm.robot, arm.terms), ["The [robot] table of session.toml", *_comment_lines(arm.terms)]
+    )
     if table is None:
         raise InputError(f"the arm of session {arm.session} is stated as URDF, without DH rows; to fix: --to arm-urdf")
     return table
@@ -143,16 +145,19 @@ def arm_dh(arm: ArmModel) -> str:
 
 def arm_urdf(arm: ArmModel) -> str:
     """Return URDF in m and rad: base_link, link_1 … link_n, flange."""
-    found = calibrated_robot(arm.robot, arm.terms)
-    declaration, chain = to_urdf(found.robot).split("\n", 1)
-    return f"{declaration}\n{xml_comment([f'The arm of session {arm.session}', *_comment_lines(found)])}{chain}\n"
+    declaration, chain = to_urdf(with_geometry(arm.robot, arm.terms)).split("\n", 1)
+    comment = xml_comment([f"The arm of session {arm.session}", *_comment_lines(arm.terms)])
+    return f"{declaration}\n{comment}{chain}\n"
 
 
-def _comment_lines(calibrated: CalibratedRobot) -> list[str]:
+def _comment_lines(terms: Sequence[Term]) -> list[str]:
     """Return what is in it, what is not, and which command fits a table that stands alone."""
-    told = ["with the joint offsets and link errors that the model of the run has.", beyond_sentence(calibrated)]
-    alone = "Without it this may leave more than the nominal arm; stitch calibrate robot fits a table for itself."
-    return [*told, alone] if calibrated.beyond else told
+    lines = ["with the joint offsets and link errors that the model of the run has.", beyond_sentence(terms)]
+    if arm_effects(terms)[1]:
+        lines.append(
+            "Without it this may leave more than the nominal arm; stitch calibrate robot fits a table for itself."
+        )
+    return lines
 
 
 ARM_FORMATS = {"arm-dh": arm_dh, "arm-urdf": arm_urdf}

@@ -1,6 +1,4 @@
-"""Kinematic calibration of a robot: the nominal arm with what a model found, and the poses that would tell more.
-
-An arm as a table of links: fitted for what such a table can hold, and proved by reading it back.
+"""Kinematic calibration of a robot: the arm as a table of links that is proved, and the poses that would tell more.
 
 Offsets and links of a model are right beside its compliance and its gears, which no table holds; without these they
 may leave more than the nominal arm does. So the table is fitted alone: all offsets and links, each with a prior of
@@ -42,25 +40,19 @@ GEOMETRY = ("joint_offset", "link_geometry")
 _PROPOSED, _TRIED = 6, 250
 # Sizes of the prior that are tried, in plausible sizes of each parameter.
 LINK_TRUSTS = tuple(2.0**k for k in range(-6, 3))
-# Of the views, how many an end holds; joints that turn less than this, rad, have none. The table is proved at ends of
-# the joints that turn farthest.
-_END, _STILL, _ENDS_PROVED = 1 / 3, 0.05, 6
+# Share of the views that an end holds; joints that turn less than so much, rad, have none.
+_END = 1 / 3
+_STILL = 0.05
+# The table is proved at so many ends, of the joints that turn farthest.
+_ENDS_PROVED = 6
 _CHANCE = 0.01  # that a table which is no better than the nominal arm is said to be
-_FEWEST_VIEWS, _NUMBERS_EACH = 12, 3
+_FEWEST_VIEWS = 12
+_NUMBERS_EACH = 3
 _UNSEEN = 1e-9  # of the largest eigenvalue: what these views do not show of hand-eye and targets
 _HEADER = "The [robot] table of session.toml: put it there in place of the nominal one."
 
 
-@dataclass(frozen=True)
-class CalibratedRobot:
-    """The corrected arm, and the effects in use that it holds and that no table of links can hold."""
-
-    robot: Robot
-    beyond: tuple[str, ...]
-    held: tuple[str, ...] = ()
-
-
-def calibrated_robot_of_run(run: RunData) -> CalibratedRobot:
+def calibrated_robot_of_run(run: RunData) -> Robot:
     """The session's robot with the joint offsets and link errors of a run.
 
     Raises:
@@ -69,31 +61,28 @@ def calibrated_robot_of_run(run: RunData) -> CalibratedRobot:
     robot = run.session.robot
     if robot is None or not run.measurement.views.joints.shape[1]:
         raise InputError(f"{run.session.path}: no joint angles or no [robot]; a kinematic calibration needs both")
-    return calibrated_robot(robot, run.terms)
+    return with_geometry(robot, run.terms)
 
 
-def calibrated_robot(robot: Robot, terms: Sequence[Term]) -> CalibratedRobot:
-    """A robot with the joint offsets and link errors of a model."""
-    of_the_arm = [term.name for term in terms if term.effect.place in ("robot", "links")]
-    held = tuple(name for name in of_the_arm if name in GEOMETRY)
-    beyond = tuple(name for name in of_the_arm if name not in GEOMETRY)
-    return CalibratedRobot(with_geometry(robot, terms), beyond, held)
+def arm_effects(terms: Sequence[Term]) -> tuple[list[str], list[str]]:
+    """The effects of the arm that a table of links can hold, and those that none can."""
+    of_arm = [term.name for term in terms if term.effect.place in ("robot", "links")]
+    return [name for name in of_arm if name in GEOMETRY], [name for name in of_arm if name not in GEOMETRY]
 
 
-def beyond_sentence(calibrated_arm: CalibratedRobot, in_table: Collection[str] = GEOMETRY) -> str:
+def beyond_sentence(terms: Sequence[Term], in_table: Collection[str] = GEOMETRY) -> str:
     """What a table of links cannot hold, and what it could but does not.
 
     Args:
         in_table: effects in the table that is written.
     """
-    told = []
-    if unproved := [name for name in calibrated_arm.held if name not in in_table]:
-        told.append(f"Found, but not in it for want of proof: {', '.join(unproved)}; model.toml has it.")
-    if calibrated_arm.beyond:
-        told.append(
-            f"Not in it, because no table of links can hold it: {', '.join(calibrated_arm.beyond)}; model.toml has it."
-        )
-    return " ".join(told) or "The model has no other effect of the arm."
+    held, beyond = arm_effects(terms)
+    sentences = []
+    if unproved := [name for name in held if name not in in_table]:
+        sentences.append(f"Found, but not in it for want of proof: {', '.join(unproved)}; model.toml has it.")
+    if beyond:
+        sentences.append(f"Not in it, because no table of links can hold it: {', '.join(beyond)}; model.toml has it.")
+    return " ".join(sentences) or "The model has no other effect of the arm."
 
 
 def with_geometry(robot: Robot, terms: Sequence[Term]) -> Robot:
@@ -120,19 +109,20 @@ def poses_to_add(run: RunData) -> Array:
     The determinant of the parameters' covariance falls most (D-optimal design, Fedorov 1972), one pose after
     the other, each seen beside those before it.
     """
-    found = run.targets
-    if found is None or not run.terms:
+    targets = run.targets
+    if targets is None or not run.terms:
         return np.zeros((0, run.measurement.views.joints.shape[1]))
     joints = nearby(run.measurement.views.joints)[:_TRIED]
     _, columns, covariance = candidate_rows(
-        candidate_measurement(run.measurement, joints), found.rows, found.landmarks, found.variances, run.terms
+        candidate_measurement(run.measurement, joints), targets.rows, targets.landmarks, targets.variances, run.terms
     )
     sigmas = np.array([p.sigma for p in stack_parameters(run.terms)])
     keep = np.isfinite(sigmas)
     half = np.linalg.inv(np.linalg.cholesky(covariance))
     # In units of what is known now: an information of one doubles it.
     white = half @ np.concatenate(columns, axis=2)[..., keep] * sigmas[keep]
-    known, chosen = np.eye(int(keep.sum())), list[int]()
+    known = np.eye(int(keep.sum()))
+    chosen = list[int]()
     for _ in range(min(_PROPOSED, len(joints))):
         gains = [np.linalg.slogdet(known + w.T @ w)[1] if k not in chosen else -np.inf for k, w in enumerate(white)]
         chosen.append(int(np.argmax(gains)))
@@ -165,14 +155,6 @@ class LinkTable:
             f"out, the nominal {nominal}."
         )
 
-    @property
-    def range_sentence(self) -> str:
-        """For which joint angles it is proved; empty for the nominal arm."""
-        if not self.effects or self.ranges is None:
-            return ""
-        each = [f"j{i + 1} {a:.0f} … {b:.0f}°" for i, (a, b) in enumerate(np.degrees(self.ranges))]
-        return f"Proved for {', '.join(each)}; beyond, nothing was measured."
-
 
 def link_table(session: SessionData) -> LinkTable:
     """The table that the ends of the joints' ranges trust; the nominal one where none leaves clearly less.
@@ -180,8 +162,8 @@ def link_table(session: SessionData) -> LinkTable:
     Raises:
         InputError: the session has no robot with joints.
     """
-    nominal, joints = session.robot, session.joints
-    if nominal is None or joints is None:
+    nominal = session.robot
+    if nominal is None or session.joints is None:
         raise InputError(f"{session.path}: no [robot] with joint angles; a table of its links needs them")
     try:
         seen = observe_links(session)
@@ -197,12 +179,13 @@ def link_table(session: SessionData) -> LinkTable:
     plain = _judge(session, seen.names, [(end, None) for end, _ in proof])
     if judged is None or plain is None:
         return LinkTable(nominal, ())
-    here, before = (float(np.sqrt(np.nanmean(squares))) for squares in (judged, plain))
+    heldout_rms = float(np.sqrt(np.nanmean(judged)))
+    nominal_rms = float(np.sqrt(np.nanmean(plain)))
     if not trust or not significantly_smaller(judged, plain, _CHANCE):
-        return LinkTable(nominal, (), here, before)
+        return LinkTable(nominal, (), heldout_rms, nominal_rms)
     ranges = np.stack([seen.joints.min(axis=0), seen.joints.max(axis=0)], axis=1)
     robot = seen.table(nominal, trust, np.ones(len(seen.joints), bool))
-    return LinkTable(robot, tuple(term.name for term in seen.terms), here, before, ranges)
+    return LinkTable(robot, tuple(term.name for term in seen.terms), heldout_rms, nominal_rms, ranges)
 
 
 def _ends(joints: Array, of: Sequence[int] | None = None) -> list[Mask]:
@@ -249,24 +232,25 @@ class SeenLinks:
 
 def observe_links(session: SessionData) -> SeenLinks:
     """Linearise the targets of a session about its nominal arm."""
-    found = run(session)
-    if found.targets is None or found.session.joints is None:
+    fit = run(session)
+    if fit.targets is None or fit.session.joints is None:
         raise InputError(f"{session.path}: no labelled points or no joint angles; a calibration needs both")
-    rows, measurement = found.targets.rows, found.measurement
+    rows = fit.targets.rows
+    measurement = fit.measurement
     terms = tuple(term_of(measurement, EFFECTS[name]) for name in GEOMETRY if name in EFFECTS)
     columns = np.concatenate(rows.effect_columns(measurement, Model(rows.T_mount), terms), axis=2) * sizes_of(terms)
     base = np.concatenate([rows.hand_eye, rows.landmarks], axis=2)
     every = rows.mixed_model(np.concatenate([base, columns], axis=2))
     # Of few numbers all columns together leave no scatter to be seen.
     enough = every.size > _NUMBERS_EACH * every.A.shape[2]
-    variances = fit_variances(every, both_starts=True).variances if enough else found.targets.variances
+    variances = fit_variances(every, both_starts=True).variances if enough else fit.targets.variances
     half = whitener(rows.mixed_model(base), variances)
     V = len(rows.lever)
     shown = np.flatnonzero(np.asarray(rows.used.any(axis=1))[:V])
     white = (half @ np.concatenate([base, columns, every.z[..., None]], axis=2))[shown]
-    names = tuple(found.session.names[v] for v in shown)
+    names = tuple(fit.session.names[v] for v in shown)
     products = white.transpose(0, 2, 1) @ white
-    return SeenLinks(names, found.session.joints[shown], terms, base.shape[2], products)
+    return SeenLinks(names, fit.session.joints[shown], terms, base.shape[2], products)
 
 
 def _judge(session: SessionData, names: Sequence[str], proof: Sequence[tuple[Mask, Robot | None]]) -> Array | None:
@@ -323,34 +307,33 @@ def _with_reported_arm(session: SessionData, robot: Robot) -> SessionData:
 def write_robot(table: LinkTable, run: RunData, folder: Path) -> None:
     """robot.toml (for an arm of DH rows) and robot.urdf."""
     (folder / "robot.urdf").write_text(to_urdf(table.robot), encoding="utf-8")
-    told = [_HEADER, *robot_notes(table, run)]
-    text = robot_toml(table.robot, told, run.session.repeatability)
+    text = robot_toml(table.robot, [_HEADER, *robot_notes(table, run)], run.session.repeatability)
     if text is not None:
         (folder / "robot.toml").write_text(text, encoding="utf-8")
 
 
 def robot_notes(table: LinkTable, run: RunData) -> list[str]:
     """What the table is worth, what is not in it, and what has to be done so that it counts; a line each."""
-    told = [table.sentence(run.session.length_unit), *filter(None, [table.range_sentence])]
-    told += [beyond_sentence(calibrated_robot_of_run(run), table.effects)]
-    return [*told, *filter(None, [_reported_pose_note(table, run.session)])]
-
-
-def _reported_pose_note(table: LinkTable, session: SessionData) -> str:
-    """How a session whose controller reports poses comes to use the table; empty where nothing stands in its way."""
-    if not table.effects or session.robot is None or not has_reported_poses(session.path / "views.csv"):
-        return ""
-    poses = [(view.T_base_flange, view.joints) for view in session.views if view.joints is not None]
-    off = max(float(np.linalg.norm((T - forward(session.robot, q))[:3, 3])) for T, q in poses)
-    return (
-        "Take x … qw out of views.csv too: they are the nominal arm's (within "
-        f"{length_text(off, session.length_unit, 2)}), and where they stand they are used and no table is."
-    )
+    session = run.session
+    notes = [table.sentence(session.length_unit)]
+    if table.effects and table.ranges is not None:
+        each = [f"j{i + 1} {a:.0f} … {b:.0f}°" for i, (a, b) in enumerate(np.degrees(table.ranges))]
+        notes.append(f"Proved for {', '.join(each)}; beyond, nothing was measured.")
+    notes.append(beyond_sentence(run.terms, table.effects))
+    if table.effects and session.robot is not None and has_reported_poses(session.path / "views.csv"):
+        poses = [(view.T_base_flange, view.joints) for view in session.views if view.joints is not None]
+        off = max(float(np.linalg.norm((T - forward(session.robot, q))[:3, 3])) for T, q in poses)
+        notes.append(
+            "Take x … qw out of views.csv too: they are the nominal arm's (within "
+            f"{length_text(off, session.length_unit, 2)}), and where they stand they are used and no table is."
+        )
+    return notes
 
 
 def robot_document(run: RunData, table: LinkTable, notes: list[str], sentence: str) -> dict[str, Any]:
     """The JSON document."""
-    result, found = result_document(run), calibrated_robot_of_run(run)
+    result = result_document(run)
+    held, beyond = arm_effects(run.terms)
     steps = [
         {"effects": list(s.effects), "residual_rms": s.residual_rms, "heldout_rms": s.heldout_rms} for s in run.ledger
     ]
@@ -370,8 +353,8 @@ def robot_document(run: RunData, table: LinkTable, notes: list[str], sentence: s
             "sentence": table.sentence(run.session.length_unit),
             "sentences": robot_notes(table, run),
         },
-        "beyond_dh": list(found.beyond),
-        "unproved": [name for name in found.held if name not in table.effects],
+        "beyond_dh": beyond,
+        "unproved": [name for name in held if name not in table.effects],
         "way": notes,
         "left": sentence,
         "next": np.round(poses_to_add(run), 2).tolist(),

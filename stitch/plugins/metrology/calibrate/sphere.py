@@ -9,6 +9,7 @@ from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.hand_eye import motions_from_first, require_motion
+from stitch.plugins.metrology.calibrate.hand_eye_report import hand_eye_document, weak_components, weak_notes
 from stitch.plugins.metrology.calibrate.sphere_fit import (
     SphereFit,
     SphereStart,
@@ -20,7 +21,6 @@ from stitch.plugins.metrology.calibrate.sphere_fit import (
     solve_decoupled,
     sphere_view,
 )
-from stitch.plugins.metrology.calibrate.tracker import hand_eye_document, weak_components, weak_notes
 from stitch.session.session import SessionData
 
 # Answers whose fits differ by less than this factor cannot be told apart.
@@ -28,7 +28,8 @@ _CLEAR = 1.3
 # Fewer views do not show the radius beside the rest.
 _VIEWS_FOR_RADIUS = 6
 # A radius that is off by more, and by more sigmas, is another one; scanners and coatings are off by less.
-_OTHER_RADIUS, _RADIUS_SIGMAS = 0.02, 4.0
+_OTHER_RADIUS = 0.02
+_RADIUS_SIGMAS = 4.0
 # Column of views.csv: the side of the laser plane, along the arc's normal, on which the centre lies.
 SIDE_COLUMN = "sphere_side"
 # A view's points are off by more than their noise beyond this ratio.
@@ -68,8 +69,9 @@ def calibrate_sphere(session: SessionData, radius_free: bool = False) -> SphereC
     T = np.array([view.T_base_flange for view in session.views])
     G = T if session.mount == "eye_in_hand" else frames.inverse(T)
     views = tuple(_fit_view(session, k, radius) for k in range(len(session.views)))
-    own = [v.measured[-1] for v in views if not v.is_line]
-    _require_radius(session, np.median(own) if own else radius, float(np.std(own)) if own else 0.0)
+    of_areas = [v.measured[-1] for v in views if not v.is_line]
+    if of_areas:
+        _require_radius(session, np.median(of_areas), float(np.std(of_areas)))
     require_motion(motions_from_first(G))
     start, how = find_sphere_start(G, views, session.scanner.T_mount)
     enough = len(views) >= _VIEWS_FOR_RADIUS
@@ -135,10 +137,10 @@ def open_sides(views: tuple[SphereView, ...]) -> Array:
 def find_sphere_start(G: Array, views: tuple[SphereView, ...], coarse: Array | None) -> tuple[SphereStart, str]:
     """Decoupled where sides are known and the poses allow it, else from many rotations."""
     if not open_sides(views).any():
-        said = np.array([v.side for v in views])
-        T = solve_decoupled(G, centres(views, said))
+        sides = np.array([v.side for v in views])
+        T = solve_decoupled(G, centres(views, sides))
         if T is not None:
-            first = refine_start(G, views, SphereStart(T, said, np.inf, np.inf))
+            first = refine_start(G, views, SphereStart(T, sides, np.inf, np.inf))
             return first, "decoupled: rotation from equal orientations, translation from different ones"
     return global_start(G, views, coarse), "global: the best of many rotations"
 
@@ -152,13 +154,15 @@ def sphere_weak_components(result: SphereCalibration, unit: str) -> list[str]:
 
 def sphere_notes(result: SphereCalibration, unit: str) -> list[str]:
     """Sentences: sides, wrist, weak components, noise against poses, the free radius, odd views."""
-    fit, notes = result.fit, list[str]()
+    fit = result.fit
+    notes = list[str]()
     if result.sides_found:
         plus = int((result.signs > 0).sum())
+        ratio = f"{result.runner_up:.0f}" if 10 <= result.runner_up < np.inf else f"{result.runner_up:.1f}"
         notes.append(
             "The session does not say on which side of the laser plane the sphere lies; the consistency of all poses "
             f"decided: {plus} views along the arc's normal, {len(result.signs) - plus} against it; the next best "
-            f"answer fits {_ratio_text(result.runner_up)} worse"
+            f"answer fits {ratio} times worse"
         )
     notes += weak_notes(result.G, sphere_weak_components(result, unit))
     if np.median(fit.view_rms) > _BEYOND_NOISE * fit.point_sigma:
@@ -175,7 +179,8 @@ def sphere_notes(result: SphereCalibration, unit: str) -> list[str]:
 
 def _view_notes(result: SphereCalibration, unit: str) -> list[str]:
     """Views that contradict the others or carry the answer alone."""
-    fit, notes = result.fit, []
+    fit = result.fit
+    notes = []
     sigma = np.sqrt(np.diag(fit.covariance))
     for view, step, share, rms in zip(result.views, fit.left_out, fit.shares, fit.view_rms, strict=True):
         if share < _DOUBTED:
@@ -190,28 +195,27 @@ def _view_notes(result: SphereCalibration, unit: str) -> list[str]:
     return notes
 
 
-def _ratio_text(ratio: float) -> str:
-    return f"{ratio:.0f} times" if np.isfinite(ratio) and ratio >= 10 else f"{ratio:.1f} times"
-
-
 def _radius_note(result: SphereCalibration, unit: str) -> list[str]:
     if result.free is None:
         return []
-    off, sigma = result.free.radius - result.nominal, float(np.sqrt(result.free.covariance[9, 9]))
-    found = f"Free, the radius becomes {result.free.radius:.4g} ± {sigma:.2g} {unit}"
+    off = result.free.radius - result.nominal
+    sigma = float(np.sqrt(result.free.covariance[9, 9]))
+    fitted = f"Free, the radius becomes {result.free.radius:.4g} ± {sigma:.2g} {unit}"
     if abs(off) <= _FREE_RADIUS_SIGMAS * sigma:
         return [
-            f"{found}: the {result.nominal:g} given agrees ({abs(off) / sigma:.1f} sigma), nothing else is revealed"
+            f"{fitted}: the {result.nominal:g} given agrees ({abs(off) / sigma:.1f} sigma), nothing else is revealed"
         ]
     return [
-        f"{found}, {abs(off) / sigma:.1f} sigma from the {result.nominal:g} given: the sphere's radius, the scanner's "
+        f"{fitted}, {abs(off) / sigma:.1f} sigma from the {result.nominal:g} given: the sphere's radius, the scanner's "
         f"scale ({off / result.nominal:+.2%}) or a coating is not what the session says"
     ]
 
 
 def sphere_document(result: SphereCalibration, session: SessionData) -> dict[str, Any]:
     """The JSON document."""
-    fit, unit, free = result.fit, session.length_unit, result.free
+    fit = result.fit
+    free = result.free
+    unit = session.length_unit
     return {
         **hand_eye_document("sphere", session, fit.T_mount, fit.covariance[:6, :6], fit.inflation, result.G),
         "centre": fit.centre.tolist(),

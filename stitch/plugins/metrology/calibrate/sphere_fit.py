@@ -1,29 +1,21 @@
-"""Hand-eye, centre and radius together from all points of all views; covariance counted in views.
+"""Hand-eye, centre and radius of one sphere together, from all points of all views; covariance counted in views.
 
-A pose error shifts the whole sphere in its view, and turning it about its centre changes nothing: all
-that a view's points say is the circle or sphere that they lie on. So the sum over the points of a view
-is carried by their robust circle (centre in the laser plane, radius) or sphere (centre, radius) with the
-normal matrix of its own fit, and nothing is lost. What the views then scatter by no number of points
-averages out: a shift σ_p per axis of the sphere (the robot), an error σ_ρ of its apparent radius and an
-error of the points σ_c that is one over the view (both the scanner). Near the equator of the sphere a
-radius off by σ_ρ puts the centre ρ/h·σ_ρ off, h its distance from the laser plane. All three are found by
-restricted maximum likelihood (Patterson & Thompson 1971).
+Each scan is fitted on its own first. A laser line on the sphere is a circle of radius ρ; the centre lies √(R² − ρ²) off
+the laser plane, to one side or the other. The sense of the arc gives the plane's normal a sign that a person can name:
+the cross product of the vectors through its upper, middle and lower points in the order of the file, the same for every
+line of one scanner. It cannot say on which side of the plane the sphere lies.
 
-Each scan of the known sphere on its own: where the centre can be, in the scanner frame.
+A first hand-eye comes from the centres: decoupled where the poses allow it, else from many rotations. G (V, 4, 4) is
+T_reference_mount: T_base_flange with the scanner on the robot, T_flange_base with the sphere on it. The centre is fixed
+in the reference frame: c = G_v X q_v for the centres q_v of the views.
 
-A laser line on the sphere is a circle of radius ρ; the centre lies √(R² − ρ²) off the laser plane, to
-one side or the other. The sense of the arc gives the plane's normal a sign that a person can name: the
-cross product of the vectors through its upper, middle and lower points in the order of the file, the
-same for every line of one scanner. It cannot say on which side of the plane the sphere lies.
-
-How the views of a sphere scatter: σ_p of the sphere's place, σ_ρ of its apparent radius, σ_c of the points.
-
-All three are found by restricted maximum likelihood (Patterson & Thompson 1971).
-
-First hand-eye from sphere centres: decoupled where the poses allow it, else from many rotations.
-
-G (V, 4, 4) is T_reference_mount: T_base_flange with the scanner on the robot, T_flange_base with the
-sphere on it. The centre is fixed in the reference frame: c = G_v X q_v for the centres q_v seen.
+Then all views are fitted together. A pose error shifts the whole sphere in its view, and turning it about its centre
+changes nothing: all that a view's points say is the circle or sphere that they lie on. So the sum over the points of a
+view is carried by their robust circle (centre in the laser plane, radius) or sphere (centre, radius) with the normal
+matrix of its own fit, and nothing is lost. What the views then scatter by no number of points averages out: a shift σ_p
+per axis of the sphere (the robot), an error σ_ρ of its apparent radius and an error of the points σ_c that is one over
+the view (both the scanner). Near the equator of the sphere a radius off by σ_ρ puts the centre ρ/h·σ_ρ off, h its
+distance from the laser plane. All three are found by restricted maximum likelihood (Patterson & Thompson 1971).
 """
 
 from collections.abc import Sequence
@@ -37,7 +29,7 @@ from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.detection.balls import fit_ball
-from stitch.plugins.metrology.calibrate.tracker import Jackknife, jackknife
+from stitch.plugins.metrology.calibrate.hand_eye_report import jackknife
 
 # Points whose rms distance from a plane is below this share of their extent are a laser line.
 _FLAT = 1e-3
@@ -271,8 +263,7 @@ def find_scatter(
     # Below a thousandth of the points' sigma a scatter is none.
     floor = np.log(1e-3 * np.median([v.sigma for v in views]))
     bounds = [(max(x - 2, floor), max(x + 2, floor + 1)) for x in start]
-    found = minimize(cost, np.maximum(start, floor), method="L-BFGS-B", bounds=bounds).x
-    return np.exp(found)
+    return np.exp(minimize(cost, np.maximum(start, floor), method="L-BFGS-B", bounds=bounds).x)
 
 
 @dataclass(frozen=True)
@@ -359,9 +350,12 @@ def _solve_sides(G: Array, views: Sequence[SphereView], R: Array) -> SphereStart
     The views that fit best are fitted again each time: least trimmed squares by concentration steps (Rousseeuw & Van
     Driessen 2006, Data Min. Knowl. Discov. 12:29).
     """
-    signs, trusted = np.array([v.side for v in views]), trusted_views(len(views))
+    signs = np.array([v.side for v in views])
+    trusted = trusted_views(len(views))
     design = np.concatenate([-G[:, :3, :3], np.broadcast_to(np.eye(3), (len(G), 3, 3))], axis=2)
-    T, rms, best = np.eye(4), np.inf, np.arange(len(views))
+    T = np.eye(4)
+    rms = np.inf
+    best = np.arange(len(views))
     for _ in range(4):
         y = (G[:, :3, :3] @ (centres(views, signs) @ R.T)[..., None])[..., 0] + G[:, :3, 3]
         x = np.linalg.pinv(design[best].reshape(-1, 6), rcond=1e-6) @ y[best].ravel()
@@ -376,9 +370,9 @@ def _solve_sides(G: Array, views: Sequence[SphereView], R: Array) -> SphereStart
 def choose_sides(G: Array, views: Sequence[SphereView], T_mount: Array, centre: Array) -> Array:
     """Sides (V,) on which the centre (3,) of the reference frame lies; those that the session says stay."""
     seen = frames.transform(frames.inverse(G @ T_mount), centre[None])[:, 0]
-    found = np.array([1.0 if (s - v.foot) @ v.normal >= 0 else -1.0 for s, v in zip(seen, views, strict=True)])
-    said = np.array([v.side for v in views])
-    return np.where(said != 0, said, found)
+    computed = np.array([1.0 if (q - v.foot) @ v.normal >= 0 else -1.0 for q, v in zip(seen, views, strict=True)])
+    stated = np.array([v.side for v in views])
+    return np.where(stated != 0, stated, computed)
 
 
 def refine_start(G: Array, views: Sequence[SphereView], start: SphereStart) -> SphereStart:
@@ -386,7 +380,8 @@ def refine_start(G: Array, views: Sequence[SphereView], start: SphereStart) -> S
 
     Only the views that fit best so far are asked.
     """
-    q, trusted = centres(views, start.signs), trusted_views(len(views))
+    q = centres(views, start.signs)
+    trusted = trusted_views(len(views))
     soft = np.array([np.eye(3) - (1 - _offset_weight(v)) * np.outer(v.normal, v.normal) for v in views])
 
     def off(x: Array) -> Array:
@@ -460,36 +455,33 @@ def fit_sphere(
         NoResultError: too few views.
     """
     n = 10 if radius_free else 9
-    free = _free_numbers(len(views), n)
+    free = 3 * len(views) - n
+    if free < _FREE:
+        needed = -(-(n + _FREE) // 3)
+        raise NoResultError(f"{len(views)} views for {n} unknowns; to fix: scan the sphere from {needed} or more poses")
     # The points' own sum has side minima for laser lines; the views' leads to the right one.
-    found = _reweight(G, views, _initial_linearisation(G, views, T_mount, radius, n))
+    fit = _reweight(G, views, _initial_linearisation(G, views, T_mount, radius, n))
     if not by_views:
-        found = _reweight(G, views, found, _points_weights(views, radius))
-    state, statistics = found.state, _statistics(found, views, free)
+        # Every point counts the same: distances from a circle of radius ρ are R/ρ times those from the sphere.
+        weights = [np.linalg.inv(v.covariance) * (v.sigma * min(v.measured[-1] / radius, 1.0)) ** 2 for v in views]
+        fit = _reweight(G, views, fit, weights)
+    state = fit.state
+    covariance, inflation, steps = _statistics(fit, views, free)
     arms = [frames.transform(T, v.points) - state.centre for T, v in zip(G @ state.T_mount, views, strict=True)]
     off = [np.linalg.norm(arm, axis=1) - state.radius for arm in arms]
     return SphereFit(
         T_mount=state.T_mount,
         centre=state.centre,
         radius=state.radius,
-        covariance=statistics.covariance,
-        inflation=statistics.inflation,
-        scatter=found.scatter,
+        covariance=covariance,
+        inflation=inflation,
+        scatter=fit.scatter,
         point_sigma=float(np.median([v.sigma for v in views])),
         rms=float(np.sqrt(np.mean(np.concatenate(off) ** 2))),
         view_rms=np.array([np.sqrt(np.mean(d**2)) for d in off]),
-        left_out=statistics.steps,
-        shares=found.shares,
+        left_out=steps,
+        shares=fit.shares,
     )
-
-
-def _free_numbers(views: int, n: int) -> int:
-    """Numbers that the views leave over for their scatter; refused where they are too few."""
-    free = 3 * views - n
-    if free < _FREE:
-        needed = -(-(n + _FREE) // 3)
-        raise NoResultError(f"{views} views for {n} unknowns; to fix: scan the sphere from {needed} or more poses")
-    return free
 
 
 def _initial_linearisation(
@@ -500,12 +492,6 @@ def _initial_linearisation(
     e, jacobian, response = linearise_sphere(G, views, state, n)
     scatter = np.array([0.005 * radius, 0.002 * radius, 2 * np.median([v.sigma for v in views])])
     return _LinearisedSphere(state, e, jacobian, response, weights=[], scatter=scatter, shares=np.ones(len(views)))
-
-
-def _points_weights(views: Sequence[SphereView], radius: float) -> list[Array]:
-    """Weights under which every point counts the same."""
-    # Distances from a circle of radius ρ are R/ρ times those from the sphere.
-    return [np.linalg.inv(v.covariance) * (v.sigma * min(v.measured[-1] / radius, 1.0)) ** 2 for v in views]
 
 
 def _reweight(
@@ -532,7 +518,7 @@ def _reweight(
     return linearised
 
 
-def _statistics(linearised: _LinearisedSphere, views: Sequence[SphereView], free: int) -> Jackknife:
+def _statistics(linearised: _LinearisedSphere, views: Sequence[SphereView], free: int) -> tuple[Array, float, Array]:
     """Sandwich of the weights and of the covariances that the scatter gives, and the jackknife over it.
 
     A scatter found from `free` numbers is itself uncertain: the error over it is Student's, not normal.

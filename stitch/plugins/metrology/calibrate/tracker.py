@@ -1,21 +1,15 @@
 """Base and tool from measured poses: a tracker and its 6D probe, or a camera and its board.
 
-Probe on the flange, sensor in the cell (eye_to_hand): T_base_flange · T_flange_probe =
-T_base_sensor · T_sensor_probe. Camera on the flange, board in the cell (eye_in_hand):
-T_base_flange · T_flange_camera = T_base_board · T_camera_board⁻¹. Both are A·X = Z·B.
+Probe on the flange, sensor in the cell (eye_to_hand):
+T_base_flange · T_flange_probe = T_base_sensor · T_sensor_probe
+Camera on the flange, board in the cell (eye_in_hand):
+T_base_flange · T_flange_camera = T_base_board · T_camera_board⁻¹
 
-Covariance counted in views: leaving one out at a time, from normal equations alone.
-
-A covariance from single points or coordinates takes every one as independent. The robot's pose errs
-once per view, so views are the samples. Leaving a view out is one Newton step from the solution.
-
-Nonlinear least squares for A·X = Z·B, with covariance in views.
-
-Residual of a view: the twist log((A X)⁻¹ Z B) in the probe's frame.
-Rotations and translations scatter by σ_r and σ_t, both found from the residuals unless given.
+Both are A·X = Z·B, solved by nonlinear least squares. The residual of a view is the twist log((A X)⁻¹ Z B) in the
+probe's frame; rotations and translations scatter by σ_r and σ_t, both found from the residuals unless given; the
+covariance is counted in views.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,8 +20,13 @@ from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.distributions import mad_sigma
 from stitch.numerics.frames import Array
-from stitch.numerics.hand_eye import axis_spread, motions_from_first, park_martin, shah, weight_roots
-from stitch.numerics.least_squares import grouped_inflation
+from stitch.numerics.hand_eye import park_martin, shah, weight_roots
+from stitch.plugins.metrology.calibrate.hand_eye_report import (
+    hand_eye_document,
+    jackknife,
+    weak_components,
+    weak_notes,
+)
 from stitch.session.reading.target_tables import read_frames
 from stitch.session.session import SessionData
 
@@ -38,50 +37,13 @@ _SMALL = 1e-6
 _HUBER = 2.0
 # Numbers of X and Z.
 _UNKNOWNS = 12
-# A component is weak where it is this many times worse known than one view is measured.
-_WEAK = 3.0
-# Wrists that turn less than this between any two views hardly turn (rad).
-_LITTLE = np.radians(45.0)
-# Views to compare in pairs; more are thinned out evenly.
-_VIEWS = 60
 # Second opinions further off than this many sigmas speak against independent errors.
 _SURE = 3.0
 # Rotations (rad) that scatter more than this do not belong to one base and tool.
 _UNRELATED = 0.3
 # Enough places for a spread among them, enough views in each to lose it without loss of rank.
-_PLACES, _VIEWS_PER_PLACE = 25, 6
-
-
-@dataclass(frozen=True)
-class Jackknife:
-    """What leaving one view out at a time says, for n parameters and V views."""
-
-    covariance: Array  # (n, n) the model's, times the inflation
-    inflation: float  # mean ratio of the jackknife's covariance to the model's, at least 1
-    steps: Array  # (V, n) change of the parameters without each view
-
-
-def jackknife(information: Array, gradient: Array, model: Array | None = None) -> Jackknife:
-    """Covariance of a weighted least-squares solution.
-
-    Args:
-        information: (V, n, n) JᵀWJ of each view.
-        gradient: (V, n) JᵀWe of each view at the solution, e the residual.
-        model: (n, n) covariance that the scatter of the residuals predicts; without it the inverse of
-            the information, right where the weights W are inverse covariances.
-
-    The jackknife of Efron & Stein (1981) never goes below the truth on average, so it only inflates.
-    """
-    count, n = gradient.shape
-    total = information.sum(axis=0)
-    model = np.linalg.inv(total) if model is None else model
-    steps = np.zeros((count, n))
-    for v in range(count):
-        # Without a view whose loss makes the rest singular no step can be taken: it has no partner.
-        steps[v] = np.linalg.lstsq(total - information[v], gradient[v], rcond=1e-12)[0]
-    # Steps of few views hardly span the parameters: they say nothing about the spread.
-    inflation = grouped_inflation(steps, model) if count > n / 2 + 2 else 1.0
-    return Jackknife(model * inflation, inflation, steps)
+_PLACES = 25
+_VIEWS_PER_PLACE = 6
 
 
 @dataclass(frozen=True)
@@ -128,14 +90,17 @@ def refine_axzb(
         if step == _STEPS or np.sqrt(xi @ total @ xi) < _SMALL:
             break
         X, Z = X @ frames.exp(xi[:6]), Z @ frames.exp(xi[6:])
-    model = np.linalg.inv(total) * (_student_variance(e.size - _UNKNOWNS) if sigma is None else 1.0)
-    statistics = jackknife(information, gradient, model)
-    heldout = np.array([e[v] + jacobian[v] @ step for v, step in enumerate(statistics.steps)])
+    model = np.linalg.inv(total)
+    if sigma is None:
+        # Variance of Student's t, each of the two scatters found from half of the free numbers; at most 3.
+        half = (e.size - _UNKNOWNS) / 2
+        model = model * min(half / max(half - 2, 1e-9), 3.0)
+    covariance, inflation, steps = jackknife(information, gradient, model)
+    heldout = np.array([e[v] + jacobian[v] @ step for v, step in enumerate(steps)])
     if groups is not None:
         member = groups == np.unique(groups)[:, None]
-        statistics = jackknife(np.tensordot(member, information, 1), member @ gradient, model)
-    spread = float(scatter[0]), float(scatter[1])
-    return AxzbSolution((X, Z), statistics.covariance, statistics.inflation, e, heldout, spread)
+        covariance, inflation, _ = jackknife(np.tensordot(member, information, 1), member @ gradient, model)
+    return AxzbSolution((X, Z), covariance, inflation, e, heldout, (float(scatter[0]), float(scatter[1])))
 
 
 def _linearise_axzb(A: Array, B: Array, X: Array, Z: Array) -> tuple[Array, Array]:
@@ -151,92 +116,21 @@ def _linearise_axzb(A: Array, B: Array, X: Array, Z: Array) -> tuple[Array, Arra
     return e, np.concatenate([by_x, by_z], axis=2)
 
 
-def _student_variance(free: int) -> float:
-    """Variance of Student's t where each of the two scatters is found from half of the free numbers; at most 3."""
-    return min(free / 2 / max(free / 2 - 2, 1e-9), 3.0)
-
-
 def _normal_equations(jacobian: Array, e: Array, robust: bool) -> tuple[Array, Array]:
     """JᵀWJ and JᵀWe of each view, each coordinate weighted as the loss weighs it."""
     w = 1 / np.maximum(1.0, np.abs(e) / _HUBER) if robust else np.ones_like(e)
     weighted = jacobian * w[..., None]
     information = np.swapaxes(weighted, 1, 2) @ jacobian
-    return np.asarray(information), np.einsum("vij,vi->vj", weighted, e)
+    return information, np.einsum("vij,vi->vj", weighted, e)
 
 
 def _residual_scatter(e: Array, robust: bool) -> tuple[float, float]:
     """σ of rotations and of translations; each half of the residuals pays for half of the unknowns."""
     free = max(1 - _UNKNOWNS / e.size, 1 / e.size)
-    halves = (e[:, :3], e[:, 3:])
-    rotation, translation = (mad_sigma(half) if robust else float(np.sqrt(np.mean(half**2))) for half in halves)
+    rotation = mad_sigma(e[:, :3]) if robust else float(np.sqrt(np.mean(e[:, :3] ** 2)))
+    translation = mad_sigma(e[:, 3:]) if robust else float(np.sqrt(np.mean(e[:, 3:] ** 2)))
     # Exact data have no scatter; what rounding leaves of lengths keeps the weights finite.
     return max(rotation / np.sqrt(free), 1e-12), max(translation / np.sqrt(free), 1e-9)
-
-
-def hand_eye_document(
-    kind: str, session: SessionData, T_mount: Array, covariance: Array, inflation: float, G: Array
-) -> dict[str, Any]:
-    """What the JSON documents of all calibrations of a hand-eye share.
-
-    Args:
-        T_mount: (4, 4) T_mount_scanner.
-        covariance: (6, 6) of its right perturbation, rotation first.
-        inflation: what leaving views out put on the covariance.
-        G: (V, 4, 4) poses of the views.
-    """
-    R = T_mount[:3, :3]
-    return {
-        "format": "stitch-calibrate/1",
-        "kind": kind,
-        "session": session.name,
-        "mount": session.mount,
-        "length_unit": session.length_unit,
-        "hand_eye": T_mount.tolist(),
-        "hand_eye_sigma": np.sqrt(np.diag(covariance)).tolist(),
-        "hand_eye_covariance": covariance.tolist(),
-        "translation_sigma_mount": np.sqrt(np.diag(R @ covariance[3:, 3:] @ R.T)).tolist(),
-        "covariance_inflation": inflation,
-        "turned_deg": float(np.degrees(largest_turn(G))),
-        "axis_spread": axis_spread(motions_from_first(G)).tolist(),
-    }
-
-
-def largest_turn(G: Array) -> float:
-    """Largest rotation angle (rad) between any two poses (V, 4, 4)."""
-    thin = G[:: max(1, len(G) // _VIEWS)]
-    return float(max(frames.angle_between(np.broadcast_to(T, thin.shape), thin).max() for T in thin))
-
-
-def weak_notes(G: Array, weak: Sequence[str]) -> list[str]:
-    """At most one sentence: the wrist hardly turned, and which components of the hand-eye are weak."""
-    sentences, angle = [], largest_turn(G)
-    if angle < _LITTLE:
-        sentences.append(
-            f"The wrist hardly turned: at most {np.degrees(angle):.0f}° between any two views; turn it by 90° or more"
-        )
-    if weak:
-        sentences.append(f"Weak: {'; '.join(weak)}")
-    return [". ".join(sentences)] if sentences else []
-
-
-def weak_components(covariance: Array, view_sigma: float, lever: float, unit: str) -> list[str]:
-    """One phrase per component of the hand-eye, in the scanner's axes, that is badly known.
-
-    Args:
-        covariance: (6, 6) of the right perturbation, rotation first.
-        view_sigma: how well one view measures a position, length unit.
-        lever: distance at which a rotation shows as displacement.
-    """
-    sigma = np.sqrt(np.diag(covariance))
-    out = []
-    for axis, turn in zip("xyz", sigma[:3], strict=True):
-        if turn * lever > _WEAK * view_sigma:
-            moved = f"{turn * lever:.2g} {unit} at the target"
-            out.append(f"rotation about scanner {axis}: {np.degrees(turn):.2g}°, {moved}")
-    for axis, shift in zip("xyz", sigma[3:], strict=True):
-        if shift > _WEAK * view_sigma:
-            out.append(f"translation along scanner {axis}: {shift:.2g} {unit}")
-    return out
 
 
 @dataclass(frozen=True)
@@ -266,33 +160,32 @@ def calibrate_tracker(session: SessionData) -> TrackerCalibration:
         InputError: frames.csv missing or broken.
         NoResultError: poses that cannot show both, or poses and frames that belong to different motions.
     """
-    seen = read_frames(session.path / "frames.csv", session.names)
+    sightings = read_frames(session.path / "frames.csv", session.names)
     flange = {view.name: view.T_base_flange for view in session.views}
-    A = np.array([flange[name] for name in seen])
-    T_sensor_probe = np.array([frames.make(s.rotation, s.points[0]) for s in seen.values() if s.rotation is not None])
-    sigma = np.array([s.sigma[0] for s in seen.values()])
+    A = np.array([flange[name] for name in sightings])
+    T_sensor_probe = np.array(
+        [frames.make(s.rotation, s.points[0]) for s in sightings.values() if s.rotation is not None]
+    )
+    sigma = np.array([s.sigma[0] for s in sightings.values()])
     eye_to_hand = session.mount == "eye_to_hand"
     B = T_sensor_probe if eye_to_hand else frames.inverse(T_sensor_probe)
     weights = None if np.isnan(sigma).any() else (np.median(sigma) / sigma) ** 2
-    fit = refine_axzb(A, B, weights=weights, robust=True, groups=_neighbourhoods(A))
+    # Places in the workspace: what base and tool do not explain errs alike in one place.
+    enough = len(A) >= _VIEWS_PER_PLACE * _PLACES
+    groups = kmeans2(A[:, :3, 3], _PLACES, minit="++", rng=0)[1] if enough else None
+    fit = refine_axzb(A, B, weights=weights, robust=True, groups=groups)
     if fit.sigma[0] > _UNRELATED:
         raise NoResultError(
             f"flange poses and frames.csv do not fit together (rotations scatter by {np.degrees(fit.sigma[0]):.0f}°); "
             f"check the mount ({session.mount}), the order of the views, and the quaternions"
         )
-    return TrackerCalibration(fit, tuple(seen), A, B, session.mount)
-
-
-def _neighbourhoods(A: Array) -> Array | None:
-    """Labels (V,) of places in the workspace: what base and tool do not explain errs alike in one place."""
-    if len(A) < _VIEWS_PER_PLACE * _PLACES:
-        return None
-    return kmeans2(A[:, :3, 3], _PLACES, minit="++", rng=0)[1]
+    return TrackerCalibration(fit, tuple(sightings), A, B, session.mount)
 
 
 def tracker_document(result: TrackerCalibration, session: SessionData) -> dict[str, Any]:
     """The JSON document."""
-    fit, h = result.fit, result.hand_eye
+    fit = result.fit
+    h = result.hand_eye
     sigma = np.sqrt(np.diag(result.covariance_of(1 - h)))
     other = {
         "name": ("T_base_board", "T_flange_probe")[h],
@@ -329,19 +222,21 @@ def compare_closed_forms(result: TrackerCalibration) -> dict[str, dict[str, floa
     half = len(result.A) // 2
     A = frames.inverse(result.A[:half]) @ result.A[half : 2 * half]
     B = frames.inverse(result.B[:half]) @ result.B[half : 2 * half]
-    out = {}
+    differences = {}
     for name, X in (("Shah (A·X = Z·B)", shah(result.A, result.B)[0]), ("Park-Martin (A·X = X·B)", park_martin(A, B))):
         off = frames.log(frames.inverse(result.fit.transforms[0]) @ X)
         size = np.linalg.norm(off.reshape(2, 3), axis=1)
-        out[name] = {"rotation_deg": float(np.degrees(size[0])), "translation": float(size[1])}
-    return out
+        differences[name] = {"rotation_deg": float(np.degrees(size[0])), "translation": float(size[1])}
+    return differences
 
 
 def tracker_notes(result: TrackerCalibration, session: SessionData) -> list[str]:
     """Sentences about the wrist, weak components, and errors that base and tool do not explain."""
-    unit, fit = session.length_unit, result.fit
+    fit = result.fit
+    unit = session.length_unit
     notes = weak_notes(result.A, _weak_phrases(result, unit))
-    position, noise = _error_sizes(fit.heldout[:, 3:])["mean"], session.scanner.noise
+    position = _error_sizes(fit.heldout[:, 3:])["mean"]
+    noise = session.scanner.noise
     if noise is not None and position > _SURE * np.sqrt(3) * noise:
         notes.append(
             f"Base and tool alone leave {position:#.3g} {unit} in the position of views left out (mean), "

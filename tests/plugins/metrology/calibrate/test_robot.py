@@ -134,7 +134,7 @@ def test_rows_and_urdf_place_the_flange_as_the_chain_does(convention, tmp_path):
     found = replace(found, session=session, measurement=measurement_of(session, prepare_capture(session)))
     zero = [term_of(found.measurement, EFFECTS[name]) for name in ("joint_offset", "link_geometry")]
     model = found.model.with_terms([term.at(1e-3 * rng.normal(size=len(term.parameters))) for term in zero])
-    arm = calibrated_robot_of_run(replace(found, model=model)).robot
+    arm = calibrated_robot_of_run(replace(found, model=model))
     (tmp_path / "a.urdf").write_text(to_urdf(arm))
     urdf = robot_from_urdf(tmp_path / "a.urdf", "base_link", "flange", "mm", np.array([0, 0, -9.81]), None)
     rows = robot_from_dh("arm", convention, dh_rows(arm), None, np.array([0, 0, -9.81]), "mm")
@@ -169,7 +169,7 @@ def cell(folder, reported):
 def written(session, folder, effects=("joint_offset",)):
     """robot.toml of a table that is said to be proved, and what the terminal shows of it."""
     found = run(session, effects=["joint_offset"])
-    robot = calibrated_robot_of_run(found).robot if effects else session.robot
+    robot = calibrated_robot_of_run(found) if effects else session.robot
     table = LinkTable(robot, effects, 0.1, 0.2)
     folder.mkdir()
     write_robot(table, found, folder)
@@ -192,7 +192,7 @@ def test_a_session_that_follows_the_advice_has_the_new_arm(tmp_path, capsys, rep
     if reported:
         views.write_text("\n".join(",".join(row.split(",")[:7]) for row in views.read_text().split()) + "\n")
     again = load_session(tmp_path / "s")
-    arm = calibrated_robot_of_run(found).robot
+    arm = calibrated_robot_of_run(found)
     np.testing.assert_allclose([v.T_base_flange for v in again.views], forward(arm, session.joints), atol=1e-6)
 
 
