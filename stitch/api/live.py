@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
+from threading import RLock
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -111,7 +112,8 @@ class LiveSession:
     """Session that grows by one view at a time; `stitch.live` begins one.
 
     Every view is matched with those before it, once. `finish` runs the session as `stitch.run` does, so that its result
-    is that of a batch.
+    is that of a batch. Whatever ends a call, an interrupt too, leaves the session as it was before; calls of several
+    threads come one after the other.
 
     Example:
         >>> live = stitch.live(mount="eye_in_hand", name="bracket")
@@ -131,6 +133,7 @@ class LiveSession:
         self._members: list[int] = []  # views of the session that the fit holds
         self._drawn = 0  # views that the recording shows in their places
         self._fit: LiveFit | None = None
+        self._lock = RLock()
 
     def add_view(
         self,
@@ -161,6 +164,18 @@ class LiveSession:
             'waiting'
         """
         began = time.perf_counter()
+        with self._lock:
+            return self._take(self._read_view(cloud, pose, joints, time_s, covariates, name), began)
+
+    def _read_view(
+        self,
+        cloud: Any,
+        pose: Any,
+        joints: Any,
+        time_s: float | None,
+        covariates: Mapping[str, float] | None,
+        name: str | None,
+    ) -> View:
         cell = self.session
         name = name or f"v{len(cell.views):03d}"
         if name in cell.names:
@@ -179,7 +194,7 @@ class LiveSession:
             name=cell.name,
             check=False,
         )
-        return self._take(replace(one.views[0], approach=None), began)
+        return replace(one.views[0], approach=None)
 
     def take(self, view: View) -> LiveView:
         """Take in a view that was read before, as of a session folder, and say whether it belongs.
@@ -195,25 +210,27 @@ class LiveSession:
         return self._take(view, time.perf_counter())
 
     def _take(self, view: View, began: float) -> LiveView:
-        before = self.session
-        try:
-            with library_threads_off():
-                said = self._judge(self._after_last(view))
-        except InputError:
-            self.session = before
-            raise
-        said = replace(said, seconds=time.perf_counter() - began)
-        self.said.append(said)
-        if self._recording is not None:
-            self._show(self._recording)
-        return said
+        with self._lock:
+            before = (self.session, self._fit, self._members, self._drawn)
+            count = len(self.said)
+            try:
+                with library_threads_off():
+                    said = replace(self._judge(self._after_last(view)), seconds=time.perf_counter() - began)
+                self.said.append(said)
+                if self._recording is not None:
+                    self._show(self._recording)
+            except BaseException:
+                self.session, self._fit, self._members, self._drawn = before
+                del self.said[count:]
+                raise
+            return said
 
     @property
     def hand_eye(self) -> FittedHandEye | None:
         """The hand-eye so far; its U holds for a complete model. None before there is one."""
-        if self._fit is None:
-            return None
         fit = self._fit
+        if fit is None:
+            return None
         unknown = unknown_numbers([fit.capture], fit.T_mount)
         return fitted_hand_eye(self.session, fit.capture, fit.T_mount, fit.covariance, unknown=unknown)
 
@@ -228,10 +245,11 @@ class LiveSession:
             >>> proposed.T_base_flange.shape, proposed.U_mm < live.hand_eye.U.mm
             ((4, 4), True)
         """
-        hand_eye = self.hand_eye
-        if self._fit is None or hand_eye is None:
-            return None
-        return _next_pose(self._fit, [self.session.views[i] for i in self._members], hand_eye)
+        with self._lock:
+            hand_eye = self.hand_eye
+            if self._fit is None or hand_eye is None:
+                return None
+            return _next_pose(self._fit, [self.session.views[i] for i in self._members], hand_eye)
 
     def finish(self, recorder: Recorder | None = None, **options: Any) -> Run:
         """Run the session: the same result as `stitch.run` on all its views.
@@ -251,6 +269,8 @@ class LiveSession:
 
     def _after_last(self, view: View) -> View:
         """Add the view to the session."""
+        if view.cloud is None:
+            raise InputError(f"view {view.name}: no scan; to fix: pass one, or leave the view out")
         before = self.session.views[-1] if self.session.views else None
         if before is not None and None not in (before.time_s, view.time_s) and view.time_s < before.time_s:  # type: ignore[operator]
             raise InputError(f"view {view.name}: its time lies before that of {before.name}; to fix: check the clock")
@@ -261,6 +281,11 @@ class LiveSession:
         return view
 
     def _judge(self, view: View) -> LiveView:
+        original = self._original_of(view)
+        if original is not None:
+            same = np.allclose(original.T_base_flange, view.T_base_flange, rtol=0.0, atol=1e-9)
+            why = f"Its scan is a copy of that of {original.name}, at {'the same' if same else 'another'} pose."
+            return self._report(view, "adds_nothing" if same else "does_not_belong", why)
         if self._fit is None:
             return self._first_fit(view)
         before = self.hand_eye
@@ -282,7 +307,7 @@ class LiveSession:
         self._fit = fit
         for v in sorted(off, reverse=True):
             self._fit = without_view(self._fit, v)
-            del self._members[v]
+            self._members = self._members[:v] + self._members[v + 1 :]
         self._fit = fit_live_hand_eye(self._fit, self._errors)
         others = " ".join(f"{self.session.names[members[v]]} does not belong: {why}" for v, why in off.items())
         gain = 1 - self.hand_eye.U.mm / before.U.mm  # type: ignore[union-attr]
@@ -290,29 +315,40 @@ class LiveSession:
         share = f"{100 * seen_before:.0f} % of it was seen before, U falls by {max(100 * gain, 0):.0f} %."
         return self._report(view, "adds_nothing" if idle else "fits", f"{others} {share}".strip())
 
+    def _original_of(self, view: View) -> View | None:
+        """Return the view before, of which this one has the same scan to the last digit."""
+        assert view.cloud is not None
+        clouds = [before.cloud for before in self.session.views[:-1]]
+        same = (i for i, cloud in enumerate(clouds) if cloud and np.array_equal(cloud.points, view.cloud.points))
+        first = next(same, None)
+        return None if first is None else self.session.views[first]
+
     def _first_fit(self, view: View) -> LiveView:
-        """Fit the views so far, if they are enough."""
-        count = len(self.session.views)
+        """Fit the views so far, if they are enough; copies do not count."""
+        copies = [i for i, said in enumerate(self.said) if said.verdict != "waiting"]
+        whole = [i for i in range(len(self.session.views)) if i not in copies]
+        session = self._session_of(whole)
+        count = len(whole)
         least = _FEWEST_TO_SEARCH if self.session.scanner.T_mount is None else _FEWEST_TO_CORRECT
         if count < least:
             return self._report(view, "waiting", f"The hand-eye is fitted from {least} views on.")
-        check_convention(self.session)
-        measurement = measurement_of(self.session, prepare_capture(self.session))
+        check_convention(session)
+        measurement = measurement_of(session, prepare_capture(session))
         try:
-            starts = surface_steps.start([self.session], [measurement], None)
+            starts = surface_steps.start([session], [measurement], None)
             if starts[0].is_ambiguous:
                 return self._report(
                     view, "waiting", "Two hand-eyes fit these views equally well; a turned view decides."
                 )
             fit = partial(surface_steps.fit, start=FitStart(starts), recorder=SilentRecorder())
-            screened = fit_screened_views([self.session], [measurement], fit)
+            screened = fit_screened_views([session], [measurement], fit)
         except NoResultError as error:
             return self._report(view, "waiting", f"No hand-eye yet: {error}.")
         screening = screened.screenings[0]
         assert screened.fitted.correction is not None
-        self._members = [i for i in range(count) if self.session.names[i] not in screening.names]
+        self._members = [i for i in whole if self.session.names[i] not in screening.names]
         self._fit = start_live_fit(screened.fitted.correction)
-        left_out = screening.line(self.session.names)
+        left_out = screening.line(session.names)
         if view.name in screening.names:
             return self._report(view, "does_not_belong", left_out)
         return self._report(view, "fits", f"The first hand-eye.{f' {left_out}.' if left_out else ''}")
@@ -327,11 +363,17 @@ class LiveSession:
         usual = UsualEffects(measurement, Model(fit.T_mount)).twists(fit.unconstrained)
         sure = find_blunders(model.with_usual(usual)).blunders
         off = [v for v in search.blunders if v in sure]
-        return {v: self._displacement(fit, model, search, v, [w for w in off if w != v]) for v in off}
+        sentences = {v: self._displacement(fit, model, search, v, [w for w in off if w != v]) for v in off}
+        return {v: sentence for v, sentence in sentences.items() if sentence is not None}
 
-    def _displacement(self, fit: LiveFit, model: ViewModel, search: BlunderSearch, view: int, others: list[int]) -> str:
+    def _displacement(
+        self, fit: LiveFit, model: ViewModel, search: BlunderSearch, view: int, others: list[int]
+    ) -> str | None:
+        """Say how far off a view is at least; None where its evidence admits that it is not."""
         middle = frames.transform(fit.unconstrained.poses[view], fit.capture.scans[view].points.mean(axis=0)[None])[0]
         rotation, shift = least_displacement(model, search, others, (), view, middle)
+        if shift == 0 and rotation <= _SMALLEST_TURN:
+            return None
         turn = f" and {1e3 * rotation:.2g} mrad" if rotation > _SMALLEST_TURN else ""
         return f"Its pose is off by at least {length_text(shift, self.session.length_unit)}{turn}."
 

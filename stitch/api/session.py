@@ -2,7 +2,7 @@
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -27,12 +27,12 @@ from stitch.output.session_files import (
 from stitch.output.urdf_file import to_urdf
 from stitch.screening.deep_check import refuse_whole
 from stitch.session.reading import session_folder
-from stitch.session.reading.arrays import cloud_of, per_view, poses_of, sighting_of
+from stitch.session.reading.arrays import cloud_of, per_view, poses_of, seconds_of, sighting_of
 from stitch.session.reading.scale_checks import check_scale
 from stitch.session.reading.session_folder import checked_scan
-from stitch.session.reading.session_toml import read_repeatability, read_robot, read_scanner
+from stitch.session.reading.session_toml import read_repeatability, read_robot, read_scanner, require_table
 from stitch.session.reading.text_files import require_folder_name, require_name, table_choice
-from stitch.session.reading.views_table import require_agreement
+from stitch.session.reading.views_table import require_agreement, require_covariate_name
 from stitch.session.robot import Robot, forward
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, StatedRepeatability, View
 from stitch.session.thinning import MAX_POINTS
@@ -40,6 +40,10 @@ from stitch.system.threads import parallel
 
 # Names of views that can be those of files.
 _PLAIN = re.compile(r"[\w+-][\w.+-]*")
+# No joint of an arm turns four times about itself, rad.
+_MOST_TURN = 8 * np.pi
+# Of what was written and read back: quaternions and degrees lose their last digits.
+_ROUNDED = 1e-9
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -152,9 +156,13 @@ class Session(SessionData):
             table_choice(toml, {"cloud_unit": cloud_unit or unit}, "cloud_unit", tuple(METRES))
             table_choice(toml, {"mount": mount}, "mount", get_args(Mount))
             if not isinstance(scanner, Scanner):
-                scanner = read_scanner(toml, dict(scanner or {}))
+                table = dict(scanner or {})
+                # Files alone are cut, and moved point by point.
+                require_table(toml, "scanner", table, without=("within", "moving"))
+                scanner = read_scanner(toml, table)
             if robot is not None and not isinstance(robot, Robot):
                 table = {"urdf": str(Path(robot).resolve())} if isinstance(robot, str | Path) else dict(robot)
+                require_table(toml, "robot", table)
                 repeatability = read_repeatability(toml, table)
                 robot = read_robot(toml, table, unit)
         return cls(
@@ -183,7 +191,7 @@ class Session(SessionData):
         whose last digit may differ.
 
         Raises:
-            InputError: the folder exists and is not empty.
+            InputError: the folder exists and is not empty, or what it would hold reads back as another session.
 
         Example:
             >>> session.save(folder / "bracket").in_memory
@@ -192,7 +200,7 @@ class Session(SessionData):
             ['clouds', 'session.toml', 'views.csv']
         """
         folder = Path(folder)
-        write_session(folder, _files_of(self))
+        write_session(folder, _files_of(self), partial(_require_same, self))
         return replace(self, path=folder)
 
 
@@ -248,6 +256,8 @@ def _arm(cell: Session, names: list[str], poses: Any, joints: Any) -> tuple[Arra
         raise InputError(f"joints: {q.shape[1]} a view, the robot has {robot.n_joints}; to fix: pass one a joint")
     if q is not None and not np.isfinite(q).all():
         raise InputError("joints: some are not finite; to fix: leave those views out")
+    if q is not None and np.abs(q).max(initial=0.0) > _MOST_TURN:
+        raise InputError(f"joints: one is {np.abs(q).max():.3g} rad, many turns; to fix: pass rad, np.radians(degrees)")
     from_joints = None if q is None or robot is None else forward(robot, q)
     if poses is None:
         if from_joints is None:
@@ -266,6 +276,11 @@ def _measured_views(cell: Session, names: list[str], scans: list[Any], points: A
     """Return views with what was seen, at no pose yet."""
     if points is not None and len(points) != len(names):
         raise InputError(f"points: {len(points)} for {len(names)} views; to fix: pass one mapping a view, or None")
+    empty = next((v for v, scan in enumerate(scans) if scan is None), None)
+    if points is None and empty is not None:
+        raise InputError(
+            f"clouds: that of view {names[empty]}, index {empty}, is None; to fix: leave it out, or pass its points"
+        )
     metres = METRES[cell.length_unit]
     scale = METRES[cloud_unit] / metres
 
@@ -299,12 +314,16 @@ def _placed_views(
 ) -> tuple[View, ...]:
     """Return the views with poses (V, 4, 4), joint angles (V, n) rad, times and covariates."""
     count = len(views)
-    time = None if times is None else per_view(times, count, "times")
+    time = None if times is None else seconds_of(times, count, "times")
     if time is not None and not (np.isfinite(time).all() and (np.diff(time) >= 0).all()):
         raise InputError(
             "times: not finite, or a later view stands before an earlier one; to fix: sort the views by time"
         )
-    columns = {str(key): per_view(values, count, f"covariates {key}") for key, values in covariates.items()}
+    names = [require_covariate_name("covariates", str(name)) for name in covariates]
+    columns = {
+        name: per_view(values, count, f"covariates {name}")
+        for name, values in zip(names, covariates.values(), strict=True)
+    }
     # As in views.csv: the sign of the difference to the view before.
     approach = None if q is None else np.sign(np.diff(q, axis=0, prepend=q[:1]))
     return tuple(
@@ -469,6 +488,45 @@ def _tables(session: SessionData) -> tuple[dict[str, dict[str, Any]], dict[str, 
     if session.cad is not None:
         tables["part"] = {"cad": session.cad.name, "cad_unit": session.cad_unit or session.length_unit}
     return tables, texts
+
+
+def _require_same(session: SessionData, folder: Path) -> None:
+    """Refuse a folder that reads back as another session."""
+    try:
+        read = session_folder.load_session(folder)
+    except InputError as error:
+        text = str(error).replace(str(folder), session.name)
+        raise InputError(f"it would not be read back: {text}") from None
+    if read.names != session.names:
+        raise InputError(f"{session.name}: names of its views cannot be written; to fix: give them plain names")
+    for view, there in zip(session.views, read.views, strict=True):
+        odd = next((what for what, same in _sameness(view, there) if not same), None)
+        if odd is not None:
+            raise InputError(f"{session.name}: {odd} of view {view.name} cannot be written; to fix: correct them")
+
+
+def _sameness(view: View, there: View) -> Iterator[tuple[str, bool]]:
+    """Yield what a view holds, and whether it is the same there."""
+    close = partial(np.allclose, rtol=_ROUNDED, atol=_ROUNDED)
+    yield "the pose", close(view.T_base_flange, there.T_base_flange)
+    yield "the joints", _both(view.joints, there.joints, close)
+    yield "the time", view.time_s == there.time_s
+    yield "the covariates", view.covariates == there.covariates
+    yield "the scan", _both(view.cloud, there.cloud, lambda a, b: a.count == b.count)
+    yield (
+        "the labelled points",
+        _both(
+            view.sighting,
+            there.sighting,
+            lambda a, b: (
+                a.targets == b.targets and close(a.points, b.points) and close(a.sigma, b.sigma, equal_nan=True)
+            ),
+        ),
+    )
+
+
+def _both(one: Any, other: Any, same: Callable[[Any, Any], bool]) -> bool:
+    return one is other if one is None or other is None else same(one, other)
 
 
 def _digits(values: Array) -> list[str]:

@@ -29,9 +29,13 @@ _FARTHEST, _NEAREST = 1.0, -0.5
 
 def equilibrated(matrix: Array) -> tuple[Array, Array]:
     """Symmetric matrices (..., k, k) of unit diagonal, and the units (..., k) that make them: rows and columns times
-    these; unknowns count in rad, mm and per hour."""
-    unit = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), 1e-300))
-    return matrix * unit[..., :, None] * unit[..., None, :], unit
+    these; unknowns count in rad, mm and per hour. Of an unknown with nothing on the diagonal, rounding apart, rows and
+    columns are zero."""
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    shown = ~(diagonal <= 1e-300)  # NaN stays
+    unit = 1 / np.sqrt(np.where(shown, diagonal, 1.0))
+    scaled = matrix * unit[..., :, None] * unit[..., None, :]
+    return np.where(shown[..., :, None] & shown[..., None, :], scaled, 0.0), unit
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.session import robot as kinematics
@@ -65,8 +66,16 @@ def visible_twists(captures: Sequence[Capture], T_mount: Array, part: tuple[Arra
 
     Args:
         part: as `seen_part` has it.
+
+    Raises:
+        NoResultError: the motions show none.
     """
     gains, directions = motion_gain(captures, T_mount, *part)
+    if gains[-1] < _VISIBLE:
+        raise NoResultError(
+            f"{captures[0].name}: the flange stands at one place in all views, which shows nothing of the hand-eye; to "
+            "fix: turn it by 20° and more about two axes between the views"
+        )
     if gains[0] >= _VISIBLE:
         return np.eye(6)
     columns = frames.adjoint(frames.make(np.eye(3), part[0])) @ directions[:, gains >= _VISIBLE]

@@ -6,7 +6,7 @@ The one writer of the format: the cells hand out their readings with it, and sim
 import csv
 import io
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,14 +50,19 @@ def pose_columns(T: Array) -> dict[str, Array]:
     return dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), columns.T, strict=True))
 
 
-def write_session(folder: Path, session: SessionFiles) -> None:
+def write_session(folder: Path, session: SessionFiles, check: Callable[[Path], None] | None = None) -> None:
     """Write one session into the new folder, with everything or not at all.
+
+    Args:
+        check: is asked about the folder before it takes its name; what it raises leaves none.
 
     Raises:
         InputError: the folder exists and is not empty.
     """
     with whole_folder(folder) as scratch:
         _write(scratch, session)
+        if check is not None:
+            check(scratch)
 
 
 def write_sessions(folder: Path, sessions: Sequence[SessionFiles]) -> None:

@@ -51,9 +51,10 @@ def hypotheses_by_surface(capture: Capture, ranked: Sequence[MotionFit]) -> tupl
         ranked: hypotheses about the poses, the likeliest first (see `rank_hypotheses`).
     """
     stated = next((fit for fit in ranked if fit.hypothesis.kind == "stated"), None)
-    if stated is None:
+    mistakes = [fit for fit in ranked if fit.hypothesis.kind != "stated"][:_HYPOTHESES_TRIED]
+    if stated is None or not mistakes:
         return ()
-    tried = [stated, *[fit for fit in ranked if fit.hypothesis.kind != "stated"][:_HYPOTHESES_TRIED]]
+    tried = [stated, *mistakes]
     posed = []
     for fit in tried:
         # The robot's lengths in the scans' unit.

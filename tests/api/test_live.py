@@ -83,6 +83,74 @@ def test_the_next_pose_lowers_U_as_it_says(live_blade):
     assert np.allclose(R @ R.T, np.eye(3)) and proposed.like in live_blade.session.names
 
 
+def test_a_copied_scan_is_said_to_be_one_and_the_next_view_is_not_accused(arrays):
+    clouds, poses = arrays
+    for at in (1, 4):
+        live = stitch.live(mount="eye_in_hand")
+        for cloud, pose in zip(clouds[:at], poses, strict=False):
+            live.add_view(cloud, pose)
+        again = live.add_view(clouds[0], poses[0])
+        assert (again.verdict, again.why) == ("adds_nothing", "Its scan is a copy of that of v000, at the same pose.")
+        moved = live.add_view(clouds[0], poses[2])
+        assert moved.verdict == "does_not_belong" and "v000, at another pose" in moved.why
+        for cloud, pose in zip(clouds[at:], poses[at:], strict=True):
+            said = live.add_view(cloud, pose)
+        assert said.verdict == "fits", said.why
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError, ValueError])
+def test_whatever_ends_a_call_the_view_is_out(arrays, error, monkeypatch):
+    clouds, poses = arrays
+    live = stitch.live(mount="eye_in_hand")
+    for cloud, pose in zip(clouds[:4], poses, strict=False):
+        live.add_view(cloud, pose)
+    before = live.hand_eye.pose
+
+    def fails(*_):
+        raise error
+
+    with monkeypatch.context() as patched:
+        patched.setattr("stitch.api.live.fit_live_hand_eye", fails)
+        with pytest.raises(error):
+            live.add_view(clouds[4], poses[4])
+    assert len(live.session.views) == len(live.said) == 4 and (live.hand_eye.pose == before).all()
+    assert live.add_view(clouds[4], poses[4]).verdict == "fits"
+
+
+def test_a_recording_that_fails_leaves_the_view_out(arrays):
+    class Broken:
+        def view(self, *_):
+            raise OSError("the viewer was closed")
+
+    live = stitch.live(mount="eye_in_hand")
+    live._recording = Broken()
+    with pytest.raises(OSError):
+        live.add_view(arrays[0][0], arrays[1][0])
+    assert not live.said and not live.session.views
+
+
+def test_views_of_several_threads_are_taken_one_after_the_other(arrays):
+    live = stitch.live(mount="eye_in_hand")
+    given = zip(*arrays, strict=True)
+    threads = [threading.Thread(target=live.add_view, args=view) for view in given]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(said.name for said in live.said) == live.session.names == [f"v{i:03d}" for i in range(5)]
+
+
+def test_three_points_or_none_are_no_scan_that_breaks_the_session(arrays):
+    clouds, poses = arrays
+    live = stitch.live(mount="eye_in_hand")
+    for k, cloud in enumerate([*clouds[:4], clouds[4][:3], None, clouds[4][:0], clouds[4]]):
+        try:
+            live.add_view(cloud, poses[min(k, 4)])
+        except stitch.InputError:
+            assert k in (4, 5, 6)
+    assert live.said[-1].verdict == "fits"
+
+
 def test_inverted_poses_are_refused_when_the_first_hand_eye_is_sought(arrays):
     clouds, poses = arrays
     live = stitch.live(mount="eye_in_hand")

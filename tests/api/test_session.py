@@ -128,6 +128,18 @@ def test_scans_that_lie_in_one_frame_already_are_refused(cell, arrays):
         ({"scanner": {"noise": -1}}, "<session>: scanner.noise is -1; use a positive number"),
         ({"points": [None]}, "points: 1 for 5 views"),
         ({"joints": np.full((5, 6), 0.3)}, "view v000: joints and reported pose differ by"),
+        ({"joints": np.full((5, 6), 95.0), "robot": None}, "joints: one is 95 rad, many turns"),
+        ({"covariates": {"humidity": np.full(5, "2026-01-01", "M8[s]")}}, "covariates humidity: dates or durations"),
+        ({"scanner": {"nose": 0.1}}, "<session>: unknown key 'scanner.nose'; did you mean 'noise'?"),
+        ({"scanner": {"within": [[-1, -1, -1], [1, 1, 1]]}}, "<session>: unknown key 'scanner.within'"),
+        ({"robot": {"joint": []}}, "<session>: unknown key 'robot.joint'; did you mean 'joints'?"),
+        ({"times": np.array([0, 1, "NaT", 3, 4], "m8[s]")}, "times: not finite"),
+        *(
+            ({"covariates": {name: np.ones(5)}}, f"covariates: {name!r} can be no covariate's name")
+            for name in ("x", "view", "time_s", "cloud", "qx", "j1_deg", "j1_approach", "", " humidity")
+        ),
+        ({"covariates": {"hu\nmidity": np.ones(5)}}, "covariates: covariate 'hu\\nmidity' holds the character"),
+        ({"points": [{"a\nb": np.ones(3)}] * 5}, "view v000: target 'a\\nb' holds the character"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(arrays, loaded, change, says):
@@ -136,6 +148,49 @@ def test_arrays_that_do_not_fit_are_refused(arrays, loaded, change, says):
     with pytest.raises(InputError) as refused:
         stitch.Session.from_arrays(**given | change)
     assert str(refused.value).startswith(says) and "\n" not in str(refused.value)
+
+
+def test_a_scan_that_is_none_is_refused_with_its_index(arrays):
+    clouds = [*arrays[0][:3], None, arrays[0][4]]
+    with pytest.raises(InputError, match="clouds: that of view v003, index 3, is None"):
+        stitch.Session.from_arrays(clouds, arrays[1], mount="eye_in_hand")
+
+
+def test_dates_and_durations_become_seconds(arrays):
+    for times in (np.datetime64("2026-05-01T10:00:00") + np.arange(5) * np.timedelta64(1500, "ms"), np.arange(5)):
+        as_durations = times.astype("m8[ms]") if times.dtype.kind == "i" else times
+        session = stitch.Session.from_arrays(*arrays, mount="eye_in_hand", times=as_durations, check=False)
+        step = 1.5 if times.dtype.kind == "M" else 1e-3
+        assert [view.time_s for view in session.views] == pytest.approx([step * v for v in range(5)])
+
+
+def test_what_is_masked_is_not_measured(arrays):
+    clouds, poses = arrays
+    mask = np.zeros(clouds[0].shape, bool)
+    mask[:7, 2] = True
+    masked = [np.ma.array(clouds[0], mask=mask), *clouds[1:]]
+    heat = np.ma.array([1.0, 2, 3, 4, 5], mask=[0, 0, 1, 0, 0])
+    session = stitch.Session.from_arrays(masked, poses, mount="eye_in_hand", covariates={"heat": heat}, check=False)
+    assert np.array_equal(session.views[0].cloud.points, clouds[0][7:])
+    assert [view.covariates for view in session.views][1:3] == [{"heat": 2.0}, {}]
+    mapped = [{"points": cloud} for cloud in masked]
+    assert len(stitch.Session.from_arrays(mapped, poses, mount="eye_in_hand", check=False).views[0].cloud.points) == (
+        len(clouds[0]) - 7
+    )
+    with pytest.raises(InputError, match="pose 2 is not finite"):
+        bad = np.ma.array(poses, mask=np.zeros(poses.shape, bool))
+        bad[2, 0, 3] = np.ma.masked
+        stitch.Session.from_arrays(clouds, bad, mount="eye_in_hand")
+
+
+def test_a_folder_that_would_read_back_otherwise_takes_no_name(loaded, tmp_path):
+    odd = replace(loaded, views=(replace(loaded.views[0], covariates={"x": 5.0}), *loaded.views[1:]))
+    with pytest.raises(InputError):
+        odd.save(tmp_path / "odd")
+    aside = replace(loaded.views[1], covariates={"q9_deg ": 5.0})
+    with pytest.raises(InputError, match="the covariates of view v001 cannot be written"):
+        replace(loaded, views=(loaded.views[0], aside, *loaded.views[2:])).save(tmp_path / "odd")
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_saved_session_is_read_as_it_was(loaded, tmp_path):

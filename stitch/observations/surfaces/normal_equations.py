@@ -244,7 +244,7 @@ def _target_only_directions(H: Array, vectors: Array) -> Array:
 def robust_scale(matches: Iterable[Match]) -> float:
     """Return the robust sigma of the residuals of all pairs: they are symmetric about zero, so no centring."""
     residuals = [m.residual for m in matches]
-    return mad_sigma(np.concatenate(residuals)) if residuals else float("nan")
+    return max(mad_sigma(np.concatenate(residuals)), _ROUNDING) if residuals else float("nan")
 
 
 def sum_matches(matches: Sequence[Match], views: int) -> Gram:

@@ -17,6 +17,7 @@ from stitch.session.reading.clouds import cloud_of_columns
 from stitch.session.reading.depth_image import lifted
 from stitch.session.reading.intrinsics import Intrinsics
 from stitch.session.reading.scan_files import measured_pixels
+from stitch.session.reading.text_files import require_name
 from stitch.session.session import Cloud, Sighting
 
 Columns = dict[str, Array]
@@ -45,7 +46,7 @@ def cloud_of(item: Any, where: str, scale: float = 1.0) -> Cloud:
     Raises:
         InputError: a kind that is not known, another shape, no points, or points that are not finite.
     """
-    is_plain = isinstance(item, np.ndarray) and item.dtype == np.float64 and item.ndim == 2 and item.shape[1] == 3
+    is_plain = type(item) is np.ndarray and item.dtype == np.float64 and item.ndim == 2 and item.shape[1] == 3
     # Where nothing is changed or left out, no copy is needed.
     if scale == 1.0 and is_plain and len(item) and np.isfinite(item).all() and item.any(axis=1).all():
         return Cloud(item)
@@ -69,12 +70,26 @@ def _columns(item: Any, where: str) -> Columns:
         colours = getattr(item, "colors", None)
         has_colours = colours is not None and len(colours) > 0
         return _points(np.asarray(item.vertices), where) | (_colours(colours, where) if has_colours else {})
-    array = np.asarray(item)
+    array = _unmasked(item)
     if array.dtype.names is not None:
         columns = {name: array[name].ravel() for name in array.dtype.names if array[name].ndim == array.ndim}
         return measured_pixels(columns)
     columns = _points(array, where)
-    return measured_pixels(columns) if array.ndim == 3 else columns
+    return measured_pixels(columns) if array.ndim == 3 or np.ma.isMaskedArray(item) else columns
+
+
+def _unmasked(values: Any) -> Array:
+    """Return an array as it is; NaN where a masked one is masked, and in the other two numbers of that row."""
+    if not np.ma.isMaskedArray(values):
+        return np.asarray(values)
+    if values.dtype.names is not None:
+        return values.data[
+            ~np.ma.getmaskarray(values).view(bool).reshape(values.size, -1).any(axis=1).reshape(values.shape)
+        ]
+    filled = values.astype(float).filled(np.nan)
+    if filled.ndim > 1 and filled.shape[-1] == 3:
+        filled[np.isnan(filled).any(axis=-1)] = np.nan
+    return filled
 
 
 def _points(points: Array, where: str) -> Columns:
@@ -86,7 +101,7 @@ def _points(points: Array, where: str) -> Columns:
 
 def _of_mapping(item: Mapping[str, Any], where: str) -> Columns:
     """Return columns of a mapping: points, normals and colors are three each, every other entry is one."""
-    rest = {str(name): np.asarray(values) for name, values in item.items()}
+    rest = {str(name): _unmasked(values) for name, values in item.items()}
     columns = _points(rest.pop("points"), where) if "points" in rest else {}
     count = len(columns.get("x", ()))
     if "normals" in rest:
@@ -235,8 +250,8 @@ def _matrices(poses: Any, where: str) -> Array:
             is_object = [
                 hasattr(p, "as_matrix") or (isinstance(p, tuple) and isinstance(p[0], Rotation)) for p in poses
             ]
-            poses = [_matrices(p, where) if o else np.asarray(p, float) for p, o in zip(poses, is_object, strict=True)]
-        return np.array(poses, float)
+            poses = [_matrices(p, where) if o else _unmasked(p) for p, o in zip(poses, is_object, strict=True)]
+        return np.array(_unmasked(poses), float)
     except (TypeError, ValueError):
         raise InputError(
             f"{where}: poses are not all matrices (4, 4); to fix: pass (V, 4, 4), RigidTransform, "
@@ -270,22 +285,40 @@ def sighting_of(item: Any, where: str) -> Sighting | None:
     points = np.array([np.asarray(place, float) for place in item.values()])
     if points.shape != (len(item), 3) or not np.isfinite(points).all():
         raise InputError(f"{where}: labelled points are not three finite numbers each; to fix: pass {{target: (3,)}}")
-    return Sighting(tuple(str(name) for name in item), points, np.full(len(item), np.nan))
+    targets = tuple(require_name(where, str(name), "target") for name in item)
+    return Sighting(targets, points, np.full(len(item), np.nan))
 
 
 def per_view(values: Any, count: int, where: str, ndim: int = 1) -> Array:
-    """Return numbers of which there is one row a view, as an array of `ndim` axes.
+    """Return numbers of which there is one row a view, as an array of `ndim` axes; NaN where one is masked.
 
     Raises:
-        InputError: another number of rows, or another shape.
+        InputError: another number of rows, another shape, or dates, which count in no unit.
     """
     try:
-        found = np.asarray(values, float)
+        found = _unmasked(values)
+        if found.dtype.kind in "mM":
+            raise InputError(f"{where}: dates or durations, not numbers; to fix: pass numbers in one unit")
+        found = found.astype(float)
     except (TypeError, ValueError):
         found = np.zeros((0,))
     if found.ndim != ndim or len(found) != count:
         raise InputError(f"{where}: shape {found.shape} for {count} views; to fix: pass one row of numbers a view")
     return found
+
+
+def seconds_of(times: Any, count: int, where: str) -> Array:
+    """Return times (V,) s: numbers as they are, durations in seconds, dates in seconds since the first of them.
+
+    Raises:
+        InputError: as of `per_view`.
+    """
+    values = np.asarray(times)
+    if values.dtype.kind not in "mM":
+        return per_view(times, count, where)
+    since = values - values.ravel()[0] if values.dtype.kind == "M" and values.size else values
+    seconds = np.where(np.isnat(values), np.nan, since / np.timedelta64(1, "s"))
+    return per_view(np.where(np.ma.getmaskarray(times), np.nan, seconds), count, where)
 
 
 def _array_kind(array: Array) -> str:

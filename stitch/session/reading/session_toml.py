@@ -1,6 +1,7 @@
 """session.toml: every key checked, tables turned to what they describe."""
 
 import shlex
+from collections.abc import Collection
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -64,16 +65,29 @@ def read_session_document(file: Path) -> dict[str, Any]:
         raise InputError(f'{file}: format is {shortened(document.get("format"))}; expected "{SESSION_FORMAT}"')
     for table, known in _KEYS.items():
         entries = document if not table else document.get(table, {})
-        if not isinstance(entries, dict):
-            raise InputError(f"{file}: [{table}] must be a table")
-        for key in entries:
-            if key not in known:
-                close = get_close_matches(key, known, 1)
-                raise InputError(
-                    f"{file}: unknown key {f'{table}.{key}' if table else key!r}"
-                    + (f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(sorted(known))}")
-                )
+        _require_entries(file, table, entries, known)
     return document
+
+
+def require_table(file: Path, name: str, table: Any, without: tuple[str, ...] = ()) -> None:
+    """Refuse a table of session.toml with keys that nobody knows, or that do not count where it comes from.
+
+    Raises:
+        InputError: no table, or such a key.
+    """
+    _require_entries(file, name, table, _KEYS[name].difference(without))
+
+
+def _require_entries(file: Path, table: str, entries: Any, known: Collection[str]) -> None:
+    if not isinstance(entries, dict):
+        raise InputError(f"{file}: [{table}] must be a table")
+    for key in map(str, entries):
+        if key not in known:
+            close = get_close_matches(key, known, 1)
+            raise InputError(
+                f"{file}: unknown key {f'{table}.{key}' if table else key!r}"
+                + (f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(sorted(known))}")
+            )
 
 
 def session_name(file: Path, document: dict[str, Any]) -> str:

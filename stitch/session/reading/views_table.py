@@ -174,9 +174,25 @@ def covariate_names(header: Sequence[str], cells: Sequence[tuple[int, dict[str, 
     Args:
         cells: line number and cells by column of every row.
     """
-    known = {"view", "cloud", "time_s", *POSE_COLUMNS}
-    rest = [name for name in header if name not in known and not _JOINT.match(name) and not _APPROACH.match(name)]
-    return [name for name in rest if any(is_number(row[name]) for _, row in cells)]
+    return [name for name in header if _may_be_covariate(name) and any(is_number(row[name]) for _, row in cells)]
+
+
+def _may_be_covariate(column: str) -> bool:
+    return column not in {"view", "cloud", "time_s", *POSE_COLUMNS} and not (
+        _JOINT.match(column) or _APPROACH.match(column)
+    )
+
+
+def require_covariate_name(where: str, name: str) -> str:
+    """Return the name of a covariate, under which views.csv can hold a column of its own.
+
+    Raises:
+        InputError: one that is another column's, empty, or not to be read back.
+    """
+    require_name(where, name, "covariate")
+    if not name or name != name.strip() or not _may_be_covariate(name):
+        raise InputError(f"{where}: {name!r} can be no covariate's name in views.csv; to fix: give it another one")
+    return name
 
 
 def _row_joints(file: Path, line: int, row: dict[str, str], count: int) -> Array | None:
