@@ -20,6 +20,8 @@ from stitch.session.measurement import Measurement
 from stitch.session.reading.text_files import optional_text, read_toml, table_choice
 
 FORMAT = "stitch-model/1"
+# What rounding, or a hand that writes six digits, does to a matrix of unit diagonal.
+_ROUNDED = 1e-5
 _HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps scanner
 # coordinates into the {carrier} frame. sigma and covariance belong to a right perturbation
 # T·exp(ξ), ξ = (rotation in rad, translation in {unit}), in the scanner frame.
@@ -109,6 +111,13 @@ def read_model(path: Path | str) -> ModelFile:
         if not is_rigid(T):
             raise InputError(f"{path}: hand_eye.{name} is not a rigid motion; its 3x3 part must be a rotation")
     covariance = _matrix(path, hand_eye, "covariance", 6) if "covariance" in hand_eye else np.zeros((6, 6))
+    sigma = np.sqrt(np.abs(np.diag(covariance)))
+    unit = np.where(sigma > 0, sigma, 1.0)
+    correlation = covariance / np.outer(unit, unit)
+    if np.abs(correlation - correlation.T).max() > _ROUNDED or np.linalg.eigvalsh(correlation)[0] < -_ROUNDED:
+        raise InputError(
+            f"{path}: hand_eye.covariance is not symmetric, or negative in some direction; to fix: copy that of the run"
+        )
     return ModelFile(
         length_unit=table_choice(path, document, "length_unit", tuple(METRES)),
         mount=str(document.get("mount")),

@@ -208,3 +208,20 @@ def test_a_model_that_was_edited_wrongly_is_refused(tmp_path, old, new, expected
     edit(file, old, new)
     with pytest.raises(InputError, match=f"model.toml: {expected}; "):
         read_model(file)
+
+
+@pytest.mark.parametrize("at, value", [((4, 4), -1e-2), ((3, 5), 2e-2), ((0, 1), -3e-8)])
+@pytest.mark.parametrize("mirrored", [True, False])
+def test_a_covariance_that_is_none_is_refused_in_a_line(tmp_path, at, value, mirrored):
+    covariance = np.diag([1e-8] * 3 + [1e-2] * 3)
+    file = tmp_path / "model.toml"
+    write_model(ModelFile("mm", "eye_in_hand", np.eye(4), np.eye(4), covariance), file)
+    assert np.array_equal(read_model(file).covariance, covariance)
+    covariance[at] = value
+    if mirrored:
+        covariance[at[::-1]] = value
+    with np.errstate(invalid="ignore"):
+        write_model(ModelFile("mm", "eye_in_hand", np.eye(4), np.eye(4), covariance), file)
+    with pytest.raises(InputError, match=r"hand_eye.covariance is not symmetric, or negative") as refused:
+        read_model(file)
+    assert "\n" not in str(refused.value)

@@ -164,7 +164,12 @@ class Jobs:
                     job.lines.append("The run has changed since this was asked for; look at it again.")
                     self._say(job)
                 else:
-                    await self._run(job)
+                    try:
+                        await self._run(job)
+                    except Exception as error:  # the commands behind it still wait
+                        job.state = "failed"
+                        job.lines.append(f"{type(error).__name__}: {error}".encode(errors="replace").decode())
+                        self._say(job)
         finally:
             if (process := self._process) is not None:
                 _interrupt(process)

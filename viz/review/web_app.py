@@ -36,10 +36,17 @@ from viz.review.run_review import RunReview
 
 
 async def json_object(request: Request) -> dict[str, Any] | None:
-    """The JSON object of a request; None where it brings something else."""
+    """The JSON object of a request; None where it brings something else: too much, too deep, no number or no text."""
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > LARGEST_BODY:
+            return None
     try:
-        found = await request.json()
-    except ValueError:
+        found = json.loads(body)
+        # Half an emoji is no text of a command, nor is 1e400 a number.
+        json.dumps(found, allow_nan=False, ensure_ascii=False).encode()
+    except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
 
@@ -276,7 +283,9 @@ class ReviewPages:
         """{"views", "targets", "bins", "place", "within"}: field and numbers of a choice."""
         asked = await json_object(request)
         try:
-            choice = _choice(asked or {})
+            if asked is None:
+                raise ValueError
+            choice = _choice(asked)
         except (ValueError, TypeError, LookupError, AttributeError):
             return error_response("a choice is {views, targets, bins, place, within}")
         try:

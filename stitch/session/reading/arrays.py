@@ -78,15 +78,13 @@ def _columns(item: Any, where: str) -> Columns:
     return measured_pixels(columns) if array.ndim == 3 or np.ma.isMaskedArray(item) else columns
 
 
-def _unmasked(values: Any) -> Array:
+def _unmasked(values: Any) -> Any:
     """Return an array as it is; NaN where a masked one is masked, and in the other two numbers of that row."""
     if not np.ma.isMaskedArray(values):
         return np.asarray(values)
     if values.dtype.names is not None:
-        return values.data[
-            ~np.ma.getmaskarray(values).view(bool).reshape(values.size, -1).any(axis=1).reshape(values.shape)
-        ]
-    filled = values.astype(float).filled(np.nan)
+        return values.data[~np.any([np.ma.getmaskarray(values[name]) for name in values.dtype.names], axis=0)]
+    filled: Array = np.ma.filled(values.astype(float), np.nan)
     if filled.ndim > 1 and filled.shape[-1] == 3:
         filled[np.isnan(filled).any(axis=-1)] = np.nan
     return filled

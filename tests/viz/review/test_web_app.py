@@ -1,5 +1,7 @@
 """Who is answered, what a page may ask for, what becomes of a run while it is looked at, and the files of the Rerun viewer."""
 
+import asyncio
+import http.client
 import json
 import os
 import re
@@ -15,6 +17,7 @@ from stitch.cli.main import main
 from stitch.errors import InputError
 from tests.viz.review.conftest import ended, served, until
 from viz.review import rerun_viewer
+from viz.review.jobs import Jobs
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +74,11 @@ def test_nothing_beside_its_own_files_can_be_read(server, run):
         ("jobs", {"kind": "note", "text": 5}, 422),
         ("jobs", {"kind": "note", "text": "a\0b"}, 422),
         ("jobs", b"x" * 300_000, 413),
+        ("jobs", b'{"kind": "note", "text": "half an emoji \\ud83d"}', 400),
+        ("jobs", b"[" * 90_000, 400),
+        ("chosen", b'{"bins": {"range": [0, 1e400]}}', 400),
+        ("chosen", b'{"bins": {"range": [0, NaN]}}', 400),
+        ("chosen", b"\xff{}", 400),
         ("jobs", {"kind": "own"}, 403),
         ("own", {"text": "import os"}, 403),
         ("own", {"text": "import os", "trust": "yes"}, 403),
@@ -91,6 +99,32 @@ def test_what_no_command_is_made_of_is_refused_in_a_line(server, run, path, body
         assert told["problem"]
         assert "\n" not in told["problem"]
     assert {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()} == before
+
+
+def test_a_body_in_chunks_has_the_same_limit(server):
+    connection = http.client.HTTPConnection(server.place, timeout=60)
+    chunks = iter([b'{"kind": "note", "text": "', *[b"x" * 10_000] * 30, b'"}'])
+    connection.request("POST", f"/{server.token}/jobs", chunks, encode_chunked=True)
+    assert connection.getresponse().status == 400
+    connection.close()
+
+
+def test_a_command_that_cannot_be_started_ends_alone():
+    async def tried():
+        told = []
+        jobs = Jobs(told.append, lambda: None)
+        queue = asyncio.create_task(jobs.work())
+        for text in ("half an emoji \ud83d", "a\0b"):
+            jobs.submit("note", ["note", text])
+        last = jobs.submit("note", ["--version"])
+        while last.state in ("waiting", "running"):
+            await asyncio.sleep(0.05)
+        queue.cancel()
+        return [job.state for job in jobs.all], told
+
+    states, told = asyncio.run(tried())
+    assert states == ["failed", "failed", "done"]
+    assert json.dumps(told, ensure_ascii=False)
 
 
 def test_numbers_of_a_choice_are_those_of_the_tables(server, run):
