@@ -11,12 +11,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from stitch.errors import InputError, NoResultError
 from stitch.plugins.intake.cloud_pairs import clouds_served
 from stitch.plugins.intake.layouts import possible_layouts
 from stitch.plugins.intake.raw_poses import RawPoses, read_lists, read_raw_poses
 
-_NAMES_POSE = re.compile(r"pose|robot|flange|tcp|joint|trajector|actual|ist\b", re.IGNORECASE)
+_NAMES_POSE = re.compile(r"pose|robot|flange|tcp|joint|trajector|actual|gripper|effector|ist\b", re.IGNORECASE)
 _NAMES_OTHER = re.compile(r"marker|board|target|tag|camera|soll?\b|rsol|edges|nominal|command", re.IGNORECASE)
 _FEWEST_ALIKE = 3  # files named alike, with a pose each
 _SHOWN = 6
@@ -92,6 +94,8 @@ def take_inventory(files: Sequence[Path], accepts: Callable[[RawPoses], bool]) -
 
 def _judged(found: FoundList, accepts: Callable[[RawPoses], bool]) -> FoundList:
     assert found.raw is not None
+    if len(found.raw.numbers) > 1 and not np.ptp(found.raw.numbers, axis=0).any():
+        return replace(found, why_not="all its rows are alike")
     try:
         if accepts(found.raw) or possible_layouts(found.raw):
             return found
@@ -118,6 +122,8 @@ def choose_list(
     rows = [found for found in inventory if found.raw is not None]
     if not open_ and len(rows) == 1:
         open_ = rows  # what is wrong with it is said by name when its columns are read
+    if len(inventory) == 1 and len(inventory[0].files) == 1 and not open_:
+        read_raw_poses(inventory[0].files)  # what is wrong with the one file is said in full
     if not open_:
         raise InputError(
             f"{folder}: no list of poses there{_shown(inventory)}; to fix: name the file of the poses with --poses "
@@ -140,12 +146,16 @@ def choose_list(
     return chosen, [chosen, *others]
 
 
-def _rank(found: FoundList, clouds: Sequence[Path]) -> tuple[int, bool, bool]:
-    """Less is better: clouds without a row, and what the names of file and list say."""
+def _rank(found: FoundList, clouds: Sequence[Path]) -> tuple[int, bool, bool, bool]:
+    """Less is better: clouds without a row, and what the names of columns, file and list say."""
     assert found.raw is not None
     served = clouds_served(clouds, found.raw.labels, found.raw.numbers)
     named = f"{found.files[0].stem} {found.raw.part}"
-    return len(clouds) - served, bool(_NAMES_OTHER.search(named)), not _NAMES_POSE.search(named)
+    strange = False
+    with suppress(InputError):
+        # Named columns that only their values make a pose.
+        strange = found.raw.header is not None and not possible_layouts(found.raw)[0].named
+    return len(clouds) - served, strange, bool(_NAMES_OTHER.search(named)), not _NAMES_POSE.search(named)
 
 
 def _shown(inventory: Sequence[FoundList]) -> str:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -286,6 +287,10 @@ def _matrix_columns(header: Sequence[str]) -> tuple[int, ...]:
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas", " ": "spaces"}
 # Lines that are drawn, as below the header of a table in Markdown.
 _RULE = re.compile(r"[-|:+=\s]*(?:-{3}|={3})[-|:+=\s]*")
+# Between cells, whatever the separator; a row of a pose has so many at least.
+_CELL_END = re.compile(r"\s*[;,=|\t]\s*|\s+")
+_FEWEST_CELLS = 6
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:,\d{3})+\.\d+|(?:['’ ]\d{3})+[.,]\d+)")
 _COMMENTS = ("#", "%", "//")
 _MAX_TABLE_MB = 50
 
@@ -334,6 +339,7 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
         [[_cell_number(file, i, row[c] if any(row[k] for k in numeric) else "nan") for c in numeric] for i, row in rows]
     )
     _require_one_decimal_mark(file, rows, numeric)
+    _require_no_thousands(file, rows, text)
     decimal = any(DECIMAL_COMMA.fullmatch(row[c]) for _, row in rows for c in numeric)
     words = f"separated by {_SEPARATORS[separator]}{', decimal commas' * decimal}"
     words += ", with a header" if header else ", without a header"
@@ -347,6 +353,28 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
         lines=tuple(i for i, _ in rows),
         words=words,
     )
+
+
+def longest_block(content: str) -> tuple[str, str] | None:
+    """Return the longest run of rows of numbers with the names above it, other lines blank, and what was left out.
+
+    None where another row of numbers stands outside it: a file of such rows is a table with a mistake in it. A last row
+    that is cut short is left out.
+    """
+    lines = content.splitlines()
+    cells = [[] if line.strip().startswith(_COMMENTS) else _CELL_END.split(line.strip()) for line in lines]
+    counts = [_number_count(row) for row in cells]
+    edges = [0, *(i for i in range(1, len(lines)) if counts[i] != counts[i - 1]), len(lines)]
+    runs = [(end - first, first) for first, end in pairwise(edges) if counts[first] >= _FEWEST_CELLS]
+    length, first = max(runs, default=(0, 0))
+    outside = [i for i, n in enumerate(counts) if n >= _SEVERAL and not first <= i < first + length]
+    short = outside == [first + length] and not any(map(str.strip, lines[first + length + 1 :]))
+    if length < _SEVERAL or (outside and not short):
+        return None
+    named = first > 0 and counts[first - 1] == 0 and len(cells[first - 1]) >= _FEWEST_CELLS
+    kept = range(first - named, first + length)
+    words = f"line {first + length + 1} is cut short and left out" if short else "lines of words passed over"
+    return "\n".join(line if i in kept else "" for i, line in enumerate(lines)), words
 
 
 def _cell_number(file: Path, line: int, cell: str) -> float:
@@ -366,6 +394,16 @@ def _require_one_decimal_mark(file: Path, rows: Sequence[tuple[int, list[str]]],
                 f"{file} line {line}: {shortened(cell)} has a point, other numbers of its column have a comma before "
                 "their decimals; to fix: write all alike, without marks for thousands"
             )
+
+
+def _require_no_thousands(file: Path, rows: Sequence[tuple[int, list[str]]], text: Sequence[int]) -> None:
+    """Refuse marks for thousands, 1.358,401 or 1'358.401, that make a column of numbers one of words."""
+    found = next(((i, row[c]) for c in text for i, row in rows if _THOUSANDS.fullmatch(row[c])), None)
+    if found is not None:
+        line, cell = found
+        raise InputError(
+            f"{file} line {line}: {shortened(cell)} has marks for thousands; to fix: write the numbers without them"
+        )
 
 
 def _split_header(

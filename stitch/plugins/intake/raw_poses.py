@@ -3,6 +3,8 @@
 import csv
 import json
 import re
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +18,13 @@ from stitch.numerics.frames import Array
 from stitch.plugins.intake.clock_times import ClockTimes, find_clock_column
 from stitch.plugins.intake.controllers.program import POSE_COLUMNS, csv_text, import_file
 from stitch.plugins.intake.pose_formats import PoseRow, joint_state_rows, open3d_rows, read_pose_text
-from stitch.plugins.intake.pose_tables import NumberTable, parse_number_table, with_one_header
+from stitch.plugins.intake.pose_tables import (
+    NumberTable,
+    longest_block,
+    parse_number,
+    parse_number_table,
+    with_one_header,
+)
 from stitch.session.reading.scan_headers import poses_in_scans, times_in_scans
 from stitch.session.reading.text_files import (
     WORKBOOKS,
@@ -29,6 +37,7 @@ from stitch.session.reading.yaml_file import parse_yaml
 
 # Poses in JSON and YAML: lists, matrices and mappings, however deep, as rows of named numbers.
 
+_LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
 # Sizes of a bare list of numbers that can be a pose or joint angles.
 _SIZES = (5, 6, 7, 8, 9, 12, 16)
 # An axis of rotation has length 1 within this; a larger angle is in degrees.
@@ -53,11 +62,32 @@ def nested_lists(document: Any, texts: tuple[str, ...] = ()) -> dict[str, list[P
     if isinstance(document, dict):
         named = [((str(key), *texts, *_texts(value)), _pose_numbers(value)) for key, value in document.items()]
         direct = [(words, row) for words, row in named if row is not None]
-        if len(direct) > 1 and len({tuple(row) for _, row in direct}) == 1:
-            out[""] = direct
+        # gripper_1, target_1, gripper_2 … are two lists.
+        stems = Counter(_LAST_NUMBER.sub("#", words[0]) for words, _ in direct)
+        several = len(stems) > 1 and min(stems.values()) > 1
+        for stem in stems if several else [""]:
+            alike = [(words, row) for words, row in direct if not stem or _LAST_NUMBER.sub("#", words[0]) == stem]
+            if len(alike) > 1 and len({tuple(row) for _, row in alike}) == 1:
+                out[stem.replace("#", "").strip("_- ")] = alike
         for key, value in document.items():
             below = nested_lists(value, (*texts, *_texts(document)))
             out |= {f"{key}.{path}".strip("."): rows for path, rows in below.items()}
+    return out
+
+
+def _xml_document(element: ElementTree.Element) -> Any:
+    """An element as JSON would have it: attributes and children by name, several of one name as a list."""
+    cells = (element.text or "").split()
+    if not len(element) and not element.attrib:
+        numbers = [x for cell in cells if (x := parse_number(cell)) is not None]
+        return " ".join(cells) if len(numbers) < max(len(cells), 1) else numbers[0] if len(numbers) == 1 else numbers
+    out: dict[str, Any] = {}
+    for name, cell in element.attrib.items():
+        number = parse_number(cell)
+        out[name] = cell if number is None else number
+    for tag in dict.fromkeys(child.tag for child in element):
+        children = [_xml_document(child) for child in element if child.tag == tag]
+        out[tag] = children[0] if len(children) == 1 else children
     return out
 
 
@@ -301,9 +331,20 @@ def read_lists(file: Path) -> list[RawPoses]:
         lists = {"": (rows, kind)} if rows else {path: (rows, kind) for path, rows in nested_lists(document).items()}
     else:
         lists = read_pose_text(text)
+        if not lists and text.lstrip().startswith("<"):
+            with suppress(ElementTree.ParseError):
+                document = _xml_document(ElementTree.fromstring(text))
+                lists = {path: (rows, "XML") for path, rows in nested_lists(document).items()}
     if lists or suffix in (".json", ".yaml", ".yml"):
         return _from_lists(file, lists)
-    table = parse_number_table(file, text)
+    try:
+        table = parse_number_table(file, text)
+    except InputError:
+        block = longest_block(text)
+        if block is None:
+            raise
+        table = parse_number_table(file, block[0])
+        table = replace(table, words=f"{table.words}; {block[1]}")
     return [_matrix_blocks(table) or _raw_poses(str(file), table.header, table.numbers, table.labels, table.words)]
 
 

@@ -79,3 +79,14 @@ def test_its_own_files_are_passed_over_and_another_points_csv_is_not(scans):
     np.savetxt(scans / "points.csv", TABLE, delimiter=",", header="x,y,z,qx,qy,qz,qw", comments="")
     (scans / "views.csv").write_text("view,cloud,x,y,z,qx,qy,qz,qw\na,scan_0.ply,0,0,0,0,0,0,1\n")
     assert [file.name for file in find_folder_files(scans).poses] == ["points.csv"]
+
+
+def test_rows_that_are_all_alike_and_columns_of_other_names_are_no_poses(scans):
+    (scans / "links.json").write_text(json.dumps([dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 0.0)] * 5))
+    lens = [dict.fromkeys(("fx", "fy", "cx", "cy", "k1"), 1.0) | {"k2": i / 10} for i in range(5)]
+    (scans / "robot.json").write_text(json.dumps(lens))
+    np.savetxt(scans / "a.csv", TABLE, delimiter=",", header="x,y,z,qx,qy,qz,qw", comments="")
+    found = find_folder_files(scans)
+    assert [file.name for file in found.poses] == ["a.csv"]
+    reasons = {entry.files[0].name: entry.why_not for entry in found.inventory}
+    assert reasons["links.json"] == "all its rows are alike"

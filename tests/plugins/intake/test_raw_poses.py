@@ -13,7 +13,7 @@ from data_synth.fixtures.robot_programs import program
 from stitch.errors import InputError
 from stitch.plugins.intake.folder_files import find_folder_files
 from stitch.plugins.intake.layouts import possible_layouts
-from stitch.plugins.intake.raw_poses import is_program, program_poses, read_raw_poses
+from stitch.plugins.intake.raw_poses import is_program, program_poses, read_lists, read_raw_poses
 from stitch.plugins.intake.readings import readings
 
 POSE_OF_ROS = """  position:
@@ -331,3 +331,50 @@ def test_the_header_of_euroc_names_a_quaternion(tmp_path):
 def test_one_angle_beside_a_position_turns_about_z(tmp_path):
     reading = only(read(tmp_path, "scara.csv", "Nr;X;Y;Z;U\n1;843.9;-26.1;737.1;90\n2;676.8;206.9;725.0;-60\n"))
     assert np.allclose(reading.T[0, :3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+JBI = """/JOB
+//POS
+///NPOS 3,0,0,0,0,0
+///POSTYPE ROBOT
+///RECTAN
+C00000=540.401,210.184,711.688,-143.2731,26.7136,-164.1689
+C00001=690.419,208.998,764.912,164.0445,21.6702,172.0475
+C00002=690.638,110.320,744.290,154.1,20.1,171.2
+//INST
+NOP
+MOVL C00000 V=50.0
+"""
+
+
+def test_rows_of_numbers_within_a_text_are_read_with_their_names(tmp_path):
+    raw = read(tmp_path, "scan.JBI", JBI)
+    assert raw.numbers.shape == (3, 6) and raw.labels[2] == ("C00002",)
+
+
+def test_a_last_row_cut_short_is_left_out_by_its_line(tmp_path):
+    rows = [f"{i},0.5,0.25,0.6,0,0,0.8" for i in range(4)]
+    raw = read(tmp_path, "poses.csv", "\n".join(["x,y,z,qx,qy,qz,qw", *rows, "4,0.5,0.2"]) + "\n")
+    assert raw.numbers.shape == (4, 7) and "line 6 is cut short and left out" in raw.words
+    with pytest.raises(InputError, match="line 3: 3 cells"):
+        read(tmp_path, "poses.csv", "\n".join(["x,y,z,qx,qy,qz,qw", rows[0], "4,0.5,0.2", *rows[1:]]) + "\n")
+
+
+def test_marks_for_thousands_are_refused_by_name(tmp_path):
+    text = "X;Y;Z;A;B;C\n1.540,401;210,184;711,688;-143,27;26,71;-164,16\n690,6;110,3;744,2;154,1;20,1;171,2\n"
+    with pytest.raises(InputError, match=r"line 2: '1.540,401' has marks for thousands"):
+        read(tmp_path, "poses.csv", text)
+
+
+def test_names_that_differ_in_more_than_a_number_are_lists_of_their_own(tmp_path):
+    T = np.eye(4).ravel().tolist()
+    document = {f"{name}_{i}": [*T[:3], float(i), *T[4:]] for i in range(3) for name in ("gripper2base", "target2cam")}
+    (tmp_path / "both.json").write_text(json.dumps(document))
+    parts = {raw.part: len(raw.numbers) for raw in read_lists(tmp_path / "both.json")}
+    assert parts["gripper2base"] == parts["target2cam"] == 3
+
+
+def test_children_of_elements_of_xml_are_numbers_by_their_names(tmp_path):
+    rows = "".join(f"<pose name='s{i}'><x>{i}</x><y>2</y><z>3</z><q>0 0.6 0 0.8</q></pose>" for i in range(3))
+    raw = read(tmp_path, "poses.xml", f"<?xml version='1.0'?><poses>{rows}</poses>")
+    assert raw.numbers.shape == (3, 7) and raw.labels[1] == ("s1",)
