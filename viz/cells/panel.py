@@ -130,7 +130,7 @@ _STYLES: list[dict[str, Any]] = [
 def write_pictures(job: PanelJob, result: PanelResult, folder: Path) -> list[str]:
     """Write the errors to expect along a motion as PNG and SVG; returns the files' names."""
     names = ["errors.png", "errors.svg"]
-    figure = errors_figure(job.robots, job.master, result.errors.shift, result.errors.turn)
+    figure = errors_figure(job.robots, job.master, result.shift_errors, result.turn_errors)
     for name in names:
         save_figure(figure, folder / name, dpi=110)
     return names
@@ -201,7 +201,7 @@ def write_page(job: PanelJob, result: PanelResult, path: Path) -> None:
     caption = "Reflectors seen by the tracker against the fitted model, every bar one robot; 1 is the tracker's sigma."
     pictures.append(Picture("What the model of each robot leaves", misfit(job, result), caption))
     caption = "What the uncertainty of the model does to the slaves when the master moves."
-    figure = errors_figure(job.robots, job.master, result.errors.shift, result.errors.turn)
+    figure = errors_figure(job.robots, job.master, result.shift_errors, result.turn_errors)
     pictures.append(Picture("Errors to expect along a motion", figure, caption))
     words = (sentence(job, result), job.file, _about(job))
     tables, notes, light = _tables(job, result), _notes(result), _light(job, result)

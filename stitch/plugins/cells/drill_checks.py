@@ -1,6 +1,6 @@
 """What a drilling cell shows of itself: the plate's place by its locating holes, and trial drives to the holes.
 
-Trial drives: what camera and rangers see at a hole, before and after the correction, and what a pin that is driven
+Trial drives tell what camera and rangers see at a hole, before and after the correction, and what a pin that is driven
 into it bounds (tables 4, 6 and 7 of the source).
 """
 
@@ -15,7 +15,7 @@ from stitch.numerics import frames
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array
 from stitch.plugins.cells.drilling_sensors import RangerFit
-from stitch.plugins.cells.job_files import JobTable, on_a_line, read_columns
+from stitch.plugins.cells.job_files import CsvColumns, JobTable, on_a_line, read_columns
 
 MIN_LOCATING = 3
 STAGES = ("drawing", "corrected", "levelled")  # driven by the drawing, by the correction, and then along the normal
@@ -43,7 +43,8 @@ def holes_in_flange(file: Path, plate_xyz: Array, T_measuring_flange: Array) -> 
         InputError: a column is missing, or fewer than three holes off one line.
     """
     table = read_columns(file, "", "x y z seen_x seen_y seen_z")
-    nominal, seen = table.stack("x y z"), table.stack("seen_x seen_y seen_z")
+    nominal = table.stack("x y z")
+    seen = table.stack("seen_x seen_y seen_z")
     if len(nominal) < MIN_LOCATING or on_a_line(nominal) or on_a_line(seen):
         raise InputError(f"{file}: the holes fix no plate; to fix: measure {MIN_LOCATING} or more off one line")
     T_measuring_plate = align_points(nominal, seen)
@@ -53,28 +54,9 @@ def holes_in_flange(file: Path, plate_xyz: Array, T_measuring_flange: Array) -> 
 
 
 def plate_place(plate_xyz: Array, stated: float, locating_rms: float | None) -> PlatePlace:
-    """Height and parallelism of holes (N, 3) in the flange frame."""
+    """Return height and parallelism of holes (N, 3) in the flange frame."""
     z = plate_xyz[:, 2]
     return PlatePlace(float(z.mean()), stated, float(np.abs(z - z.mean()).max()), locating_rms)
-
-
-@dataclass(frozen=True)
-class Pin:
-    """A round bar in the tool's place, length unit."""
-
-    diameter: float
-    feed: float  # along the hole, from the levelled pose
-
-
-@dataclass(frozen=True)
-class Trial:
-    """What was seen at one hole."""
-
-    hole: str
-    stage: str  # of STAGES
-    uv: Array  # (2,)
-    readings: dict[str, float]  # by ranger
-    diameter: float | None  # of the hole
 
 
 @dataclass(frozen=True)
@@ -91,7 +73,7 @@ class TrialError:
     pin_tilt: float | None
 
 
-def read_trials(file: Path, rangers: tuple[str, ...], pin: Pin | None) -> tuple[Trial, ...]:
+def read_trials(file: Path, rangers: tuple[str, ...], with_pin: bool) -> CsvColumns:
     """Read trial drives: hole, stage, u, v, a column for each ranger and, with a pin, the hole's diameter.
 
     Raises:
@@ -99,57 +81,52 @@ def read_trials(file: Path, rangers: tuple[str, ...], pin: Pin | None) -> tuple[
     """
     if len(rangers) < 3:
         raise InputError(f"{file}: trials need three rangers for a normal; to fix: name the rangers' table")
-    table = read_columns(file, "hole stage", f"u v {' '.join(rangers)}{' diameter' if pin else ''}")
+    table = read_columns(file, "hole stage", f"u v {' '.join(rangers)}{' diameter' if with_pin else ''}")
     for stage in table.texts["stage"]:
         if stage not in STAGES:
             raise InputError(f"{file}: stage is {stage!r}; to fix: write one of {', '.join(STAGES)}")
-    return tuple(
-        Trial(
-            name,
-            stage,
-            np.array([table.numbers["u"][i], table.numbers["v"][i]]),
-            {ranger: float(table.numbers[ranger][i]) for ranger in rangers},
-            float(table.numbers["diameter"][i]) if pin else None,
-        )
-        for i, (name, stage) in enumerate(zip(table.texts["hole"], table.texts["stage"], strict=True))
-    )
+    return table
 
 
-def read_pin(document: JobTable) -> Pin | None:
-    """Return the pin of a job's table [pin]; None without one."""
+def read_pin(document: JobTable) -> tuple[float, float] | None:
+    """Return diameter and feed along the hole, from the levelled pose, of a pin in the tool's place; None without."""
     if "pin" not in document:
         return None
     table = document.table("pin", ("diameter", "feed"))
-    return Pin(table.number("diameter", positive=True), table.number("feed", positive=True))
+    return table.number("diameter", positive=True), table.number("feed", positive=True)
 
 
 def trial_error(
-    trial: Trial,
+    trials: CsvColumns,
+    row: int,
     beams: Mapping[str, RangerFit],
     in_plane_of: Callable[[Array, float], Array],
     stated: float,
-    pin: Pin | None,
+    pin: tuple[float, float] | None,
 ) -> TrialError:
-    """Return the error of one drive.
+    """Return the error of the drive in one row of the trials.
 
     Args:
         in_plane_of: x, y (2,) in the flange frame of an image point (2,) at a height.
         stated: height of the work plane.
+        pin: its diameter and feed.
     """
-    spots = np.array([beams[name].origin + d * beams[name].direction for name, d in trial.readings.items()])
+    stage = trials.texts["stage"][row]
+    spots = np.array([beam.origin + trials.numbers[name][row] * beam.direction for name, beam in beams.items()])
     normal = np.linalg.svd(spots - spots.mean(axis=0))[2][2]
     seen_at = float(spots[:, 2].mean())
     height = seen_at - stated
     tilt = float(np.arccos(min(abs(normal[2]), 1.0)))
-    in_plane = float(np.linalg.norm(in_plane_of(trial.uv, seen_at)))
+    in_plane = float(np.linalg.norm(in_plane_of(trials.stack("u v")[row], seen_at)))
     position = turn = None
-    if pin is not None and trial.diameter is not None and trial.stage == STAGES[-1]:
+    if pin is not None and stage == STAGES[-1]:
+        diameter, feed = pin
         # The pin went in: it leaves the hole no more room than this, nor can it stray further than its tilt says.
-        position = min((trial.diameter - pin.diameter) / 2, in_plane + pin.feed * np.tan(tilt))
-        turn = float(np.arctan(position / pin.feed))
+        position = min((float(trials.numbers["diameter"][row]) - diameter) / 2, in_plane + feed * np.tan(tilt))
+        turn = float(np.arctan(position / feed))
     return TrialError(
-        trial.hole,
-        trial.stage,
+        trials.texts["hole"][row],
+        stage,
         height=height,
         tilt=tilt,
         in_plane=in_plane,

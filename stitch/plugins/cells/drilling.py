@@ -1,10 +1,9 @@
-"""A drilling job from its readings to the corrected drives."""
+"""`stitch drill`: a drilling job from its readings to the corrected drives."""
 
-import json
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,10 @@ from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES, value_uncertainty_text
-from stitch.output.session_files import SessionFiles, pose_columns, write_session
+from stitch.output.session_files import SessionFiles, pose_columns
 from stitch.plugins.cells.drill_checks import (
     STAGES,
-    Pin,
     PlatePlace,
-    Trial,
     TrialError,
     holes_in_flange,
     plate_place,
@@ -50,19 +47,19 @@ from stitch.plugins.cells.drilling_sensors import (
 )
 from stitch.plugins.cells.job_files import (
     POSE_COLUMNS,
+    CsvColumns,
     JobTable,
     Wanted,
     fixed_digits,
+    hand_out,
     points_table,
     poses_from_columns,
     read_columns,
     read_job_file,
     require_unique,
     write_columns,
-    write_recording_and_page,
 )
 from stitch.session.reading.csv_files import read_csv_lines
-from stitch.system.process import console
 
 DRILL_FORMAT = "stitch-drill/1"
 _FILES = {"plate", "plate_image", "holes", "placed", "rangers", "joint1", "joint6", "checks", "locating", "trials"}
@@ -108,8 +105,8 @@ class DrillJob:
     checks: HoleObservations | None  # plate and check holes together
     joint6_height: float = 0.0  # of the axis of joint 6 above the base's origin
     locating_rms: float | None = None  # of the plate's locating holes; None: the plate is given in the flange frame
-    trials: tuple[Trial, ...] = ()
-    pin: Pin | None = None
+    trials: CsvColumns | None = None
+    pin: tuple[float, float] | None = None  # diameter, feed
     file: Path | None = None  # that was read
 
 
@@ -126,14 +123,20 @@ def read_drill_job(file: Path | str) -> DrillJob:
         if key not in paths:
             raise InputError(f"{file}: {key} is missing; to fix: name the CSV file")
     plate_xyz, plate_uv = _read_plate(paths["plate"], paths.get("plate_image"))
-    marker_paths, joint6_height = _read_marker_paths(file, paths), document.number("joint6_height", 0.0)
+    marker_paths = _read_marker_paths(file, paths)
+    joint6_height = document.number("joint6_height", 0.0)
     locating_rms = None
     if "locating" in paths:
         if marker_paths is None or "home" not in document:
             raise InputError(f"{file}: locating goes with joint1, joint6 and [home]; to fix: add them")
-        T_measuring_flange = _base_frame(file, marker_paths, joint6_height) @ document.pose("home")
+        try:
+            T_measuring_base = base_frame(*marker_paths, joint6_height)
+        except NoResultError as error:
+            raise InputError(f"{file}: {error}") from None
+        T_measuring_flange = T_measuring_base @ document.pose("home")
         plate_xyz, locating_rms = holes_in_flange(paths["locating"], plate_xyz, T_measuring_flange)
-    holes, pin = _read_holes(paths["holes"]), read_pin(document)
+    holes = _read_holes(paths["holes"])
+    pin = read_pin(document)
     rangers = _read_ranger_tables(paths["rangers"]) if "rangers" in paths else {}
     return DrillJob(
         length_unit=document.choice("length_unit", METRES),
@@ -147,7 +150,7 @@ def read_drill_job(file: Path | str) -> DrillJob:
         checks=_read_check_holes(document, paths["checks"], plate_xyz, plate_uv) if "checks" in paths else None,
         joint6_height=joint6_height,
         locating_rms=locating_rms,
-        trials=read_trials(paths["trials"], tuple(rangers), pin) if "trials" in paths else (),
+        trials=read_trials(paths["trials"], tuple(rangers), pin is not None) if "trials" in paths else None,
         pin=pin,
         file=file,
     )
@@ -158,7 +161,8 @@ def _read_plate(file: Path, picture: Path | None) -> tuple[Array, Array]:
     if picture is None:
         plate = read_columns(file, "", "x y z u v")
         return plate.stack("x y z"), plate.stack("u v")
-    xyz, uv = read_columns(file, "", "x y z").stack("x y z"), holes_of_plate(picture)
+    xyz = read_columns(file, "", "x y z").stack("x y z")
+    uv = holes_of_plate(picture)
     if len(xyz) != len(uv):
         raise InputError(f"{file}: has {len(xyz)} rows; to fix: with plate_image, list the {len(uv)} holes it shows")
     return xyz, uv
@@ -166,21 +170,20 @@ def _read_plate(file: Path, picture: Path | None) -> tuple[Array, Array]:
 
 def _read_holes(file: Path) -> tuple[Hole, ...]:
     table = read_columns(file, "hole group kind", "x y z i j k")
-    positions, directions = table.stack("x y z"), table.stack("i j k")
-    holes = []
-    for row, (name, group, kind) in enumerate(zip(*(table.texts[c] for c in ("hole", "group", "kind")), strict=True)):
-        size = np.linalg.norm(directions[row])
+    rows = zip(*table.texts.values(), table.stack("x y z"), table.stack("i j k"), strict=True)
+    holes: list[Hole] = []
+    for name, group, kind, position, direction in rows:
+        size = np.linalg.norm(direction)
         if abs(size - 1) > 0.01:
             raise InputError(
                 f"{file}: direction of hole {name} has length {size:.4f}; to fix: write i, j, k as a unit vector"
             )
         if kind not in ("reference", "drill"):
             raise InputError(f"{file}: kind of hole {name} is {kind!r}; to fix: write reference or drill")
-        holes.append(Hole(name, group, kind == "reference", positions[row], directions[row] / size))
-    pairs = [(hole.name, hole.group) for hole in holes]
-    for pair in pairs:
-        if pairs.count(pair) > 1:
-            raise InputError(f"{file}: hole {pair[0]} stands twice in group {pair[1]}; to fix: leave one of them out")
+        holes.append(Hole(name, group, kind == "reference", position, direction / size))
+    for (name, group), count in Counter((hole.name, hole.group) for hole in holes).items():
+        if count > 1:
+            raise InputError(f"{file}: hole {name} stands twice in group {group}; to fix: leave one of them out")
     return tuple(holes)
 
 
@@ -194,7 +197,8 @@ def _read_placed_tools(file: Path, holes: tuple[Hole, ...], plate_xyz: Array, pl
     else:
         table = read_columns(file, "hole", f"{POSE_COLUMNS} u v height")
         pixels = table.stack("u v")
-    poses, names = poses_from_columns(table), table.texts["hole"]
+    poses = poses_from_columns(table)
+    names = table.texts["hole"]
     require_unique(file, "hole", names)
     for hole in holes:
         if hole.reference and hole.name not in names:
@@ -204,13 +208,15 @@ def _read_placed_tools(file: Path, holes: tuple[Hole, ...], plate_xyz: Array, pl
                 f"{file}: on hole {hole.name} the tool's z lies more than 30° off the hole's direction; to fix: let "
                 "directions point into the part, and a, b, c turn about z, y', x''"
             )
-    seen = zip(names, poses, pixels, table.numbers["height"].tolist(), strict=True)
-    return {name: PlacedTool(T_base_tool, uv, height) for name, T_base_tool, uv, height in seen}
+    tools = map(PlacedTool, poses, pixels, table.numbers["height"].tolist())
+    return dict(zip(names, tools, strict=True))
 
 
 def _read_ranger_tables(file: Path) -> dict[str, tuple[Array, Array]]:
     table = read_columns(file, "ranger", "a b c d reading")
-    planes, readings, names = table.stack("a b c d"), table.numbers["reading"], np.array(table.texts["ranger"])
+    planes = table.stack("a b c d")
+    readings = table.numbers["reading"]
+    names = np.array(table.texts["ranger"])
     if (np.linalg.norm(planes[:, :3], axis=1) == 0).any():
         raise InputError(f"{file}: a plane has a = b = c = 0; to fix: write its normal there")
     return {str(name): (planes[names == name], readings[names == name]) for name in dict.fromkeys(names)}
@@ -223,13 +229,6 @@ def _read_marker_paths(file: Path, paths: dict[str, Path]) -> tuple[Array, Array
         return None
     joint6, joint1 = (read_columns(paths[key], "", "x y z").stack("x y z") for key in ("joint6", "joint1"))
     return joint6, joint1
-
-
-def _base_frame(file: Path, marker_paths: tuple[Array, Array], joint6_height: float) -> Array:
-    try:
-        return base_frame(*marker_paths, joint6_height)
-    except NoResultError as error:
-        raise InputError(f"{file}: {error}") from None
 
 
 def _read_check_holes(document: JobTable, file: Path, plate_xyz: Array, plate_uv: Array) -> HoleObservations:
@@ -278,7 +277,7 @@ class DrillResult:
 
 
 def solve_drill_job(job: DrillJob) -> DrillResult:
-    """Homography, compensation of every group, and what else the job holds readings for.
+    """Return homography, compensation of every group, and what else the job holds readings for.
 
     What the check holes show of the camera is taken out of the reference holes' places.
 
@@ -302,6 +301,11 @@ def solve_drill_job(job: DrillJob) -> DrillResult:
         np.array([groups[h.group].T_actual_nominal[:3, :3] @ h.direction for h in once.values()]),
     )
     rangers = {name: fit_ranger(*readings) for name, readings in job.rangers.items()}
+    trials: list[TrialError] = []
+    if job.trials is not None:
+        in_plane = partial(hole_in_plane, H, effects)
+        rows = range(job.trials.rows)
+        trials = [trial_error(job.trials, row, rangers, in_plane, job.height, job.pin) for row in rows]
     return DrillResult(
         H,
         leave_one_out_errors=leave_one_out(xy, job.plate_uv) if len(xy) > 4 else np.empty((0, 2)),
@@ -312,36 +316,29 @@ def solve_drill_job(job: DrillJob) -> DrillResult:
         effects=effects,
         tool_axis=tool_axis,
         plate=plate_place(job.plate_xyz, job.height, job.locating_rms),
-        trials=tuple(
-            trial_error(trial, rangers, partial(_in_plane, H, effects), job.height, job.pin) for trial in job.trials
-        ),
+        trials=tuple(trials),
     )
 
 
 def _corrected_drive(hole: Hole, group: GroupCompensation, tool_axis: ToolAxis | None) -> Drive:
-    position, direction = (found[0] for found in group.apply(hole.position[None], hole.direction[None]))
-    R = hole_rotation(direction)
-    return Drive(hole, position, direction, R if tool_axis is None else tool_axis.orient(R))
+    positions, directions = group.apply(hole.position[None], hole.direction[None])
+    R = hole_rotation(directions[0])
+    return Drive(hole, positions[0], directions[0], R if tool_axis is None else tool_axis.orient(R))
 
 
 def _measured_hole(job: DrillJob, H: Array, effects: EffectSelection | None, name: str) -> Array:
-    """Drive coordinate (3,) of a reference hole from where the robot ended and what it saw there."""
+    """Return the drive coordinate (3,) of a reference hole from where the robot ended and what it saw there."""
     placed = job.placed[name]
-    offset = np.append(hole_in_plane(job, H, effects, name), placed.height - job.height)
+    offset = np.append(hole_in_plane(H, effects, placed.uv, placed.height), placed.height - job.height)
     return placed.T_base_tool[:3, 3] + placed.T_base_tool[:3, :3] @ offset
 
 
-def hole_in_plane(job: DrillJob, H: Array, effects: EffectSelection | None, name: str) -> Array:
-    """x, y (2,) in the flange frame at which the camera saw a reference hole.
+def hole_in_plane(H: Array, effects: EffectSelection | None, uv: Array, height: float) -> Array:
+    """Return x, y (2,) in the flange frame of a hole that the camera saw at uv (2,).
 
     Where check holes have shown the camera beyond its work plane, at the hole's own height and without the effects that
     were selected; else as if the hole lay in the work plane: a camera tilted by 25° is then off by 0.47 mm for each mm.
     """
-    placed = job.placed[name]
-    return _in_plane(H, effects, placed.uv, placed.height)
-
-
-def _in_plane(H: Array, effects: EffectSelection | None, uv: Array, height: float) -> Array:
     if effects is not None:
         return effects.camera.plane(uv[None], height)[0]
     return to_plane(H, uv[None])[0]
@@ -360,8 +357,9 @@ def write_drives(result: DrillResult, file: Path) -> None:
 
 
 def drill_document(result: DrillResult) -> dict[str, Any]:
-    """Plain numbers for JSON: lengths in length_unit, angles in degrees."""
-    measuring, tool = result.T_measuring_base, result.tool_axis
+    """Return plain numbers for JSON: lengths in length_unit, angles in degrees."""
+    measuring = result.T_measuring_base
+    tool = result.tool_axis
     return {
         "homography": result.H.tolist(),
         "leave_one_out": np.linalg.norm(result.leave_one_out_errors, axis=1).tolist(),
@@ -411,7 +409,7 @@ def _trial_document(t: TrialError) -> dict[str, Any]:
 
 
 def correction_sentence(result: DrillResult, length_unit: str) -> str:
-    """What the correction is worth."""
+    """Say what the correction is worth."""
     before = np.concatenate([np.linalg.norm(c.errors, axis=1) for c in result.groups.values()])
     after = np.concatenate([np.linalg.norm(c.residuals, axis=1) for c in result.groups.values()])
     return (
@@ -421,39 +419,42 @@ def correction_sentence(result: DrillResult, length_unit: str) -> str:
     )
 
 
-def hand_eye_sentences(result: DrillResult, length_unit: str) -> Iterator[str]:
-    """What camera and plate are worth; nothing where four holes leave none to test with."""
+def detail_sentences(result: DrillResult, length_unit: str) -> Iterator[str]:
+    """Say where the plate lies, what camera and plate are worth, which effects there are, and the trial drives' errors.
+
+    Four holes of the plate leave none to test the camera with.
+    """
+    plate = result.plate
+    yield (
+        f"Plate: its holes lie {plate.height:.2f} {length_unit} from the flange, {plate.stated:.2f} stated, and "
+        f"parallel to it within {plate.parallelism:.2f} {length_unit}."
+    )
     if len(result.leave_one_out_errors):
         sizes = np.linalg.norm(result.leave_one_out_errors, axis=1)
         yield (
             "Hand-eye: each hole of the plate mapped by the others is off by "
             f"{sizes.mean():.3f} {length_unit} on average, {sizes.max():.3f} {length_unit} at most."
         )
+    yield from significant_effect_sentences(result, length_unit)
+    yield from _absent_effect_sentences(result)
+    yield from _trial_sentences(result.trials, length_unit)
 
 
-def plate_sentence(plate: PlatePlace, length_unit: str) -> str:
-    """Where the plate lies against the flange."""
-    return (
-        f"Plate: its holes lie {plate.height:.2f} {length_unit} from the flange, {plate.stated:.2f} stated, and "
-        f"parallel to it within {plate.parallelism:.2f} {length_unit}."
-    )
-
-
-def trial_sentences(trials: tuple[TrialError, ...], length_unit: str) -> Iterator[str]:
-    """Errors of the trial drives by stage, and what the pin bounds."""
+def _trial_sentences(trials: tuple[TrialError, ...], length_unit: str) -> Iterator[str]:
+    """Say the errors of the trial drives by stage, and what the pin bounds."""
     for stage in STAGES:
-        own = [t for t in trials if t.stage == stage]
-        if own:
-            tilts = np.degrees([t.tilt for t in own])
+        drives = [t for t in trials if t.stage == stage]
+        if drives:
+            tilts = np.degrees([t.tilt for t in drives])
             yield (
-                f"Trial drives, {stage}: 3D {_range_text([t.distance for t in own])} {length_unit}, 2D "
-                f"{_range_text([t.in_plane for t in own])} {length_unit}, direction {_range_text(tilts)}°."
+                f"Trial drives, {stage}: 3D {_range_text([t.distance for t in drives])} {length_unit}, 2D "
+                f"{_range_text([t.in_plane for t in drives])} {length_unit}, direction {_range_text(tilts)}°."
             )
     bounds = [(t.pin_position, t.pin_tilt) for t in trials if t.pin_position is not None and t.pin_tilt is not None]
     if bounds:
         position, tilt = np.max(bounds, axis=0)
-        angle = f"{np.degrees(tilt):.2f}°"
-        yield f"The pin went in: position within {position:.2f} {length_unit}, direction within {angle}."
+        angle = np.degrees(tilt)
+        yield f"The pin went in: position within {position:.2f} {length_unit}, direction within {angle:.2f}°."
 
 
 def _range_text(values: Any) -> str:
@@ -461,7 +462,7 @@ def _range_text(values: Any) -> str:
 
 
 def significant_effect_sentences(result: DrillResult, length_unit: str) -> Iterator[str]:
-    """Effects of camera and tool that are taken out."""
+    """Say the effects of camera and tool that are taken out."""
     for trial in result.effects.trials if result.effects else ():
         if trial.accepted:
             yield f"{_camera_effect_sentence(trial, length_unit)} (1 σ; p = {trial.p_value:.1g}). That is taken out."
@@ -472,8 +473,8 @@ def significant_effect_sentences(result: DrillResult, length_unit: str) -> Itera
         )
 
 
-def absent_effect_sentences(result: DrillResult) -> Iterator[str]:
-    """Effects of camera and tool that were looked for in vain."""
+def _absent_effect_sentences(result: DrillResult) -> Iterator[str]:
+    """Say the effects of camera and tool that were looked for in vain."""
     for trial in result.effects.trials if result.effects else ():
         if not trial.accepted:
             yield f"{_ABSENT_EFFECTS[trial.effect]} beyond chance (p = {trial.p_value:.1g})."
@@ -482,7 +483,7 @@ def absent_effect_sentences(result: DrillResult) -> Iterator[str]:
 
 
 def _camera_effect_sentence(effect_test: CameraEffectTest, length_unit: str) -> str:
-    """What an effect of the camera is, and its size."""
+    """Say what an effect of the camera is, and its size."""
     if effect_test.effect == "plate_height":
         return (
             f"The plate of holes is {value_uncertainty_text(effect_test.value, effect_test.sigma)} {length_unit} off "
@@ -497,15 +498,16 @@ def _tool_tilt_sentence(tool: ToolAxis) -> str:
 
 
 def hole_session(job: DrillJob, result: DrillResult) -> SessionFiles:
-    """One view for each reference hole; the sensors' frame is the flange's, and the drawing gives the targets.
+    """Return one view for each reference hole; the sensors' frame is the flange's, and the drawing gives the targets.
 
     The sigma is what leaving one hole of the plate out says of the camera; the rangers' height has none of its own.
     """
     T_tool_flange = frames.make(np.eye(3), np.array([0.0, 0.0, -job.height]))
     names = tuple(job.placed)
+    tools = job.placed.values()
     views = [f"at-{name}" for name in names]
-    T_base_flange = np.array([job.placed[name].T_base_tool @ T_tool_flange for name in names])
-    places = [np.append(hole_in_plane(job, result.H, result.effects, name), job.placed[name].height) for name in names]
+    T_base_flange = np.array([tool.T_base_tool @ T_tool_flange for tool in tools])
+    places = [np.append(hole_in_plane(result.H, result.effects, tool.uv, tool.height), tool.height) for tool in tools]
     errors = result.leave_one_out_errors
     sigma = np.full(len(names), np.sqrt((errors**2).mean())) if len(errors) else None
     return SessionFiles(
@@ -525,43 +527,28 @@ def run_drill(file: Path, wanted: Wanted) -> None:
     result = solve_drill_job(job)
     if wanted.output is not None:
         write_drives(result, wanted.output)
-    if wanted.session is not None:
-        write_session(wanted.session, hole_session(job, result))
-    write_recording_and_page("drill", wanted.recording, wanted.report, job, result)
-    if wanted.as_json:
-        print(json.dumps(drill_document(result), indent=1))
+    terminal = hand_out(
+        "drill", wanted, lambda: [hole_session(job, result)], lambda: drill_document(result), job, result
+    )
+    if terminal is None:
         return
-    terminal, unit = console(), job.length_unit
+    unit = job.length_unit
     terminal.print(correction_sentence(result, unit))
-    terminal.print(plate_sentence(result.plate, unit))
-    for line in chain(
-        hand_eye_sentences(result, unit),
-        significant_effect_sentences(result, unit),
-        absent_effect_sentences(result),
-        trial_sentences(result.trials, unit),
-    ):
+    for line in detail_sentences(result, unit):
         terminal.print(line)
     if result.rangers:
-        terminal.print(_ranger_table(result, unit))
-    terminal.print(_drive_table(result, unit))
-    if wanted.output is not None:
-        print(wanted.output)
-
-
-def _ranger_table(result: DrillResult, unit: str) -> Table:
-    headings = ("sensor", f"origin x y z / {unit}", "direction", f"rms / {unit}")
-    table = Table(*headings, title="Beams of the range sensors, in the frame of the flange", title_justify="left")
-    for name, beam in result.rangers.items():
-        table.add_row(name, fixed_digits(beam.origin, 3), fixed_digits(beam.direction, 4), f"{beam.rms:.3f}")
-    return table
-
-
-def _drive_table(result: DrillResult, unit: str) -> Table:
-    """Corrected poses of the tool, and how far each went from where the drawing has it."""
+        beams = Table(title="Beams of the range sensors, in the frame of the flange", title_justify="left")
+        for heading in ("sensor", f"origin x y z / {unit}", "direction", f"rms / {unit}"):
+            beams.add_column(heading)
+        for name, beam in result.rangers.items():
+            beams.add_row(name, fixed_digits(beam.origin, 3), fixed_digits(beam.direction, 4), f"{beam.rms:.3f}")
+        terminal.print(beams)
     headings = ("hole", "group", f"x y z / {unit}", "a b c / °", f"shift / {unit}")
     table = Table(*headings, title="Drives: T_base_tool, angles about z, y', x''", title_justify="left")
     for drive in result.drives:
         shift = float(np.linalg.norm(drive.position - drive.hole.position))
-        place, angles = fixed_digits(drive.position, 3), fixed_digits(np.degrees(drive.angles), 3)
-        table.add_row(drive.hole.name, drive.hole.group, place, angles, f"{shift:.3f}")
-    return table
+        angles = fixed_digits(np.degrees(drive.angles), 3)
+        table.add_row(drive.hole.name, drive.hole.group, fixed_digits(drive.position, 3), angles, f"{shift:.3f}")
+    terminal.print(table)
+    if wanted.output is not None:
+        print(wanted.output)

@@ -1,14 +1,12 @@
 """What drilling needs of its sensors: base frame, camera, range sensors, the tool's axis, and groups of holes.
 
-The camera beyond one plane: a 3x4 projection near the work plane, with radial distortion and a plate height error.
+Near the work plane the camera is a homography. Beyond it, it is a 3x4 projection with radial distortion and an error of
+the plate's height. On one plane these are hidden: a homography takes up a wrong height completely, and distortion
+partly. A hole seen at many places and heights, which robot and rangers measure, shows them.
 
-On one plane all three are hidden: a homography takes up a wrong height completely, and distortion partly. A hole
-seen at many places and heights, which robot and rangers measure, shows them.
-
-The tool's true axis in its own frame, from how the robot reports to stand when the tool is upright on a hole.
-
-The rigid motion of hole positions cannot see a tool frame that is turned against the tool; the reference holes can:
-there the rangers made the tool upright, so the hole's direction in the reported tool frame is the tool's axis.
+The tool's true axis follows from how the robot reports to stand when the tool is upright on a hole. The rigid motion of
+hole positions cannot see a tool frame that is turned against the tool; the reference holes can: there the rangers made
+the tool upright, so the hole's direction in the reported tool frame is the tool's axis.
 """
 
 from dataclasses import dataclass
@@ -39,23 +37,36 @@ _TILT_P_LIMIT = 0.01
 _MIN_HOLES = 4
 
 
-@dataclass(frozen=True)
-class Circle:
-    """A circle in space; the axis follows the right-hand rule along the order of the points."""
+def base_frame(joint6_path: Array, joint1_path: Array, height_joint6: float = 0.0) -> Array:
+    """Return T_measuring_base (4, 4) from marker paths (N, 3) in the measuring system, at the home pose.
 
-    centre: Array  # (3,)
-    axis: Array  # (3,) unit vector
-    radius: float
-    rms: float  # of the distances from the circle, in and out of its plane
+    The axis of joint 6 is x, that of joint 1 is z, y = z × x (source, formulas 1 and 2). The origin lies on the axis
+    of joint 1, `height_joint6` below the axis of joint 6. The paths run in the right-hand sense of x and z.
+
+    Raises:
+        NoResultError: a path is no circle, or both axes are parallel.
+    """
+    centre6, x6, _ = fit_circle(joint6_path)
+    centre1, z, _ = fit_circle(joint1_path)
+    y = np.cross(z, x6)
+    if np.linalg.norm(y) < np.sin(_PARALLEL):
+        raise NoResultError("the axes of joint 1 and joint 6 are parallel at this pose; to fix: move to the home pose")
+    y /= np.linalg.norm(y)
+    x = np.cross(y, z)
+    # The foot of the common normal: c1 + a z and c6 + b x6 at their closest.
+    foot = np.linalg.lstsq(np.column_stack([z, -x6]), centre6 - centre1, rcond=None)[0][0]
+    return frames.make(np.column_stack([x, y, z]), centre1 + (foot - height_joint6) * z)
 
 
-def fit_circle(points: Array) -> Circle:
-    """Circle through points (N, 3): plane by SVD, then least squares of the distances within it.
+def fit_circle(points: Array) -> tuple[Array, Array, float]:
+    """Return centre (3,), axis (3,) and radius of the circle through points (N, 3).
+
+    Plane by SVD, then least squares of the distances within it. The axis is a unit vector that follows the right-hand
+    rule along the order of the points.
 
     Raises:
         NoResultError: fewer than four points, or points on a line.
     """
-    points = np.asarray(points, float)
     middle = points.mean(axis=0)
     _, spread, axes = np.linalg.svd(points - middle, full_matrices=False)
     if len(points) < 4 or spread[1] < 1e-6 * spread[0]:
@@ -70,52 +81,28 @@ def fit_circle(points: Array) -> Circle:
     centre = middle + x[:2] @ axes[:2]
     arms = points - centre
     swept = np.cross(arms[:-1], arms[1:]).sum(axis=0)
-    axis = axes[2] * np.sign(axes[2] @ swept)
-    out = np.column_stack([np.linalg.norm(flat - x[:2], axis=1) - x[2], arms @ axis])
-    return Circle(centre, axis, float(x[2]), float(np.sqrt((out**2).sum(axis=1).mean())))
-
-
-def base_frame(joint6_path: Array, joint1_path: Array, height_joint6: float = 0.0) -> Array:
-    """T_measuring_base (4, 4) from marker paths (N, 3) in the measuring system, at the home pose.
-
-    The axis of joint 6 is x, that of joint 1 is z, y = z × x (source, formulas 1 and 2). The origin lies on the axis
-    of joint 1, `height_joint6` below the axis of joint 6. The paths run in the right-hand sense of x and z.
-
-    Raises:
-        NoResultError: a path is no circle, or both axes are parallel.
-    """
-    about_x, about_z = fit_circle(joint6_path), fit_circle(joint1_path)
-    z = about_z.axis
-    y = np.cross(z, about_x.axis)
-    if np.linalg.norm(y) < np.sin(_PARALLEL):
-        raise NoResultError("the axes of joint 1 and joint 6 are parallel at this pose; to fix: move to the home pose")
-    y /= np.linalg.norm(y)
-    x = np.cross(y, z)
-    # The foot of the common normal: c1 + a z and c6 + b x6 at their closest.
-    between = about_x.centre - about_z.centre
-    foot = np.linalg.lstsq(np.column_stack([z, -about_x.axis]), between, rcond=None)[0][0]
-    origin = about_z.centre + (foot - height_joint6) * z
-    return frames.make(np.column_stack([x, y, z]), origin)
+    return centre, axes[2] * np.sign(axes[2] @ swept), float(x[2])
 
 
 def fit_homography(xy: Array, uv: Array) -> Array:
-    """H (3, 3) with s·[u v 1]ᵀ = H·[x y 1]ᵀ, from N ≥ 4 points (N, 2) each; source, formula 5.
+    """Return H (3, 3) with s·[u v 1]ᵀ = H·[x y 1]ᵀ, from N ≥ 4 points (N, 2) each; source, formula 5.
 
     Normalised DLT (Hartley 1997), then least squares of the image distances in pixels.
 
     Raises:
         NoResultError: fewer than four points, or points on a line.
     """
-    xy, uv = np.asarray(xy, float), np.asarray(uv, float)
     if len(xy) < 4:
         raise NoResultError(
             f"a homography needs four or more holes, {len(xy)} are given; to fix: find more of them in the image"
         )
-    to_xy, to_uv = _normaliser(xy), _normaliser(uv)
+    to_xy = _normaliser(xy)
+    to_uv = _normaliser(uv)
     start, values = _direct_linear_transform(xy, uv, to_xy, to_uv)
     if values[7] < 1e-9 * values[0]:
         raise NoResultError("the holes lie on a line and fix no homography; to fix: use holes spread over the plane")
-    p, q = _project(to_xy, xy), _project(to_uv, uv)
+    p = _project(to_xy, xy)
+    q = _project(to_uv, uv)
 
     def matrix_of(x: Array) -> Array:
         return np.append(x, 1.0).reshape(3, 3)
@@ -126,13 +113,12 @@ def fit_homography(xy: Array, uv: Array) -> Array:
 
 
 def to_plane(H: Array, uv: Array) -> Array:
-    """Work-plane points (..., N, 2) of image points in pixels; source, formula 13."""
-    return _project(np.asarray(np.linalg.inv(H), float), np.asarray(uv, float))
+    """Return work-plane points (..., N, 2) of image points in pixels; source, formula 13."""
+    return _project(np.asarray(np.linalg.inv(H), float), uv)
 
 
 def leave_one_out(xy: Array, uv: Array) -> Array:
-    """Errors (N, 2) in the work plane: each hole mapped by the homography of the others, minus its true place."""
-    xy, uv = np.asarray(xy, float), np.asarray(uv, float)
+    """Return errors (N, 2) in the work plane: each hole mapped by a homography of the others, minus its true place."""
     errors = np.zeros_like(xy)
     for i in range(len(xy)):
         keep = np.arange(len(xy)) != i
@@ -141,8 +127,9 @@ def leave_one_out(xy: Array, uv: Array) -> Array:
 
 
 def _normaliser(points: Array) -> Array:
-    """Similarity (d+1, d+1) that brings points (N, d) to mean 0 and mean distance √d (Hartley 1997)."""
-    mean, size = points.mean(axis=0), points.shape[1]
+    """Return the similarity (d+1, d+1) that brings points (N, d) to mean 0 and mean distance √d (Hartley 1997)."""
+    mean = points.mean(axis=0)
+    size = points.shape[1]
     scale = np.sqrt(size) / max(float(np.linalg.norm(points - mean, axis=1).mean()), np.finfo(float).tiny)
     matrix = np.diag([scale] * size + [1.0])
     matrix[:size, size] = -scale * mean
@@ -150,20 +137,21 @@ def _normaliser(points: Array) -> Array:
 
 
 def _direct_linear_transform(points: Array, uv: Array, to_points: Array, to_uv: Array) -> tuple[Array, Array]:
-    """Normalised projection of points (N, d) onto image points, its last entry one and left out; singular values.
+    """Return the normalised projection of points (N, d) onto image points, without its last entry, and singular values.
 
-    In normalised coordinates the points' centre maps near the image's, so the last entry is far from zero.
+    The last entry is one. In normalised coordinates the points' centre maps near the image's, so it is far from zero.
     """
     p = np.column_stack([_project(to_points, points), np.ones(len(points))])
-    q, zero = _project(to_uv, uv), np.zeros_like(p)
+    q = _project(to_uv, uv)
+    zero = np.zeros_like(p)
     matrix = np.vstack([np.hstack([p, zero, -q[:, :1] * p]), np.hstack([zero, p, -q[:, 1:] * p])])
     values, vectors = np.linalg.svd(matrix)[1:]
     h = vectors[-1]
-    return np.asarray(h[:-1] / h[-1]), values
+    return h[:-1] / h[-1], values
 
 
 def _project(P: Array, points: Array) -> Array:
-    """Points (..., N, d) through a projective map (k+1, d+1)."""
+    """Return points (..., N, d) through a projective map (k+1, d+1)."""
     mapped = points @ P[:, :-1].T + P[:, -1]
     return mapped[..., :-1] / mapped[..., -1:]
 
@@ -196,18 +184,9 @@ class CameraFit:
         """Over both coordinates of all holes, in pixels²."""
         return float((self.residuals**2).sum())
 
-    @property
-    def unknowns(self) -> int:
-        """Fitted numbers."""
-        return 11 + len(self.effects)
-
-    def image(self, xyz: Array) -> Array:
-        """Image points (N, 2) of points (N, 3) in the flange frame."""
-        return distort(_project(self.P, xyz), self.k1, self.centre, self.corner)
-
     def plane(self, uv: Array, z: float | Array) -> Array:
-        """x, y (N, 2) in the flange frame of image points (N, 2) at height z, scalar or (N,)."""
-        ideal = undistort(np.asarray(uv, float), self.k1, self.centre, self.corner)
+        """Return x, y (N, 2) in the flange frame of image points (N, 2) at height z, scalar or (N,)."""
+        ideal = undistort(uv, self.k1, self.centre, self.corner)
         z = np.broadcast_to(np.asarray(z, float), len(ideal))
         # Rows of u·(P3 X) = P1 X and v·(P3 X) = P2 X, solved for x and y.
         rows = self.P[:2] - ideal[..., None] * self.P[2]
@@ -216,13 +195,13 @@ class CameraFit:
 
 
 def distort(uv: Array, k1: float, centre: Array, corner: float) -> Array:
-    """Ideal to real image points (..., 2): away from the centre by k1·(r/corner)² of their distance r."""
+    """Return real image points of ideal ones (..., 2): away from the centre by k1·(r/corner)² of their distance r."""
     arm = uv - centre
     return centre + arm * (1 + k1 * ((arm / corner) ** 2).sum(axis=-1, keepdims=True))
 
 
 def undistort(uv: Array, k1: float, centre: Array, corner: float) -> Array:
-    """Real to ideal image points (..., 2): `distort` inverted by iteration; converges for |k1| well below 1/3."""
+    """Return ideal image points of real ones (..., 2): `distort` inverted by iteration, for |k1| well below 1/3."""
     arm = real = uv - centre
     for _ in range(_UNDISTORT_STEPS):
         arm = real / (1 + k1 * ((arm / corner) ** 2).sum(axis=-1, keepdims=True))
@@ -230,7 +209,7 @@ def undistort(uv: Array, k1: float, centre: Array, corner: float) -> Array:
 
 
 def fit_camera(observations: HoleObservations, effects: tuple[str, ...] = ()) -> CameraFit:
-    """Projection and the named effects by least squares of the image distances.
+    """Fit the projection and the named effects by least squares of the image distances.
 
     Raises:
         NoResultError: too few holes, all at one height, or a plate height error asked for without a plate.
@@ -239,7 +218,8 @@ def fit_camera(observations: HoleObservations, effects: tuple[str, ...] = ()) ->
     centre = np.array(observations.image_size) / 2 - 0.5
     corner = float(np.linalg.norm(observations.image_size) / 2)
     # Normalised as the DLT wants it, for the refinement's conditioning too.
-    to_uv, to_xyz = _normaliser(observations.uv), _normaliser(observations.xyz)
+    to_uv = _normaliser(observations.uv)
+    to_xyz = _normaliser(observations.xyz)
     start, _ = _direct_linear_transform(observations.xyz, observations.uv, to_xyz, to_uv)
 
     def camera(x: Array) -> tuple[Array, dict[str, float]]:
@@ -298,18 +278,17 @@ class CameraEffectTest:
 class EffectSelection:
     """The trials in their order and the camera with what was accepted."""
 
-    plain: CameraFit
     camera: CameraFit
     trials: tuple[CameraEffectTest, ...]
 
 
 def select_effects(observations: HoleObservations) -> EffectSelection:
-    """Forward selection among EFFECTS by F-test and BIC, the best first.
+    """Select among CAMERA_EFFECTS forwards, by F-test and BIC, the best first.
 
     Raises:
         NoResultError: the observations fix no camera.
     """
-    plain = current = fit_camera(observations)
+    current = fit_camera(observations)
     trials: list[CameraEffectTest] = []
     while len(current.effects) < len(CAMERA_EFFECTS):
         fits = [fit_camera(observations, (*current.effects, e)) for e in CAMERA_EFFECTS if e not in current.effects]
@@ -320,12 +299,12 @@ def select_effects(observations: HoleObservations) -> EffectSelection:
             trials += [t for i, t in enumerate(tried) if i != best]
             break
         current = fits[best]
-    return EffectSelection(plain, current, tuple(trials))
+    return EffectSelection(current, tuple(trials))
 
 
 def _test_effect(smaller: CameraFit, bigger: CameraFit) -> CameraEffectTest:
     count = bigger.residuals.size
-    free = count - bigger.unknowns
+    free = count - 11 - len(bigger.effects)
     F = (smaller.sum_of_squares - bigger.sum_of_squares) / (bigger.sum_of_squares / free)
     bic = count * np.log(bigger.sum_of_squares / smaller.sum_of_squares) + np.log(count)
     p = float(f.sf(max(F, 0.0), 1, free))
@@ -346,17 +325,16 @@ class GroupCompensation:
     errors: Array  # (N, 3) drive errors, actual minus nominal
 
     def apply(self, positions: Array, directions: Array) -> tuple[Array, Array]:
-        """Corrected positions and directions (M, 3) of holes of the group."""
+        """Return corrected positions and directions (M, 3) of holes of the group."""
         return frames.transform(self.T_actual_nominal, positions), frames.rotate(self.T_actual_nominal, directions)
 
 
 def compensate_group(nominal: Array, actual: Array) -> GroupCompensation:
-    """Rigid motion from three or more reference holes (N, 3) by SVD (Kabsch 1976; source, formulas 15 and 16).
+    """Return the rigid motion of three or more reference holes (N, 3) by SVD (Kabsch 1976; source, formulas 15, 16).
 
     Raises:
         NoResultError: fewer than three holes, or holes on a line.
     """
-    nominal, actual = np.asarray(nominal, float), np.asarray(actual, float)
     if len(nominal) < 3 or on_a_line(nominal) or on_a_line(actual):
         raise NoResultError("a group needs three or more reference holes off one line; to fix: add a reference hole")
     T = align_points(nominal, actual)
@@ -364,12 +342,11 @@ def compensate_group(nominal: Array, actual: Array) -> GroupCompensation:
 
 
 def hole_rotation(direction: Array) -> Array:
-    """R_base_hole (..., 3, 3): z = hole direction, x = (z2, −z1, 0)/norm, y = z × x (source, formulas 6 to 9).
+    """Return R_base_hole (..., 3, 3): z = hole direction, x = (z2, −z1, 0)/norm, y = z × x (source, formulas 6 to 9).
 
     The x axis of a vertical hole, which the formula leaves open, is the x axis of the base.
     """
-    z = np.asarray(direction, float)
-    z = z / np.linalg.norm(z, axis=-1, keepdims=True)
+    z = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
     x = np.stack([z[..., 1], -z[..., 0], np.zeros_like(z[..., 0])], axis=-1)
     size = np.linalg.norm(x, axis=-1, keepdims=True)
     x = np.where(size > 1e-9, x / np.maximum(size, 1e-9), [1.0, 0.0, 0.0])
@@ -377,8 +354,7 @@ def hole_rotation(direction: Array) -> Array:
 
 
 def euler_zyx(R: Array) -> Array:
-    """Angles (..., 3) in rad about z, y', x'' (A, B, C of a KUKA controller): R = Rz(A) Ry(B) Rx(C)."""
-    R = np.asarray(R, float)
+    """Return angles (..., 3) in rad about z, y', x'' (A, B, C of a KUKA controller): R = Rz(A) Ry(B) Rx(C)."""
     return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_euler("ZYX").reshape(*R.shape[:-2], 3)
 
 
@@ -419,9 +395,10 @@ def _read_picture(file: Path) -> NDArray[np.uint8]:
 
 
 def find_holes(image: NDArray[np.uint8], min_width: float = 20.0) -> Array:
-    """Centres (N, 2) in pixels of the dark, nearly elliptic spots wider than `min_width`; (0, 0) is a pixel's middle.
+    """Return centres (N, 2) in pixels of the dark, nearly elliptic spots wider than `min_width`.
 
-    A spot's centre is the grey-weighted mean over its surroundings, so that partly covered edge pixels count.
+    (0, 0) is a pixel's middle. A spot's centre is the grey-weighted mean over its surroundings, so that partly covered
+    edge pixels count.
 
     Raises:
         InputError: OpenCV is not installed, or the image is not one grey channel.
@@ -440,14 +417,13 @@ def find_holes(image: NDArray[np.uint8], min_width: float = 20.0) -> Array:
         _, (a, b), _ = cv2.fitEllipse(contour)
         area = cv2.contourArea(contour)
         # Scratches and letters fill their ellipse badly; a hole fills it to a few per cent.
-        if min(a, b) < min_width or abs(area / (np.pi * a * b / 4) - 1) > 0.1:
-            continue
-        centres.append(_centroid(image, cv2.boundingRect(contour)))
+        if min(a, b) >= min_width and abs(area / (np.pi * a * b / 4) - 1) <= 0.1:
+            centres.append(_centroid(image, cv2.boundingRect(contour)))
     return np.array(centres, float).reshape(-1, 2)
 
 
 def order_grid(centres: Array, rows: int = 3, columns: int = 3) -> Array:
-    """Centres of a hole array (rows·columns, 2), sorted by rows from the top and by columns from the left.
+    """Return centres of a hole array (rows·columns, 2), sorted by rows from the top and by columns from the left.
 
     Raises:
         NoResultError: another number of holes.
@@ -462,7 +438,7 @@ def order_grid(centres: Array, rows: int = 3, columns: int = 3) -> Array:
 
 
 def _centroid(image: NDArray[np.uint8], box: tuple[int, int, int, int]) -> Array:
-    """Mean of the pixels in and just around a box, weighted by how much darker they are than the plate."""
+    """Return the mean of the pixels in and just around a box, weighted by how much darker they are than the plate."""
     u, v, width, height = box
     margin = 6
     rows = slice(max(v - margin, 0), v + height + margin)
@@ -474,7 +450,7 @@ def _centroid(image: NDArray[np.uint8], box: tuple[int, int, int, int]) -> Array
     v_index, u_index = np.mgrid[
         rows.start : rows.start + patch.shape[0], columns.start : columns.start + patch.shape[1]
     ]
-    return np.asarray([(weight * u_index).sum() / weight.sum(), (weight * v_index).sum() / weight.sum()], float)
+    return np.array([(weight * u_index).sum(), (weight * v_index).sum()]) / weight.sum()
 
 
 @dataclass(frozen=True)
@@ -487,16 +463,16 @@ class RangerFit:
 
 
 def fit_ranger(planes: Array, readings: Array) -> RangerFit:
-    """Beam from planes (N, 4) Ax + By + Cz + D = 0 in the flange frame and the reading at each, N ≥ 6.
+    """Return the beam from planes (N, 4) Ax + By + Cz + D = 0 in the flange frame and the reading at each, N ≥ 6.
 
     Solves A(x + d nx) + B(y + d ny) + C(z + d nz) + D = 0 (source, formula 4): linear first, then with |n| = 1.
 
     Raises:
         NoResultError: fewer than six planes, or planes that leave the beam open.
     """
-    planes, readings = np.asarray(planes, float), np.asarray(readings, float)
     planes = planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
-    normals, offsets = planes[:, :3], planes[:, 3]
+    normals = planes[:, :3]
+    offsets = planes[:, 3]
     matrix = np.hstack([normals, readings[:, None] * normals])
     # Columns of unit size, so that the rank does not depend on the length unit.
     scale = np.linalg.norm(matrix, axis=0)
@@ -530,7 +506,7 @@ class ToolAxis:
     accepted: bool
 
     def orient(self, R_base_hole: Array) -> Array:
-        """Reported orientation (..., 3, 3) that lays the tool's axis along the hole's z; unchanged if not accepted."""
+        """Return the reported orientation (..., 3, 3) that lays an accepted axis along the hole's z."""
         if not self.accepted:
             return R_base_hole
         turn = np.cross([0.0, 0.0, 1.0], self.axis)
@@ -539,20 +515,20 @@ class ToolAxis:
 
 
 def find_tool_axis(reported: Array, directions: Array) -> ToolAxis | None:
-    """Axis from reported orientations (N, 3, 3) and hole directions (N, 3), both in the base; None below four holes.
+    """Return the axis from reported orientations (N, 3, 3) and hole directions (N, 3), both in the base.
 
-    Hotelling's T² of the two small components against zero (Anderson 2003, section 5.2).
+    None below four holes. Hotelling's T² of the two small components against zero (Anderson 2003, section 5.2).
     """
     count = len(reported)
     if count < _MIN_HOLES:
         return None
-    seen = np.einsum("nji,nj->ni", reported, directions)
-    small = seen[:, :2]
+    local = np.einsum("nji,nj->ni", reported, directions)
+    small = local[:, :2]
     scatter = np.cov(small, rowvar=False)
     mean = small.mean(axis=0)
     F = count * mean @ np.linalg.pinv(scatter) @ mean * (count - 2) / (2 * (count - 1))
     p = float(f.sf(F, 2, count - 2))
-    axis = seen.mean(axis=0)
+    axis = local.mean(axis=0)
     axis /= np.linalg.norm(axis)
     tilt = float(np.arctan2(np.hypot(axis[0], axis[1]), axis[2]))
     return ToolAxis(axis, tilt, float(np.sqrt(np.trace(scatter) / 2 / count)), p, p < _TILT_P_LIMIT)

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.output.session_files import SessionFiles, TableColumns, write_session, write_sessions
+from stitch.output.session_files import SessionFiles, TableColumns, write_sessions
 from stitch.session.reading.csv_files import finite_number, read_csv_lines
 from stitch.session.reading.text_files import read_toml
 from stitch.system.files import whole_file
@@ -244,14 +244,14 @@ def write_recording_and_page(command: str, recording: Path | None, report: Path 
 def hand_out(
     command: str,
     wanted: Wanted,
-    session: Callable[[], SessionFiles | list[SessionFiles]],
+    sessions: Callable[[], list[SessionFiles]],
     document: Callable[[], Any],
     *results: Any,
 ) -> Console | None:
-    """Write session, recording and page of a command's job and result (`results`), and its JSON, as far as wanted.
+    """Write sessions, recording and page of a command's job and result (`results`), and its JSON, as far as wanted.
 
     Args:
-        session, document: make the session or sessions, and the plain data for JSON.
+        sessions, document: make the sessions, and the plain data for JSON.
 
     Returns:
         The terminal for people; None where JSON was wanted alone.
@@ -260,11 +260,7 @@ def hand_out(
         InputError: as `write_recording_and_page`.
     """
     if wanted.session is not None:
-        files = session()
-        if isinstance(files, list):
-            write_sessions(wanted.session, files)
-        else:
-            write_session(wanted.session, files)
+        write_sessions(wanted.session, sessions())
     write_recording_and_page(command, wanted.recording, wanted.report, *results)
     if not wanted.as_json:
         return console()

@@ -1,7 +1,8 @@
-"""A panel job from its readings to the commands of all robots."""
+"""`stitch panel`: a panel job from its readings to the commands of all robots."""
 
-import json
+from collections import Counter
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,14 @@ from rich.table import Table
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
-from stitch.output.session_files import SessionFiles, pose_columns, write_sessions
+from stitch.output.session_files import SessionFiles, pose_columns
 from stitch.plugins.cells.job_files import (
     POSE_COLUMNS,
     CsvColumns,
     JobTable,
     Wanted,
     call_machines,
+    hand_out,
     points_table,
     poses_from_columns,
     poses_from_rows,
@@ -28,7 +30,6 @@ from stitch.plugins.cells.job_files import (
     write_columns,
     write_pictures,
     write_poses,
-    write_recording_and_page,
 )
 from stitch.plugins.cells.panel_model import (
     ClampLayout,
@@ -55,7 +56,6 @@ from stitch.plugins.cells.panel_model import (
     shape_step,
     true_flanges,
 )
-from stitch.system.process import console
 
 # Twice a triangle's area against the sum of two squared sides: below, it is a line.
 _FLAT = 1e-3
@@ -93,21 +93,23 @@ def read_calibration(
         InputError: a column or robot is missing, or reflectors lie on one line.
     """
     columns = _read_robots(file, names, "robot", f"{POSE_COLUMNS} x1 y1 z1 x2 y2 z2 x3 y3 z3")
-    poses, seen = poses_from_columns(columns), columns.stack("x1 y1 z1 x2 y2 z2 x3 y3 z3").reshape(-1, 3, 3)
-    seen = frames.transform(T_world_tracker, seen)
+    poses = poses_from_columns(columns)
+    reflectors = columns.stack("x1 y1 z1 x2 y2 z2 x3 y3 z3").reshape(-1, 3, 3)
+    reflectors = frames.transform(T_world_tracker, reflectors)
     robot = np.array(columns.texts["robot"])
-    sides = seen[:, 1:] - seen[:, :1]
+    sides = reflectors[:, 1:] - reflectors[:, :1]
     flat = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) < _FLAT * (sides**2).sum(axis=(1, 2))
     if flat.any():
         raise InputError(
             f"{file}: data row {np.argmax(flat) + 1}: the reflectors lie on one line; to fix: read them again"
         )
+    readings = []
     for name in names:
-        if not (robot == name).any():
+        rows = robot == name
+        if not rows.any():
             raise InputError(f"{file}: robot {name} has no row; to fix: measure its poses, or leave it out of the job")
-    return tuple(
-        ReflectorReadings(n, poses[robot == n], seen[robot == n], tracker.sigma(seen[robot == n])) for n in names
-    )
+        readings.append(ReflectorReadings(name, poses[rows], reflectors[rows], tracker.sigma(reflectors[rows])))
+    return tuple(readings)
 
 
 def read_per_robot(file: Path, names: tuple[str, ...], column_names: str) -> Array:
@@ -117,11 +119,12 @@ def read_per_robot(file: Path, names: tuple[str, ...], column_names: str) -> Arr
         InputError: a column is missing, or a robot is missing, unknown or there twice.
     """
     columns = _read_robots(file, names, "robot", column_names)
-    listed = columns.texts["robot"]
+    robots = columns.texts["robot"]
+    counts = Counter(robots)
     for name in names:
-        if listed.count(name) != 1:
-            raise InputError(f"{file}: robot {name} stands in {listed.count(name)} rows; to fix: give each robot one")
-    return columns.stack(column_names)[[listed.index(name) for name in names]]
+        if counts[name] != 1:
+            raise InputError(f"{file}: robot {name} stands in {counts[name]} rows; to fix: give each robot one")
+    return columns.stack(column_names)[[robots.index(name) for name in names]]
 
 
 def read_panel_points(file: Path, robots: tuple[str, ...] | None, T_world_tracker: Array) -> PanelPoints:
@@ -133,11 +136,11 @@ def read_panel_points(file: Path, robots: tuple[str, ...] | None, T_world_tracke
     numbers = "x y z seen_x seen_y seen_z"
     columns = _read_robots(file, robots, "point robot", numbers) if robots else read_columns(file, "point", numbers)
     clamp = np.array([robots.index(name) for name in columns.texts["robot"]] if robots else [-1] * columns.rows)
-    for i, name in enumerate(robots or ()):
-        if not (clamp == i).any():
+    for name in robots or ():
+        if name not in columns.texts["robot"]:
             raise InputError(f"{file}: robot {name} has no control point; to fix: measure one or more beside its clamp")
-    seen = frames.transform(T_world_tracker, columns.stack("seen_x seen_y seen_z"))
-    return PanelPoints(columns.texts["point"], columns.stack("x y z"), seen, clamp)
+    measured = frames.transform(T_world_tracker, columns.stack("seen_x seen_y seen_z"))
+    return PanelPoints(columns.texts["point"], columns.stack("x y z"), measured, clamp)
 
 
 def read_world(file: Path, tracker: LaserTracker) -> Array:
@@ -147,19 +150,19 @@ def read_world(file: Path, tracker: LaserTracker) -> Array:
         InputError: a column is missing, the points fix no frame, or one contradicts the others.
     """
     columns = read_columns(file, "point", "x y z seen_x seen_y seen_z")
-    seen = columns.stack("seen_x seen_y seen_z")
-    sigma = replace(tracker, position=np.zeros(3)).sigma(seen)
+    measured = columns.stack("seen_x seen_y seen_z")
+    sigma = replace(tracker, position=np.zeros(3)).sigma(measured)
     try:
-        found = rigid_fit(columns.stack("x y z"), seen, sigma)
+        fit = rigid_fit(columns.stack("x y z"), measured, sigma)
     except NoResultError as error:
         raise InputError(f"{file}: {error}") from None
-    sizes = np.linalg.norm(found.residuals, axis=1)
+    sizes = np.linalg.norm(fit.residuals, axis=1)
     worst = int(np.argmax(sizes))
     # With few points much of an error hides in the fit; ten sigmas beyond it are no noise.
     if sizes[worst] > 10 * np.sqrt(3) * sigma[worst]:
         name = columns.texts["point"][worst]
         raise InputError(f"{file}: point {name} is {sizes[worst]:.3f} mm off the others; to fix: measure it anew")
-    return frames.inverse(found.T)
+    return frames.inverse(fit.T)
 
 
 def _read_robots(file: Path, names: tuple[str, ...], texts: str, numbers: str) -> CsvColumns:
@@ -211,7 +214,12 @@ def read_panel_job(file: Path | str) -> PanelJob:
         )
     names = tuple(robots)
     paths = _file_paths(document.table("files", _FILES, required=True))
-    tracker = _read_tracker(document.table("tracker", {"position", "constant", "per_length"}, required=True))
+    settings = document.table("tracker", {"position", "constant", "per_length"}, required=True)
+    tracker = LaserTracker(
+        settings.vectors("position", (3,), "[x, y, z] in mm"),
+        constant=settings.number("constant", 0.010, positive=True),
+        per_length=settings.number("per_length", 5e-6, positive=True),
+    )
     T_world_tracker = np.eye(4)
     if "world" in paths:
         T_world_tracker = read_world(paths["world"], tracker)
@@ -250,16 +258,8 @@ def _read_layout(entries: JobTable, columns: int) -> ClampLayout:
     return layout
 
 
-def _read_tracker(entries: JobTable) -> LaserTracker:
-    return LaserTracker(
-        entries.vectors("position", (3,), "[x, y, z] in mm"),
-        constant=entries.number("constant", 0.010, positive=True),
-        per_length=entries.number("per_length", 5e-6, positive=True),
-    )
-
-
 def _read_shape(entries: JobTable) -> tuple[float, Array]:
-    """Tolerance, and which of the six axes are driven."""
+    """Read the tolerance, and which of the six axes are driven."""
     axes = entries.entries.get("axes", ["rx", "ry", "z"])
     if not isinstance(axes, list) or not axes:
         raise entries.refusal("axes", f"list some of {', '.join(_AXES)}")
@@ -293,15 +293,6 @@ def _file_paths(entries: JobTable) -> dict[str, Path]:
 
 
 @dataclass(frozen=True)
-class ExpectedErrors:
-    """Of the slaves against the master, from the global model's covariance."""
-
-    shift: MotionErrors
-    turn: MotionErrors
-    by_master: Array  # (N, 2) worst error of a slave, mm, after the longest shift and turn, if robot N were master
-
-
-@dataclass(frozen=True)
 class PanelResult:
     """Everything a job gives; commands are poses for the controllers, which do not know of leg offsets."""
 
@@ -309,7 +300,10 @@ class PanelResult:
     models: tuple[RobotModel, ...]
     legs: tuple[LegOffset, ...]  # empty without the legs' joints
     preposition: Array  # (N, 4, 4)
-    errors: ExpectedErrors
+    # Errors to expect of the slaves against the master, from the global model's covariance.
+    shift_errors: MotionErrors
+    turn_errors: MotionErrors
+    errors_by_master: Array  # (N, 2) worst of a slave, mm, after the longest shift and turn, if robot N were master
     pose: RigidFit | None  # T_world_panel
     pose_error: Array | None  # (6,) twist from target to measured pose, panel frame
     pose_commands: Array | None  # (N, 4, 4)
@@ -319,12 +313,13 @@ class PanelResult:
 
 
 def calibrate_robots(job: PanelJob) -> tuple[tuple[RobotModel, ...], tuple[LegOffset, ...]]:
-    """Models of all robots; those in which a leg offset is found are calibrated anew without it.
+    """Return models of all robots; those in which a leg offset is found are calibrated anew without it.
 
     Raises:
         NoResultError: a robot has too few poses, or turned about one axis only.
     """
-    models, offsets = [], []
+    models = []
+    offsets = []
     for readings in job.calibration:
         model = calibrate_robot(readings)
         if job.legs is not None:
@@ -338,40 +333,46 @@ def calibrate_robots(job: PanelJob) -> tuple[tuple[RobotModel, ...], tuple[LegOf
 
 
 def solve_panel_job(job: PanelJob) -> PanelResult:
-    """Model, pre-positions and errors to expect; pose and shape corrections where the job has their readings.
+    """Return model, pre-positions and errors to expect; pose and shape corrections where the job has their readings.
 
     Raises:
         NoResultError: a step has too few or degenerate readings; names the step.
     """
     _require_forces_within_limits(job)
     models, offsets = calibrate_robots(job)
-    bases, clamps = (np.array([getattr(m, name) for m in models]) for name in ("T_world_base", "T_flange_contact"))
+    bases = np.array([model.T_world_base for model in models])
+    clamps = np.array([model.T_flange_contact for model in models])
+    # What to tell the controllers so that the flanges really come there; first order in a leg's offset.
+    commands_for = partial(_flanges_with_offsets, job, offsets, sign=-1.0)
     layout = clamp_contacts(job.layout)
     before = preposition(bases, job.T_world_target, layout.T_panel_contact, clamps)
     stand = before if job.flanges is None else _flanges_with_offsets(job, offsets, job.flanges)
-    shift = errors_along_motion(models, stand, job.master, _DISTANCES, turn=False)
-    turn = errors_along_motion(models, stand, job.master, _ANGLES, turn=True)
+    shift_errors = errors_along_motion(models, stand, job.master, _DISTANCES, turn=False)
+    turn_errors = errors_along_motion(models, stand, job.master, _ANGLES, turn=True)
     by_master = errors_by_master(models, stand, float(_DISTANCES[-1]), float(_ANGLES[-1]))
     pose = pose_error = pose_commands = shape = shape_largest = shape_commands = None
     T_world_panel = job.T_world_target
     if job.targets is not None:
         pose = rigid_fit(job.targets.nominal, job.targets.measured, job.tracker.sigma(job.targets.measured))
-        T_world_panel, pose_error = pose.T, frames.log(frames.inverse(job.T_world_target) @ pose.T)
+        T_world_panel = pose.T
+        pose_error = frames.log(frames.inverse(job.T_world_target) @ pose.T)
         stand = adjust_pose(bases, stand, job.master, pose.T, job.T_world_target)
-        pose_commands = _commands_for(job, offsets, stand)
+        pose_commands = commands_for(stand)
     if job.control is not None:
         # With targets, the shape is evaluated on the panel where it was measured and corrected where it goes.
-        seen = frames.transform(frames.inverse(T_world_panel), job.control.measured)
+        measured = frames.transform(frames.inverse(T_world_panel), job.control.measured)
         control = ControlPoints(job.control.nominal, job.control.clamp, layout.T_panel_contact)
-        shape = shape_step(seen, control, stand, clamps, axes=job.axes)
+        shape = shape_step(measured, control, stand, clamps, axes=job.axes)
         shape_largest = largest_deviations(shape.deviations, control)
-        shape_commands = _commands_for(job, offsets, shape.T_base_flange)
+        shape_commands = commands_for(shape.T_base_flange)
     return PanelResult(
         contacts=layout,
         models=models,
         legs=offsets,
-        preposition=_commands_for(job, offsets, before),
-        errors=ExpectedErrors(shift, turn, by_master),
+        preposition=commands_for(before),
+        shift_errors=shift_errors,
+        turn_errors=turn_errors,
+        errors_by_master=by_master,
         pose=pose,
         pose_error=pose_error,
         pose_commands=pose_commands,
@@ -402,7 +403,7 @@ def _require_forces_within_limits(job: PanelJob) -> None:
 
 
 def _flanges_with_offsets(job: PanelJob, offsets: tuple[LegOffset, ...], believed: Array, sign: float = 1.0) -> Array:
-    """Where the flanges (N, 4, 4) really are when the controllers believe them at `believed`."""
+    """Return where the flanges (N, 4, 4) really are when the controllers believe them at `believed`."""
     real = believed.copy()
     for i, offset in enumerate(offsets):
         if offset.detected and job.legs is not None:
@@ -410,14 +411,9 @@ def _flanges_with_offsets(job: PanelJob, offsets: tuple[LegOffset, ...], believe
     return real
 
 
-def _commands_for(job: PanelJob, offsets: tuple[LegOffset, ...], target_flanges: Array) -> Array:
-    """What to tell the controllers so that the flanges really come to `target_flanges`; first order in the offset."""
-    return _flanges_with_offsets(job, offsets, target_flanges, sign=-1.0)
-
-
 def panel_document(job: PanelJob, result: PanelResult) -> dict[str, Any]:
-    """Plain data for JSON. mm, degrees, N."""
-    out: dict[str, Any] = {
+    """Return plain data for JSON. mm, degrees, N."""
+    document: dict[str, Any] = {
         "robots": {m.name: _robot_document(m) for m in result.models},
         "leg_offsets": {
             o.robot: {
@@ -432,29 +428,30 @@ def panel_document(job: PanelJob, result: PanelResult) -> dict[str, Any]:
             for o in result.legs
         },
         "errors": {
-            "after_100_mm": result.errors.shift.position[:, -1].max(axis=0).tolist(),
-            "after_2_deg": result.errors.turn.position[:, -1].max(axis=0).tolist(),
-            "by_master": dict(zip(job.robots, result.errors.by_master.tolist(), strict=True)),
+            "after_100_mm": result.shift_errors.position[:, -1].max(axis=0).tolist(),
+            "after_2_deg": result.turn_errors.position[:, -1].max(axis=0).tolist(),
+            "by_master": dict(zip(job.robots, result.errors_by_master.tolist(), strict=True)),
         },
     }
     if result.pose is not None and result.pose_error is not None:
-        out["pose"] = {
+        sigma = np.sqrt(np.diag(result.pose.covariance))
+        document["pose"] = {
             "position_error": result.pose_error[3:].tolist(),
             "angle_error_deg": np.degrees(result.pose_error[:3]).tolist(),
-            "sigma": np.sqrt(np.diag(result.pose.covariance)[3:]).tolist(),
-            "sigma_deg": np.degrees(np.sqrt(np.diag(result.pose.covariance)[:3])).tolist(),
+            "sigma": sigma[3:].tolist(),
+            "sigma_deg": np.degrees(sigma[:3]).tolist(),
             "targets_rms": float(np.sqrt((result.pose.residuals**2).mean())),
         }
     if result.shape_largest is not None:
         deviation = dict(zip(job.robots, result.shape_largest.tolist(), strict=True))
         ok = bool(result.shape_largest.max() <= job.tolerance)
-        out["shape"] = {"largest_deviation": deviation, "tolerance": job.tolerance, "within_tolerance": ok}
+        document["shape"] = {"largest_deviation": deviation, "tolerance": job.tolerance, "within_tolerance": ok}
     if job.forces is not None:
-        out["forces"] = {
+        document["forces"] = {
             name: {"force_N": float(np.linalg.norm(row[3:])), "torque_Nm": float(np.linalg.norm(row[:3]) / 1000)}
             for name, row in zip(job.robots, job.forces, strict=True)
         }
-    return out
+    return document
 
 
 def _robot_document(model: RobotModel) -> dict[str, Any]:
@@ -476,6 +473,7 @@ def write_folder(job: PanelJob, result: PanelResult, folder: Path) -> list[str]:
     """Write commands and model; returns the files' names."""
     folder.mkdir(parents=True, exist_ok=True)
     write_poses(folder / "preposition.csv", "robot", job.robots, result.preposition)
+    _write_model(folder / "model.csv", job, result)
     written = ["preposition.csv", "model.csv"]
     for name, commands in (("pose_move.csv", result.pose_commands), ("shape_move.csv", result.shape_commands)):
         if commands is not None:
@@ -486,7 +484,6 @@ def write_folder(job: PanelJob, result: PanelResult, folder: Path) -> list[str]:
         columns: dict[str, Any] = {"point": job.control.names, "dx": off[:, 0], "dy": off[:, 1], "dz": off[:, 2]}
         write_columns(folder / "deviations.csv", columns)
         written.append("deviations.csv")
-    _write_model(folder / "model.csv", job, result)
     return written
 
 
@@ -503,16 +500,16 @@ def _write_model(file: Path, job: PanelJob, result: PanelResult) -> None:
 
 
 def leg_sentence(o: LegOffset) -> str:
-    """A leg whose length its controller does not know."""
-    doubt = "" if o.chi_square_drop - o.runner_up_drop > _CLEAR else f"; leg {o.runner_up} explains it nearly as well"
+    """Say which leg's length its controller does not know."""
+    rival = "" if o.chi_square_drop - o.runner_up_drop > _CLEAR else f"; leg {o.runner_up} explains it nearly as well"
     return (
         f"Leg {o.leg} of robot {o.robot} is {o.offset:+.3f} ± {o.sigma:.3f} mm (1 σ) longer than its controller "
-        f"believes{doubt}. It is taken out of the model and put into the commands."
+        f"believes{rival}. It is taken out of the model and put into the commands."
     )
 
 
 def shape_sentence(job: PanelJob, result: PanelResult) -> str | None:
-    """The clamp where the shape is off most; None without control points."""
+    """Say the clamp where the shape is off most; None without control points."""
     if result.shape_largest is None:
         return None
     worst = int(np.argmax(result.shape_largest))
@@ -524,7 +521,7 @@ def shape_sentence(job: PanelJob, result: PanelResult) -> str | None:
 
 
 def robot_sessions(job: PanelJob, result: PanelResult) -> list[SessionFiles]:
-    """One session a robot, since each has a base of its own; the sensor's frame is the world's.
+    """Return one session a robot, since each has a base of its own; the sensor's frame is the world's.
 
     The poses are the controller's own, a leg offset that was found is still in them. A parallel robot has no chain of
     joints that a session could name; the lengths of its legs go along as covariates.
@@ -608,20 +605,23 @@ def run_panel(file: Path, drive: str | None, wanted: Wanted) -> None:
     written = []
     if wanted.output is not None:
         written = write_folder(job, result, wanted.output) + write_pictures("panel", wanted.output, job, result)
-    if wanted.session is not None:
-        write_sessions(wanted.session, robot_sessions(job, result))
-    write_recording_and_page("panel", wanted.recording, wanted.report, job, result)
-    if wanted.as_json:
-        steps = {"corrections": {"largest_deviation": largest}} if largest else {}
-        print(json.dumps(panel_document(job, result) | steps, indent=1))
+    steps = {"corrections": {"largest_deviation": largest}} if largest else {}
+    terminal = hand_out(
+        "panel",
+        wanted,
+        lambda: robot_sessions(job, result),
+        lambda: panel_document(job, result) | steps,
+        job,
+        result,
+    )
+    if terminal is None:
         return
-    terminal = console()
     _print_model(terminal, result)
     _print_moves(terminal, job, result)
     if largest:
-        told = " → ".join(f"{size:.2f}" for size in largest)
-        made = f"{len(largest) - 1} correction{'s' * (len(largest) != 2)}"
-        terminal.print(f"Shape control: {made}, largest deviation {told} mm.")
+        sizes = " → ".join(f"{size:.2f}" for size in largest)
+        count = f"{len(largest) - 1} correction{'s' * (len(largest) != 2)}"
+        terminal.print(f"Shape control: {count}, largest deviation {sizes} mm.")
     for name in written:
         print(f"{wanted.output}/{name}")
 
@@ -635,9 +635,9 @@ def _print_model(terminal: Console, result: PanelResult) -> None:
         cells = (f"{sigma[1]:.3f}", f"{degrees[0]:.4f}", f"{sigma[3]:.3f}", f"{degrees[2]:.4f}", f"{model.p_value:.3g}")
         table.add_row(model.name, *cells)
     terminal.print(table)
-    found = [offset for offset in result.legs if offset.detected]
-    for o in found:
-        terminal.print(leg_sentence(o))
+    offsets = [offset for offset in result.legs if offset.detected]
+    for offset in offsets:
+        terminal.print(leg_sentence(offset))
     for model in result.models:
         if model.p_value < 1e-4:
             times = np.sqrt(model.chi_square / model.redundancy)
@@ -645,17 +645,18 @@ def _print_model(terminal: Console, result: PanelResult) -> None:
                 f"Robot {model.name}: its residuals are {times:.1f} times what the tracker's sigma allows and nothing "
                 "known explains them; look at single rows, or at the robot."
             )
-    if result.legs and not found:
+    if result.legs and not offsets:
         terminal.print("No leg offset beyond chance in any robot.")
 
 
 def _print_moves(terminal: Console, job: PanelJob, result: PanelResult) -> None:
-    shift, turn = (errors.position[:, -1].max() for errors in (result.errors.shift, result.errors.turn))
+    shift = result.shift_errors.position[:, -1].max()
+    turn = result.turn_errors.position[:, -1].max()
     terminal.print(
         f"With {job.robots[job.master]} as master, the others are off by {shift:.3f} mm rms at most after a shift by "
         f"100 mm, {turn:.3f} mm after a turn by 2°."
     )
-    worst = result.errors.by_master.max(axis=1)
+    worst = result.errors_by_master.max(axis=1)
     best = int(np.argmin(worst))
     if worst[best] < 0.9 * worst[job.master]:
         terminal.print(

@@ -1,21 +1,17 @@
-"""The global model of robot and tracker: where each robot stands and where its clamp sits, with covariance.
+"""The global model of robots, tracker and panel: calibration, the panel's place, pose and shape, and errors to expect.
 
 T_world_base · T_base_flange · T_flange_contact = T_world_contact. The clamp's pads are replaced by three reflectors
-that the tracker measures while the robot moves; base and clamp are both unknown.
+that the tracker measures while the robot moves; base and clamp are both unknown, and come with their covariance. Six
+(or more) clamps of three pads each touch the panel on its equivalent cylinder. The source prints its formulas as
+pictures; these are rebuilt from its text and its figures' captions.
 
-Error of the slaves against the master along a motion: what the global model's uncertainty makes of it.
+The model's uncertainty makes the slaves err against the master along a motion. For a pure translation d the slave errs
+by (δR)·d, so the position error grows with the distance and the direction error does not change; for a pure turn the
+relative positions of the flanges enter too (source, eqs. 19-24).
 
-For a pure translation d the slave errs by (δR)·d, so the position error grows with the distance and the direction
-error does not change; for a pure turn the relative positions of the flanges enter too (source, eqs. 19-24).
-
-Where the clamps touch the panel: six (or more) clamps of three pads each on the equivalent cylinder.
-
-The source prints its formulas as pictures; these are rebuilt from its text and its figures' captions.
-
-A hidden offset of one leg of a six-legged robot, found in the tracker's data.
-
-The controller turns a flange pose into six leg lengths; a leg that is δ longer than it believes moves the flange by
-the twist J⁻¹·e·δ. What of that is the same in all poses hides in base and clamp; the rest stays in the residuals.
+One leg of a six-legged robot may have a hidden offset. The controller turns a flange pose into six leg lengths; a leg
+that is δ longer than it believes moves the flange by the twist J⁻¹·e·δ. What of that is the same in all poses hides in
+base and clamp; the rest stays in the residuals, where `find_leg_offset` looks for it.
 """
 
 from collections.abc import Sequence
@@ -45,12 +41,12 @@ SHAPE_AXES = np.array([True, True, False, False, False, True])
 
 
 def contact_frame(points: Array) -> Array:
-    """Frames (..., 4, 4) in the frame of the points (..., 3, 3): the base's two pads, then the third one.
+    """Return frames (..., 4, 4) in the frame of the points (..., 3, 3): the base's two pads, then the third one.
 
     Origin in the pads' centroid, x from the base's middle to the third pad, z along (p3 − p1) × (p2 − p1): into the
     panel if the base's pads are listed from −y to +y as the clamp sees it.
     """
-    p1, p2, p3 = np.moveaxis(np.asarray(points, float), -2, 0)
+    p1, p2, p3 = np.moveaxis(points, -2, 0)
     origin = (p1 + p2 + p3) / 3
     x = _unit(p3 - (p1 + p2) / 2)
     z = _unit(np.cross(p3 - p1, p2 - p1))
@@ -62,7 +58,7 @@ def _unit(v: Array) -> Array:
 
 
 def preposition(T_world_base: Array, T_world_panel: Array, T_panel_contact: Array, T_flange_contact: Array) -> Array:
-    """T_base_flange (N, 4, 4) that brings every clamp to its place on a panel that stands at T_world_panel (4, 4).
+    """Return T_base_flange (N, 4, 4) that brings every clamp to its place on a panel at T_world_panel (4, 4).
 
     T_Bi_Fi = T_W_Bi⁻¹ · T_W_P · T_P_CPi · T_Fi_CPi⁻¹.
     """
@@ -70,7 +66,7 @@ def preposition(T_world_base: Array, T_world_panel: Array, T_panel_contact: Arra
 
 
 def follow(T_world_base: Array, T_base_flange: Array, master: int, T_base_flange_master: Array) -> Array:
-    """All T_base_flange (N, 4, 4) once the master (index) goes to T_base_flange_master (4, 4).
+    """Return all T_base_flange (N, 4, 4) once the master (index) goes to T_base_flange_master (4, 4).
 
     Clamps keep their relative poses: T_BiS_FiS' = T_BiS_BM · T_BM_FM' · T_FiS_FM⁻¹, where T_FiS_FM follows from the
     poses (N, 4, 4) at which the robots stand now and T_BiS_BM from the global model.
@@ -86,7 +82,7 @@ def follow(T_world_base: Array, T_base_flange: Array, master: int, T_base_flange
 def adjust_pose(
     T_world_base: Array, T_base_flange: Array, master: int, T_world_panel: Array, T_world_target: Array
 ) -> Array:
-    """All T_base_flange (N, 4, 4) that take the panel from its measured pose to its target pose, both (4, 4).
+    """Return all T_base_flange (N, 4, 4) that take the panel from its measured pose to its target pose, both (4, 4).
 
     The panel rides on the master: T_BM_FM' = T_W_BM⁻¹ · (T_W_target · T_W_P⁻¹) · T_W_BM · T_BM_FM.
     """
@@ -130,12 +126,8 @@ class RobotModel:
         return float(chi2.sf(self.chi_square, self.redundancy))
 
 
-def initial_guess(readings: ReflectorReadings) -> tuple[Array, Array]:
-    """T_world_base, T_flange_contact (4, 4) in closed form: AX = XB over motions from the first pose, then the base.
-
-    Raises:
-        NoResultError: too few poses, or motions about one axis only.
-    """
+def _initial_base(readings: ReflectorReadings) -> Array:
+    """Return T_world_base (4, 4) in closed form: AX = XB over motions from the first pose, then the base."""
     if len(readings.T_base_flange) < _MINIMUM:
         raise NoResultError(
             f"robot {readings.name}: {len(readings.T_base_flange)} poses; to fix: measure at least {_MINIMUM}"
@@ -149,11 +141,11 @@ def initial_guess(readings: ReflectorReadings) -> tuple[Array, Array]:
         raise NoResultError(f"robot {readings.name}: {error}") from None
     bases = T_world_contact @ frames.inverse(T_flange_contact) @ frames.inverse(readings.T_base_flange)
     offsets = frames.log(frames.inverse(bases[0]) @ bases)
-    return bases[0] @ frames.exp(offsets.mean(axis=0)), T_flange_contact
+    return bases[0] @ frames.exp(offsets.mean(axis=0))
 
 
 def calibrate_robot(readings: ReflectorReadings) -> RobotModel:
-    """Both unknowns at once, each reflector coordinate weighted by the tracker's sigma.
+    """Fit both unknowns at once, each reflector coordinate weighted by the tracker's sigma.
 
     The three reflectors are unknown points of the flange (9) beside the base (6), so nothing about the clamp need be
     known beforehand; the contact frame follows from them.
@@ -161,7 +153,7 @@ def calibrate_robot(readings: ReflectorReadings) -> RobotModel:
     Raises:
         NoResultError: too few poses, or motions about one axis only.
     """
-    T_base, _T_contact = initial_guess(readings)
+    T_base = _initial_base(readings)
     inside = frames.inverse(T_base @ readings.T_base_flange)
     points = frames.transform(inside, readings.reflectors).mean(axis=0)
 
@@ -189,8 +181,9 @@ def calibrate_robot(readings: ReflectorReadings) -> RobotModel:
 
 
 def _contact_jacobian(points: Array) -> Array:
-    """(6, 9): twist of the contact frame per mm of each reflector coordinate, by central differences."""
-    step, T_inverse = 1e-3, frames.inverse(contact_frame(points))
+    """Return the twist (6, 9) of the contact frame per mm of each reflector coordinate, by central differences."""
+    step = 1e-3
+    T_inverse = frames.inverse(contact_frame(points))
     changes = step * np.eye(9).reshape(9, 3, 3)
     ahead, back = (frames.log(T_inverse @ contact_frame(points + sign * changes)) for sign in (1, -1))
     return (ahead - back).T / (2 * step)
@@ -208,7 +201,7 @@ class MotionErrors:
 def errors_along_motion(
     models: Sequence[RobotModel], T_base_flange: Array, master: int, steps: Array, *, turn: bool, draws: int = 200
 ) -> MotionErrors:
-    """Rms change of the relative pose of each slave's contact frame, per axis and step.
+    """Return the rms change of the relative pose of each slave's contact frame, per axis and step.
 
     The true cell is drawn about the model from each robot's covariance; commands come from the model alone.
 
@@ -218,30 +211,30 @@ def errors_along_motion(
     """
     rng = np.random.default_rng(0)
     xi = np.stack([rng.multivariate_normal(np.zeros(12), m.covariance, draws, "ignore") for m in models], axis=1)
-    T_world_base, T_flange_contact = (
-        np.array([getattr(m, n) for m in models]) for n in ("T_world_base", "T_flange_contact")
-    )
-    true_base, true_contact = T_world_base @ frames.exp(xi[..., :6]), T_flange_contact @ frames.exp(xi[..., 6:])
+    T_world_base = np.array([model.T_world_base for model in models])
+    true_base = T_world_base @ frames.exp(xi[..., :6])
+    true_contact = np.array([model.T_flange_contact for model in models]) @ frames.exp(xi[..., 6:])
 
     def relative(flanges: Array) -> Array:
         contact = true_base @ flanges @ true_contact
         return frames.inverse(contact[:, master : master + 1]) @ contact
 
     before = frames.inverse(relative(T_base_flange))
-    out = np.zeros((2, 3, len(steps), len(models)))
+    position, angle = np.zeros((2, 3, len(steps), len(models)))
     for axis in range(3):
         for k, step in enumerate(steps):
             motion = frames.exp(step * np.eye(6)[axis if turn else 3 + axis])
             T_master = T_base_flange[master].copy()
-            T_master[:3, :3], T_master[:3, 3] = motion[:3, :3] @ T_master[:3, :3], T_master[:3, 3] + motion[:3, 3]
+            T_master[:3, :3] = motion[:3, :3] @ T_master[:3, :3]
+            T_master[:3, 3] += motion[:3, 3]
             change = frames.log(before @ relative(follow(T_world_base, T_base_flange, master, T_master)))
-            for part, columns in enumerate((change[..., 3:], change[..., :3])):
-                out[part, axis, k] = np.sqrt((columns**2).sum(axis=-1).mean(axis=0))
-    return MotionErrors(np.asarray(steps, float), out[0], out[1])
+            position[axis, k] = np.sqrt((change[..., 3:] ** 2).sum(axis=-1).mean(axis=0))
+            angle[axis, k] = np.sqrt((change[..., :3] ** 2).sum(axis=-1).mean(axis=0))
+    return MotionErrors(steps, position, angle)
 
 
 def errors_by_master(models: Sequence[RobotModel], T_base_flange: Array, distance: float, angle: float) -> Array:
-    """(N, 2) worst rms position error (mm) of any slave after a distance (mm) and an angle (rad), per master."""
+    """Return the worst rms position error (N, 2), mm, of any slave after a distance (mm) and an angle, per master."""
     motions = ((np.array([distance]), False), (np.array([angle]), True))
     return np.array(
         [
@@ -260,7 +253,7 @@ class LaserTracker:
     per_length: float = 5e-6
 
     def sigma(self, points: Array) -> Array:
-        """Sigma of each coordinate of points (..., 3) in the world frame -> (...)."""
+        """Return the sigma of each coordinate of points (..., 3) in the world frame -> (...)."""
         return self.constant + self.per_length * np.linalg.norm(points - self.position, axis=-1)
 
 
@@ -283,12 +276,11 @@ class Contacts:
 
     pads: Array  # (N, 3, 3) the base's two, then the third one; panel frame
     T_panel_contact: Array  # (N, 4, 4); z into the panel, x from the base to the third pad
-    columns: Array  # (columns,) angle of each column about the cylinder's axis, rad
     tilt: float  # θ between a clamp's plane and the axis, rad
 
 
 def clamp_contacts(layout: ClampLayout) -> Contacts:
-    """Pads and contact frames, symmetric about the panel's middle; the bases lie towards the ends.
+    """Return pads and contact frames, symmetric about the panel's middle; the bases lie towards the ends.
 
     A clamp's chord W_c spans the angle 2·asin(W_c/2R), the free chord D the angle 2·asin(D/2R). The base's pads lie
     lower than the third one by the rise R·(1 − cos(α/2)), so the clamp's plane leans by sin θ = rise/H and covers
@@ -318,7 +310,7 @@ def clamp_contacts(layout: ClampLayout) -> Contacts:
     if np.abs(angles).max() + width / 2 >= np.pi / 2:
         raise InputError("layout: the clamps reach beyond a quarter turn; to fix: take fewer columns or less spacing")
     pads = np.array([_pads(layout.radius, a, width, side * outer, side * inner) for side in (-1, 1) for a in angles])
-    return Contacts(pads, contact_frame(pads), angles, tilt)
+    return Contacts(pads, contact_frame(pads), tilt)
 
 
 def _pads(radius: float, angle: float, width: float, x_base: float, x_third: float) -> Array:
@@ -352,13 +344,13 @@ class LegOffset:
 
 
 def leg_lengths(legs: Legs, T_base_flange: Array) -> Array:
-    """(M, 6) lengths, mm, that a controller sets for flange poses (M, 4, 4)."""
+    """Return the lengths (M, 6), mm, that a controller sets for flange poses (M, 4, 4)."""
     ends = frames.transform(T_base_flange, legs.platform)
     return np.linalg.norm(ends - legs.base, axis=-1)
 
 
 def leg_jacobian(legs: Legs, T_base_flange: Array) -> Array:
-    """(M, 6, 6): change of leg length per flange twist ξ in T·exp(ξ), rotation first; poses (M, 4, 4).
+    """Return (M, 6, 6) the change of leg length per flange twist ξ in T·exp(ξ), rotation first; poses (M, 4, 4).
 
     From l = |R p + t − b|: ∂l/∂v = Rᵀu and ∂l/∂ω = p × Rᵀu, u the leg's unit direction (Merlet 2006, ch. 2).
     """
@@ -400,27 +392,27 @@ def find_leg_offset(readings: ReflectorReadings, model: RobotModel, legs: Legs, 
 
 
 def _motion_of_points(points: Array) -> Array:
-    """(N, 3, 6): motion of points (N, 3) per unit of a twist, rotation first."""
+    """Return (N, 3, 6) the motion of points (N, 3) per unit of a twist, rotation first."""
     return np.concatenate([-frames.skew(points), np.tile(np.eye(3), (len(points), 1, 1))], axis=-1)
 
 
 def true_flanges(legs: Legs, T_base_flange: Array, offsets: Sequence[tuple[int, float]]) -> Array:
-    """Where the flange (M, 4, 4) really is when legs (from 1) are longer than the controller believes, mm.
+    """Return where the flange (M, 4, 4) really is when legs (from 1) are longer than the controller believes, mm.
 
     Raises:
         NoResultError: the legs cannot hold the flange in a pose.
     """
     twists = _twists_per_leg(legs, T_base_flange)
     xi = sum((twists[..., leg - 1] * size for leg, size in offsets), np.zeros((len(T_base_flange), 6)))
-    return T_base_flange @ frames.exp(np.asarray(xi))
+    return T_base_flange @ frames.exp(xi)
 
 
 def _twists_per_leg(legs: Legs, T_base_flange: Array) -> Array:
-    """(M, 6, leg): flange twist per mm of each leg."""
+    """Return (M, 6, leg) the flange twist per mm of each leg."""
     lengths = leg_jacobian(legs, T_base_flange)
-    broken = np.logical_not(np.asarray(np.isfinite(lengths).all(axis=(1, 2))))
-    condition = np.linalg.cond(np.where(broken[:, None, None], 0.0, lengths))
-    loose = np.flatnonzero(np.logical_not(condition < _SINGULAR))
+    finite = np.isfinite(lengths).all(axis=(1, 2), keepdims=True)
+    condition = np.linalg.cond(np.where(finite, lengths, 0.0))
+    loose = np.flatnonzero(~(condition < _SINGULAR))
     if len(loose):
         x, y, z = T_base_flange[loose[0], :3, 3]
         raise NoResultError(
@@ -440,7 +432,7 @@ class RigidFit:
 
 
 def rigid_fit(nominal: Array, measured: Array, sigma: Array) -> RigidFit:
-    """The motion that takes nominal points (N, 3) onto measured ones (N, 3), each with its sigma (N,).
+    """Return the motion that takes nominal points (N, 3) onto measured ones (N, 3), each with its sigma (N,).
 
     Kabsch/Wahba solution (Horn 1987). All points count alike: a body that is millimetres out of shape would move by
     more than its targets' noise if the targets near the tracker counted for more. The sigmas make the covariance.
@@ -448,7 +440,6 @@ def rigid_fit(nominal: Array, measured: Array, sigma: Array) -> RigidFit:
     Raises:
         NoResultError: fewer than three points, or all on one line.
     """
-    nominal, measured = np.asarray(nominal, float), np.asarray(measured, float)
     if len(nominal) < 3:
         raise NoResultError(f"{len(nominal)} points fix no pose; to fix: measure at least three that are not on a line")
     if on_a_line(nominal):
@@ -457,7 +448,7 @@ def rigid_fit(nominal: Array, measured: Array, sigma: Array) -> RigidFit:
         )
     T = align_points(nominal, measured)
     arms = nominal - nominal.mean(axis=0)
-    gain = np.linalg.pinv(_motion_of_points(arms).reshape(-1, 6)) * np.repeat(np.asarray(sigma, float), 3)
+    gain = np.linalg.pinv(_motion_of_points(arms).reshape(-1, 6)) * np.repeat(sigma, 3)
     return RigidFit(T, gain @ gain.T, measured - frames.transform(T, nominal))
 
 
@@ -512,7 +503,7 @@ def shape_step(
 
 
 def largest_deviations(deviations: Array, control: ControlPoints) -> Array:
-    """(N,) largest deviation across the panel's surface (along a contact frame's z) at each clamp, mm."""
+    """Return the largest deviation (N,) across the panel's surface (along a contact frame's z) at each clamp, mm."""
     across = np.einsum("ki,ki->k", deviations, control.T_panel_contact[control.clamp][:, :3, 2])
     clamps = range(len(control.T_panel_contact))
     return np.array([np.abs(across[control.clamp == i]).max(initial=0.0) for i in clamps])

@@ -304,7 +304,7 @@ def fit_cad(
         N = _normal_matrix(design, weight, cad)
         shrink, size = varying_ridge(N, numbers, scale, size)
         pull = np.concatenate([np.zeros(6), numbers]) * shrink
-        step: Array = np.linalg.solve(N + np.diag(shrink), -design.T @ (weight * rest) - pull)
+        step = np.asarray(np.linalg.solve(N + np.diag(shrink), -design.T @ (weight * rest) - pull), float)
         T_base_part = moved_about(T_base_part, step[:6], cad.centre)
         numbers = numbers + step[6:]
         if np.abs(step[3:]).max() < _STILL * cad.size and scale <= 1.05 * max(spread, noise):

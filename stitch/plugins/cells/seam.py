@@ -91,7 +91,7 @@ def _robust(design: Array, values: Array, points: Array) -> tuple[Array, Array, 
     weight = np.ones(len(values))
     for _ in range(20):
         root = np.sqrt(weight)
-        coefficients: Array = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
+        coefficients = np.asarray(np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0], float)
         residual = values - design @ coefficients
         scale = max(mad_sigma(residual), 1e-9)
         weight = tukey(residual, scale)

@@ -449,7 +449,7 @@ def run_fit(file: Path, allowance: str | None, wanted: Wanted) -> None:
     terminal = hand_out(
         "fit",
         wanted,
-        lambda: scan_session(file.stem, job.placed, job.cad_file),
+        lambda: [scan_session(file.stem, job.placed, job.cad_file)],
         lambda: fit_document(job, parts),
         job,
         parts,
@@ -486,7 +486,7 @@ def run_seam(file: Path, wanted: Wanted) -> None:
     if wanted.output is not None:
         write_seam(seams, wanted.output)
     terminal = hand_out(
-        "seam", wanted, lambda: scan_session(file.stem, job.placed), lambda: seam_document(seams), job, seams
+        "seam", wanted, lambda: [scan_session(file.stem, job.placed)], lambda: seam_document(seams), job, seams
     )
     if terminal is None:
         return

@@ -58,9 +58,9 @@ def test_circle_exact_and_its_sense():
     rng = np.random.default_rng(0)
     for seed in range(20):
         T = random_pose(np.random.default_rng(seed))
-        c = fit_circle(arc(T[:3, 3], T[:3, 2], 300, 70, 8, rng))
-        assert np.abs(c.centre - T[:3, 3]).max() < 1e-6 and abs(c.radius - 300) < 1e-6
-        assert np.abs(c.axis - T[:3, 2]).max() < 1e-9
+        centre, axis, radius = fit_circle(arc(T[:3, 3], T[:3, 2], 300, 70, 8, rng))
+        assert np.abs(centre - T[:3, 3]).max() < 1e-6 and abs(radius - 300) < 1e-6
+        assert np.abs(axis - T[:3, 2]).max() < 1e-9
 
 
 def test_base_frame_from_two_paths():
