@@ -78,7 +78,7 @@ def _calibrated(features: FeatureList, truth: np.ndarray, rng: np.random.Generat
 
 def _measured(state: RunData, wanted: FeatureList) -> tuple[MeasuredFeatures, HandEyeTransfer]:
     chain = error_chain(state)
-    hand_eye = hand_eye_transfer(state.measurement, chain.capture, chain.freed, state.model)
+    hand_eye = hand_eye_transfer(state.measurement, chain.capture, chain.unconstrained, state.model)
     return measure_features(place_errors(state, chain), wanted), hand_eye
 
 

@@ -108,16 +108,18 @@ def fit_features(points: RunPoints, features: Sequence[Feature]) -> tuple[Fitted
 
 def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeature]) -> MeasuredFeatures:
     """Return the numbers of fits and of distances between them, under all that may be wrong about the places."""
-    table = number_table(wanted.features, fits)
-    responses = stack_responses([places.responses(fit.at, fit.gradient) for fit in fits]).combined(table.slopes)
+    quantities, values, nominal, slopes = number_table(wanted.features, fits)
+    responses = stack_responses([places.responses(fit.at, fit.gradient) for fit in fits]).combined(slopes)
+    variances, vectors = np.linalg.eigh(responses.noise)
     rows = [(s.name, responses.loadings(s), s.degrees) for s in places.sources]
-    rows.append((OWN_NOISE, _root_of(responses.noise), np.inf))
-    rows += [(c.source, _stated_loadings(c, table), c.degrees) for c in wanted.contributions]
-    covariance = np.sum([own @ own.T for _, own, _ in rows], axis=0)
+    rows.append((OWN_NOISE, vectors * np.sqrt(np.maximum(variances, 0.0)), np.inf))
+    rows += [(c.source, _stated_loadings(c, quantities, values), c.degrees) for c in wanted.contributions]
+    covariance = np.sum([loadings @ loadings.T for _, loadings, _ in rows], axis=0)
     by_fit = {fit.feature.name: fit for fit in fits}
+    length_unit = places.measurement.length_unit
     numbers = []
-    for q, (feature, quantity) in enumerate(table.names):
-        squares = np.array([own[q] @ own[q] for _, own, _ in rows])
+    for q, (feature, quantity) in enumerate(quantities):
+        squares = np.array([loadings[q] @ loadings[q] for _, loadings, _ in rows])
         total = max(squares.sum(), 1e-300)
         shares = dict.fromkeys((name for name, _, _ in rows), 0.0)
         for (name, _, _), square in zip(rows, squares, strict=True):
@@ -128,9 +130,9 @@ def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeat
             Number(
                 feature=feature,
                 quantity=quantity,
-                unit=_unit_of(quantity, places.measurement.length_unit),
-                value=float(table.values[q]),
-                nominal=float(table.nominal[q]),
+                unit="rad" if quantity.startswith("slope") else length_unit,
+                value=float(values[q]),
+                nominal=float(nominal[q]),
                 u=float(np.sqrt(squares.sum())),
                 degrees=float(total**2 / spread) if spread > 0 else np.inf,
                 shares=dict(sorted(shares.items(), key=lambda item: -item[1])),
@@ -138,16 +140,7 @@ def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeat
                 form=float("nan") if fit is None else fit.form,
             )
         )
-    return MeasuredFeatures(tuple(numbers), covariance, tuple(fits), places.measurement.length_unit)
-
-
-def _unit_of(quantity: str, length_unit: str) -> str:
-    return "rad" if quantity.startswith("slope") else length_unit
-
-
-def _root_of(covariance: Array) -> Array:
-    values, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+    return MeasuredFeatures(tuple(numbers), covariance, tuple(fits), length_unit)
 
 
 def stack_responses(parts: Sequence[Responses]) -> Responses:
@@ -160,24 +153,21 @@ def stack_responses(parts: Sequence[Responses]) -> Responses:
     )
 
 
-@dataclass(frozen=True)
-class FeatureNumbers:
-    """Q numbers of features and distances, and how they follow from the numbers of the fits."""
-
-    names: tuple[tuple[Feature, str], ...]
-    values: Array  # (Q,)
-    nominal: Array  # (Q,)
-    slopes: Array  # (Q, B) in the B numbers of all fits
-
-
-def number_table(features: Sequence[Feature], fits: Sequence[FittedFeature]) -> FeatureNumbers:
-    """Return all numbers in the order of the features."""
+def number_table(
+    features: Sequence[Feature], fits: Sequence[FittedFeature]
+) -> tuple[list[tuple[Feature, str]], Array, Array, Array]:
+    """Return all numbers in the order of the features: what each is, values (Q,), nominal values (Q,), and slopes
+    (Q, B) in the B numbers of all fits."""
     start = dict(zip([f.feature.name for f in fits], np.cumsum([0, *(len(f.values) for f in fits)]), strict=False))
-    by_name, width = {fit.feature.name: fit for fit in fits}, sum(len(fit.values) for fit in fits)
-    names, values, nominal, slopes = list[tuple[Feature, str]](), list[float](), list[float](), list[Array]()
+    by_name = {fit.feature.name: fit for fit in fits}
+    width = sum(len(fit.values) for fit in fits)
+    quantities = list[tuple[Feature, str]]()
+    values = list[float]()
+    nominal = list[float]()
+    slopes = list[Array]()
     for feature in features:
         row = np.zeros((len(NUMBERS[feature.kind]), width))
-        names += [(feature, quantity) for quantity in NUMBERS[feature.kind]]
+        quantities += [(feature, quantity) for quantity in NUMBERS[feature.kind]]
         if feature.kind == "distance":
             a, b = (by_name[name] for name in feature.between)
             distance, of_a, of_b = _distance_slopes(a, b)
@@ -192,7 +182,7 @@ def number_table(features: Sequence[Feature], fits: Sequence[FittedFeature]) -> 
             values += fit.values.tolist()
             nominal += _nominal_values(feature).tolist()
         slopes.append(row)
-    return FeatureNumbers(tuple(names), np.array(values), np.array(nominal), np.vstack(slopes))
+    return quantities, np.array(values), np.array(nominal), np.vstack(slopes)
 
 
 def _nominal_values(feature: Feature) -> Array:
@@ -229,11 +219,11 @@ def _distance_slopes(a: FittedFeature, b: FittedFeature) -> tuple[float, Array, 
     return distance, sign * (b.feature.R @ [-su, -sv, 1.0]) @ a.position_slopes, -sign * np.array([1.0, x, y])
 
 
-def _stated_loadings(stated: Contribution, table: FeatureNumbers) -> Array:
+def _stated_loadings(stated: Contribution, quantities: Sequence[tuple[Feature, str]], values: Array) -> Array:
     """(Q, ·) what a stated contribution does to the numbers: a relative one to all lengths together."""
-    lengths = np.array([quantity in ("distance", "diameter") for _, quantity in table.names])
-    own = np.array([stated.length * (not quantity.startswith("slope")) for _, quantity in table.names])
-    return np.column_stack([stated.relative * table.values * lengths, np.diag(own)])
+    lengths = np.array([quantity in ("distance", "diameter") for _, quantity in quantities])
+    each = np.array([stated.length * (not quantity.startswith("slope")) for _, quantity in quantities])
+    return np.column_stack([stated.relative * values * lengths, np.diag(each)])
 
 
 @dataclass(frozen=True)
@@ -260,7 +250,8 @@ def monte_carlo(
     linear = evaluate(places, wanted, thin)
     modes = [(s, rng.standard_normal((s.views.shape[1], trials))) for s in places.sources]
     by_feature = {fit.feature.name: (fit.feature, _refits(places, fit, modes, trials, rng)) for fit in thin}
-    table, columns = number_table(wanted.features, thin), list[Array]()
+    quantities, values, _, _ = number_table(wanted.features, thin)
+    columns = list[Array]()
     for feature in wanted.features:
         if feature.kind == "distance":
             (a, of_a), (b, of_b) = (by_feature[name] for name in feature.between)
@@ -269,9 +260,9 @@ def monte_carlo(
             columns.append(by_feature[feature.name][1])
     drawn = np.hstack(columns)
     for stated in wanted.contributions:
-        loadings = _stated_loadings(stated, table)
+        loadings = _stated_loadings(stated, quantities, values)
         drawn = drawn + rng.standard_normal((trials, loadings.shape[1])) @ loadings.T
-    interval = np.quantile(drawn, [0.025, 0.975], axis=0).T - table.values[:, None]
+    interval = np.quantile(drawn, [0.025, 0.975], axis=0).T - values[:, None]
     return MonteCarlo(trials, drawn.std(axis=0, ddof=1), np.array([n.u for n in linear.numbers]), interval)
 
 
@@ -283,15 +274,15 @@ def _refits(
     rng: np.random.Generator,
 ) -> Array:
     """(M, q) numbers of a feature from its points as M trials move them."""
-    totals = [
-        np.sum([getattr(s, name) @ drawn for s, drawn in modes], axis=0).T for name in ("views", "parameters", "field")
-    ]
-    twists, own = totals[0], np.hstack(totals[1:])
+    twists = np.sum([s.views @ drawn for s, drawn in modes], axis=0).T
+    parameters = np.sum([s.parameters @ drawn for s, drawn in modes], axis=0).T
+    field = np.sum([s.field @ drawn for s, drawn in modes], axis=0).T
+    of_points = np.hstack([parameters, field])
     shapes, noise = places.point_modes(fit.at)
-    out = np.empty((trials, len(fit.values)))
+    numbers = np.empty((trials, len(fit.values)))
     for start in range(0, trials, _TRIAL_BLOCK):
         block = slice(start, min(start + _TRIAL_BLOCK, trials))
-        moved = fit.at.points + np.tensordot(own[block], shapes, axes=1)
+        moved = fit.at.points + np.tensordot(of_points[block], shapes, axes=1)
         moved += noise * rng.standard_normal((*moved.shape[:2], 1))
-        out[block] = [fit.refit(points) for points in places.moved(fit.at, twists[block], moved)]
-    return out
+        numbers[block] = [fit.refit(points) for points in places.moved(fit.at, twists[block], moved)]
+    return numbers

@@ -13,16 +13,16 @@ from stitch.plugins.watch.dfq_file import Characteristic
 MEASURE_FORMAT = "stitch-measure/1"
 
 
-def measure_document(found: MeasuredFeatures, run: str, trials: MonteCarlo | None = None) -> dict[str, Any]:
+def measure_document(measured: MeasuredFeatures, run: str, trials: MonteCarlo | None = None) -> dict[str, Any]:
     """Return features.json: all numbers with their budgets, and the covariance of all of them together."""
-    ratios = [None] * len(found.numbers) if trials is None else trials.ratio.tolist()
+    ratios = [None] * len(measured.numbers) if trials is None else trials.ratio.tolist()
     return {
         "format": MEASURE_FORMAT,
         "run": run,
-        "length_unit": found.length_unit,
+        "length_unit": measured.length_unit,
         "k": COVERAGE_FACTOR,
-        "numbers": [_number(n, ratio) for n, ratio in zip(found.numbers, ratios, strict=True)],
-        "covariance": {"numbers": [n.name for n in found.numbers], "matrix": found.covariance.tolist()},
+        "numbers": [_number(n, ratio) for n, ratio in zip(measured.numbers, ratios, strict=True)],
+        "covariance": {"numbers": [n.name for n in measured.numbers], "matrix": measured.covariance.tolist()},
         "trials": None if trials is None else trials.trials,
         "not_included": list(NOT_INCLUDED),
     }
@@ -53,21 +53,23 @@ def _number(n: Number, ratio: float | None) -> dict[str, Any]:
     }
 
 
-def measure_csv(found: MeasuredFeatures) -> str:
+def measure_csv(measured: MeasuredFeatures) -> str:
     """Return a table with a row a number: a column a source, its standard uncertainty in the number's unit, and a
     column a number, the covariance with that in the product of both units."""
-    sources = sorted({source for n in found.numbers for source in n.shares})
+    sources = sorted({source for n in measured.numbers for source in n.shares})
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n")
-    head = "feature kind quantity unit value nominal u k U degrees_of_freedom lower upper conforms points form_95"
-    write.writerow([*head.split(), *(f"u: {source}" for source in sources), *(f"cov: {n.name}" for n in found.numbers)])
-    for n, covariance in zip(found.numbers, found.covariance, strict=True):
+    columns = "feature kind quantity unit value nominal u k U degrees_of_freedom lower upper conforms points form_95"
+    write.writerow(
+        [*columns.split(), *(f"u: {source}" for source in sources), *(f"cov: {n.name}" for n in measured.numbers)]
+    )
+    for n, covariance in zip(measured.numbers, measured.covariance, strict=True):
         limits = n.limits or ("", "")
         conforms = {True: "yes", False: "no", None: "open" if n.limits else ""}[n.conforms]
         numbers = [_text(x) for x in (n.value, n.nominal, n.u, COVERAGE_FACTOR, n.U, n.degrees)]
-        own = [n.feature.name, n.feature.kind, n.quantity, n.unit, *numbers, *map(_text, limits), conforms, n.points]
+        head = [n.feature.name, n.feature.kind, n.quantity, n.unit, *numbers, *map(_text, limits), conforms, n.points]
         by_source = [n.u * np.sqrt(n.shares.get(s, 0.0)) for s in sources]
-        write.writerow([*own, *map(_text, (n.form, *by_source, *covariance))])
+        write.writerow([*head, *map(_text, (n.form, *by_source, *covariance))])
     return out.getvalue()
 
 
@@ -76,6 +78,6 @@ def _text(x: float | str) -> str:
     return x if isinstance(x, str) else "" if not np.isfinite(x) else f"{x:.9g}"
 
 
-def characteristics(found: MeasuredFeatures) -> list[Characteristic]:
+def characteristics(measured: MeasuredFeatures) -> list[Characteristic]:
     """Return what a DFQ file says of the numbers."""
-    return [Characteristic(n.name, n.unit, n.nominal, *(n.limits or (np.nan, np.nan))) for n in found.numbers]
+    return [Characteristic(n.name, n.unit, n.nominal, *(n.limits or (np.nan, np.nan))) for n in measured.numbers]

@@ -43,9 +43,15 @@ from stitch.session.capture import Capture
 from stitch.system.threads import library_threads_off
 
 # Sources as people call them.
-SCATTER, ARM, WANDERING = "robot: scatter of the poses", "robot: joints and links", "robot: wandering in time"
-STOP, OVERLAPS, SCANNER = "robot: shared by the scans of a stop", "noise of the overlaps", "scanner: smooth errors"
-OTHER_RUN, OTHER_ARM, UNSEEN = "model of another run", "arm of another run", "hand-eye: not shown by the motions"
+SCATTER = "robot: scatter of the poses"
+ARM = "robot: joints and links"
+WANDERING = "robot: wandering in time"
+STOP = "robot: shared by the scans of a stop"
+OVERLAPS = "noise of the overlaps"
+SCANNER = "scanner: smooth errors"
+OTHER_RUN = "model of another run"
+OTHER_ARM = "arm of another run"
+UNSEEN = "hand-eye: not shown by the motions"
 # What a session does not show of itself.
 NOT_INCLUDED = (
     "scale of the scanner, where range_scale is not in the model: an artefact of known length shows it",
@@ -79,7 +85,7 @@ def place_errors(run: RunData, chain: "ErrorChain | None" = None) -> PlaceErrors
             measurement=run.measurement,
             capture=chain.capture,
             poses=run.poses,
-            centre=chain.freed.overlaps.gram.centre,
+            centre=chain.unconstrained.overlaps.gram.centre,
             sources=tuple(_sources(run, chain)),
             slopes=PointSlopes(run.measurement, terms, run.model) if terms else None,
             half=half_field(run.measurement),
@@ -88,10 +94,10 @@ def place_errors(run: RunData, chain: "ErrorChain | None" = None) -> PlaceErrors
 
 @dataclass(frozen=True)
 class ErrorChain:
-    """The linear maps of the module's head; twists (6V,) about the centre of `freed`, F fitted parameters."""
+    """The linear maps of the module's head; twists (6V,) about the centre of the overlaps, F fitted parameters."""
 
     capture: Capture
-    freed: UnconstrainedPoses
+    unconstrained: UnconstrainedPoses
     solution: HandEyeSolution
     fitted: Mask  # (P,) of all parameters of effects
     of_points: Mask  # (P,) of effects that change points
@@ -103,16 +109,16 @@ class ErrorChain:
     def of_poses(self, root: Array) -> tuple[Array, Array]:
         """What errors of poses (6V, m) make of the views (6V, m) and of the parameters (6 + F, m)."""
         x = self.answer @ root
-        return np.asarray(self.follow @ root - root + self.to_views @ x), x
+        return self.follow @ root - root + self.to_views @ x, x
 
     def of_overlaps(self, twists: Array) -> tuple[Array, Array]:
         """The same of errors of what the overlaps show, twists (6V, m)."""
         x = self.answer @ twists
-        return np.asarray(self.follow @ twists + self.to_views @ x), x
+        return self.follow @ twists + self.to_views @ x, x
 
     def of_model(self, x: Array) -> tuple[Array, Array]:
         """The same of errors of the parameters (6 + F, m) themselves."""
-        return np.asarray(self.to_views @ x), x
+        return self.to_views @ x, x
 
 
 def error_chain(run: RunData) -> ErrorChain:
@@ -124,26 +130,28 @@ def error_chain(run: RunData) -> ErrorChain:
     """
     if not run.measurement.capture.scans or run.registered is None:
         raise InputError(f"{run.session.name}: has no clouds, so no surface; to fix: name a run of scans")
-    measurement, model = run.measurement, run.model
-    own = corrected_capture(measurement, model)
-    freed = unconstrained_poses(own, own.poses(model.T_mount), run.gate)
-    columns, parameters = view_columns(measurement, model, freed), stack_parameters(model.terms)
+    measurement = run.measurement
+    model = run.model
+    capture = corrected_capture(measurement, model)
+    unconstrained = unconstrained_poses(capture, capture.poses(model.T_mount), run.gate)
+    columns = view_columns(measurement, model, unconstrained)
     given = REUSED in run.stages[0].note
-    fitted = np.array([p.fitted and (given or not p.kept) for p in parameters], bool)
+    fitted = np.array([p.fitted and (given or not p.kept) for p in stack_parameters(model.terms)], bool)
     of_points = np.array([moves_points([term]) for term in model.terms for _ in term.parameters], bool)
     effects = FittedEffects((columns[:, fitted],), values_of(model.terms)[fitted], WEAK * sizes_of(model.terms)[fitted])
-    found = solve_hand_eye([own], [freed], model.T_mount, effects)
-    answer = np.asarray(found.gls.gain @ found.rig.parts[0].reduced_poses.reduction)
-    follow = _follow_overlaps(run, own, found, freed.overlaps.gram.centre)
-    g = freed.overlaps.gram
+    solution = solve_hand_eye([capture], [unconstrained], model.T_mount, effects)
+    part = solution.rig.parts[0]
+    answer = solution.gls.gain @ part.reduced_poses.reduction
+    centre = unconstrained.overlaps.gram.centre
+    follow = _follow_overlaps(run, capture, solution, centre)
     of_views = np.column_stack(
-        [hand_eye_jacobian(found.rig.parts[0].hand_eye_frames, g.centre), columns[:, fitted] * ~of_points[fitted]]
+        [hand_eye_jacobian(part.hand_eye_frames, centre), columns[:, fitted] * ~of_points[fitted]]
     )
     by_points = np.column_stack([np.zeros((len(columns), 6)), columns[:, fitted] * of_points[fitted]])
     return ErrorChain(
-        capture=own,
-        freed=freed,
-        solution=found,
+        capture=capture,
+        unconstrained=unconstrained,
+        solution=solution,
         fitted=fitted,
         of_points=of_points,
         columns=columns,
@@ -153,14 +161,15 @@ def error_chain(run: RunData) -> ErrorChain:
     )
 
 
-def _follow_overlaps(run: RunData, own: Capture, found: HandEyeSolution, centre: Array) -> Array:
+def _follow_overlaps(run: RunData, capture: Capture, solution: HandEyeSolution, centre: Array) -> Array:
     """(6V, 6V) K: by how much of what the overlaps show register moves the views, twists about `centre` (3,)."""
     assert run.registered is not None
-    scatter, method = found.scatter[0], METHODS[run.register_method]
-    H = normal_equations(run.registered, own, run.poses, run.poses_model, scatter=scatter, method=method).H
+    scatter = solution.scatter[0]
+    method = METHODS[run.register_method]
+    H = normal_equations(run.registered, capture, run.poses, run.poses_model, scatter=scatter, method=method).H
     about = run.registered.gram.centre
     held = np.zeros_like(H)
-    for v, precision in enumerate(prior_precision(own, scatter, about)):
+    for v, precision in enumerate(prior_precision(capture, scatter, about)):
         held[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] = precision
     shift = np.kron(np.eye(len(run.poses)), frames.adjoint(frames.make(np.eye(3), centre - about)))
     K = np.eye(len(H)) - np.linalg.solve(H, held)
@@ -174,7 +183,8 @@ def _sources(run: RunData, chain: ErrorChain) -> Iterator[ErrorSource]:
         for k, (size, known) in enumerate(zip(sizes, degrees, strict=True))
     ]
     for name, (views, x), known, k in [*_pose_modes(run, chain, twists * sizes), *_model_modes(run, chain), *smooth]:
-        parameters, field = np.zeros((len(chain.fitted), x.shape[1])), np.zeros((len(sizes), x.shape[1]))
+        parameters = np.zeros((len(chain.fitted), x.shape[1]))
+        field = np.zeros((len(sizes), x.shape[1]))
         parameters[chain.fitted] = x[6:]
         if k is not None:
             field[k] = sizes[k]
@@ -187,11 +197,11 @@ def _smooth_errors(run: RunData, chain: ErrorChain) -> tuple[Array, Array, Array
     Sizes are those that the covariance of the hand-eye counts. One whose logarithm is known to s has ½/s² degrees of
     freedom (JCGM 100, G.4.2).
     """
-    sums, noise = sum_smooth_errors(run.measurement, chain.freed)
-    twists = apparent_twists(sums, chain.freed)
+    sums, noise = sum_smooth_errors(run.measurement, chain.unconstrained)
+    twists = apparent_twists(sums, chain.unconstrained)
     if not np.isfinite(noise):
         return twists, np.zeros(twists.shape[1]), np.full(twists.shape[1], _MANY)
-    likelihood = shared_error_likelihood(sums, twists, chain.freed, noise)
+    likelihood = shared_error_likelihood(sums, twists, chain.unconstrained, noise)
     shares = likelihood.map_shares
     spread = likelihood.share_spread(shares)
     of_mode = np.append(np.zeros(twists.shape[1] - 1, int), 1)  # all over the field have one size, incidence its own
@@ -203,10 +213,11 @@ def _pose_modes(run: RunData, chain: ErrorChain, smooth: Array) -> Iterator[_Mod
 
     What the overlaps vary by more than they would if smooth errors (6V, K) were known is not noise but the scanner's.
     """
-    found, g = chain.solution, chain.freed.overlaps.gram
+    rig = chain.solution.rig
+    g = chain.unconstrained.overlaps.gram
     errors = prior_pose_errors([run.measurement], run.model, [g.centre])
     errors = errors.restricted(errors.causes - {JOINT_SCATTER})
-    mixed = found.rig.mixed(errors)
+    mixed = rig.mixed(errors)
     sizes = fit_variances(mixed, both_starts=True)
     sigma = np.sqrt(mean_variances(mixed, sizes))
     known = 2 / np.clip(np.diag(satterthwaite(mixed, sizes).spread), 2 / _MANY, 2.0)
@@ -214,10 +225,10 @@ def _pose_modes(run: RunData, chain: ErrorChain, smooth: Array) -> Iterator[_Mod
     for k, axes in enumerate((slice(0, 3), slice(3, 6))):
         root = block_diag(*carried[:, :, axes])
         yield SCATTER, chain.of_poses(sigma[k] * root), float(known[k]), None
-    seen = g.visible
-    noise = sigma[NOISE] * seen.scale[:, None] * seen.vectors * np.sqrt(g.variance / seen.values)
-    seen_smooth = found.rig.reduce([smooth])
-    beside = replace(mixed, fixed=(seen_smooth @ seen_smooth.T)[None])
+    visible = g.visible
+    noise = sigma[NOISE] * visible.scale[:, None] * visible.vectors * np.sqrt(g.variance / visible.values)
+    reduced_smooth = rig.reduce([smooth])
+    beside = replace(mixed, fixed=(reduced_smooth @ reduced_smooth.T)[None])
     left = mean_variances(beside, fit_variances(beside, both_starts=True))[NOISE] / sigma[NOISE] ** 2
     for name, share in ((OVERLAPS, min(left, 1.0)), (SCANNER, 1.0 - min(left, 1.0))):
         yield name, chain.of_overlaps(np.sqrt(share) * noise), float(known[NOISE]), None
@@ -231,14 +242,15 @@ def _model_modes(run: RunData, chain: ErrorChain) -> Iterator[_Modes]:
     kept = chain.columns @ kept_root(run.terms, run.model.effects_covariance)
     if kept.any():
         yield OTHER_ARM, chain.of_poses(kept), _MANY, None
-    found, hand_eye = chain.solution, np.eye(6 + int(chain.fitted.sum()))[:, :6]
+    solution = chain.solution
     if not chain.answer.any():
         effects = run.model.effects_covariance.root(run.terms)[chain.fitted]
         yield OTHER_RUN, chain.of_model(block_diag(_root(run.mount_covariance), effects)), _MANY, None
         return
-    yield UNSEEN, chain.of_model(found.gls.covariance @ _root(found.prior)), _MANY, None
-    if found.hidden.size:
-        yield UNSEEN, chain.of_model(hand_eye @ found.hidden), _MANY, None
+    yield UNSEEN, chain.of_model(solution.gls.covariance @ _root(solution.prior)), _MANY, None
+    if solution.hidden.size:
+        hand_eye = np.eye(6 + int(chain.fitted.sum()))[:, :6]
+        yield UNSEEN, chain.of_model(hand_eye @ solution.hidden), _MANY, None
 
 
 def _root(covariance: Array) -> Array:

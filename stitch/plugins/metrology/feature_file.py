@@ -16,7 +16,8 @@ from stitch.session.reading.robot_description import require_known_keys
 from stitch.session.reading.text_files import read_toml, reason_of, shortened
 
 # Points count within so many spacings of the nominal surface, and a patch is so wide, where nobody says so.
-_WITHIN, _PATCH = 10.0, 15.0
+_WITHIN = 10.0
+_PATCH = 15.0
 _COMMON = ("name", "kind", "tolerance", "calibrated", "U")
 _KEYS = {
     "point": ("at", "normal", "radius", "within"),
@@ -101,26 +102,30 @@ class _Reader:
         name = row.get("name", f"{kind} {i + 1}")
         if not isinstance(name, str) or not name.isprintable():
             raise InputError(f"{where}: name is {shortened(name)}; to fix: write a word in quotes")
-        found = replace(self._stated(where, row), name=name, kind=kind, tolerance=self._tolerance(where, row))
+        lengths = {
+            key: self.scale * float(self._numbers(where, row, key, ()))
+            for key in ("nominal", "calibrated", "U")
+            if key in row
+        }
+        stated = Feature(
+            name,
+            kind,
+            tolerance=self._tolerance(where, row),
+            nominal=lengths.get("nominal"),
+            calibrated=lengths.get("calibrated"),
+            calibrated_U=lengths.get("U", 0.0),
+        )
         if kind == "distance":
             between = row.get("between")
             if not isinstance(between, list) or len(between) != 2 or between[0] == between[1]:
                 raise InputError(f"{where}: between is {shortened(between)}; to fix: name two features")
-            return replace(found, between=(str(between[0]), str(between[1])))
-        return self._placed(where, row, found)
+            return replace(stated, between=(str(between[0]), str(between[1])))
+        return self._placed(where, row, stated)
 
-    def _stated(self, where: str, row: dict[str, Any]) -> Feature:
-        """Return what any feature may state."""
-        numbers = {
-            key: None if key not in row else self.scale * float(self._numbers(where, row, key, ()))
-            for key in ("nominal", "calibrated")
-        }
-        U = self.scale * float(self._numbers(where, row, "U", ())) if "U" in row else 0.0
-        return Feature("", "", nominal=numbers["nominal"], calibrated=numbers["calibrated"], calibrated_U=U)
-
-    def _placed(self, where: str, row: dict[str, Any], found: Feature) -> Feature:
+    def _placed(self, where: str, row: dict[str, Any], stated: Feature) -> Feature:
         """Return a feature with its place and size."""
-        kind, T = found.kind, self.T_reference_part
+        kind = stated.kind
+        T = self.T_reference_part
         at = frames.transform(T, self.scale * self._numbers(where, row, "at", (3,))[None])[0]
         sizes = {
             key: self.scale * float(self._numbers(where, row, key, ())) if key in row else default
@@ -134,7 +139,8 @@ class _Reader:
         for key in ("diameter", "length"):
             if key in _KEYS[kind] and not sizes[key] > 0:
                 raise InputError(f"{where}: {key} is {shortened(row.get(key))}; to fix: write a length above zero")
-        cad, axis = None, np.array([0.0, 0.0, 1.0])
+        cad = None
+        axis = np.array([0.0, 0.0, 1.0])
         for direction in {"normal", "axis"} & set(_KEYS[kind]):
             axis = frames.rotate(T, self._numbers(where, row, direction, (3,))[None])[0]
             if not np.linalg.norm(axis) > 0:
@@ -145,7 +151,7 @@ class _Reader:
             at, axis = places[0], normals[0]
         radius = sizes["length"] / 2 if kind == "cylinder" else sizes["radius"]
         return replace(
-            found,
+            stated,
             at=at,
             axis=axis / np.linalg.norm(axis),
             size=sizes["diameter"],
@@ -212,17 +218,17 @@ class _Reader:
             return None
         shape = (2,) if isinstance(value, list) else ()
         numbers = self.scale * self._numbers(where, row, "tolerance", shape)
-        low, high = (-abs(float(numbers)), abs(float(numbers))) if not shape else (float(numbers[0]), float(numbers[1]))
+        low, high = map(float, numbers if shape else (-abs(numbers), abs(numbers)))
         if not low < high:
             raise InputError(f"{where}: tolerance is {shortened(value)}; to fix: write one number, or [lower, upper]")
         return low, high
 
     def _numbers(self, where: str, row: dict[str, Any], key: str, shape: tuple[int, ...]) -> Array:
         try:
-            found = np.array(row[key], float)
+            numbers = np.array(row[key], float)
         except (KeyError, TypeError, ValueError, OverflowError):
-            found = np.full(shape or (1,), np.nan)
-        if found.shape != shape or not np.isfinite(found).all():
+            numbers = np.full(shape or (1,), np.nan)
+        if numbers.shape != shape or not np.isfinite(numbers).all():
             form = {(): "a number", (3,): "[x, y, z]", (2,): "[lower, upper]", (4, 4): "four rows of four"}[shape]
             raise InputError(f"{where}: {key} is {shortened(row.get(key))}; to fix: write {form}")
-        return found
+        return numbers

@@ -97,7 +97,8 @@ class FittedFeature:
 
     def refit(self, points: Array) -> Array:
         """Return the values (q,) where the points that count lie at (N, 3)."""
-        surface, local = _surface_of(self.feature, self.at), (points - self.feature.at) @ self.feature.R
+        surface = _surface_of(self.feature, self.at)
+        local = (points - self.feature.at) @ self.feature.R
         theta = self.parameters
         for _ in range(_STEPS):
             residual, J, _ = surface(theta, local)
@@ -172,7 +173,7 @@ def nearest_on_mesh(mesh: Any, points: Array) -> tuple[Array, Array]:
     _, face, place = igl.point_mesh_squared_distance(
         np.ascontiguousarray(points, float), np.ascontiguousarray(mesh.vertices, float), faces
     )
-    return np.asarray(place), np.asarray(mesh.face_normals[face], float)
+    return place, mesh.face_normals[face]
 
 
 def nominal_parameters(feature: Feature) -> Array:
@@ -208,25 +209,28 @@ def fit_feature(feature: Feature, points: RunPoints, near: Indices) -> FittedFea
                 "to fix: correct its place, widen `within`, or scan it from more sides"
             )
         kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), _MOST_POINTS)).astype(np.int64)]
-        found = fit_points(feature, points.take(kept), theta)
-        kept = kept[np.abs(found.residual) <= _OUTLYING * mad_sigma(found.residual)]
-    return found
+        fit = fit_points(feature, points.take(kept), theta)
+        kept = kept[np.abs(fit.residual) <= _OUTLYING * mad_sigma(fit.residual)]
+    return fit
 
 
 def fit_points(feature: Feature, at: RunPoints, start: Array) -> FittedFeature:
     """Return a feature fitted to all of some points, from parameters to begin with."""
-    surface, local = _surface_of(feature, at), (at.points - feature.at) @ feature.R
-    theta = _solve(surface, local, start)
+    surface = _surface_of(feature, at)
+    local = (at.points - feature.at) @ feature.R
+    theta = least_squares(
+        lambda x: surface(x, local)[0], start, jac=lambda x: surface(x, local)[1], method="lm", x_scale="jac"
+    ).x
     residual, J, normal = surface(theta, local)
-    parameter_slopes = -np.linalg.pinv(J)
-    to_values = _value_slopes(feature, len(theta))
-    values = _values(feature, theta)
+    # The numbers are linear in the parameters.
+    zero = _values(feature, np.zeros(len(theta)))
+    to_values = np.column_stack([_values(feature, unit) - zero for unit in np.eye(len(theta))])
     return FittedFeature(
         feature=feature,
         at=at,
         parameters=theta,
-        values=values,
-        slopes=to_values @ parameter_slopes,
+        values=_values(feature, theta),
+        slopes=to_values @ -np.linalg.pinv(J),
         normal=normal @ feature.R.T,
         residual=residual,
     )
@@ -248,14 +252,6 @@ def _on_surface(feature: Feature, at: RunPoints, theta: Array, within: float) ->
     return bounded & same & (np.abs(residual) <= within)
 
 
-def _solve(surface: _Surface, local: Array, start: Array) -> Array:
-    """Return the parameters (k,) of least squares."""
-    found = least_squares(
-        lambda x: surface(x, local)[0], start, jac=lambda x: surface(x, local)[1], method="lm", x_scale="jac"
-    )
-    return found.x
-
-
 def _values(feature: Feature, theta: Array) -> Array:
     """(q,) numbers of a feature from its parameters (k,)."""
     if "x" not in NUMBERS[feature.kind]:
@@ -270,9 +266,3 @@ def position_of(feature: Feature, values: Array) -> Array:
     if "x" in NUMBERS[feature.kind]:
         return values[..., 1:]
     return feature.at + values[..., :1] * feature.axis
-
-
-def _value_slopes(feature: Feature, count: int) -> Array:
-    """(q, k) slopes of the numbers of a feature in its k parameters: the numbers are linear in them."""
-    zero = _values(feature, np.zeros(count))
-    return np.column_stack([_values(feature, unit) - zero for unit in np.eye(count)])

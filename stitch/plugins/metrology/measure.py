@@ -15,7 +15,6 @@ from stitch.errors import InputError
 
 if TYPE_CHECKING:
     from stitch.plugins.metrology.budget import MeasuredFeatures, MonteCarlo, Number
-    from stitch.run_data import RunData
 
 _SOURCES = 3  # that are shown of a budget
 _FEWEST_TRIALS = 200
@@ -51,30 +50,32 @@ def measure(
     from stitch.plugins.metrology.documents import measure_csv, measure_document
     from stitch.plugins.metrology.error_sources import place_errors
     from stitch.plugins.metrology.feature_file import read_features
+    from stitch.plugins.metrology.place_errors import point_sigmas, write_sigmas
     from stitch.system.files import whole_file
 
     _require_measure_options(features, trials, dfq)
     with lock_run_folder(run), show_activity("measuring: reading the scans"):
         state = load_run(run, effects_file, trust=trust)
         if features is None:
-            count = _write_point_sigmas(state, run)
-            say(f"stitched.ply has the column sigma for {count:,} points.")
+            sigma = point_sigmas(place_errors(state), state.fused)
+            write_sigmas(run / "stitched.ply", sigma)
+            say(f"stitched.ply has the column sigma for {len(sigma):,} points.")
             return
         wanted = read_features(features, state.session.length_unit, state.measurement.capture.spacing)
         places = place_errors(state)
-        found = measure_features(places, wanted)
-        checked = monte_carlo(places, wanted, found.fits, trials) if trials else None
-        document = measure_document(found, str(run), checked)
+        measured = measure_features(places, wanted)
+        checked = monte_carlo(places, wanted, measured.fits, trials) if trials else None
+        document = measure_document(measured, str(run), checked)
         write_json(document, run / "features.json")
         with whole_file(run / "features.csv") as file:
-            file.write_text(measure_csv(found), encoding="utf-8")
+            file.write_text(measure_csv(measured), encoding="utf-8")
         call_entry_points("stitch.measure_pages", document, run / "features.html")
         if dfq is not None:
-            _write_dfq(found, state.session.name, run, dfq)
+            _write_dfq(measured, state.session.name, run, dfq)
     if as_json:
         emit(to_json(document))
         return
-    _show_numbers(found, checked)
+    _show_numbers(measured, checked)
     show_files(run, ("features.json", "features.csv", "features.html"))
     show_next(f"Next: stitch verify {shlex.quote(str(run))} ARTEFACT")
 
@@ -88,47 +89,34 @@ def _require_measure_options(features: Path | None, trials: int, dfq: Path | Non
         raise InputError(f"--dfq {dfq}: to fix: name a file that ends in .dfq, in a folder that exists")
 
 
-def _write_point_sigmas(state: RunData, folder: Path) -> int:
-    """Write the column `sigma` of stitched.ply and return the number of its points."""
-    from stitch.plugins.metrology.error_sources import place_errors
-    from stitch.plugins.metrology.place_errors import point_sigmas, write_sigmas
-
-    sigma = point_sigmas(place_errors(state), state.fused)
-    write_sigmas(folder / "stitched.ply", sigma)
-    return len(sigma)
-
-
-def _write_dfq(found: MeasuredFeatures, part: str, run: Path, file: Path) -> None:
+def _write_dfq(measured: MeasuredFeatures, part: str, run: Path, file: Path) -> None:
     from stitch.plugins.metrology.documents import characteristics
     from stitch.plugins.watch.dfq_file import dfq_text
     from stitch.system.files import whole_file
 
     time = (run / "result.json").stat().st_mtime
-    text = dfq_text(part, characteristics(found), [(time, [n.value for n in found.numbers])])
+    text = dfq_text(part, characteristics(measured), [(time, [n.value for n in measured.numbers])])
     with whole_file(file) as scratch:
         scratch.write_bytes(text.encode("utf-8-sig"))
 
 
-def _show_numbers(found: MeasuredFeatures, checked: MonteCarlo | None) -> None:
+def _show_numbers(measured: MeasuredFeatures, checked: MonteCarlo | None) -> None:
     from stitch.plugins.metrology.error_sources import NOT_INCLUDED
     from stitch.plugins.metrology.verification import agreeing, verified_numbers
 
-    title = f"Numbers with U (k = 2), {found.length_unit} and rad"
+    title = f"Numbers with U (k = 2), {measured.length_unit} and rad"
     rows = [
-        (n.name, f"{n.value:.5g}", _digits(n.value - n.nominal), _digits(n.U), _budget_text(n)) for n in found.numbers
+        (n.name, f"{n.value:.5g}", f"{n.value - n.nominal:.2g}", f"{n.U:.2g}", _budget_text(n))
+        for n in measured.numbers
     ]
     show_table(title, ("number", "value", "off nominal", "U", "most of U"), rows, words=("number", "most of U"))
     if checked is not None:
         low, high = float(checked.ratio.min()), float(checked.ratio.max())
         say(f"Monte Carlo over propagation, {checked.trials:,} trials: {low:.3f} to {high:.3f}.")
-    numbers = verified_numbers(found)
+    numbers = verified_numbers(measured)
     if numbers:
         say(f"{agreeing(numbers)} of {len(numbers)} calibrated numbers agree within U and that of their calibration.")
     show_block([("not in U", text) for text in NOT_INCLUDED])
-
-
-def _digits(x: float) -> str:
-    return f"{x:.2g}"
 
 
 def _budget_text(n: Number) -> str:

@@ -94,19 +94,21 @@ class PlaceErrors:
     def responses(self, at: RunPoints, gradient: Array) -> "Responses":
         """What numbers with these slopes (q, N, 3) in the points, reference frame, answer to errors of the places."""
         views = np.zeros((len(gradient), len(self.poses), 6))
-        field, parameters = np.zeros((len(gradient), self.modes_of_field)), np.zeros((len(gradient), self.parameters))
+        field = np.zeros((len(gradient), self.modes_of_field))
+        parameters = np.zeros((len(gradient), self.parameters))
         noise = np.zeros((len(gradient), len(gradient)))
         for v in np.unique(at.view):
-            own = np.flatnonzero(at.view == v)
-            g = gradient[:, own]
-            views[:, v, :3] = np.cross(at.points[own] - self.centre, g).sum(axis=1)
+            of_view = np.flatnonzero(at.view == v)
+            g = gradient[:, of_view]
+            views[:, v, :3] = np.cross(at.points[of_view] - self.centre, g).sum(axis=1)
             views[:, v, 3:] = g.sum(axis=1)
-            index, seen = at.index[own], frames.rotate(frames.inverse(self.poses[v]), g)
-            field += np.einsum("qni,kni->qk", seen, self.field_modes(v, index))
+            index = at.index[of_view]
+            g_scanner = frames.rotate(frames.inverse(self.poses[v]), g)
+            field += np.einsum("qni,kni->qk", g_scanner, self.field_modes(v, index))
             if self.slopes is not None:
-                parameters += np.einsum("qni,kni->qk", seen, self.slopes.at(v, self.poses[v], index))
+                parameters += np.einsum("qni,kni->qk", g_scanner, self.slopes.at(v, self.poses[v], index))
             scan = self.capture.scans[v]
-            along = scan.noise * np.einsum("qni,ni->qn", seen, scan.normals[index])
+            along = scan.noise * np.einsum("qni,ni->qn", g_scanner, scan.normals[index])
             noise += along @ along.T
         return Responses(views.reshape(len(gradient), -1), parameters, field, noise)
 
@@ -116,24 +118,24 @@ class PlaceErrors:
         shapes = np.zeros((self.parameters + self.modes_of_field, len(at.points), 3))
         noise = np.zeros_like(at.points)
         for v in np.unique(at.view):
-            own = np.flatnonzero(at.view == v)
-            index = at.index[own]
-            seen = self.field_modes(v, index)
+            of_view = np.flatnonzero(at.view == v)
+            index = at.index[of_view]
+            modes = self.field_modes(v, index)
             if self.slopes is not None:
-                seen = np.concatenate([self.slopes.at(v, self.poses[v], index), seen])
-            shapes[:, own] = frames.rotate(self.poses[v], seen)
-            noise[own] = self.capture.scans[v].noise * at.normals[own]
+                modes = np.concatenate([self.slopes.at(v, self.poses[v], index), modes])
+            shapes[:, of_view] = frames.rotate(self.poses[v], modes)
+            noise[of_view] = self.capture.scans[v].noise * at.normals[of_view]
         return shapes, noise
 
     def moved(self, at: RunPoints, twists: Array, points: Array) -> Array:
         """Return points (M, N, 3) of some views, moved with their views by left twists (M, 6V) about the centre."""
         views, index = np.unique(at.view, return_inverse=True)
         T = frames.moved_about(self.centre, twists.reshape(len(twists), -1, 6)[:, views], np.eye(4))
-        out = np.empty_like(points)
+        moved = np.empty_like(points)
         for v in range(len(views)):
-            own = index == v
-            out[:, own] = points[:, own] @ T[:, v, :3, :3].transpose(0, 2, 1) + T[:, None, v, :3, 3]
-        return out
+            of_view = index == v
+            moved[:, of_view] = points[:, of_view] @ T[:, v, :3, :3].transpose(0, 2, 1) + T[:, None, v, :3, 3]
+        return moved
 
     @property
     def modes_of_field(self) -> int:
@@ -170,21 +172,23 @@ def _sigmas(places: PlaceErrors, points: Array, normals: Array, cell: float) -> 
     square = np.zeros(len(points))
     twists = [source.views.reshape(len(places.poses), 6, -1) for source in places.sources]
     for k, views in enumerate(sets):
-        own = np.flatnonzero(member.ravel() == k)
+        at = np.flatnonzero(member.ravel() == k)
         shares = views / max(views.sum(), 1)
         mean = np.concatenate([np.tensordot(shares, t, axes=1) for t in twists], axis=1)
-        moved = lever[own] @ mean + _of_points(places, views, shares, nearest[own], normals[own])
-        square[own] = np.einsum("nm,nm->n", moved, moved)
-        square[own] += sum(share**2 * scan.noise**2 for share, scan in zip(shares, places.capture.scans, strict=True))
+        moved = lever[at] @ mean + _of_points(places, views, shares, nearest[at], normals[at])
+        square[at] = np.einsum("nm,nm->n", moved, moved)
+        square[at] += sum(share**2 * scan.noise**2 for share, scan in zip(shares, places.capture.scans, strict=True))
     return np.sqrt(square)
 
 
 def _views_of(places: PlaceErrors, points: Array, cell: float) -> tuple[Mask, Indices]:
     """(N, V) which views see each point, at least the nearest one, and the nearest point of every view."""
-    distance, index = np.empty((len(points), len(places.poses))), np.empty((len(points), len(places.poses)), np.int64)
+    distance = np.empty((len(points), len(places.poses)))
+    index = np.empty((len(points), len(places.poses)), np.int64)
     for v, (scan, T) in enumerate(zip(places.capture.scans, places.poses, strict=True)):
         d, i = scan.tree.query(np.ascontiguousarray(frames.transform(frames.inverse(T), points)), k=1)
-        distance[:, v], index[:, v] = d.ravel(), i.ravel()
+        distance[:, v] = d.ravel()
+        index[:, v] = i.ravel()
     return (distance < cell) | (distance == distance.min(axis=1, keepdims=True)), index
 
 

@@ -68,7 +68,7 @@ def verify(
             raise InputError(f"{listed}: no feature is calibrated; to fix: write calibrated = … and U = … of some")
         chain = error_chain(state)
         measured = measure_features(place_errors(state, chain), wanted)
-        hand_eye = hand_eye_transfer(state.measurement, chain.capture, chain.freed, state.model)
+        hand_eye = hand_eye_transfer(state.measurement, chain.capture, chain.unconstrained, state.model)
         result = judge(measured, wanted.limits, hand_eye)
     document = verification_document(result, state, str(run), str(session), _valid_until(cell), notes)
     folder = output or Path("verify") / state.session.name

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from stitch.session.session import SessionData
 
 # Pairs that are shown, and the share of wrong names from which they are told.
-_PAIRS, _MISTAKEN = 3, 0.05
+_PAIRS = 3
+_MISTAKEN = 0.05
 
 _Folder = Annotated[
     Path, typer.Argument(metavar="SESSION|RUN", help="Session with planned views, or folder that `stitch run` wrote.")
@@ -95,17 +96,17 @@ def plan_views(
             else _cell_of_session(folder, part, size, field, start)
         )
     with show_activity("planning: what views would tell, pose by pose"):
-        found = plan_further_views(session, planned, wanted)
-    document = plan_document(found, planned.cell.model.T_mount)
+        plan = plan_further_views(session, planned, wanted)
+    document = plan_document(plan, planned.cell.model.T_mount)
     if output is not None:
         with whole_folder(output) as scratch:
             (scratch / "plan.json").write_text(to_json(document) + "\n", encoding="utf-8")
-            if found.proposed:
-                write_table(scratch / "views.csv", view_columns(found))
+            if plan.proposed:
+                write_table(scratch / "views.csv", view_columns(plan))
     if as_json:
         emit(to_json(document))
     else:
-        _show_plan(found, planned.cell, output)
+        _show_plan(plan, planned.cell, output)
 
 
 def _require_plan_options(views: int | None, size: float | None, field: float | None, output: Path | None) -> None:
@@ -130,18 +131,14 @@ def place_of(folder: Path, feature: str | None) -> str | None:
 
 
 def _plan_request(views: int | None, split: tuple[str, str] | None, halve: bool, feature: str | None) -> PlanRequest:
-    from stitch.effects.contract import find_effect
-    from stitch.plugins.metrology.planning.plan import PlanRequest
+    from stitch.plugins.metrology.planning.plan import plan_request
 
-    for name in split or ():
-        find_effect(name)
     if split is not None and split[0] == split[1]:
         raise InputError(f"--split {split[0]} {split[1]}: to fix: name two effects")
     at = None if feature is None else _option_numbers("--for", feature, "a place as x,y,z, as 0,20,150", (3, 6))
     if at is not None and not any(at[3:]) and len(at) > 3:
         raise InputError(f"--for {feature!r}: the normal has no direction; to fix: give x,y,z,nx,ny,nz, or x,y,z alone")
-    split_any = not halve and at is None
-    return PlanRequest(halve=halve or split is None, split=split, split_any=split_any, views=views, feature=at)
+    return plan_request(views, split, halve, at)
 
 
 def _cell_of_run(folder: Path, stated: Mapping[str, object], trust: bool) -> tuple[SessionData, PlannedCell]:
@@ -181,12 +178,12 @@ def _option_numbers(option: str, text: str, what: str, counts: tuple[int, ...] =
     import numpy as np
 
     try:
-        found = np.array([float(word) for word in text.split(",")])
+        numbers = np.array([float(word) for word in text.split(",")])
     except ValueError:
-        found = np.array([np.nan])
-    if not np.isfinite(found).all() or (counts and len(found) not in counts):
+        numbers = np.array([np.nan])
+    if not np.isfinite(numbers).all() or (counts and len(numbers) not in counts):
         raise InputError(f"{option} {text!r}: to fix: give {what}")
-    return found
+    return numbers
 
 
 def _show_plan(plan: Plan, cell: CellModel, output: Path | None) -> None:
@@ -239,14 +236,16 @@ def _show_outlook(plan: Plan, o: Outlook, cell: CellModel) -> None:
             say(f"{c.effect} would be taken for {c.taken_for} most often.")
     if unseen := [e.name for e in o.effects if not e.observable]:
         say(f"These views cannot show: {', '.join(unseen)}.")
-    needs = sorted({need for own in o.untestable.values() for need in own})
-    without = [f"{', '.join(name for name, own in o.untestable.items() if need in own)} ({need})" for need in needs]
+    needs = sorted({need for lacking in o.untestable.values() for need in lacking})
+    without = [
+        f"{', '.join(name for name, lacking in o.untestable.items() if need in lacking)} ({need})" for need in needs
+    ]
     if without:
         say(f"Not asked, with what that would need: {'; '.join(without)}.")
     # Pairs that are not told apart at usual size, or the hardest one.
     for pair in [pair for pair in o.pairs if pair.size > 1][:_PAIRS] or list(o.pairs[:1]):
-        own, rival, size = (pair.a, pair.b, pair.size_a) if pair.size_a > pair.size_b else (pair.b, pair.a, pair.size_b)
-        say(f"{own} is told from {rival} {_multiple_text(size)}.")
+        effect, rival = (pair.a, pair.b) if pair.size_a > pair.size_b else (pair.b, pair.a)
+        say(f"{effect} is told from {rival} {_multiple_text(pair.size)}.")
 
 
 def _source_shares(hand_eye: ExpectedHandEye) -> str:
@@ -261,8 +260,8 @@ def _detectable_text(e: EffectOutlook) -> str:
     if not e.detectable:
         return "–"
     name = min(e.detectable, key=lambda name: e.detectable[name] / e.usual[name])
-    told = format_amount(e.detectable[name], e.detectable[name] / 10, e.units[name])
-    return f"{name} {told._replace(sigma='–')}"
+    amount = format_amount(e.detectable[name], e.detectable[name] / 10, e.units[name])
+    return f"{name} {amount._replace(sigma='–')}"
 
 
 def _show_proposed(plan: Plan) -> None:
@@ -292,9 +291,9 @@ def _show_proposed(plan: Plan) -> None:
 def _no_views_reason(plan: Plan) -> str:
     if plan.session.robot is None or plan.session.joints is None:
         return "that needs [robot] in session.toml, and joint angles of all views"
-    own = None if plan.split is None or plan.now is None else _find_pair(plan.now, plan.split)
-    if own is not None and own.size <= 1:
-        return f"at usual size these views tell {own.a} from {own.b} as they are"
+    pair = None if plan.split is None or plan.now is None else _find_pair(plan.now, plan.split)
+    if pair is not None and pair.size <= 1:
+        return f"at usual size these views tell {pair.a} from {pair.b} as they are"
     return "no pose within reach brings more"
 
 

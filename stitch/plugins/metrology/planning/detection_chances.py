@@ -3,18 +3,13 @@
 What planned views would see is drawn: an effect of a given size, beside everything that poses err by otherwise. Every
 candidate effect is then judged as a diagnosis judges it (`diagnosis.evidence`), at the expected variances: family-wise
 p, Bayes factor, and odds over every rival in the model in which neither of the two is among the errors that remain, and
-over joints that follow by no law; not over a flange that errs in time by no law.
-What a diagnosis asks of views left out is not drawn.
+over joints that follow by no law; not over a flange that errs in time by no law. What a diagnosis asks of views left
+out is not drawn. The variances stay as they are expected, so that a test is a few small matrices and thousands of draws
+cost nothing.
 
-One candidate beside a model of planned views: its log Bayes factor and its F test on whatever these may see.
-
-The variances are the expected ones and stay as they are, so that a test is a few small matrices and thousands of
-draws cost nothing.
-
-From which size on planned views would tell one effect from another, pair by pair.
-
-Two effects are told apart by what of one's pattern the other cannot imitate, λ in units of the scatter; it grows with
-the square of the size. The other may take all its parameters, each up to about ten times its plausible size.
+Pair by pair, two effects are told apart by what of one's pattern the other cannot imitate, λ in units of the scatter;
+it grows with the square of the size. The other may take all its parameters, each up to about ten times its plausible
+size.
 """
 
 from collections.abc import Sequence
@@ -73,27 +68,15 @@ class CandidateTest:
 
     def evaluate(self, numbers: Array) -> tuple[Array, Mask]:
         """(D,) log Bayes factors, and whether they are significant, of D draws (n, D) of the channel."""
-        white, logs, significant = self.linear.whiten(numbers), [], np.zeros(numbers.shape[1], bool)
+        white = self.linear.whiten(numbers)
+        significant = np.zeros(numbers.shape[1], bool)
+        logs = []
         for form in self.forms:
             b = form.against @ white
             logs.append(0.5 * np.sum(b * (form.inverse @ b), axis=0) - form.occam + np.log(form.weight))
             significant |= np.sum((form.solved @ b) ** 2, axis=0) > form.limit
         highest = np.max(logs, axis=0)
-        return np.asarray(highest + np.log(np.sum(np.exp(logs - highest), axis=0))), significant
-
-
-def test_of_candidate(linear: LinearModel, candidate: Candidate, tests: int) -> CandidateTest:
-    """Build the test of a candidate that is one of so many.
-
-    Args:
-        linear: the candidate is none of its pose errors.
-    """
-    found = [
-        _form_test(linear, scale * form.columns * form.sizes, float(weight), tests, share)
-        for form, weight in zip(candidate.forms, form_weights(candidate), strict=True)
-        for scale, share in regime_of(linear).scales.items()
-    ]
-    return CandidateTest(linear, tuple(found))
+        return highest + np.log(np.sum(np.exp(logs - highest), axis=0)), significant
 
 
 def covariance_tests(linear: LinearModel, covariance: Array, sigmas: Array) -> tuple[CandidateTest, ...]:
@@ -141,16 +124,16 @@ class EffectPair:
 
 def effect_pairs(linear: LinearModel, candidates: Sequence[Candidate]) -> list[EffectPair]:
     """All pairs of some candidates, hardest first."""
-    out = []
+    pairs = []
     for i, a in enumerate(candidates):
         for b in candidates[i + 1 :]:
             base = linear.restricted(linear.causes - {a.name, b.name})
-            out.append(EffectPair(a.name, b.name, identifiable_size(base, a, b), identifiable_size(base, b, a)))
-    return sorted(out, key=lambda pair: -pair.size)
+            pairs.append(EffectPair(a.name, b.name, identifiable_size(base, a, b), identifiable_size(base, b, a)))
+    return sorted(pairs, key=lambda pair: -pair.size)
 
 
-def identifiable_size(base: LinearModel, own: Candidate, rival: Candidate) -> float:
-    """Multiple of the usual size from which `own` is told from `rival`: median over the forms it may have.
+def identifiable_size(base: LinearModel, effect: Candidate, rival: Candidate) -> float:
+    """Multiple of the usual size from which an effect is told from its rival: median over the forms it may have.
 
     Args:
         base: neither of the two is among its pose errors.
@@ -158,23 +141,20 @@ def identifiable_size(base: LinearModel, own: Candidate, rival: Candidate) -> fl
     whole = [form for form in rival.forms if form.keep.sum() == rival.forms[0].keep.sum()]
     imitations = [base.residual(form.columns) * form.sizes for form in whole]
     sizes = []
-    for form in own.forms:
+    for form in effect.forms:
         pattern = base.residual(form.columns) * form.sizes
         apart = min(separation(pattern, X) for X in imitations)
         sizes.append(float(np.sqrt(limits.SEPARATION_LAMBDA / apart)) if apart > 0 else float("inf"))
-    return _median(np.array(sizes), form_weights(own))
+    order = np.argsort(sizes)
+    weights = form_weights(effect)
+    share = np.cumsum(weights[order]) / weights.sum()
+    return sizes[order[np.searchsorted(share, 0.5)]]
 
 
 def separation(pattern: Array, rival: Array) -> float:
     """λ: squared length of what columns (n, p) of a pattern keep when a rival's (n, q) imitate it."""
     left = pattern - rival @ np.linalg.solve(rival.T @ rival + RIDGE * np.eye(rival.shape[1]), rival.T @ pattern)
     return float(np.sum(pattern * left))
-
-
-def _median(values: Array, weights: Array) -> float:
-    order = np.argsort(values)
-    share = np.cumsum(weights[order]) / weights.sum()
-    return float(values[order][np.searchsorted(share, 0.5)])
 
 
 @dataclass(frozen=True)
@@ -192,7 +172,8 @@ class ExpectedDiagnosis:
     """What a diagnosis of planned views would say, whatever these may see: all candidate effects beside the model."""
 
     def __init__(self, linear: LinearModel, candidates: Sequence[Candidate]) -> None:
-        self.linear, self.candidates = linear, [c for c in candidates if _is_visible(linear, c)]
+        self.linear = linear
+        self.candidates = [c for c in candidates if _is_visible(linear, c)]
         self.tests = max(len(self.candidates), 1)
         self._half = np.linalg.cholesky(linear.covariance[0])
         self._of_arm = set({} if linear.pose_errors is None else linear.pose_errors.effects)
@@ -202,9 +183,10 @@ class ExpectedDiagnosis:
 
     def chance(self, effect: str, shift: Array, rng: np.random.Generator) -> Chance:
         """Return what would be said of an effect that shifts the channel by (n, D), under all other errors."""
-        numbers = np.asarray(self._half @ rng.standard_normal(shift.shape) + shift)
-        own = [self._test({c.name}, c).evaluate(numbers) for c in self.candidates]
-        factor, significant = np.array([f for f, _ in own]), np.array([s for _, s in own])
+        numbers = self._half @ rng.standard_normal(shift.shape) + shift
+        answers = [self._test({c.name}, c).evaluate(numbers) for c in self.candidates]
+        factor = np.array([f for f, _ in answers])
+        significant = np.array([s for _, s in answers])
         best = self._best(numbers, np.where(significant & (factor > 0), factor, -np.inf))
         alarm = (significant & (factor > limits.LOG_BAYES_FACTOR)).any(axis=0)
         counts = {c.name: float(np.mean(alarm & (best == k))) for k, c in enumerate(self.candidates)}
@@ -217,9 +199,13 @@ class ExpectedDiagnosis:
         """A candidate where some effects are none of the errors that remain."""
         key = frozenset(removed & self._of_arm), candidate.name
         if key not in self._tests:
-            self._tests[key] = test_of_candidate(
-                self.linear.restricted(self.linear.causes - set(removed)), candidate, self.tests
+            linear = self.linear.restricted(self.linear.causes - removed)
+            forms = (
+                _form_test(linear, scale * form.columns * form.sizes, float(weight), self.tests, share)
+                for form, weight in zip(candidate.forms, form_weights(candidate), strict=True)
+                for scale, share in regime_of(linear).scales.items()
             )
+            self._tests[key] = CandidateTest(linear, tuple(forms))
         return self._tests[key]
 
     def _best(self, numbers: Array, factor: Array) -> Array:
@@ -236,46 +222,39 @@ class ExpectedDiagnosis:
             for other in np.flatnonzero(np.isfinite(factor[:, led]).any(axis=1)):
                 contested = led[np.isfinite(factor[other, led])]
                 if other != k:
-                    out[contested[~self._ahead(int(k), int(other), numbers[:, contested])]] = -1
+                    pair = [self.candidates[k], self.candidates[other]]
+                    names = {c.name for c in pair}
+                    ahead, rival = (self._test(names, c).evaluate(numbers[:, contested])[0] for c in pair)
+                    out[contested[~(ahead > rival + limits.ODDS)]] = -1
         return out
 
     def _ahead_of_laws(self, k: int, numbers: Array) -> Mask:
         """(D,) whether a candidate is ahead of joints that follow by no law (`joint_effect_covariances`)."""
-        own = self._test({self.candidates[k].name}, self.candidates[k])
+        test = self._test({self.candidates[k].name}, self.candidates[k])
         if k not in self._laws:
-            found, sizes = joint_effect_covariances(own.linear), np.sqrt(limits.UNMODELLED_VARIANCES)
-            self._laws[k] = [[covariance_tests(own.linear, C, sizes) for C in kind] for kind in found]
+            sizes = np.sqrt(limits.UNMODELLED_VARIANCES)
+            covariances = joint_effect_covariances(test.linear)
+            self._laws[k] = [[covariance_tests(test.linear, C, sizes) for C in kind] for kind in covariances]
         kinds = self._laws[k]
         if not kinds:
             return np.ones(numbers.shape[1], bool)
         # Of each law the log Bayes factor at the likeliest of its sizes.
         factors = [[np.max([size.evaluate(numbers)[0] for size in law], axis=0) for law in kind] for kind in kinds]
         rival = log_posterior_of_any(np.array([log_mean_exp(np.array(kind)) for kind in factors]))
-        return own.evaluate(numbers)[0] + np.log(limits.PRIOR_PHYSICAL / self.tests) > rival + limits.ODDS
-
-    def _ahead(self, k: int, other: int, numbers: Array) -> Mask:
-        pair = [self.candidates[k], self.candidates[other]]
-        own, rival = (self._test({c.name for c in pair}, c).evaluate(numbers)[0] for c in pair)
-        return own > rival + limits.ODDS
+        return test.evaluate(numbers)[0] + np.log(limits.PRIOR_PHYSICAL / self.tests) > rival + limits.ODDS
 
 
 def _is_visible(linear: LinearModel, candidate: Candidate) -> bool:
     """True if one parameter at its plausible size is half a sigma at the least, as a diagnosis has it."""
-    white = (
-        linear.restricted(linear.causes - {candidate.name}).residual(candidate.forms[0].columns)
-        * candidate.forms[0].sizes
-    )
+    form = candidate.forms[0]
+    white = linear.restricted(linear.causes - {candidate.name}).residual(form.columns) * form.sizes
     return bool((np.linalg.norm(white, axis=0) > limits.SEEN_SIGMAS).any())
 
 
 def usual_shifts(candidate: Candidate, rng: np.random.Generator, draws: int = DRAWS) -> Array:
     """(n, D) what an effect of usual size does: each parameter of a form that is drawn, as large as is plausible."""
-    chosen = rng.choice(len(candidate.forms), draws, p=form_weights(candidate))
-    out = []
-    for k in chosen:
-        form = candidate.forms[k]
-        out.append(form.columns @ (form.sizes * rng.choice([-1.0, 1.0], len(form.sizes))))
-    return np.array(out).T
+    chosen = [candidate.forms[k] for k in rng.choice(len(candidate.forms), draws, p=form_weights(candidate))]
+    return np.array([f.columns @ (f.sizes * rng.choice([-1.0, 1.0], len(f.sizes))) for f in chosen]).T
 
 
 @dataclass(frozen=True)
@@ -325,8 +304,8 @@ def view_outlook(
     Raises:
         NoResultError: a view that would not see the part, or views that do not overlap.
     """
-    found = simulate_views(session, cell)
-    linear = expected_model(found, cell)
+    views = simulate_views(session, cell)
+    linear = expected_model(views, cell)
     fitted_scatter = expected_scatter(linear, cell.scatter.noise) if fitted_scatter is None else fitted_scatter
     diagnosed = with_scatter(linear, fitted_scatter.fitted)
     candidates, missing = candidates_of(linear, empirical=False)
@@ -337,8 +316,8 @@ def view_outlook(
     ordinary = replace(believed, errors=believed.errors | usual)
     return Outlook(
         views=len(session.views),
-        hand_eye=expected_hand_eye(with_scatter(linear, believed), found, feature),
-        ordinary=expected_hand_eye(with_scatter(linear, ordinary), found, feature),
+        hand_eye=expected_hand_eye(with_scatter(linear, believed), views, feature),
+        ordinary=expected_hand_eye(with_scatter(linear, ordinary), views, feature),
         effects=_effect_outlooks(diagnosed, candidates, expected, chances),
         pairs=tuple(effect_pairs(diagnosed, expected.candidates)),
         untestable={name: needs for name, needs in missing.items() if name not in linear.model.effects},
@@ -349,12 +328,20 @@ def view_outlook(
 def _effect_outlooks(
     linear: LinearModel, candidates: Sequence[Candidate], expected: ExpectedDiagnosis, chances: bool
 ) -> tuple[EffectOutlook, ...]:
-    shown, rng, out = {c.name for c in expected.candidates}, np.random.default_rng(0), []
+    shown = {c.name for c in expected.candidates}
+    rng = np.random.default_rng(0)
+    outlooks = []
     for c in steps("effects", candidates):
         sizes = detectable_sizes(linear, c, expected.tests)
-        believable = {p.name: sizes[p.name] for p in c.parameters if p.name in sizes and sizes[p.name] < p.limit}
-        chance = expected.chance(c.name, usual_shifts(c, rng), rng) if chances and c.name in shown else None
-        own = [p for p in c.parameters if not p.grid]
-        usual, units = {p.name: p.typical for p in own}, {p.name: p.unit for p in own}
-        out.append(EffectOutlook(c.name, c.name in shown, believable, usual=usual, units=units, chance=chance))
-    return tuple(sorted(out, key=lambda e: (not e.observable, e.multiple)))
+        fitted = [p for p in c.parameters if not p.grid]
+        outlooks.append(
+            EffectOutlook(
+                name=c.name,
+                observable=c.name in shown,
+                detectable={p.name: sizes[p.name] for p in c.parameters if sizes.get(p.name, np.inf) < p.limit},
+                usual={p.name: p.typical for p in fitted},
+                units={p.name: p.unit for p in fitted},
+                chance=expected.chance(c.name, usual_shifts(c, rng), rng) if chances and c.name in shown else None,
+            )
+        )
+    return tuple(sorted(outlooks, key=lambda e: (not e.observable, e.multiple)))

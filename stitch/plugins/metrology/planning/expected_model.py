@@ -1,9 +1,8 @@
 """Planned views as a linear model: what their scans would say, with the scatter that is expected of them.
 
-How large errors of planned views would be found: what they would see is drawn, and fitted as a run fits it.
-
-No number of views excludes that an arm errs by a little more than its scatter; how much they leave open is what the
-covariance of a run counts. It is the posterior mean of the variances, averaged over draws.
+How large the errors of planned views would be found is drawn, and fitted as a run fits it: no number of views excludes
+that an arm errs by a little more than its scatter; how much they leave open is what the covariance of a run counts. It
+is the posterior mean of the variances, averaged over draws.
 """
 
 from __future__ import annotations
@@ -48,19 +47,26 @@ _POINTS = 9_000
 # Sides of a block that stands for a part of which only the size is known.
 _SIDES = np.array([1.0, 0.7, 0.5])
 # A ray is as wide as so many distances between the points; what lies so many rays' widths behind another is hidden.
-_RAY, _BEHIND = 2.0, 4.0
+_RAY = 2.0
+_BEHIND = 4.0
 # Cosine to the optical axis beyond which no scanner sees.
 _AHEAD = 0.3
 # Scatter of a good arm's flange, sigma per axis (rad, mm), and an area scanner's noise along the ray (mm): where nobody
 # states them. EN ISO 9283 repeatabilities of 0.05 to 0.1 mm are sigmas of 14 to 28 µm.
-USUAL_ROTATION, USUAL_TRANSLATION, USUAL_NOISE = 20e-6, 0.02, 0.02
-_SPACINGS, _SIGMAS = 1.5, 6.0  # of the gate
+USUAL_ROTATION = 20e-6
+USUAL_TRANSLATION = 0.02
+USUAL_NOISE = 0.02
+# Points farther apart than so many spacings and sigmas of the noise are not of one place.
+_SPACINGS = 1.5
+_SIGMAS = 6.0
 # Fewer points of a view say nothing of six directions.
 FEWEST = 60
 # Full angle of the field where nobody states it, and how far it reaches about the standoff.
-USUAL_FIELD_DEG, _DEPTH = 30.0, 0.3
+USUAL_FIELD_DEG = 30.0
+_DEPTH = 0.3
 # Of what a run's scanner saw, the share that counts as its field, and what is added to it.
-_SEEN, _MARGIN = 0.99, 0.1
+_SEEN = 0.99
+_MARGIN = 0.1
 # Draws among so many numbers at the most; a fit among more takes seconds, and the expected variances must do.
 _DRAWS = ((150, 3), (400, 1))
 
@@ -162,8 +168,10 @@ def expected_scan(part: PlannedPart, T_reference_scanner: Array, field: FieldOfV
     ahead = np.flatnonzero(points @ field.axis > _AHEAD * np.linalg.norm(points, axis=1))
     if not len(ahead):
         return ahead
-    points, normals = points[ahead], frames.rotate(T, part.normals[ahead])
-    slopes, reach = points[:, :2] / (points @ field.axis)[:, None], np.linalg.norm(points, axis=1)
+    points = points[ahead]
+    normals = frames.rotate(T, part.normals[ahead])
+    slopes = points[:, :2] / (points @ field.axis)[:, None]
+    reach = np.linalg.norm(points, axis=1)
     cosine = -np.einsum("ij,ij->i", points, normals) / reach
     inside = (np.abs(slopes) <= field.half).all(axis=1) & (reach > field.near) & (reach < field.far)
     return ahead[inside & (cosine > GRAZING_COSINE) & ~_is_occluded(slopes, reach)]
@@ -200,9 +208,12 @@ class Scatter:
 
 def stated_scatter(session: SessionData) -> Scatter:
     """Return the scatter that session.toml states, or the usual one; no errors that repeat."""
-    unit, stated, assumed = session.length_unit, session.repeatability, list[str]()
+    unit = session.length_unit
     mm = METRES["mm"] / METRES[unit]
-    rotation, translation, noise = stated.sigma_rotation, stated.sigma_translation, session.scanner.noise
+    rotation = session.repeatability.sigma_rotation
+    translation = session.repeatability.sigma_translation
+    noise = session.scanner.noise
+    assumed = list[str]()
     if translation is None:
         translation = USUAL_TRANSLATION * mm
         assumed.append(f"the flange scatters by {length_text(translation, unit)} per axis (robot.repeatability)")
@@ -229,12 +240,12 @@ def mean_scatter(linear: LinearModel, noise: float, variances: Sequence[tuple[Ar
     Args:
         noise: of the scans.
     """
-    both = []
-    for found in np.mean(variances, axis=0):
-        rotation, translation = np.sqrt(found[:NOISE])
-        errors = dict(zip(linear.component_names, map(float, found[NOISE + 1 :]), strict=True))
-        both.append(Scatter(float(rotation), float(translation), noise, float(found[NOISE]), errors))
-    return FittedScatter(*both)
+    scatters = []
+    for mean in np.mean(variances, axis=0):
+        rotation, translation = np.sqrt(mean[:NOISE])
+        errors = dict(zip(linear.component_names, map(float, mean[NOISE + 1 :]), strict=True))
+        scatters.append(Scatter(float(rotation), float(translation), noise, float(mean[NOISE]), errors))
+    return FittedScatter(*scatters)
 
 
 @dataclass(frozen=True)
@@ -254,8 +265,8 @@ class ExpectedModel(LinearModel):
     def refit(self) -> Self:
         """The variances that the remaining errors had in the model this was taken from."""
         source = self.full_model or self
-        own = dict(zip(source.component_names, source.null.variances[NOISE + 1 :], strict=True))
-        kept = [own[name] for name in self.component_names]
+        variance_of = dict(zip(source.component_names, source.null.variances[NOISE + 1 :], strict=True))
+        kept = [variance_of[name] for name in self.component_names]
         return self.at(np.append(source.null.variances[: NOISE + 1], kept))
 
     def at(self, variances: Array) -> Self:
@@ -366,19 +377,26 @@ def cell_of_session(
     Raises:
         InputError: a session that does not say where the scanner sits or how far it sees, or an unknown part.
     """
-    file, scanner = session.path / "session.toml", session.scanner
+    file = session.path / "session.toml"
+    scanner = session.scanner
     if scanner.T_mount is None:
         raise InputError(f"{file}: no scanner.pose; to fix: state roughly where the scanner sits")
     if scanner.standoff is None:
         raise InputError(f"{file}: no scanner.standoff; to fix: state the distance from scanner to part")
     if scanner.kind not in (None, "area", "line"):
         raise InputError(f"{file}: scanner.kind is {scanner.kind}, not a scan; to fix: stitch run, then stitch next")
-    scatter, assumed = stated_scatter(session), list[str]()
+    scatter = stated_scatter(session)
+    assumed = list[str]()
     half = np.tan(np.radians((field_deg or USUAL_FIELD_DEG) / 2))
     if field_deg is None:
         assumed.append(f"the scanner's field is {USUAL_FIELD_DEG:.0f}° wide (--field)")
-    near, far = scanner.standoff * (1 - _DEPTH), scanner.standoff * (1 + _DEPTH)
-    field = FieldOfView(np.array([half, half]), near, far, standoff=scanner.standoff, axis=scanner.optical_axis)
+    field = FieldOfView(
+        half=np.array([half, half]),
+        near=scanner.standoff * (1 - _DEPTH),
+        far=scanner.standoff * (1 + _DEPTH),
+        standoff=scanner.standoff,
+        axis=scanner.optical_axis,
+    )
     surface, words = _part_of_session(session, part, size_mm)
     cell = CellModel(Model(scanner.T_mount), surface, field, scatter)
     T_base_flange = np.array([view.T_base_flange for view in session.views])
@@ -427,8 +445,8 @@ def cell_of_state(state: RunData, points: Array, normals: Array) -> PlannedCell:
     )
     noise = float(np.nanmedian([scan.noise for scan in scans]))
     linear = linear_model_of(state)
-    told = mean_scatter(linear, noise, [(linear.null.variances, mean_variances(linear.mixed, linear.null))])
-    return PlannedCell(CellModel(state.model, thinned_surface(points, normals), field, told.believed), (), told)
+    scatter = mean_scatter(linear, noise, [(linear.null.variances, mean_variances(linear.mixed, linear.null))])
+    return PlannedCell(CellModel(state.model, thinned_surface(points, normals), field, scatter.believed), (), scatter)
 
 
 def _part_of_session(session: SessionData, part: Path | None, size_mm: float | None) -> tuple[PlannedPart, list[str]]:
@@ -468,11 +486,13 @@ def expected_hand_eye(
     Args:
         feature: (3,) reference frame: the place whose displacement U counts; None: the middle of what the views see.
     """
-    capture, T_mount = simulated.measurement.capture, linear.model.T_mount
-    sizes, components = linear.null.variances, linear.mixed.components[:, 0]
+    sizes = linear.null.variances
+    components = linear.mixed.components[:, 0]
     names = (*WHITE_COMPONENTS, *linear.component_names)
     columns = linear.reduce(linear.design)
-    prior = weak_prior([capture], [simulated.unconstrained], T_mount, linear.sizes[6:])
+    prior = weak_prior(
+        [simulated.measurement.capture], [simulated.unconstrained], linear.model.T_mount, linear.sizes[6:]
+    )
     scatter = np.einsum("c,cij->ij", sizes[: NOISE + 1], components[: NOISE + 1])
     weighed = generalised_fit(scatter, columns, prior)
     sources = {
@@ -483,17 +503,11 @@ def expected_hand_eye(
         sources["scanner field"] = weighed.gain @ field @ weighed.gain.T
     sources["unseen"] = weighed.covariance @ prior @ weighed.covariance
     covariance = np.sum(list(sources.values()), axis=0)
-    return ExpectedHandEye(covariance[:6, :6], _shares_of(sources, covariance), simulated.field_middle(feature))
-
-
-def _shares_of(sources: dict[str, Array], covariance: Array) -> dict[str, float]:
-    """Mean share of every source in the variance of the hand-eye, over its directions; they add up to 1.
-
-    The hand-eye is what the first six rows of all these covariances are of.
-    """
+    # The hand-eye is what the first six rows are of; mean share of every source in its variance, over its directions.
     scaled, unit = equilibrated(covariance[:6, :6])
     weight = np.linalg.inv(scaled) * np.outer(unit, unit)
-    return {name: float(np.sum(weight * own[:6, :6])) / 6 for name, own in sources.items()}
+    shares = {name: float(np.sum(weight * part[:6, :6])) / 6 for name, part in sources.items()}
+    return ExpectedHandEye(covariance[:6, :6], shares, simulated.field_middle(feature))
 
 
 def expected_scatter(linear: ExpectedModel, noise: float) -> FittedScatter:
@@ -505,12 +519,14 @@ def expected_scatter(linear: ExpectedModel, noise: float) -> FittedScatter:
     draws = next((count for size, count in _DRAWS if linear.mixed.size <= size), 0)
     if not draws or linear.pose_errors is None:
         return mean_scatter(linear, noise, [(linear.null.variances, linear.null.variances)])
-    half, rng, found = np.linalg.cholesky(linear.covariance[0]), np.random.default_rng(0), []
+    half = np.linalg.cholesky(linear.covariance[0])
+    rng = np.random.default_rng(0)
+    fits = []
     for _ in range(draws):
         mixed = replace(linear.mixed, z=(half @ rng.standard_normal(len(half)))[None])
         null = fit_variances(mixed, both_starts=True)
-        found.append((null.variances, mean_variances(mixed, null)))
-    return mean_scatter(linear, noise, found)
+        fits.append((null.variances, mean_variances(mixed, null)))
+    return mean_scatter(linear, noise, fits)
 
 
 def with_scatter(linear: ExpectedModel, scatter: Scatter) -> ExpectedModel:

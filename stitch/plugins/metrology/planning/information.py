@@ -36,10 +36,11 @@ class TwistChannel:
     def with_each(self, chosen: Sequence[int], others: Sequence[int]) -> Array:
         """(K, q, q) normal matrices of some views and one more."""
         half, white = self._white(chosen)
-        rows, more = _rows(chosen), _rows(others)
+        rows = _rows(chosen)
+        more = _rows(others)
         B = solve_triangular(half, self.covariance[np.ix_(rows, more)], lower=True).reshape(len(rows), -1, 6)
-        own = self.covariance.reshape(len(self.covariance) // 6, 6, -1, 6)[others, :, others]
-        left = own - np.einsum("rki,rkj->kij", B, B)
+        alone = self.covariance.reshape(len(self.covariance) // 6, 6, -1, 6)[others, :, others]
+        left = alone - np.einsum("rki,rkj->kij", B, B)
         columns = self.columns[more].reshape(len(others), 6, -1) - np.einsum("rki,rq->kiq", B, white)
         fresh = np.linalg.solve(np.linalg.cholesky(left), columns)
         return white.T @ white + fresh.transpose(0, 2, 1) @ fresh

@@ -33,7 +33,9 @@ from stitch.session.session import SessionData
 from stitch.system.threads import library_threads_off
 
 # Points on the part and correspondences of a view are few here: there are many pairs, and noise is not what limits.
-_SAMPLES, _POINTS, _MIN_VIEW_SAMPLES = 250, 4000, 25
+_SAMPLES = 250
+_POINTS = 4000
+_MIN_VIEW_SAMPLES = 25
 # Keeps what too few views leave open finite: a radian, and many times any part.
 _OPEN = 1e-8
 # Of a feature so small a share of U is asked for that every view counts that brings something.
@@ -41,28 +43,24 @@ _MUCH = 0.1
 # Whatever the unit, no logarithm of a length comes near.
 _NEVER = -50.0
 # Reached, but for rounding; and what a view must bring to be worth taking.
-_REACHED, _WORTH = 1 - 1e-6, 0.01
+_REACHED = 1 - 1e-6
+_WORTH = 0.01
 # Among views that bring nearly the same the nearest is taken.
 _NEARLY = 0.95
 _SWEEPS = 2
 # Fewer views give no hand-eye: two motions about different axes are the least (Tsai & Lenz 1989).
 _MIN_PRESENT_VIEWS = 3
 # Views that are tried; and proposed, beside present ones or where there are none, unless a number is asked for.
-_TRIED, _MORE, _ALL = 40, 6, 12
+_TRIED = 40
+_MORE = 6
+_ALL = 12
 # For one feature as many are tried again, so many times, close to those that were chosen.
 _CLOSER = 2
 # Effects that would be detected so often at usual size are worth telling apart; so many hard pairs are looked at, and
 # what a single view must bring to one of them.
-_DETECTED, _PAIRS, _BETTER = 0.5, 6, 0.02
-
-
-@dataclass(frozen=True)
-class EffectColumns:
-    """One effect of a pair: its columns at plausible sizes, and the forms that it may have."""
-
-    columns: Array  # (6N, P)
-    forms: Array  # (F, P) bool: parameters that are free
-    weights: Array  # (F,) share of the prior of each
+_DETECTED = 0.5
+_PAIRS = 6
+_BETTER = 0.02
 
 
 @dataclass(frozen=True)
@@ -77,26 +75,29 @@ class PossibleViews:
     def channel(self, foreign_effects: Sequence[str] = (), columns: Sequence[Array] = ()) -> TwistChannel:
         """Hand-eye, a common motion, effects in use, further columns; `foreign_effects` are such as no arm has of
         itself."""
-        m, freed, model = self.simulated.measurement, self.simulated.unconstrained, self.cell.model
-        g = freed.overlaps.gram
+        m = self.simulated.measurement
+        unconstrained = self.simulated.unconstrained
+        model = self.cell.model
+        g = unconstrained.overlaps.gram
         errors = prior_pose_errors([m], model, [g.centre])
         errors = errors.restricted(errors.causes - set(foreign_effects))
         sizes = self.scatter.variances(errors.names)
         covariance = np.einsum("c,cij->ij", sizes[3:], errors.components) + self._white()
-        field = field_scatter(m, freed)
+        field = field_scatter(m, unconstrained)
         covariance += field @ field.T
         # Of every view against all others.
         information = np.zeros((g.views, 6, 6))
         for side in (0, 1):
             np.add.at(information, g.pairs[:, side].astype(np.int64), g.matrix)
         covariance += noise_of(information, sizes[2] * g.variance, max(g.lever, 1e-9))
-        used = view_columns(m, model, freed) * sizes_of(model.terms)
+        used = view_columns(m, model, unconstrained) * sizes_of(model.terms)
         common = np.tile(np.eye(6), (g.views, 1))
-        own = hand_eye_jacobian(m.capture.hand_eye_frames(model.T_mount), g.centre)
-        return TwistChannel(covariance, np.hstack([own, common, used, *columns]))
+        hand_eye = hand_eye_jacobian(m.capture.hand_eye_frames(model.T_mount), g.centre)
+        return TwistChannel(covariance, np.hstack([hand_eye, common, used, *columns]))
 
-    def effect(self, name: str) -> EffectColumns:
-        """Return how the views answer to an effect of the library.
+    def effect(self, name: str) -> tuple[Array, Array, Array]:
+        """Return how the views answer to an effect of the library: columns (6N, P) at plausible sizes, the forms that
+        it may have (F, P) bool, parameters that are free, and each one's share of the prior (F,).
 
         Raises:
             InputError: one that is not known, or that these views cannot have.
@@ -106,7 +107,7 @@ class PossibleViews:
         term = term_of(measurement, effect)
         response = view_responses(measurement, self.cell.model, [term], self.simulated.unconstrained)[0].columns
         masks = free_masks(term)
-        return EffectColumns(response * term.typical, np.array(masks), weights_of_masks(masks))
+        return response * term.typical, np.array(masks), weights_of_masks(masks)
 
     def _white(self) -> Array:
         """(6N, 6N) of the flange's scatter, view by view."""
@@ -156,18 +157,19 @@ class SplitPair:
 
     channel: TwistChannel
     names: tuple[str, str]
-    effects: tuple[EffectColumns, EffectColumns]  # their columns are the channel's last
+    forms: tuple[Array, Array]  # (F, P) bool of each: parameters that are free; their columns are the channel's last
+    weights: tuple[Array, Array]  # (F,) share of the prior of each form
 
     def progress(self, normal: Array) -> Array:
         """(...) share of the forms that are told apart, of the effect that is told worse; 1 if all are."""
-        counts = [e.columns.shape[1] for e in self.effects]
-        at = normal.shape[-1] - sum(counts)
-        a, b = slice(at, at + counts[0]), slice(at + counts[0], at + sum(counts))
-        both = []
-        for own, rival, effect in ((a, b, self.effects[0]), (b, a, self.effects[1])):
-            apart = separations(normal, own, rival) @ effect.forms.T
-            both.append(np.minimum(apart / SEPARATION_LAMBDA, 1.0) @ effect.weights)
-        return np.minimum(*both)
+        middle = normal.shape[-1] - self.forms[1].shape[1]
+        a = slice(middle - self.forms[0].shape[1], middle)
+        b = slice(middle, normal.shape[-1])
+        shares = []
+        for pattern, rival, forms, weights in zip((a, b), (b, a), self.forms, self.weights, strict=True):
+            apart = separations(normal, pattern, rival) @ forms.T
+            shares.append(np.minimum(apart / SEPARATION_LAMBDA, 1.0) @ weights)
+        return np.minimum(*shares)
 
 
 Goal = KnownPlace | SplitPair
@@ -191,7 +193,8 @@ def choose_views(goals: Sequence[Goal], joints: Array, present: int, most: int) 
         present: how many these are.
         most: views at the most.
     """
-    before, chosen = list(range(present)), list[int]()
+    before = list(range(present))
+    chosen = list[int]()
     now = present_progress(goals, before)
     while len(chosen) < most and now < _REACHED:
         others = [k for k in range(present, len(joints)) if k not in chosen]
@@ -200,18 +203,15 @@ def choose_views(goals: Sequence[Goal], joints: Array, present: int, most: int) 
         gained = mean_progress(goals, [*before, *chosen], others)
         if gained.max() - now < _WORTH:
             break
-        k = _nearest_worthwhile(others, gained, now, joints, [*before, *chosen][-1])
+        # Of those that bring nearly the most, the one that is nearest to the view before.
+        good = np.flatnonzero(gained - now >= _NEARLY * (gained.max() - now))
+        last = joints[[*before, *chosen][-1]]
+        k = others[int(good[np.argmin([float(np.abs(joints[others[int(i)]] - last).sum()) for i in good])])]
         chosen.append(k)
         now = float(gained[others.index(k)])
     for _ in range(_SWEEPS):
         chosen, now = _exchange_views(goals, joints, before, chosen, now)
     return travel_order(joints, present - 1, _without_redundant(goals, before, chosen, now))
-
-
-def _nearest_worthwhile(others: Sequence[int], gained: Array, now: float, joints: Array, last: int) -> int:
-    good = np.flatnonzero(gained - now >= _NEARLY * (gained.max() - now))
-    travel = [float(np.abs(joints[others[int(i)]] - joints[last]).sum()) for i in good]
-    return others[int(good[np.argmin(travel)])]
 
 
 def _exchange_views(
@@ -239,12 +239,14 @@ def _without_redundant(goals: Sequence[Goal], before: list[int], chosen: list[in
 
 def travel_order(joints: Array, last: int, chosen: Sequence[int]) -> list[int]:
     """Views of joint angles (V, n), each the nearest to the one before, beginning at the view `last`."""
-    out, left, at = list[int](), list(chosen), last
+    order = list[int]()
+    left = list(chosen)
+    at = last
     while left:
         at = min(left, key=lambda k: float(np.abs(joints[k] - joints[at]).sum()))
         left.remove(at)
-        out.append(at)
-    return out
+        order.append(at)
+    return order
 
 
 @dataclass(frozen=True)
@@ -261,6 +263,17 @@ class PlanRequest:
     def place(self) -> Array | None:
         """(3,) of the feature, reference frame."""
         return None if self.feature is None else self.feature[:3]
+
+
+def plan_request(views: int | None, split: tuple[str, str] | None, halve: bool, feature: Array | None) -> PlanRequest:
+    """Return what is asked: without a word both to halve U and to split the hardest pair.
+
+    Raises:
+        InputError: an effect that is not known.
+    """
+    for name in split or ():
+        find_effect(name)
+    return PlanRequest(halve or split is None, split, not halve and feature is None, views, feature)
 
 
 @dataclass(frozen=True)
@@ -304,21 +317,18 @@ def plan_further_views(session: SessionData, planned: PlannedCell, request: Plan
         NoResultError: views that would not see the part.
     """
     with library_threads_off():
-        cell, present = planned.cell, len(session.views)
-        now = (
-            view_outlook(session, cell, planned.fitted_scatter, request.place)
-            if present >= _MIN_PRESENT_VIEWS
-            else None
-        )
+        cell = planned.cell
+        enough = len(session.views) >= _MIN_PRESENT_VIEWS
+        now = view_outlook(session, cell, planned.fitted_scatter, request.place) if enough else None
         empty = Plan(session, planned.assumed, now, request.split, (), None)
         if session.robot is None or session.joints is None or not (request.halve or request.split or request.split_any):
             return empty
-        told = planned.fitted_scatter if now is None else now.fitted_scatter
-        goals, chosen, joints = _search_views(session, cell, told.believed if told else cell.scatter, now, request)
+        errors = planned.fitted_scatter if now is None else now.fitted_scatter
+        goals, chosen, joints = _search_views(session, cell, errors.believed if errors else cell.scatter, now, request)
         if not chosen:
             return empty
         further = with_views(session, list(joints))
-        after = view_outlook(further, cell, told, request.place, chances=now is None)
+        after = view_outlook(further, cell, errors, request.place, chances=now is None)
         split = next((goal.names for goal in goals if isinstance(goal, SplitPair)), None)
         place_now = next((goal.now for goal in goals if isinstance(goal, KnownPlace) and np.isfinite(goal.now)), None)
         return replace(
@@ -380,15 +390,16 @@ def _place_goal(views: PossibleViews, request: PlanRequest) -> KnownPlace:
 
 
 def _split_goal(views: PossibleViews, names: tuple[str, str]) -> SplitPair:
-    a, b = (views.effect(name) for name in names)
-    return SplitPair(views.channel(names, (a.columns, b.columns)), names, (a, b))
+    columns, forms, weights = zip(*(views.effect(name) for name in names), strict=True)
+    return SplitPair(views.channel(names, columns), names, forms, weights)
 
 
 def _hardest_pair_goal(views: PossibleViews, now: Outlook) -> list[Goal]:
     """The pair of detectable effects that is told apart worst, of those that some view improves."""
-    seen = {e.name for e in now.effects if e.chance is not None and e.chance.detected > _DETECTED}
-    hard = [pair for pair in now.pairs if {pair.a, pair.b} <= seen and pair.size > 1][:_PAIRS]
-    present, others = range(now.views), range(now.views, len(views.session.views))
+    detected = {e.name for e in now.effects if e.chance is not None and e.chance.detected > _DETECTED}
+    hard = [pair for pair in now.pairs if {pair.a, pair.b} <= detected and pair.size > 1][:_PAIRS]
+    present = range(now.views)
+    others = range(now.views, len(views.session.views))
     for pair in hard:
         goal = _split_goal(views, (pair.a, pair.b))
         if mean_progress([goal], present, others).max() > present_progress([goal], present) + _BETTER:

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 
 from stitch.api.verbs import stored_cloud, stored_state
-from stitch.effects.contract import find_effect
 from stitch.errors import InputError
 from stitch.plugins.metrology.planning.expected_model import PlannedCell, cell_of_session, cell_of_state
-from stitch.plugins.metrology.planning.plan import Plan, PlanRequest, plan_further_views
+from stitch.plugins.metrology.planning.plan import Plan, plan_further_views, plan_request
 from stitch.run_data import RunData
 from stitch.session.session import SessionData
 
@@ -48,11 +47,8 @@ def plan(
         >>> outlook.views
         5
     """
-    for name in split or ():
-        find_effect(name)
     at = None if feature is None else np.asarray(feature, float).reshape(-1)
-    split_any = not halve and at is None
-    wanted = PlanRequest(halve=halve or split is None, split=split, split_any=split_any, views=views, feature=at)
+    wanted = plan_request(views, split, halve, at)
     if isinstance(cell, RunData):
         return plan_further_views(cell.session, _cell_of_run(cell), wanted)
     planned = cell_of_session(cell, None if part is None else Path(part), size, field)
