@@ -43,8 +43,9 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.urdf_file import to_urdf
 from stitch.plugins.intake.cloud_pairs import pairings
-from stitch.plugins.intake.convention_choice import choose_convention, choose_mounting
+from stitch.plugins.intake.convention_choice import choose_convention
 from stitch.plugins.intake.first_session import capture_of
+from stitch.plugins.intake.mounting import choose_mounting
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.readings import StatedTable, all_readings, candidate_units
 from stitch.screening.hypotheses import ORDERS

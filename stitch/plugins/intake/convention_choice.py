@@ -14,9 +14,8 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.cloud_pairs import Pairing
-from stitch.plugins.intake.folder_files import Because, Guess
 from stitch.plugins.intake.layouts import MM, POSE_UNITS
-from stitch.plugins.intake.readings import JOINT_ANGLES, Reading
+from stitch.plugins.intake.readings import Reading
 from stitch.screening.background import find_standing_scene
 from stitch.screening.closing import CLEARLY_BETTER, fit_centroids, surface_misfit
 from stitch.screening.conventions import equivalent_hypotheses, fit_hypotheses
@@ -25,8 +24,6 @@ from stitch.screening.motions import FEWEST, ROTATION, TRANSLATION_M, RelativeSc
 from stitch.session.capture import Capture
 from stitch.session.session import Mount
 from stitch.system.process import steps
-
-# A way to take clouds and table together: how rotations read, unit, direction, which row to which cloud.
 
 
 @dataclass(frozen=True)
@@ -73,9 +70,6 @@ def all_interpretations(
         for unit in ([reading.layout.length_unit] if reading.layout.length_unit else units)
         for carries in directions
     ]
-
-
-# Ways that stitch alike: poses that differ by one fixed frame before or behind them cannot be told apart by scans.
 
 
 def equivalent_interpretations(
@@ -136,8 +130,6 @@ _SHORT = 4
 _CLOSED = 0.5
 # A fitted scale belongs to a unit within this factor: 10 and 25.4 lie 2.5 apart.
 _UNIT_FACTOR = 1.5
-# Scanner or part sits at the flange if it lies this much nearer to its frame's origin than the other.
-_NEARER = 1.5
 
 
 @dataclass(frozen=True)
@@ -303,70 +295,6 @@ def _flange_distances(capture: Capture, score: ConventionScore) -> tuple[float, 
     used = range(len(poses)) if hypothesis.used is None else hypothesis.used
     centres = [frames.transform(poses[v], capture.scans[v].points.mean(axis=0)[None])[0] for v in used]
     return float(np.linalg.norm(score.T_mount[:3, 3])), float(np.linalg.norm(np.mean(centres, axis=0)))
-
-
-# Which of scanner and part the robot carries, and whether poses are of the flange in the base or the other way round.
-#
-# Scans cannot tell "the scanner at the flange" from "the part at the flange, poses inverted": both move alike. What
-# tells them apart is where things lie: what sits at the flange is near its origin, what stands in the cell is not near
-# that of the base.
-
-_WORDS = {"eye_in_hand": "the scanner sits at the flange", "eye_to_hand": "the part sits at the flange"}
-
-
-@dataclass(frozen=True)
-class Mounting:
-    """How the poses are to be taken."""
-
-    mount: str
-    inverted: bool  # the table holds T_flange_base
-    guess: Guess
-
-    def flange(self, T: Array) -> Array:
-        """T_base_flange from poses as the table has them, (..., 4, 4)."""
-        return frames.inverse(T) if self.inverted else T
-
-
-def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool | None) -> Mounting:
-    """Settle who carries the scanner: as a person states it, else by where things lie.
-
-    Args:
-        mount, inverse: as stated; None where they are not.
-    """
-    reading = decided.best.interpretation.reading
-    of_joints = reading.rotation == JOINT_ANGLES
-    direct = "eye_in_hand" if decided.best.interpretation.carries else "eye_to_hand"
-    other = "eye_to_hand" if decided.best.interpretation.carries else "eye_in_hand"
-    away = (decided.scanner_away, decided.part_away)
-    scanner, part = (f"{mm:.0f} mm" for mm in away)
-    placed = (
-        f"under it the scanner lies {scanner} from the origin of its frame and the part {part} from that of its own"
-    )
-    told = True
-    by: Because = "file"
-    if mount is not None:
-        chosen, reason = mount, "stated with --mount"
-    elif reading.layout.turntable:
-        chosen, reason = "eye_to_hand", "a turntable carries the part"
-    elif inverse is not None or of_joints:
-        chosen = other if inverse else direct
-        reason = "the direction of the poses is " + ("stated" if inverse is not None else "known from joint angles")
-    elif decided.determined and max(away) > _NEARER * min(away):
-        chosen = "eye_in_hand" if min(away) == decided.scanner_away else "eye_to_hand"
-        reason = f"{placed}: what lies nearer sits at the flange"
-        by = "usual"
-    elif decided.determined:
-        chosen, reason, told = direct, f"{placed}; poses are usually those of the flange in the base", False
-    else:
-        chosen, reason, told = direct, "as poses usually are", False
-    inverted = chosen != direct
-    value = f"{chosen}, {_WORDS[chosen]}; the poses are {'T_flange_base' if inverted else 'T_base_flange'}"
-    rest = other if chosen == direct else direct
-    runner_up = f"{rest} with poses {'inverted' if not inverted else 'as they are'}" if mount is None else None
-    return Mounting(chosen, inverted, Guess("mount", value, reason, told, "--mount", runner_up, by))
-
-
-# Scans that lie in one frame already: moved there by the scanner's software, so that no pose is left to tell.
 
 
 def require_no_background(folder: Path, capture: Capture, scale: float) -> None:

@@ -17,17 +17,16 @@ from stitch.plugins.intake.convention_choice import (
     ConventionChoice,
     ConventionScore,
     Interpretation,
-    Mounting,
     all_interpretations,
     choose_by_surfaces,
     choose_convention,
-    choose_mounting,
     fitted_scale,
     require_no_background,
     require_own_frames,
     weigh_doubts,
 )
-from stitch.plugins.intake.folder_files import Because, FolderFiles, Guess, angles_in_names, find_folder_files
+from stitch.plugins.intake.folder_files import FolderFiles, angles_in_names, find_folder_files
+from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.layouts import (
     CLOUD_UNITS,
     MM,
@@ -35,21 +34,21 @@ from stitch.plugins.intake.layouts import (
     cloud_units,
     covariate_columns,
     kept_column,
-    size_words,
     unit_pairs,
 )
+from stitch.plugins.intake.mounting import Mounting, choose_mounting
 from stitch.plugins.intake.raw_poses import RawPoses, header_poses
 from stitch.plugins.intake.readings import (
     Reading,
-    StatedTable,
     all_readings,
     candidate_units,
     doubted_readings,
     mixed_readings,
-    require_known_word,
     with_joints_of,
 )
-from stitch.plugins.intake.scan_targets import TargetSearch, find_folder_targets, target_motions
+from stitch.plugins.intake.scan_targets import find_folder_targets, target_motions
+from stitch.plugins.intake.session_guesses import session_guesses
+from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.plugins.intake.stops import rows_with_scans
 from stitch.plugins.intake.sudden_change import require_no_change
 from stitch.screening.motions import RelativeScans, register_scan_pairs
@@ -61,169 +60,6 @@ from stitch.session.reading.scan_headers import poses_in_scans
 from stitch.session.session import Cloud, Mount, Scanner, SessionData, Sighting, View
 from stitch.session.thinning import distinct_points, thin_session
 from stitch.system.process import steps
-
-# What a person states with flags, of a table of poses and of the folder it lies in; None where nothing is stated.
-
-_MOUNTS = ("eye_in_hand", "eye_to_hand")
-
-
-@dataclass(frozen=True)
-class StatedFolder(StatedTable):
-    """And what its folder holds beside it, checked."""
-
-    poses: Path | None = None
-    cloud_unit: str | None = None
-    mount: str | None = None
-    orientation: tuple[float, ...] = ()  # of all poses, where the table has x, y, z alone
-    within: tuple[float, ...] = ()  # corners of the box that counts, low first, scanner frame, unit of the clouds
-    targets: TargetSearch = field(default_factory=TargetSearch)  # boards and balls in the scans
-
-    def __post_init__(self) -> None:
-        """As of the table."""
-        super().__post_init__()
-        require_known_word("--cloud-unit", self.cloud_unit, CLOUD_UNITS)
-        require_known_word("--mount", self.mount, _MOUNTS)
-        if self.within and (len(self.within) != 6 or not (self.box[0] < self.box[1]).all()):
-            raise InputError("--within: to fix: state the lowest and the highest corner, x,y,z,x,y,z, of a box")
-
-    @property
-    def box(self) -> Array:
-        """The corners (2, 3) of the box that counts; (0, 3) where everything does."""
-        return np.array(self.within, float).reshape(-1, 3)
-
-    def accepts(self, raw: RawPoses) -> bool:
-        """Whether the columns or the orientation stated make poses of rows that no layout accepts."""
-        return len(self.columns) == raw.numbers.shape[1] or (len(self.orientation) > 0 and raw.numbers.shape[1] >= 3)
-
-    @property
-    def carries(self) -> bool | None:
-        """Whether the poses as written carry the mount's frame, where mount and direction are both stated."""
-        if self.mount is None or self.inverse is None:
-            return None
-        return (self.mount == "eye_in_hand") != self.inverse
-
-
-# The guesses of a first session, each with its reason in words.
-
-
-def session_guesses(
-    files: FolderFiles,
-    raw: RawPoses,
-    decided: ConventionChoice,
-    clouds: Sequence[Array],
-    own_units: Sequence[str],
-    stated: StatedFolder,
-) -> tuple[Guess, ...]:
-    """What was found and how it is read; of the mount speaks `choose_mounting`."""
-    return (
-        _files_guess(files, raw),
-        _pairing_guess(decided),
-        _columns_guess(raw, decided, stated),
-        _rotation_guess(decided, stated),
-        _length_unit_guess(decided, stated),
-        _cloud_unit_guess(files, decided, clouds, own_units, stated),
-    )
-
-
-def score_words(score: ConventionScore) -> str:
-    """What the scans say of a way."""
-    if not np.isfinite(score.misfit):
-        return "profiles do not tell it"
-    if not score.meets:
-        return "no two views meet"
-    motions = "" if score.closed is None else f", {100 * score.closed:.0f} % of the scanner's motions close"
-    return f"a rough fit leaves {score.misfit:.2f} mm{motions}"
-
-
-def _files_guess(files: FolderFiles, raw: RawPoses) -> Guess:
-    clouds = f"{len(files.clouds)} clouds {files.clouds[0].name} … {files.clouds[-1].name}"
-    aside = f"; left aside: {', '.join(f.name for f in files.unused[:5])}" if files.unused else ""
-    ends = dict.fromkeys((*files.poses[:1], *files.poses[-1:]))  # one, where there is one file
-    found = f"{clouds}, {len(raw.numbers)} poses in {' … '.join(file.name for file in ends) or 'their headers'}"
-    return Guess("files", found, f"{raw.words}{aside}", True, "--poses")
-
-
-def _pairing_guess(decided: ConventionChoice) -> Guess:
-    pairing = decided.best.interpretation.pairing
-    if pairing.by_name:
-        return Guess("pairing", pairing.words, "cloud and pose bear the same name, time or number", True, "--poses")
-    reason = f"names do not tell it; under it {score_words(decided.best)}"
-    flag = "a column with the cloud's file name"
-    return Guess("pairing", pairing.words, reason, decided.determined, flag, by="scans")
-
-
-def _columns_guess(raw: RawPoses, decided: ConventionChoice, stated: StatedFolder) -> Guess:
-    layout = decided.best.interpretation.reading.layout
-    beside = list(covariate_columns(layout, range(len(raw.numbers)), raw.time_s))
-    words = f"; beside the poses {', '.join(beside)}" if beside else ""
-    taken = ", ".join(f"{x:.10g}" for x in layout.offset)
-    words += f"; {taken} taken off all positions, as they are those of a site" if taken else ""
-    words += f"; {raw.clock.words}" if raw.clock is not None and raw.clock.words else ""
-    if stated.columns:
-        return Guess("columns", ", ".join(stated.columns), f"stated with --columns{words}", True, "--columns")
-    reason = ("the file names them" if layout.named else "told by their values") + words
-    by: Because = "file" if layout.named else "scans"
-    return Guess("columns", layout.words, reason, layout.named or decided.determined, "--columns", by=by)
-
-
-def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
-    best = decided.best.interpretation.reading
-    if stated.rotation:
-        return Guess("rotation", best.words, "stated with --rotation", True, "--rotation")
-    if decided.overruled:
-        named = ", as the columns are named" * best.layout.named
-        reason = f"the scans contradict {decided.overruled}{named}; {score_words(decided.best)}"
-        return Guess("rotation", best.words, reason, decided.determined, "--rotation", by="scans")
-    if best.layout.convention is not None:
-        sure = best.layout.sure or (decided.determined and not decided.only_believed)
-        reason = f"only the names say so; {decided.only_believed or 'others'} would fit too"
-        reason = "told by the file" if sure else reason
-        return Guess("rotation", best.words, reason, sure, "--rotation")
-    reason = score_words(decided.best)
-    alike = [w.reading.words for w in decided.equivalent if w.reading.words != best.words]
-    if alike:
-        reason += f"; {', '.join(dict.fromkeys(alike[:3]))} would stitch alike, with another hand-eye"
-    other = decided.runner_up
-    words = None
-    if other is not None:
-        direction = "poses as they are" if other.interpretation.carries else "poses inverted"
-        words = f"{other.interpretation.reading.words}, {direction}, {score_words(other)}"
-    worse = None if other is None or not decided.best.misfit else other.misfit / decided.best.misfit
-    worse_by = None if worse is None or not np.isfinite(worse) else round(worse, 3)
-    return Guess("rotation", best.words, reason, decided.determined, "--rotation", words, "scans", worse_by)
-
-
-def _length_unit_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
-    way = decided.best.interpretation
-    reach = float(np.linalg.norm(way.reading.T[:, :3, 3], axis=1).max())
-    if stated.length_unit:
-        return Guess("length_unit", way.length_unit, "stated with --unit", True, "--unit")
-    if way.reading.layout.length_unit:
-        return Guess("length_unit", way.length_unit, "told by the file", True, "--unit")
-    metres = reach * POSE_UNITS[way.length_unit]
-    reason = f"positions reach {reach:.4g}, that is {metres:.2f} m, as robots do; {score_words(decided.best)}"
-    # The motions of the scans have a scale only where the unit of the clouds is known.
-    by: Because = "scans" if stated.cloud_unit else "usual"
-    return Guess("length_unit", way.length_unit, reason, decided.determined, "--unit", by=by)
-
-
-def _cloud_unit_guess(
-    files: FolderFiles,
-    decided: ConventionChoice,
-    clouds: Sequence[Array],
-    own_units: Sequence[str],
-    stated: StatedFolder,
-) -> Guess:
-    if stated.cloud_unit:
-        return Guess("cloud_unit", stated.cloud_unit, "stated with --cloud-unit", True, "--cloud-unit")
-    other = own_units[1] if len(own_units) > 1 else None
-    counted = files.clouds[0].suffix.lower() in (".png", ".tif", ".tiff")
-    words = "; whole numbers of depth are mm unless the intrinsics state depth_scale" * counted
-    known = stated.length_unit or decided.best.interpretation.reading.layout.length_unit
-    by: Because = "scans" if known and decided.determined else "usual"
-    reason = f"{size_words(clouds)}{words}"
-    return Guess("cloud_unit", own_units[0], reason, other is None, "--cloud-unit", other, by)
-
 
 # Enough points a view to tell conventions.
 _POINTS = 8000

@@ -9,7 +9,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
 
 import numpy as np
 from natsort import natsorted, ns
@@ -24,8 +23,6 @@ from stitch.session.reading.scan_files import ptx_scans
 from stitch.session.reading.scan_headers import poses_in_scans
 from stitch.session.reading.text_files import WORKBOOKS, readable
 from stitch.system.packages import import_extra
-
-# Which files of a folder are scans, and which of them are the scans of its campaign.
 
 # Text files are clouds or tables of poses: a scan has more lines than a campaign has views.
 _EITHER = (".txt", ".csv", ".asc")
@@ -68,55 +65,6 @@ def _is_cloud_array(file: Path) -> bool:
         return False
     image = len(shape) == 3 and shape[1:] not in ((4, 4), (3, 4))
     return shape[-1] >= 3 and (image or (len(shape) == 2 and shape[0] >= _CLOUD_LINES))
-
-
-# What was guessed about a folder: each guess with its reason, how sure it is, and the flag that overrules it.
-
-
-Because = Literal["file", "scans", "usual"]
-
-
-@dataclass(frozen=True)
-class Guess:
-    """One thing that the files do not say, or say only in a name."""
-
-    what: str  # "rotation", "mount" …
-    value: str
-    reason: str
-    determined: bool  # the files or the scans tell it; False: it cannot be told from these views
-    flag: str  # that overrules it
-    runner_up: str | None = None
-    by: Because = "file"  # what decides it; a guess that is not determined is only usual
-    worse_by: float | None = None  # how many times worse the runner-up fits the scans
-
-    @property
-    def because(self) -> Because:
-        """What decides it: a file or a person says so, the scans say so, or it is only usual."""
-        return self.by if self.determined else "usual"
-
-    @property
-    def line(self) -> str:
-        """For a comment or a terminal; what is only usual with a question mark."""
-        return f"{'? ' if self.because == 'usual' else ''}{self._words}"
-
-    @property
-    def _words(self) -> str:
-        untold = "" if self.determined else f" cannot be told from these views, {self.flag} overrules it;"
-        other = f"; next best: {self.runner_up}" if self.runner_up else ""
-        return f"{self.what}: {self.value};{untold} {self.reason}{other}"
-
-    def as_dict(self) -> dict[str, Any]:
-        """As `stitch init --json` prints it."""
-        return {
-            "what": self.what,
-            "value": self.value,
-            "reason": self.reason,
-            "told": self.determined,
-            "flag": self.flag,
-            "runner_up": self.runner_up,
-            "because": self.because,
-            "against": [{"what": self.runner_up, "worse_by": self.worse_by}] if self.runner_up else [],
-        }
 
 
 _DEEPEST = 3
@@ -268,7 +216,8 @@ def _is_own(entry: Path) -> bool:
     if begins is None or not entry.is_file():
         return False
     with entry.open("rb") as stream:
-        return begins in stream.readline(_HEADER)
+        # Beside a session; without one, points of this form are what a tracker measured.
+        return begins in stream.readline(_HEADER) and (entry.parent / "session.toml").exists()
 
 
 def _may_hold_poses(file: Path) -> bool:
@@ -300,8 +249,6 @@ def _stated_list(poses: Path, part: str, clouds: set[Path]) -> FoundList:
     files = tuple(natsorted(inside, alg=ns.IGNORECASE))
     return FoundList(files, read_raw_poses(files), "poses")
 
-
-# Files that hold the scans of a whole campaign, E57 and Leica's PTX, as one file a scan.
 
 # Tables and descriptions that lie beside such a file are far smaller.
 _SMALL_MB = 5.0

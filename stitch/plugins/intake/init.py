@@ -21,8 +21,9 @@ from stitch.errors import InputError, NoResultError
 from stitch.plugins.intake.detect import BallOption, BoardOption, parse_target_options
 
 if TYPE_CHECKING:
-    from stitch.plugins.intake.first_session import FirstSession, StatedFolder
-    from stitch.plugins.intake.folder_files import Guess
+    from stitch.plugins.intake.first_session import FirstSession
+    from stitch.plugins.intake.guesses import Guess
+    from stitch.plugins.intake.stated_folder import StatedFolder
 
 # Lines of what is left aside on a terminal.
 _SHOWN = 8
@@ -103,8 +104,8 @@ def init(
       stitch init scans --rotation zyx-intrinsic --angles deg --unit mm --mount eye_in_hand -o session
       stitch init drive.mcap --topic /points
     """
-    from stitch.plugins.intake.first_session import StatedFolder
     from stitch.plugins.intake.ros_bag import find_bag
+    from stitch.plugins.intake.stated_folder import StatedFolder
 
     if bag := find_bag(folder):
         _init_from_bag(bag, output, mount, topic, frames, as_json)

@@ -10,7 +10,7 @@ from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES
 from stitch.plugins.intake.clock_times import EPOCH_S, since_1970
-from stitch.plugins.intake.pose_tables import read_names
+from stitch.plugins.intake.column_names import read_names
 from stitch.plugins.intake.raw_poses import RawPoses
 
 # A quaternion with three digits has length 1 within this.
@@ -220,8 +220,6 @@ def joint_layouts(raw: RawPoses) -> list[ColumnLayout]:
     return [ColumnLayout(nothing, nothing, raw.numbers, "columns are joint angles")]
 
 
-# Columns beside the poses, times and temperatures, as views.csv names them.
-
 _TIMES = re.compile(r"(?:time|timestamp|stamp|zeit|t|sec|seconds)(?:_(s|ms|us|µs|ns|min|h))?")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 # Names that views.csv keeps for itself.
@@ -277,8 +275,6 @@ def _is_row_count(values: Array) -> bool:
     """True of the numbers 0 or 1 to the last, in any order."""
     return len(values) > 2 and bool((np.diff(np.sort(values)) == 1).all()) and values.min() in (0, 1)
 
-
-# Which units lengths can have, by what robots reach and scanners see.
 
 # Scans are judged in millimetres.
 MM = 1e-3

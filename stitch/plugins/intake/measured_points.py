@@ -22,8 +22,9 @@ from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_ey
 from stitch.output.session_files import pose_columns, table_text
 from stitch.plugins.intake.cloud_pairs import LACKING, Pairing, pairings
 from stitch.plugins.intake.controllers.program import numbered_names
-from stitch.plugins.intake.first_session import StatedFolder, bare_session
-from stitch.plugins.intake.folder_files import Guess, clouds_among, list_files
+from stitch.plugins.intake.first_session import bare_session
+from stitch.plugins.intake.folder_files import clouds_among, list_files
+from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.layouts import POSE_UNITS, covariate_columns, pose_units, possible_layouts
 from stitch.plugins.intake.measured_tables import (
     CAMERAS,
@@ -41,6 +42,7 @@ from stitch.plugins.intake.measured_tables import (
 from stitch.plugins.intake.raw_poses import PROGRAMS, STRUCTURED, TABLES
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, readings
 from stitch.plugins.intake.session_draft import comment_lines, joint_columns, require_free, robot_lines, session_name
+from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.capture import Capture, build_capture, sightings_of
 from stitch.session.reading.session_toml import SESSION_FORMAT
 from stitch.session.reading.text_files import WORKBOOKS

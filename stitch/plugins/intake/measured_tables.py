@@ -12,16 +12,15 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
-from stitch.plugins.intake.first_session import StatedFolder
+from stitch.plugins.intake.column_names import bare_name, read_names
 from stitch.plugins.intake.layouts import POSE_UNITS, possible_layouts
-from stitch.plugins.intake.pose_tables import bare_name, parse_number_table, read_names, with_one_header
+from stitch.plugins.intake.pose_tables import parse_number_table, with_one_header
 from stitch.plugins.intake.raw_poses import STRUCTURED, RawPoses, is_program, read_raw_poses
 from stitch.plugins.intake.readings import Reading, joint_readings, readings, with_joints_of
+from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.reading.robot_description import robot_from_dh
 from stitch.session.reading.text_files import WORKBOOKS, read_any_text, workbook_sheets
 from stitch.session.robot import Robot
-
-# What the tables of a folder hold, column by column.
 
 _ROBOT = re.compile(r"robot|flange|tcp|joint|\barm\b|kuka|abb|fanuc|nominal|command|program", re.IGNORECASE)
 MEASURED = re.compile(
@@ -139,9 +138,6 @@ def read_tables(file: Path) -> list[Table]:
             raw = read_raw_poses([file])
         out.append(Table(file, title, raw, unit))
     return out
-
-
-# The robot: its geometry, and its poses or joints.
 
 
 @dataclass(frozen=True)

@@ -69,8 +69,6 @@ def _labelled(text: str, spans: Sequence[tuple[int, int]], rows: Iterable[dict[s
     return list(zip(near, rows, strict=True))
 
 
-# X 837.75, Y 184.59 … in any layout of lines: KUKA's $POS_ACT and E6POS, FANUC's position pages, pendants of others.
-
 _KEYED = re.compile(
     rf"(?<![\w.$])(?:([A-Za-z_]+\d)[ \t]*[\s:=][ \t]*|([A-Za-z_]+)[ \t]*[:=]?[ \t]*)({_NUMBER})"
     r"[ \t]*(mm|cm|m|deg|rad|°)?(?![\w.])"
@@ -149,8 +147,6 @@ def _tagged_lists(text: str) -> dict[str, list[PoseRow]]:
     return out
 
 
-# Poses in brackets: ABB's robtargets, p[…] of Universal Robots, tf_echo of ROS.
-
 _ROBTARGET = re.compile(rf"\[\s*{_list_of(3)}\s*,\s*{_list_of(4)}(?:\s*,\s*\[[^\]]*\])*\s*\]?")
 _UR_POSE = re.compile(rf"(?<!\w)p\s*{_list_of(6)}")
 _TF_ECHO = re.compile(rf"Translation:\s*{_list_of(3)}.*?Quaternion[^\[]*{_list_of(4)}", re.DOTALL)
@@ -178,8 +174,6 @@ def _matched_rows(pattern: re.Pattern[str], text: str, names: Sequence[str]) -> 
     return _labelled(text, [m.span() for m in found], rows) if found else []
 
 
-# Pose files of HALCON, one pose each.
-
 # Codes of create_pose: order of the rotation by its lower bits, the direction of the transform by the two others.
 _HALCON_ORDERS = {0: "gba", 2: "abg", 4: "rodriguez"}
 _COORDINATE_SYSTEM, _SUBTRACTED = 1, 8
@@ -203,8 +197,6 @@ def _halcon_rows(text: str) -> list[PoseRow]:
     T = frames.make(R, -R @ shift if code & _SUBTRACTED else shift)
     return [((), posed(frames.inverse(T) if code & _COORDINATE_SYSTEM else T, "m"))]
 
-
-# Cameras of reconstruction programs.
 
 _FOUR_NUMBERS = rf"[ \t]*\[*[ \t]*{_POINTED}(?:[ \t,;]+{_POINTED}){{3}}[ \t]*\]*[,;]?[ \t]*(?:\r?\n|$)"
 _BLOCK = re.compile(rf"^(?:{_FOUR_NUMBERS}){{4}}", re.MULTILINE)

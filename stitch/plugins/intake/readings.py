@@ -1,4 +1,9 @@
-"""Every way to read the poses of a table: orders of rotations, units, and joint angles by the robot's URDF."""
+"""Every way to read the poses of a table: orders of rotations, units, and joint angles by the robot's URDF.
+
+Orders of Euler angles: twelve, about axes that turn along (intrinsic) or that stand still (extrinsic); Diebel (2006),
+"Representing Attitude". `zyx-intrinsic` turns by the first number about z, by the second about the new y. The arm of a
+URDF lies between its root and what people call the flange.
+"""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -45,11 +50,6 @@ def require_known_word(flag: str, value: str | None, known: Collection[str]) -> 
     if value is not None and value not in known:
         raise InputError(f"{flag} {value}: to fix: use {', '.join(known)}")
 
-
-# Every way to read the rotations of a table, each with the words that name it.
-#
-# Orders of Euler angles: twelve, about axes that turn along (intrinsic) or that stand still (extrinsic); Diebel (2006),
-# "Representing Attitude". `zyx-intrinsic` turns by the first number about z, by the second about the new y.
 
 # The usual ones first: roll, pitch, yaw (FANUC, ROS, Yaskawa); A, B, C (KUKA); the others as they come.
 _USUAL = ("xyz-extrinsic", "zyx-intrinsic", "xyz-intrinsic", "rotation-vector", "zyz-intrinsic")
@@ -247,8 +247,6 @@ def candidate_units(readings: Sequence[Reading], stated: StatedTable) -> list[st
     return list(dict.fromkeys(unit for r in open_ for unit in pose_units(r.T[:, :3, 3]))) or ["mm"]
 
 
-# Joint angles as poses, where a URDF lies beside them.
-
 JOINT_ANGLES, _SLIDING = "joint angles", "joints that turn and slide"
 
 
@@ -309,8 +307,6 @@ def _readings_of_sliding_arm(urdf: Path, layout: ColumnLayout, angle_unit: str |
         return out
     return []
 
-
-# Between which links of a URDF the arm lies: the root, and what people call the flange.
 
 # tool0 and flange are those of ROS-Industrial.
 _FLANGES = ("tool0", "flange", "ee_link", "tcp")

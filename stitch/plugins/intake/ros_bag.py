@@ -19,10 +19,11 @@ from stitch.numerics.frames import Array
 from stitch.output.session_files import pose_columns, whole_folder, write_table
 from stitch.plugins.intake.cloud_pairs import Pairing
 from stitch.plugins.intake.convention_choice import choose_convention
-from stitch.plugins.intake.first_session import capture_of, score_words
-from stitch.plugins.intake.folder_files import Guess
+from stitch.plugins.intake.first_session import capture_of
+from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.layouts import ColumnLayout
 from stitch.plugins.intake.readings import Reading, arm_link_pairs
+from stitch.plugins.intake.session_guesses import score_words
 from stitch.plugins.intake.stops import AROUND, middle_of_stops, stationary_scans
 from stitch.screening.motions import register_scan_pairs
 from stitch.session.reading.clouds import read_cloud

@@ -12,7 +12,8 @@ from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
 from stitch.plugins.intake.detection.balls import ball_sightings
 from stitch.plugins.intake.detection.boards import Board, PlacedBoard, board_sightings, boards_in
-from stitch.plugins.intake.folder_files import FolderFiles, Guess
+from stitch.plugins.intake.folder_files import FolderFiles
+from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.layouts import MM
 from stitch.screening.motions import RelativeScans
 from stitch.session.reading.range_image import read_range_image
@@ -20,8 +21,6 @@ from stitch.session.reading.session_toml import read_session_document
 from stitch.session.reading.views_table import read_views
 from stitch.session.session import SessionData, Sighting
 from stitch.system.packages import import_extra
-
-# How the scanner moved between views, from targets that both show: a flat board tells as much as any.
 
 # Views that are compared: each with the next few that show the same targets.
 _NEXT = 4
@@ -172,9 +171,6 @@ def _merged_sightings(parts: Sequence[Sighting]) -> Sighting:
         np.vstack([part.points for part in parts]),
         np.concatenate([part.sigma for part in parts]),
     )
-
-
-# Boards and balls in the scans of a raw folder, before anybody says how its poses are to be read.
 
 
 def find_folder_targets(

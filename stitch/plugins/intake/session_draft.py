@@ -16,7 +16,7 @@ from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
 from stitch.output.session_files import pose_columns, table_text, write_table
 from stitch.plugins.intake.first_session import FirstSession
-from stitch.plugins.intake.folder_files import Guess
+from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, covariate_columns
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, arm_from_urdf
 from stitch.plugins.intake.scan_targets import points_columns

@@ -11,10 +11,11 @@ import numpy as np
 from stitch.numerics.units import METRES
 from stitch.plugins.intake.cloud_pairs import pairings
 from stitch.plugins.intake.convention_choice import choose_convention, require_own_frames
-from stitch.plugins.intake.first_session import StatedFolder, capture_of
+from stitch.plugins.intake.first_session import capture_of
 from stitch.plugins.intake.layouts import MM
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.readings import all_readings
+from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.screening.motions import register_scan_pairs
 from stitch.session.session import SessionData
 

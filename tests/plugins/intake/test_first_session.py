@@ -17,9 +17,10 @@ from data_synth.write import write_session
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.output.urdf_file import to_urdf
-from stitch.plugins.intake.first_session import StatedFolder, first_session
+from stitch.plugins.intake.first_session import first_session
 from stitch.plugins.intake.folder_files import one_scan_a_file
 from stitch.plugins.intake.session_draft import write_draft
+from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.session_folder import load_session
 

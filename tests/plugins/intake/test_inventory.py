@@ -77,6 +77,7 @@ def test_a_text_of_another_ending_is_opened(scans):
 
 def test_its_own_files_are_passed_over_and_another_points_csv_is_not(scans):
     np.savetxt(scans / "points.csv", TABLE, delimiter=",", header="x,y,z,qx,qy,qz,qw", comments="")
+    (scans / "session.toml").write_text('format = "stitch-session/1"\n')
     (scans / "views.csv").write_text("view,cloud,x,y,z,qx,qy,qz,qw\na,scan_0.ply,0,0,0,0,0,0,1\n")
     assert [file.name for file in find_folder_files(scans).poses] == ["points.csv"]
 

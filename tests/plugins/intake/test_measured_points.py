@@ -7,8 +7,8 @@ from data_synth.fixtures.tracker_folders import FOLDERS, tracked_arm
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
-from stitch.plugins.intake.first_session import StatedFolder
 from stitch.plugins.intake.measured_points import measured_session, write_measured
+from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.capture import prepare_capture
 from stitch.session.reading.session_folder import load_session
 from tests.needs import needs

@@ -11,11 +11,12 @@ import pytest
 from data_synth.write import write_session
 from stitch.errors import InputError
 from stitch.output.urdf_file import to_urdf
-from stitch.plugins.intake.first_session import StatedFolder, first_session
+from stitch.plugins.intake.first_session import first_session
 from stitch.plugins.intake.layouts import ColumnLayout
 from stitch.plugins.intake.raw_poses import RawPoses, read_raw_poses
 from stitch.plugins.intake.readings import StatedTable, all_readings, mixed_readings, readings, rotation_conventions
 from stitch.plugins.intake.session_draft import write_draft
+from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.reading.session_folder import load_session
 
 

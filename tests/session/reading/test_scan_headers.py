@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from stitch.errors import InputError
-from stitch.plugins.intake.first_session import StatedFolder, first_session
+from stitch.plugins.intake.first_session import first_session
+from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.scan_headers import poses_in_scans, times_in_scans
 from tests.needs import needs
