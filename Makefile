@@ -62,13 +62,14 @@ test: export PYTHONDONTWRITEBYTECODE =
 test: install
 	$(PYTHON) -m pytest
 
-# Style, format, types, which room may import which, and how large each part may be.
+# Style, format, types, which room may import which, how large each part may be, and licences of what it brings.
 lint: install
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 	$(VENV)/bin/lint-imports --no-logo
 	$(PYTHON) bench/budget.py
+	$(PYTHON) bench/licences.py
 
 check: lint
 	$(PYTHON) -m pytest -m "slow or not slow" --cov

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import stitch
+from bench.licences import brought, complaints, kind, licence
 from stitch.errors import InputError
 from stitch.system.packages import DISTRIBUTION, command_for, import_extra, stitch_version
 
@@ -70,3 +71,31 @@ def test_a_missing_package_is_one_line_with_the_command():
 def test_papers_name_version_and_licence():
     citation = (ROOT / "CITATION.cff").read_text("utf-8")
     assert f"version: {PROJECT['version']}\n" in citation and f"license: {PROJECT['license']}\n" in citation
+
+
+def test_nothing_of_gpl_comes_with_the_base():
+    licences = {name: licence(metadata) for name, metadata in brought().items()}
+    assert {"numpy", "scipy", "pykdtree"} < set(licences) and "plyfile" not in licences
+    assert complaints(licences) == []
+    assert [name for name, stated in licences.items() if kind(stated) == "LGPL"] == ["pykdtree"]
+
+
+@pytest.mark.parametrize(
+    ("stated", "is_kind"),
+    [
+        ("GPL-3.0-or-later", "GPL"),
+        ("GNU Affero General Public License v3", "GPL"),
+        ("GNU General Public License v2 (GPLv2)", "GPL"),
+        ("GNU Lesser General Public License v3 (LGPLv3)", "LGPL"),
+        ("LGPL-3.0-only", "LGPL"),
+        ("MIT OR GPL-3.0-only", ""),
+        ("BSD-3-Clause", ""),
+    ],
+)
+def test_a_licence_is_of_a_kind(stated, is_kind):
+    assert kind(stated) == is_kind
+    assert bool(complaints({"some": stated})) == (is_kind == "GPL")
+
+
+def test_a_package_that_states_no_licence_is_told():
+    assert complaints({"some": ""}) == ["some: states no licence; look it up before it comes with the base"]
