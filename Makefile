@@ -11,11 +11,13 @@ BASE := $(shell for p in python3 python3.13 python3.12 python3.11; do $$p $(SERV
 # What only the system can bring is installed where that asks nobody: for root, with apt.
 ROOT_APT := test "$$(id -u)" = 0 && command -v apt-get >/dev/null && apt-get update -q
 PIP := $(PYTHON) -m pip --quiet --disable-pip-version-check
-# Open3D has no wheel for a Linux whose C library is older than 2.35, or another: there it is left out of what is pinned.
-OLD_LINUX := import os, sys; sys.exit(not (sys.platform == "linux" and \
-	[int(n) for n in (os.confstr("CS_GNU_LIBC_VERSION") or "no 0.0").split()[1].split(".")] < [2, 35]))
+# Open3D has no wheel for a Linux whose C library is older than 2.35, or another: there it is left out of what is pinned,
+# and where one that is not ours can be imported: open3d-cpu would write over its files.
+NO_OPEN3D := import os, sys; from importlib import metadata, util; sys.exit(not (sys.platform == "linux" and \
+	[int(n) for n in (os.confstr("CS_GNU_LIBC_VERSION") or "no 0.0").split()[1].split(".")] < [2, 35] or \
+	util.find_spec("open3d") and not any(d.name == "open3d-cpu" for d in metadata.distributions())))
 PINNED := $(VENV)/constraints.txt
-PIN := { $(PYTHON) -c '$(OLD_LINUX)' && sed '/^open3d/,/[^\]$$/d' constraints.txt || cat constraints.txt; } >$(PINNED)
+PIN := { $(PYTHON) -c '$(NO_OPEN3D)' && sed '/^open3d/,/[^\]$$/d' constraints.txt || cat constraints.txt; } >$(PINNED)
 # What Open3D lacks of the system: packages to standard output, a sentence to standard error.
 LACKING := $(PYTHON) -m stitch.system.open3d_library
 
@@ -89,7 +91,7 @@ endif
 # finds no hash for it. What other indexes or settings of this machine might write into it is refused.
 lock:
 	@command -v uv >/dev/null || { echo "make lock needs uv" >&2; exit 2; }
-	uv pip compile pyproject.toml constraints.in --extra dev --universal --python-version 3.11 --generate-hashes \
+	uv pip compile pyproject.toml constraints.in --extra dev --extra open3d --universal --python-version 3.11 --generate-hashes \
 		--no-strip-extras --no-emit-index-url --no-emit-find-links --no-annotate --no-header --quiet -o constraints.txt
 	uv pip compile pyproject.toml --extra docs --universal --python-version 3.11 --generate-hashes --constraint constraints.txt \
 		$$(sed -nE 's/^([a-z0-9-]+)(\[.*\])?==.*/--no-emit-package \1/p' constraints.txt) \

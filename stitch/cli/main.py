@@ -16,7 +16,7 @@ from stitch.cli.terminal import say, speak_any_terminal
 from stitch.errors import StitchError
 from stitch.session.reading.text_files import shortened
 from stitch.system import process, time_limit
-from stitch.system.packages import stitch_version
+from stitch.system.packages import missing_package, stitch_version
 from stitch.system.process import watched
 
 _LONGEST = 2000
@@ -95,6 +95,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _exit_with_message(
             "not enough memory; to fix: leave out views, thin the scans, or state --memory (stitch run)", 1
         )
+    except ModuleNotFoundError as error:
+        missing = missing_package(error)
+        _exit_with_message(missing or _unexpected_message(error), 2 if missing else 1)
     except Exception as error:
         _exit_with_message(_unexpected_message(error), 1)
 

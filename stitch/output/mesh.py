@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import igl
 import numpy as np
 from pykdtree.kdtree import KDTree
 
@@ -62,6 +61,8 @@ def mesh_of(points: Array, normals: Array, outside: float = 0.0) -> TriangleMesh
     Raises:
         NoResultError: the points span no surface.
     """
+    import igl
+
     if len(points) < _NEIGHBOURS:
         raise NoResultError(NO_SURFACE)
     tree = KDTree(np.ascontiguousarray(points, float))

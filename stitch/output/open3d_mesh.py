@@ -1,6 +1,5 @@
 """Meshes that Open3D makes of the fused cloud: closed, or with a tenth of the triangles."""
 
-import igl
 import numpy as np
 from pykdtree.kdtree import KDTree
 from scipy.sparse import coo_array
@@ -87,6 +86,8 @@ class MeshFit:
     """How a mesh lies to the points (N, 3) that it was made of, of the same frame and unit; of many some are asked."""
 
     def __init__(self, mesh: TriangleMesh, points: Array) -> None:
+        import igl
+
         tree = KDTree(np.ascontiguousarray(points, float))
         asked = np.ascontiguousarray(points[:: max(1, len(points) // _ASKED)], float)
         distance = np.sqrt(igl.point_mesh_squared_distance(asked, mesh.vertices, mesh.triangles)[0])

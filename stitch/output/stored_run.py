@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from stitch.effects.user_file import load
 from stitch.errors import InputError
@@ -254,10 +253,12 @@ def _restore_fit(folder: Path, document: dict[str, Any], run: RunData) -> Fit:
 
 def _target_fit(folder: Path, run: RunData) -> TargetModelFit:
     """Return what the labelled points say under the model; the distances of views left out are those of the fit."""
+    from pyarrow.parquet import read_table
+
     fit = evaluate_targets(run.measurement, run.model)
     used = fit.rows.sightings.used
     heldout: Array = np.full(used.shape, np.nan)
     # Beside clouds views are left out with their surfaces, not by their labelled points.
     if not run.measurement.capture.scans:
-        heldout[used] = pq.read_table(folder / "residuals.parquet")["heldout"].to_numpy()
+        heldout[used] = read_table(folder / "residuals.parquet")["heldout"].to_numpy()
     return replace(fit, heldout=heldout)

@@ -6,11 +6,13 @@ Run by `make install`: prints the packages of the system that are missing, and s
 import ctypes
 import sys
 from importlib import import_module
+from importlib.metadata import packages_distributions
 from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
 from stitch.errors import InputError
+from stitch.system.packages import command_for
 
 # Libraries of the system that Open3D is linked with, used or not, and the packages of Debian and Ubuntu that have them.
 _LIBRARIES = {
@@ -21,7 +23,6 @@ _LIBRARIES = {
     "libudev.so.1": "libudev1",
     "libidn2.so.0": "libidn2-0",
 }
-_PACKAGE = "open3d-cpu" if sys.platform == "linux" else "open3d"
 
 
 def import_open3d(needed_by: str) -> Any:
@@ -64,11 +65,13 @@ def _compiled_part() -> Any:
 def _remedy(error: Exception) -> tuple[str, str]:
     """Return why Open3D cannot be imported, and what to do."""
     if isinstance(error, ModuleNotFoundError):
-        return "Open3D is not installed", f"pip install {_PACKAGE}"
+        return "Open3D is not installed", command_for("open3d")
     if packages := missing_packages():
         names = [name for name, package in _LIBRARIES.items() if package in packages]
         return f"Open3D lacks {', '.join(names)} of the system", f"apt-get install {' '.join(packages)}"
-    return f"Open3D cannot be imported ({error})", f"pip install --force-reinstall {_PACKAGE}"
+    # The one that is there: open3d-cpu would write over the files of another.
+    there = next(iter(packages_distributions().get("open3d", ["open3d"])))
+    return f"Open3D cannot be imported ({error})", f"pip install --force-reinstall {there}"
 
 
 def missing_packages() -> list[str]:

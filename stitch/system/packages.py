@@ -3,6 +3,7 @@
 `import stitch` and the command `stitch` belong to the distribution DISTRIBUTION: on PyPI, `stitch` is somebody else's.
 """
 
+import re
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,43 @@ from typing import Any
 from stitch.errors import InputError
 
 DISTRIBUTION = "stitch-scans"
+# Packages by the name under which they are installed: that of their import, and what is not there without them.
+PACKAGES = {
+    "numpy": ("numpy", "everything"),
+    "scipy": ("scipy", "everything"),
+    "pykdtree": ("pykdtree", "everything that matches points"),
+    "threadpoolctl": ("threadpoolctl", "everything"),
+    "tomli-w": ("tomli_w", "model.toml, and so every result"),
+    "typer": ("typer", "the commands"),
+    "rich": ("rich", "the commands"),
+    "pyyaml": ("yaml", "poses and intrinsics as YAML"),
+    "python-neo-lzf": ("lzf", "scans as PCD"),
+    "natsort": ("natsort", "init: the order of files"),
+    "pyarrow": ("pyarrow", "residuals.parquet"),
+    "jsonschema": ("jsonschema", "the check of result.json when a run is read again"),
+    "libigl": ("igl", "--mesh, measure, fit, seam"),
+    "kiss-icp": ("kiss_icp", "the start of the hand-eye of a scanner that never stops"),
+    "trimesh": ("trimesh", "scans as meshes, CAD, the simulator"),
+    "embreex": ("embreex", "a simulator of full speed"),
+    "manifold3d": ("manifold3d", "the simulator's parts"),
+    "scikit-fem": ("skfem", "the simulated panel cell"),
+    "rerun-sdk": ("rerun", "the recording and its viewer"),
+    "matplotlib": ("matplotlib", "figures and pages"),
+    "pillow": ("PIL", "pictures and depth images"),
+    "jinja2": ("jinja2", "pages"),
+    "starlette": ("starlette", "review in a browser"),
+    "uvicorn": ("uvicorn", "review in a browser"),
+    "open3d": ("open3d", "--mesh watertight and light, compare --with open3d, clouds to Open3D"),
+    "pye57": ("pye57", "clouds as E57"),
+    "laspy": ("laspy", "clouds as LAS and LAZ"),
+    "h5py": ("h5py", "scans as ZDF of Zivid"),
+    "openexr": ("OpenEXR", "depth images as EXR"),
+    "python-calamine": ("python_calamine", "tables as workbooks"),
+    "opencv-python-headless": ("cv2", "boards in scans, lenses that distort, holes in pictures"),
+    "rosbags": ("rosbags", "bags of ROS, and MCAP"),
+    "distributed": ("distributed", "batch on more than one process"),
+    "cryptography": ("cryptography", "batch on more than one process"),
+}
 
 
 def stitch_version() -> str:
@@ -22,6 +60,27 @@ def stitch_version() -> str:
 def command_for(extra: str) -> str:
     """Return the command that installs what an extra of this package brings."""
     return f"pip install '{DISTRIBUTION}[{extra}]'"
+
+
+def command_of(name: str) -> str:
+    """Return the command that installs one of PACKAGES: its extra where it has one, else itself."""
+    from importlib.metadata import requires
+
+    for requirement in requires(DISTRIBUTION) or ():
+        asked, _, marker = requirement.partition(";")
+        if re.match(r"[\w.-]+", asked)[0].lower() == name:  # type: ignore[index]
+            extra = re.search(r"""extra == ["'](.+?)["']""", marker)
+            return command_for(extra[1]) if extra else f"pip install '{asked.strip()}'"
+    return f"pip install {name}"
+
+
+def missing_package(error: ModuleNotFoundError) -> str | None:
+    """Return the line for one of PACKAGES that an import did not find; None for anything else."""
+    top = (error.name or "").partition(".")[0]
+    for name, (module, purpose) in PACKAGES.items():
+        if module == top:
+            return f"needs {name}, which is not installed ({purpose}); to fix: {command_of(name)}"
+    return None
 
 
 def import_extra(name: str, where: Path | str, extra: str) -> Any:

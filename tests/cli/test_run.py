@@ -105,7 +105,8 @@ def test_a_mesh_for_which_open3d_is_missing_is_refused_before_the_work(session, 
     with pytest.raises(SystemExit) as ended:
         main(["run", str(session), "-o", str(tmp_path / "run"), "--mesh", "watertight"])
     assert ended.value.code == 2
-    assert "stitch: --mesh watertight: Open3D is not installed; to fix: pip install open3d" in capsys.readouterr().err
+    missing = "stitch: --mesh watertight: Open3D is not installed; to fix: pip install 'stitch-scans[open3d]'"
+    assert missing in capsys.readouterr().err
     with pytest.raises(SystemExit) as ended:
         main(["run", str(session), "-o", str(tmp_path / "run"), "--mesh=smooth"])
     assert ended.value.code == 2 and "--mesh smooth: to fix" in capsys.readouterr().err

@@ -47,7 +47,7 @@ class Absent:
 LACKS = {
     "the package": (
         ModuleNotFoundError("No module named 'open3d'"),
-        "Open3D is not installed; to fix: pip install open3d",
+        "Open3D is not installed; to fix: pip install 'stitch-scans[open3d]'",
     ),
     "two libraries": (
         ImportError("libGL.so.1: cannot open shared object file"),

@@ -9,8 +9,17 @@ import pytest
 
 import stitch
 from bench.licences import brought, complaints, kind, licence
+from stitch.cli.main import main
 from stitch.errors import InputError
-from stitch.system.packages import DISTRIBUTION, command_for, import_extra, stitch_version
+from stitch.system.packages import (
+    DISTRIBUTION,
+    PACKAGES,
+    command_for,
+    command_of,
+    import_extra,
+    missing_package,
+    stitch_version,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
@@ -99,3 +108,44 @@ def test_a_licence_is_of_a_kind(stated, is_kind):
 
 def test_a_package_that_states_no_licence_is_told():
     assert complaints({"some": ""}) == ["some: states no licence; look it up before it comes with the base"]
+
+
+def test_all_packages_that_are_asked_for_are_listed_with_what_they_are_for():
+    extras = {name: asked for name, asked in EXTRAS.items() if name not in ("dev", "docs")}
+    asked = {name_of(r) for requirements in (PROJECT["dependencies"], *extras.values()) for r in requirements}
+    assert set(PACKAGES) == asked - {"open3d-cpu"}
+    for extra, requirements in extras.items():
+        assert {command_of(name_of(r)) for r in requirements} <= {
+            command_for(extra),
+            "pip install open3d-cpu",
+            command_for("open3d"),
+        }
+
+
+def test_open3d_is_no_dependency_of_the_base():
+    assert not [r for r in PROJECT["dependencies"] if r.startswith("open3d")]
+    assert command_of("open3d") == command_for("open3d")
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        (
+            "rerun",
+            "needs rerun-sdk, which is not installed (the recording and its viewer); to fix: pip install 'rerun-sdk>=",
+        ),
+        ("cv2.aruco", "needs opencv-python-headless, which is not installed (boards in scans, lenses that distort, "),
+    ],
+)
+def test_a_package_that_an_import_misses_is_one_line_of_the_command(module, line, monkeypatch, capsys):
+    error = ModuleNotFoundError(f"No module named {module!r}", name=module)
+    assert missing_package(error).startswith(line)
+
+    def lacks():
+        raise error
+
+    monkeypatch.setattr("stitch.cli.main.build", lacks)
+    with pytest.raises(SystemExit) as ended:
+        main(["run"])
+    assert ended.value.code == 2 and capsys.readouterr().err.startswith(f"stitch: {line}")
+    assert missing_package(ModuleNotFoundError("no", name="stitch.nothing")) is None

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import igl
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -69,6 +68,8 @@ def read_cad(file: Path) -> CadSurface:
 
 def cad_surface(mesh: Any) -> CadSurface:
     """Make a trimesh ready for searching."""
+    import igl
+
     centre = mesh.bounds.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
     boxes = igl.AABB()

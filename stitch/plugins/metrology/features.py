@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-import igl
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -169,6 +168,8 @@ def _surface_of(feature: Feature, at: RunPoints) -> _Surface:
 
 def nearest_on_mesh(mesh: Any, points: Array) -> tuple[Array, Array]:
     """Return the nearest places (N, 3) of a trimesh and its normals (N, 3) there."""
+    import igl
+
     faces = np.ascontiguousarray(mesh.faces, np.int64)
     _, face, place = igl.point_mesh_squared_distance(
         np.ascontiguousarray(points, float), np.ascontiguousarray(mesh.vertices, float), faces

@@ -1,0 +1,67 @@
+"""`stitch doctor` names each package that is there or missing, what is not without it, and the command that brings it."""
+
+import json
+
+import pytest
+
+from stitch.cli.main import main
+from stitch.plugins import doctor
+from stitch.system.packages import PACKAGES, command_for
+
+
+@pytest.fixture
+def without_laspy(monkeypatch):
+    """An installation in which laspy is missing and the rest is there."""
+    monkeypatch.setattr(doctor, "installed", lambda name: None if name == "laspy" else "1.0")
+
+
+def said(capsys, *arguments):
+    with pytest.raises(SystemExit) as ended:
+        main(["doctor", *map(str, arguments)])
+    assert not ended.value.code
+    return capsys.readouterr().out
+
+
+def test_json_lists_all_packages(without_laspy, capsys):
+    packages = json.loads(said(capsys, "--json"))["packages"]
+    assert [row["name"] for row in packages] == list(PACKAGES)
+    assert {tuple(row) for row in packages} == {("name", "version", "for", "command")}
+    (missing,) = [row for row in packages if row["version"] is None]
+    assert missing == {
+        "name": "laspy",
+        "version": None,
+        "for": "clouds as LAS and LAZ",
+        "command": command_for("formats"),
+    }
+
+
+def test_people_see_what_is_missing_and_what_to_type(without_laspy, capsys):
+    text = said(capsys)
+    assert f"{len(PACKAGES) - 1} of {len(PACKAGES)} packages are there" in text
+    (row,) = [line for line in text.splitlines() if line.split()[:1] == ["laspy"]]
+    assert "clouds as LAS and LAZ" in row and command_for("formats") in row
+
+
+def test_a_full_open3d_counts_as_one_of_ours(monkeypatch):
+    def version(name):
+        if name == "open3d":
+            return "0.19.0+cuda"
+        raise doctor.PackageNotFoundError(name)
+
+    monkeypatch.setattr(doctor, "version", version)
+    assert doctor.installed("open3d") == "0.19.0+cuda" and doctor.installed("scipy") is None
+
+
+def test_a_run_says_which_versions_were_others(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(
+        "stitch.output.stored_run.read_result", lambda run: {"versions": {"stitch": "0.0.9", "numpy": "1.0"}}
+    )
+    monkeypatch.setattr(doctor, "installed", lambda name: "1.0")
+    assert doctor.other_versions(tmp_path) == [{"name": "stitch", "run": "0.0.9", "here": "1.0"}]
+    assert f"{tmp_path}: computed with stitch 0.0.9; here is 1.0" in " ".join(said(capsys, tmp_path).split())
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["doctor", str(tmp_path)])
+    assert ended.value.code == 2 and "name a run folder that `stitch run` wrote" in capsys.readouterr().err
