@@ -1,12 +1,12 @@
-"""Both solutions of one stand, after the check that its readings belong together."""
+"""`stitch base`: both solutions of one stand, after the check that its readings belong together."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 from rich.table import Table
 from scipy.stats import norm
 
@@ -14,12 +14,13 @@ from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
-from stitch.output.session_files import SessionFiles, pose_columns, write_session
+from stitch.output.session_files import SessionFiles, pose_columns
 from stitch.plugins.cells.job_files import (
     JobTable,
     Wanted,
     checked_table,
     fixed_digits,
+    hand_out,
     points_table,
     read_job_file,
     write_recording_and_page,
@@ -38,14 +39,14 @@ from stitch.plugins.cells.stand import (
     project,
     rail_direction,
 )
-from stitch.system.process import console
 
 # A distance that differs by more than this many sigmas is a wrong reading, not noise (one in two million).
 CONTRADICTION_SIGMAS = 5.0
 STAND_FORMAT = "stitch-base/1"
 # Sigmas of a careful operator where the file states none: the source sees 0.1 to 0.2 mm as the smallest distance
 # that an eye can tell, and calls its distance and angle sensors better than that.
-_POINT, _SLIDE, _LENGTH, _ANGLE, _LEVEL = 1e-4, 1e-4, 1e-4, 1e-4, 1e-3
+_POINT = _SLIDE = _LENGTH = _ANGLE = 1e-4
+_LEVEL = 1e-3
 _KEYS = {"format", "length_unit", "angle_unit", "main", "second", "rod", "level"}
 _TURN = {"clockwise": 1.0, "anticlockwise": -1.0}
 _CYLINDER = ("joint1", "radius", "height")
@@ -72,9 +73,9 @@ def solve_stand(stand: Stand) -> BaseResult:
     comparisons = compare_distances(stand)
     wrong = [c for c in comparisons if c.sigmas > CONTRADICTION_SIGMAS]
     if wrong:
-        told = "; ".join(comparison_text(c, stand.length_unit) for c in wrong)
+        texts = "; ".join(comparison_text(c, stand.length_unit) for c in wrong)
         raise NoResultError(
-            f"rod and joints contradict each other: {told}. No transform is given; to fix: read these points again"
+            f"rod and joints contradict each other: {texts}. No transform is given; to fix: read these points again"
         )
     solution = fit_stand(stand)
     if solution.p_value < 2 * norm.sf(CONTRADICTION_SIGMAS):
@@ -85,20 +86,20 @@ def solve_stand(stand: Stand) -> BaseResult:
             f"redundant readings; the largest misfit is {sizes[worst]:.4g} {stand.length_unit} at "
             f"{(stand.rail.names + stand.rod.names)[worst]}; to fix: read that point again, or state larger sigmas"
         )
-    turns = {
-        name: angles.tolist()
-        for touched in (stand.rail, stand.rod)
-        if touched.rpy is not None
-        for name, angles in zip(touched.names, touched.rpy, strict=True)
-    }
+    turns: dict[str, list[float]] = {}
+    for touched in (stand.rail, stand.rod):
+        if touched.rpy is not None:
+            turns |= zip(touched.names, touched.rpy.tolist(), strict=True)
+    projection = no_projection = None
     try:
-        return BaseResult(stand.length_unit, solution, project(stand), None, comparisons, turns)
+        projection = project(stand)
     except NoResultError as error:
-        return BaseResult(stand.length_unit, solution, None, str(error), comparisons, turns)
+        no_projection = str(error)
+    return BaseResult(stand.length_unit, solution, projection, no_projection, comparisons, turns)
 
 
 def comparison_text(c: DistanceComparison, unit: str) -> str:
-    """One comparison in words and numbers."""
+    """Say one comparison in words and numbers."""
     a, b = c.pair
     return (
         f"{a} to {b} is {c.by_stand:.4f} {unit} by the stand and {c.by_robot:.4f} {unit} by the robot, a difference of "
@@ -107,15 +108,16 @@ def comparison_text(c: DistanceComparison, unit: str) -> str:
 
 
 def base_document(result: BaseResult) -> dict[str, Any]:
-    """Plain numbers for JSON: lengths in length_unit, angles in rad."""
-    solution, projection = result.fit, result.projection
+    """Return plain numbers for JSON: lengths in length_unit, angles in rad."""
+    solution = result.fit
+    projection = result.projection
     planes = projection and {
         "T_base1_base2": projection.T_base1_base2.tolist(),
         "gamma_beta_alpha": [None if np.isnan(a) else float(a) for a in projection.gamma_beta_alpha],
         "offsets": projection.offsets.tolist(),
         "likewise": {
-            plane: {"open": found} if isinstance(found, str) else {"angle": found[0], "offsets": found[1:].tolist()}
-            for plane, found in projection.likewise.items()
+            plane: {"open": angle} if isinstance(angle, str) else {"angle": angle[0], "offsets": angle[1:].tolist()}
+            for plane, angle in projection.likewise.items()
         },
         "flange_beta_alpha": None if (tilt := projection.flange_beta_alpha) is None else tilt.tolist(),
     }
@@ -141,7 +143,7 @@ def base_document(result: BaseResult) -> dict[str, Any]:
 
 
 def rod_session(stand: Stand, result: BaseResult) -> SessionFiles:
-    """One view for each rod setting; the sensor's frame is the stand's.
+    """Return one view for each rod setting; the sensor's frame is the stand's.
 
     The readings tell where the tip was, not how it was turned: its frame is taken parallel to the base, which changes
     nothing, because the target lies in its origin.
@@ -199,18 +201,18 @@ def read_stand(file: Path | str) -> Stand:
 def _touched_points(
     document: JobTable, name: str, readings: set[str], unit: float, to_rad: float
 ) -> tuple[TouchedPoints, list[JobTable]]:
-    """The points of one robot, from coordinates or from joint 1, radius and height.
+    """Read the points of one robot, from coordinates or from joint 1, radius and height.
 
     Args:
         unit, to_rad: metres per length unit and rad per angle unit.
     """
     robot = document.table(name, {"points", "sigma", "arm"}, required=True)
-    listed = robot.entries.get("points")
-    if not isinstance(listed, list) or len(listed) < 2:
+    rows = robot.entries.get("points")
+    if not isinstance(rows, list) or len(rows) < 2:
         raise InputError(f"{document.file}: [[{name}.points]] has fewer than two entries; to fix: add one")
     sigma = robot.table("sigma", {"point", "joint", *_CYLINDER})
     known = {"name", "point", "rpy", "joints", *_CYLINDER, *readings}
-    entries = [checked_table(document.file, f"{name}.points[{i + 1}]", entry, known) for i, entry in enumerate(listed)]
+    entries = [checked_table(document.file, f"{name}.points[{i + 1}]", row, known) for i, row in enumerate(rows)]
     names = tuple(str(entry.entries.get("name", f"{name} {i + 1}")) for i, entry in enumerate(entries))
     rpy = _stated_flange_angles(entries, by_joints="arm" in robot)
     if "arm" in robot:
@@ -242,7 +244,7 @@ def _touched_points(
 
 
 def _stated_flange_angles(entries: list[JobTable], by_joints: bool) -> Array | None:
-    """α, β, γ (N, 3) as the controller shows them, in the file's unit; None where no point states them."""
+    """Read α, β, γ (N, 3) as the controller shows them, in the file's unit; None where no point states them."""
     stated = [entry for entry in entries if "rpy" in entry]
     if stated and (by_joints or len(stated) < len(entries)):
         raise stated[0].refusal("rpy", "state it at every point of this robot, and not beside joints")
@@ -253,15 +255,15 @@ def _stated_flange_angles(entries: list[JobTable], by_joints: bool) -> Array | N
 def _points_of_joints(
     robot: JobTable, entries: list[JobTable], names: tuple[str, ...], sigma: JobTable, *, unit: float, to_rad: float
 ) -> TouchedPoints:
-    """Where the tip stood by the joints' angles and the arm's DH rows, and how the flange was turned."""
+    """Return where the tip stood by the joints' angles and the arm's DH rows, and how the flange was turned."""
     table = robot.table("arm", {"dh", "joints", "tip"})
-    listed = table.entries.get("joints")
-    if not isinstance(listed, list) or not listed:
+    entry_rows = table.entries.get("joints")
+    if not isinstance(entry_rows, list) or not entry_rows:
         raise table.refusal("joints", "list the DH rows, as { a = 0.3, alpha_deg = -90, d = 0.5, theta_deg = 0 }")
     place = f"{table.place}.joints"
     rows = [
         checked_table(robot.file, f"{place}[{i + 1}]", row, {"a", "alpha_deg", "d", "theta_deg", "slides"})
-        for i, row in enumerate(listed)
+        for i, row in enumerate(entry_rows)
     ]
     slides = np.array([row.entries.get("slides", False) is True for row in rows])
     arm = DhArm(
@@ -328,32 +330,16 @@ def run_base(file: Path, wanted: Wanted) -> None:
         # The page shows which readings contradict each other.
         write_recording_and_page("base", None, wanted.report, stand, None)
         raise
-    if wanted.session is not None:
-        write_session(wanted.session, rod_session(stand, result))
-    write_recording_and_page("base", wanted.recording, wanted.report, stand, result)
-    if wanted.as_json:
-        print(json.dumps(base_document(result), indent=1))
-    else:
-        _print_solution(result)
+    terminal = hand_out(
+        "base", wanted, lambda: [rod_session(stand, result)], lambda: base_document(result), stand, result
+    )
+    if terminal is not None:
+        _print_solution(terminal, result)
 
 
-def _plane_lines(projection: Projection, unit: str) -> Iterator[str]:
-    """What the planes beside X-Y show: by our triangle, by the source's rules, by the flanges."""
-    _, beta, alpha = projection.gamma_beta_alpha
-    turns = (("X-Z", "β", beta), ("Y-Z", "α", alpha))
-    for (plane, letter, angle), offsets in zip(turns, projection.offsets[1:], strict=True):
-        own = "open, taken as level" if np.isnan(angle) else f"{fixed_digits(np.array([angle]), 6)} rad"
-        found = projection.likewise[plane]
-        if not isinstance(found, str):
-            found = f"{letter} {fixed_digits(found[:1], 6)} rad, {fixed_digits(found[1:], 5)} {unit}"
-        yield f"{plane}: {letter} {own}, {fixed_digits(offsets, 5)} {unit}; by the cosine rules of X-Y: {found}."
-    if projection.flange_beta_alpha is not None:
-        yield f"By the pins, upright in their cups: β α {fixed_digits(projection.flange_beta_alpha, 6)} rad."
-
-
-def _print_solution(result: BaseResult) -> None:
-    terminal = console()
-    unit, solution = result.length_unit, result.fit
+def _print_solution(terminal: Console, result: BaseResult) -> None:
+    unit = result.length_unit
+    solution = result.fit
     headings = ("solution", f"x y z / {unit}", "rotation vector / rad")
     table = Table(*headings, title="T_base1_base2, translation and turn about the axes of base 1", title_justify="left")
     poses = {"least squares": solution.T_base1_base2}
@@ -379,3 +365,17 @@ def _print_solution(result: BaseResult) -> None:
         terminal.print(f"No projection: {result.no_projection}.")
     for row in solution.T_base1_base2:
         print(" ".join(f"{value:.9g}" for value in row))
+
+
+def _plane_lines(projection: Projection, unit: str) -> Iterator[str]:
+    """Say what the planes beside X-Y show: by our triangle, by the source's rules, by the flanges."""
+    _, beta, alpha = projection.gamma_beta_alpha
+    turns = (("X-Z", "β", beta), ("Y-Z", "α", alpha))
+    for (plane, letter, angle), offsets in zip(turns, projection.offsets[1:], strict=True):
+        size = "open, taken as level" if np.isnan(angle) else f"{fixed_digits(np.array([angle]), 6)} rad"
+        rules = projection.likewise[plane]
+        if not isinstance(rules, str):
+            rules = f"{letter} {fixed_digits(rules[:1], 6)} rad, {fixed_digits(rules[1:], 5)} {unit}"
+        yield f"{plane}: {letter} {size}, {fixed_digits(offsets, 5)} {unit}; by the cosine rules of X-Y: {rules}."
+    if projection.flange_beta_alpha is not None:
+        yield f"By the pins, upright in their cups: β α {fixed_digits(projection.flange_beta_alpha, 6)} rad."

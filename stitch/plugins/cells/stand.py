@@ -1,18 +1,16 @@
-"""The stand and what was read on it.
+"""The stand, what was read on it, a check of the readings, and two solutions: least squares and the source's.
 
 Stand frame S: origin at slide zero, x along the rail away from P1, z the pivot axis of the rod, y = z × x.
 At angle 0 the rod lies on the rail and points back to P1, towards −x.
 
-Distances that two instruments give independently: where they differ, one of them is wrong.
+The check compares distances that two instruments give independently: where they differ, one of them is wrong. The
+distance between two settings of the rod follows from slide, angle and length alone, whatever the bases are; the second
+robot measures the same distance by its joints. So the comparison needs no fit and names its pair of points.
 
-The distance between two settings of the rod follows from slide, angle and length alone, whatever the bases are; the
-second robot measures the same distance by its joints. So the comparison needs no fit and names its pair of points.
-
-The source's solution: project the polyhedron of points and origins onto X-Y, X-Z and Y-Z (formulas 5 to 11).
-
-The X-Y plane is solved by the cosine rule, letter for letter but for two misprints: |O2R2| is printed with the
-coordinates of R1, and |O1e| with |O1P1| where its triangle has the side |O1P2|. Both pairs are equal in the
-source's experiments. The source's γ counts clockwise; `project` returns right-handed angles, so its γ is −γz.
+The source projects the polyhedron of points and origins onto X-Y, X-Z and Y-Z (formulas 5 to 11). It solves the X-Y
+plane by the cosine rule, which is here letter for letter but for two misprints: |O2R2| is printed with the coordinates
+of R1, and |O1e| with |O1P1| where its triangle has the side |O1P2|. Both pairs are equal in the source's experiments.
+The source's γ counts clockwise; `project` returns right-handed angles, so its γ is −γz.
 
 For X-Z and Y-Z the source says "likewise". `Projection.likewise` has the same rules there, 0/0 in its experiments,
 where P1 and P2 fall on one point of the X-Z plane. So T takes these planes from the vectors R1R2 that rod and second
@@ -85,13 +83,14 @@ class Stand:
 
 
 def cylinder_points(joint1: Array | float, radius: Array | float, height: Array | float) -> Array:
-    """Points (..., 3) of a robot that reaches `radius` and `height` at the joint-1 angle, right-handed about z."""
+    """Return points (..., 3) that a robot reaches by joint 1 (right-handed about z), `radius` and `height`."""
     return np.stack([radius * np.cos(joint1), radius * np.sin(joint1), height], axis=-1)
 
 
 def cylinder_covariance(joint1: float, radius: float, sigma: tuple[float, float, float]) -> Array:
-    """Covariance (3, 3) of one of `cylinder_points` from the sigmas of joint 1 (rad), radius and height."""
-    c, s = np.cos(joint1), np.sin(joint1)
+    """Return the covariance (3, 3) of one of `cylinder_points` from the sigmas of joint 1 (rad), radius and height."""
+    c = np.cos(joint1)
+    s = np.sin(joint1)
     jacobian = np.array([[-radius * s, c, 0.0], [radius * c, s, 0.0], [0.0, 0.0, 1.0]])
     return jacobian @ np.diag(np.square(sigma)) @ jacobian.T
 
@@ -109,21 +108,21 @@ class DhArm:
     tip: Array = field(default_factory=lambda: np.zeros(3))  # in the flange frame
 
     def flange(self, joints: Array) -> Array:
-        """T_base_flange (..., 4, 4) at joints (..., n)."""
+        """Return T_base_flange (..., 4, 4) at joints (..., n)."""
         T = np.eye(4)
-        for i, q in enumerate(np.moveaxis(np.asarray(joints, float), -1, 0)):
-            turn = self.theta[i] + (0.0 if self.slides[i] else q)
-            shift = self.d[i] + (q if self.slides[i] else 0.0)
-            joint, link = elementary("z", turn, shift), elementary("x", self.alpha[i], self.a[i])
+        for i, q in enumerate(np.moveaxis(joints, -1, 0)):
+            turn, shift = (0.0, q) if self.slides[i] else (q, 0.0)
+            joint = elementary("z", self.theta[i] + turn, self.d[i] + shift)
+            link = elementary("x", self.alpha[i], self.a[i])
             T = T @ (link @ joint if self.modified else joint @ link)
         return T
 
     def touched(self, joints: Array, sigma: Array) -> tuple[Array, Array, Array]:
-        """Tips (N, 3), their covariance (N, 3, 3) from the joints' sigmas (n,), and α, β, γ (N, 3) of the flange."""
-        T, steps = self.flange(joints), 1e-5 * np.eye(len(sigma))
+        """Return tips (N, 3), their covariance (N, 3, 3) by joints' sigmas (n,), and the flange's α, β, γ (N, 3)."""
+        steps = 1e-5 * np.eye(len(sigma))
         ahead, back = (self._tips(joints[:, None] + sign * steps) for sign in (1, -1))
         slopes = (ahead - back) / 2e-5 * sigma[:, None]
-        angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX")[:, ::-1]
+        angles = Rotation.from_matrix(self.flange(joints)[:, :3, :3]).as_euler("ZYX")[:, ::-1]
         return self._tips(joints), np.einsum("nki,nkj->nij", slopes, slopes), angles
 
     def _tips(self, joints: Array) -> Array:
@@ -132,13 +131,13 @@ class DhArm:
 
 
 def rod_points(slide: Array, angle: Array, length: Array, turn: float) -> Array:
-    """Rod cup (M, 3) in the stand frame (formulas 5 and 6 of the source, with the slide added)."""
+    """Return the rod's cup (M, 3) in the stand frame (formulas 5 and 6 of the source, with the slide added)."""
     across = turn * length * np.sin(angle)
     return np.stack([slide - length * np.cos(angle), across, np.zeros_like(slide)], axis=-1)
 
 
 def level_stand(rail: Array, rail_slide: Array) -> Array:
-    """T_base1_stand (4, 4) from points (N, 3) on the rail, with the rod's swing horizontal across the rail.
+    """Return T_base1_stand (4, 4) from points (N, 3) on the rail, with the rod's swing horizontal across the rail.
 
     The source's choice: the line R–S of its figure 6 is perpendicular to the vertical plane through the rail.
     """
@@ -151,7 +150,7 @@ def level_stand(rail: Array, rail_slide: Array) -> Array:
 
 
 def rail_direction(rail: Array) -> Array:
-    """(3,) unit direction of growing slide, in which the points (N, 3) are listed."""
+    """Return the unit direction (3,) of growing slide, in which the points (N, 3) are listed."""
     line = np.linalg.svd(rail - rail.mean(axis=0), full_matrices=False)[2][0]
     return line * np.sign(line @ (rail[-1] - rail[0]))
 
@@ -177,17 +176,17 @@ class DistanceComparison:
 
 
 def compare_distances(stand: Stand) -> tuple[DistanceComparison, ...]:
-    """Every pair of rod settings, and every pair of rail points whose slide was read; largest contradiction first."""
-    found = [_compare_rod_pair(stand, i, j) for i, j in combinations(range(len(stand.slide)), 2)]
+    """Compare every pair of rod settings, and of rail points whose slide was read; largest contradiction first."""
+    comparisons = [_compare_rod_pair(stand, i, j) for i, j in combinations(range(len(stand.slide)), 2)]
     known = np.flatnonzero(np.isfinite(stand.rail_slide)).tolist()
     for i, j in combinations(known, 2):
         distance = abs(float(stand.rail_slide[j] - stand.rail_slide[i]))
-        found.append(_distance_comparison(stand.rail, i, j, distance, 2 * stand.sigma_slide**2))
-    return tuple(sorted(found, key=lambda c: -c.sigmas))
+        comparisons.append(_distance_comparison(stand.rail, i, j, distance, 2 * stand.sigma_slide**2))
+    return tuple(sorted(comparisons, key=lambda c: -c.sigmas))
 
 
 def _compare_rod_pair(stand: Stand, i: int, j: int) -> DistanceComparison:
-    """Both slides count as one reading where they are equal: the pivot was not moved."""
+    """Compare one pair. Both slides count as one reading where they are equal: the pivot was not moved."""
     apart = stand.cups[j] - stand.cups[i]
     distance = float(np.linalg.norm(apart))
     unit = apart / max(distance, np.finfo(float).tiny)
@@ -234,16 +233,17 @@ class BaseFit:
 
 
 def fit_stand(stand: Stand) -> BaseFit:
-    """Maximum likelihood over both base poses and over the true values of all rod readings.
+    """Fit by maximum likelihood over both base poses and over the true values of all rod readings.
 
     Raises:
         NoResultError: the readings leave a direction of the second base open.
     """
-    start, scales = _initial_poses(stand), _unknown_scales(stand)
+    start = _initial_poses(stand)
+    scales = _unknown_scales(stand)
     steps = np.diag(1e-2 * scales)
 
     def jacobian_at(x: Array) -> Array:
-        """Central differences, all columns in one evaluation; a step is a hundredth of a typical error."""
+        """Return central differences, all columns in one evaluation; a step is a hundredth of a typical error."""
         ahead, back = _residuals(stand, start, x + np.stack([steps, -steps]))
         return (ahead - back).T / (2e-2 * scales)
 
@@ -277,7 +277,7 @@ def fit_stand(stand: Stand) -> BaseFit:
 
 
 def _initial_poses(stand: Stand) -> tuple[Array, Array]:
-    """Level stand, and the second base from its points; bases upright where the points leave that open."""
+    """Return the level stand, and the second base from its points; bases upright where the points leave that open."""
     T_stand = level_stand(stand.rail.points, stand.rail_slide)
     here = frames.transform(T_stand, stand.cups)
     there = stand.rod.points
@@ -291,7 +291,7 @@ def _initial_poses(stand: Stand) -> tuple[Array, Array]:
 
 
 def _unknown_scales(stand: Stand) -> Array:
-    """Typical size of each unknown's error, for conditioning: rad for rotations, length elsewhere."""
+    """Return the typical size of each unknown's error, for conditioning: rad for rotations, length elsewhere."""
     length = max(stand.sigma_length, stand.sigma_slide)
     pose = np.repeat([stand.sigma_angle, length], 3)
     along = np.full(len(stand.rail.points), length)
@@ -300,8 +300,9 @@ def _unknown_scales(stand: Stand) -> Array:
 
 
 def _unpack(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, ...]:
-    """Poses, positions along the rail, and corrections of slide, angle and length; x is (..., n)."""
-    N, M = len(stand.rail.points), len(stand.slide)
+    """Return poses, positions along the rail, and corrections of slide, angle and length; x is (..., n)."""
+    N = len(stand.rail.points)
+    M = len(stand.slide)
     poses = []
     for T0, step in zip(start, (x[..., :6], x[..., 6:12]), strict=True):
         turn = frames.exp(np.concatenate([step[..., :3], np.zeros_like(step[..., :3])], axis=-1))[..., :3, :3]
@@ -311,7 +312,7 @@ def _unpack(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, 
 
 
 def _point_misfits(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[Array, Array]:
-    """Touched minus fitted points, each in the base of the robot that touched them."""
+    """Return touched minus fitted points, each in the base of the robot that touched them."""
     T_stand, T_base, along, slide, angle, length = _unpack(stand, start, x)
     rail = frames.transform(T_stand, along[..., None] * np.array([1.0, 0.0, 0.0]))
     cup = rod_points(stand.slide + slide, stand.angle + angle, stand.length + length, stand.turn)
@@ -320,7 +321,7 @@ def _point_misfits(stand: Stand, start: tuple[Array, Array], x: Array) -> tuple[
 
 
 def _residuals(stand: Stand, start: tuple[Array, Array], x: Array) -> Array:
-    """Everything over its sigma: touched points, rod readings, level of the stand and of the second base."""
+    """Return everything over its sigma: touched points, rod readings, level of the stand and of the second base."""
     T_stand, T_base, along, slide, angle, length = _unpack(stand, start, x)
     rail, rod = _point_misfits(stand, start, x)
     known = np.isfinite(stand.rail_slide)
@@ -356,7 +357,7 @@ class Projection:
 
 
 def project(stand: Stand) -> Projection:
-    """T_base1_base2 from exactly two points per robot by the source's three projections.
+    """Return T_base1_base2 from exactly two points per robot by the source's three projections.
 
     Raises:
         NoResultError: other than two points per robot, a slide that moved between R1 and R2, or triangles that do
@@ -387,12 +388,16 @@ def project(stand: Stand) -> Projection:
 
 
 def _likewise(stand: Stand, pivot: Array, R_base1: Array, turned: Array, axes: tuple[int, int]) -> Array | str:
-    """Angle and both offsets (3,) in X-Z or Y-Z, x or y first, or why there are none; `turned` is R after γ (2, 3)."""
+    """Return angle and both offsets (3,) in X-Z or Y-Z, x or y first, or why there are none.
+
+    Args:
+        turned: R after γ (2, 3).
+    """
     for name, points in (("P1 and P2", stand.rail.points), ("R1 and R2", R_base1)):
         apart = points[1] - points[0]
         if np.linalg.norm(apart[list(axes)]) < _SHORT * np.linalg.norm(apart):
             return f"{name} fall on one point of this plane, where the cosine rules are 0/0"
-    found = []
+    solutions = []
     for side in (1.0, -1.0):
         try:
             angle, offset = _cosine_rules(stand, pivot, R_base1, turned, axes, side)
@@ -400,21 +405,20 @@ def _likewise(stand: Stand, pivot: Array, R_base1: Array, turned: Array, axes: t
             continue
         back = turned[:, axes] @ _rotation(2, angle)[:2, :2].T + offset
         gap = float(np.abs(back - R_base1[:, axes]).max())
-        found.append((gap, np.array([angle, *(offset[::-1] if axes == (2, 0) else offset)])))
-    gap, best = min(found, key=lambda pair: pair[0], default=(np.inf, None))
+        solutions.append((gap, np.array([angle, *(offset[::-1] if axes == (2, 0) else offset)])))
+    gap, best = min(solutions, key=lambda pair: pair[0], default=(np.inf, None))
     if best is not None and gap < _CLOSED * stand.length.max():
         return best
     return "the triangles do not close in this plane"
 
 
 def _flange_tilt(stand: Stand, gamma: float) -> Array | None:
-    """(2,) β and α that make the flanges' z axes of both robots parallel; None where their angles are not known."""
+    """Return β and α (2,) that make both flanges' z axes parallel; None where their angles are not known."""
     if stand.rail.rpy is None or stand.rod.rpy is None:
         return None
     main, second = (
-        Rotation.from_euler("ZYX", touched.rpy[:, ::-1]).as_matrix()[:, :, 2].mean(axis=0)
-        for touched in (stand.rail, stand.rod)
-        if touched.rpy is not None
+        Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()[:, :, 2].mean(axis=0)
+        for rpy in (stand.rail.rpy, stand.rod.rpy)
     )
     # Both upwards; the turn about x alone changes y, then that about y the angle from z to x.
     here, there = (axis * np.sign(axis[2]) for axis in (_rotation(2, -gamma) @ main, second))
@@ -427,7 +431,7 @@ def _flange_tilt(stand: Stand, gamma: float) -> Array | None:
 def _cosine_rules(
     stand: Stand, pivot: Array, R_base1: Array, rod: Array, axes: tuple[int, int], side: float
 ) -> tuple[float, Array]:
-    """Angle and offsets (2,) in the plane of `axes` by formulas 5 to 10 and the cosine rules after them.
+    """Return angle and offsets (2,) in the plane of `axes` by formulas 5 to 10 and the cosine rules after them.
 
     Written for the source's side: seen against the plane's normal, the rod turns clockwise. With `side` −1 all is
     mirrored.
@@ -440,14 +444,22 @@ def _cosine_rules(
     mirror = np.array([1.0, side])
     P, R, e, cups = (points[..., list(axes)] * mirror for points in (stand.rail.points, rod, pivot, R_base1))
     # Formulas 5 to 10 in this plane: the rod's length, and its angle against the rail.
-    length, theta = np.linalg.norm(cups - e, axis=1), _angles_between(P[0] - P[1], cups - e)
+    length = np.linalg.norm(cups - e, axis=1)
+    theta = _angles_between(P[0] - P[1], cups - e)
     P2e = float(np.linalg.norm(e - P[1]))
-    Pr, Rr = np.arctan2(P[:, 1], P[:, 0]), -np.arctan2(R[:, 1], R[:, 0])
-    O1P, O2R = np.hypot(P[:, 0], P[:, 1]), np.hypot(R[:, 0], R[:, 1])
-    P1P2, R1R2 = _third_side(O1P[0], O1P[1], abs(Pr[0] - Pr[1])), _third_side(O2R[0], O2R[1], abs(Rr[0] - Rr[1]))
-    C1, C3 = _angle(O1P[0], P1P2, O1P[1]), _angle(O2R[0], R1R2, O2R[1])
-    C2, C4, C7 = np.pi - (C1 + Pr[0]), np.pi - (C3 + Rr[0]), np.pi - (C3 + abs(Rr[0] - Rr[1]))
-    C5, C6 = _angle(length[0], R1R2, length[1]), _angle(R1R2, length[1], length[0])
+    Pr = np.arctan2(P[:, 1], P[:, 0])
+    Rr = -np.arctan2(R[:, 1], R[:, 0])
+    O1P = np.hypot(P[:, 0], P[:, 1])
+    O2R = np.hypot(R[:, 0], R[:, 1])
+    P1P2 = _third_side(O1P[0], O1P[1], abs(Pr[0] - Pr[1]))
+    R1R2 = _third_side(O2R[0], O2R[1], abs(Rr[0] - Rr[1]))
+    C1 = _angle(O1P[0], P1P2, O1P[1])
+    C3 = _angle(O2R[0], R1R2, O2R[1])
+    C2 = np.pi - (C1 + Pr[0])
+    C4 = np.pi - (C3 + Rr[0])
+    C7 = np.pi - (C3 + abs(Rr[0] - Rr[1]))
+    C5 = _angle(length[0], R1R2, length[1])
+    C6 = _angle(R1R2, length[1], length[0])
     gamma_z = C2 + C4 + theta[0] - C5
     O2e = _third_side(O2R[1], length[1], C7 + C6)
     C8 = _angle(O2e, length[1], O2R[1])
@@ -465,7 +477,7 @@ def _cosine_rules(
 
 
 def _angles_between(a: Array, b: Array) -> Array:
-    """(N,) angles of vectors b (N, 2) against a (2,), without sign."""
+    """Return the angles (N,) of vectors b (N, 2) against a (2,), without sign."""
     return np.abs(np.arctan2(a[0] * b[:, 1] - a[1] * b[:, 0], b @ a))
 
 
@@ -474,7 +486,7 @@ def _third_side(a: float, b: float, between: float) -> float:
 
 
 def _angle(a: float, b: float, opposite: float) -> float:
-    """Angle between the sides a and b of a triangle."""
+    """Return the angle between the sides a and b of a triangle."""
     cosine = (a * a + b * b - opposite * opposite) / (2 * a * b) if a * b > 0 else np.nan
     # A triangle that lies flat may miss ±1 by rounding; one that misses more does not close.
     if not abs(cosine) < 1 + 1e-12:
@@ -485,16 +497,17 @@ def _angle(a: float, b: float, opposite: float) -> float:
 
 
 def _plane(R_base1: Array, R_turned: Array, axes: tuple[int, int], normal: int) -> tuple[float, Array]:
-    """Angle about the axis `normal` and the two offsets, from the direction of R1R2 in the plane `axes`."""
-    here, there = R_base1[:, axes], R_turned[:, axes]
-    d1, d2 = here[1] - here[0], there[1] - there[0]
-    seen = np.linalg.norm(d2) > _SHORT * np.linalg.norm(R_turned[1] - R_turned[0])
-    angle = float(np.arctan2(d2[0] * d1[1] - d2[1] * d1[0], d2 @ d1)) if seen else float("nan")
+    """Return the angle about the axis `normal` and the two offsets, from the direction of R1R2 in the plane `axes`."""
+    d1 = (R_base1[1] - R_base1[0])[list(axes)]
+    d2 = (R_turned[1] - R_turned[0])[list(axes)]
+    angle = float("nan")
+    if np.linalg.norm(d2) > _SHORT * np.linalg.norm(R_turned[1] - R_turned[0]):
+        angle = float(np.arctan2(d2[0] * d1[1] - d2[1] * d1[0], d2 @ d1))
     turned = R_turned @ _rotation(normal, angle).T
-    return angle, np.asarray((R_base1 - turned).mean(axis=0)[list(axes)])
+    return angle, (R_base1 - turned).mean(axis=0)[list(axes)]
 
 
 def _rotation(axis: int, angle: float) -> Array:
-    """(3, 3); of an angle that a plane does not show, no turn."""
+    """Return the turn (3, 3) about an axis; of an angle that a plane does not show, no turn."""
     angle = 0.0 if np.isnan(angle) else angle
     return frames.exp(np.concatenate([angle * np.eye(3)[axis], np.zeros(3)]))[:3, :3]
