@@ -28,6 +28,11 @@ MOTIONS = ("one_turn", "no_turn", "one_axis", "still", "two_places", "tiny", "co
 TARGETS = ("one", "two", "on_a_line", "in_a_plane", "at_one_place", "each_seen_once")
 SURFACES = ("plane", "sphere", "cylinder", "line", "point", "few_points", "apart")
 GAPS = ("empty_view", "no_sightings", "missing_cloud", "all_outliers", "no_noise", "copied_scan")
+TRAITS = {
+    "points": (*MOTIONS, *GAPS, *TARGETS),
+    "clouds": (*MOTIONS, *GAPS, *SURFACES),
+    "both": (*MOTIONS, *GAPS, *TARGETS, *SURFACES),
+}
 _HAND_EYE = frames.exp(np.array([0.3, -0.2, 1.1, 40.0, -25.0, 120.0]))
 _FROM_PART = 350.0  # mm, from the scanner to the middle of the part
 _POINTS = 400
@@ -37,7 +42,6 @@ def drawn(seed: int) -> Row:
     """Return what a seed stands for: kind of session, number of views, mount and traits."""
     rng = np.random.default_rng(seed)
     kind = str(rng.choice(["points", "clouds", "both"], p=[0.6, 0.25, 0.15]))
-    words = [*MOTIONS, *GAPS, *(TARGETS if kind != "clouds" else ()), *(SURFACES if kind != "points" else ())]
     count = int(rng.choice([0, 1, 2, 3], p=[0.35, 0.4, 0.2, 0.05]))
     return {
         "seed": seed,
@@ -48,7 +52,7 @@ def drawn(seed: int) -> Row:
         "stated": bool(rng.random() < 0.5),  # where the scanner sits, roughly
         "checked": bool(rng.random() < 0.7),  # whether the poses are what they are said to be
         "times": str(rng.choice(["none", "rising", "same"])),
-        "traits": sorted(rng.choice(words, count, replace=False).tolist()),
+        "traits": sorted(rng.choice(TRAITS[kind], count, replace=False).tolist()),
     }
 
 

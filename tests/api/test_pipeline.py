@@ -7,10 +7,13 @@ from threading import current_thread
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import stitch
+from bench import degenerate
 from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
@@ -222,3 +225,48 @@ def test_the_effect_of_a_kept_arm_that_errs_here_is_named():
     imitated = replace(arm, effects={**arm.effects, "gear_harmonic": {**wrong, **zero}})
     (doubt,), _ = told_of(run(session, arm=imitated))
     assert "without its gear_harmonic" in doubt
+
+
+_QUIET = settings(max_examples=8, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+
+
+@_QUIET
+@given(
+    seed=st.integers(0, 10_000), views=st.integers(2, 6), traits=st.sets(st.sampled_from(degenerate.TRAITS["points"]))
+)
+def test_no_session_of_labelled_points_ends_in_a_traceback(seed, views, traits):
+    job = degenerate.drawn(seed) | {"kind": "points", "views": views, "traits": sorted(traits)}
+    assert degenerate.trial(job)["crashes"] == []
+
+
+@pytest.mark.slow
+@settings(_QUIET, max_examples=15)
+@given(
+    seed=st.integers(0, 10_000), views=st.integers(2, 6), traits=st.sets(st.sampled_from(degenerate.TRAITS["clouds"]))
+)
+def test_no_session_of_scans_ends_in_a_traceback(seed, views, traits):
+    job = degenerate.drawn(seed) | {"kind": "clouds", "views": views, "traits": sorted(traits)}
+    assert degenerate.trial(job)["crashes"] == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "views", "traits"),
+    [
+        ("clouds", 6, ["still"]),
+        ("clouds", 4, ["part_still"]),
+        ("clouds", 5, ["copied_row"]),
+        ("clouds", 3, ["copied_row", "part_still"]),
+        ("clouds", 3, []),
+        ("clouds", 4, ["few_points"]),
+        ("clouds", 6, ["plane", "two_places"]),
+        ("both", 3, ["missing_cloud"]),
+        ("clouds", 5, ["missing_cloud"]),
+        ("points", 4, ["no_sightings"]),
+        ("points", 3, []),
+        ("points", 5, ["all_outliers"]),
+    ],
+)
+def test_what_once_ended_in_a_traceback_ends_in_a_result_or_a_sentence(kind, views, traits):
+    job = degenerate.drawn(7) | {"kind": kind, "views": views, "traits": traits, "checked": False}
+    outcome = degenerate.trial(job)
+    assert outcome["crashes"] == [] and (outcome["result"] or outcome["refused"])

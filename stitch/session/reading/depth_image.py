@@ -10,6 +10,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
+from stitch.session.reading.announced_points import require_exr_room
 from stitch.session.reading.intrinsics import Intrinsics, find_intrinsics
 from stitch.system.packages import import_extra
 
@@ -76,6 +77,7 @@ def _pixels(path: Path) -> Array:
 
 
 def _exr(path: Path) -> Array:
+    require_exr_room(path)
     with import_extra("OpenEXR", path, "formats").File(str(path)) as file:
         channels = {name: np.asarray(channel.pixels, float) for name, channel in file.channels().items()}
     name = next((name for name in _CHANNELS if name in channels), next(iter(channels)))

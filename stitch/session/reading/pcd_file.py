@@ -15,6 +15,8 @@ from stitch.numerics.frames import Array
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
 _HEADER_BYTES = 65536
+# LZF packs no more bytes than 264 into three.
+_MOST_PACKED = 90
 
 
 def read_pcd(path: Path) -> dict[str, Array]:
@@ -93,7 +95,7 @@ def _compressed_columns(
 ) -> dict[str, Array]:
     """Of data that are LZF-compressed, and stored field by field."""
     packed, size = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, 0)
-    if size != layout.itemsize * count or len(body) < 8 + packed:
+    if size != layout.itemsize * count or len(body) < 8 + packed or size > _MOST_PACKED * packed:
         raise InputError(f"{path}: compressed data are cut short; export it again")
     data = lzf.decompress(body[8 : 8 + packed], size) if size else b""
     if data is None or len(data) != size:

@@ -12,6 +12,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
+from stitch.session.reading import announced_points
 from stitch.session.reading.csv_files import is_number
 from stitch.session.reading.depth_image import is_depth_image, read_depth_columns
 from stitch.session.reading.text_files import require_file
@@ -133,7 +134,8 @@ def read_array(path: Path) -> dict[str, Array]:
     """Return columns (N,) of a .npy: (N, 3) or more, an image (H, W, 3) with NaN in empty pixels, or depths (H, W)."""
     if is_depth_image(path):
         return read_depth_columns(path)
-    array = np.load(path, allow_pickle=False)
+    # Mapped, so that a header that announces more than the file has is refused before room is made.
+    array = np.array(np.load(path, mmap_mode="r", allow_pickle=False))
     if array.dtype.kind not in "fiu" or array.ndim not in (2, 3) or array.shape[-1] < 3:
         raise InputError(f"{path}: an array {array.shape} is no cloud; save (N, 3) or (H, W, 3) numbers")
     table = array.reshape(-1, array.shape[-1])
@@ -163,6 +165,8 @@ def ptx_scans(path: Path) -> list[list[str]]:
     scans = []
     while lines:
         end = _PTX_HEADER + int(lines[0]) * int(lines[1])
+        if end < _PTX_HEADER:
+            raise InputError(f"{path}: {lines[0]} columns of {lines[1]} points announced; export it again")
         scans.append(lines[:end])
         lines = lines[end:]
     return scans
@@ -170,6 +174,7 @@ def ptx_scans(path: Path) -> list[list[str]]:
 
 def read_las(path: Path) -> dict[str, Array]:
     """Return columns (N,) x, y, z and intensity of LAS and LAZ, by laspy."""
+    announced_points.require_las_room(path)
     las = import_extra("laspy", path, "formats").read(path)
     xyz = np.asarray(las.xyz, float)
     return {**dict(zip("xyz", xyz.T, strict=True)), "intensity": np.asarray(las.intensity, float)}
@@ -177,6 +182,7 @@ def read_las(path: Path) -> dict[str, Array]:
 
 def read_e57(path: Path) -> dict[str, Array]:
     """Return columns (N,) of the one scan of an E57 in its own frame, by pye57."""
+    announced_points.require_e57_room(path)
     file = import_extra("pye57", path, "formats").E57(str(path))
     if file.scan_count != 1:
         raise InputError(_several_scans_message(path, f"{file.scan_count} scans"))
@@ -219,6 +225,7 @@ def read_zdf_image(path: Path) -> tuple[Array, Array | None]:
         image = file.get("data/rgba_image")
         if cloud is None or len(cloud.shape) != 3 or cloud.shape[2] != 3:
             raise InputError(f"{path}: no data/pointcloud of x, y, z in it; to fix: save it as PLY in Zivid Studio")
+        announced_points.require_room(path, cloud.shape[0] * cloud.shape[1])
         points = np.asarray(cloud, float)
         if image is None or image.shape[:2] != points.shape[:2] or image.shape[2] < len(_COLOURS):
             return points, None

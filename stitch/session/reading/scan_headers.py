@@ -11,6 +11,7 @@ import numpy as np
 
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
+from stitch.session.reading.announced_points import require_e57_room
 from stitch.system.packages import import_extra
 
 _HEAD = 4096
@@ -46,6 +47,7 @@ def poses_in_scans(files: list[Path]) -> Array | None:
 
 
 def _e57(file: Path) -> Array | None:
+    require_e57_room(file)
     # A header is good for as long as its file is open.
     opened = import_extra("pye57", file, "formats").E57(str(file))
     header = opened.get_header(0)
@@ -87,6 +89,7 @@ def times_in_scans(files: list[Path]) -> list[str] | None:
 
 def _e57_seconds(file: Path) -> float:
     """Return seconds since _GPS_EPOCH; zero where the header has no time."""
+    require_e57_room(file)
     opened = import_extra("pye57", file, "formats").E57(str(file))
     try:
         return float(opened.get_header(0).acquisitionStart_dateTimeValue)
