@@ -46,13 +46,14 @@ def cell():
 
 def _numbers(state, wanted):
     places = place_errors(state)
-    return number_table(wanted.features, fit_features(places.points, wanted.features)).values
+    _, values, _, _ = number_table(wanted.features, fit_features(places.points, wanted.features))
+    return values
 
 
 def _responses(places, wanted):
     fits = fit_features(places.points, wanted.features)
-    table = number_table(wanted.features, fits)
-    return stack_responses([places.responses(fit.at, fit.gradient) for fit in fits]).combined(table.slopes)
+    _, _, _, slopes = number_table(wanted.features, fits)
+    return stack_responses([places.responses(fit.at, fit.gradient) for fit in fits]).combined(slopes)
 
 
 def _lengths(wanted, values):
