@@ -153,7 +153,7 @@ def bad_arm(job: Row) -> Row:
     knock = pose(rng.normal(size=3) * job["times"] * scatter / 2000, job["times"] * scatter * way / np.linalg.norm(way))
     true = [*true[:start], *(knock @ T for T in true[start:])]
     found = deep_check(labelled_session(nominal, seen_by(true, X, places, mount, rng), mount))
-    moved = [v.views[0] for v in found if v.kind == "moved"]
+    moved = [v.views[0] for v in found if v.kind == "reclamped"]
     right = bool(moved) and abs(int(moved[0][1:]) - start) <= 1 and len(found) == 1
     return {
         "views": views,

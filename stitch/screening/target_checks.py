@@ -11,11 +11,11 @@ import numpy as np
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
-from stitch.numerics.distributions import nan_median
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.units import METRES, length_text
 from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye, sensor_motions
 from stitch.observations.targets.outliers import drop_mislabelled, find_mislabelled
+from stitch.screening.common_move import find_common_move
 from stitch.screening.conventions import rank_hypotheses
 from stitch.screening.hypotheses import UNITS, Hypothesis, distinct, hypotheses, problem, stated_hypothesis
 from stitch.screening.motions import RelativeScans
@@ -24,14 +24,13 @@ from stitch.screening.problems import SessionProblem, likeliest_text
 from stitch.session.capture import Capture, Sightings, build_capture, sightings_of
 from stitch.session.session import SessionData
 
-# No arm is off by more; a better hypothesis must leave a fifth of what the stated one leaves.
-_LIMIT_M, _CLEARER = 0.005, 0.2
+# Arms that are off by this much, and by this share of how far the targets move, are bad and may be right; a better
+# hypothesis must leave a fifth of what the stated one leaves.
+_LIMIT_M, _SHARE_OF_MOTION, _CLEARER = 0.005, 0.1, 0.2
 # Hypotheses that are fitted in full.
 _MAX_HYPOTHESES = 12
 # Views that are tried, of more of them so many in a row all over the session: what is wrong with all shows in these.
 _TRIED, _IN_A_ROW = 60, 6
-# Views that a side of a common displacement has at least, and the share of views that must be on their side of it.
-_SIDE_VIEWS, _ON_ITS_SIDE = 5, 0.9
 
 # How far poses leave the sightings of one target apart: median distance from its middle (length_unit); the hand-eye
 # (4, 4); and the middles (K, 3) in the reference frame, NaN where fewer than two views show one.
@@ -63,16 +62,13 @@ def check_targets(session: SessionData) -> list[SessionProblem]:
     rows = _tried_rows(len(session.views))
     stated = stated_hypothesis(session, rows)
     capture = _capture_of(session, rows)
-    limit = _LIMIT_M / METRES[session.length_unit]
+    moved = _find_common_move(session, rows, capture)
+    if moved is not None:
+        return [moved]
     as_stated = _fit_hypothesis(capture, stated)
-    most_agree = as_stated is not None and as_stated[0] < limit
-    if as_stated is not None and most_agree:
-        off = _distances_from_middles(capture, as_stated) > limit
-        if np.mean(off) < 1 - _ON_ITS_SIDE:
-            return []
-    moved = _find_common_move(session, rows, limit)
-    if moved is not None or most_agree:
-        return [moved] if moved is not None else []
+    limit = max(_LIMIT_M / METRES[session.length_unit], _SHARE_OF_MOTION * _motion_seen(capture))
+    if as_stated is not None and as_stated[0] < limit:
+        return []
     tried = _hypotheses_to_try(session, rows, capture, limit)
     spreads = [(h, fit[0]) for h in tried if (fit := _fit_hypothesis(capture, h)) is not None]
     best, spread = min(spreads, key=lambda pair: pair[1], default=(stated, np.inf))
@@ -101,55 +97,30 @@ def _capture_of(session: SessionData, rows: Indices) -> Capture:
     return build_capture(session.name, (), T, session.mount, sightings_of(some))
 
 
-def _find_common_move(session: SessionData, rows: Indices, limit: float) -> SessionProblem | None:
-    """Find the row from which on everything that the sensor shows stands elsewhere; None if there is none.
-
-    A tracker that was knocked over, or a table that was moved: each side of it fits by itself. One side is fitted to a
-    third of the views, and the others are held against it.
-
-    Args:
-        limit: distance from a target's middle that no arm makes, length_unit.
-    """
-    capture = _capture_of(session, rows)
-    count = len(rows)
-    third = max(count // 3, _SIDE_VIEWS)
-    for at_end in (False, True):
-        order = np.arange(count)[::-1] if at_end else np.arange(count)
-        fit = _fit_some(session, rows[np.sort(order[:third])], limit)
-        if fit is None:
-            continue
-        beyond = (_distances_from_middles(capture, fit) > limit)[order]
-        right = np.array([np.mean(np.append(~beyond[:k], beyond[k:])) for k in range(count)])
-        k = int(np.argmax(right))
-        if right[k] < _ON_ITS_SIDE or not _SIDE_VIEWS <= k <= count - _SIDE_VIEWS:
-            continue
-        if _fit_some(session, rows[np.sort(order[k:])], limit) is None:
-            continue
-        # Between the last row on the side that was fitted and the first one on the other.
-        near, far = sorted((int(rows[order[k - 1]]), int(rows[order[k]])))
-        between = np.arange(near, far + 1)
-        beyond = _distances_from_middles(_capture_of(session, between), fit) > limit
-        start = near + int(np.sum(beyond) if at_end else np.sum(~beyond))
-        sensor_or_targets = "the tracker" if session.mount == "eye_to_hand" else "all targets together"
-        what = f"{sensor_or_targets}, or the robot's base, moved"
-        names = session.names
-        return problem("moved", names[start:], what=what, before=names[start - 1], after=names[start])
-    return None
+def _find_common_move(session: SessionData, rows: Indices, capture: Capture) -> SessionProblem | None:
+    """Find the view from which on everything that the sensor shows stands elsewhere; None if there is none."""
+    move = find_common_move(capture)
+    if move is None:
+        return None
+    # Between the last row before it that was tried and the first one after.
+    between = np.arange(rows[move.start - 1] + 1, rows[move.start])
+    start = int(rows[move.start])
+    if len(between):
+        start -= int(np.sum(move.shows(_capture_of(session, between))))
+    sensor_or_targets = "the tracker" if session.mount == "eye_to_hand" else "all targets together"
+    what = f"{sensor_or_targets}, or the robot's base, moved"
+    names = session.names
+    found = problem("moved", names[start:], what=what, before=names[start - 1], after=names[start])
+    return found if move.is_sure else replace(found, certain=False)
 
 
-def _fit_some(session: SessionData, rows: Indices, limit: float) -> TargetSpread | None:
-    """Return the fit to some rows; None where they do not hold together."""
-    fit = _fit_hypothesis(_capture_of(session, rows), stated_hypothesis(session, rows))
-    return None if fit is None or fit[0] > limit else fit
-
-
-def _distances_from_middles(capture: Capture, fit: TargetSpread) -> Array:
-    """(V,) median distance of what a view shows from where a fit of other views has it; 0 where that has nothing."""
+def _motion_seen(capture: Capture) -> float:
+    """Return how far targets move before the sensor, rms (length_unit): no convention of poses changes that."""
     s = capture.sightings
     assert s is not None
-    _, T_mount, middles = fit
-    apart = np.linalg.norm(frames.transform(capture.poses(T_mount), s.points) - middles[s.target], axis=2)
-    return np.nan_to_num(nan_median(np.where(s.used, apart, np.nan).T))
+    points, target = s.points[s.used], s.target[s.used]
+    squares = [np.sum((points[target == k] - points[target == k].mean(axis=0)) ** 2) for k in np.unique(target)]
+    return float(np.sqrt(np.sum(squares) / len(points)))
 
 
 def _hypotheses_to_try(session: SessionData, rows: Indices, capture: Capture, length: float) -> Iterator[Hypothesis]:

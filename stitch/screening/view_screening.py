@@ -217,9 +217,9 @@ def screen_targets(session: SessionData, targets: TargetModelFit) -> ViewScreeni
         NoResultError: none does.
     """
     rotation, translation = np.sqrt(targets.variances[:2])
-    if beyond_any_arm(session, rotation, translation):
-        refuse(session, check_targets(session))
-    return ViewScreening(doubts=target_warnings(session, targets.rows.sightings))
+    problems = check_targets(session) if beyond_any_arm(session, rotation, translation) else []
+    refuse(session, problems)
+    return ViewScreening(doubts=(*(p.fix for p in problems), *target_warnings(session, targets.rows.sightings)))
 
 
 def session_warnings(

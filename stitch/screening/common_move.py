@@ -1,0 +1,204 @@
+"""Find the view from which on everything that the sensor shows stands elsewhere: a tracker that was knocked over, a
+table or a robot's base that was moved.
+
+Two hypotheses are fitted to labelled points: one hand-eye with one set of targets for all views, and the same with one
+rigid motion of the base (6 numbers) from some view on. What both leave is held against the scatter that the session
+itself shows, so that a bad arm is not taken for one that moved: −2 log likelihood falls by n·d·log of the ratio of the
+squares, of the views' means and of what is left about them. The six numbers and the choice of the view have their price
+(BIC). Neighbouring views with like errors count as fewer.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.errors import NoResultError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Mask
+from stitch.observations.targets.closed_form_hand_eye import closed_form_hand_eye
+from stitch.session.capture import Capture, Sightings
+
+# Views that a side has at least, and targets of a view that are asked.
+_SIDE_VIEWS, _TARGETS = 3, 8
+# −2 log of the odds beyond the price of the numbers from which a move is believed: a thousand to one.
+_BELIEVED = 2 * np.log(1000.0)
+# A move of fewer times what the arm errs is a doubt only.
+_SURE_TIMES = 3.0
+# Solutions on the way to the move that fits best.
+_STEPS = 12
+
+
+@dataclass(frozen=True)
+class CommonMove:
+    """From view `start` on the base stands elsewhere."""
+
+    start: int
+    moved: float  # length_unit, rms over what the sensor shows
+    scatter: float  # length_unit, rms of the views
+    T: Array  # (4, 4) of the base
+    T_mount: Array  # (4, 4) T_mount_sensor
+    middles: Array  # (K, 3) of the targets, reference frame
+
+    @property
+    def is_sure(self) -> bool:
+        """False where the arm errs as much."""
+        return self.moved > _SURE_TIMES * self.scatter
+
+    def shows(self, capture: Capture) -> Mask:
+        """Return which views of another capture stand on the moved side."""
+        s = capture.sightings
+        assert s is not None
+        apart = []
+        for T in (np.eye(4), self.T):
+            placed = _placed(capture, self.T_mount, T, s)[1]
+            off = np.linalg.norm(placed - self.middles[s.target], axis=2)
+            apart.append(np.where(s.used, np.nan_to_num(off), 0.0).sum(axis=1))
+        return apart[1] < apart[0]
+
+
+def find_common_move(capture: Capture) -> CommonMove | None:
+    """Return the move that the evidence is for; None where there is none or too few views could show it."""
+    s = capture.sightings
+    assert s is not None
+    capture = replace(capture, sightings=_thinned(s))
+    count = len(s.points)
+    if count < 2 * _SIDE_VIEWS + 2:
+        return None
+    fits = [_MoveFit(capture, T_mount) for T_mount in _starts(capture)]
+    if not fits:
+        return None
+    one = min((fit.solved([count]) for fit in fits), key=lambda fit: fit.total)
+    starts = list(range(_SIDE_VIEWS, count - _SIDE_VIEWS + 1))
+    two = max((fit.solved(starts) for fit in [*fits, one]), key=lambda fit: one.evidence_of(fit))
+    price = 6 * np.log(count) + 2 * np.log(len(starts)) + _BELIEVED
+    return two.move() if one.evidence_of(two) > price else None
+
+
+def _thinned(s: Sightings) -> Sightings:
+    """Return sightings with some targets a view, those that most views show."""
+    rank = np.argsort(np.argsort(-s.view_counts, kind="stable"))[s.target]
+    of_view = np.argsort(np.argsort(np.where(s.used, rank, len(s.targets)), axis=1), axis=1)
+    return replace(s, used=s.used & (of_view < _TARGETS))
+
+
+def _starts(capture: Capture) -> Iterator[Array]:
+    """Yield hand-eyes (4, 4) of all views, of the first and of the last third: one side at least holds together."""
+    count = len(capture.T_reference_mount)
+    third = max(count // 3, _SIDE_VIEWS)
+    for left_out in (np.arange(0), np.arange(third, count), np.arange(count - third)):
+        try:
+            yield closed_form_hand_eye(capture.without(left_out))
+        except (NoResultError, np.linalg.LinAlgError):
+            continue
+
+
+def _placed(capture: Capture, T_mount: Array, T: Array, s: Sightings) -> tuple[Array, Array]:
+    """Return points (V, S, 3) in the base's frame and in the reference frame, with the base moved by T (…, 4, 4)."""
+    if capture.scanner_rides:
+        in_base = frames.transform(T @ capture.poses(T_mount), s.points)
+        return in_base, in_base
+    in_base = frames.transform(np.broadcast_to(T @ T_mount, capture.T_reference_mount.shape), s.points)
+    return in_base, frames.transform(capture.T_reference_mount, in_base)
+
+
+class _MoveFit:
+    """Hand-eye, targets, and a move of the base from a view on, by least squares."""
+
+    def __init__(self, capture: Capture, T_mount: Array, T: Array | None = None, start: int | None = None) -> None:
+        self.capture, self.T_mount = capture, T_mount
+        self.T = np.eye(4) if T is None else T
+        self.start = len(capture.T_reference_mount) if start is None else start
+        s = capture.sightings
+        assert s is not None
+        self.sightings = s
+        self.view, self.slot = np.nonzero(s.used)
+        self.target = s.target[self.view, self.slot]
+        base = np.where((np.arange(len(s.points)) >= self.start)[:, None, None], self.T, np.eye(4))
+        self.in_base, self.placed = (x[self.view, self.slot] for x in _placed(capture, T_mount, base, s))
+        self.rest = self._centred(self.placed[:, :, None])[:, :, 0]
+
+    @property
+    def total(self) -> float:
+        """Sum of squares."""
+        return float(np.sum(self.rest**2))
+
+    def solved(self, starts: list[int]) -> "_MoveFit":
+        """Return the best of the moves from any of the views, improved until nothing changes."""
+        best = self
+        for _ in range(_STEPS):
+            tried = [_MoveFit(self.capture, best.T_mount, best.T, start)._stepped() for start in starts]
+            nearer = min(tried, key=lambda fit: fit.total)
+            if nearer.start == best.start and nearer.total > (1 - 1e-6) * best.total:
+                break
+            # Of two views with one move the likelier comes first; then only it and its neighbours are looked at.
+            best, starts = nearer, [k for k in starts if abs(k - nearer.start) <= 2]
+        return best
+
+    def _stepped(self) -> "_MoveFit":
+        """Return one step of Gauss and Newton."""
+        p = self.sightings.points[self.view, self.slot]
+        middle = p.mean(axis=0)
+        there = self.in_base.mean(axis=0)
+        size = float(np.linalg.norm(p - middle, axis=1).mean()) or 1.0
+        to_reference = (
+            np.broadcast_to(np.eye(3), (len(p), 3, 3))
+            if self.capture.scanner_rides
+            else self.capture.T_reference_mount[self.view, :3, :3]
+        )
+        moved = (self.view >= self.start)[:, None, None]
+        of_base = np.where(moved, self.T[:3, :3], np.eye(3))
+        carried = self.capture.T_reference_mount[self.view, :3, :3]
+        to_base = of_base @ carried if self.capture.scanner_rides else of_base
+        of_mount = to_reference @ to_base @ self.T_mount[:3, :3]
+        rows = [of_mount @ -frames.skew((p - middle) / size), of_mount]
+        rows += [moved * (to_reference @ -frames.skew((self.in_base - there) / size)), moved * to_reference]
+        columns = self._centred(np.concatenate(rows, axis=2)).reshape(-1, 12)
+        x = np.linalg.lstsq(columns, -self.rest.ravel(), rcond=1e-8)[0]
+        turn = np.repeat([1 / size, 1.0], 3)
+        about, about_base = frames.make(np.eye(3), middle), frames.make(np.eye(3), there)
+        T_mount = self.T_mount @ about @ frames.exp(turn * x[:6]) @ frames.inverse(about)
+        T = about_base @ frames.exp(turn * x[6:]) @ frames.inverse(about_base) @ self.T
+        return _MoveFit(self.capture, T_mount, T, self.start)
+
+    def _centred(self, rows: Array) -> Array:
+        """Return rows (N, 3, c) less the mean of their target's."""
+        sums = np.zeros((len(self.sightings.targets), *rows.shape[1:]))
+        np.add.at(sums, self.target, rows)
+        count = np.maximum(np.bincount(self.target, minlength=len(sums)), 1)
+        return rows - (sums / count[:, None, None])[self.target]
+
+    def _view_squares(self) -> tuple[Array, Array, Array]:
+        """Return means (V, 3) of views, and squares (3, 3) of these and of what is left about them."""
+        count = np.bincount(self.view, minlength=len(self.sightings.points))
+        means = np.zeros((len(count), 3))
+        np.add.at(means, self.view, self.rest)
+        means /= np.maximum(count, 1)[:, None]
+        left = self.rest - means[self.view]
+        return means, means.T @ means, (left / count[self.view, None]).T @ left
+
+    def evidence_of(self, other: "_MoveFit") -> float:
+        """Return by how much −2 log likelihood falls from this fit to another one."""
+        means, *squares = other._view_squares()
+        own = self._view_squares()[1:]
+        following = float(np.sum(means[1:] * means[:-1])) / max(float(np.sum(means**2)), 1e-300)
+        memory = float(np.clip(following, 0.0, 0.95))
+        views = (len(means) - 3) * (1 - memory) / (1 + memory)
+        fall = 0.0
+        for before, after in zip(own, squares, strict=True):
+            # Directions that scatter: an error of one joint has one.
+            dimensions = np.trace(after) ** 2 / max(float(np.sum(after**2)), 1e-300)
+            if np.trace(after) > 0:
+                fall += dimensions * float(np.log(np.trace(before) / np.trace(after)))
+        return views * fall
+
+    def move(self) -> CommonMove:
+        """Return the move with its size."""
+        moved = self.view >= self.start
+        before = frames.transform(frames.inverse(self.T), self.in_base[moved])
+        distance = float(np.sqrt(np.mean(np.sum((self.in_base[moved] - before) ** 2, axis=1))))
+        middles = np.full((len(self.sightings.targets), 3), np.nan)
+        for k in np.unique(self.target):
+            middles[k] = self.placed[self.target == k].mean(axis=0)
+        scatter = float(np.sqrt(self.total / len(self.rest)))
+        return CommonMove(self.start, distance, scatter, self.T, self.T_mount, middles)
