@@ -23,7 +23,7 @@ from stitch.fit.fit import FitStart, FittedRig, InitialModel
 from stitch.fit.pipelines import coarse_stage, pipeline_for
 from stitch.fit.sentences import view_notes
 from stitch.fusion.register import DEFAULT, method_named
-from stitch.model.model_toml import ModelFile, arm_model, convert_unit
+from stitch.model.model_toml import ModelFile, arm_model, convert_unit, without_events
 from stitch.observations.observability import unknown_numbers, unobservable
 from stitch.recorder import Recorder, RecorderMemory, SilentRecorder
 from stitch.run_data import Fit, LedgerStep, RunData, StageResult
@@ -95,7 +95,7 @@ def run_rig(
         prepared = (capture.result() for capture in captures) if captures else map(prepare_capture, sessions)
         measurements = [measurement_of(session, capture) for session, capture in zip(sessions, prepared, strict=True)]
         effects = list(dict.fromkeys(effects))
-        model = convert_unit(model, sessions[0].length_unit) if model else None
+        model = without_events(convert_unit(model, sessions[0].length_unit)) if model else None
         arm = convert_unit(arm, sessions[0].length_unit) if arm else None
         require_effects(measurements, [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())])
         require_measured_once(sessions)

@@ -1,7 +1,8 @@
 """model.toml, the form of a model for people: read and written, and bound to a session.
 
-Between the file and a session stand units, parameters that mean the same, and sigmas. `keep_arm_effects` takes nothing
-but the arm of another run: its effects on joints and links as they are, under another mount, tool or day.
+Between the file and a session stand units, parameters that mean the same, and sigmas. `without_events` leaves behind
+what happened at one view of a session; `keep_arm_effects` takes nothing but the arm of another run: its effects on
+joints and links as they are, under another mount, tool or day.
 """
 
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ import tomli_w
 from stitch.effects.contract import Effect, Parameter, find_effect, parameters_in, require_available
 from stitch.errors import InputError
 from stitch.model.model import ARM_PLACES, EffectsCovariance, Model, Target, Term
+from stitch.numerics import frames
 from stitch.numerics.frames import Array, is_rigid
 from stitch.numerics.units import METRES
 from stitch.session.measurement import Measurement
@@ -177,6 +179,28 @@ def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:
     return matrix
 
 
+def without_events(file: ModelFile) -> ModelFile:
+    """Return the model for another session: without effects that begin at one view of its own, whose numbers say
+    nothing of other views; targets where they stand in the end.
+
+    Raises:
+        InputError: an effect that is not known.
+    """
+    events = [name for name, parameters in file.effects.items() if any(p.discrete for p in parameters.values())]
+    targets = file.targets
+    for name in events:
+        moved = [p.value for p in file.effects[name].values() if not p.discrete]
+        if find_effect(name).place == "part" and len(moved) == 6:
+            T = frames.exp(np.array(moved))
+            targets = {key: _moved_target(target, T) for key, target in targets.items()}
+    return replace(file, effects={k: v for k, v in file.effects.items() if k not in events}, targets=targets)
+
+
+def _moved_target(target: Target, T: Array) -> Target:
+    orientation = None if target.orientation is None else T[:3, :3] @ target.orientation
+    return replace(target, position=frames.transform(T, target.position), orientation=orientation)
+
+
 def keep_arm_effects(file: ModelFile) -> ModelFile:
     """Return the model with nothing but the effects of its arm, all of them kept.
 
@@ -201,7 +225,7 @@ def arm_model(file: ModelFile) -> ModelFile | None:
     """
     effects = {
         name: {key: replace(p, kept=True) for key, p in parameters.items()}
-        for name, parameters in file.effects.items()
+        for name, parameters in without_events(file).effects.items()
         if find_effect(name).place in ARM_PLACES
     }
     return replace(file, effects=effects, targets={}) if effects else None

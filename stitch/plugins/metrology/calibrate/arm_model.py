@@ -10,7 +10,7 @@ from stitch.effects.contract import find_effect, missing_need
 from stitch.errors import InputError
 from stitch.model.forward import perturbed_frames
 from stitch.model.model import ARM_PLACES, EffectsCovariance, Term
-from stitch.model.model_toml import ModelFile, bind_to_session, convert_unit
+from stitch.model.model_toml import ModelFile, bind_to_session, convert_unit, without_events
 from stitch.numerics.frames import Array
 from stitch.output.session_files import robot_toml
 from stitch.output.stored_run import read_result, trusted_model
@@ -83,7 +83,8 @@ def arm_from(session: SessionData, file: ModelFile) -> ArmModel:
         raise InputError(f"{session.path}: no joint angles or no [robot]; to fix: state both, which an arm needs")
     T_base_flange = np.array([view.T_base_flange for view in session.views])
     measurement = _arm_measurement(session.name, session.robot, T_base_flange, views, session.length_unit)
-    of_arm = {name: values for name, values in file.effects.items() if find_effect(name).place in ARM_PLACES}
+    effects = without_events(file).effects
+    of_arm = {name: values for name, values in effects.items() if find_effect(name).place in ARM_PLACES}
     model = bind_to_session(convert_unit(replace(file, effects=of_arm), session.length_unit), measurement)
     return ArmModel(
         session=session.name,
