@@ -120,6 +120,8 @@ _RULE = re.compile(r"[-|:+=\s]*(?:-{3}|={3})[-|:+=\s]*")
 # Between cells, whatever the separator; a row of a pose has so many at least.
 _CELL_END = re.compile(r"\s*[;,=|\t]\s*|\s+")
 _FEWEST_CELLS = 6
+# Longer lines are of drawings and documents.
+_LONGEST_LINE = 100_000
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:,\d{3})+\.\d+|(?:['’ ]\d{3})+[.,]\d+)")
 _COMMENTS = ("#", "%", "//")
 _MAX_TABLE_MB = 50
@@ -153,7 +155,7 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     body = [(i, line) for i, line in kept if not line.startswith(_COMMENTS)]
     # Where every line is marked, #1 is a row's number.
     body = body or [(i, line) for i, line in kept if _MARKED_NUMBER.match(line)]
-    if not body:
+    if not body or max(len(line) for _, line in body) > _LONGEST_LINE:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
     separator = _separator_of([line for _, line in body])
     read = trimmed_rows([(i, split_cells(line, separator)) for i, line in body])
@@ -191,7 +193,7 @@ def longest_block(content: str) -> tuple[str, str] | None:
     None where another row of numbers stands outside it: a file of such rows is a table with a mistake in it. A last row
     that is cut short is left out.
     """
-    lines = content.splitlines()
+    lines = content.splitlines() or [""]
     cells = [[] if line.strip().startswith(_COMMENTS) else _CELL_END.split(line.strip()) for line in lines]
     counts = [_number_count(row) for row in cells]
     edges = [0, *(i for i in range(1, len(lines)) if counts[i] != counts[i - 1]), len(lines)]

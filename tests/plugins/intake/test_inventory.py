@@ -68,6 +68,17 @@ def test_a_refusal_shows_what_stands_in_the_folder(scans):
     assert "--poses FILE#LIST" in text and "--columns" in text
 
 
+def test_texts_of_other_things_do_not_stop_it(scans):
+    (scans / "drawing.svg").write_text(f'<svg><path d="{"0.5,0.25 " * 30000}"/></svg>')
+    (scans / "quoted.txt").write_text(f'"{"a,b " * 60000}"\nx,y\n1,2\n')
+    (scans / "broken.xml").write_text("<a><b>")
+    (scans / "broken.yaml").write_text("a: [1,2\n b: }")
+    (scans / "blank.txt").write_text("\n")
+    np.savetxt(scans / "a.csv", TABLE, delimiter=",", header="x,y,z,qx,qy,qz,qw", comments="")
+    found = find_folder_files(scans)
+    assert [file.name for file in found.poses] == ["a.csv"] and len(found.inventory) == 6
+
+
 def test_a_text_of_another_ending_is_opened(scans):
     lines = [f'<Rob><RIst X="{x}" Y="{y}" Z="{z}" A="10" B="20" C="{30 + x}"/></Rob>' for x, y, z in P.tolist()]
     (scans / "log.rsi").write_text("\n".join(lines))
