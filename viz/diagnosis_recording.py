@@ -23,7 +23,7 @@ from viz.viewer import rerun_program
 os.environ.setdefault("RERUN_ANALYTICS", "off")
 
 _SHOWN = 8
-NOT_YET = "Not asked yet: `stitch diagnose RUN` says which effect is missing."
+NOT_YET = "Not diagnosed yet: `stitch diagnose RUN` says which effect is missing."
 
 
 def add_diagnosis(found: Diagnosis, screen: dict[str, Any] | None, session: SessionData, path: Path) -> None:

@@ -42,7 +42,7 @@ def write_diagnosis(found: Diagnosis, state: RunData, folder: Path) -> None:
 def _sections(found: Diagnosis, screen: dict[str, Any], unit: str, folder: Path) -> dict[str, str]:
     """Return what a diagnosis says on the page of a run, by section."""
     shown = {"verdict": found.verdict, "named": list(found.effects), "um": MICROMETRES[unit], "colours": colour_stops()}
-    data = script_json({key: screen[key] for key in ("now", "why", "candidates", "places")} | shown)
+    data = script_json({key: screen[key] for key in ("now", "why", "candidates", "places", "deciding_view")} | shown)
     parts = {
         "finding": f'<p class="verdict">{_words(screen["headline"])}</p>\n'
         f'<p class="evidence">{_words(screen["proof"])}</p>\n'
@@ -80,6 +80,7 @@ def _bars(found: Diagnosis, screen: dict[str, Any], unit: str) -> dict[str, Any]
     most = max(row["heldout"] or 0.0 for row in rows) or 1.0
     bars = [
         {
+            "fits": row.get("fits", ""),
             "words": row["words"],
             "effect": row["effect"],
             "told": "–" if row["heldout"] is None else _in_um(row["heldout"], unit),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.progress import opened_run, show_activity
-from stitch.cli.terminal import emit, in_full, say, show_columns, show_next
+from stitch.cli.terminal import answers, emit, in_full, say, show_columns, show_next
 from stitch.system.process import end_at_once
 
 if TYPE_CHECKING:
@@ -45,8 +45,9 @@ def diagnose_run(
     if as_json:
         emit(to_json(document))
     else:
-        show_diagnosis(diagnosis)
-        show_next(suggested_command(diagnosis, shlex.quote(str(run))))
+        with answers():
+            show_diagnosis(diagnosis)
+            show_next(suggested_command(diagnosis, shlex.quote(str(run))))
     end_at_once()
 
 
@@ -62,26 +63,33 @@ def next_measurement(
     Examples:
       stitch next runs/blade-17
     """
-    from stitch.diagnosis.thresholds import ALIAS_CORRELATION
     from stitch.output.json_file import to_json
 
     diagnosis, document = _diagnose_folder(run, effects_file, trust)
-    effects = diagnosis.effects
-    apart = "No effect correlates with {} by more than " + f"{ALIAS_CORRELATION} in these views"
     if as_json:
         emit(to_json({key: document[key] for key in ("verdict", "effects", "next")}))
-    elif diagnosis.next:
+    else:
+        with answers():
+            _show_next_views(diagnosis)
+    end_at_once()
+
+
+def _show_next_views(diagnosis: Diagnosis) -> None:
+    from stitch.diagnosis.thresholds import ALIAS_CORRELATION
+
+    effects = diagnosis.effects
+    apart = "No effect correlates with {} by more than " + f"{ALIAS_CORRELATION} in these views"
+    if diagnosis.next:
         for proposal in diagnosis.next:
             say(f"To separate {' from '.join(proposal.separates)}: {proposal.do}.")
     elif diagnosis.verdict == "adequate":
-        say("Nothing is missing: there is nothing to tell apart.")
+        say("No missing effect was found: there is nothing to tell apart.")
     elif len(effects) > 1:
         say(f"No pose within reach, and no artefact that is known here, separates {' from '.join(effects)}.")
     elif diagnosis.verdict == "missing_effect" and not diagnosis.likelier_than_not:
         say(f"{apart.format(effects[0])}. More views, at any poses, can tell it from chance.")
     else:
         say(f"Nothing has to be told apart. {apart.format('the likeliest')}.")
-    end_at_once()
 
 
 def _diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, Any]]:
@@ -145,7 +153,7 @@ def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], l
     from stitch.model.model import uncertainty_scope
 
     if (rest := 1 - sum(c.ranked.posterior for c in diagnosis.candidates)) > _MIN_POSTERIOR_SHARE:
-        say(f"{rest:.2f} of the posterior: nothing is missing, or something without a name.")
+        say(f"Probability that no known effect is missing: {rest:.2f}.")
     for c in listed:
         if c.ranked.score.observable and (c.name in diagnosis.effects or c.ranked.adjusted < _CLEAR):
             aliases = ", ".join(f"{name} {alike:.2f}" for name, alike in list(c.aliases.items())[:2])
@@ -153,13 +161,10 @@ def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], l
     show_budget(diagnosis.budget, length_unit)
     if unseen := [c.name for c in diagnosis.candidates if not c.ranked.score.observable]:
         say(f"These views cannot show: {', '.join(unseen)}.")
-    untested = [
-        f"{', '.join(name for name, lacks in diagnosis.missing.items() if lacks == needs)} "
-        f"({' and '.join(map(describe_need, needs))})"
-        for needs in sorted(set(diagnosis.missing.values()))
-    ]
-    if untested:
-        say(f"Not tested, with what that would need: {'; '.join(untested)}.")
+    for needs in sorted(set(diagnosis.missing.values())):
+        names = [name for name, lacks in diagnosis.missing.items() if lacks == needs]
+        were, they = ("was", "it needs") if len(names) == 1 else ("were", "they need")
+        say(f"{', '.join(names)} {were} not tested: {they} {' and '.join(map(describe_need, needs))}.")
     if diagnosis.verdict == "adequate":
         _show_missed(diagnosis, length_unit)
     else:

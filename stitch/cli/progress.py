@@ -76,11 +76,12 @@ class LiveLine:
         self._status: Any = None
         self._visible = False
         self._step = self._detail = ""
-        self._started: float | None = None
+        self._began = time.monotonic()  # the clock of all steps of a command: it never runs backwards
+        self._runs = False
         self._plain = _PlainLines()
 
     def __str__(self) -> str:
-        seconds = round(time.monotonic() - (self._started or 0.0))
+        seconds = round(time.monotonic() - self._began)
         return f"{self._step}{self._detail}; {seconds // 60}:{seconds % 60:02d}"
 
     def __rich__(self) -> Any:
@@ -89,17 +90,17 @@ class LiveLine:
         return Text(str(self))
 
     def begin(self, step: str, detail: str = "") -> None:
-        """Show a step with the time since the first one, until `stop`; loops stand in its place meanwhile."""
+        """Show a step with the time since the first of all, until `stop`; loops stand in its place meanwhile."""
         self._step, self._detail = step, detail
-        self._started = time.monotonic() if self._started is None else self._started
+        self._runs = True
         self.say(self, step)
 
     def loops_ended(self) -> None:
         """Show the step that stood before the loops; nothing if there was none."""
-        if self._started is None:
-            self.stop()
-        else:
+        if self._runs:
             self.say(self, self._step)
+        else:
+            self.stop()
 
     def say(self, text: object, step: str) -> None:
         """Show a text of a step in place of the last."""
@@ -121,7 +122,7 @@ class LiveLine:
 
     def stop(self) -> None:
         """Clear the line; the next text begins it anew."""
-        self._started = None
+        self._runs = False
         self._plain.stop()
         if self._status is not None and self._visible:
             self._status.stop()

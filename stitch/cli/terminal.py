@@ -1,4 +1,4 @@
-"""What a command prints: results alone on standard output, lines and tables for people on standard error."""
+"""What a command prints: results on standard output, progress and all else for people on standard error."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ _SPELT = {"µ": "u", "μ": "u", "–": "-", "—": "-", "±": "+-", "×": "x", "
 # Where results go, and whether headlines alone are printed: of the innermost command that runs.
 _results: list[IO[str]] = []
 _briefly: list[bool] = []
+# Where lines and tables for people go, while these are a command's result.
+_answers: list[IO[str]] = []
 
 
 def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = None) -> None:
@@ -24,14 +26,28 @@ def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = N
 
     Args:
         hang: columns by which all lines but the first are indented.
-        stream: where it goes; None is standard error.
+        stream: where it goes; None is standard error, or standard output while a command `answers`.
     """
     from stitch.system.lines import broken_lines, printable
     from stitch.system.process import console
 
-    terminal, text = console(stream), printable(text)
+    terminal, text = console(stream or _answer_stream()), printable(text)
     lines = broken_lines(text, terminal.width, hang) if terminal.is_terminal else [text]
     terminal.print("\n".join(lines), soft_wrap=True, style="bold" if bold else None)
+
+
+def _answer_stream() -> IO[str] | None:
+    return _answers[-1] if _answers else None
+
+
+@contextmanager
+def answers() -> Iterator[None]:
+    """While the block lasts, lines and tables for people are the command's result: they go to standard output."""
+    _answers.append(results_stream())
+    try:
+        yield
+    finally:
+        _answers.pop()
 
 
 def show_block(rows: Sequence[tuple[str, str]]) -> None:
@@ -63,7 +79,7 @@ def show_table(
 
     say(title, bold=True, stream=stream)
     widths = [max(map(cell_len, column)) for column in zip(headings, *rows, strict=True)]
-    terminal = console(stream)
+    terminal = console(stream or _answer_stream())
     if terminal.is_terminal and sum(widths) + 2 * len(widths) > terminal.width:
         for first, *cells in rows:
             named = ", ".join(f"{heading} {cell}" for heading, cell in zip(headings[1:], cells, strict=True))

@@ -16,13 +16,15 @@ from typing import Any
 
 import numpy as np
 
+from stitch.diagnosis.candidate_views import candidate_measurement
 from stitch.diagnosis.candidates import Form, candidate_as_fitted
+from stitch.diagnosis.next_view import surface_views_at
 from stitch.diagnosis.residual_structure import Dependence, predicted_distances
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.effects.contract import EFFECTS, Effect, parameters_in, twist
-from stitch.model.forward import moves_points, point_correction, scan_points
-from stitch.model.model import Term
+from stitch.model.forward import moves_points, point_correction, pose_derivatives, scan_points
+from stitch.model.model import Model, Term
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.numerics.least_squares import fit_columns
@@ -31,7 +33,7 @@ from stitch.numerics.units import covariate_text
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import JOINT_SCATTER
 from stitch.observations.surfaces.surface_model import SurfaceObservation, surfaces_of
-from stitch.session.measurement import ScanView, Views
+from stitch.session.measurement import Measurement, ScanView, Views
 
 # Dots along one trend: more cannot be told apart.
 _MOST = 300
@@ -48,6 +50,15 @@ _POINT_AXES = {
     "intensity_bias": ("intensity, in standard deviations", ""),
     "part_sag": ("height above the clamp", None),
 }
+_CONSTANT = Effect(
+    "constant",
+    "mount",
+    {"xi": twist("", 1e-3, 1.0)},
+    lambda views, xi: np.tile(xi, (views.count, 1)),
+    (),
+    (),
+    "empirical",
+)
 
 # What an effect lives on, its unit, and where the views stand along it (V,).
 _Axis = tuple[str, str, Array]
@@ -90,6 +101,62 @@ def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[s
         return _trends_of_points(fitted, effects, [again for _, again in pairs])
     plot = _plot(fitted, _beside(linear, pairs[0][0]), *_direction(fitted, effects[0]))
     return {} if plot is None else {effect.term.name: _trend_on(plot, effect) for effect in effects}
+
+
+@dataclass(frozen=True)
+class ExpectedView:
+    """What two candidates expect of one further view along what is drawn; units as in their trends."""
+
+    at: float
+    sigma: float  # by which the dot of one view scatters
+    expected: dict[str, tuple[float, float]]  # effect: value and its standard deviation
+
+
+def expected_in_view(linear: LinearModel, rivals: Sequence[Score], joints: Array) -> ExpectedView | None:
+    """Return what two candidates for the same dots expect at joint angles (n,).
+
+    None where nobody says how it would look there: of labelled points, of effects of points, along gravity.
+    """
+    fitted = linear.restricted(())
+    surfaces = surfaces_of(fitted)
+    anew = [scored if fitted is linear else score(fitted, scored.candidate) for scored in rivals]
+    if surfaces is None or not all(s.fitted for s in anew) or moves_points([s.form.term for s in anew]):
+        return None
+    effects = [_fit_effect(fitted, scored) for scored in anew]
+    motion, (follows, _, _) = _direction(fitted, effects[0])
+    if "gravity" in follows:
+        return None
+    further = surface_views_at(_beside(linear, rivals[0]), surfaces, joints[None], anew[0], anew[1])
+    measurement = candidate_measurement(linear.measurement, joints[None])
+    at = float(_axis(measurement.views, effects[0].term, motion)[2][0])
+    if follows in ("time", "view order"):
+        at = float(measurement.views.time[0]) if follows == "time" else float(linear.measurement.views.count)
+    rim = np.repeat([surfaces.reach, 1.0], 3)
+    unit = _unit_twist(fitted, motion, measurement, surfaces.centre) * rim
+    along = unit * rim / max(float(unit @ unit), 1e-300)
+    expected = {}
+    for effect, response in zip(effects, (further.a[0], further.b[0]), strict=True):
+        change = effect.change
+        whole = effect.form.response - fitted.design @ change.absorbed
+        # What all views do together no view shows.
+        common = (whole - fitted.observation.expand(fitted.reduce(whole))).reshape(-1, 6, whole.shape[1]).mean(axis=0)
+        a = further.design.shape[2]
+        per_unit = along @ (response - further.design[0] @ change.absorbed[:a] - common)
+        spread = float(np.sqrt(max(per_unit @ change.covariance @ per_unit, 0.0)))
+        expected[effect.term.name] = (float(per_unit @ change.values), spread)
+    return ExpectedView(at, float(np.linalg.norm(along @ further.half[0])), expected)
+
+
+def _unit_twist(linear: LinearModel, motion: "_Motion", measurement: Measurement, centre: Array) -> Array:
+    """Return (6,) the twist of a further view by a unit of what is drawn."""
+    bare = Model(linear.model.T_mount)
+    if motion.joint is not None:
+        return next(pose_derivatives(measurement, bare, [_zero(linear, EFFECTS["joint_offset"])], centre))[
+            motion.joint, 0
+        ]
+    if motion.twist is not None:
+        return motion.twist @ next(pose_derivatives(measurement, bare, [_zero(linear, _CONSTANT)], centre))[:, 0]
+    return np.append(np.zeros(3), motion.columns[0, -3:])
 
 
 def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
@@ -163,6 +230,7 @@ class _Motion:
     columns: Array  # (V, k) displacements
     response: Array  # (V, k) displacements by the effect
     joint: int | None = None  # counted from 0
+    twist: Array | None = None  # (6,) of the mount, a unit
 
     @property
     def line(self) -> Array:
@@ -175,6 +243,7 @@ class _Change:
     """What an effect changes in what the model predicts of the reduced observations."""
 
     per_unit: Array  # (n, p) per unit of each parameter, hand-eye and effects in use fitted anew beside it
+    absorbed: Array  # (a, p) by how much these stand in for a unit
     values: Array  # (p,)
     covariance: Array  # (p, p)
 
@@ -190,7 +259,7 @@ def _change(linear: LinearModel, columns: Array, beside: LinearModel) -> _Change
     own = beside.residual(columns)
     values = fit_columns(linear.residual(columns), linear.white_residual)
     covariance = np.linalg.pinv(own.T @ own).astype(float)
-    return _Change(columns - linear.reduce(linear.design) @ absorbed, values, covariance)
+    return _Change(columns - linear.reduce(linear.design) @ absorbed, absorbed, values, covariance)
 
 
 @dataclass(frozen=True)
@@ -221,7 +290,8 @@ def _direction(linear: LinearModel, effect: _Effect) -> tuple[_Motion, _Axis]:
     motion = _motion(linear, effect)
     line = motion.line
     if motion.joint is None and line[np.argmax(np.abs(line))] < 0:
-        motion = replace(motion, columns=-motion.columns)
+        turned = None if motion.twist is None else -motion.twist
+        motion = replace(motion, columns=-motion.columns, twist=turned)
     return motion, _axis(linear.measurement.views, effect.term, motion)
 
 
@@ -320,17 +390,13 @@ def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
         columns = _displacements(linear, turned[:, joint : joint + 1])[..., 0]
         return _Motion(f"joint {joint + 1}", "rad", columns, errors[:, joint : joint + 1] * columns, joint)
     if term.effect.place == "mount":
-        specs = {"xi": twist("", 1e-3, 1.0)}
-        constant = Effect(
-            "constant", "mount", specs, lambda views, xi: np.tile(xi, (views.count, 1)), (), (), "empirical"
-        )
         twists = term.effect.function(linear.measurement.views, **term.arguments)
         along = (twists - twists.mean(axis=0))[np.argmax(np.sum(response**2, axis=1))]
-        at_constant = linear.responses([Term(constant, parameters_in(linear.measurement, constant))])[0].columns
+        at_constant = linear.responses([_zero(linear, _CONSTANT)])[0].columns
         columns = _displacements(linear, at_constant @ along[:, None])[..., 0]
         # Rows of a mean length of one.
-        columns = columns / max(float(np.mean(np.linalg.norm(columns, axis=1))), 1e-300)
-        return _Motion("the scanner's mount", unit, columns, response)
+        length = max(float(np.mean(np.linalg.norm(columns, axis=1))), 1e-300)
+        return _Motion("the scanner's mount", unit, columns / length, response, twist=along / length)
     direction = np.linalg.svd(response - response.mean(axis=0), full_matrices=False)[2][0]
     of = "the part" if term.effect.place == "part" else "the arm"
     return _Motion(of, unit, np.tile(direction, (len(response), 1)), response)
@@ -338,8 +404,11 @@ def _motion(linear: LinearModel, effect: _Effect) -> _Motion:
 
 def _joint_columns(linear: LinearModel) -> Array:
     """Return (·, n) response to a turn of each joint."""
-    offset = EFFECTS["joint_offset"]
-    return linear.responses([Term(offset, parameters_in(linear.measurement, offset))])[0].columns
+    return linear.responses([_zero(linear, EFFECTS["joint_offset"])])[0].columns
+
+
+def _zero(linear: LinearModel, effect: Effect) -> Term:
+    return Term(effect, parameters_in(linear.measurement, effect))
 
 
 def _joint_errors(views: Views, fitted: Term) -> Array:

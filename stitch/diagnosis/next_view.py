@@ -176,9 +176,7 @@ def candidate_views(linear: LinearModel, a: Score, b: Score) -> CandidateViews |
 def _of_surfaces(linear: LinearModel, surfaces: SurfaceObservation, a: Score, b: Score) -> CandidateViews | None:
     """Return poses in which the scanner would see the part about as it has before; None if poses cannot show the
     effects."""
-    zero = [scored.form.at(np.zeros(len(scored.values))) for scored in (a, b)]
     T_mount = linear.model.T_mount
-    centre = surfaces.unconstrained.overlaps.gram.centre
 
     def poses_of(joints: Array) -> Array:
         assert linear.measurement.robot is not None
@@ -186,11 +184,21 @@ def _of_surfaces(linear: LinearModel, surfaces: SurfaceObservation, a: Score, b:
         return build_capture("candidates", (), T, linear.measurement.mount).poses(T_mount)
 
     driven = linear.measurement.views.joints
-    joints = reachable(driven, poses_of, surfaces.capture.poses(T_mount), centre)[:_TRIED]
-    if moves_points(zero) or not len(joints):
+    joints = reachable(driven, poses_of, surfaces.capture.poses(T_mount), surfaces.centre)[:_TRIED]
+    if moves_points([scored.form.term for scored in (a, b)]) or not len(joints):
         return None
+    return surface_views_at(linear, surfaces, joints, a, b)
+
+
+def surface_views_at(
+    linear: LinearModel, surfaces: SurfaceObservation, joints: Array, a: Score, b: Score
+) -> CandidateViews:
+    """Return further views of surfaces at joint angles (K, n) for two effects of poses: six numbers a view, its
+    twist."""
+    zero = [scored.form.at(np.zeros(len(scored.values))) for scored in (a, b)]
+    centre = surfaces.centre
     measurement = candidate_measurement(linear.measurement, joints)
-    bare = Model(T_mount)
+    bare = Model(linear.model.T_mount)
     to_centre = frames.make(np.eye(3), -centre)
     hand_eye = frames.adjoint(to_centre @ (perturbed_frames(measurement, ())[0] @ bare.T_mount))
     extra = np.zeros((len(joints), 6, linear.white_design.shape[1] - 6))

@@ -11,6 +11,7 @@ import numpy as np
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
 from stitch.diagnosis.effect_trend import (
     EffectTrend,
+    expected_in_view,
     trend_in_model,
     trend_of_curve,
     trend_of_dependence,
@@ -20,6 +21,7 @@ from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.diagnosis.sentences import odds_text
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
 from stitch.diagnosis.unmodelled_time_effects import reportable
+from stitch.effects.contract import describe_need
 from stitch.numerics.frames import Array
 from stitch.numerics.units import angle_text, length_text
 from stitch.observations.surfaces.surface_model import surfaces_of
@@ -33,8 +35,12 @@ _BEST = 3
 _HELPS = 0.94
 # Digits of a field in length_unit: thousandths of its largest value are finer than any colour.
 _FINE = 1e-3
+# An effect that leaves so much more of the error on views left out fits less well.
+_WORSE = 0.03
 # What an effect changes over the views by less than this share of its size is the same in all.
 _FLAT = 0.02
+# A chance that needs no number.
+_PLAIN_CHANCE = 0.5
 _NAMING = ("missing_effect", "cannot_tell")
 
 
@@ -53,6 +59,7 @@ def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
         "noise": diagnosis.noise_floor,
         "why": _trend_row(why),
         "candidates": [_candidate_row(diagnosis, c, if_added.get(c.name), trends.get(c.name)) for c in candidates],
+        "deciding_view": _deciding_view(diagnosis, trends),
         "places": None if patches is None else np.round(patches.points, 2).tolist(),
         "doubts": list(open_doubts(diagnosis)),
     }
@@ -119,7 +126,48 @@ def _candidate_row(
         "words": _cause(candidate, trend),
         "heldout": None if validation is None else diagnosis.rms_if_added(validation)[1],
         **_on_part(field),
+        "fits": _fits(diagnosis, candidate),
         "why": _trend_row(trend),
+    }
+
+
+def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
+    """Return whether a candidate fits these views, and why not where it does not."""
+    if candidate.name in diagnosis.effects:
+        return "yes"
+    if diagnosis.verdict == "adequate":
+        return "not needed"
+    unit = diagnosis.linear.measurement.length_unit
+    validation = candidate.cross_validation
+    left = diagnosis.heldout_rms if validation is None else diagnosis.rms_if_added(validation)[1]
+    if diagnosis.verdict == "unknown_effect":
+        return f"no: it leaves {length_text(left, unit, 2)}"
+    named = next(c for c in diagnosis.candidates if c.name == diagnosis.effects[0])
+    if named.cross_validation is not None:
+        more = left - diagnosis.rms_if_added(named.cross_validation)[1]
+        if more > _WORSE * left:
+            return f"no: it leaves {length_text(more, unit, 1)} more"
+    against = named.ranked.score.log_bayes_factor - candidate.ranked.score.log_bayes_factor
+    return f"no: the evidence is {odds_text(max(against, 0.0))} against it"
+
+
+def _deciding_view(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> dict[str, Any] | None:
+    """Return what the first two rivals expect in the view that is proposed to tell them apart, over their dots."""
+    rivals = [c for c in compared(diagnosis) if c.name in diagnosis.effects and c.name in trends]
+    pose = next((proposal for proposal in diagnosis.next if proposal.joints_deg is not None), None)
+    if diagnosis.verdict != "cannot_tell" or len(rivals) < 2 or pose is None or pose.joints_deg is None:
+        return None
+    scores = [c.ranked.score for c in rivals if c.name in pose.separates][:2]
+    view = expected_in_view(diagnosis.linear, scores, np.radians(pose.joints_deg)) if len(scores) == 2 else None
+    if view is None:
+        return None
+    expected = [{"effect": name, "value": value, "sigma": sigma} for name, (value, sigma) in view.expected.items()]
+    return {
+        "joints_deg": pose.joints_deg,
+        "views": pose.views,
+        "at": view.at,
+        "sigma": view.sigma,
+        "expected": expected,
     }
 
 
@@ -151,7 +199,8 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
     match diagnosis.verdict:
         case "adequate":
             in_model = " and ".join(diagnosis.linear.model.effects)
-            return f"With {in_model} in the model, nothing more is missing." if in_model else "Nothing is missing."
+            tested = _tested(diagnosis)
+            return f"With {in_model} in the model, {tested}" if in_model else tested[0].upper() + tested[1:]
         case "unknown_effect":
             follows = ""
             if diagnosis.follows_field:
@@ -162,11 +211,38 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
             elif diagnosis.depends_on and diagnosis.depends_on[0].p_value < CLEAR_DEPENDENCE:
                 follows = f": the error follows {plain_covariate(diagnosis.depends_on[0].covariate)}"
             return f"Something is missing that no known effect explains{follows}."
-    causes = [_cause(c, trends.get(c.name)) for c in compared(diagnosis) if c.name in diagnosis.effects]
-    if len(causes) > 1:
-        rivals = " or ".join([causes[0], *(cause[:1].lower() + cause[1:] for cause in causes[1:])])
-        return f"{rivals}: these views cannot tell which."
-    return f"{'' if diagnosis.certain else 'Perhaps: '}{causes[0]}."
+    named = [c for c in compared(diagnosis) if c.name in diagnosis.effects]
+    if len(named) > 1:
+        return _rivals(named, trends)
+    return f"{'' if diagnosis.certain else 'Perhaps: '}{_cause(named[0], trends.get(named[0].name))}."
+
+
+def _tested(diagnosis: Diagnosis) -> str:
+    """Return among how many effects none was found, and how many could not be tested, with what they need."""
+    seen = sum(c.ranked.score.observable for c in diagnosis.candidates)
+    untested = len(diagnosis.candidates) - seen + len(diagnosis.missing)
+    if not untested:
+        return f"no missing effect was found among {seen}."
+    needs = dict.fromkeys(describe_need(need) for needs in diagnosis.missing.values() for need in needs)
+    if seen < len(diagnosis.candidates):
+        needs |= {"other views": None}
+    return f"no missing effect was found among {seen}; {untested} could not be tested (they need {'; '.join(needs)})."
+
+
+def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend]) -> str:
+    """Return what these views cannot tell apart, in two sentences where it is one joint."""
+    joints = {trends[c.name].moves if c.name in trends else "" for c in named}
+    joint = joints.pop() if len(joints) == 1 else ""
+    names = [c.name for c in named]
+    if joint.startswith("joint") and all(name in JOINT_DESCRIPTIONS for name in names):
+        if set(names) == {"gear_eccentricity", "gear_harmonic"}:
+            which = "it errs once or twice a turn"
+            return f"{joint.capitalize()} has an uneven gear. These views cannot tell whether {which}."
+        which = " or ".join(JOINT_DESCRIPTIONS[name] for name in names)
+        return f"{joint.capitalize()} errs. These views cannot tell whether it {which}."
+    causes = [_cause(c, trends.get(c.name)) for c in named]
+    which = ", or ".join(cause[:1].lower() + cause[1:] for cause in causes)
+    return f"These views cannot tell which of {len(causes)} it is: {which}."
 
 
 def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
@@ -230,7 +306,8 @@ def certainty(diagnosis: Diagnosis) -> str:
             nameless = " Its cause is less sure: a curve without a name would explain as much."
             return f"{chance_text(named.adjusted)} {evidence}{nameless if named.posterior <= 0.5 else ''}"
         case "cannot_tell":
-            return chance_text(min(c.ranked.adjusted for c in diagnosis.candidates if c.name in diagnosis.effects))
+            # Of the weaker one: which of them is the true one nobody knows.
+            return chance_text(max(c.ranked.adjusted for c in diagnosis.candidates if c.name in diagnosis.effects))
         case "unknown_effect":
             clear = [x.p_value for x in diagnosis.depends_on if x.p_value < CLEAR_DEPENDENCE]
             if clear:
@@ -242,7 +319,9 @@ def certainty(diagnosis: Diagnosis) -> str:
     likeliest = next((c.ranked for c in diagnosis.candidates if c.ranked.score.observable), None)
     if likeliest is None:
         return "No known effect can be tested with these views."
-    nearest = f"Of {likeliest.tests} known effects tried, {likeliest.name} comes nearest."
+    if likeliest.adjusted > _PLAIN_CHANCE:
+        return f"None of {likeliest.tests} further effects shows."
+    nearest = f"Of {likeliest.tests} further effects, {likeliest.name} comes nearest."
     return f"{nearest} {chance_text(likeliest.adjusted)}"
 
 

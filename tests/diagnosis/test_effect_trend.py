@@ -5,7 +5,7 @@ import pytest
 
 from data_synth import kinematics
 from stitch.diagnosis.candidates import candidate_of
-from stitch.diagnosis.effect_trend import EffectTrend, trends_of_candidates
+from stitch.diagnosis.effect_trend import EffectTrend, expected_in_view, trends_of_candidates
 from stitch.diagnosis.score import score
 from stitch.effects.contract import EFFECTS, parameters_in
 from stitch.model.model import Term
@@ -88,6 +88,21 @@ def test_dots_lie_about_the_true_displacement_within_their_sigma(cells: list[Fre
         about_wrong.append(np.mean(((wrong.measured - wrong.predicted) / wrong.sigma) ** 2))
     assert np.mean(squares) == pytest.approx(1.0, abs=0.3)
     assert min(about_wrong) > 3
+
+
+def test_a_further_view_where_one_stood_is_expected_about_where_that_one_is_predicted(cells: list[FreedBlade]):
+    """A dot shows the visible directions of its view alone, a further view is expected with all of them."""
+    true, _ = _with_gear(cells[0])
+    linear = cells[0].seen(true)
+    candidates = [candidate_of(linear, EFFECTS[name]) for name in ("gear_harmonic", "gear_eccentricity")]
+    rivals = [score(linear, candidate) for candidate in candidates if candidate is not None]
+    trends = trends_of_candidates(linear, rivals)
+    trend = trends["gear_harmonic"]
+    found = [expected_in_view(linear, rivals, joints) for joints in linear.measurement.views.joints]
+    views = [view for view in found if view is not None]
+    assert [view.at for view in views] == pytest.approx(trend.at)
+    assert np.corrcoef([view.expected["gear_harmonic"][0] for view in views], trend.predicted)[0, 1] > 0.9
+    assert min(view.expected["gear_harmonic"][1] for view in views) > 0 and min(view.sigma for view in views) > 0
 
 
 def test_a_slip_is_a_step_of_its_size_in_the_order_of_views(cells: list[FreedBlade]):

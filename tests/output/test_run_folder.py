@@ -131,7 +131,7 @@ def test_a_diagnosis_of_this_very_model_is_not_made_anew(folder, tmp_path, monke
     assert "Nothing at all.\nNothing was added" in told and f"Next: stitch export {run} --to ros" in told
     (run / "diagnosis.json").write_text(json.dumps(document | {"of": "another"}))
     stitch_command("report", run, "--no-diagnosis")
-    assert "Nobody has asked yet" in page.read_text() and "asked</p>" not in page.read_text()
+    assert "Not diagnosed yet" in page.read_text() and "asked</p>" not in page.read_text()
 
 
 STALE = ("diagnosis.json", "diagnosis.rrd", "compare.json", "mesh.ply", "recording.rrd", "robot.toml", "robot.urdf")

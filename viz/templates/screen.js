@@ -102,7 +102,8 @@ function showScreen(root, part, found, um) {
       xyPlot(place, { x: { label: "views in their order", names: part.names }, y: { label: "µm" }, series: [{ kind: "dots", x: seen.map(s => s[0]), y: seen.map(s => s[1]), names: true, said: seen.map(s => said[s[0]]), tint: "dot" }] }, 230, i => chooseView(i < 0 ? -1 : seen[i][0]));
       return;
     }
-    const plot = coursePlot(course, part && part.names, um, !asked && found.verdict === "unknown_effect" ? "their course" : "what the effect predicts");
+    const deciding = !asked && found.deciding_view, rivals = deciding && deciding.expected.map(e => found.candidates.find(c => c.effect === e.effect));
+    const plot = rivals ? duelPlot(rivals, deciding, part && part.names, um) : coursePlot(course, part && part.names, um, !asked && found.verdict === "unknown_effect" ? "their course" : "what the effect predicts");
     title.textContent = plot.title;
     xyPlot(place, { ...plot.spec, pressed: course.views.indexOf(view) }, 230, i => chooseView(i < 0 ? -1 : course.views[i] ?? -1));
   }
@@ -150,11 +151,25 @@ function coursePlot(course, names, um, line = "what the effect predicts") {
   const said = measured.map((m, i) => `${course.views.length ? `${named_[i]}, ` : ""}${shortNumber(x[i])}: measured ${shortNumber(m)} ± ${shortNumber(2 * sigma[i])} ${unit}, predicted ${shortNumber(predicted[i])} ± ${shortNumber(2 * about[i])} ${unit}`);
   return {
     title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are" : "is"} off without it in the model (${unit}), ± 2σ. Dots: measured. Line: ${course.of.endsWith("views") ? "means" : line}`,
+    perUnit: seconds ? 1 / per : 1,
     spec: {
       x: { label, names: inOrder && course.views.length === (names || []).length ? named_ : undefined }, y: { label: unit },
       shaded: jumps ? { from: (x[first - 1] + x[first]) / 2, said: `from ${named_[first]} on` } : undefined,
       series: [{ kind: "band", x, y: predicted, sigma: about, tint: "predicted" }, { kind: "line", x, y: predicted, step: jumps, tint: "predicted" }, { kind: "dots", x, y: measured, sigma, names: course.views.length > 0, said, tint: "dot" }],
     },
+  };
+}
+
+// Two rivals over the same dots, and in a stripe what each expects in the view that decides.
+function duelPlot(rivals, view, names, um) {
+  const [first, second] = rivals.map(c => coursePlot(c.why, names, um)), factor = rivals[0].why.value_unit === "rad" ? 1e3 : um, unit = first.spec.y.label;
+  const x = view.at * first.perUnit, tints = ["predicted", "0"], [, , dots] = first.spec.series;
+  const lines = [first, second].flatMap((plot, k) => plot.spec.series.slice(0, 2).map(s => ({ ...s, tint: tints[k], dashed: k === 1 })));
+  const expected = view.expected.map((e, k) => ({ kind: "dots", x: [x], y: [e.value * factor], sigma: [Math.hypot(e.sigma, view.sigma) * factor], tint: tints[k], open: true,
+    said: [`${e.effect} expects ${shortNumber(e.value * factor)} ± ${shortNumber(2 * e.sigma * factor)} ${unit} there; one view scatters by ± ${shortNumber(2 * view.sigma * factor)}`], label: `${e.effect}: ${shortNumber(Number((e.value * factor).toPrecision(2)))} ± ${shortNumber(Number((2 * Math.hypot(e.sigma, view.sigma) * factor).toPrecision(2)))}`, below: e.value < view.expected[1 - k].value }));
+  return {
+    title: `Two laws, the same dots: how far ${rivals[0].why.of} is off without either (${unit}), ± 2σ. Solid: ${view.expected[0].effect}, dashed: ${view.expected[1].effect}; in the stripe what each expects in the view that stitch next proposes`,
+    spec: { ...first.spec, shaded: undefined, stripe: { at: x, said: `measure here: ${shortNumber(x)}${rivals[0].why.unit === "°" ? "°" : ""}` }, series: [...lines, ...expected, dots] },
   };
 }
 
