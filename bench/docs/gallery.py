@@ -79,7 +79,7 @@ HIDDEN = (
     Hidden("lens_distortion", 3),
 )
 _VERDICTS = {
-    "adequate": "nothing is missing",
+    "adequate": "no missing effect was found",
     "missing_effect": "an effect is missing",
     "cannot_tell": "something is missing; these views cannot tell what",
     "unknown_effect": "something unknown is missing",

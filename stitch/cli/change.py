@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -79,19 +80,34 @@ def _refit_run(run: Path, state: RunData, effects: list[str], recording: bool, a
     """Give the run folder the model with these effects, and show it; what was fitted before is not fitted anew."""
     from stitch.api.pipeline import change
     from stitch.output import run_folder
-    from stitch.output.stored_run import load_run
+    from stitch.output.stored_run import load_run, standing_diagnosis
 
     if run_folder.restore_fit(run, effects, recording):
         with show_activity("reading the fit that was kept"):
             result = load_run(run, None if state.effects_file is None else Path(state.effects_file))
     else:
         run_folder.preload_entry_points("stitch.reports")
+        standing = standing_diagnosis(run, state)
         with show_activity("reading the run"), run_folder.replace_run_files(run) as scratch:
             result = change(state, effects, recorder_for(scratch, recording))
+            if told := _as_good(standing, state, effects):
+                result = result.with_fit(notes=(told, *result.notes))
             run_folder.write_with_page(result, scratch)
     _show_changed(result, run, as_json)
     if not as_json:
         show_next(f"Next: stitch diagnose {shlex.quote(str(run))}")
+
+
+def _as_good(standing: dict[str, Any], state: RunData, effects: Sequence[str]) -> str:
+    """Return which effects fit these views as well as those that are added now; empty where a diagnosis tells them
+    apart."""
+    undecided = standing.get("effects", []) if standing.get("verdict") == "cannot_tell" else []
+    added = [name for name in undecided if name in effects and name not in state.effects]
+    others = [name for name in undecided if name not in effects]
+    if not added or not others:
+        return ""
+    fit = "fits" if len(others) == 1 else "fit"
+    return f"{' and '.join(added)} was added, or {' or '.join(others)}, which {fit} these views as well."
 
 
 def _add_diagnosed(

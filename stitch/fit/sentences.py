@@ -92,8 +92,8 @@ def support_note(dropped: Unsupported) -> str:
     if not dropped.share:
         return ""
     return (
-        f"{dropped.alone + dropped.looked_through:,} of {dropped.points:,} points ({dropped.share:.2%}) are not in the "
-        f"cloud: {dropped.alone:,} on no surface, {dropped.looked_through:,} where other views look through"
+        f"left out {dropped.alone + dropped.looked_through:,} of {dropped.points:,} points ({dropped.share:.2%}): "
+        f"{dropped.alone:,} strays, {dropped.looked_through:,} that another view sees through"
     )
 
 

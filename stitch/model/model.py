@@ -319,9 +319,9 @@ def uncertainty_scope(verdict: str | None) -> str:
     Args:
         verdict: of the diagnosis; None where there is none yet.
     """
-    scopes = {
-        None: "; whether an effect is missing has not been asked",
-        "adequate": "; no effect is found missing",
-    }
-    scope = scopes.get(verdict, ", and this one seems to lack something")
-    return f"U of the hand-eye holds for a complete model{scope}."
+    if verdict in ("missing_effect", "cannot_tell"):
+        return "The ± of the hand-eye are too small until the effect is added."
+    if verdict == "unknown_effect":
+        return "The ± of the hand-eye are too small: something without a name is missing."
+    found = "no effect is found missing" if verdict == "adequate" else "whether an effect is missing has not been asked"
+    return f"U of the hand-eye holds for a complete model; {found}."
