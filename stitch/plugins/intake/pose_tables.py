@@ -120,6 +120,8 @@ _RULE = re.compile(r"[-|:+=\s]*(?:-{3}|={3})[-|:+=\s]*")
 # Between cells, whatever the separator; a row of a pose has so many at least.
 _CELL_END = re.compile(r"\s*[;,=|\t]\s*|\s+")
 _FEWEST_CELLS = 6
+# Lines that tell the separator.
+_SAMPLED = 2000
 # Longer lines are of drawings and documents.
 _LONGEST_LINE = 100_000
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:(?:\.\d{3})+,\d+|(?:,\d{3})+\.\d+|(?:['’ ]\d{3})+[.,]\d+)")
@@ -157,7 +159,7 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     body = body or [(i, line) for i, line in kept if _MARKED_NUMBER.match(line)]
     if not body or max(len(line) for _, line in body) > _LONGEST_LINE:
         raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
-    separator = _separator_of([line for _, line in body])
+    separator = _separator_of([line for _, line in body[:_SAMPLED]])
     read = trimmed_rows([(i, split_cells(line, separator)) for i, line in body])
     rows = rows_below_titles(read)
     above = len(read) - len(rows)
