@@ -396,7 +396,8 @@ def find_cad_start(scan: JoinedScans, cad: CadSurface) -> tuple[Array, float, fl
             f"{scan.usable.sum()} usable points in the scan; to fix: scan surfaces head-on, edges do not count"
         )
     index = _spread_sample(scan)
-    points, normals = scan.points[index], scan.normals[index]
+    points = scan.points[index]
+    normals = scan.normals[index]
     gate = cad.size / 25
     fine = cad.size / 250
     ranked = sorted(_axis_candidates(points, cad), key=lambda T: -_inlier_share(T, points, normals, cad, gate))

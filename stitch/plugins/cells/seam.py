@@ -8,7 +8,7 @@ import numpy as np
 from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.distributions import mad_sigma, tukey
-from stitch.numerics.frames import Array
+from stitch.numerics.frames import Array, Indices
 from stitch.plugins.cells.cad import tukey_slope
 from stitch.plugins.cells.placed_scans import SOURCES, JoinedScans, PlacingErrors
 
@@ -38,7 +38,8 @@ def find_edge(points: Array, normals: Array, facing: float, moves: Array | None 
     Raises:
         NoResultError: the surface or the flank was not seen; names which.
     """
-    up, out = normals[:, 2], facing * normals[:, 0]
+    up = normals[:, 2]
+    out = facing * normals[:, 0]
     flank = np.flatnonzero((out > 0.75) & (up < 0.6))
     if len(flank) < _FEWEST:
         raise NoResultError(f"{len(flank)} points on the flank; to fix: scan it leaned by 30 to 45° towards it")
@@ -167,24 +168,26 @@ def measure_seam(
             scatter in `errors`.
         errors: how the scans' places may err. What moves both edges alike does not count.
     """
-    sources = [source for source in SOURCES if errors is not None and not (pose_sigma and source == "robot")]
-    return [_measure(scan, T_base_part, station, limits, pose_sigma, errors, sources) for station in stations]
+    return [_measure_station(scan, T_base_part, station, limits, pose_sigma, errors) for station in stations]
 
 
-def _measure(
+def _measure_station(
     scan: JoinedScans,
     T_base_part: Array,
     station: Station,
     limits: Limits,
     pose_sigma: float,
     errors: PlacingErrors | None,
-    sources: Sequence[str],
 ) -> Seam:
     T_station_base = frames.inverse(T_base_part @ station.T_part_station)
     points = frames.transform(T_station_base, scan.points)
     near = scan.usable & (np.abs(points) < np.array([_ACROSS, _ALONG, _DEPTH])).all(axis=1)
-    points, normals = points[near], frames.rotate(T_station_base, scan.normals[near])
-    modes = [mode for source in sources if errors for mode in errors.modes(scan.take(near), source)]
+    points = points[near]
+    normals = frames.rotate(T_station_base, scan.normals[near])
+    modes: list[tuple[Indices, Array]] = []
+    if errors is not None:
+        sources = [source for source in SOURCES if not (pose_sigma and source == "robot")]
+        modes = [mode for source in sources for mode in errors.modes(scan.take(near), source)]
     moves = np.zeros((len(modes), *points.shape))
     for k, (index, moved) in enumerate(modes):
         moves[k, index] = frames.rotate(T_station_base, moved)
