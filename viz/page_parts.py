@@ -71,7 +71,7 @@ def identity(run: RunData) -> list[Row]:
     joints = "" if session.robot is None else f", {session.robot.n_joints} joints"
     of = f" of {len(session.views) + len(run.left_out)}" if run.left_out else ""
     return [
-        ("SessionData", session.name),
+        ("Session", session.name),
         ("Views", f"{len(session.views)}{of}, {_points(session)}"),
         page_written(),
         ("Arm", ("not stated" if session.robot is None else session.robot.name or "without a name") + joints),

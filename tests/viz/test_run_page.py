@@ -65,6 +65,7 @@ def test_the_page_says_what_the_result_says(recorded, page):
         assert f"<td>{um:,.0f}</td>" in page if um >= 1e3 else f"<td>{um:.3g}</td>" in page
     assert unbroken(plain_verdict(model_history(run), "mm")) in page
     assert escape(unbroken(run.verdict)) in page
+    assert "<dt>Session</dt>" in page
 
 
 def test_the_page_needs_nothing_beside_it_and_can_be_mailed(page):
