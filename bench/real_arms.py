@@ -198,5 +198,5 @@ def bad_jobs(seeds: range, **_: Any) -> Iterator[Row]:
     yield from ({"world": w, "times": t, "seed": s} for w in WORLDS for t in TIMES for s in seeds)
 
 
-TURNING = Table(turning_jobs, turning, turning_summary, range(100, 120), "points", "turning")
-BAD_ARMS = Table(bad_jobs, bad_arm, bad_summary, range(100, 120), "points", "bad-arms")
+TURNING = Table(turning_jobs, turning, turning_summary, range(100, 120), page="points", block="turning")
+BAD_ARMS = Table(bad_jobs, bad_arm, bad_summary, range(100, 120), page="points", block="bad-arms")
