@@ -19,6 +19,7 @@ from scipy.special import ndtr
 from stitch.numerics.frames import Array, Mask
 from stitch.plugins.watch.state_bank import WILD
 
+# States of a Markov chain, and halvings of a bisection.
 _STATES = 121
 _STEPS = 36
 CUSUM_REFERENCES = (0.25, 2.0)
@@ -41,12 +42,12 @@ def empty_charts(parameters: int) -> Charts:
 
 def updated_charts(charts: Charts, innovations: Array) -> Charts:
     """One session more; innovations (P,), NaN where there is none."""
-    seen = np.isfinite(innovations)
-    u = np.clip(np.where(seen, innovations, 0.0), -WILD, WILD)
+    is_shown = np.isfinite(innovations)
+    u = np.clip(np.where(is_shown, innovations, 0.0), -WILD, WILD)
     signed = u[:, None, None] * np.array([1.0, -1.0])
     cusums = np.maximum(charts.cusums + signed - np.array(CUSUM_REFERENCES)[:, None], 0.0)
     ewma = (1 - EWMA_WEIGHT) * charts.ewma + EWMA_WEIGHT * u
-    return Charts(np.where(seen[:, None, None], cusums, charts.cusums), np.where(seen, ewma, charts.ewma))
+    return Charts(np.where(is_shown[:, None, None], cusums, charts.cusums), np.where(is_shown, ewma, charts.ewma))
 
 
 def restarted(charts: Charts, moved: Mask) -> Charts:
@@ -63,13 +64,13 @@ def limit_shares(charts: Charts, limit: tuple[float, ...]) -> Array:
 
 @cache
 def chart_limits(sessions: float, parameters: int) -> tuple[float, ...]:
-    """Limit of each chart of `NAMES` so that the whole cell alarms falsely once in so many sessions.
+    """Limit of each chart of `CHART_NAMES` so that the whole cell alarms falsely once in so many sessions.
 
     The rate is split evenly over charts and parameters: were they independent, rates would add up; as the charts of one
     parameter go together, the cell's rate is smaller.
     """
-    own = sessions * parameters * len(CHART_NAMES)
-    return (*(cusum_limit(k, own) for k in CUSUM_REFERENCES), ewma_limit(EWMA_WEIGHT, own))
+    run_length = sessions * parameters * len(CHART_NAMES)
+    return (*(cusum_limit(k, run_length) for k in CUSUM_REFERENCES), ewma_limit(EWMA_WEIGHT, run_length))
 
 
 def cusum_limit(reference: float, run_length: float) -> float:

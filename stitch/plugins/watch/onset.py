@@ -18,7 +18,7 @@ LONGEST = 600
 # Sessions for each number that an undisturbed parameter is told by.
 _FEW = 3
 # Sessions after an onset from which a line, or a response to a channel, can be told from a step.
-_COURSE = 6
+_TREND = 6
 # Share of a column that must be left beside the columns of the undisturbed parameter.
 _MIN_COLUMN_SHARE = 1e-6
 
@@ -42,22 +42,24 @@ def find_onset(values: Array, sigmas: Array, days: Array, covariates: Array, cha
         days: (n,) times.
         covariates: (n, c) what the undisturbed parameter follows; the first belong to `channels`.
     """
-    seen = np.flatnonzero(np.isfinite(values) & np.isfinite(sigmas) & (sigmas > 0))[-LONGEST:]
-    n = len(seen)
+    shown = np.flatnonzero(np.isfinite(values) & np.isfinite(sigmas) & (sigmas > 0))[-LONGEST:]
+    n = len(shown)
     # What a few sessions follow cannot be told.
-    follows = covariates[seen] if n >= _FEW * (1 + covariates.shape[1]) else np.zeros((n, 0))
-    base, _ = np.linalg.qr(_varying_columns(np.column_stack([np.ones(n), follows])) / sigmas[seen, None])
+    follows = covariates[shown] if n >= _FEW * (1 + covariates.shape[1]) else np.zeros((n, 0))
+    base, _ = np.linalg.qr(_varying_columns(np.column_stack([np.ones(n), follows])) / sigmas[shown, None])
     if n < base.shape[1] + 2:
         return None
-    y: Array = _without_base(base, (values[seen] / sigmas[seen])[:, None])[:, 0]
-    best, tried, square = (0.0, "", 0, 0.0), 0, float(y @ y)
-    for shape, columns in _change_shapes(days[seen], covariates[seen], channels).items():
-        white = columns / sigmas[seen, None]
+    y: Array = _without_base(base, (values[shown] / sigmas[shown])[:, None])[:, 0]
+    best = (0.0, "", 0, 0.0)
+    tried = 0
+    square = float(y @ y)
+    for shape, columns in _change_shapes(days[shown], covariates[shown], channels).items():
+        white = columns / sigmas[shown, None]
         left = _without_base(base, white)
         length = np.sum(left**2, axis=0)
-        told = length > _MIN_COLUMN_SHARE * np.maximum(np.sum(white**2, axis=0), 1e-300)
-        gains = np.where(told, (y @ left) ** 2 / np.where(told, length, 1.0), 0.0)
-        tried += int(told.sum())
+        is_visible = length > _MIN_COLUMN_SHARE * np.maximum(np.sum(white**2, axis=0), 1e-300)
+        gains = np.where(is_visible, (y @ left) ** 2 / np.where(is_visible, length, 1.0), 0.0)
+        tried += int(is_visible.sum())
         at = int(np.argmax(gains))
         if gains[at] > best[0]:
             best = (float(gains[at]), shape, at, float(y @ left[:, at] / length[at]))
@@ -67,18 +69,19 @@ def find_onset(values: Array, sigmas: Array, days: Array, covariates: Array, cha
         return None
     t = np.sqrt(gain / max((square - gain) / freedom, 1e-12 * square))
     p_value = min(1.0, tried * 2 * float(stdtr(freedom, -t)))
-    return Onset(int(seen[at]), shape, size, abs(size) / float(t), p_value)
+    return Onset(int(shown[at]), shape, size, abs(size) / float(t), p_value)
 
 
 def _change_shapes(days: Array, covariates: Array, channels: Sequence[str]) -> dict[str, Array]:
     """(n, n) columns by shape: in column k what begins at session k, per day and per unit of the channel."""
     after = np.tri(len(days)).astype(float)
-    out, long = {"step": after}, after.copy()
-    long[:, -_COURSE:] = 0.0
-    out["drift"] = long * (days[:, None] - days[None, :])
+    columns = {"step": after}
+    long = after.copy()
+    long[:, -_TREND:] = 0.0
+    columns["drift"] = long * (days[:, None] - days[None, :])
     for c, name in enumerate(channels):
-        out[name] = long * (covariates[:, c, None] - covariates[None, :, c])
-    return out
+        columns[name] = long * (covariates[:, c, None] - covariates[None, :, c])
+    return columns
 
 
 def _varying_columns(columns: Array) -> Array:

@@ -23,6 +23,7 @@ from scipy.special import gammaln, ndtri, stdtr
 
 from stitch.numerics.frames import Array, Indices, Mask
 
+# Places of a member's numbers.
 LEVEL, SLOPE, COVARIATES = 0, 1, 2
 # Process noise of the members: of the level per √day, of the slope at the start per day, of the slope per day and
 # √day; standard deviations in sigmas of one session.
@@ -39,7 +40,8 @@ MEMBERS = (
     (0.3, 1.0, 0.1),
 )
 # Variance of what is not known at all, and above which an innovation only says where that is.
-_UNKNOWN, _START_VARIANCES = 1e8, 1e5
+_UNKNOWN = 1e8
+_START_VARIANCES = 1e5
 # A session farther off than so many sigmas counts as so many: one wild session must not carry the level away.
 WILD = 4.0
 # Degrees of freedom that the stated sigmas are worth: few, for they may be twice too small; enough that a jump of a
@@ -74,7 +76,7 @@ class Bank:
     @property
     def best(self) -> Indices:
         """(P,) member by which the sessions so far were likeliest."""
-        return np.asarray(np.argmax(self.log_likelihood, axis=1), np.int64)
+        return np.argmax(self.log_likelihood, axis=1)
 
     def chosen(self, members: Indices) -> "Bank":
         """The bank with one member a parameter (P,) left."""
@@ -113,7 +115,7 @@ def with_parameters(
     noise = np.broadcast_to(np.stack([level, wander], axis=1), (K, M, 2))
     new = {"mean": np.zeros((K, M, d)), "covariance": covariance, "squares": np.zeros((K, M)), "count": np.zeros(K)}
     new |= {"log_likelihood": np.zeros((K, M)), "noise": noise, "origin": values, "unit": sigmas}
-    return Bank(**{name: np.concatenate([own, new[name]]) for name, own in vars(bank).items()})
+    return Bank(**{name: np.concatenate([known, new[name]]) for name, known in vars(bank).items()})
 
 
 def reset_moved(bank: Bank, moved: Mask) -> Bank:
@@ -148,27 +150,29 @@ def updated_bank(bank: Bank, values: Array, sigmas: Array, covariates: Array) ->
     Returns:
         The bank, and the innovations of member 0 as standard normal numbers (P,); NaN where nothing can be said yet.
     """
-    seen = np.isfinite(values) & np.isfinite(sigmas) & (sigmas > 0)
+    is_shown = np.isfinite(values) & np.isfinite(sigmas) & (sigmas > 0)
     x = np.concatenate([[1.0, 0.0], covariates])
-    y = np.where(seen, (values - bank.origin) / bank.unit, 0.0)[:, None]
-    R = np.where(seen, (sigmas / bank.unit) ** 2, 1.0)[:, None]
+    y = np.where(is_shown, (values - bank.origin) / bank.unit, 0.0)[:, None]
+    R = np.where(is_shown, (sigmas / bank.unit) ** 2, 1.0)[:, None]
     carried = bank.covariance @ x  # (P, M, d)
     F = carried @ x + R
     e = y - bank.mean @ x
-    told = (seen[:, None] & (F < _START_VARIANCES * R))[:, :1]
-    freedom, spread = bank.count + _STATED, np.sqrt(F * bank.scatter)
+    tells_scatter = (is_shown[:, None] & (F < _START_VARIANCES * R))[:, :1]
+    freedom = bank.count + _STATED
+    spread = np.sqrt(F * bank.scatter)
     e_calm = np.clip(e, -WILD * spread, WILD * spread)
-    gain = np.where(seen[:, None], 1.0, 0.0)[..., None] * carried / F[..., None]
+    gain = np.where(is_shown[:, None], 1.0, 0.0)[..., None] * carried / F[..., None]
     covariance = bank.covariance - gain[..., None] * carried[..., None, :]
+    density = student_log_density(e_calm, spread, freedom[:, None])
     after = replace(
         bank,
         mean=bank.mean + gain * e_calm[..., None],
         covariance=(covariance + np.swapaxes(covariance, -1, -2)) / 2,
-        squares=bank.squares + np.where(told, e_calm**2 / F, 0.0),
-        count=bank.count + told[:, 0],
-        log_likelihood=bank.log_likelihood + np.where(told, student_log_density(e_calm, spread, freedom[:, None]), 0.0),
+        squares=bank.squares + np.where(tells_scatter, e_calm**2 / F, 0.0),
+        count=bank.count + tells_scatter[:, 0],
+        log_likelihood=bank.log_likelihood + np.where(tells_scatter, density, 0.0),
     )
-    return after, normal_equivalent(np.where(told, e / spread, np.nan)[:, 0], freedom)
+    return after, normal_equivalent(np.where(tells_scatter, e / spread, np.nan)[:, 0], freedom)
 
 
 def slope_odds(bank: Bank, still: int = STILL, steady: int = STEADY) -> Array:
@@ -194,8 +198,8 @@ def transition(d: int, days: float) -> Array:
 
 def student_log_density(e: Array, spread: Array, freedom: Array) -> Array:
     """(...,) log density of t = e/spread as one of e, up to a constant; `freedom` are the degrees of freedom."""
-    told = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - np.log(freedom) / 2 - np.log(spread)
-    return told - (freedom + 1) / 2 * np.log1p((e / spread) ** 2 / freedom)
+    constant = gammaln((freedom + 1) / 2) - gammaln(freedom / 2) - np.log(freedom) / 2 - np.log(spread)
+    return constant - (freedom + 1) / 2 * np.log1p((e / spread) ** 2 / freedom)
 
 
 def normal_equivalent(t: Array, freedom: Array) -> Array:

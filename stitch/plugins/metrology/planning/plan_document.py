@@ -7,7 +7,7 @@ import numpy as np
 from stitch.model.model import expanded_uncertainty
 from stitch.numerics.frames import Array
 from stitch.output.session_files import pose_columns
-from stitch.plugins.metrology.planning.detection_chances import EffectOutlook, EffectPair, Outlook
+from stitch.plugins.metrology.planning.detection_chances import EffectOutlook, Outlook
 from stitch.plugins.metrology.planning.expected_model import ExpectedHandEye
 from stitch.plugins.metrology.planning.plan import Plan, ProposedView
 
@@ -35,14 +35,14 @@ def _outlook(o: Outlook, T_mount: Array) -> dict[str, Any]:
         "hand_eye": _hand_eye(o.hand_eye, T_mount) | {"shares": o.hand_eye.shares},
         "hand_eye_of_an_ordinary_arm": _hand_eye(o.ordinary, T_mount),
         "effects": [_effect(e) for e in o.effects],
-        "pairs": [_pair(pair) for pair in o.pairs],
+        "pairs": [{"effects": [p.a, p.b], "identifiable": {p.a: p.size_a, p.b: p.size_b}} for p in o.pairs],
         "not_asked": {name: list(needs) for name, needs in o.untestable.items()},
     }
 
 
-def _hand_eye(found: ExpectedHandEye, T_mount: Array) -> dict[str, Any]:
+def _hand_eye(expected: ExpectedHandEye, T_mount: Array) -> dict[str, Any]:
     """U (k = 2) of rotation vector and position in the mount frame, as `run` prints it, and at the part."""
-    return {"U": expanded_uncertainty(T_mount, found.covariance).tolist(), "U_at_part": found.U}
+    return {"U": expanded_uncertainty(T_mount, expected.covariance).tolist(), "U_at_part": expected.U}
 
 
 def _effect(e: EffectOutlook) -> dict[str, Any]:
@@ -59,10 +59,6 @@ def _effect(e: EffectOutlook) -> dict[str, Any]:
         "chance_misnamed": None if chance is None else chance.misnamed,
         "taken_for": None if chance is None else chance.taken_for,
     }
-
-
-def _pair(pair: EffectPair) -> dict[str, Any]:
-    return {"effects": [pair.a, pair.b], "identifiable": {pair.a: pair.size_a, pair.b: pair.size_b}}
 
 
 def _proposed(view: ProposedView) -> dict[str, Any]:

@@ -30,7 +30,9 @@ _FORMAT = "stitch-batch-mark/1"
 # A worker that was given up may still be at work on a session: its successor waits for it, this long (s).
 LOCK_WAIT_SECONDS = 3600.0
 _RETRY_SECONDS = 0.5
-DOCUMENT, PAGE = "batch.json", "batch.html"  # beside the runs: for programs, and for people
+# Beside the runs: for programs, and for people.
+DOCUMENT = "batch.json"
+PAGE = "batch.html"
 BATCH_FORMAT = "stitch-batch/1"
 _WORKERS_DIED = NoResultError(
     "workers died over it, also when it ran alone; to fix: give it more memory, or thin its scans, and start the batch "
@@ -62,15 +64,15 @@ def session_content_hash(session: Path) -> str | None:
         files = [*measured_files(session), *(file for file in named if file.is_file())]
     except (OSError, ValueError, csv.Error, InputError):
         return None
-    found = content_hash(Path(session.anchor), files)
-    return None if found == UNKNOWN else found
+    digest = content_hash(Path(session.anchor), files)
+    return None if digest == UNKNOWN else digest
 
 
 def write_mark(job: BatchJob, content: str | None, folder: Path) -> None:
     """Write into a folder that becomes the run's of which content it is; both are there at once."""
-    told = {"format": _FORMAT, "batch": job.batch, "content": content, "began_with": _first_step_hash(folder)}
+    mark = {"format": _FORMAT, "batch": job.batch, "content": content, "began_with": _first_step_hash(folder)}
     with whole_file(folder / MARK) as file:
-        file.write_text(json.dumps(told) + "\n", encoding="utf-8")
+        file.write_text(json.dumps(mark) + "\n", encoding="utf-8")
 
 
 def finished_batch(job: BatchJob, content: str | None) -> str | None:
@@ -81,11 +83,11 @@ def finished_batch(job: BatchJob, content: str | None) -> str | None:
     if content is None or sessions_in(job.run) != [str(job.session.resolve())]:
         return None
     try:
-        told = json.loads((job.run / MARK).read_text(encoding="utf-8"))
+        mark = json.loads((job.run / MARK).read_text(encoding="utf-8"))
         # A later `stitch run` leaves the mark, and begins the history of the model anew.
-        own = told["began_with"] == _first_step_hash(job.run) and told["format"] == _FORMAT
-        whole = own and told["content"] == content and (not job.force or told["batch"] == job.batch)
-        return str(told["batch"]) if whole else None
+        is_of_run = mark["began_with"] == _first_step_hash(job.run) and mark["format"] == _FORMAT
+        counts = is_of_run and mark["content"] == content and (not job.force or mark["batch"] == job.batch)
+        return str(mark["batch"]) if counts else None
     except (OSError, ValueError, LookupError, TypeError, InputError):
         return None
 
@@ -173,8 +175,8 @@ def finished_row(session: Path, run: Path, skipped: bool = False) -> SessionRow:
 def failed_row(session: Path, run: Path, error: BaseException) -> SessionRow:
     """Return the row of a session without a result: why, in one line."""
     kind = "" if isinstance(error, StitchError) else f"{type(error).__name__}: "
-    told = f"{kind}{' '.join(str(error).split())}"
-    return SessionRow(str(session), run.name, error=told, bad_input=isinstance(error, InputError))
+    text = f"{kind}{' '.join(str(error).split())}"
+    return SessionRow(str(session), run.name, error=text, bad_input=isinstance(error, InputError))
 
 
 def run_session(job: BatchJob) -> SessionRow:
@@ -237,8 +239,8 @@ def batch_sentence(rows: Sequence[SessionRow]) -> str:
     """Return how many are run, were finished before, have failed."""
     counts = batch_document(rows)
     words = {"done": "run", "skipped": "finished before", "failed": "without a result"}
-    told = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
-    return f"{len(rows)} {'session' if len(rows) == 1 else 'sessions'}: {', '.join(told) or 'nothing to do'}."
+    parts = [f"{counts[key]} {text}" for key, text in words.items() if counts[key]]
+    return f"{len(rows)} {'session' if len(rows) == 1 else 'sessions'}: {', '.join(parts) or 'nothing to do'}."
 
 
 def run_jobs(
@@ -280,11 +282,11 @@ def rows_from(
     suspected = []
     for done in import_module("distributed").as_completed(futures).batches():
         # Fetched together: one by one a scheduler would be busy with that alone.
-        whole = [future for future in done if future.status == "finished"]
-        told = dict(zip(whole, client.gather(whole), strict=True))
+        finished = [future for future in done if future.status == "finished"]
+        rows = dict(zip(finished, client.gather(finished), strict=True))
         for future in done:
             job = job_of.pop(future)
-            row = told.get(future) or _row_of_future(future, job)
+            row = rows.get(future) or _row_of_future(future, job)
             # The scheduler need not keep what has been told.
             future.release()
             if row is None:
