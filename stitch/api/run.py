@@ -222,8 +222,8 @@ class Run(RunData):
         (3, 'base')
         >>> run.views[0].name, run.views[0].pose.shape
         ('v000', (4, 4))
-        >>> run.residuals.column_names[:3]
-        ['view', 'partner', 'x']
+        >>> tuple(run.residuals.column_names[:3])
+        ('view', 'partner', 'x')
         >>> print(run)
         [[s]] 5 views, eye_in_hand, mm
         ...
@@ -289,8 +289,8 @@ class Run(RunData):
 
         Example:
             >>> saved = run.save(folder / "runs" / "bracket", recording=False)
-            >>> sorted(path.name for path in saved.iterdir())[:3]
-            ['ledger.json', 'model.toml', 'report.html']
+            >>> tuple(sorted(path.name for path in saved.iterdir())[:3])
+            ('ledger.json', 'model.toml', 'report.html')
         """
         folder = Path(folder)
         whole = self.measured or public_session(self.session)
