@@ -3,6 +3,7 @@
 import ast
 import inspect
 import json
+import pickle
 import re
 import shutil
 import subprocess
@@ -11,8 +12,11 @@ import sysconfig
 import textwrap
 import tomllib
 import venv
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import chdir
+from copy import deepcopy
 from importlib import import_module, util
+from multiprocessing import get_context
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -297,3 +301,56 @@ def test_the_installed_program_runs_outside_the_checkout(environment, tmp_path):
     run(environment / "stitch", "synth", "blade", "cell", "--views", "6", "--seed", "3")
     run(environment / "stitch", "run", "cell", "-o", "found")
     assert {"result.json", "report.html", "recording.rrd"} <= {p.name for p in (tmp_path / "found").iterdir()}
+
+
+def same_values(one, other, met=()):
+    """True where two objects hold the same, whatever they are made of; trees are no part of what is held."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind in "fc")
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(same_values(one[key], other[key], met) for key in one)
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(same_values(*pair, met) for pair in zip(one, other, strict=True))
+    if hasattr(one, "__dict__") and not isinstance(one, type) and not callable(one):
+        if id(one) in met:  # it holds itself
+            return True
+        held = [{key: value for key, value in vars(each).items() if key != "tree"} for each in (one, other)]
+        return same_values(*held, (*met, id(one)))
+    return one == other or (one != one and other != other)
+
+
+@pytest.fixture(scope="module")
+def values():
+    """An object of every public class, by its name, and the tables that a run hands out."""
+    cell = measured_blade(0, views=8, mount="eye_in_hand", pixels=30)
+    clouds, poses = [cloud.points for cloud in cell.clouds], np.array(cell.T_base_flange)
+    session = stitch.Session.from_arrays(clouds, poses, mount="eye_in_hand", check=False)
+    run = stitch.run(session)
+    errors = {kind.__name__: kind("no") for kind in (stitch.StitchError, stitch.InputError, stitch.NoResultError)}
+    found = stitch.diagnose(run)
+    inner = {"ResidualTables": stitch.compare(run), "Table": run.residuals}
+    return errors | {"Session": session, "Run": run, "Diagnosis": found, "Model": run.model} | inner
+
+
+# Views of a session that grows, with its threads and its recording: no value.
+NO_VALUES = {"LiveSession"}
+
+
+def test_a_process_hands_back_every_public_class_as_it_was(values):
+    public = {name for name in stitch.__all__ if inspect.isclass(getattr(stitch, name))}
+    assert public - NO_VALUES == values.keys() - {"ResidualTables", "Table"}
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        for name, value in values.items():
+            came = pool.submit(deepcopy, value).result()
+            assert type(came) is type(value) and str(came) == str(value), name
+            if name != "Table" and name not in ("StitchError", "InputError", "NoResultError"):
+                assert same_values(came, value), name
+
+
+def test_a_run_that_came_from_another_process_goes_on(values):
+    came = pickle.loads(pickle.dumps(values["Run"]))
+    assert all("tree" not in vars(scan) for scan in came.measurement.capture.scans)
+    assert str(stitch.diagnose(came).sentence) == values["Diagnosis"].sentence
+    assert same_values(stitch.compare(came), values["ResidualTables"])

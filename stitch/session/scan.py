@@ -1,7 +1,7 @@
 """A view made ready for matching, once: KD-tree, normals, edges, spacing and noise, scanner frame."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -44,11 +44,21 @@ class Scan:
     usable: Array  # (N,) bool: neither edge nor crease nor grazing
     area: Array  # (N,) surface per point: the inverse of the local density
     confidence: Array  # (N,) cosine of incidence
-    tree: Any  # pykdtree KDTree over `points`
+    tree: Any = field(repr=False, compare=False)  # pykdtree KDTree over `points`
     spacing: float  # median distance between neighbours
     scanned_spacing: float  # the same between all points that were scanned, of which these may be some
     noise: float  # 1-sigma across the surface, from the scan itself
     eye: Array  # (3,) from where the scanner looks
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the tree out of pickles and copies: it is made of the points when it is asked for."""
+        return {name: value for name, value in vars(self).items() if name != "tree"}
+
+    def __getattr__(self, name: str) -> Any:
+        if name != "tree" or "points" not in vars(self):
+            raise AttributeError(name)
+        tree = vars(self)["tree"] = KDTree(self.points, leafsize=16)
+        return tree
 
     @cached_property
     def box(self) -> Array:
