@@ -5,12 +5,13 @@ ends where what moves both is the same.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
+from stitch.errors import NoResultError
 from stitch.numerics.frames import Array
 from stitch.plugins.metrology.feature_file import Contribution, FeatureList
 from stitch.plugins.metrology.features import NUMBERS, Feature, FittedFeature, fit_feature, position_of, reach_of
@@ -77,6 +78,7 @@ class MeasuredFeatures:
     covariance: Array  # (Q, Q)
     fits: tuple[FittedFeature, ...]  # of all features but distances
     length_unit: str
+    not_measured: dict[str, str] = field(default_factory=dict)  # features without numbers, and why
 
     @property
     def correlation(self) -> Array:
@@ -86,24 +88,35 @@ class MeasuredFeatures:
 
 
 def measure_features(places: PlaceErrors, wanted: FeatureList) -> MeasuredFeatures:
-    """Fit features to the points of a run.
+    """Fit features to the points of a run; those on which too few points lie are named, and the others stand.
 
     Raises:
-        NoResultError: too few points lie on a feature.
+        NoResultError: too few points lie on each of them.
     """
-    return evaluate(places, wanted, fit_features(places.points, wanted.features))
+    fits, not_measured = fit_features(places.points, wanted.features)
+    if not fits:
+        raise NoResultError(next(iter(not_measured.values())))
+    for feature in wanted.features:
+        if feature.kind == "distance" and (missing := not_measured.keys() & set(feature.between)):
+            not_measured[feature.name] = f"{feature.name}: {', '.join(sorted(missing))} was not measured"
+    measured = replace(wanted, features=tuple(f for f in wanted.features if f.name not in not_measured))
+    return replace(evaluate(places, measured, fits), not_measured=not_measured)
 
 
-def fit_features(points: RunPoints, features: Sequence[Feature]) -> tuple[FittedFeature, ...]:
-    """Return the fits of all features but distances.
-
-    Raises:
-        NoResultError: too few points lie on one.
-    """
+def fit_features(points: RunPoints, features: Sequence[Feature]) -> tuple[tuple[FittedFeature, ...], dict[str, str]]:
+    """Return the fits of features but distances, and by name why others have none: too few points lie there."""
     tree = cKDTree(points.points, balanced_tree=False, compact_nodes=False)
-    placed = [feature for feature in features if feature.kind != "distance"]
-    near = (np.sort(np.array(tree.query_ball_point(f.at, reach_of(f)), np.int64)) for f in placed)
-    return tuple(fit_feature(feature, points, index) for feature, index in zip(placed, near, strict=True))
+    fits = []
+    not_measured = dict[str, str]()
+    for feature in features:
+        if feature.kind == "distance":
+            continue
+        near = np.sort(np.array(tree.query_ball_point(feature.at, reach_of(feature)), np.int64))
+        try:
+            fits.append(fit_feature(feature, points, near))
+        except NoResultError as error:
+            not_measured[feature.name] = str(error)
+    return tuple(fits), not_measured
 
 
 def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeature]) -> MeasuredFeatures:

@@ -24,6 +24,7 @@ def measure_document(measured: MeasuredFeatures, run: str, trials: MonteCarlo | 
         "numbers": [_number(n, ratio) for n, ratio in zip(measured.numbers, ratios, strict=True)],
         "covariance": {"numbers": [n.name for n in measured.numbers], "matrix": measured.covariance.tolist()},
         "trials": None if trials is None else trials.trials,
+        "not_measured": measured.not_measured,
         "not_included": list(NOT_INCLUDED),
     }
 

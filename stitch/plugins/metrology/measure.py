@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -64,7 +65,8 @@ def measure(
         wanted = read_features(features, state.session.length_unit, state.measurement.capture.spacing)
         places = place_errors(state)
         measured = measure_features(places, wanted)
-        checked = monte_carlo(places, wanted, measured.fits, trials) if trials else None
+        seen = replace(wanted, features=tuple(f for f in wanted.features if f.name not in measured.not_measured))
+        checked = monte_carlo(places, seen, measured.fits, trials) if trials else None
         document = measure_document(measured, str(run), checked)
         write_json(document, run / "features.json")
         with whole_file(run / "features.csv") as file:
@@ -116,6 +118,7 @@ def _show_numbers(measured: MeasuredFeatures, checked: MonteCarlo | None) -> Non
     numbers = verified_numbers(measured)
     if numbers:
         say(f"{agreeing(numbers)} of {len(numbers)} calibrated numbers agree within U and that of their calibration.")
+    show_block([("not measured", text) for text in measured.not_measured.values()])
     show_block([("not in U", text) for text in NOT_INCLUDED])
 
 

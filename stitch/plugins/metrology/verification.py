@@ -119,6 +119,7 @@ class Verification:
     forms: tuple[FormError, ...]
     hand_eye: HandEyeTransfer
     length_unit: str
+    not_measured: dict[str, str]  # features without numbers, and why
 
     @property
     def agreeing(self) -> int:
@@ -146,7 +147,8 @@ class Verification:
         verdicts += [self.U_holds, self.hand_eye.holds]
         if False in verdicts:
             return False
-        return None if None in verdicts or HAND_EYE not in self.answers_to else True
+        decided = None not in verdicts and not self.not_measured and HAND_EYE in self.answers_to
+        return True if decided else None
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -177,6 +179,8 @@ class Verification:
                 f"U is too large for the limit of {worst.number.feature.name}{more}: "
                 f"{worst.deviation:+.2g} ± {worst.U:.2g} {self.length_unit} beside {worst.limit:g}."
             )
+        if self.not_measured:
+            facts.append(f"Not measured: {', '.join(self.not_measured)}.")
         facts.append(self.hand_eye.sentence(self.length_unit))
         if HAND_EYE not in self.answers_to:
             facts.append(
@@ -199,7 +203,9 @@ def verify(measured: MeasuredFeatures, limits: dict[str, float] | None, hand_eye
         for fit in measured.fits
         if fit.feature.kind in ("sphere", "plane", "cylinder")
     ]
-    return Verification(verified_numbers(measured, limits), tuple(forms), hand_eye, measured.length_unit)
+    return Verification(
+        verified_numbers(measured, limits), tuple(forms), hand_eye, measured.length_unit, measured.not_measured
+    )
 
 
 def verified_numbers(
@@ -284,6 +290,7 @@ def verification_document(
         "forms": [
             {"feature": f.feature, "form_95": f.form, "limit": f.limit, "passes": f.passes} for f in result.forms
         ],
+        "not_measured": result.not_measured,
         "doubts": list(state.doubts),
         "notes": [*state.notes, *notes],
         "left_out": [{"view": item.view, "why": item.why} for item in state.left_out],

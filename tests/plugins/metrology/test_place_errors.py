@@ -46,12 +46,12 @@ def cell():
 
 def _numbers(state, wanted):
     places = place_errors(state)
-    _, values, _, _ = number_table(wanted.features, fit_features(places.points, wanted.features))
+    _, values, _, _ = number_table(wanted.features, fit_features(places.points, wanted.features)[0])
     return values
 
 
 def _responses(places, wanted):
-    fits = fit_features(places.points, wanted.features)
+    fits = fit_features(places.points, wanted.features)[0]
     _, _, _, slopes = number_table(wanted.features, fits)
     return stack_responses([places.responses(fit.at, fit.gradient) for fit in fits]).combined(slopes)
 
@@ -109,7 +109,7 @@ def test_error_of_one_pose_moves_features_as_predicted(cell):
 
 def test_shares_add_up_and_the_largest_source_is_named(cell):
     _, places, wanted = cell
-    fits = fit_features(places.points, wanted.features)
+    fits = fit_features(places.points, wanted.features)[0]
     for name in {source.name for source in places.sources}:
         larger = tuple(
             replace(s, views=50 * s.views, field=50 * s.field) if s.name == name else s for s in places.sources
@@ -145,7 +145,7 @@ def test_what_smooth_errors_make_of_the_overlaps_is_not_called_noise(cell):
 
 def test_a_distance_is_better_known_than_its_ends(cell):
     _, places, wanted = cell
-    found = evaluate(places, wanted, fit_features(places.points, wanted.features))
+    found = evaluate(places, wanted, fit_features(places.points, wanted.features)[0])
     U = {n.name: n.U for n in found.numbers}
     ends = np.hypot(*(np.linalg.norm([U[f"ball {i}.{axis}"] for axis in "xyz"]) for i in (0, 1)))
     assert U["apart.distance"] < 0.5 * ends
@@ -155,14 +155,14 @@ def test_a_distance_is_better_known_than_its_ends(cell):
 def test_monte_carlo_agrees_with_the_propagation(cell):
     _, places, wanted = cell
     few = FeatureList((*wanted.features[:2], wanted.features[3]), (Contribution("scale", relative=2e-5),))
-    found = monte_carlo(places, few, fit_features(places.points, few.features), 400)
+    found = monte_carlo(places, few, fit_features(places.points, few.features)[0], 400)
     # Five standard deviations of 400 trials.
     assert np.abs(found.ratio - 1).max() < 5 / np.sqrt(2 * 400)
 
 
 def test_a_stated_contribution_counts_by_its_length(cell):
     _, places, wanted = cell
-    fits = fit_features(places.points, wanted.features)
+    fits = fit_features(places.points, wanted.features)[0]
     plain = evaluate(places, wanted, fits)
     stated = evaluate(places, replace(wanted, contributions=(Contribution("scale", relative=1e-3),)), fits)
     for before, after in zip(plain.numbers, stated.numbers, strict=True):
@@ -177,7 +177,7 @@ def test_every_fused_point_has_a_sigma_of_the_size_of_a_small_patch(cell):
     T = state.fused.points
     at = T[len(T) // 2]
     patch = Feature("here", "point", at=at, axis=state.fused.normals[len(T) // 2], radius=8.0, within=3.0)
-    found = evaluate(places, FeatureList((patch,)), fit_features(places.points, (patch,)))
+    found = evaluate(places, FeatureList((patch,)), fit_features(places.points, (patch,))[0])
     known = float(np.median(sigma[np.linalg.norm(T - at, axis=1) < 8.0]))
     number = found.numbers[0]
     shared = number.u * np.sqrt(1 - number.shares[OWN_NOISE])

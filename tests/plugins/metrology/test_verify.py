@@ -182,3 +182,14 @@ def test_lengths_come_into_the_unit_of_the_run(tmp_path):
     feature = read_features(file, "mm", 0.5).features[0]
     assert feature.at == pytest.approx([1000, 100, 0]) and feature.size == pytest.approx(30)
     assert feature.tolerance == pytest.approx((-0.1, 0.2))
+
+
+def test_a_feature_that_nobody_saw_is_named_and_the_others_stand(cell):
+    document = tomllib.loads((cell / "artefact" / "artefact.toml").read_text())
+    document["feature"][0]["at"] = [900.0, 0.0, 0.0]
+    document["limits"]["size"] = 0.15
+    (cell / "unseen.toml").write_text(tomli_w.dumps(document))
+    code, unseen = _verify(cell, cell / "unseen.toml")
+    assert code == 3 and unseen["passed"] is None and len(unseen["numbers"]) == 10
+    assert set(unseen["not_measured"]) == {"ball 1", *(f"distance {k}-1" for k in (2, 3, 4, 5))}
+    assert "Not measured: ball 1" in unseen["sentence"]
