@@ -73,7 +73,7 @@ lint: install
 	$(PYTHON) bench/budget.py
 	$(PYTHON) bench/licences.py
 
-check: lint
+check: lint docs
 	$(PYTHON) -m pytest -m "slow or not slow" --cov
 	@$(VENV)/bin/coverage report --include='stitch/*' --format=total --fail-under=93
 

@@ -49,7 +49,15 @@ from stitch.session.reading.text_files import WORKBOOKS
 from stitch.session.session import Mount, Sighting, View
 from stitch.system.files import whole_file
 
-# What was measured: views, each with its targets.
+# Time about that of a pose within which a target's rows count, s.
+_AROUND_S = 0.25
+# Views by which all ways are judged, and then so many of the best.
+_FEW_VIEWS, _MORE_VIEWS, _BEST = 12, 60, 8
+_LEAST_MM = 1e-4  # what tables round
+_TOLD, _FITS = 1.3, 0.02  # next best is so much worse; what fits leaves less than this share of the points' spread
+_LEVER_MM = 100.0  # at which a turn of a probe counts
+# A recording of motion capture is as long as a scan; scans are more, and have neither names nor times.
+_LONG_TABLES = 2
 
 
 @dataclass(frozen=True)
@@ -196,11 +204,6 @@ def _long_table(m: Measured, count: int) -> Observed:
     return Observed(tuple(by_view) if named else ("",) * len(by_view), tuple(by_view.values()), words=words)
 
 
-# Which rows belong to which pose: in one table each to its own, else by time, by name, by number, by order.
-
-_AROUND_S = 0.25
-
-
 def at_times(seen: Observed, times: Array, poses: Array) -> tuple[Observed, float]:
     """Return what was measured about the times of the poses, the median of each target, and how near it is, s.
 
@@ -249,14 +252,6 @@ def pair(seen: Observed, found: Sequence[Measured], poses: RobotPoses) -> tuple[
         ) from None
 
 
-# The way to read all of it under which one hand-eye fits best.
-
-# Views by which all ways are judged, and then so many of the best.
-_FEW_VIEWS, _MORE_VIEWS, _BEST = 12, 60, 8
-_LEAST_MM = 1e-4  # what tables round
-_TOLD, _FITS = 1.3, 0.02  # next best is so much worse; what fits leaves less than this share of the points' spread
-
-
 @dataclass(frozen=True)
 class Way:
     """One way to read what was found, lengths in mm."""
@@ -294,9 +289,6 @@ def _capture(seen: Observed, way: Way, views: Sequence[int]) -> Capture:
         for v, pose in zip(views, T, strict=True)
     ]
     return build_capture("", (), T, way.mount, sightings_of(bare_session(each, way.mount)))
-
-
-_LEVER_MM = 100.0  # at which a turn of a probe counts
 
 
 def _misfit(seen: Observed, way: Way, at_most: int) -> float:
@@ -339,13 +331,6 @@ def candidate_interpretations(
     out.sort(key=lambda way: way.misfit)
     judged = [replace(way, misfit=_misfit(seen, way, _MORE_VIEWS)) for way in out[:_BEST]]
     return sorted([*judged, *out[_BEST:]], key=lambda way: way.misfit)
-
-
-# What was found, with reasons, and the files of the session.
-
-
-# A recording of motion capture is as long as a scan; scans are more, and have neither names nor times.
-_LONG_TABLES = 2
 
 
 @dataclass(frozen=True)

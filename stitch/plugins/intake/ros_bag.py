@@ -33,13 +33,27 @@ from stitch.session.reading.text_files import shortened
 from stitch.session.robot import forward
 from stitch.system.packages import import_extra
 
-# Frames of ROS chained: what tf recorded between parents and children, interpolated in time.
-
 # An edge moves if it turns (rad) or shifts (m) by more between its recordings.
 _STATIC_TURN, _STATIC_SHIFT = 1e-4, 1e-4
 # Recordings this long (s) before or after a moment still say where things were.
 _MAX_TRANSFORM_AGE = 0.5
 _LONGEST = 200
+# Time, parent, child, T_parent_child (4, 4), whether published as fixed.
+Recording = tuple[float, str, str, Array, bool]
+# As REP 199 and drivers of robots name them, the usual first.
+_FLANGES = ("tool0", "flange", "ee_link", "link_ee")
+_BASES = ("base_link", "base", "link_0", "world")
+CLOUD, IMAGE, CAMERA = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+_TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_JOINTS, _TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
+_DEPTH = ("16UC1", "32FC1", "mono16")
+_MAX_JOINT_AGE = 0.5
+_GRAVITY = np.array([0.0, 0.0, -9.81])
+_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+# Depth in whole numbers counts millimetres (REP 118).
+_METRES_PER_MM = 1e-3
+_FEWEST = 3
+_MM_PER_METRE = 1e3
 
 
 @dataclass
@@ -48,10 +62,6 @@ class _TreeEdge:
     times: list[float] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)  # T_parent_child, m
     static: bool = False
-
-
-# Time, parent, child, T_parent_child (4, 4), whether published as fixed.
-Recording = tuple[float, str, str, Array, bool]
 
 
 class TransformTree:
@@ -142,13 +152,6 @@ class TransformTree:
         return T
 
 
-# Which frames of tf are base and flange, and who carries the scanner: by what moves, then by name.
-
-# As REP 199 and drivers of robots name them, the usual first.
-_FLANGES = ("tool0", "flange", "ee_link", "link_ee")
-_BASES = ("base_link", "base", "link_0", "world")
-
-
 @dataclass(frozen=True)
 class BagFrames:
     """Names of frames of tf."""
@@ -222,14 +225,6 @@ def _is_rigid(tree: TransformTree, frame: str, link: str) -> bool:
     """Whether nothing moves between a link and a frame above which it lies."""
     path = tree.above(frame)
     return not any(tree.moves(f) for f in path[: path.index(link)])
-
-
-# What a bag of ROS 1 or 2, or an MCAP file, recorded of an arm and a scanner (rosbags).
-
-CLOUD, IMAGE, CAMERA = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
-_TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-_JOINTS, _TEXT = "sensor_msgs/msg/JointState", "std_msgs/msg/String"
-_DEPTH = ("16UC1", "32FC1", "mono16")
 
 
 @dataclass
@@ -320,12 +315,6 @@ def _frame_name(frame: str) -> str:
     return frame.lstrip("/")
 
 
-# Joint angles of a bag in the order of the arm, by the URDF that it recorded.
-
-_MAX_JOINT_AGE = 0.5
-_GRAVITY = np.array([0.0, 0.0, -9.81])
-
-
 def recorded_urdf(
     contents: BagContents, bag_frames: BagFrames, times: Array, folder: Path
 ) -> tuple[dict[str, str], Array | None, Guess]:
@@ -382,13 +371,6 @@ def interpolated_joints(contents: BagContents, names: list[str], times: Array) -
     return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
 
 
-# PointCloud2 and depth images of a bag as arrays: (N, k), or (H, W, k) where the scan is an image; lengths in m.
-
-_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-# Depth in whole numbers counts millimetres (REP 118).
-_METRES_PER_MM = 1e-3
-
-
 def cloud_array(message: Any, where: str) -> Array:
     """x, y, z, and red, green, blue or intensity behind them; NaN where a pixel measured nothing.
 
@@ -442,10 +424,6 @@ def depth_array(message: Any, camera: Any) -> Array:
     fx, cx, fy, cy = (float(K[i]) for i in (0, 2, 4, 5))
     v, u = np.mgrid[: message.height, : message.width]
     return np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=-1)
-
-
-_FEWEST = 3
-_MM_PER_METRE = 1e3
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,8 @@
-"""A taught point, and how each controller writes an orientation. Lengths in mm, angles in rad."""
+"""A taught point, and how each controller writes an orientation. Lengths in mm, angles in rad.
+
+A pose as the numbers of each controller. Among numbers that mean the same pose those nearest to the ones before are
+taken, so that a target that hardly moves hardly changes.
+"""
 
 import re
 from collections.abc import Callable, Mapping
@@ -11,11 +15,12 @@ from scipy.spatial.transform import Rotation
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 
-# A pose as the numbers of each controller. Among numbers that mean the same pose those nearest to the ones before are
-# taken, so that a target that hardly moves hardly changes.
-
 # cos B below which A and C turn about the same axis, and one of them is free (rad).
 _LOCKED = 1e-6
+_FEWEST_JOINTS = 4
+Span = tuple[int, int]  # begin and end in a text
+# What stands between commas, without the space around it.
+CELL = re.compile(r"[^,\s](?:[^,]*[^,\s])?")
 
 
 def zyx_numbers(T: Array, near: Array | None = None) -> Array:
@@ -68,12 +73,6 @@ def _zyx(R: Array, near: Array | None) -> Array:
     both = np.array([first, [first[0] + np.pi, np.pi - b, first[2] + np.pi]])
     off = (both - near + np.pi) % (2 * np.pi) - np.pi
     return np.asarray(near + min(off, key=lambda own: float(np.linalg.norm(own))))
-
-
-_FEWEST_JOINTS = 4
-Span = tuple[int, int]  # begin and end in a text
-# What stands between commas, without the space around it.
-CELL = re.compile(r"[^,\s](?:[^,]*[^,\s])?")
 
 
 @dataclass(frozen=True)
