@@ -103,7 +103,7 @@ function showScreen(root, part, found, um) {
       return;
     }
     const deciding = !asked && found.deciding_view, rivals = deciding && deciding.expected.map(e => found.candidates.find(c => c.effect === e.effect));
-    const plot = rivals ? duelPlot(rivals, deciding, part && part.names, um) : coursePlot(course, part && part.names, um, !asked && found.verdict === "unknown_effect" ? "their course" : "what the effect predicts");
+    const plot = rivals ? duelPlot(rivals, deciding, part && part.names, um) : coursePlot(course, part && part.names, um, !asked && found.verdict === "unknown_effect" ? "their trend" : "what the effect predicts");
     title.textContent = plot.title;
     xyPlot(place, { ...plot.spec, pressed: course.views.indexOf(view) }, 230, i => chooseView(i < 0 ? -1 : course.views[i] ?? -1));
   }
