@@ -85,7 +85,7 @@ def write_certificate(document: Mapping[str, Any], path: Path) -> None:
         "U of both",
         "U of the model",
         "over what U allows",
-        "kept or not",
+        "verdict",
     )
     tables = [
         {

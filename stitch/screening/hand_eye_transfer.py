@@ -26,7 +26,7 @@ from stitch.session.measurement import Measurement
 # That a hand-eye which is right is doubted.
 _CHANCE = 0.01
 # A hand-eye that is off by so many of its U would be found: else these views do not say whether it is right.
-_FOUND_FROM = 5.0
+FOUND_FROM = 5.0
 # What another run's effects may still err by.
 _EFFECTS = "effects of the model"
 
@@ -50,7 +50,7 @@ class HandEyeTransfer:
     @property
     def decides(self) -> bool:
         """True if these views would show a hand-eye that is off by five times its U."""
-        return _FOUND_FROM * self.U_given >= self.U
+        return FOUND_FROM * self.U_given >= self.U
 
     def sentence(self, unit: str) -> str:
         """Return how the two compare, for people."""

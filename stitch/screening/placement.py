@@ -14,6 +14,7 @@ from pykdtree.kdtree import KDTree
 from scipy.spatial.transform import Rotation
 
 from stitch.numerics import frames
+from stitch.numerics.distributions import MAD_TO_SIGMA
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
@@ -163,7 +164,7 @@ def _icp_scan(scan: Scan, surface: ReferenceSurface, starts: Array, gates: Array
         arm = frames.transform(poses, points) - frames.transform(poses, centre[None])
         J = np.concatenate([np.cross(arm, normal) / lever, normal], axis=2)
         spread = np.median(np.where(meets, np.abs(residual), np.nan_to_num(gate)), axis=1)
-        cut = np.maximum(3 * 1.4826 * spread, 2 * surface.tolerance)[:, None]
+        cut = np.maximum(3 * MAD_TO_SIGMA * spread, 2 * surface.tolerance)[:, None]
         weight = meets * np.clip(1 - (residual / np.maximum(cut, 1e-300)) ** 2, 0, None) ** 2
         H = np.einsum("sn,sni,snj->sij", weight, J, J, optimize=True)
         b = np.einsum("sn,sni,sn->si", weight, J, residual, optimize=True)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from stitch.numerics import frames
-from stitch.numerics.distributions import tukey
+from stitch.numerics.distributions import MAD_TO_SIGMA, tukey
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.matching import sample_points
 from stitch.screening.hypotheses import UNITS
@@ -97,7 +97,7 @@ def _fit_scale(scan: Scan, T: Array, surface: ReferenceSurface, size: float) -> 
         arm = frames.transform(T, scaled) - frames.transform(T, centre[None])
         along = np.einsum("nj,nj->n", arm, normal)[:, None] / lever
         J = np.concatenate([np.cross(arm, normal) / lever, normal, along], axis=1)
-        spread = 1.4826 * np.median(np.abs(residual[meets])) if meets.any() else gate
+        spread = MAD_TO_SIGMA * np.median(np.abs(residual[meets])) if meets.any() else gate
         weight = meets * tukey(residual, max(spread, surface.tolerance / 4))
         H = J.T @ (weight[:, None] * J)
         step = -np.linalg.solve(H + 1e-6 * (np.trace(H) + 1e-9) * np.eye(7), J.T @ (weight * residual))

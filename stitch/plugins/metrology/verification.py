@@ -20,7 +20,7 @@ from stitch.numerics.distributions import binomial_tail
 from stitch.plugins.metrology import error_sources
 from stitch.plugins.metrology.budget import COVERAGE_FACTOR, MeasuredFeatures, Number
 from stitch.run_data import RunData
-from stitch.screening.hand_eye_transfer import HandEyeTransfer
+from stitch.screening.hand_eye_transfer import FOUND_FROM, HandEyeTransfer
 
 VERIFY_FORMAT = "stitch-verify/1"
 # |E_n| up to 1 agrees (ISO 13528); of numbers of which 95 % should agree, so few by chance in one case of a hundred
@@ -184,7 +184,7 @@ class Verification:
         facts.append(self.hand_eye.sentence(self.length_unit))
         if HAND_EYE not in self.answers_to:
             facts.append(
-                f"These views would not show a hand-eye that is off by {5 * self.hand_eye.U_given:.2g} "
+                f"These views would not show a hand-eye that is off by {FOUND_FROM * self.hand_eye.U_given:.2g} "
                 f"{self.length_unit}; to fix: turn the scanner more between views."
             )
         return tuple(facts)

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from stitch.errors import InputError
 from stitch.numerics import frames
+from stitch.numerics.distributions import MAD_TO_SIGMA
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.session.scan import Scan, prepare_scan
@@ -71,7 +72,7 @@ def refine_ball(points: Array, centre: Array, radius: float, known: float | None
         if len(kept) <= len(x):
             break
         x = least_squares(_distances, x, args=(kept, known), loss="soft_l1", f_scale=scale, x_scale="jac").x
-        scale = max(1.4826 * float(np.median(np.abs(_distances(x, kept, known)))), 1e-9 * scale)
+        scale = max(MAD_TO_SIGMA * float(np.median(np.abs(_distances(x, kept, known)))), 1e-9 * scale)
         inside, gate = _distances(x, thin, known), _OUTLIER_GATE * scale
     off = _distances(x, points, known)
     k, keep, sigma = points.shape[1], np.abs(off) < gate, scale

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stitch.errors import InputError
 from stitch.numerics import frames
+from stitch.numerics.distributions import MAD_TO_SIGMA
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array, Mask
 from stitch.session.session import RangeImage, Sighting
@@ -278,12 +279,12 @@ def _on_plane(points: Array) -> Mask:
     best = int(np.argmin(np.median(off, axis=1)))
     # Without noise the scatter is what numbers are rounded to.
     floor = _ROUNDED * float(np.linalg.norm(np.ptp(points, axis=0)))
-    kept = off[best] <= _PLANE_GATE * 1.4826 * np.median(off[best]) + floor
+    kept = off[best] <= _PLANE_GATE * MAD_TO_SIGMA * np.median(off[best]) + floor
     for _ in range(3):
         middle = points[kept].mean(axis=0)
         normal = np.linalg.svd(points[kept] - middle, full_matrices=False)[2][2]
         off_now: Array = np.abs((points - middle) @ normal)
-        kept = off_now <= _PLANE_GATE * 1.4826 * np.median(off_now[kept]) + floor
+        kept = off_now <= _PLANE_GATE * MAD_TO_SIGMA * np.median(off_now[kept]) + floor
     return np.asarray(kept, bool)
 
 
@@ -394,7 +395,7 @@ def _consistent_corners(placed: PlacedBoard) -> PlacedBoard:
             break
         off = _drawing_deviation(placed)
         worst = int(np.argmax(off))
-        scatter = 1.4826 * float(np.median(off)) / 1.5
+        scatter = MAD_TO_SIGMA * float(np.median(off)) / 1.5
         if off[worst] <= _CORNER_GATE * max(scatter, 1.0):
             break
         placed = placed.only(np.arange(len(off)) != worst)
