@@ -47,7 +47,7 @@ def _check_readable(sessions: list[Path], as_json: bool) -> None:
         try:
             summaries.append(session_summary(load_session(path)))
         except InputError as error:
-            errors.append(str(error))
+            errors.append(error.command_line)
     if as_json:
         emit(json.dumps({"sessions": summaries, "errors": errors}, indent=1))
     else:

@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             finally:
                 live_line().stop()
     except StitchError as error:
-        _exit_with_message(str(error), error.exit_code)
+        _exit_with_message(error.command_line, error.exit_code)
     except BrokenPipeError:
         # Whoever read the output has seen enough; nothing must be flushed to it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

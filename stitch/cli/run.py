@@ -198,7 +198,7 @@ def _follow_session(folder: Path, views: int | None) -> None:
             try:
                 session = load_session(folder, scans=False) if table.is_file() else None
             except InputError as error:
-                failed.note(str(error))
+                failed.note(error.command_line)
                 session = None
             if session is not None:
                 live = live or follow(session)
@@ -208,7 +208,7 @@ def _follow_session(folder: Path, views: int | None) -> None:
                     try:
                         view = load_session(folder, only=name).views[0]
                     except InputError as error:
-                        failed.note(str(error))
+                        failed.note(error.command_line)
                         break
                     say(str(live.take(view)))
                     failed = _Failures()

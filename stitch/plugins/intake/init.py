@@ -263,7 +263,7 @@ def _ask_uncertain(folder: Path, out: Path, first: FirstSession, stated: StatedF
             first = _judge_folder(folder, replace(stated, **answers))
             break
         except InputError as error:
-            say(str(error), bold=True)
+            say(error.command_line, bold=True)
     if not typer.confirm("Write the session?", default=True, err=True):
         raise InputError(f"{out}: nothing was written; to fix: state what is wrong with the flags above")
     return first
