@@ -4,26 +4,24 @@
 compensate, turn upright, with `measure` in place of robot and sensors.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bench.harness import Parts, Row, Table, markdown
 from data_synth.cells.drilling import GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.cells.drilling_image import render_plate
-from stitch.errors import NoResultError
-from stitch.numerics import frames
 from stitch.numerics.frames import Array
+from stitch.plugins.cells.drill_servo import drive_pose, servo_to_hole, turn_upright
 from stitch.plugins.cells.drilling_sensors import (
-    GroupCompensation,
+    FlangeSensors,
     HoleObservations,
+    HoleSight,
     compensate_group,
     find_holes,
     fit_homography,
     fit_ranger,
-    hole_rotation,
     leave_one_out,
     order_grid,
     select_effects,
@@ -38,187 +36,48 @@ PUBLISHED = {
 # True k1 and plate height (mm).
 HIDDEN = ((0.0, 0.0), (-0.004, 0.0), (0.0, 0.4), (-0.004, 0.4))
 IMAGES = 5
-_MOST_STEPS = 30
-
-# Moves to a pose T_base_tool and returns the ranges (n,) and the hole's image point (2,); the same over a named hole.
-Measure = Callable[[Array], tuple[Array, Array]]
-MeasureHole = Callable[[str, Array], tuple[Array, Array]]
-# Position (3,) and inward direction (3,) by hole name.
-Holes = Mapping[str, tuple[Array, Array]]
-
-
-def drive_pose(position: Array, direction: Array) -> Array:
-    """T_base_tool (..., 4, 4) that puts the tool on a hole."""
-    return frames.make(hole_rotation(direction), position)
 
 
 @dataclass(frozen=True)
-class Rangers:
-    """Beams of all rangers in the flange frame."""
-
-    origins: Array  # (n, 3)
-    directions: Array  # (n, 3)
-
-
-@dataclass(frozen=True)
-class RangedPlane:
-    """The surface under the tool, in the flange frame."""
-
-    normal: Array  # (3,) unit vector into the part, so close to +z
-    height: float  # along the tool axis
-
-    @property
-    def tilt(self) -> float:
-        """Angle (rad) between tool axis and normal."""
-        return float(np.arctan2(np.hypot(self.normal[0], self.normal[1]), self.normal[2]))
-
-
-def fit_ranged_plane(rangers: Rangers, readings: Array) -> RangedPlane:
-    """Plane through the laser points of three or more readings (n,), and its height on the tool axis.
-
-    The source takes the mean z of its four points, which is the same where the axis passes their centre.
-    """
-    points = rangers.origins + np.asarray(readings)[:, None] * rangers.directions
-    centre = points.mean(axis=0)
-    normal = np.linalg.svd(points - centre)[2][2]
-    normal = normal * np.sign(normal[2])
-    return RangedPlane(normal, float(centre @ normal / normal[2]))
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """When the tool counts as placed; the source's values, in rad and mm."""
-
-    tilt: float = float(np.radians(0.35))
-    height: float = 0.5
-    offset: float = 0.2
-
-
-@dataclass(frozen=True)
-class FlangeSensors:
-    """The calibrated sensors of the flange."""
-
-    rangers: Rangers
-    H: Array  # (3, 3) work plane to image
-    height: float  # h, of the work plane
-    thresholds: Thresholds = Thresholds()
-
-
-@dataclass(frozen=True)
-class HoleSight:
-    """What the sensors say at one pose: hole against tool, in the flange frame."""
-
-    normal: Array  # (3,)
-    tilt: float
-    offset: Array  # (3,): x', y', h' − h
-
-
-@dataclass(frozen=True)
-class ServoResult:
-    """The end of a servo loop."""
-
-    T_base_tool: Array  # (4, 4)
-    final_sight: HoleSight
-    steps: int
-
-    @property
-    def hole(self) -> Array:
-        """Drive coordinate (3,) of the hole: p + R'·(x', y', h' − h) (source, formula 14)."""
-        return self.T_base_tool[:3, 3] + self.T_base_tool[:3, :3] @ self.final_sight.offset
-
-
-def measure_hole(sensors: FlangeSensors, ranges: Array, uv: Array) -> HoleSight:
-    """One measurement in the flange frame, from the rangers' readings and an image point (2,)."""
-    plane = fit_ranged_plane(sensors.rangers, ranges)
-    xy = to_plane(sensors.H, np.asarray(uv)[None])[0]
-    return HoleSight(plane.normal, plane.tilt, np.append(xy, plane.height - sensors.height))
-
-
-def align_tool_axis(T_base_tool: Array, normal: Array) -> Array:
-    """The pose turned about the tool's origin so that its axis lies along `normal` (3,), given in the flange frame."""
-    z = np.array([0.0, 0.0, 1.0])
-    axis = np.cross(z, normal)
-    size = np.linalg.norm(axis)
-    turn = axis / size * np.arctan2(size, normal[2]) if size > 0 else axis
-    R = T_base_tool[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
-    return frames.make(R, T_base_tool[:3, 3])
-
-
-def servo_to_hole(measure: Measure, sensors: FlangeSensors, T_base_tool: Array) -> ServoResult:
-    """Tilt, then height, then camera offset, and again until all three are below their thresholds; starts at a pose
-    (4, 4).
-
-    Raises:
-        NoResultError: the loop does not converge.
-    """
-    limits = sensors.thresholds
-    for step in range(_MOST_STEPS):
-        sight = measure_hole(sensors, *measure(T_base_tool))
-        x, y, dh = sight.offset
-        R = T_base_tool[:3, :3]
-        if sight.tilt >= limits.tilt:
-            T_base_tool = align_tool_axis(T_base_tool, sight.normal)
-        elif abs(dh) >= limits.height:
-            T_base_tool = frames.make(R, T_base_tool[:3, 3] + R @ [0.0, 0.0, dh])
-        elif np.hypot(x, y) >= limits.offset:
-            T_base_tool = frames.make(R, T_base_tool[:3, 3] + R @ [x, y, 0.0])
-        else:
-            return ServoResult(T_base_tool, sight, step)
-    raise NoResultError(
-        f"the tool did not converge on the hole in {_MOST_STEPS} steps: tilt {np.degrees(sight.tilt):.2f}°, height "
-        f"{dh:+.2f}, offset {np.hypot(x, y):.2f}; calibrate rangers and camera again"
-    )
-
-
-@dataclass(frozen=True)
-class HoleGroup:
+class DrilledGroup:
     """One group after compensation."""
 
-    placed: dict[str, ServoResult]  # reference holes
-    compensation: GroupCompensation
+    moves: list[int]  # of the servo loop on each reference hole
     drives: dict[str, Array]  # T_base_tool (4, 4) of the holes to drill
 
 
-def calibrate_sensors(
-    plate_xyz: Array, plate_uv: Array, planes: Array, readings: Array, height: float
-) -> FlangeSensors:
-    """Sensors from the nine-hole plate (N, 3), (N, 2), and from planes (M, 4) with readings (rangers, M).
-
-    Raises:
-        NoResultError: too few or degenerate holes or planes.
-    """
-    beams = [fit_ranger(planes, row) for row in readings]
-    rangers = Rangers(np.array([b.origin for b in beams]), np.array([b.direction for b in beams]))
-    return FlangeSensors(rangers, fit_homography(plate_xyz[:, :2], plate_uv), height)
+def calibrated_sensors(cell: DrillingCell) -> tuple[FlangeSensors, Array, Array]:
+    """Sensors from the cell's nine-hole plate and its planes, and the plate itself: (9, 3), (9, 2)."""
+    xyz, uv = cell.plate()
+    planes, readings = cell.plane_readings()
+    beams = {f"L{i + 1}": fit_ranger(planes, row) for i, row in enumerate(readings)}
+    return FlangeSensors(fit_homography(xyz[:, :2], uv), None, beams, HEIGHT), xyz, uv
 
 
 def run_group(
-    measure: MeasureHole, sensors: FlangeSensors, nominal: Holes, references: Sequence[str], targets: Sequence[str]
-) -> HoleGroup:
+    cell: DrillingCell, sensors: FlangeSensors, references: Sequence[str], targets: Sequence[str]
+) -> DrilledGroup:
     """Servo onto the references, compensate the targets, then turn each target upright by the rangers.
 
     Raises:
         NoResultError: a servo loop does not converge, or the references fix no rigid motion.
     """
-    placed = {
-        name: servo_to_hole(lambda T, name=name: measure(name, T), sensors, drive_pose(*nominal[name]))  # type: ignore[misc]
-        for name in references
-    }
-    actual = np.array([placed[name].hole for name in references])
-    compensation = compensate_group(np.array([nominal[name][0] for name in references]), actual)
-    positions, directions = compensation.apply(*(np.array([nominal[name][i] for name in targets]) for i in (0, 1)))
+    moves, actual = [], []
+    for name in references:
+        T_base_tool, sight, count = servo_to_hole(_looker(cell, sensors, name), drive_pose(*cell.nominal[name]))
+        moves.append(count)
+        actual.append(sight.hole(T_base_tool))
+    compensation = compensate_group(np.array([cell.nominal[name][0] for name in references]), np.array(actual))
+    positions, directions = compensation.apply(*(np.array([cell.nominal[name][i] for name in targets]) for i in (0, 1)))
     drives = {
-        name: turn_upright(lambda T, name=name: measure(name, T), sensors, drive_pose(p, v))  # type: ignore[misc]
-        for name, p, v in zip(targets, positions, directions, strict=True)
+        name: turn_upright(_looker(cell, sensors, name), drive_pose(position, direction))
+        for name, position, direction in zip(targets, positions, directions, strict=True)
     }
-    return HoleGroup(placed, compensation, drives)
+    return DrilledGroup(moves, drives)
 
 
-def turn_upright(measure: Callable[[Array], tuple[Array, Array]], sensors: FlangeSensors, T_base_tool: Array) -> Array:
-    """The pose (4, 4) turned twice by what the rangers see: the second turn takes up what the first one's size left."""
-    for _ in range(2):
-        T_base_tool = align_tool_axis(T_base_tool, measure_hole(sensors, *measure(T_base_tool)).normal)
-    return T_base_tool
+def _looker(cell: DrillingCell, sensors: FlangeSensors, name: str) -> Callable[[Array], HoleSight]:
+    return lambda T_base_tool: sensors.see(*cell.measure(name, T_base_tool))
 
 
 def jobs(seeds: range) -> Iterator[Row]:
@@ -232,17 +91,16 @@ def jobs(seeds: range) -> Iterator[Row]:
 def _experiment(job: Row) -> Row:
     """Errors (2, 8, 3) before and after, the steps of the servo loops, and the leave-one-out mean."""
     cell = DrillingCell(job["seed"])
-    xyz, uv = cell.plate()
-    sensors = calibrate_sensors(xyz, uv, *cell.plane_readings(), HEIGHT)
+    sensors, xyz, uv = calibrated_sensors(cell)
     errors: tuple[list[list[float]], list[list[float]]] = ([], [])
     steps = []
     for references, targets in GROUPS.values():
-        group = run_group(cell.measure, sensors, cell.nominal, references, targets)
-        steps += [placed.steps for placed in group.placed.values()]
+        group = run_group(cell, sensors, references, targets)
+        steps += group.moves
         for name in targets:
             for rows, T in zip(errors, (drive_pose(*cell.nominal[name]), group.drives[name]), strict=True):
-                sight = measure_hole(sensors, *cell.measure(name, T))
-                rows.append([*map(float, cell.errors(name, T)), float(np.hypot(*sight.offset[:2]))])
+                sight = sensors.see(*cell.measure(name, T))
+                rows.append([*map(float, cell.errors(name, T)), sight.in_plane])
     left_out = np.linalg.norm(leave_one_out(xyz[:, :2], uv), axis=1).mean()
     return {"errors": errors, "steps": steps, "left_out": float(left_out)}
 

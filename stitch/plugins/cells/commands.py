@@ -48,19 +48,28 @@ def drill(
     recording: RecordingOption = None,
     report: ReportOption = None,
     session: SessionOption = None,
+    servo: Annotated[
+        str | None,
+        typer.Option(
+            "--servo",
+            metavar="COMMAND",
+            help="Moves the robot to a pose (JSON on its standard input) and prints what rangers and camera see.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Correct the drives of holes from reference holes that the robot has seen.
+    """Correct the drives of holes from reference holes that the robot has seen, or drives onto now.
 
     \b
     Examples:
       stitch drill job.toml --report page.html
+      stitch drill job.toml -o drives.csv --servo "./drive-and-read"
     """
     from stitch.plugins.cells.drilling import run_drill
     from stitch.plugins.cells.job_files import Wanted
 
     with tell_seconds("drill: the drives of the holes"):
-        run_drill(file, Wanted(output, recording, report, session, as_json))
+        run_drill(file, servo, Wanted(output, recording, report, session, as_json))
 
 
 def panel(

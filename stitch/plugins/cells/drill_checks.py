@@ -4,7 +4,6 @@ Trial drives tell what camera and rangers see at a hole, before and after the co
 into it bounds (tables 4, 6 and 7 of the source).
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array
-from stitch.plugins.cells.drilling_sensors import RangerFit
+from stitch.plugins.cells.drilling_sensors import HoleSight
 from stitch.plugins.cells.job_files import CsvColumns, JobTable, on_a_line, read_columns
 
 MIN_LOCATING = 3
@@ -96,41 +95,26 @@ def read_pin(document: JobTable) -> tuple[float, float] | None:
     return table.number("diameter", positive=True), table.number("feed", positive=True)
 
 
-def trial_error(
-    trials: CsvColumns,
-    row: int,
-    beams: Mapping[str, RangerFit],
-    in_plane_of: Callable[[Array, float], Array],
-    stated: float,
-    pin: tuple[float, float] | None,
-) -> TrialError:
-    """Return the error of the drive in one row of the trials.
+def trial_error(hole: str, stage: str, sight: HoleSight, pin: tuple[float, float] | None = None) -> TrialError:
+    """Return the error of one drive to a hole from what was seen there.
 
     Args:
-        in_plane_of: x, y (2,) in the flange frame of an image point (2,) at a height.
-        stated: height of the work plane.
-        pin: its diameter and feed.
+        pin: the hole's play about a pin that was driven into it (difference of diameters), and the pin's feed.
     """
-    stage = trials.texts["stage"][row]
-    spots = np.array([beam.origin + trials.numbers[name][row] * beam.direction for name, beam in beams.items()])
-    normal = np.linalg.svd(spots - spots.mean(axis=0))[2][2]
-    seen_at = float(spots[:, 2].mean())
-    height = seen_at - stated
-    tilt = float(np.arccos(min(abs(normal[2]), 1.0)))
-    in_plane = float(np.linalg.norm(in_plane_of(trials.stack("u v")[row], seen_at)))
+    height = float(sight.offset[2])
     position = turn = None
-    if pin is not None and stage == STAGES[-1]:
-        diameter, feed = pin
+    if pin is not None:
+        play, feed = pin
         # The pin went in: it leaves the hole no more room than this, nor can it stray further than its tilt says.
-        position = min((float(trials.numbers["diameter"][row]) - diameter) / 2, in_plane + feed * np.tan(tilt))
+        position = min(play / 2, sight.in_plane + feed * np.tan(sight.tilt))
         turn = float(np.arctan(position / feed))
     return TrialError(
-        trials.texts["hole"][row],
+        hole,
         stage,
         height=height,
-        tilt=tilt,
-        in_plane=in_plane,
-        distance=float(np.hypot(height, in_plane)),
+        tilt=sight.tilt,
+        in_plane=sight.in_plane,
+        distance=float(np.hypot(height, sight.in_plane)),
         pin_position=position,
         pin_tilt=turn,
     )

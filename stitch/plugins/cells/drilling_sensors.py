@@ -532,3 +532,61 @@ def find_tool_axis(reported: Array, directions: Array) -> ToolAxis | None:
     axis /= np.linalg.norm(axis)
     tilt = float(np.arctan2(np.hypot(axis[0], axis[1]), axis[2]))
     return ToolAxis(axis, tilt, float(np.sqrt(np.trace(scatter) / 2 / count)), p, p < _TILT_P_LIMIT)
+
+
+@dataclass(frozen=True)
+class HoleSight:
+    """A hole against the tool, by rangers and camera at one pose, in the flange frame."""
+
+    normal: Array  # (3,) unit vector into the part
+    offset: Array  # (3,): x', y', h' − h
+    uv: Array  # (2,) pixels
+
+    @property
+    def tilt(self) -> float:
+        """Angle (rad) between the tool's axis and the normal."""
+        return float(np.arctan2(np.hypot(self.normal[0], self.normal[1]), self.normal[2]))
+
+    @property
+    def in_plane(self) -> float:
+        """Distance of the hole from the tool's axis by the camera, e2D of the source."""
+        return float(np.hypot(self.offset[0], self.offset[1]))
+
+    def hole(self, T_base_tool: Array) -> Array:
+        """Return the hole's drive coordinate (3,): p + R'·(x', y', h' − h) (source, formula 14)."""
+        return T_base_tool[:3, 3] + T_base_tool[:3, :3] @ self.offset
+
+
+@dataclass(frozen=True)
+class FlangeSensors:
+    """Camera and rangers of the flange, calibrated."""
+
+    H: Array  # (3, 3) work plane to image
+    effects: EffectSelection | None  # of the camera; None without check holes
+    beams: dict[str, RangerFit]
+    height: float  # h, of the work plane
+
+    def in_plane(self, uv: Array, height: float) -> Array:
+        """Return x, y (2,) in the flange frame of a hole that the camera saw at uv (2,).
+
+        Where check holes have shown the camera beyond its work plane, at the hole's own height and without the effects
+        that were selected; else as if the hole lay in the work plane: a camera tilted by 25° is then off by 0.47 mm for
+        each mm.
+        """
+        if self.effects is not None:
+            return self.effects.camera.plane(uv[None], height)[0]
+        return to_plane(self.H, uv[None])[0]
+
+    def see(self, ranges: Array, uv: Array) -> HoleSight:
+        """Return what three or more ranges (n,) and an image point (2,) say of a hole.
+
+        The plane through the laser points gives normal and height; the height is read on the tool's axis, where the
+        source takes the mean of its four points, which is the same if the axis passes their centre.
+        """
+        beams = self.beams.values()
+        spots = np.array([beam.origin + d * beam.direction for beam, d in zip(beams, ranges, strict=True)])
+        middle = spots.mean(axis=0)
+        normal = np.linalg.svd(spots - middle)[2][2]
+        normal = normal * np.sign(normal[2])
+        height = float(middle @ normal / normal[2])
+        return HoleSight(normal, np.append(self.in_plane(uv, height), height - self.height), uv)

@@ -11,9 +11,6 @@ import csv
 import json
 import math
 import reprlib
-import shlex
-import subprocess
-import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -25,7 +22,7 @@ import numpy as np
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from stitch.errors import InputError, NoResultError
+from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.output.session_files import SessionFiles, TableColumns, write_sessions
@@ -323,23 +320,3 @@ def points_table(views: Sequence[str], targets: Sequence[str], places: Array, si
     columns: dict[str, Any] = {"view": list(views), "target": list(targets)}
     columns |= dict(zip("xyz", places.T, strict=True))
     return columns if sigma is None else columns | {"sigma": np.asarray(sigma, float)}
-
-
-def call_machines(drive: str) -> None:
-    """Run the program of --drive, which moves the robots and measures anew.
-
-    Raises:
-        InputError: it cannot be started.
-        NoResultError: it fails.
-    """
-    try:
-        done = subprocess.run(shlex.split(drive), check=False, capture_output=True, text=True)
-    except (OSError, ValueError) as error:
-        raise InputError(f"--drive {drive}: {error}; to fix: write a program and its arguments") from None
-    print(done.stdout, end="", file=sys.stderr)
-    if done.returncode:
-        message = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise NoResultError(
-            f"--drive {drive}: exit code {done.returncode}, {message}. The robots stand where it left them; to fix: "
-            "see its message, then call again"
-        )

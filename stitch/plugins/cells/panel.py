@@ -1,5 +1,6 @@
 """`stitch panel`: a panel job from its readings to the commands of all robots."""
 
+import sys
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,7 +20,6 @@ from stitch.plugins.cells.job_files import (
     CsvColumns,
     JobTable,
     Wanted,
-    call_machines,
     hand_out,
     points_table,
     poses_from_columns,
@@ -56,6 +56,7 @@ from stitch.plugins.cells.panel_model import (
     shape_step,
     true_flanges,
 )
+from stitch.system.programs import call_program
 
 # Twice a triangle's area against the sum of two squared sides: below, it is a line.
 _FLAT = 1e-3
@@ -589,7 +590,7 @@ def control_shape(file: Path, drive: str, folder: Path) -> tuple[PanelJob, Panel
                 f"the shape is still {largest[-1]:.2f} mm off after {_MOST_CORRECTIONS} corrections, "
                 f"{job.tolerance:g} mm are allowed; to fix: look at the forces, and which clamp a point belongs to"
             )
-        call_machines(drive)
+        print(call_program("--drive", drive), end="", file=sys.stderr)
 
 
 def run_panel(file: Path, drive: str | None, wanted: Wanted) -> None:

@@ -1,6 +1,7 @@
 """Drilling: every step against truth or a closed form, and the whole experiment against the published errors."""
 
 import json
+import pickle
 import shutil
 import sys
 
@@ -8,16 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.drilling import (
-    FlangeSensors,
-    Rangers,
-    align_tool_axis,
-    calibrate_sensors,
-    drive_pose,
-    fit_ranged_plane,
-    run_group,
-    servo_to_hole,
-)
+from bench.drilling import calibrated_sensors, run_group
 from data_synth.cells.drilling import FOCAL, GROUPS, HEIGHT, IMAGE, NINE, DrillingCell, Sizes
 from data_synth.cells.drilling_image import ellipse_centres, render_holes, render_plate
 from data_synth.cells.drilling_job import write_job, write_locating, write_trials
@@ -25,9 +17,13 @@ from stitch.cli.main import main
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.plugins.cells import drilling_sensors
-from stitch.plugins.cells.drilling import read_drill_job, solve_drill_job
+from stitch.plugins.cells.drill_job import read_drill_job
+from stitch.plugins.cells.drill_servo import align_tool_axis, drive_pose, servo_to_hole
+from stitch.plugins.cells.drilling import solve_drill_job
 from stitch.plugins.cells.drilling_sensors import (
+    FlangeSensors,
     HoleObservations,
+    RangerFit,
     base_frame,
     compensate_group,
     distort,
@@ -120,9 +116,10 @@ def test_surface_of_a_tilted_plane():
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     normal = Rotation.from_euler("xy", [0.03, -0.05]).apply([0.0, 0, 1])
     d = ((np.array([0, 0, 186.0]) - origins) @ normal) / (directions @ normal)
-    seen = fit_ranged_plane(Rangers(origins, directions), d)
-    assert seen.height == pytest.approx(186, abs=1e-9)
-    assert seen.tilt == pytest.approx(np.arccos(np.cos(0.03) * np.cos(0.05)), abs=1e-9)
+    beams = {f"L{i}": RangerFit(*beam, rms=0.0) for i, beam in enumerate(zip(origins, directions, strict=True))}
+    sight = FlangeSensors(np.eye(3), None, beams, 180.0).see(d, np.zeros(2))
+    assert sight.offset[2] == pytest.approx(6, abs=1e-9)
+    assert sight.tilt == pytest.approx(np.arccos(np.cos(0.03) * np.cos(0.05)), abs=1e-9)
 
 
 def to_image(H, xy):
@@ -183,8 +180,9 @@ def test_upright_turns_the_axis_onto_the_normal():
 
 
 def ideal_sensors():
-    beams = Rangers(np.array([[30.0, 0, 100], [0, 30, 100], [-30, -30, 100]]), np.tile([0.0, 0, 1], (3, 1)))
-    return FlangeSensors(beams, np.diag([20.0, 20.0, 1.0]), 186.0)
+    origins = np.array([[30.0, 0, 100], [0, 30, 100], [-30, -30, 100]])
+    beams = {f"L{i}": RangerFit(origin, np.array([0.0, 0, 1]), rms=0.0) for i, origin in enumerate(origins)}
+    return FlangeSensors(np.diag([20.0, 20.0, 1.0]), None, beams, 186.0)
 
 
 def test_servo_ends_within_the_three_thresholds():
@@ -192,24 +190,26 @@ def test_servo_ends_within_the_three_thresholds():
     seeing = ideal_sensors()
     hole, normal = np.array([1.5, -2.0, 2.2]), Rotation.from_euler("xy", [0.05, -0.03]).apply([0.0, 0, 1])
 
-    def measure(T):
+    origins = np.array([beam.origin for beam in seeing.beams.values()])
+
+    def look(T):
         back = frames.inverse(T @ frames.make(np.eye(3), np.array([0, 0, -186.0])))
         centre, n = frames.transform(back, hole[None])[0], back[:3, :3] @ normal
-        d = ((centre - seeing.rangers.origins) @ n) / n[2]
+        d = ((centre - origins) @ n) / n[2]
         # The ideal camera looks straight down the tool axis.
-        return d, 20 * centre[:2]
+        return seeing.see(d, 20 * centre[:2])
 
-    end = servo_to_hole(measure, seeing, np.eye(4))
-    x, y, dh = end.final_sight.offset
-    assert end.final_sight.tilt < np.radians(0.35) and abs(dh) < 0.5 and np.hypot(x, y) < 0.2 and end.steps <= 4
+    T_base_tool, sight, moves = servo_to_hole(look, np.eye(4))
+    x, y, dh = sight.offset
+    assert sight.tilt < np.radians(0.35) and abs(dh) < 0.5 and np.hypot(x, y) < 0.2 and moves <= 4
     # The height is read on the tool axis: off by tilt times offset, at most 0.006 rad · 0.2 mm.
-    assert np.abs(end.hole - hole).max() < 2e-3
+    assert np.abs(sight.hole(T_base_tool) - hole).max() < 2e-3
 
 
 def test_servo_that_does_not_settle_says_so():
     """Rangers that show the same tilt whatever the robot does."""
     with pytest.raises(NoResultError, match="did not converge"):
-        servo_to_hole(lambda T: (np.array([86.0, 87.0, 88.0]), np.zeros(2)), ideal_sensors(), np.eye(4))
+        servo_to_hole(lambda T: ideal_sensors().see(np.array([86.0, 87.0, 88.0]), np.zeros(2)), np.eye(4))
 
 
 def test_compensation_recovers_a_rigid_motion():
@@ -283,11 +283,11 @@ def test_too_few_holes_in_the_image():
 def experiment(seed):
     """True errors (8, 2) in mm and deg of the holes to drill, before and after."""
     cell = DrillingCell(seed)
-    seeing = calibrate_sensors(*cell.plate(), *cell.plane_readings(), HEIGHT)
+    seeing, _, _ = calibrated_sensors(cell)
     before, after = [], []
     for references, targets in GROUPS.values():
         before += [cell.errors(name, drive_pose(*cell.nominal[name])) for name in targets]
-        group = run_group(cell.measure, seeing, cell.nominal, references, targets)
+        group = run_group(cell, seeing, references, targets)
         after += [cell.errors(name, group.drives[name]) for name in targets]
     return np.array(before), np.array(after)
 
@@ -512,3 +512,74 @@ def test_trials_name_what_is_wrong(tmp_path):
     table.write_text(table.read_text().replace("drawing", "drawn"))
     with pytest.raises(InputError, match="stage is 'drawn'; to fix: write one of drawing, corrected, levelled"):
         read_drill_job(tmp_path / "job.toml")
+
+
+MACHINE = """
+import json, pathlib, pickle, sys
+import numpy as np
+from scipy.spatial.transform import Rotation
+question = json.load(sys.stdin)
+pose = question["pose"]
+if question["hole"] == "{unreachable}":
+    print("joint 5 ends at 118 deg", file=sys.stderr)
+    sys.exit(3)
+store = pathlib.Path(__file__).with_name("cell.pickle")
+cell = pickle.loads(store.read_bytes())
+T = np.eye(4)
+T[:3, :3] = Rotation.from_euler("ZYX", [pose["a_deg"], pose["b_deg"], pose["c_deg"]], degrees=True).as_matrix()
+T[:3, 3] = pose["x"], pose["y"], pose["z"]
+ranges, uv = cell.measure(question["hole"], T)
+store.write_bytes(pickle.dumps(cell))
+print(json.dumps({{"rangers": {{f"L{{i + 1}}": d for i, d in enumerate(ranges)}}, "uv": uv.tolist()}}))
+"""
+
+
+@pytest.fixture
+def driven_job(tmp_path):
+    """A job of one group of which the tool was placed on no hole yet, and the command that drives the simulated cell."""
+    cell = DrillingCell(5)
+    write_job(tmp_path, cell)
+    (tmp_path / "placed.csv").unlink()
+    lines = (tmp_path / "holes.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    kept = [lines[0], *(line for line in lines[1:] if line.split(",")[1] == "1")]
+    (tmp_path / "holes.csv").write_text("".join(kept), encoding="utf-8")
+    (tmp_path / "cell.pickle").write_bytes(pickle.dumps(cell))
+    return tmp_path, cell
+
+
+def drive(folder, unreachable="", *arguments):
+    (folder / "machine.py").write_text(MACHINE.format(unreachable=unreachable), encoding="utf-8")
+    with pytest.raises(SystemExit) as stop:
+        main(["drill", str(folder / "job.toml"), "--servo", f"{sys.executable} {folder / 'machine.py'}", *arguments])
+    return stop.value.code
+
+
+def test_servo_drives_the_cell_to_the_published_errors(driven_job, capsys):
+    """Cut short by a hole out of reach, the call keeps what it has; the next one goes on and ends upright on all holes."""
+    folder, cell = driven_job
+    assert drive(folder, "105") == 1
+    message = capsys.readouterr().err
+    assert "hole 105" in message and "cannot reach" in message and "joint 5 ends at 118 deg" in message
+    placed = (folder / "placed.csv").read_text(encoding="utf-8").splitlines()
+    assert [line.split(",")[0] for line in placed] == ["hole", "101", "102"]
+    assert drive(folder, "", "-o", str(folder / "drives.csv"), "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (folder / "placed.csv").read_text(encoding="utf-8").startswith("\n".join(placed))
+    rows = np.genfromtxt(folder / "drives.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    assert len(rows) == 4 == sum(trial["stage"] == "levelled" for trial in document["trials"])
+    for row in rows:
+        R = Rotation.from_euler("ZYX", [row["a_deg"], row["b_deg"], row["c_deg"]], degrees=True).as_matrix()
+        position, direction = cell.errors(str(row["hole"]), frames.make(R, np.array([row["x"], row["y"], row["z"]])))
+        assert position <= 0.30 and direction <= 0.21
+
+
+def test_what_a_servo_command_prints_is_checked(driven_job, capsys):
+    folder, _ = driven_job
+    with pytest.raises(SystemExit) as stop:
+        main(["drill", str(folder / "job.toml"), "--servo", "echo 12"])
+    message = capsys.readouterr().err
+    assert stop.value.code == 1 and "hole 101" in message and '"uv": [u, v]' in message
+    with pytest.raises(SystemExit) as stop:
+        main(["drill", str(folder / "job.toml"), "--servo", "no-such-program"])
+    assert stop.value.code == 2 and "write a program" in capsys.readouterr().err
+    assert not (folder / "placed.csv").exists()
