@@ -20,6 +20,9 @@ from typing import Any
 import numpy as np
 
 from bench.harness import DOCS, ROOT, Row, Table, grouped, markdown
+from bench.speed import part_from_reference, points_of
+from data_synth.fixtures.part_distance import off_surface
+from data_synth.fixtures.quiet_scenes import mesh_of
 from stitch.numerics import frames
 
 ROWS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
@@ -68,6 +71,16 @@ class Room:
     def blade_disagreement(self, command: str) -> str:
         steps = self.read("blade-run/result.json")["disagreement"]["steps"]
         return f"{1e3 * steps[-1]['mean']:.1f} µm between views on average over the part"
+
+    def blade_off_part(self, command: str) -> str:
+        self.run(command)
+        session, run, truth = (self.folder / name for name in ("blade", "blade-run", "blade.truth.json"))
+        views = json.loads((run / "result.json").read_text(encoding="utf-8"))["views"]
+        clouds = [points_of(session / "clouds" / f"{view['view']}.ply") for view in views]
+        T = part_from_reference(clouds, np.array([view["pose"] for view in views]), json.loads(truth.read_text()))
+        off = np.abs(off_surface(mesh_of("blade"), frames.transform(T, points_of(run / "stitched.ply")))[0])
+        median, most = 1e3 * np.quantile(off, (0.5, 0.95))
+        return f"half of its points within {median:.0f} µm of the true part, 95 % within {most:.0f} µm"
 
     def blade_hand_eye(self, command: str) -> str:
         revealed = self.json(f"{command} --json")

@@ -25,7 +25,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from bench.harness import PICTURES, ROOT, Row, Table, grouped, markdown, stitch_process
@@ -38,6 +38,7 @@ from stitch.effects.contract import EFFECTS, missing_need
 from stitch.model.forward import corrected_capture, moves_points
 from stitch.model.model import term_of
 from stitch.numerics import frames
+from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.effect_columns import view_responses
 from stitch.observations.surfaces.matching import sample_points
@@ -79,9 +80,8 @@ def large_trial(job: Row) -> Row:
         write_panel(session, job["views"], job["points"])
     run = session.with_name(f"run-{session.name}")
     cost = stitch_process("run", session, "-o", run, "--no-recording", "--force", "--memory", "3GB")
-    vertex = PlyData.read(str(run / "stitched.ply"))["vertex"].data
-    some = vertex[:: max(1, len(vertex) // 1_000_000)]
-    off = np.abs(distance(np.column_stack([some[axis] for axis in "xyz"]).astype(float)))
+    points = points_of(run / "stitched.ply")
+    off = np.abs(distance(points[:: max(1, len(points) // 1_000_000)]))
     result = json.loads((run / "result.json").read_text())
     stages = {stage["name"]: stage["seconds"] for stage in result["stages"]}
     quality = {"median": float(np.median(off)), "most": float(np.quantile(off, 0.95))}
@@ -290,7 +290,7 @@ def peer_trial(job: Row) -> Row:
         poses = {name: np.load(folder / f"{name}.npy") for name in commands}
         views = json.loads((run / "result.json").read_text())["views"]
         poses |= dict.fromkeys(OURS, np.array([view["pose"] for view in views]))
-        clouds = [_points_of(file) for file in sorted((session / "clouds").iterdir())]
+        clouds = [points_of(file) for file in sorted((session / "clouds").iterdir())]
         truth = json.loads(session.with_suffix(".truth.json").read_text())
         off = {name: 1e3 * _off_part(job["scene"], clouds, poses[name], truth) for name in seconds}
         programs = {
@@ -300,9 +300,8 @@ def peer_trial(job: Row) -> Row:
         return {"programs": programs, "points": sum(map(len, clouds))}
 
 
-def _points_of(file: Path) -> Array:
-    vertex = PlyData.read(str(file))["vertex"]
-    return np.column_stack([vertex[axis] for axis in "xyz"]).astype(float)
+def points_of(file: Path) -> Array:
+    return np.asarray(trimesh.load(file).vertices, float)
 
 
 def _start_poses(session: Path) -> Array:
@@ -315,15 +314,19 @@ def _start_poses(session: Path) -> Array:
 
 def _off_part(scene: str, clouds: list[Array], poses: Array, truth: Row) -> Array:
     """(N,) of all points from the true part (mm), after the rigid motion that no scan can tell."""
+    placed = np.concatenate([frames.transform(T, c) for T, c in zip(poses, clouds, strict=True)])
+    in_part = frames.transform(part_from_reference(clouds, poses, truth), placed)
+    return np.abs(off_surface(mesh_of(scene), in_part)[0])
+
+
+def part_from_reference(clouds: list[Array], poses: Array, truth: Row) -> Array:
+    """T_part_reference (4, 4) of a run: its views brought nearest to where they truly were, then into the part."""
     placed, right = (
         np.concatenate([frames.transform(T, c) for T, c in zip(p, clouds, strict=True)])
         for p in (poses, np.array(truth["poses"]))
     )
-    a, b = placed.mean(axis=0), right.mean(axis=0)
-    U, _, Vt = np.linalg.svd((placed - a).T @ (right - b))
-    R = Vt.T @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ U.T
-    in_part = frames.transform(frames.inverse(np.array(truth["T_reference_part"])), (placed - a) @ R.T + b)
-    return np.abs(off_surface(mesh_of(scene), in_part)[0])
+    T_reference_run = align_points(placed, right)
+    return frames.inverse(np.array(truth["T_reference_part"])) @ T_reference_run
 
 
 def peer_summary(rows: list[Row]) -> list[str]:

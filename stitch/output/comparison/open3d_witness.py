@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from pykdtree.kdtree import KDTree
+from scipy.stats import binomtest
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
@@ -25,6 +26,11 @@ _POINTS = 30_000
 _DISTANCES, _ROBUST = (1.0, 0.5), 0.25
 # Points that say how far the clouds lie apart.
 _ASKED = 20_000
+_ASKED_OF_VIEW = 3_000
+# Fewer common points say nothing of an overlap.
+_FEWEST = 100
+# A difference of sides that chance makes as often as this is none.
+_CLEAR = 0.05
 _NEIGHBOURS = 20
 # Views are paired that look from within 60° of each other, and of which so much meets at the start: on a thin part the
 # other side lies within reach.
@@ -44,6 +50,7 @@ class Witness:
     to_run: Array  # (N,) from points of its cloud to the surface of the run's, signed along the normal, length_unit
     from_run: Array  # (M,) from points of the run's cloud to the surface of its own
     places: Array  # (M, 3) of the latter, reference frame
+    overlaps: Array  # (P, 2) how far apart two views' surfaces lie by the run's poses and by Open3D's, medians
 
     def document(self) -> dict[str, Any]:
         """Return what witness.json holds."""
@@ -57,6 +64,7 @@ class Witness:
             ],
             "to_run": _summary(self.to_run),
             "from_run": _summary(self.from_run),
+            "overlaps": {"run": self.overlaps[:, 0].tolist(), "open3d": self.overlaps[:, 1].tolist()},
         }
 
     def sentences(self, length_unit: str) -> list[str]:
@@ -74,7 +82,30 @@ class Witness:
             f"The views differ by {length_text(float(np.median(self.shift)), length_unit)} and "
             f"{angle_text(float(np.median(self.turn)))} in the median.",
             f"{self.views[worst]} differs most, by {length_text(float(self.shift[worst]), length_unit)}.",
+            *self._nearer_sentences(length_unit),
         ]
+
+    def _nearer_sentences(self, length_unit: str) -> Iterator[str]:
+        """Say by whose poses the surfaces of two views meet more closely.
+
+        Both were fitted to these surfaces, with six numbers a view against thousands of points: who is nearer by that
+        is not told here.
+        """
+        count = len(self.overlaps)
+        if not count:
+            return
+        ours, theirs = (length_text(float(x), length_unit) for x in np.median(self.overlaps, axis=0))
+        nearer = int((self.overlaps[:, 0] < self.overlaps[:, 1]).sum())
+        yield (
+            f"Where two views overlap, their surfaces lie {ours} apart by this run's poses and {theirs} by Open3D's "
+            "(medians)."
+        )
+        chance = binomtest(nearer, count).pvalue
+        if chance > _CLEAR:
+            yield f"This run is nearer in {nearer} of {count} overlaps: no difference beyond chance (p = {chance:.2g})."
+        else:
+            name = "This run" if 2 * nearer > count else "Open3D"
+            yield f"{name} is nearer in {max(nearer, count - nearer)} of {count} overlaps (p = {chance:.1g})."
 
 
 def _summary(distance: Array) -> dict[str, float]:
@@ -96,8 +127,9 @@ def open3d_witness(run: RunData) -> Witness:
     if len(clouds) < len(run.session.views):
         raise NoResultError("--with open3d: labelled points are no clouds; there is nothing for Open3D to register")
     clouds = [points[:: max(1, len(points) // _POINTS)] for points in clouds]
+    spacing = _spacing(clouds)
     with _one_thread(o3d):
-        poses, pairs = _registered(o3d, clouds, run.poses_model, _spacing(clouds))
+        poses, pairs = _registered(o3d, clouds, run.poses_model, spacing)
         normals = [np.asarray(cloud.normals) for cloud in _with_normals(o3d, clouds)]
     poses = _common_motion(clouds, poses, run.poses) @ poses
     difference = frames.inverse(run.poses) @ poses
@@ -117,6 +149,7 @@ def open3d_witness(run: RunData) -> Witness:
         to_run=_from_surface(placed[:: max(1, len(placed) // _ASKED)], fused, fused_normals),
         from_run=_from_surface(asked, placed, placed_normals),
         places=asked,
+        overlaps=_overlaps(clouds, normals, (run.poses, poses), 2 * spacing),
     )
 
 
@@ -201,6 +234,28 @@ def _common_motion(clouds: list[Array], poses: Array, wanted: Array) -> Array:
     b = np.concatenate([frames.transform(T, points) for T, points in zip(wanted, clouds, strict=True)])
     R = frames.nearest_rotation((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
     return frames.make(R, b.mean(axis=0) - R @ a.mean(axis=0))
+
+
+def _overlaps(clouds: list[Array], normals: list[Array], rivals: tuple[Array, Array], reach: float) -> Array:
+    """Return (P, 2): for each overlap of two views, how far its points lie from the other's surface by either poses.
+
+    Counted are the points that have a partner within `reach` by both.
+    """
+    trees = [KDTree(np.ascontiguousarray(points, float)) for points in clouds]
+    medians = []
+    for i, j in _one_sided(clouds, rivals[0]):
+        moved = clouds[j][:: max(1, len(clouds[j]) // _ASKED_OF_VIEW)]
+        distances = []
+        meets = np.ones(len(moved), bool)
+        for poses in rivals:
+            places = frames.transform(frames.inverse(poses[i]) @ poses[j], moved)
+            apart, at = trees[i].query(np.ascontiguousarray(places))
+            meets &= apart < reach
+            at = np.minimum(at, len(clouds[i]) - 1)
+            distances.append(np.einsum("ni,ni->n", places - clouds[i][at], normals[i][at]))
+        if meets.sum() > _FEWEST:
+            medians.append([np.median(np.abs(distance[meets])) for distance in distances])
+    return np.array(medians).reshape(-1, 2)
 
 
 def _from_surface(points: Array, surface: Array, normals: Array) -> Array:
