@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from stitch.errors import InputError, NoResultError
@@ -70,6 +71,9 @@ def solve_stand(stand: Stand) -> BaseResult:
     Raises:
         NoResultError: the readings contradict each other, or leave the second base open.
     """
+    for touched in (stand.rail, stand.rod):
+        if touched.rpy is not None:
+            _check_pins(touched.names, touched.rpy)
     comparisons = compare_distances(stand)
     wrong = [c for c in comparisons if c.sigmas > CONTRADICTION_SIGMAS]
     if wrong:
@@ -96,6 +100,21 @@ def solve_stand(stand: Stand) -> BaseResult:
     except NoResultError as error:
         no_projection = str(error)
     return BaseResult(stand.length_unit, solution, projection, no_projection, comparisons, turns)
+
+
+def _check_pins(names: tuple[str, ...], rpy: Array) -> None:
+    """Refuse flanges of one robot that point against each other: a pin enters its cups from one side.
+
+    The rod and the slide hold nothing against a joint of the wrong sign, which leaves the distances possible.
+    """
+    axes = Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()[:, :, 2]
+    against = np.argwhere(axes @ axes.T < 0)
+    if len(against):
+        first, second = (names[i] for i in against[0])
+        raise NoResultError(
+            f"the flange at {second} points against the one at {first}, but a pin enters its cups from one side; to "
+            "fix: check the signs of the joint angles there"
+        )
 
 
 def comparison_text(c: DistanceComparison, unit: str) -> str:
