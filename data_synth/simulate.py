@@ -55,11 +55,13 @@ def simulate(
     views: int | None = None,
     planned: tuple[Plan, Array] | None = None,
     day: int = 0,
+    waits: Array | None = None,
 ) -> Measured:
     """Run one session. Independent streams of chance for plan, cell, nature and every view.
 
     Args:
         planned: joint angles and the rail's positions (V,), instead of those planned for scene and seed.
+        waits: (V,) s that somebody waits before each view, longer than usual.
         day: another one has other views, climate and scatter in the same cell: arm, hand-eye and scanner.
 
     Raises ValueError for an unknown law, NoResultError for a plan that cannot be driven.
@@ -71,6 +73,7 @@ def simulate(
     times, covariates = _climate(scene, len(plan.joints), cell)
     if day:
         times, covariates = _climate(scene, len(plan.joints), _stream(seed, 3, day))
+    times = times if waits is None else times + np.cumsum(waits)
     field_weights = field_map(scene.scanner, cell)
     T_mount = scene.T_mount @ frames.exp(cell.standard_normal(6) * np.repeat(scene.mount_spread, 3))
     moments = moments_of(scene, plan, times, covariates)

@@ -27,7 +27,7 @@ _CORE_COMMANDS = {
     "add": "stitch.cli.change:add",
     "drop": "stitch.cli.change:drop",
     "note": "stitch.cli.note:note",
-    "next": "stitch.cli.diagnose:next_measurement",
+    "next": "stitch.cli.next_view:next_measurement",
     "effects": "stitch.cli.effects:effects",
     "report": "stitch.cli.report:report",
 }

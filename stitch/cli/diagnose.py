@@ -1,4 +1,4 @@
-"""`stitch diagnose RUN`: which effect is missing; `stitch next RUN`: what to measure."""
+"""`stitch diagnose RUN`: which effect is missing."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def diagnose_run(
     from stitch.output.json_file import to_json
     from stitch.output.plain_finding import suggested_command
 
-    diagnosis, document = _diagnose_folder(run, effects_file, trust)
+    diagnosis, document = diagnose_folder(run, effects_file, trust)
     if as_json:
         emit(to_json(document))
     else:
@@ -51,48 +51,8 @@ def diagnose_run(
     end_at_once()
 
 
-def next_measurement(
-    run: RunFolder,
-    effects_file: EffectsFile = None,
-    trust: Trust = False,
-    as_json: Json = False,
-) -> None:
-    """Say which poses or artefacts would separate what cannot be told apart.
-
-    \b
-    Examples:
-      stitch next runs/blade-17
-    """
-    from stitch.output.json_file import to_json
-
-    diagnosis, document = _diagnose_folder(run, effects_file, trust)
-    if as_json:
-        emit(to_json({key: document[key] for key in ("verdict", "effects", "next")}))
-    else:
-        with answers():
-            _show_next_views(diagnosis)
-    end_at_once()
-
-
-def _show_next_views(diagnosis: Diagnosis) -> None:
-    from stitch.diagnosis.thresholds import ALIAS_CORRELATION
-
-    effects = diagnosis.effects
-    apart = "No effect correlates with {} by more than " + f"{ALIAS_CORRELATION} in these views"
-    if diagnosis.next:
-        for proposal in diagnosis.next:
-            say(f"To separate {' from '.join(proposal.separates)}: {proposal.do}.")
-    elif diagnosis.verdict == "adequate":
-        say("No missing effect was found: there is nothing to tell apart.")
-    elif len(effects) > 1:
-        say(f"No pose within reach, and no artefact that is known here, separates {' from '.join(effects)}.")
-    elif diagnosis.verdict == "missing_effect" and not diagnosis.likelier_than_not:
-        say(f"{apart.format(effects[0])}. More views, at any poses, can tell it from chance.")
-    else:
-        say(f"Nothing has to be told apart. {apart.format('the likeliest')}.")
-
-
-def _diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, Any]]:
+def diagnose_folder(run: Path, effects_file: Path | None, trust: bool) -> tuple[Diagnosis, dict[str, Any]]:
+    """Return the diagnosis of a run folder and its document, after both are written there."""
     from stitch.api.pipeline import diagnose
     from stitch.output.run_folder import preload_entry_points
 

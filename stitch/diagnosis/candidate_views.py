@@ -59,9 +59,13 @@ def reachable(
     return joints[inside]
 
 
-def candidate_measurement(measurement: Measurement, joints: Array) -> Measurement:
+def candidate_measurement(measurement: Measurement, joints: Array, wait: Array | float = 0.0) -> Measurement:
     """Return the measurement with views that nobody has taken yet, right after the last one, each approached from
-    there."""
+    there.
+
+    Args:
+        wait: (K,) s by which they come later.
+    """
     assert measurement.robot is not None
     views = measurement.views
     count = len(joints)
@@ -77,7 +81,7 @@ def candidate_measurement(measurement: Measurement, joints: Array) -> Measuremen
         joints=joints,
         previous=last,
         approach=np.sign(joints - last),
-        time=np.full(count, views.time[-1] + pause),
+        time=np.full(count, views.time[-1] + pause) + wait,
         velocity=velocity,
         torques=torques,
         covariates={name: np.full(count, values[-1]) for name, values in views.covariates.items()},
@@ -85,6 +89,31 @@ def candidate_measurement(measurement: Measurement, joints: Array) -> Measuremen
         T_base_flange=T_base_flange,
     )
     return replace(measurement, views=candidate, T_base_flange=T_base_flange, scan_views=())
+
+
+def with_candidates(measurement: Measurement, further: Measurement) -> Measurement:
+    """Return the measurement with candidate views behind its own; without points."""
+    views, more = measurement.views, further.views
+
+    def joined(name: str) -> Array:
+        return np.concatenate([getattr(views, name), getattr(more, name)])
+
+    every = replace(
+        views,
+        count=views.count + more.count,
+        velocity=None if views.velocity is None else joined("velocity"),
+        torques=replace(views.torques, values=np.concatenate([views.torques.values, more.torques.values])),
+        covariates={name: np.append(values, more.covariates[name]) for name, values in views.covariates.items()},
+        joints=joined("joints"),
+        previous=joined("previous"),
+        approach=joined("approach"),
+        time=joined("time"),
+        number=np.concatenate([views.number, more.number]),
+        T_base_flange=joined("T_base_flange"),
+    )
+    T_base_flange = every.T_base_flange
+    capture = build_capture("candidates", (), T_base_flange, measurement.mount)
+    return replace(measurement, capture=capture, views=every, T_base_flange=T_base_flange, scan_views=())
 
 
 def _torques_at(robot: Robot, views: Views, joints: Array) -> Torques:

@@ -25,6 +25,9 @@ class Proposal:
     separates: tuple[str, ...]
     joints_deg: list[float] | None = None
     views: int | None = None  # how many such views are needed
+    T_base_flange: list[list[float]] | None = None  # (4, 4) length_unit, at those joints
+    wait_s: float = 0.0  # after the last view, beside the usual pause
+    probability: float | None = None  # that the right one of the rivals is named after it and the poses before it
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy as np
 
 from stitch.diagnosis.candidate_views import candidate_measurement
 from stitch.diagnosis.candidates import Form, candidate_as_fitted
-from stitch.diagnosis.next_view import surface_views_at
+from stitch.diagnosis.deciding_view import model_beside, predict_views
 from stitch.diagnosis.residual_structure import Dependence, predicted_distances
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
@@ -33,6 +33,7 @@ from stitch.numerics.units import covariate_text
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.pose_errors import JOINT_SCATTER
 from stitch.observations.surfaces.surface_model import SurfaceObservation, surfaces_of
+from stitch.session.capture import build_capture
 from stitch.session.measurement import Measurement, ScanView, Views
 
 # Dots along one trend: more cannot be told apart.
@@ -99,52 +100,59 @@ def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[s
     effects = [_fit_effect(fitted, again) for _, again in pairs]
     if moves_points([effects[0].term]):
         return _trends_of_points(fitted, effects, [again for _, again in pairs])
-    plot = _plot(fitted, _beside(linear, pairs[0][0]), *_direction(fitted, effects[0]))
+    plot = _plot(fitted, model_beside(linear, pairs[0][0]), *_direction(fitted, effects[0]))
     return {} if plot is None else {effect.term.name: _trend_on(plot, effect) for effect in effects}
 
 
 @dataclass(frozen=True)
 class ExpectedView:
-    """What two candidates expect of one further view along what is drawn; units as in their trends."""
+    """What rivals expect of one further view along what is drawn; units as in their trends."""
 
     at: float
     sigma: float  # by which the dot of one view scatters
-    expected: dict[str, tuple[float, float]]  # effect: value and its standard deviation
+    expected: dict[str, tuple[float, float]]  # effect: value and the standard deviation of what would be seen
 
 
-def expected_in_view(linear: LinearModel, rivals: Sequence[Score], joints: Array) -> ExpectedView | None:
-    """Return what two candidates for the same dots expect at joint angles (n,).
+def expected_in_view(
+    linear: LinearModel, rivals: Sequence[Score], joints: Array, wait: float = 0.0
+) -> ExpectedView | None:
+    """Return what candidates for the same dots expect at joint angles (n,), `wait` s later than usual.
 
     None where nobody says how it would look there: of labelled points, of effects of points, along gravity.
     """
     fitted = linear.restricted(())
     surfaces = surfaces_of(fitted)
-    anew = [scored if fitted is linear else score(fitted, scored.candidate) for scored in rivals]
-    if surfaces is None or not all(s.fitted for s in anew) or moves_points([s.form.term for s in anew]):
+    anew = score(fitted, rivals[0].candidate)
+    if surfaces is None or not anew.fitted or moves_points([scored.form.term for scored in rivals]):
         return None
-    effects = [_fit_effect(fitted, scored) for scored in anew]
-    motion, (follows, _, _) = _direction(fitted, effects[0])
+    effect = _fit_effect(fitted, anew)
+    motion, (follows, _, _) = _direction(fitted, effect)
     if "gravity" in follows:
         return None
-    further = surface_views_at(_beside(linear, rivals[0]), surfaces, joints[None], anew[0], anew[1])
-    measurement = candidate_measurement(linear.measurement, joints[None])
-    at = float(_axis(measurement.views, effects[0].term, motion)[2][0])
-    if follows in ("time", "view order"):
-        at = float(measurement.views.time[0]) if follows == "time" else float(linear.measurement.views.count)
+    measurement = candidate_measurement(linear.measurement, joints[None], wait)
+    at = float(_axis(measurement.views, effect.term, motion)[2][0])
+    if follows == "view order":
+        at = float(linear.measurement.views.count)
     rim = np.repeat([surfaces.reach, 1.0], 3)
     unit = _unit_twist(fitted, motion, measurement, surfaces.centre) * rim
     along = unit * rim / max(float(unit @ unit), 1e-300)
+    # A dot is what the model without any candidate leaves.
+    without = fitted.baseline_trial.solve()
     expected = {}
-    for effect, response in zip(effects, (further.a[0], further.b[0]), strict=True):
-        change = effect.change
-        whole = effect.form.response - fitted.design @ change.absorbed
-        # What all views do together no view shows.
-        common = (whole - fitted.observation.expand(fitted.reduce(whole))).reshape(-1, 6, whole.shape[1]).mean(axis=0)
-        a = further.design.shape[2]
-        per_unit = along @ (response - further.design[0] @ change.absorbed[:a] - common)
-        spread = float(np.sqrt(max(per_unit @ change.covariance @ per_unit, 0.0)))
-        expected[effect.term.name] = (float(per_unit @ change.values), spread)
-    return ExpectedView(at, float(np.linalg.norm(along @ further.half[0])), expected)
+    for scored, prediction in zip(rivals, predict_views(linear, rivals, joints[None], np.array([wait])), strict=True):
+        mean, covariance = prediction.of([], np.zeros(1, np.int64))
+        value = along @ (mean[0] - prediction.design[0] @ without)
+        expected[scored.name] = (float(value), float(np.sqrt(along @ covariance[0] @ along)))
+    return ExpectedView(at, float(np.sqrt(along @ _view_scatter(linear, rivals[0], measurement) @ along)), expected)
+
+
+def _view_scatter(linear: LinearModel, scored: Score, measurement: Measurement) -> Array:
+    """Return (6, 6) by which the twist of a further view scatters by itself, beside a candidate."""
+    base = model_beside(linear, scored)
+    flange = build_capture("candidate", (), measurement.T_base_flange, measurement.mount).T_reference_flange
+    carried = frames.adjoint(frames.make(np.eye(3), -base.observation.centre) @ flange)[0]
+    variances = np.repeat(np.maximum(base.flange_scatter(base.null), 1e-300), 3)
+    return np.asarray(carried * variances @ carried.T)
 
 
 def _unit_twist(linear: LinearModel, motion: "_Motion", measurement: Measurement, centre: Array) -> Array:
@@ -275,14 +283,6 @@ def _fit_effect(linear: LinearModel, scored: Score) -> _Effect:
     beside = linear if scored.variances is None else replace(linear, null=at_variances(linear.mixed, scored.variances))
     change = _change(linear, scored.form.columns, beside)
     return _Effect(scored.form.at(change.values), scored.form, change)
-
-
-def _beside(linear: LinearModel, scored: Score) -> LinearModel:
-    """Return the model with the variances that are left beside a candidate."""
-    if scored.base_model is not None or scored.variances is None:
-        return scored.base_model or linear
-    base = linear.restricted(linear.causes - {scored.name})
-    return replace(base, null=at_variances(base.mixed, scored.variances))
 
 
 def _direction(linear: LinearModel, effect: _Effect) -> tuple[_Motion, _Axis]:

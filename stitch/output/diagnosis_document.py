@@ -146,6 +146,7 @@ _CANDIDATE = Document(
     Key("hand_eye_if_missed", NUMBER_OR_NULL, optional=True),
     Key("left_out", Kind({"type": ["object", "null"], "additionalProperties": NUMBER.schema}), optional=True),
 )
+_NEXT = "do separates joints_deg views T_base_flange wait_s probability"
 _TRIED = Document(Key("effect", TEXT, write=itemgetter(0)), Key("dropped", TEXT, write=itemgetter(1)))
 # Lengths in length_unit, angles in rad.
 DIAGNOSIS = Document(
@@ -165,7 +166,9 @@ DIAGNOSIS = Document(
     # Along what a joint errs by no known law, in the unit of its covariate; errors in rad.
     Key("joint_laws", write=lambda d: rows_of_fields(d.curves, "joint covariate share at error sigma may_follow")),
     Key("time_law", write=lambda d: _time_law(d.time_curve)),
-    Key("next", write=lambda d: rows_of_fields(d.next, "do separates joints_deg views")),
+    Key(
+        "next", write=lambda d: rows_of_fields(d.next, "do separates joints_deg views T_base_flange wait_s probability")
+    ),
     Key("next_command", write=lambda d: suggested_command(d, "RUN")),
     Key(
         "alias_matrix",

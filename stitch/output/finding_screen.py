@@ -153,19 +153,23 @@ def _fits(diagnosis: Diagnosis, candidate: CandidateEffect) -> str:
 
 def _deciding_view(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> dict[str, Any] | None:
     """Return what the first two rivals expect in the view that is proposed to tell them apart, over their dots."""
-    rivals = [c for c in compared(diagnosis) if c.name in diagnosis.effects and c.name in trends]
+    rivals = [c.ranked.score for c in compared(diagnosis) if c.name in diagnosis.effects and c.name in trends]
     pose = next((proposal for proposal in diagnosis.next if proposal.joints_deg is not None), None)
     if diagnosis.verdict != "cannot_tell" or len(rivals) < 2 or pose is None or pose.joints_deg is None:
         return None
-    scores = [c.ranked.score for c in rivals if c.name in pose.separates][:2]
-    view = expected_in_view(diagnosis.linear, scores, np.radians(pose.joints_deg)) if len(scores) == 2 else None
+    view = expected_in_view(diagnosis.linear, rivals, np.radians(pose.joints_deg), pose.wait_s)
     if view is None:
         return None
     expected = [{"effect": name, "value": value, "sigma": sigma} for name, (value, sigma) in view.expected.items()]
+    trend = trends[rivals[0].name]
     return {
         "joints_deg": pose.joints_deg,
-        "views": pose.views,
+        "wait_s": pose.wait_s,
+        "views": sum(proposal.joints_deg is not None for proposal in diagnosis.next),
+        "probability": pose.probability,
         "at": view.at,
+        "of": trend.of,
+        "value_unit": trend.value_unit,
         "sigma": view.sigma,
         "expected": expected,
     }

@@ -39,7 +39,7 @@ _STARTS = 40
 _AGREE = 0.02
 # Decimals of positions, of rotations and of joint angles: what each controller stores, so that a moved target is not
 # rounded away where its number was written short. FANUC listings have three, whatever they show.
-_DECIMALS = {"kuka": (4, 5, 5), "fanuc": (3, 3, 3), "abb": (4, 9, 5), "ur": (7, 7, 7)}
+_DECIMALS = {"kuka": (4, 5, 5), "fanuc": (3, 3, 3), "abb": (4, 9, 5), "ur": (7, 7, 7), "yaskawa": (3, 4, 4)}
 # A move below this (mm and rad together) is none: numbers are not written anew for rounding's sake.
 _NEGLIGIBLE_CHANGE = 1e-9
 # The rotation that goes with that, mrad for each mm: what moves a hand of half a metre by so much.
@@ -289,7 +289,7 @@ def compensated_texts(program: Program, moves: Array, turns: Array, j2_in_j3: bo
         if point.T_frame_tool is not None and np.abs(frames.log(move)).max() > _NEGLIGIBLE_CHANGE:
             old = _span_values(text, point.pose_at)
             new = NUMBERS[program.controller](point.T_frame_tool @ move, old)
-            if program.controller in ("kuka", "fanuc"):
+            if program.controller in ("kuka", "fanuc", "yaskawa"):
                 # Controllers take angles within ±180°; what was beyond already stays beyond.
                 new[3:] = np.where(np.abs(old[3:]) <= 180, (new[3:] + 180) % 360 - 180, new[3:])
             edits[file] += _edits(text, point.pose_at, new, [place] * 3 + [turn] * (len(new) - 3))

@@ -13,7 +13,7 @@ import numpy as np
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
-from stitch.plugins.intake.controllers import abb, fanuc, kuka, tracker_csv, universal_robots
+from stitch.plugins.intake.controllers import abb, fanuc, kuka, tracker_csv, universal_robots, yaskawa
 from stitch.plugins.intake.controllers.taught_points import TaughtPoint, line_of, program_text, without_comments
 from stitch.plugins.intake.controllers.tracker_csv import TrackerPoint
 from stitch.session.reading.csv_files import is_number
@@ -72,12 +72,13 @@ PROGRAMS: dict[str, ModuleType] = {
     ".src": kuka,
     ".mod": abb,
     ".script": universal_robots,
+    ".jbi": yaskawa,
 }
 # Frame and tool of nothing: points taught in them are flange poses in the base.
-NOTHING_IN_FORCE = ("UF 0, UT 0", "TOOL 0, BASE 0", "tool0, wobj0")
+NOTHING_IN_FORCE = ("UF 0, UT 0", "TOOL 0, BASE 0", "tool0, wobj0", "TOOL 0, BASE", "TOOL 0, ROBOT")
 # No length in mm and no angle of a controller is larger.
 _LARGEST = 1e9
-_NAMES = {fanuc: "fanuc", kuka: "kuka", abb: "abb", universal_robots: "ur"}
+_NAMES = {fanuc: "fanuc", kuka: "kuka", abb: "abb", universal_robots: "ur", yaskawa: "yaskawa"}
 _COMMENTS = {kuka: ";", universal_robots: "#", abb: "!"}
 
 
@@ -86,7 +87,7 @@ class Program:
     """One program as it stands in its files."""
 
     file: Path
-    controller: str  # kuka | fanuc | abb | ur
+    controller: str  # kuka | fanuc | abb | ur | yaskawa
     points: tuple[TaughtPoint, ...]  # in the order of the file, each once
     texts: dict[Path, str]  # of the files that hold the points' numbers, byte for byte
     T_base_frame: Array  # (4, 4) mm

@@ -55,6 +55,7 @@ NUMBERS: dict[str, Callable[..., Array]] = {
     "fanuc": fixed_xyz_numbers,
     "abb": quaternion_w_first_numbers,
     "ur": rotation_vector_numbers,
+    "yaskawa": fixed_xyz_numbers,
 }
 
 

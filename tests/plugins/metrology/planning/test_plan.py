@@ -15,7 +15,6 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import Growth, labelled_cell
 from data_synth.write import write_session
 from stitch.cli.main import main
-from stitch.diagnosis import next_view
 from stitch.diagnosis.candidate_views import candidate_measurement
 from stitch.diagnosis.candidates import candidates_of
 from stitch.diagnosis.evidence import gather_evidence
@@ -118,23 +117,6 @@ def test_views_not_taken_yet_come_after_those_that_were():
     np.testing.assert_allclose(later.since_first("part_temperature_c"), warmth[-1] - warmth[0])
     assert EFFECTS["part_slip"].function(later, xi=np.ones(6), v=8.0).all()
     assert not (EFFECTS["latency"].function(later.joints, later, dt=1.0) - later.joints).any()
-
-
-def test_the_next_view_serves_the_two_that_stay_most_alike(monkeypatch):
-    """Of three suspects no two may stay together, however well others come apart."""
-    gains = {"ab": [9, 2, 0], "ac": [0, 2, 9], "bc": [0, 3, 9]}
-
-    class CandidateEffect:
-        def __init__(self, name):
-            self.name = name
-
-    def of_two(evidence, a, b):
-        return np.radians([[10.0], [20.0], [30.0]]), 0.4, np.array(gains[a.name + b.name], float)
-
-    monkeypatch.setattr(next_view, "_gains", of_two)
-    joints, count, separated = next_view._best_pose(None, [CandidateEffect(name) for name in "abc"])
-    assert joints == pytest.approx([20.0])
-    assert count == 3 and separated == ("a", "b", "c")  # (5.4 − 0.4)/2
 
 
 VIEWS = 6

@@ -1,0 +1,383 @@
+"""Which further views decide between rival effects, and how likely: by simulation over the rivals and the scatter.
+
+Each rival, with hand-eye and effects in use fitted beside it, predicts what a further view would show: a mean and a
+covariance (of what it does not know of itself, of the arm's errors, of scatter and noise). A view is worth as much as
+these predictions differ for what they are known to (Box & Hill 1967, Technometrics 9:57; Atkinson & Fedorov 1975,
+Biometrika 62:57). Every rival in turn is taken for the true one and its views are drawn; that one is decided for which
+is then twenty times likelier than all others, as a diagnosis asks.
+
+A further view is counted in the frame of the views that there are: less the mean motion of these, as nobody sees it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.diagnosis.candidate_views import (
+    candidate_measurement,
+    candidate_rows,
+    nearby,
+    reachable,
+    with_candidates,
+)
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.score import Score
+from stitch.diagnosis.thresholds import ODDS
+from stitch.model.forward import moves_points, pose_derivatives
+from stitch.model.model import Model, Term
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Indices
+from stitch.numerics.kernels import exponential_kernel, process_covariance
+from stitch.numerics.least_squares import equilibrated
+from stitch.numerics.reml import NOISE, at_variances
+from stitch.observations.linear_model import LinearModel
+from stitch.observations.pose_errors import DRIFT_MEMORY, PoseErrors, flange_twists, prior_pose_errors, usual_time_step
+from stitch.observations.surfaces.hand_eye_fit import hand_eye_jacobian
+from stitch.observations.surfaces.surface_model import SurfaceObservation
+from stitch.observations.targets.rows import TargetRows
+from stitch.session.capture import build_capture
+from stitch.session.measurement import Measurement
+from stitch.session.robot import forward
+
+# Poses that are tried, and again close to the best of them.
+_TRIED, _CLOSER, _BEST = 72, 24, 3
+# Views that are proposed at the most, and the odds at which one more is not needed.
+MOST_VIEWS, SURE = 3, 0.95
+# A view that adds less than this to the probability that the true one is named is not worth driving to.
+_WORTH = 0.02
+# Draws of each rival for the search, and for the odds that are stated.
+_SEARCH_DRAWS, _STATED_DRAWS = 96, 2000
+# Shares of the session's duration that one may wait where a rival goes with time.
+_WAITS = (0.0, 0.25, 0.5, 1.0)
+
+
+@dataclass(frozen=True)
+class DecidingViews:
+    """Further views in the order in which they are taken."""
+
+    joints: Array  # (K, n) rad
+    wait: Array  # (K,) s after the last view that there is, beside the usual pause
+    probability: Array  # (K,) that the true rival is named after the view and those before it
+    wrong: float  # that a wrong one is, after all of them
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a rival expects of N further views, m numbers each."""
+
+    mean: Array  # (N, m)
+    unknown: Array  # (N, m, q) root of the covariance by what the rival does not know of itself
+    shared: Array | None  # (N, m, N, m) covariance of all else; None: independent between views
+    own: Array  # (N, m, m) covariance of each view beside
+    design: Array  # (N, m, a) of hand-eye and effects in use
+
+    def of(self, chosen: Sequence[int], more: Indices) -> tuple[Array, Array]:
+        """Return mean (C, D) and covariance (C, D, D) of the chosen views, each time with one of `more` (C,)."""
+        stacks = np.column_stack([np.tile(np.array(chosen, np.int64), (len(more), 1)), more])
+        C, k = stacks.shape
+        m = self.mean.shape[1]
+        roots = self.unknown[stacks].reshape(C, k * m, -1)
+        covariance = roots @ roots.transpose(0, 2, 1)
+        blocks = covariance.reshape(C, k, m, k, m)
+        if self.shared is not None:
+            blocks += self.shared[stacks[:, :, None], :, stacks[:, None, :]].transpose(0, 1, 3, 2, 4)
+        each = np.arange(k)
+        blocks[:, each, :, each] += self.own[stacks].transpose(1, 0, 2, 3)
+        return self.mean[stacks].reshape(C, k * m), covariance
+
+
+def deciding_views(linear: LinearModel, rivals: Sequence[Ranked], most: int = MOST_VIEWS) -> DecidingViews | None:
+    """Return the further views after which one of the rivals is most likely named; None where no pose tells them apart.
+
+    Poses within reach, near those driven, from which the scanner sees the part as it has before.
+    """
+    scores = [ranked.score for ranked in rivals]
+    if linear.measurement.robot is None or not linear.measurement.views.joints.shape[1]:
+        return None
+    if len(scores) < 2 or not all(scored.fitted for scored in scores):
+        return None
+    if isinstance(linear.observation, SurfaceObservation) and moves_points([scored.form.term for scored in scores]):
+        return None
+    log_weights = np.array([ranked.log_posterior for ranked in rivals])
+    joints = possible_joints(linear)[:_TRIED]
+    if not len(joints):
+        return None
+    first = _choose(linear, scores, log_weights, joints, most)
+    best = joints[np.argsort(-first.single, kind="stable")[:_BEST]]
+    closer = possible_joints(linear, best)[:_CLOSER]
+    both = np.concatenate([best, joints[first.chosen], closer])
+    choice = _choose(linear, scores, log_weights, np.unique(both.round(9), axis=0), most)
+    if not choice.chosen:
+        return None
+    return DecidingViews(
+        choice.joints[choice.chosen], choice.wait[choice.chosen], np.array(choice.probability), choice.wrong
+    )
+
+
+@dataclass(frozen=True)
+class _Choice:
+    joints: Array  # (N, n) tried
+    wait: Array  # (N,)
+    single: Array  # (N,) probability of the true rival after each view alone
+    chosen: list[int]
+    probability: list[float]
+    wrong: float
+
+
+def _choose(linear: LinearModel, scores: Sequence[Score], log_weights: Array, joints: Array, most: int) -> _Choice:
+    """Return the views that are chosen one after the other among joints (N, n)."""
+    wait = _waits(linear, scores, len(joints))
+    predictions = predict_views(linear, scores, joints, wait)
+    m = predictions[0].mean.shape[1]
+    every: Indices = np.arange(len(joints), dtype=np.int64)
+    rng = np.random.default_rng(0)
+    weights = np.exp(log_weights - log_weights.max())
+    true_share = float(np.sum((weights / weights.sum()) ** 2))
+    chosen = list[int]()
+    probability = list[float]()
+    single, wrong = np.zeros(len(joints)), 0.0
+    while len(chosen) < min(most, len(joints)) and (not probability or probability[-1] < SURE):
+        draws = rng.standard_normal((_SEARCH_DRAWS, (len(chosen) + 1) * m))
+        of_true = _decisions(predictions, log_weights, chosen, every, draws)[2]
+        of_true[chosen] = -1.0
+        if not chosen:
+            single = of_true
+        k = int(of_true.argmax())
+        stated = rng.standard_normal((_STATED_DRAWS, (len(chosen) + 1) * m))
+        right, missed, share = _decisions(predictions, log_weights, chosen, every[k : k + 1], stated)
+        if share[0] < true_share + _WORTH:
+            break
+        chosen.append(k)
+        probability.append(float(right[0]))
+        true_share, wrong = float(share[0]), float(missed[0])
+    return _Choice(joints, wait, single, chosen, probability, wrong)
+
+
+def _decisions(
+    predictions: Sequence[Prediction], log_weights: Array, chosen: Sequence[int], more: Indices, draws: Array
+) -> tuple[Array, Array, Array]:
+    """Return for each of `more` (C,) the probabilities that the true rival is named after it, that a wrong one is, and
+    the mean probability of the true one.
+
+    Args:
+        draws: (S, D) standard normal numbers, the same for all.
+    """
+    parts = [prediction.of(chosen, more) for prediction in predictions]
+    halves = [np.linalg.cholesky(covariance) for _, covariance in parts]
+    inverses = [np.linalg.inv(half) for half in halves]
+    sizes = [np.log(np.diagonal(half, axis1=1, axis2=2)).sum(axis=1) for half in halves]
+    weights = np.exp(log_weights - log_weights.max())
+    weights = weights / weights.sum()
+    right, wrong, share = np.zeros((3, len(more)))
+    for g, ((mean, _), half) in enumerate(zip(parts, halves, strict=True)):
+        seen = mean[:, None] + draws @ half.transpose(0, 2, 1)
+        fits = np.array(
+            [
+                log_weight - size[:, None] - 0.5 * np.sum(((seen - other) @ back.transpose(0, 2, 1)) ** 2, axis=2)
+                for log_weight, size, (other, _), back in zip(
+                    log_weights, sizes, [(m[:, None], c) for m, c in parts], inverses, strict=True
+                )
+            ]
+        )
+        rival = np.delete(fits, g, axis=0)
+        ahead = fits[g] - rival.max(axis=0)
+        right += weights[g] * (ahead > ODDS).mean(axis=1)
+        # The best of the others, ahead of all that are left.
+        order = np.sort(fits, axis=0)
+        wrong += weights[g] * ((ahead < 0) & (order[-1] - order[-2] > ODDS)).mean(axis=1)
+        share += weights[g] * np.exp(fits[g] - np.logaddexp.reduce(fits, axis=0)).mean(axis=1)
+    return right, wrong, share
+
+
+def possible_joints(linear: LinearModel, chosen: Array | None = None) -> Array:
+    """Return (K, n) joint angles, rad, near those driven, or closer to chosen ones, from which the part is seen."""
+    driven = linear.measurement.views.joints
+    observation = linear.observation
+    if not isinstance(observation, SurfaceObservation):
+        return nearby(driven, chosen)
+    T_mount = linear.model.T_mount
+
+    def poses_of(joints: Array) -> Array:
+        assert linear.measurement.robot is not None
+        T = forward(linear.measurement.robot, joints)
+        return build_capture("candidates", (), T, linear.measurement.mount).poses(T_mount)
+
+    return reachable(driven, poses_of, observation.capture.poses(T_mount), observation.centre, chosen)
+
+
+def _waits(linear: LinearModel, scores: Sequence[Score], count: int) -> Array:
+    """Return (N,) s that one waits before each view; none where no rival goes with time."""
+    views = linear.measurement.views
+    effects = [scored.candidate.effect for scored in scores]
+    with_time = any("time" in effect.needs or "time" in effect.prefers for effect in effects)
+    if not with_time or not views.has("time"):
+        return np.zeros(count)
+    shares = np.array(_WAITS)[np.arange(count) % len(_WAITS)]
+    return np.asarray((shares * float(np.ptp(views.time))).round(-1))
+
+
+def predict_views(linear: LinearModel, scores: Sequence[Score], joints: Array, wait: Array) -> list[Prediction]:
+    """Return what each rival expects of views at joints (N, n)."""
+    match linear.observation:
+        case SurfaceObservation() as surfaces:
+            further = _FurtherScans.of(linear, surfaces, joints, wait)
+            return [_predict_scans(linear, scored, further) for scored in scores]
+        case TargetRows() as targets:
+            return [_predict_targets(linear, targets, scored, joints, wait) for scored in scores]
+    return []
+
+
+@dataclass(frozen=True)
+class _FurtherScans:
+    """V views of surfaces and N further ones."""
+
+    surfaces: SurfaceObservation
+    measurement: Measurement  # of V + N
+    errors: PoseErrors | None  # of their twists, not reduced
+    flange: Array  # (V + N, 6, 6) adjoint of the flange
+
+    @classmethod
+    def of(cls, linear: LinearModel, surfaces: SurfaceObservation, joints: Array, wait: Array) -> "_FurtherScans":
+        further = candidate_measurement(linear.measurement, joints, wait)
+        every = with_candidates(linear.measurement, further)
+        errors = None
+        if linear.pose_errors is not None:
+            errors = prior_pose_errors([every], linear.model, [surfaces.centre])
+            errors = _with_drift(errors, every, linear.measurement, surfaces.centre)
+        to_centre = frames.make(np.eye(3), -surfaces.centre)
+        flange = frames.adjoint(to_centre @ every.capture.T_reference_flange)
+        return cls(surfaces, every, errors, flange)
+
+    @property
+    def before(self) -> int:
+        """6V numbers of the views that there are."""
+        return len(self.surfaces.reduced_poses.reduction[0])
+
+    def further(self, columns: Array) -> Array:
+        """(6N, P) of the further views, less the mean motion (6, P) of the others, of columns (6 (V + N), P)."""
+        mean = columns[: self.before].reshape(-1, 6, columns.shape[1]).mean(axis=0)
+        return columns[self.before :] - np.tile(mean, ((len(columns) - self.before) // 6, 1))
+
+    def covariance(self, base: LinearModel) -> Array:
+        """(6 (V + N), 6 (V + N)) of the twists by what poses err."""
+        variances = base.null.variances
+        n = 6 * len(self.flange)
+        blocks = np.zeros((len(self.flange), 6, len(self.flange), 6))
+        each = np.arange(len(self.flange))
+        white = np.repeat(np.maximum(variances[:NOISE], 1e-300), 3)
+        blocks[each, :, each] = (self.flange * white) @ self.flange.transpose(0, 2, 1)
+        out = blocks.reshape(n, n)
+        if self.errors is not None and base.pose_errors is not None:
+            errors = self.errors.restricted(base.pose_errors.causes)
+            out = out + np.einsum("c,cij->ij", variances[NOISE + 1 :], errors.components)
+        return out
+
+    def noise(self, base: LinearModel) -> Array:
+        """(6, 6) by which the surfaces put a view where it is not: as of the views that there are."""
+        expansion = self.surfaces.reduced_poses.expansion
+        noise = base.mixed.components[NOISE, 0] * base.null.variances[NOISE]
+        if base.mixed.fixed is not None:
+            noise = noise + base.mixed.fixed[0]
+        blocks = (expansion @ noise @ expansion.T).reshape(-1, 6, self.before // 6, 6)
+        each = np.arange(len(blocks))
+        return np.asarray(blocks[each, :, each].mean(axis=0))
+
+
+def _with_drift(errors: PoseErrors, every: Measurement, before: Measurement, centre: Array) -> PoseErrors:
+    """Return the errors with what wanders counted in the steps of the views that there are."""
+    step = usual_time_step(before)
+    time = every.views.time / step if step > 0 else every.views.number.astype(float)
+    flange = flange_twists([every], [centre])
+    components = errors.components.copy()
+    for name, memory in DRIFT_MEMORY.items():
+        components[errors.names.index(name)] = process_covariance(flange, exponential_kernel(time, time, memory))
+    return replace(errors, components=components)
+
+
+def _predict_scans(linear: LinearModel, scored: Score, scans: _FurtherScans) -> Prediction:
+    base = model_beside(linear, scored)
+    measurement, bare, centre = scans.measurement, Model(linear.model.T_mount), scans.surfaces.centre
+    hand_eye = hand_eye_jacobian(measurement.capture.hand_eye_frames(bare.T_mount), centre)
+    used = _used_columns(linear, scans)
+    effect = _twists(measurement, bare, zero_term(scored), centre)[:, scored.form.keep]
+    columns = scans.further(np.hstack([hand_eye, used, effect]))
+    covariance = scans.covariance(base)
+    across = scans.further(covariance[:, : scans.before] @ scans.surfaces.reduced_poses.reduction.T)
+    together = scans.further(scans.further(covariance).T)
+    N = len(columns) // 6
+    own = np.broadcast_to(scans.noise(base) + 1e-18 * np.eye(6), (N, 6, 6))
+    mean, unknown, explained = _given_views(base, scored, columns, across)
+    shared = (together - explained).reshape(N, 6, N, 6)
+    design = columns[:, : base.white_design.shape[1]].reshape(N, 6, -1)
+    return Prediction(mean.reshape(N, 6), unknown.reshape(N, 6, -1), shared, own, design)
+
+
+def _used_columns(linear: LinearModel, scans: _FurtherScans) -> Array:
+    """(6 (V + N), a − 6) of effects in use; further views answer only to what moves poses."""
+    design = linear.design[:, 6:]
+    out = np.vstack([design, np.zeros((6 * len(scans.flange) - len(design), design.shape[1]))])
+    for term in linear.model.terms:
+        if moves_points([term]):
+            continue
+        twists = _twists(scans.measurement, linear.model, term, scans.surfaces.centre)
+        for j, column in enumerate(design.T):
+            off = np.linalg.norm(twists[: len(design)] - column[:, None], axis=0)
+            if len(off) and off.min() < 1e-6 * np.linalg.norm(column):
+                out[:, j] = twists[:, off.argmin()]
+    return out
+
+
+def _twists(measurement: Measurement, model: Model, term: Term, centre: Array) -> Array:
+    """(6V, P) twists of all views per unit of each parameter of a term."""
+    derivative = next(pose_derivatives(measurement, model, [term], centre))
+    return derivative.reshape(len(derivative), -1).T
+
+
+def _given_views(base: LinearModel, scored: Score, columns: Array, across: Array) -> tuple[Array, Array, Array]:
+    """Return mean (M,) of further numbers given those that were seen, the root (M, q) of what is not known of the
+    coefficients, and the covariance (M, M) that the seen ones explain.
+
+    Args:
+        columns: (M, q) of the further numbers: hand-eye and effects in use, then the rival's parameters.
+        across: (M, n) covariance with the reduced observations.
+    """
+    white = np.column_stack([base.white_design, base.whiten(scored.form.columns)])
+    seen = base.whiten(np.ascontiguousarray(across.T))
+    # A rival is of plausible size, or as much larger as it seems to be.
+    precision = np.append(np.zeros(base.white_design.shape[1]), (scored.scale * scored.form.sizes) ** -2.0)
+    normal, unit = equilibrated(white.T @ white + np.diag(precision))
+    values, vectors = np.linalg.eigh(normal)
+    root = unit[:, None] * vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))
+    coefficients = root @ (root.T @ (white.T @ base.white_z))
+    mean = columns @ coefficients + seen.T @ (base.white_z - white @ coefficients)
+    return mean, (columns - seen.T @ white) @ root, seen.T @ seen
+
+
+def _predict_targets(linear: LinearModel, targets: TargetRows, scored: Score, joints: Array, wait: Array) -> Prediction:
+    """Return what a rival expects where all targets are seen: beside it views err independently."""
+    base = model_beside(linear, scored)
+    measurement = candidate_measurement(linear.measurement, joints, wait)
+    flange_and_noise = np.append(base.flange_scatter(base.null), base.null.variances[NOISE])
+    rows, columns, covariance = candidate_rows(
+        measurement, targets, targets.places, flange_and_noise, [zero_term(scored)]
+    )
+    extra = np.zeros((*rows.residual.shape, linear.design.shape[1] - 6 - rows.landmarks.shape[2]))
+    every = np.concatenate([rows.hand_eye, rows.landmarks, extra, columns[0][..., scored.form.keep]], axis=2)
+    N, m, q = every.shape
+    mean, unknown, _ = _given_views(base, scored, every.reshape(-1, q), np.zeros((N * m, len(base.white_z))))
+    design = every[..., : base.white_design.shape[1]]
+    return Prediction(mean.reshape(N, m), unknown.reshape(N, m, -1), None, covariance, design)
+
+
+def model_beside(linear: LinearModel, scored: Score) -> LinearModel:
+    """Return the model with the variances that are left beside a candidate."""
+    if scored.base_model is not None or scored.variances is None:
+        return scored.base_model or linear
+    base = linear.restricted(linear.causes - {scored.name})
+    return replace(base, null=at_variances(base.mixed, scored.variances))
+
+
+def zero_term(scored: Score) -> Term:
+    """Return the candidate's best form at zero."""
+    return scored.form.at(np.zeros(len(scored.values)))

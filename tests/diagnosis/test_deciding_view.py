@@ -1,0 +1,101 @@
+"""The view that decides: odds against a closed form, predictions against views that were taken, poses within reach."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import stitch
+from data_synth import kinematics
+from data_synth.fixtures.in_memory import session_of
+from data_synth.fixtures.quiet_scenes import clean, plan_for
+from data_synth.simulate import simulate
+from stitch.diagnosis import deciding_view
+from stitch.diagnosis.deciding_view import Prediction, deciding_views, possible_joints, predict_views
+from stitch.diagnosis.thresholds import ODDS
+from stitch.numerics import frames
+from stitch.session.capture import build_capture
+
+VIEWS, FURTHER = 12, 3
+
+
+def prediction(mean, sigma):
+    """Of one view with one number, which scatters alone."""
+    return Prediction(np.array([[mean]]), np.zeros((1, 1, 1)), None, np.full((1, 1, 1), sigma**2), np.zeros((1, 1, 0)))
+
+
+@pytest.mark.parametrize("apart", [2.0, 3.0, 5.0])
+def test_the_odds_of_two_rivals_that_differ_in_one_number_are_those_of_the_closed_form(apart):
+    """The log likelihood ratio of two normals δ sigmas apart is itself normal: mean δ²/2, variance δ²."""
+    draws = np.random.default_rng(0).standard_normal((40_000, 1))
+    rivals = [prediction(0.0, 0.02), prediction(0.02 * apart, 0.02)]
+    right, wrong, _ = deciding_view._decisions(rivals, np.zeros(2), [], np.zeros(1, int), draws)
+    assert right[0] == pytest.approx(norm.cdf((apart**2 / 2 - ODDS) / apart), abs=0.01)
+    assert wrong[0] == pytest.approx(norm.cdf((-(apart**2) / 2 - ODDS) / apart), abs=0.005)
+
+
+def test_a_view_in_which_the_rivals_expect_the_same_decides_nothing():
+    draws = np.random.default_rng(0).standard_normal((1000, 1))
+    rivals = [prediction(0.1, 0.02), prediction(0.1, 0.02)]
+    right, wrong, share = deciding_view._decisions(rivals, np.zeros(2), [], np.zeros(1, int), draws)
+    assert (right[0], wrong[0], share[0]) == (0.0, 0.0, 0.5)
+
+
+@pytest.fixture(scope="module")
+def cell():
+    """A cell with an uneven gear: what its first views tell, and further ones that were taken."""
+    scene = clean("blade", rays=60)
+    plan, rail = plan_for(scene, 3, VIEWS + FURTHER)
+    measured = simulate(scene, {"gear_eccentricity": 1.5}, 3, planned=(plan, rail))
+    session = session_of(measured)
+    found = stitch.diagnose(stitch.run(replace(session, views=session.views[:VIEWS])))
+    return found, measured, plan
+
+
+def rivals_of(found):
+    """As if the first views told them not apart at all."""
+    named = [c.ranked for c in found.candidates if c.name in ("gear_eccentricity", "gear_harmonic")]
+    return [replace(ranked, log_posterior=0.0) for ranked in named]
+
+
+def test_what_is_expected_of_a_further_view_is_what_it_shows_within_what_is_known(cell):
+    """True poses of the generator, whose kinematics are its own: squares in units of the covariance stay small."""
+    found, measured, plan = cell
+    linear = found.linear
+    (true,) = [ranked for ranked in rivals_of(found) if ranked.name == "gear_eccentricity"]
+    expected = predict_views(linear, [true.score], plan.joints[VIEWS:], np.zeros(FURTHER))[0]
+    to_centre = frames.make(np.eye(3), -linear.observation.centre)
+    model = build_capture("all", (), measured.T_base_flange, linear.measurement.mount).poses(linear.model.T_mount)
+    twists = frames.log(to_centre @ measured.T_reference_scanner @ frames.inverse(to_centre @ model))
+    seen = twists[VIEWS:] - twists[:VIEWS].mean(axis=0)
+    mean, covariance = expected.of([0, 1], np.array([2]))
+    off = seen.ravel() - mean[0]
+    square = off @ np.linalg.solve(covariance[0], off)
+    # 18 numbers: a chi square beyond 42 has a chance of one in a thousand.
+    assert square < 42
+
+
+def test_proposed_poses_are_near_those_driven_and_their_odds_rise_with_each(cell):
+    found, _, plan = cell
+    views = deciding_views(found.linear, rivals_of(found))
+    assert views is not None
+    assert (np.diff(views.probability) > -0.02).all()
+    driven = plan.joints[:VIEWS]
+    for q in views.joints:
+        assert np.abs(q - driven).max(axis=1).min() < np.radians(61)
+        assert np.abs(q).max() < np.radians(171)
+    seen = kinematics.flange(plan.arm, views.joints)
+    assert np.isfinite(seen).all()
+
+
+def test_the_chosen_view_decides_at_least_as_often_as_those_that_were_tried(cell):
+    found, *_ = cell
+    rivals = rivals_of(found)
+    views = deciding_views(found.linear, rivals, most=1)
+    joints = possible_joints(found.linear)[:40]
+    weights = np.array([ranked.log_posterior for ranked in rivals])
+    tried = predict_views(found.linear, [r.score for r in rivals], joints, np.zeros(len(joints)))
+    draws = np.random.default_rng(5).standard_normal((2000, 6))
+    right = deciding_view._decisions(tried, weights, [], np.arange(len(joints)), draws)[0]
+    assert views.probability[0] > right.max() - 0.05
