@@ -59,12 +59,21 @@ OUTCOMES = ("right", "cannot be told", "wrong")
 MILLIMETRES = {"mm": 1.0, "m": 1e3}
 # The hand-eye behind the cases; under it the views of a right session lie this near to each other, mm.
 T_CASES = frames.make(Rotation.from_rotvec([0.080, -0.120, 0.750]).as_matrix(), np.array([62.0, -38.0, 95.0]))
-MEET_MM, _NEIGHBOURS = 0.15, 8
+MEET_MM, _NEIGHBOURS = 0.25, 8
 # Of positions as tables round them; of the distance of clouds from the scanner, as a share.
 NEAR_MM, SIZE = 0.05, 5e-3
+# OpenGL's axes, and what a refusal has to say where it is right.
+OTHER_HAND_EYES = {"nerfstudio_transforms": np.diag([1.0, -1.0, -1.0, 1.0])}
+TRUE_CAUSES = {"tool_changed_midway": r"changed at scan_06\.ply: .* by \((-?0\.\d), (-?0\.\d), (149\.\d|150\.\d)\) mm"}
 # Where the true hand-eye is another, a wrist that never turns leaves it open, or nothing of a run can be judged by it.
 TURNTABLE = "turntable_names_only"
-NO_HAND_EYE = ("gantry_constant_rotation", "line_profiles_xyz", "bag_without_tf_static", "quaternion_2_decimals")
+NO_HAND_EYE = (
+    "gantry_constant_rotation",
+    "line_profiles_xyz",
+    "bag_without_tf_static",
+    "quaternion_2_decimals",
+    "scara_xyzu_points_csv",
+)
 NO_TRUE_HAND_EYE = (TURNTABLE, "bag_without_tf_static", "crash-steps-6-views", "duplicated-points")
 _SEED = 11
 
@@ -143,7 +152,8 @@ def case_trial(job: Row) -> Row:
         flags = follow(first.refusal, folder) if first.code else None
         if flags is not None:
             last = init(bag, out, *flags)
-        verdict = case_verdict(name, out) if not last.code else "refused"
+        caused = name in TRUE_CAUSES and re.search(TRUE_CAUSES[name], last.refusal)
+        verdict = "rightly refused" if caused else "refused" if last.code else case_verdict(name, out)
         if last.code and "pip install" in last.refusal:
             verdict = "needs a package"
         verdict += " once it is stated" if flags is not None else ""
@@ -158,7 +168,7 @@ def case_verdict(name: str, out: Path) -> str:
         return "right" if turns(session, [float(re.findall(r"\d+", v.name)[-1]) for v in session.views]) else "wrong"
     if name in NO_HAND_EYE:
         return "right" if session.mount == "eye_in_hand" else "wrong"
-    off = apart(session, T_CASES)
+    off = apart(session, OTHER_HAND_EYES.get(name, T_CASES))
     return "right" if off < MEET_MM else f"wrong ({off:.2f} mm)"
 
 

@@ -21,6 +21,7 @@ from stitch.model.model import Model as Model
 from stitch.model.model_toml import read_model as read_model
 from stitch.plugins.explain.verb import explain as explain
 from stitch.plugins.export.verb import export_run as export_run
+from stitch.plugins.intake.verb import init as init
 from stitch.plugins.metrology.planning.verb import plan as plan
 
 MODULES: dict[str, str]

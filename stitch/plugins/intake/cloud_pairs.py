@@ -3,12 +3,12 @@
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, count
 from pathlib import Path
 
-from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.clock_times import rows_by_time
+from stitch.plugins.intake.refusals import Fix, Refusal
 
 # Clouds or poses that a list may lack where nothing but the order pairs them: more, and they do not belong together.
 LACKING = 2
@@ -22,6 +22,13 @@ class Pairing:
     rows: tuple[int | None, ...]
     words: str
     by_name: bool  # names tell it; else the order is a guess
+
+    @property
+    def stated(self) -> str:
+        """As --rows takes it."""
+        told = ["-" if row is None else str(row + 1) for row in self.rows]
+        in_order = all(row is not None and row == first for row, first in zip(self.rows, count(self.rows[0] or 0)))
+        return f"{told[0]}-{told[-1]}" if in_order else ",".join(told)
 
     @property
     def used(self) -> tuple[int, ...]:
@@ -55,9 +62,9 @@ def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
         gaps = _incomplete_pairings(N, M) if M - N <= LACKING else []
         return numbered + [pair for pair in gaps if all(pair.rows != other.rows for other in numbered)]
     if abs(N - M) > LACKING or min(N, M) < 3:
-        raise InputError(
-            f"{clouds[0].parent}: {N} clouds and {M} poses, and their names do not tell which belong together; to fix: "
-            "write the cloud's file name beside each pose, or leave out what does not belong"
+        raise Refusal(
+            f"{clouds[0].parent}: {N} clouds and {M} poses, and their names do not tell which belong together",
+            Fix("state the row of each cloud, in the order of their names, as with --rows 1-7,-,9", {"rows": "ROWS"}),
         )
     if N == M:
         same: tuple[int | None, ...] = tuple(range(N))
@@ -65,6 +72,22 @@ def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
         out.append(Pairing(same[::-1], "the poses in reverse order", False))
         return out + [_shifted_pairing(N, by) for by in _SHIFTS if N - abs(by) >= 4]
     return _incomplete_pairings(N, M)
+
+
+def stated_pairing(clouds: Sequence[Path], rows: Sequence[int | None], count: int) -> Pairing:
+    """Return the pairing that a person states.
+
+    Args:
+        rows: from 0, of each cloud.
+        count: of the rows of the table.
+
+    Raises:
+        InputError: another number than of clouds, or a row that is not there.
+    """
+    if len(rows) != len(clouds) or max((row for row in rows if row is not None), default=0) >= count:
+        told = f"--rows: {len(rows)} for {len(clouds)} clouds and a table of {count} rows"
+        raise Refusal(told, Fix("write a row, or -, for each cloud in the order of their names", {"rows": "ROWS"}))
+    return Pairing(tuple(rows), "stated with --rows", True)
 
 
 def named_pairing(

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.cloud_pairs import Pairing
 from stitch.plugins.intake.layouts import MM, POSE_UNITS
 from stitch.plugins.intake.readings import Reading
+from stitch.plugins.intake.refusals import Refusal, change, state
 from stitch.screening.background import find_standing_scene
 from stitch.screening.closing import CLEARLY_BETTER, fit_centroids, surface_misfit
 from stitch.screening.conventions import equivalent_hypotheses, fit_hypotheses
@@ -128,6 +128,9 @@ def _small(off: Array) -> bool:
 _SHORT = 4
 # Motions that closed give a start for the surfaces.
 _CLOSED = 0.5
+# Motions that close under one way, against those under the next: then the lead of surfaces that chance does not reach
+# (see CLEARLY_BETTER) tells it.
+_TWICE, BY_CHANCE = 1.9, 1.12
 # A fitted scale belongs to a unit within this factor: 10 and 25.4 lie 2.5 apart.
 _UNIT_FACTOR = 1.5
 
@@ -261,7 +264,11 @@ def _choose_interpretation(
     clear = runner_up is None or runner_up.misfit >= CLEARLY_BETTER * best.misfit
     # The motions alone single a way out.
     close = equivalent_hypotheses(list(closing.values()))
-    single = len(close) == 1 and interpretations[int(close[0].hypothesis.kind)] is best.interpretation
+    leads = bool(close) and interpretations[int(close[0].hypothesis.kind)] is best.interpretation
+    single = leads and len(close) == 1
+    # Both judges put the same way first, each by more than chance does.
+    agreed = leads and all(_TWICE * fit.closed <= close[0].closed for fit in close[1:])
+    clear |= agreed and runner_up is not None and runner_up.misfit >= BY_CHANCE * best.misfit
     told = single if by_targets else (clear or single) and best.meets and len(best.interpretation.pairing.used) > 2
     same = equivalent_interpretations(best.interpretation, interpretations)
     best = replace(
@@ -312,10 +319,8 @@ def require_no_background(folder: Path, capture: Capture, scale: float) -> None:
         return
     share, box = found
     corners = ",".join(f"{x / scale:.4g}" for x in box.ravel())
-    raise InputError(
-        f"{folder}: {share:.0%} of what the scans show stands still before the scanner: a table, a wall; to fix: state "
-        f"--within {corners}"
-    )
+    told = f"{folder}: {share:.0%} of what the scans show stands still before the scanner: a table, a wall"
+    raise Refusal(told, state(within=corners))
 
 
 def require_own_frames(folder: Path, motions: Callable[[], RelativeScans], decided: ConventionChoice) -> None:
@@ -335,8 +340,8 @@ def require_own_frames(folder: Path, motions: Callable[[], RelativeScans], decid
     moved = np.linalg.norm(T[:, :3, 3], axis=1)
     still = float(((rotation_angles(T) < ROTATION) & (moved < TRANSLATION_M / MM)).mean())
     if still > max(0.5, decided.best.closed or 0.0):
-        raise InputError(
+        raise Refusal(
             f"{folder}: {still:.0%} of neighbouring scans meet as they are, and not as the poses say: they lie in one "
-            "frame already, or most of what they show stands still before the scanner; to fix: export every scan in "
-            "the scanner's own frame, or cut away what stands still"
+            "frame already, or most of what they show stands still before the scanner",
+            change(folder, "export every scan in the scanner's own frame, or cut away what stands still"),
         )

@@ -12,7 +12,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
-from stitch.plugins.intake.cloud_pairs import Pairing, pairings
+from stitch.plugins.intake.cloud_pairs import Pairing, pairings, stated_pairing
 from stitch.plugins.intake.convention_choice import (
     ConventionChoice,
     ConventionScore,
@@ -46,6 +46,7 @@ from stitch.plugins.intake.readings import (
     mixed_readings,
     with_joints_of,
 )
+from stitch.plugins.intake.refusals import Fix, Refusal, change, state
 from stitch.plugins.intake.scan_targets import find_folder_targets, target_motions
 from stitch.plugins.intake.session_guesses import session_guesses
 from stitch.plugins.intake.stated_folder import StatedFolder
@@ -97,7 +98,11 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     found = find_folder_files(folder, stated.poses, stated.accepts)
     raw = _read_table(found, stated)
     clouds, kept, lost = _read_clouds(found.clouds, stated.box)
-    pairs = [pairing.of(kept, raw.without_pose) for pairing in pairings(found.clouds, raw.labels, raw.numbers)]
+    if stated.rows:
+        ways_to_pair = [stated_pairing(found.clouds, stated.rows, len(raw.numbers))]
+    else:
+        ways_to_pair = pairings(found.clouds, raw.labels, raw.numbers)
+    pairs = [pairing.of(kept, raw.without_pose) for pairing in ways_to_pair]
     found = replace(found, clouds=tuple(found.clouds[i] for i in kept))
     points = [c.points for c in clouds]
     own_units = [stated.cloud_unit] if stated.cloud_unit else cloud_units(points)
@@ -252,9 +257,10 @@ def _profiles_of_a_sphere(
     """
     radii = stated.targets.balls or ()
     if len(radii) != 1:
-        raise InputError(
-            f"{files.folder}: every cloud is one profile of a laser line and shows no surface; to fix: for profiles of "
-            f"one sphere state its radius in mm, stitch init {files.folder} --ball RADIUS --yes"
+        words = f"for profiles of one sphere state its radius in mm, stitch init {files.folder} --ball RADIUS --yes"
+        raise Refusal(
+            f"{files.folder}: every cloud is one profile of a laser line and shows no surface",
+            Fix(words, {"ball": "RADIUS"}),
         )
     decided = ConventionChoice(ConventionScore(way, np.eye(4), np.inf, False, None), None, False, (), 0.0, 0.0)
     points = [cloud.points for cloud in clouds]
@@ -273,7 +279,7 @@ def _read_table(found: FolderFiles, stated: StatedFolder) -> RawPoses:
     raw = raw.oriented(stated.orientation) if stated.orientation else raw
     if found.urdf is not None and raw.header is not None and not stated.columns:
         raw = with_joints_of(raw, found.urdf)
-    return rows_with_scans(raw, found.clouds, found.urdf, stated)
+    return raw if stated.rows else rows_with_scans(raw, found.clouds, found.urdf, stated)
 
 
 def _read_clouds(files: Sequence[Path], box: Array) -> tuple[list[Cloud], list[int], list[str]]:
@@ -288,7 +294,7 @@ def _read_clouds(files: Sequence[Path], box: Array) -> tuple[list[Cloud], list[i
             cloud = distinct_points(read_cloud(file))
             cloud = cloud.within(box) if len(box) else cloud
             if len(cloud.points) < _FEWEST:
-                raise InputError(f"{file}: {len(cloud.points)} points show no surface; to fix: take the scan out")
+                raise Refusal(f"{file}: {len(cloud.points)} points show no surface", change(file, "take the scan out"))
         except InputError as error:
             lost.append(error)
             continue
@@ -343,19 +349,17 @@ def require_scale(files: FolderFiles, scale: float | None, stated: StatedFolder)
     if first.suffix.lower() in DEPTH_SUFFIXES:
         camera = find_intrinsics(first)
         per_metre = (camera.units_per_metre or 1000.0) * factor
-        raise InputError(
-            f"{camera.source}: {told}, so a count of depth is {1000 / per_metre:.4g} mm; to fix: write depth_scale = "
-            f'{per_metre:.6g} (counts per metre) there, as "depth_scale": {per_metre:.6g}'
+        words = f'write depth_scale = {per_metre:.6g} (counts per metre) there, as "depth_scale": {per_metre:.6g}'
+        raise Refusal(
+            f"{camera.source}: {told}, so a count of depth is {1000 / per_metre:.4g} mm",
+            change(camera.source, words),
         )
     if factor in (1000.0, 0.001) and stated.length_unit:
-        raise InputError(f"--unit {stated.length_unit}: {told}; to fix: leave --unit out")
+        raise Refusal(f"--unit {stated.length_unit}: {told}", Fix("leave --unit out", {"unit": ""}))
     if factor in (1000.0, 0.001):
-        unit = "mm" if factor == 0.001 else "m"
-        raise InputError(f"{files.folder}: {told}; to fix: state --cloud-unit {unit}")
-    raise InputError(
-        f"{files.folder}: {told}; to fix: multiply x, y, z of the clouds by {1 / factor:.6g}, or those of the poses by "
-        f"{factor:.6g}"
-    )
+        raise Refusal(f"{files.folder}: {told}", state(cloud_unit="mm" if factor == 0.001 else "m"))
+    words = f"multiply x, y, z of the clouds by {1 / factor:.6g}, or those of the poses by {factor:.6g}"
+    raise Refusal(f"{files.folder}: {told}", change(files.folder, words))
 
 
 def _read_folder_poses(files: FolderFiles) -> RawPoses:

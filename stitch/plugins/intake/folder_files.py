@@ -16,6 +16,7 @@ from natsort import natsorted, ns
 from stitch.errors import InputError
 from stitch.plugins.intake.inventory import FoundList, choose_list, take_inventory
 from stitch.plugins.intake.raw_poses import RawPoses, read_by_its_program, read_lists, read_raw_poses
+from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.session.reading.clouds import CLOUD_SUFFIXES
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
 from stitch.session.reading.intrinsics import find_intrinsics
@@ -106,13 +107,15 @@ def find_folder_files(
     """
     _require_folder(folder)
     file, part = _file_and_part(poses)
+    # As a refusal names it: beside the scans.
+    file = folder / file if file is not None and not file.exists() and (folder / file).exists() else file
     if file is not None and not file.exists():
-        raise InputError(f"{file}: no such file; to fix: name the file of the poses")
+        raise Refusal(f"{file}: no such file", Fix("name the file of the poses with --poses FILE", {"poses": "FILE"}))
     files = list_files(folder)
     named = {file, *(file.iterdir() if file is not None and file.is_dir() else ())}
     clouds, other_clouds = clouds_among([f for f in files if f not in named])
     if not clouds:
-        raise InputError(_no_clouds_message(folder, files))
+        raise _no_clouds(folder, files)
     # A recording of the robot is as long as a scan, and the only text beside scans of another kind.
     texts = [f for f in other_clouds if f.suffix.lower() in _EITHER]
     taken = {*clouds, *(other_clouds if len(texts) > _RECORDINGS else set(other_clouds) - {*texts})}
@@ -178,23 +181,24 @@ def _require_folder(folder: Path) -> None:
     if folder.is_dir():
         return
     if not folder.is_file():
-        raise InputError(f"{folder}: no such folder; to fix: name the folder of the scans")
+        raise Refusal(f"{folder}: no such folder", change(folder, "name the folder of the scans"))
     if folder.suffix.lower() in _PACKED:
-        raise InputError(f"{folder}: is packed; to fix: unpack it and name the folder")
-    raise InputError(f"{folder}: is a file; to fix: name the folder that it lies in, {folder.parent}")
+        raise Refusal(f"{folder}: is packed", change(folder, "unpack it and name the folder"))
+    raise Refusal(f"{folder}: is a file", change(folder, f"name the folder that it lies in, {folder.parent}"))
 
 
-def _no_clouds_message(folder: Path, files: Sequence[Path]) -> str:
+def _no_clouds(folder: Path, files: Sequence[Path]) -> Refusal:
     """Why, and what to do: an archive that nobody has unpacked, or files of other kinds."""
     packed = next((f for f in files if f.suffix.lower() in _PACKED), None)
     if packed is not None:
-        return f"{folder}: no clouds there, only packed in {packed.relative_to(folder)}; to fix: unpack it there"
+        told = f"{folder}: no clouds there, only packed in {packed.relative_to(folder)}"
+        return Refusal(told, change(packed, "unpack it there"))
     kinds = Counter(f.suffix.lower() or f.name for f in files).most_common(3)
     there = f", only {', '.join(f'{count} {kind}' for kind, count in kinds)}" if kinds else ""
-    return (
-        f"{folder}: no clouds there{there}; to fix: put the scans there as {', '.join(CLOUD_SUFFIXES)}, or "
-        "the points that a tracker measured beside the poses"
+    words = (
+        f"put the scans there as {', '.join(CLOUD_SUFFIXES)}, or the points that a tracker measured beside the poses"
     )
+    return Refusal(f"{folder}: no clouds there{there}", change(folder, words))
 
 
 def list_files(folder: Path, depth: int = 0) -> list[Path]:
@@ -241,11 +245,14 @@ def _stated_list(poses: Path, part: str, clouds: set[Path]) -> FoundList:
         raw = next((raw for raw in lists if raw.part == part), None)
         if raw is None:
             parts = ", ".join(f"{poses.name}#{raw.part}" for raw in lists if raw.part)
-            raise InputError(f"{poses}: has no list {part}; to fix: name one of {parts or poses.name}")
+            raise Refusal(
+                f"{poses}: has no list {part}", Fix(f"name one of {parts or poses.name}", {"poses": "FILE#LIST"})
+            )
         return FoundList((poses,), raw, "poses")
     inside = [f for f in poses.iterdir() if f.is_file() and f not in clouds and _may_hold_poses(f)]
     if not inside:
-        raise InputError(f"{poses}: no files of poses there; to fix: name the file or the folder of the poses")
+        named = Fix("name the file or the folder of the poses with --poses FILE", {"poses": "FILE"})
+        raise Refusal(f"{poses}: no files of poses there", named)
     files = tuple(natsorted(inside, alg=ns.IGNORECASE))
     return FoundList(files, read_raw_poses(files), "poses")
 

@@ -17,6 +17,7 @@ from stitch.errors import InputError, NoResultError
 from stitch.plugins.intake.cloud_pairs import clouds_served
 from stitch.plugins.intake.layouts import possible_layouts
 from stitch.plugins.intake.raw_poses import RawPoses, read_lists, read_raw_poses
+from stitch.plugins.intake.refusals import Fix, Refusal
 
 _NAMES_POSE = re.compile(r"pose|robot|flange|tcp|joint|trajector|actual|gripper|effector|ist\b", re.IGNORECASE)
 _NAMES_OTHER = re.compile(r"marker|board|target|tag|camera|soll?\b|rsol|edges|nominal|command", re.IGNORECASE)
@@ -125,17 +126,16 @@ def choose_list(
     if len(inventory) == 1 and len(inventory[0].files) == 1 and not open_:
         read_raw_poses(inventory[0].files)  # what is wrong with the one file is said in full
     if not open_:
-        raise InputError(
-            f"{folder}: no list of poses there{_shown(inventory)}; to fix: name the file of the poses with --poses "
-            "FILE, or a list of it with --poses FILE#LIST, and its columns with --columns x,y,z,rx,ry,rz"
-        )
+        words = "name the file of the poses with --poses FILE, or a list of it with --poses FILE#LIST, and its columns "
+        named = Fix(f"{words}with --columns x,y,z,rx,ry,rz", {"poses": "FILE#LIST", "columns": "COLUMNS"})
+        raise Refusal(f"{folder}: no list of poses there{_shown(inventory)}", named)
     ranked = sorted(open_, key=lambda found: _rank(found, clouds))
     best = [found for found in ranked if _rank(found, clouds) == _rank(ranked[0], clouds)]
     if len(best) > 1 and not all(found.files == best[0].files for found in best):
         names = ", ".join(found.name for found in best[:4])
-        raise InputError(
-            f"{folder}: several files may hold the poses ({names}){_shown(inventory)}; to fix: name it with "
-            f"--poses {best[0].files[0].relative_to(folder)}"
+        raise Refusal(
+            f"{folder}: several files may hold the poses ({names}){_shown(inventory)}",
+            *(Fix(f"name it with --poses {found.files[0]}", {"poses": str(found.files[0])}) for found in best[:4]),
         )
     chosen = replace(ranked[0], taken_for="poses", why_not="")
     others = [

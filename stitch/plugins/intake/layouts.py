@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES
 from stitch.plugins.intake.clock_times import EPOCH_S, since_1970
 from stitch.plugins.intake.column_names import read_names
 from stitch.plugins.intake.raw_poses import RawPoses
+from stitch.plugins.intake.refusals import Fix, Refusal, change
 
 # A quaternion with three digits has length 1 within this.
 _UNIT_LENGTH = 5e-3
@@ -42,6 +42,15 @@ class ColumnLayout:
     rest: dict[str, Array] = field(default_factory=dict)  # other named columns (V,): times, temperatures
 
     @property
+    def stated(self) -> dict[str, str]:
+        """The option of `stitch init` that states what the words of a table without names say; none of others."""
+        turn = {3: "rx,ry,rz", 4: "rot0,rot1,rot2,rot3"}.get(self.rotation.shape[1], "")
+        first = "position" if self.words.startswith("columns 1 to 3 are the position") else "rotation"
+        if self.named or not turn or not self.words.startswith("columns 1 "):
+            return {}
+        return {"columns": f"x,y,z,{turn}" if first == "position" else f"{turn},x,y,z"}
+
+    @property
     def angles(self) -> Array:
         """Numbers that are angles: of the rotation, else of the joints."""
         return self.rotation if self.rotation.shape[1] == 3 or self.joints is None else self.joints
@@ -64,10 +73,10 @@ def possible_layouts(raw: RawPoses) -> list[ColumnLayout]:
     found_all = tried[count](x) if count in tried else []
     if not found_all:
         called = "" if raw.header is None else f", called {', '.join(raw.header)},"
-        raise InputError(
-            f"{raw.source}: {raw.numbers.shape[1]} columns of numbers{called} "
-            "hold no pose that is known; to fix: name each with --columns, for example --columns x,y,z,rx,ry,rz "
-            "(qx,qy,qz,qw for a quaternion, j1,j2 … for joint angles, - for one to leave out)"
+        words = "name each with --columns, for example --columns x,y,z,rx,ry,rz (qx,qy,qz,qw for a quaternion, j1,j2 … "
+        raise Refusal(
+            f"{raw.source}: {raw.numbers.shape[1]} columns of numbers{called} hold no pose that is known",
+            Fix(f"{words}for joint angles, - for one to leave out)", {"columns": "COLUMNS"}),
         )
     return [_without_offset(replace(layout, rest=rest)) for layout in found_all]
 
@@ -145,15 +154,17 @@ def _require_rotation(raw: RawPoses) -> None:
     """
     header = raw.header or ()
     if read_names(header).position and not read_names(header).rotation:
-        raise InputError(
-            f"{raw.source}: x, y, z stand there without a rotation; to fix: state the one that all poses have, as with "
-            "--orientation 180,0,0 --rotation xyz-extrinsic, or name the columns of the rotation with --columns"
+        words = "state the one that all poses have, as with --orientation 180,0,0 --rotation xyz-extrinsic"
+        raise Refusal(
+            f"{raw.source}: x, y, z stand there without a rotation",
+            Fix(words, {"orientation": "ORIENTATION", "rotation": "ROTATION"}),
+            Fix("name the columns of the rotation with --columns", {"columns": "COLUMNS"}),
         )
     joints = [name for name in header if _JOINT_WORDS.search(name)]
     if len(joints) >= _FEWEST_JOINTS:
-        raise InputError(
-            f"{raw.source}: {', '.join(joints)} are joint angles, of which the robot's URDF tells the order; to fix: "
-            "put the URDF beside the table, or name them with --columns j1,j2,j3,j4,j5,j6 as they stand"
+        raise Refusal(
+            f"{raw.source}: {', '.join(joints)} are joint angles, of which the robot's URDF tells the order",
+            change(raw.source, "put the URDF beside the table"),
         )
 
 

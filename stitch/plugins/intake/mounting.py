@@ -67,4 +67,5 @@ def choose_mounting(decided: ConventionChoice, mount: str | None, inverse: bool 
     value = f"{chosen}, {_WORDS[chosen]}; the poses are {'T_flange_base' if inverted else 'T_base_flange'}"
     rest = other if chosen == direct else direct
     runner_up = f"{rest} with poses {'inverted' if not inverted else 'as they are'}" if mount is None else None
-    return Mounting(chosen, inverted, Guess("mount", value, reason, told, "--mount", runner_up, by))
+    guess = Guess("mount", value, reason, told, "--mount", runner_up, by, None, {"mount": chosen}, {"mount": rest})
+    return Mounting(chosen, inverted, guess)

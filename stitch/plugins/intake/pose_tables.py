@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.clock_times import is_time_of_day
+from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.session.reading.text_files import read_any_text, shortened
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -158,7 +158,7 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     # Where every line is marked, #1 is a row's number.
     body = body or [(i, line) for i, line in kept if _MARKED_NUMBER.match(line)]
     if not body or max(len(line) for _, line in body) > _LONGEST_LINE:
-        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+        raise _no_rows(file)
     separator = _separator_of([line for _, line in body[:_SAMPLED]])
     read = trimmed_rows([(i, split_cells(line, separator)) for i, line in body])
     rows = rows_below_titles(read)
@@ -168,7 +168,7 @@ def parse_number_table(file: Path, content: str) -> NumberTable:
     header, rows = _split_labels(header, rows)
     text, numeric = _text_and_number_columns(rows)
     if len(numeric) < (1 if header else _SEVERAL):
-        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+        raise _no_rows(file)
     numbers = np.array(
         [[_cell_number(file, i, row[c] if any(row[k] for k in numeric) else "nan") for c in numeric] for i, row in rows]
     )
@@ -211,10 +211,15 @@ def longest_block(content: str) -> tuple[str, str] | None:
     return "\n".join(line if i in kept else "" for i, line in enumerate(lines)), words
 
 
+def _no_rows(file: Path) -> Refusal:
+    named = Fix("name the table of poses with --poses FILE", {"poses": "FILE"})
+    return Refusal(f"{file}: holds no rows of numbers", named)
+
+
 def _cell_number(file: Path, line: int, cell: str) -> float:
     found = parse_number(cell)
     if found is None or abs(found) >= 1e30:
-        raise InputError(f"{file} line {line}: {shortened(cell)} is no number; to fix: write one there")
+        raise Refusal(f"{file} line {line}: {shortened(cell)} is no number", change(file, "write one there"))
     return found
 
 
@@ -224,9 +229,10 @@ def _require_one_decimal_mark(file: Path, rows: Sequence[tuple[int, list[str]]],
         pointed = [(i, row[c]) for i, row in rows if "." in row[c]]
         if pointed and any("," in row[c] for _, row in rows):
             line, cell = pointed[0]
-            raise InputError(
+            raise Refusal(
                 f"{file} line {line}: {shortened(cell)} has a point, other numbers of its column have a comma before "
-                "their decimals; to fix: write all alike, without marks for thousands"
+                "their decimals",
+                change(file, "write all alike, without marks for thousands"),
             )
 
 
@@ -235,9 +241,8 @@ def _require_no_thousands(file: Path, rows: Sequence[tuple[int, list[str]]], tex
     found = next(((i, row[c]) for c in text for i, row in rows if _THOUSANDS.fullmatch(row[c])), None)
     if found is not None:
         line, cell = found
-        raise InputError(
-            f"{file} line {line}: {shortened(cell)} has marks for thousands; to fix: write the numbers without them"
-        )
+        told = f"{file} line {line}: {shortened(cell)} has marks for thousands"
+        raise Refusal(told, change(file, "write the numbers without them"))
 
 
 def _split_header(
@@ -246,7 +251,7 @@ def _split_header(
     """The header's names, from the first row or the comment above it, and the rows of numbers, all of one length."""
     header: list[str] | None = None
     if not rows:
-        raise InputError(f"{file}: holds no rows of numbers; to fix: name the table of poses")
+        raise _no_rows(file)
     top, first = rows[0]
     below = rows[1:] or rows
     width = Counter(len(row) for _, row in [*below, rows[0]]).most_common(1)[0][0]
@@ -264,11 +269,11 @@ def _split_header(
         header = names if len(names) == width and all(parse_number(name) is None for name in names) else None
     odd = next(((i, row) for i, row in rows if len(row) != width), None)
     if odd is not None:
-        raise InputError(
-            f"{file} line {odd[0]}: {len(odd[1])} cells, other rows have {width}; to fix: write one number a column"
-        )
+        told = f"{file} line {odd[0]}: {len(odd[1])} cells, other rows have {width}"
+        raise Refusal(told, change(file, "write one number a column"))
     if header is not None and len(header) != width:
-        raise InputError(f"{file} line {top}: {len(header)} names for {width} columns; to fix: name every column once")
+        told = f"{file} line {top}: {len(header)} names for {width} columns"
+        raise Refusal(told, change(file, "name every column once"))
     return header, rows
 
 

@@ -24,6 +24,7 @@ from stitch.plugins.intake.pose_tables import (
     parse_number_table,
     with_one_header,
 )
+from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.session.reading.scan_headers import poses_in_scans, times_in_scans
 from stitch.session.reading.text_files import (
     WORKBOOKS,
@@ -71,11 +72,13 @@ class RawPoses:
             InputError: more or fewer names than columns, or a name twice.
         """
         if twice := {name for name in names if name != "-" and names.count(name) > 1}:
-            raise InputError(f"--columns {','.join(names)}: {twice.pop()} stands twice; to fix: name each column once")
+            told = f"--columns {','.join(names)}: {twice.pop()} stands twice"
+            raise Refusal(told, Fix("name each column once", {"columns": "COLUMNS"}))
         if len(names) != self.numbers.shape[1]:
-            raise InputError(
+            raise Refusal(
                 f"--columns {','.join(names)}: {len(names)} names, {self.source} has {self.numbers.shape[1]} columns "
-                "of numbers; to fix: name each, and - for one to leave out"
+                "of numbers",
+                Fix("name each, and - for one to leave out", {"columns": "COLUMNS"}),
             )
         return replace(self, header=tuple(names), words=f"{self.words}; columns as named")
 
@@ -87,9 +90,10 @@ class RawPoses:
         """
         where = [i for i, name in enumerate(self.header or "xyz") if name.lower().split(" ")[0].rstrip("_m[(") in "xyz"]
         if len(orientation) not in (3, 4) or len(where) != 3:
-            raise InputError(
-                f"--orientation: {len(orientation)} numbers for {self.source}; to fix: state three angles, or a "
-                "quaternion x,y,z,w, for a table of x, y, z alone"
+            words = "state three angles, or a quaternion x,y,z,w, for a table of x, y, z alone"
+            raise Refusal(
+                f"--orientation: {len(orientation)} numbers for {self.source}",
+                Fix(words, {"orientation": "ORIENTATION", "rotation": "ROTATION"}),
             )
         names = ("rot0", "rot1", "rot2") if len(orientation) == 3 else ("qx", "qy", "qz", "qw")
         header = (*(self.header or "xyz"), *names)
@@ -109,7 +113,8 @@ def read_raw_poses(files: Sequence[Path]) -> RawPoses:
     width = rows[0].numbers.shape[1]
     other = next((r for r in rows if r.numbers.shape[1] != width or r.header != rows[0].header), None)
     if other is not None:
-        raise InputError(f"{other.source}: is written otherwise than {rows[0].source}; to fix: export all alike")
+        told = f"{other.source}: is written otherwise than {rows[0].source}"
+        raise Refusal(told, change(other.source, "export all alike"))
     return RawPoses(
         source=f"{files[0].name} … {files[-1].name}",
         header=rows[0].header,
@@ -131,9 +136,9 @@ def _read_each(files: Sequence[Path]) -> tuple[list[RawPoses], frozenset[int]]:
             refused = refused or error
             continue
         if len(rows[i].numbers) != 1:
-            raise InputError(
-                f"{file}: holds {len(rows[i].numbers)} poses, one a file is expected; to fix: name the one file of "
-                "all poses with --poses FILE"
+            raise Refusal(
+                f"{file}: holds {len(rows[i].numbers)} poses, one a file is expected",
+                Fix("name the one file of all poses with --poses FILE", {"poses": str(file)}),
             )
     if refused is not None and len(rows) < _FEWEST_WHOLE * len(files):
         raise refused
@@ -150,8 +155,9 @@ def _read_file(file: Path) -> RawPoses:
     """
     lists = read_lists(file)
     if file.suffix.lower() in WORKBOOKS and len(lists) > 1:
-        raise InputError(
-            f"{file}: {len(lists)} sheets hold rows of numbers; to fix: leave the sheet of the poses alone"
+        raise Refusal(
+            f"{file}: {len(lists)} sheets hold rows of numbers",
+            *(Fix(f"name one with --poses {file}#{raw.part}", {"poses": f"{file}#{raw.part}"}) for raw in lists[:4]),
         )
     return max(lists, key=lambda raw: len(raw.numbers))
 
@@ -205,7 +211,8 @@ def _from_workbook(file: Path) -> list[RawPoses]:
             sheet = _raw_poses(f"{file}, sheet {name}", table.header, table.numbers, table.labels, f"sheet {name}")
             found.append(replace(sheet, part=name))
     if not found:
-        raise InputError(f"{file}: no sheet holds rows of numbers; to fix: name the table of poses")
+        named = Fix("name the table of poses with --poses FILE", {"poses": "FILE"})
+        raise Refusal(f"{file}: no sheet holds rows of numbers", named)
     return found
 
 
@@ -219,9 +226,9 @@ def _raw_poses(
     """
     broken = np.asarray(~np.isfinite(numbers).all(axis=1), bool)
     if len(numbers) > 1 and (~broken).sum() < _FEWEST_WHOLE * len(numbers):
-        raise InputError(
-            f"{source}: {broken.sum()} of {len(numbers)} rows hold a number that is not finite; to fix: export "
-            "the poses again"
+        raise Refusal(
+            f"{source}: {broken.sum()} of {len(numbers)} rows hold a number that is not finite",
+            change(source, "export the poses again"),
         )
     whole = np.where(broken[:, None], numbers[np.argmin(broken)], numbers) if broken.any() else numbers
     return RawPoses(source, header, whole, tuple(labels), words, frozenset(np.flatnonzero(broken).tolist()))
@@ -256,7 +263,7 @@ def _from_json(file: Path, text: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{file}: not valid JSON ({reason_of(error)}); to fix: correct it there") from None
+        raise Refusal(f"{file}: not valid JSON ({reason_of(error)})", change(file, "correct it there")) from None
 
 
 def _from_numpy(file: Path) -> list[RawPoses]:
@@ -264,11 +271,12 @@ def _from_numpy(file: Path) -> list[RawPoses]:
         loaded = np.load(file, allow_pickle=False)
         arrays = {file.stem: loaded} if isinstance(loaded, np.ndarray) else {k: loaded[k] for k in loaded.files}
     except (ValueError, OSError, EOFError) as error:
-        raise InputError(f"{file}: cannot be read ({reason_of(error)}); to fix: save plain numbers") from None
+        raise Refusal(f"{file}: cannot be read ({reason_of(error)})", change(file, "save plain numbers")) from None
     fitting = [(name, a) for name, a in arrays.items() if a.dtype.kind in "fiu" and a.ndim in (2, 3) and a.size]
     fitting.sort(key=lambda item: -item[1].ndim)
     if not fitting:
-        raise InputError(f"{file}: holds no array (V, C) or (V, 4, 4); to fix: save the poses as one of these")
+        told = f"{file}: holds no array (V, C) or (V, 4, 4)"
+        raise Refusal(told, change(file, "save the poses as one of these"))
     out: list[RawPoses] = []
     for name, array in fitting:
         x = np.asarray(array, float)
@@ -280,13 +288,14 @@ def _from_numpy(file: Path) -> list[RawPoses]:
 
 def _from_lists(file: Path, lists: dict[str, tuple[list[PoseRow], str]]) -> list[RawPoses]:
     """Return the lists all of whose rows have the same names."""
-    refused = InputError(f"{file}: holds no poses that are known; to fix: write a table or 4×4 matrices")
+    refused = Refusal(f"{file}: holds no poses that are known", change(file, "write a table or 4×4 matrices"))
     out: list[RawPoses] = []
     for part, (rows, kind) in lists.items():
         names = tuple(rows[0][1])
         odd = next((i for i, (_, row) in enumerate(rows, 1) if tuple(row) != names), None)
         if odd is not None:
-            refused = InputError(f"{file}: pose {odd} is written otherwise than the first; to fix: write all alike")
+            told = f"{file}: pose {odd} is written otherwise than the first"
+            refused = Refusal(told, change(file, "write all alike"))
             continue
         numbers = np.array([list(row.values()) for _, row in rows], float)
         header = None if all(re.fullmatch(r"\d+", name) for name in names) else names
@@ -306,9 +315,8 @@ def header_poses(clouds: Sequence[Path]) -> RawPoses:
     """
     poses = poses_in_scans(list(clouds))
     if poses is None:
-        raise InputError(
-            f"{clouds[0].parent}: no poses in the headers of the scans; to fix: name them with --poses FILE"
-        )
+        named = Fix("name them with --poses FILE", {"poses": "FILE"})
+        raise Refusal(f"{clouds[0].parent}: no poses in the headers of the scans", named)
     told = times_in_scans(list(clouds))
     times: Sequence[tuple[str, ...]] = [()] * len(clouds) if told is None else [(time,) for time in told]
     words = "they may be the scanner's own, of scans that were registered already: then the hand-eye is about unity"

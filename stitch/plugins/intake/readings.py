@@ -19,6 +19,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.layouts import POSE_UNITS, ColumnLayout, joint_layouts, pose_units, possible_layouts
 from stitch.plugins.intake.raw_poses import RawPoses
+from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.screening.hypotheses import ORDERS
 from stitch.session.reading.robot_description import moving_joints, poses_of_urdf, robot_from_urdf
 from stitch.session.robot import Robot, forward
@@ -48,7 +49,8 @@ class StatedTable:
 def require_known_word(flag: str, value: str | None, known: Collection[str]) -> None:
     """Refuse a word that a flag does not know."""
     if value is not None and value not in known:
-        raise InputError(f"{flag} {value}: to fix: use {', '.join(known)}")
+        name = flag.split(",")[0].strip("-").replace("-", "_")
+        raise Refusal(f"{flag} {value}:", Fix(f"use {', '.join(known)}", {name: name.upper()}))
 
 
 # The usual ones first: roll, pitch, yaw (FANUC, ROS, Yaskawa); A, B, C (KUKA); the others as they come.
@@ -68,6 +70,11 @@ class Reading:
     layout: ColumnLayout
     rank: int  # of the usual, 0 first
     variant: str = ""  # what else was done to the numbers: an axis added, a joint uncoupled
+
+    @property
+    def stated(self) -> dict[str, str]:
+        """Options of `stitch init` that state it."""
+        return {"rotation": self.rotation} | ({"angles": self.angle_unit} if self.angle_unit else {})
 
     @property
     def words(self) -> str:
@@ -103,7 +110,8 @@ def readings(layout: ColumnLayout, rotation: str | None = None, angle_unit: str 
         found = [r for r in found if r.rotation == stated]
         if not found:
             numbers = layout.rotation.shape[1]
-            raise InputError(f"--rotation {stated}: the rotation has {numbers} numbers; to fix: use one of {known}")
+            told = f"--rotation {stated}: the rotation has {numbers} numbers"
+            raise Refusal(told, Fix(f"use one of {known}", {"rotation": "ROTATION"}))
     return found
 
 
@@ -262,10 +270,8 @@ def joint_readings(layout: ColumnLayout, arm: Path | Robot | None, angle_unit: s
     joints = layout.joints
     assert joints is not None
     if arm is None:
-        raise InputError(
-            "joint angles need the robot; to fix: put the URDF into the folder, or give poses; with DH rows write "
-            "session.toml by hand"
-        )
+        words = "put the URDF into the folder, or give poses; with DH rows write session.toml by hand"
+        raise Refusal("joint angles need the robot", change(".", words))
     if isinstance(arm, Path) and (sliding := _readings_of_sliding_arm(arm, layout, angle_unit or layout.angle_unit)):
         return sliding
     robot = arm if isinstance(arm, Robot) else arm_from_urdf(arm, joints.shape[1])[0]

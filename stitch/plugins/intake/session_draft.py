@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
@@ -19,6 +18,7 @@ from stitch.plugins.intake.first_session import FirstSession
 from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.layouts import CLOUD_UNITS, MM, POSE_UNITS, covariate_columns
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, arm_from_urdf
+from stitch.plugins.intake.refusals import Fix, Refusal
 from stitch.plugins.intake.scan_targets import points_columns
 from stitch.session.reading.session_toml import SESSION_FORMAT
 from stitch.system.files import whole_file
@@ -34,8 +34,10 @@ def require_free(folder: Path, names: Iterable[str]) -> None:
     """
     for name in names:
         if (folder / name).exists() or (folder / name).is_symlink():
-            raise InputError(
-                f"{folder / name}: exists already; to fix: replace it with --force, or name another folder with -o"
+            raise Refusal(
+                f"{folder / name}: exists already",
+                Fix("replace it with --force", {"force": "yes"}),
+                Fix("name another folder with -o", {"output": "OUT"}),
             )
 
 

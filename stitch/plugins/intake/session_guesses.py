@@ -60,10 +60,10 @@ def _files_guess(files: FolderFiles, raw: RawPoses) -> Guess:
 def _pairing_guess(decided: ConventionChoice) -> Guess:
     pairing = decided.best.interpretation.pairing
     if pairing.by_name:
-        return Guess("pairing", pairing.words, "cloud and pose bear the same name, time or number", True, "--poses")
+        return Guess("pairing", pairing.words, "cloud and pose bear the same name, time or number", True, "--rows")
     reason = f"names do not tell it; under it {score_words(decided.best)}"
-    flag = "a column with the cloud's file name"
-    return Guess("pairing", pairing.words, reason, decided.determined, flag, by="scans")
+    states = {"rows": pairing.stated}
+    return Guess("pairing", pairing.words, reason, decided.determined, "--rows", by="scans", states=states)
 
 
 def _columns_guess(raw: RawPoses, decided: ConventionChoice, stated: StatedFolder) -> Guess:
@@ -77,7 +77,8 @@ def _columns_guess(raw: RawPoses, decided: ConventionChoice, stated: StatedFolde
         return Guess("columns", ", ".join(stated.columns), f"stated with --columns{words}", True, "--columns")
     reason = ("the file names them" if layout.named else "told by their values") + words
     by: Because = "file" if layout.named else "scans"
-    return Guess("columns", layout.words, reason, layout.named or decided.determined, "--columns", by=by)
+    told = layout.named or decided.determined
+    return Guess("columns", layout.words, reason, told, "--columns", by=by, states=layout.stated)
 
 
 def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
@@ -87,12 +88,12 @@ def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
     if decided.overruled:
         named = ", as the columns are named" * best.layout.named
         reason = f"the scans contradict {decided.overruled}{named}; {score_words(decided.best)}"
-        return Guess("rotation", best.words, reason, decided.determined, "--rotation", by="scans")
+        return Guess("rotation", best.words, reason, decided.determined, "--rotation", by="scans", states=best.stated)
     if best.layout.convention is not None:
         sure = best.layout.sure or (decided.determined and not decided.only_believed)
         reason = f"only the names say so; {decided.only_believed or 'others'} would fit too"
         reason = "told by the file" if sure else reason
-        return Guess("rotation", best.words, reason, sure, "--rotation")
+        return Guess("rotation", best.words, reason, sure, "--rotation", states=best.stated)
     reason = score_words(decided.best)
     alike = [w.reading.words for w in decided.equivalent if w.reading.words != best.words]
     if alike:
@@ -104,7 +105,9 @@ def _rotation_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
         words = f"{other.interpretation.reading.words}, {direction}, {score_words(other)}"
     worse = None if other is None or not decided.best.misfit else other.misfit / decided.best.misfit
     worse_by = None if worse is None or not np.isfinite(worse) else round(worse, 3)
-    return Guess("rotation", best.words, reason, decided.determined, "--rotation", words, "scans", worse_by)
+    states, rival = best.stated, {} if other is None else other.interpretation.reading.stated
+    told = decided.determined
+    return Guess("rotation", best.words, reason, told, "--rotation", words, "scans", worse_by, states, rival)
 
 
 def _length_unit_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess:
@@ -118,7 +121,8 @@ def _length_unit_guess(decided: ConventionChoice, stated: StatedFolder) -> Guess
     reason = f"positions reach {reach:.4g}, that is {metres:.2f} m, as robots do; {score_words(decided.best)}"
     # The motions of the scans have a scale only where the unit of the clouds is known.
     by: Because = "scans" if stated.cloud_unit else "usual"
-    return Guess("length_unit", way.length_unit, reason, decided.determined, "--unit", by=by)
+    states = {"unit": way.length_unit}
+    return Guess("length_unit", way.length_unit, reason, decided.determined, "--unit", by=by, states=states)
 
 
 def _cloud_unit_guess(
@@ -136,4 +140,5 @@ def _cloud_unit_guess(
     known = stated.length_unit or decided.best.interpretation.reading.layout.length_unit
     by: Because = "scans" if known and decided.determined else "usual"
     reason = f"{size_words(clouds)}{words}"
-    return Guess("cloud_unit", own_units[0], reason, other is None, "--cloud-unit", other, by)
+    states, rival = {"cloud_unit": own_units[0]}, {"cloud_unit": other} if other else {}
+    return Guess("cloud_unit", own_units[0], reason, other is None, "--cloud-unit", other, by, None, states, rival)

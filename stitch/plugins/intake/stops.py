@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.plugins.intake.clock_times import times_of_both
@@ -14,6 +13,7 @@ from stitch.plugins.intake.cloud_pairs import LACKING, named_pairing
 from stitch.plugins.intake.layouts import POSE_UNITS, pose_units, recorded_times
 from stitch.plugins.intake.raw_poses import RawPoses
 from stitch.plugins.intake.readings import JOINT_ANGLES, Reading, StatedTable, all_readings
+from stitch.plugins.intake.refusals import Fix, Refusal
 
 # The arm stands if it turns (rad) and shifts (m) by less from this long (s) before to this long after.
 AROUND = 0.2
@@ -52,9 +52,12 @@ def rows_with_scans(raw: RawPoses, clouds: Sequence[Path], urdf: Path | None, st
     if len(stops) < _FEWEST or abs(len(stops) - count) > LACKING:
         if rows < _MANY * count:
             return raw
-        raise InputError(
-            f"{raw.source}: the arm stops {len(stops)} times in its {rows} rows, and there are {count} clouds; to fix: "
-            "keep one row for each cloud, with the cloud's file name beside it"
+        raise Refusal(
+            f"{raw.source}: the arm stops {len(stops)} times in its {rows} rows, and there are {count} clouds",
+            Fix(
+                "state the row of each cloud, in the order of their names, as with --rows 12,450,-,902",
+                {"rows": "ROWS"},
+            ),
         )
     return _picked(thin, stops, f"{len(stops)} stops of the arm in {rows} rows")
 

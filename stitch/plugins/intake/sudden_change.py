@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.convention_choice import Interpretation
 from stitch.plugins.intake.layouts import MM
+from stitch.plugins.intake.refusals import Fix, Refusal
 from stitch.screening.conventions import fit_hypotheses
 from stitch.screening.hypotheses import Hypothesis
 from stitch.screening.motions import FEWEST, TRANSLATION_M, MotionFit, RelativeScans, fit_motions
@@ -47,7 +47,17 @@ def require_no_change(clouds: Sequence[Path], motions: RelativeScans, ways: Sequ
         for k in range(_FEWEST_VIEWS, count - _FEWEST_VIEWS + 1):
             change = _change_at(hypothesis, motions, k)
             if change is not None and change[1].closed >= _FITS > as_it_stands.closed:
-                raise InputError(_change_message(clouds, k, *change, as_it_stands))
+                raise Refusal(_change_message(clouds, k, *change, as_it_stands), *_one_part_each(count, k))
+
+
+def _one_part_each(count: int, k: int) -> list[Fix]:
+    """Sessions of the views before the change, and of those from it on."""
+    first, last = f"1-{k}{',-' * (count - k)}", f"{'-,' * k}{k + 1}-{count}"
+    words = ("make one session of the scans before it", "another of those from it on")
+    return [
+        Fix(f"{told}, --rows={rows} -o {name}", {"rows": rows, "output": name})
+        for told, rows, name in zip(words, (first, last), ("before", "after"), strict=True)
+    ]
 
 
 def _within(motions: RelativeScans, first: int, end: int) -> RelativeScans:
@@ -97,7 +107,5 @@ def _change_message(clouds: Sequence[Path], k: int, change: Array, undone: Motio
     return (
         f"{clouds[0].parent}: a tool, the scanner, the part or the base changed at {clouds[k].name}: the scans before "
         f"it and those from it on fit each among themselves, by ({shift}) mm and {turn:.2f}° from another; with that "
-        f"undone {undone.closed:.0%} of the scanner's motions close, as it stands {as_it_stands.closed:.0%}; to fix: "
-        f"put the scans up to {clouds[k - 1].name} and those from {clouds[k].name} on, with their poses, into two "
-        "folders, a session each, or export all poses with one tool and base"
+        f"undone {undone.closed:.0%} of the scanner's motions close, as it stands {as_it_stands.closed:.0%}"
     )

@@ -97,11 +97,13 @@ def test_a_terminal_is_asked_what_cannot_be_told(raw, capsys, monkeypatch):
     answers = iter(["zyx-intrinsik", "", "", "zyx-intrinsic", "", "eye_in_hand", "y"])
     asked = []
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-    monkeypatch.setattr("typer.prompt", lambda text, default, err: asked.append(text) or next(answers) or default)
+    told = lambda text, err, default="": asked.append(text) or next(answers) or default  # noqa: E731
+    monkeypatch.setattr("typer.prompt", told)
     monkeypatch.setattr("typer.confirm", lambda text, default, err: next(answers) == "y")
     code, _, err = ended(capsys, "init", raw)
     assert code == 0, err
-    assert [text.split()[0] for text in asked] == ["rotation", "length_unit", "mount"] * 2
+    first = ["rotation", "length_unit", "mount"]
+    assert [text.split()[0] for text in asked] == [*first, "--rotation", *first[1:]]
     assert "--rotation zyx-intrinsik" in err
     text = (raw / "session.toml").read_text(encoding="utf-8")
     assert "zyx-intrinsic" in text and 'mount = "eye_in_hand"' in text

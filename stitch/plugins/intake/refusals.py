@@ -1,0 +1,79 @@
+"""Refusals of a folder: what is wrong, and as data what leads on, options of `stitch init` or a change of a file."""
+
+import shlex
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from stitch.errors import InputError
+
+
+@dataclass(frozen=True)
+class Fix:
+    """One way on. An option whose value is in capitals is for a person to fill in."""
+
+    words: str
+    options: Mapping[str, str] = field(default_factory=dict)  # by name, `cloud_unit`; empty: asked again without it
+    file: Path | None = None  # to be changed as the words say
+    shows: tuple[str, ...] = ()  # lines that a person has to see to answer
+
+    def command(self, folder: Path) -> str:
+        """What is typed then."""
+        flags = (f"--{name.replace('_', '-')} {shlex.quote(value)}" for name, value in self.options.items() if value)
+        return " ".join(["stitch init", shlex.quote(str(folder)), *flags])
+
+    def python(self, folder: Path) -> str:
+        """The same from Python."""
+        options = (f"{name}={value!r}" for name, value in self.options.items() if value)
+        return f"stitch.init({', '.join([repr(str(folder)), *options])})"
+
+    def as_dict(self, folder: Path) -> dict[str, object]:
+        """As `stitch init --json` prints it."""
+        return {
+            "words": self.words,
+            "options": dict(self.options),
+            "file": str(self.file) if self.file else None,
+            "command": self.command(folder),
+            "python": self.python(folder),
+        }
+
+
+class Refusal(InputError):
+    """Bad input of a folder, with what leads on as data."""
+
+    def __init__(self, what: str, *fixes: Fix) -> None:
+        super().__init__(what, fix_cli=_joined(fix.words for fix in fixes), fix_python=_joined(_passed(f) for f in fixes))
+        self.fixes = fixes
+        # "--rotation xyz: to fix: …"
+        if what.endswith(":"):
+            self.what, self.fix_cli, self.fix_python = f"{what} to fix: {self.fix_cli}", "", ""
+
+    def named(self, scratch: Path, folder: Path) -> "Refusal":
+        """Return the same with a passing folder called by the name of the one that it stands for."""
+
+        def told(text: str) -> str:
+            return text.replace(str(scratch), str(folder))
+
+        fixes = [replace(f, words=told(f.words), file=f.file and Path(told(str(f.file)))) for f in self.fixes]
+        return Refusal(told(self.what), *fixes)
+
+
+def _joined(advice: Iterable[str]) -> str:
+    return ", or ".join(advice)
+
+
+def _passed(fix: Fix) -> str:
+    """The words for a program, where they are none but options."""
+    stated = all(not value.isupper() for value in fix.options.values()) and fix.words.startswith("state --")
+    return f"pass {', '.join(f'{name}={value!r}' for name, value in fix.options.items())}" if stated else fix.words
+
+
+def state(**options: str) -> Fix:
+    """Return the advice to state options."""
+    flags = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in options.items())
+    return Fix(f"state {flags}", options)
+
+
+def change(file: Path | str, words: str) -> Fix:
+    """Return the advice to change a file."""
+    return Fix(words, file=Path(file))
