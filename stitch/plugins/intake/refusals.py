@@ -1,7 +1,7 @@
 """Refusals of a folder: what is wrong, and as data what leads on, options of `stitch init` or a change of a file."""
 
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -42,7 +42,8 @@ class Refusal(InputError):
     """Bad input of a folder, with what leads on as data."""
 
     def __init__(self, what: str, *fixes: Fix) -> None:
-        super().__init__(what, fix_cli=_joined(fix.words for fix in fixes), fix_python=_joined(_passed(f) for f in fixes))
+        typed, passed = ", or ".join(fix.words for fix in fixes), ", or ".join(map(_passed, fixes))
+        super().__init__(what, fix_cli=typed, fix_python=passed)
         self.fixes = fixes
         # "--rotation xyz: to fix: …"
         if what.endswith(":"):
@@ -56,10 +57,6 @@ class Refusal(InputError):
 
         fixes = [replace(f, words=told(f.words), file=f.file and Path(told(str(f.file)))) for f in self.fixes]
         return Refusal(told(self.what), *fixes)
-
-
-def _joined(advice: Iterable[str]) -> str:
-    return ", or ".join(advice)
 
 
 def _passed(fix: Fix) -> str:
