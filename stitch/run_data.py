@@ -8,6 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from stitch.model.axis_places import AxisPlace, axis_places
 from stitch.model.model import Model, Term
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.hand_eye_fit import Repeatability
@@ -214,6 +215,11 @@ class RunData:
     def effects(self) -> list[str]:
         """Names of the effects in use."""
         return self.model.effects
+
+    @cached_property
+    def axes(self) -> tuple[AxisPlace, ...]:
+        """Where the external axes stand, with sigma."""
+        return axis_places(self.measurement, self.model)
 
     # Fields of `fit`.
 

@@ -23,7 +23,7 @@ from stitch.fit.fit import FitStart, FittedRig, InitialModel
 from stitch.fit.pipelines import coarse_stage, pipeline_for
 from stitch.fit.sentences import view_notes
 from stitch.fusion.register import DEFAULT, method_named
-from stitch.model.model_toml import ModelFile, arm_model, convert_unit, without_events
+from stitch.model.model_toml import ModelFile, arm_model, convert_unit, with_model_axes, without_events
 from stitch.observations.observability import unknown_numbers, unobservable
 from stitch.recorder import Recorder, RecorderMemory, SilentRecorder
 from stitch.run_data import Fit, LedgerStep, RunData, StageResult
@@ -87,6 +87,8 @@ def run_rig(
     """
     method_named(register)
     require_same_rig(sessions, model)
+    if model:
+        sessions = [with_model_axes(session, model) for session in sessions]
     recorders = recorders or [SilentRecorder() for _ in sessions]
     with library_threads_off():
         clock = Clock()
@@ -229,7 +231,7 @@ def _show_coarse_stage(
 
 def _initial_model(session: SessionData, effects: Sequence[str], arm: ModelFile | None) -> InitialModel | None:
     """Return what gives the model from which effects beside another run's arm are fitted; None without any."""
-    if not effects and not arm:
+    if not effects and not arm and not session.axes:
         return None
     from stitch.diagnosis.score import start_with_effects
 
@@ -444,7 +446,7 @@ def change(state: RunData, effects: Sequence[str], recorder: Recorder | None = N
         require_effects([measurement], effects)
         new = [name for name in effects if name not in state.model.effects]
         model = start_with_effects(session, new, None, measurement, state.model, state.gate)
-        model = model.with_terms([term for term in model.terms if term.name in effects])
+        model = model.with_terms([term for term in model.terms if term.is_geometry or term.name in effects])
         gate = COARSE_GATE * part_size([measurement.capture]) if session.has_clouds else float("nan")
         hand_eye = CoarseHandEye(state.T_mount_coarse, gate, "of the first run", ())
         coarse = _show_coarse_stage(session, measurement, hand_eye, clock.lap(), recorder)

@@ -242,10 +242,14 @@ class Run(RunData):
     @property
     def stitched(self) -> Stitched:
         """The stitched cloud (N, 3) with normals and residuals, reference frame."""
-        frame = "flange" if self.session.mount == "eye_to_hand" else "base"
         fused = self.fused
         return Stitched(
-            fused.points, fused.normals, fused.residual, fused.count, frame=frame, length_unit=self.session.length_unit
+            fused.points,
+            fused.normals,
+            fused.residual,
+            fused.count,
+            frame=self.session.reference_frame,
+            length_unit=self.session.length_unit,
         )
 
     @property

@@ -86,6 +86,8 @@ def _show_effect(effect: Effect) -> None:
         "joint": ", one a joint",
         "torque": ", one a gravity torque",
         "twist": ", a twist: rx … tz",
+        "rotary": ", one or more a rotary axis",
+        "linear": ", one or more a linear axis",
     }
     lines = [f"{effect.name} ({effect.tier}), at {effect.place}: {PLACES[effect.place]}", f"  {effect.formula}"]
     for key, spec in effect.specs.items():

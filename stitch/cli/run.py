@@ -335,7 +335,7 @@ def show_report(result: RunData, tolerance: float | None = None, with_hand_eye: 
     """Print what a run found: a headline, what to do about it, numbers in a block, the hand-eye, and notes."""
     from stitch.output.comparison.model_history import model_history
     from stitch.output.comparison.run_verdict import run_headline
-    from stitch.output.fit_report import report_rows, run_hand_eye_lines
+    from stitch.output.fit_report import axis_lines, report_rows, run_hand_eye_lines
     from stitch.run_data import doubt_remedy
 
     say(f"{result.session.name}: {run_headline(result, model_history(result))}", bold=True)
@@ -346,6 +346,8 @@ def show_report(result: RunData, tolerance: float | None = None, with_hand_eye: 
     for note in result.notes[:excluded]:
         say(note, bold=True)
     show_light(result, tolerance)
+    for line in axis_lines(result):
+        say(line, hang=2)
     rows = report_rows(result)
     if not in_full():
         show_block([rows[0], rows[2]])  # error on views left out, sensor's noise

@@ -11,10 +11,10 @@ from stitch.effects.contract import (
     Effect,
     Parameter,
     by_joint,
+    is_asked,
     missing_need,
     one_by_one,
     parameters_in,
-    stands_still,
     without_offset,
 )
 from stitch.effects.empirical import empirical_effects
@@ -89,8 +89,9 @@ class Candidate:
 def candidates_of(linear: LinearModel, empirical: bool = True) -> tuple[list[Candidate], dict[str, tuple[str, ...]]]:
     """Return physical, user and (if asked for) empirical effects that are not in the model, and what unavailable ones
     lack."""
-    in_use = linear.model.effects
-    library = [e for e in EFFECTS.values() if e.name not in in_use and not stands_still(linear.measurement, e)]
+    in_use = [term.name for term in linear.model.terms]
+    # What holds still is asked nothing, and of axes nobody is told who has none.
+    library = [e for e in EFFECTS.values() if e.name not in in_use and is_asked(linear.measurement, e)]
     missing = {e.name: needs for e in library if (needs := missing_need(linear.measurement, e))}
     effects = [e for e in library if e.name not in missing]
     shapes = empirical_effects(linear.measurement.views) if empirical else []

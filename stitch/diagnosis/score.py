@@ -22,7 +22,7 @@ from stitch.diagnosis.candidates import Candidate, Form, candidate_of
 from stitch.diagnosis.regime import regime_of
 from stitch.effects.contract import find_effect
 from stitch.fit.pipelines import linearise
-from stitch.model.model import Model, term_of
+from stitch.model.model import Model, geometry_terms, term_of
 from stitch.model.model_toml import ModelFile, bind_to_session
 from stitch.numerics.distributions import chi2_limit, f_tail
 from stitch.numerics.frames import Array, Mask
@@ -262,6 +262,8 @@ def start_with_effects(
     if arm:
         known_arm = bind_to_session(arm, measurement)
         model = replace(model, terms=known_arm.terms, effects_covariance=known_arm.effects_covariance)
+    if not any(term.is_geometry for term in model.terms):
+        model = model.with_terms([*geometry_terms(measurement), *model.terms])
     terms = [term_of(measurement, find_effect(name)) for name in effects]
     if any(term.gridded.any() for term in terms):
         linear = linearise(session, measurement, model, gate)

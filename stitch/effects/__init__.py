@@ -3,7 +3,7 @@
 Importing the package registers the library; `user_file.load` adds a user's own.
 """
 
-from stitch.effects import empirical, library
+from stitch.effects import axis_effects, empirical, library
 from stitch.effects.contract import (
     EFFECTS,
     Effect,
@@ -22,6 +22,7 @@ __all__ = [
     "EFFECTS",
     "Effect",
     "Parameter",
+    "axis_effects",
     "effect",
     "empirical",
     "event",

@@ -17,6 +17,7 @@ import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.units import Amount, format_amount
+from stitch.session.axes import KINDS, Axis
 from stitch.session.measurement import Measurement
 
 # Stands for all views of the session in a grid.
@@ -27,6 +28,7 @@ PLACES = {
     "sensor": "(points (N, 3) at x*, view: ScanView, parameters) → points (N, 3) that the scanner reports",
     "robot": "(joints (V, n) reported, views: Views, parameters) → true joints (V, n)",
     "links": "(links: Links, views: Views, parameters) → Links",
+    "axis": "(motion: AxisMotion, views: Views, parameters) → AxisMotion of the external axes",
     "mount": "(views: Views, parameters) → twists (V, 6): the mount is M·exp(twist)",
     "part": "(views: Views, parameters) → twists (V, 6): the part sits displaced by exp(twist), reference frame",
     "shape": "(points (N, 3) of the part in the reference frame, view: ScanView, parameters) → displaced points",
@@ -45,6 +47,9 @@ _WHERE_FROM = {
     "intensity": "an intensity for every point",
     "optics": "a sensor with optics that has all points ahead of it (kind area, line or camera under [scanner])",
     "surfaces": "a sensor that scans surfaces (kind area or line under [scanner])",
+    "axis": "an external axis ([[axis]] in session.toml)",
+    "rotary_axis": "a rotary axis ([[axis]] in session.toml)",
+    "linear_axis": "a linear axis ([[axis]] in session.toml)",
     "gravity_at_mount": "a scanner that the robot turns against gravity",
     "gravity_at_part": "a part that the robot turns against gravity",
 }
@@ -54,7 +59,7 @@ _WHERE_FROM = {
 class Spec:
     """How an argument of the function becomes parameters."""
 
-    kind: str  # number | vector | offset | joint | torque | twist
+    kind: str  # number | vector | offset | joint | torque | twist | rotary | linear
     unit: str
     typical: float
     limit: float
@@ -95,6 +100,11 @@ def per_joint(unit: str, typical: float, limit: float) -> Spec:
 def per_torque(unit: str, typical: float, limit: float) -> Spec:
     """Return one number for each gravity torque that `Views.sag` knows: c1 … cn with masses, c2_3 … without."""
     return Spec("torque", unit, typical, limit)
+
+
+def per_axis(kind: str, unit: str, typical: float, limit: float, axes: Sequence[str] = ("",)) -> Spec:
+    """Return an array (K·a,) with a numbers for each of the K external axes of a kind, rotary or linear: Au_table."""
+    return Spec(kind, unit, typical, limit, axes=tuple(axes))
 
 
 def twist(
@@ -175,7 +185,7 @@ class Effect:
     function: Callable[..., Any]
     needs: tuple[str, ...]  # joints, torque, velocity, intensity, or the name of a covariate
     prefers: tuple[str, ...]  # covariates used where present
-    tier: str  # physical | empirical | user
+    tier: str  # physical | empirical | user | geometry: in every model of a session that has it, and no candidate
     group: str = ""  # covariate that an empirical effect follows
 
     @property
@@ -183,12 +193,18 @@ class Effect:
         """The first line of the function's docstring."""
         return (self.function.__doc__ or "").strip().splitlines()[0]
 
-    def parameters(self, joints: int, torques: Sequence[str], length_unit: str) -> tuple[Parameter, ...]:
+    def parameters(
+        self, joints: int, torques: Sequence[str], length_unit: str, axes: Sequence[Axis] = ()
+    ) -> tuple[Parameter, ...]:
         """Return all parameters for an arm of n joints at zero, in the session's unit."""
         named = [
             (key, spec, name)
             for key, spec in self.specs.items()
-            for name in _parameter_names(key, spec, joints, torques)
+            for name in (
+                [f"{key}{part}_{axis.name}" for axis in axes if axis.kind == spec.kind for part in spec.axes]
+                if spec.kind in KINDS
+                else _parameter_names(key, spec, joints, torques)
+            )
         ]
         return tuple(_parameter(key, spec, name, length_unit) for key, spec, name in named)
 
@@ -284,7 +300,7 @@ def parameters_in(measurement: Measurement, effect: Effect) -> tuple[Parameter, 
             grid=events if p.grid == EVERY_VIEW else p.grid,
             names=views.names if p.discrete else (),
         )
-        for p in effect.parameters(views.joints.shape[1], views.torques.names, measurement.length_unit)
+        for p in effect.parameters(views.joints.shape[1], views.torques.names, measurement.length_unit, views.axes.axes)
     )
 
 
@@ -305,6 +321,13 @@ def missing_need(measurement: Measurement, effect: Effect) -> tuple[str, ...]:
 def stands_still(measurement: Measurement, effect: Effect) -> bool:
     """Return whether an effect is one of what hangs at the flange where that does not: the part, or the scanner."""
     return ("gravity_at_mount" if measurement.eye_to_hand else "gravity_at_part") in effect.needs
+
+
+def is_asked(measurement: Measurement, effect: Effect) -> bool:
+    """Return whether an effect is a candidate here, or one that a user may like to know of."""
+    if effect.tier == "geometry" or stands_still(measurement, effect):
+        return False
+    return effect.place != "axis" or bool(measurement.views.axes)
 
 
 def require_available(measurement: Measurement, effect: Effect) -> None:
@@ -328,7 +351,12 @@ def describe_need(need: str) -> str:
 
 
 def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Return indices of the parameters of each joint; empty for an effect without joints."""
+    """Return indices of the parameters of each joint or external axis; empty for an effect without them."""
+    if effect.place == "axis":
+        of_axes: dict[str, list[int]] = {}
+        for i, parameter in enumerate(parameters):
+            of_axes.setdefault(parameter.name.partition("_")[2], []).append(i)
+        return list(of_axes.values())
     if not any(spec.kind in ("joint", "torque") for spec in effect.specs.values()):
         return []
     letters = sorted(effect.specs, key=len, reverse=True)

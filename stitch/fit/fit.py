@@ -147,6 +147,24 @@ def fitted_parameters(terms: Sequence[Term], before: Mask, whitened: Callable[[M
         whitened: the observation in units of the scatter that is left when some parameters explain theirs.
     """
     sizes = sizes_of(terms)
+    geometry = np.array([term.is_geometry and not p.held for term in terms for p in term.parameters], bool)
+    if geometry.any():
+        # Where an axis stands is asked as the hand-eye is, before anything that may go wrong.
+        data = whitened(before | geometry)
+        shown = geometry & independent(data.base, data.further * geometry, sizes, 1 / UNSEEN)
+        others = [term for term in terms if not term.is_geometry]
+        if not others:
+            return shown
+        there = np.array([not term.is_geometry for term in terms for _ in term.parameters], bool)
+
+        def beside(free: Mask) -> WhitenedData:
+            whole = shown.copy()
+            whole[there] = free
+            seen = whitened(whole)
+            return WhitenedData(np.hstack([seen.base, seen.further[:, shown]]), seen.further[:, there], seen.z)
+
+        shown[there] = fitted_parameters(others, before[there], beside)
+        return shown
     groups, effects, first = list[list[int]](), list[int](), 0
     for number, term in enumerate(terms):
         if not any(p.kept for p in term.parameters):

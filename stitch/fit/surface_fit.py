@@ -93,7 +93,9 @@ def fit_surfaces(
     model = replace(
         step.model,
         terms=with_parameter_values(terms, values_of(terms), sigmas),
-        effects_covariance=covariance_of_fit(terms, fitted, hand_eye.values_covariance, kept),
+        effects_covariance=covariance_of_fit(
+            terms, fitted, hand_eye.values_covariance, kept, hand_eye.visible_covariance
+        ),
     )
     captures, unconstrained = _free_views(measurements, model, [f.overlaps.gate for f in linearised.unconstrained])
     overlaps = tuple(_final_overlaps(c, model.T_mount, gate) for c, gate in zip(captures, gates, strict=True))
@@ -128,7 +130,7 @@ class LinearisedSurfaces:
         fitted = np.zeros(len(held), bool) if before is None else before[0]
         fitted = fitted_parameters(self.model.terms, fitted, self._whitened)
         omitted = omitted_rms(self._whitened(fitted), sizes_of(self.model.terms), fitted, self._effect_of_parameter)
-        return fitted, np.where(held, 0.0, omitted), scanner_errors
+        return fitted, np.where(held | self._is_gauge, 0.0, omitted), scanner_errors
 
     def solve(self, choice: Choice, errors: PoseErrors | None = None) -> "SurfaceStep":
         """Return the step, with a covariance that counts how poses may err; without, one of scatter alone."""
@@ -172,6 +174,12 @@ class LinearisedSurfaces:
     def _effect_of_parameter(self) -> Indices:
         """(P,) index of the effect of every parameter."""
         return np.array([k for k, term in enumerate(self.model.terms) for _ in term.parameters], int)
+
+    @property
+    def _is_gauge(self) -> Mask:
+        """(P,) places of axes where no robot says how their common frame stands: what is not fitted is free."""
+        is_free = any(m.views.axes and not m.views.axes.has_robot for m in self.measurements)
+        return np.array([is_free and term.is_geometry for term in self.model.terms for _ in term.parameters], bool)
 
     @property
     def _held(self) -> Mask:

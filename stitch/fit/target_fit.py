@@ -81,11 +81,17 @@ def fit_targets(sessions: Sequence["TargetSession"], recorder: Recorder) -> list
     of_effects = slice(linearised.base.shape[2], None)
     sigmas = known_sigmas(terms, step.choice, np.sqrt(np.diag(covariance)[of_effects]))
     terms = with_parameter_values(terms, values_of(terms), sigmas)
-    effects_covariance = covariance_of_fit(terms, step.choice, covariance[of_effects, of_effects], kept)
     fits = []
     for k, (before, after) in enumerate(zip(linearised.sessions, moved, strict=True)):
         unknowns = linearised.unknowns_of[k]
         of_session = covariance[unknowns, unknowns]
+        effects_covariance = covariance_of_fit(
+            terms,
+            step.choice,
+            covariance[of_effects, of_effects],
+            kept,
+            np.hstack([of_session[:6, :6], covariance[unknowns, of_effects][:6]]),
+        )
         final = replace(
             after, model=Model(after.model.T_mount, terms, of_session[:6, :6], effects_covariance=effects_covariance)
         )

@@ -15,6 +15,7 @@ from pykdtree.kdtree import KDTree
 from stitch.model.model import ARM_PLACES, Model, Term
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
+from stitch.session.axes import AxisMotion
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement, ScanView
 from stitch.session.robot import FlangeSlopes, Links, exact_links, flange_slopes, forward, forward_with_errors
@@ -32,6 +33,7 @@ class ChainErrors:
     links: Links  # as they truly are
     mount: Array  # (V, 6) twist right of the hand-eye
     part: Array  # (V, 6) twist of the part in the reference frame
+    axes: AxisMotion | None = None  # of the external axes, as they truly move
 
 
 def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErrors | None = None) -> ChainErrors:
@@ -39,8 +41,9 @@ def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErr
     views = measurement.views
     if base is None:
         right = exact_links(*views.joints.shape)
-        base = ChainErrors(views.joints, right, np.zeros((views.count, 6)), np.zeros((views.count, 6)))
-    joints, mount, part = base.joints, base.mount, base.part
+        axes = views.axes.as_read() if views.axes else None
+        base = ChainErrors(views.joints, right, np.zeros((views.count, 6)), np.zeros((views.count, 6)), axes)
+    joints, mount, part, axes = base.joints, base.mount, base.part, base.axes
     # A user's own effect may change the links that it is given in place.
     links = Links(*(value.copy() for value in vars(base.links).values()))
     for term in terms:
@@ -54,7 +57,9 @@ def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErr
             mount = mount + function(views, **arguments)
         elif term.effect.place == "part":
             part = part + function(views, **arguments)
-    return ChainErrors(joints, links, mount, part)
+        elif term.effect.place == "axis":
+            axes = function(axes, views, **arguments)
+    return ChainErrors(joints, links, mount, part, axes)
 
 
 def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[Array, Array]:
@@ -65,6 +70,8 @@ def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[A
         true = forward_with_errors(measurement.robot, errors.joints, errors.links)
         # A reported pose that differs from the nominal kinematics (a calibrated controller) keeps its difference.
         T_base_flange = T_base_flange @ frames.inverse(forward(measurement.robot, measurement.views.joints)) @ true
+    if errors.axes is not None and any(term.effect.place == "axis" for term in terms):
+        T_base_flange = measurement.views.axes.correction(errors.axes) @ T_base_flange
     left = frames.inverse(T_base_flange) if measurement.eye_to_hand else T_base_flange
     return frames.exp(-errors.part) @ left, frames.exp(errors.mount)
 
@@ -219,7 +226,7 @@ def pose_derivatives(measurement: Measurement, model: Model, terms: Sequence[Ter
     in_use = chain_errors(measurement, model.terms)
     for term in terms:
         others = in_use
-        if term.name in model.effects:
+        if any(used.name == term.name for used in model.terms):
             others = chain_errors(measurement, model.without(term.name).terms)
         errors = chain_errors(measurement, [term], others)
         if chain is None or not chain.is_about(errors):
@@ -229,7 +236,7 @@ def pose_derivatives(measurement: Measurement, model: Model, terms: Sequence[Ter
         fitted = [i for i, p in enumerate(term.parameters) if not p.discrete]
         steps = [[chain_errors(measurement, [moved], others) for moved in _stepped(term, i, sizes[i])] for i in fitted]
         if steps:
-            twists = chain.twists(steps, term.effect.place in ARM_PLACES)
+            twists = chain.twists(steps, term.effect.place)
             derivatives[fitted] = twists / (2 * np.array(sizes)[fitted, None, None])
         yield derivatives
 
@@ -245,13 +252,24 @@ class _ChainJacobian:
 
     def is_about(self, errors: ChainErrors) -> bool:
         """Return whether errors are those of this model: of the same effects, summed in another order, they are."""
-        arrays, others = ((e.joints, *vars(e.links).values(), e.mount, e.part) for e in (self.errors, errors))
+        arrays, others = (
+            (e.joints, *vars(e.links).values(), e.mount, e.part, *(vars(e.axes).values() if e.axes else ()))
+            for e in (self.errors, errors)
+        )
         pairs = zip(arrays, others, strict=True)
         return all(np.array_equal(a, b) or np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in pairs)
 
-    def twists(self, steps: Sequence[Sequence[ChainErrors]], of_arm: bool) -> Array:
-        """Return (P, V, 6) left twists of the views between the two errors of each step, near these."""
-        if of_arm and self.measurement.robot is not None:
+    def twists(self, steps: Sequence[Sequence[ChainErrors]], place: str) -> Array:
+        """Return (P, V, 6) left twists of the views between the two errors of each step, near these.
+
+        Args:
+            place: in the chain, of what was stepped.
+        """
+        if place == "axis":
+            carried = self.measurement.views.axes.carried
+            moved = [frames.log(carried(up.axes) @ frames.inverse(carried(down.axes))) for up, down in steps]
+            return _apply_matrices(self.of_base, np.array(moved))
+        if place in ARM_PLACES and self.measurement.robot is not None:
             moved = []
             for up, down in steps:
                 links = {name: value - getattr(down.links, name) for name, value in vars(up.links).items()}
@@ -275,6 +293,13 @@ class _ChainJacobian:
             # (T·exp ξ)⁻¹ = exp(−ξ)·T⁻¹: the flange's own side stands left.
             return -frames.adjoint(self.to_centre @ frames.exp(-self.errors.part))
         return frames.adjoint(self._left)
+
+    @cached_property
+    def of_base(self) -> Array:
+        """(V, 6, 6) for twists left of the flange's effective pose."""
+        if self.measurement.eye_to_hand:
+            return -frames.adjoint(self._left)
+        return frames.adjoint(self.to_centre @ frames.exp(-self.errors.part))
 
     @cached_property
     def of_mount(self) -> Array:

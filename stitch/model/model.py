@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stitch.effects.contract import Effect, Parameter, parameters_in
+from stitch.effects.axis_effects import PLACEMENT
+from stitch.effects.contract import Effect, Parameter, find_effect, parameters_in
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Mask
 from stitch.numerics.units import METRES, value_uncertainty_text
@@ -45,6 +46,11 @@ class Term:
     def name(self) -> str:
         """That of the effect."""
         return self.effect.name
+
+    @property
+    def is_geometry(self) -> bool:
+        """True if it says where something stands and not what goes wrong: in every model that can have it."""
+        return self.effect.tier == "geometry"
 
     @property
     def sigmas_from_zero(self) -> float:
@@ -96,6 +102,8 @@ class EffectsCovariance:
 
     names: tuple[str, ...] = ()  # effect.parameter
     matrix: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (K, K)
+    # With axes: (6, 6 + K) of T·exp(ξ) with itself, as far as the motions show it, and with the parameters; else empty.
+    with_hand_eye: Array = field(default_factory=lambda: np.zeros((6, 0)))
 
     def root(self, terms: Sequence[Term]) -> Array:
         """Return (P, K) L with L·Lᵀ the covariance of all parameters of some terms, zero where nothing is known of one.
@@ -151,7 +159,7 @@ class Model:
     @property
     def effects(self) -> list[str]:
         """Names of the effects in use."""
-        return [term.name for term in self.terms]
+        return [term.name for term in self.terms if not term.is_geometry]
 
     def with_terms(self, terms: Sequence[Term]) -> "Model":
         """Return the model with other effects in use.
@@ -184,6 +192,18 @@ class Model:
         effects = ", ".join(self.effects) or "no effects"
         position = ", ".join(f"{x:.4g}" for x in self.T_mount[:3, 3])
         return f"Model(hand-eye at ({position}), {effects}, {len(self.targets)} targets)"
+
+
+def geometry_terms(measurement: Measurement) -> tuple[Term, ...]:
+    """Return what every model of a session fits beside the hand-eye, at zero: where its axes stand."""
+    axes = measurement.views.axes
+    if not axes:
+        return ()
+    term = term_of(measurement, find_effect(PLACEMENT))
+    still = {axis.name for k, axis in enumerate(axes.axes) if axis.is_fixed or k == axes.own}
+    # One that is used as given is held as what another run knows is.
+    parameters = [replace(p, kept=p.name.partition("_")[2] in still) for p in term.parameters]
+    return (Term(term.effect, tuple(parameters)),)
 
 
 def term_of(measurement: Measurement, effect: Effect) -> Term:
@@ -229,14 +249,23 @@ def kept_root(terms: Sequence[Term], covariance: EffectsCovariance) -> Array:
     return root[:, (root != 0).any(axis=0)]
 
 
-def covariance_of_fit(terms: Sequence[Term], fitted: Mask, matrix: Array, kept: Array) -> EffectsCovariance:
+def covariance_of_fit(
+    terms: Sequence[Term], fitted: Mask, matrix: Array, kept: Array, with_hand_eye: Array | None = None
+) -> EffectsCovariance:
     """Return that of the fitted parameters (K of P, bool) with their matrix (K, K), beside those kept, with their root
-    (P, L)."""
+    (P, L); `with_hand_eye` (6, 6 + K) counts where there are axes."""
     names = [f"{term.name}.{p.name}" for term in terms for p in term.parameters]
     whole = kept @ kept.T
     whole[np.ix_(fitted, fitted)] += matrix
     known = np.diag(whole) > 0
-    return EffectsCovariance(tuple(n for n, k in zip(names, known, strict=True) if k), whole[np.ix_(known, known)])
+    covariance = EffectsCovariance(
+        tuple(n for n, k in zip(names, known, strict=True) if k), whole[np.ix_(known, known)]
+    )
+    if with_hand_eye is None or not any(term.is_geometry for term in terms):
+        return covariance
+    beside = np.zeros((6, len(names)))
+    beside[:, fitted] = with_hand_eye[:, 6:]
+    return replace(covariance, with_hand_eye=np.hstack([with_hand_eye[:, :6], beside[:, known]]))
 
 
 def printed_covariance(T_mount: Array, covariance: Array) -> Array:

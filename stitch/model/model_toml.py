@@ -18,8 +18,10 @@ from stitch.model.model import ARM_PLACES, EffectsCovariance, Model, Target, Ter
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, is_rigid
 from stitch.numerics.units import METRES
+from stitch.session.axes import place_axes
 from stitch.session.measurement import Measurement
 from stitch.session.reading.text_files import optional_text, read_toml, table_choice
+from stitch.session.session import SessionData
 
 FORMAT = "stitch-model/1"
 # What rounding, or a hand that writes six digits, does to a matrix of unit diagonal.
@@ -49,6 +51,7 @@ class ModelFile:
     effects_file: str | None = None  # Python file with effects of the user's own
     targets: dict[str, Target] = field(default_factory=dict)  # of a session with labelled points
     effects_covariance: EffectsCovariance = field(default_factory=EffectsCovariance)  # stands in result.json
+    axes: dict[str, tuple[Array, Array | None]] = field(default_factory=dict)  # direction and point before placement
 
 
 def write_model(model: ModelFile, path: Path) -> None:
@@ -74,6 +77,12 @@ def write_model(model: ModelFile, path: Path) -> None:
             if target.orientation is not None:
                 targets[name]["orientation"] = target.orientation
         document["targets"] = {name: {k: v.tolist() for k, v in table.items()} for name, table in targets.items()}
+    if model.axes:
+        # Where the fit began; axis_placement counts from there.
+        document["axes"] = {
+            name: {"direction": direction.tolist(), **({} if point is None else {"point": point.tolist()})}
+            for name, (direction, point) in model.axes.items()
+        }
     if model.effects_file:
         document["effects_file"] = model.effects_file
     header = _HEADER.format(frame=f"T_{carrier}_scanner", carrier=carrier, unit=model.length_unit)
@@ -129,6 +138,41 @@ def read_model(path: Path | str) -> ModelFile:
         effects=_effects(path, document.get("effects", {})),
         effects_file=optional_text(path, document, "", "effects_file"),
         targets=_targets(path, document.get("targets", {})),
+        axes=_axes(path, document.get("axes", {})),
+    )
+
+
+def _axes(path: Path, tables: Any) -> dict[str, tuple[Array, Array | None]]:
+    try:
+        axes = {
+            str(name): (np.array(t["direction"], float), np.array(t["point"], float) if "point" in t else None)
+            for name, t in tables.items()
+        }
+        if any(v is not None and (v.shape != (3,) or not np.isfinite(v).all()) for pair in axes.values() for v in pair):
+            raise ValueError
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
+        raise InputError(
+            f"{path}: axes must be tables such as [axes.table] with direction, point; to fix: three numbers each"
+        ) from None
+    return axes
+
+
+def with_model_axes(session: SessionData, file: ModelFile) -> SessionData:
+    """Return the session with its axes where a model's placement counts from.
+
+    Raises:
+        InputError: an axis that the model does not know, or one of it that the session has not.
+    """
+    own, known = [axis.name for axis in session.axes], list(file.axes)
+    if sorted(own) != sorted(known):
+        raise InputError(
+            f"{session.path}: its axes are {', '.join(own) or 'none'}, those of the model {', '.join(known) or 'none'}"
+            "; to fix: give both the same [[axis]] tables"
+        )
+    if not own:
+        return session
+    return place_axes(
+        session, [replace(a, direction=file.axes[a.name][0], point=file.axes[a.name][1]) for a in session.axes]
     )
 
 
@@ -284,6 +328,7 @@ def convert_unit(file: ModelFile, length_unit: str) -> ModelFile:
     known = file.effects_covariance
     units = {f"{name}.{key}": p.unit for name, parameters in file.effects.items() for key, p in parameters.items()}
     factors = np.array([factor ** _power(units.get(name, ""), file.length_unit) for name in known.names])
+    beside = np.append(scale, factors)
     return replace(
         file,
         length_unit=length_unit,
@@ -294,7 +339,12 @@ def convert_unit(file: ModelFile, length_unit: str) -> ModelFile:
             name: {key: _rescaled(p, file.length_unit, length_unit, factor) for key, p in parameters.items()}
             for name, parameters in file.effects.items()
         },
-        effects_covariance=replace(known, matrix=known.matrix * np.outer(factors, factors)),
+        effects_covariance=replace(
+            known,
+            matrix=known.matrix * np.outer(factors, factors),
+            with_hand_eye=known.with_hand_eye * np.outer(scale, beside[: known.with_hand_eye.shape[1]]),
+        ),
+        axes={name: (d, None if point is None else point * factor) for name, (d, point) in file.axes.items()},
         targets={
             name: Target(t.position * factor, t.sigma * factor, t.orientation) for name, t in file.targets.items()
         },

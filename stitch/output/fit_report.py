@@ -31,6 +31,7 @@ def fit_report(run: RunData, at_part: tuple[float, float]) -> str:
         f"  {run_verdict(run, model_history(run))}",
         f"[[Hand-eye]] {name.removeprefix('Hand-eye ')}",
         *numbers,
+        *axis_lines(run),
         f"  U at the part {'not known' if run.unknown else f'{place} mm and {turn} mrad'}",
         *_part("Errors", _aligned(_errors(run))),
         *_part("Effects", _aligned((f"{effect}.{p.name}", str(p.formatted)) for effect, p in _fitted(run))),
@@ -52,6 +53,13 @@ def run_hand_eye_lines(run: RunData) -> list[str]:
         unknown=run.unknown,
         stated=run.session.scanner.T_mount is not None,
     )
+
+
+def axis_lines(run: RunData) -> list[str]:
+    """Return where the external axes stand with U (k = 2); none without axes."""
+    where = "base frame" if run.session.has_poses else "scanner's frame"
+    unit = run.session.length_unit
+    return [f"Axis {place.line(unit)} ({where})" for place in run.axes]
 
 
 def report_rows(run: RunData) -> list[tuple[str, str]]:
@@ -98,7 +106,9 @@ def _errors(run: RunData) -> list[tuple[str, str]]:
 
 def _fitted(run: RunData) -> list[tuple[str, Parameter]]:
     """Return parameters that were fitted or tried, with the names of their effects."""
-    return [(term.name, p) for term in run.terms for p in term.parameters if p.fitted or p.grid]
+    return [
+        (term.name, p) for term in run.terms for p in term.parameters if (p.fitted or p.grid) and not term.is_geometry
+    ]
 
 
 def _history(run: RunData) -> list[tuple[str, str]]:

@@ -29,6 +29,11 @@ DESCRIPTIONS = {
     "field_curvature": "the scanner sees a flat surface bent",
     "lens_distortion": "the scanner's lens distorts",
     "scanner_thermal_scale": "the scanner's scale changes with its warmth",
+    "axis_eccentricity": "a table runs out of true sideways, once a turn",
+    "axis_wobble": "a table wobbles, once a turn",
+    "axis_scale": "a rail counts its way too long or too short",
+    "axis_pitch": "a rail's carriage tips or yaws along its way",
+    "axis_backlash": "an external axis has play",
 }
 # What ends an effect at the machine; the scans at hand are saved by adding it to the model.
 REMEDIES = {
@@ -56,6 +61,11 @@ REMEDIES = {
     "field_curvature": "have the scanner calibrated, or use the middle of its field",
     "lens_distortion": "have the scanner calibrated, or use the middle of its field",
     "scanner_thermal_scale": "let the scanner warm up before scanning",
+    "axis_eccentricity": "have the table's bearing checked; until then keep the effect in the model",
+    "axis_wobble": "have the table's bearing checked; until then keep the effect in the model",
+    "axis_scale": "have the rail measured, or write its scale into the controller",
+    "axis_pitch": "have the rail aligned; until then keep the effect in the model",
+    "axis_backlash": "approach every reading from the same side",
 }
 # The same of one joint.
 JOINT_DESCRIPTIONS = {

@@ -33,6 +33,7 @@ from stitch.output.schema import (
     array_of,
     list_of,
     number,
+    plain,
     table_of,
 )
 from stitch.run_data import ExcludedView, Fit, LedgerStep, Note, RunData, StageResult, Unsupported, ViewLinks
@@ -76,6 +77,7 @@ def model_of(run: RunData) -> ModelFile:
         effects_file=run.effects_file if uses_file else None,
         targets=_targets(run.targets),
         effects_covariance=run.model.effects_covariance,
+        axes={a.name: (a.direction, a.point) for a in run.session.axes if a.direction is not None},
     )
 
 
@@ -155,7 +157,8 @@ def effects_covariance(document: dict[str, Any], file: Path) -> EffectsCovarianc
     """
     if not (stated := document.get("effects_covariance")):
         return EffectsCovariance()
-    names, rows = _COVARIANCE.fields(stated).values()
+    known = _COVARIANCE.fields(stated)
+    names, rows = known["names"], known["matrix"]
     if [len(row) for row in rows] != [len(names)] * len(names):
         raise InputError(
             f"{file}: effects_covariance.matrix is not {len(names)}x{len(names)} for its {len(names)} parameters; "
@@ -164,7 +167,8 @@ def effects_covariance(document: dict[str, Any], file: Path) -> EffectsCovarianc
     matrix = np.array(rows, float).reshape(len(names), len(names))
     if not np.isfinite(matrix).all() or (np.diag(matrix) <= 0).any():
         raise InputError(f"{file}: effects_covariance holds no variances; to fix: run `stitch run` again")
-    return EffectsCovariance(names, matrix)
+    beside = np.array(known.get("with_hand_eye", []), float)
+    return EffectsCovariance(names, matrix, beside.reshape(6, -1))
 
 
 def restore_counted_targets(measurement: Measurement, session: SessionData, document: dict[str, Any]) -> Measurement:
@@ -248,6 +252,11 @@ def _all_views(run: RunData) -> list[ViewRow]:
     return [rows[place] for place in sorted(rows)]
 
 
+def _axis_rows(run: RunData) -> list[dict[str, Any]]:
+    """Return where the axes stand; a sigma is null where the views do not show it."""
+    return [{key: plain(value) for key, value in vars(place).items() if value is not None} for place in run.axes]
+
+
 def _disagreement(run: RunData) -> dict[str, Any] | None:
     """Return how far the views disagree on the part at every step of the model's history; None without clouds."""
     history = model_history(run)
@@ -318,7 +327,11 @@ _LINKAGE = Document(
     Key("weak", _WEAK.rows(lambda view, partner="": (view, partner)), optional=True),
 )
 _UNSUPPORTED = Document(*(Key(name, COUNT, optional=True) for name in ("points", "alone", "looked_through")))
-_COVARIANCE = Document(Key("parameters", TEXTS, "names"), Key("matrix", Kind(list_of(list_of(NUMBER)).schema)))
+_COVARIANCE = Document(
+    Key("parameters", TEXTS, "names"),
+    Key("matrix", Kind(list_of(list_of(NUMBER)).schema)),
+    Key("with_hand_eye", Kind(list_of(list_of(NUMBER)).schema), when=lambda known: known.with_hand_eye.size),
+)
 _OUTLIER = Document(Key("view", TEXT), Key("target", Kind({"type": ["string", "null"]})))
 _DISAGREEMENT = Kind({"type": ["object", "null"], "properties": {"gate": NUMBER.schema}})
 _PATH = Kind({"type": "string", "pattern": "^[^\\u0000]+$", "maxLength": 4000})
@@ -331,7 +344,7 @@ RESULT = Document(
     Key("name", attribute="session.name"),
     Key("length_unit", attribute="session.length_unit"),
     Key("mount", attribute="session.mount"),
-    Key("reference_frame", write=lambda run: "flange" if run.session.mount == "eye_to_hand" else "base"),
+    Key("reference_frame", attribute="session.reference_frame"),
     Key("hand_eye", MATRIX, "T_mount"),
     Key("hand_eye_coarse", attribute="T_mount_coarse"),
     Key("hand_eye_sigma", write=lambda run: np.sqrt(np.diag(run.mount_covariance))),
@@ -346,6 +359,7 @@ RESULT = Document(
     Key("repeatability", _SCATTER.kind(partial(Repeatability, noise_factor=float("nan"))), of=Fit),
     Key("effects", _EFFECTS, "terms"),
     Key("effects_covariance", _COVARIANCE.kind(), "model.effects_covariance", optional=True),
+    Key("axes", write=_axis_rows, when=attrgetter("session.axes")),
     Key("views", _VIEWS, write=_all_views),
     Key("left_out", _LEFT_OUT.rows(), optional=True),
     Key("linkage", _LINKAGE.kind(ViewLinks), "links", of=RunData, optional=True),

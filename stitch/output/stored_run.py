@@ -13,7 +13,7 @@ from stitch.fit.correct import converged_overlaps, gate_of_model
 from stitch.fit.target_fit import evaluate_targets
 from stitch.model.forward import corrected_capture
 from stitch.model.model import EffectsCovariance
-from stitch.model.model_toml import ModelFile, bind_to_session, read_model
+from stitch.model.model_toml import ModelFile, bind_to_session, read_model, with_model_axes
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.matching import sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, collect_overlaps
@@ -120,7 +120,7 @@ def load_run(folder: Path, effects_file: Path | None = None, trust: bool = False
     path = Path(document["session"])
     if not path.is_dir():
         raise InputError(f"{folder}/result.json: its session {path} has gone; to fix: restore it or correct the path")
-    session = load_session(path)
+    session = with_model_axes(load_session(path), file)
     with library_threads_off():
         measurement = with_part_origin(measurement_of(session, prepare_capture(session)), file.T_mount_coarse)
         left_out = results.excluded_views(document)

@@ -15,6 +15,7 @@ import numpy as np
 
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
+from stitch.session.axes import Axes, axes_of
 from stitch.session.capture import Capture
 from stitch.session.robot import Robot
 from stitch.session.session import Mount, SensorKind, SessionData
@@ -48,10 +49,11 @@ class Views:
     number: Indices  # (V,) of the view in its session, from 0
     path: Array  # (W, n) joints of all views of the session, by their number
     T_base_flange: Array  # (V, 4, 4) reported
-    gravity: Array  # (3,) unit vector, base frame
+    gravity: Array  # (3,) unit vector, base frame; (V, 3) where an axis turns what is left of the robot; zero: unknown
     eye_to_hand: bool
     names: tuple[str, ...] = ()  # of the session's views
     T_mount: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) hand-eye, coarse
+    axes: Axes = field(default_factory=Axes)
 
     @cached_property
     def gravity_at_mount(self) -> Array:
@@ -65,11 +67,12 @@ class Views:
 
     @property
     def _gravity_in_flange(self) -> Array:
-        return frames.rotate(frames.inverse(self.T_base_flange), self.gravity[None])[:, 0]
+        down = self.gravity[None] if self.gravity.ndim == 1 else self.gravity[:, None]
+        return frames.rotate(frames.inverse(self.T_base_flange), down)[:, 0]
 
     @property
     def _gravity_in_base(self) -> Array:
-        return np.tile(self.gravity, (self.count, 1))
+        return np.tile(self.gravity, (self.count, 1)) if self.gravity.ndim == 1 else self.gravity
 
     def at_scanner(self, twists: Array) -> Array:
         """Return (V, 6) twists of the mount frame about its origin, as an effect of the mount returns them."""
@@ -117,6 +120,8 @@ class Views:
             torques=replace(self.torques, values=self.torques.values[keep]),
             covariates={name: values[keep] for name, values in self.covariates.items()},
             number=self.number[keep],
+            axes=self.axes.only(keep) if self.axes else self.axes,
+            gravity=self.gravity if self.gravity.ndim == 1 else self.gravity[keep],
             T_base_flange=self.T_base_flange[keep],
         )
 
@@ -126,6 +131,9 @@ class Views:
             "joints": self.joints.shape[1] > 0,
             "torque": len(self.torques.names) > 0,
             "velocity": self.velocity is not None,
+            "axis": bool(self.axes),
+            "rotary_axis": bool(self.axes.rotary.any()),
+            "linear_axis": bool((~self.axes.rotary).any()),
             "time": bool(np.isfinite(self.time).all()) and self.count > 1 and float(np.ptp(self.time)) > 0,
             "gravity_at_mount": float(np.ptp(self.gravity_at_mount, axis=0).max()) > TURNED,
             "gravity_at_part": float(np.ptp(self.gravity_at_part, axis=0).max()) > TURNED,
@@ -288,6 +296,7 @@ def intensity_scale(session: SessionData) -> tuple[float, float] | None:
 def views_of(session: SessionData) -> Views:
     """Collect what effects may know; joints count only where the robot's kinematics are known too."""
     views = session.views
+    axes = axes_of(session)
     count = len(views)
     has_joints = session.robot is not None and all(view.joints is not None for view in views)
     joints = np.array([view.joints for view in views]) if has_joints else np.zeros((count, 0))
@@ -320,10 +329,20 @@ def views_of(session: SessionData) -> Views:
         number=np.arange(count),
         path=joints,
         T_base_flange=np.array([view.T_base_flange for view in views]),
-        gravity=gravity_of(session.robot),
+        gravity=_gravity_left_of(axes, session),
+        axes=axes,
         eye_to_hand=session.mount == "eye_to_hand",
         names=tuple(session.names),
     )
+
+
+def _gravity_left_of(axes: Axes, session: SessionData) -> Array:
+    """Return gravity in the frame left of the effective poses: (3,), or (V, 3) where an axis turns it."""
+    if not session.has_poses:
+        return np.zeros(3)
+    gravity = gravity_of(session.robot)
+    turned = frames.rotate(frames.inverse(axes.sides()[0]), gravity[None, None])[:, 0] if axes else gravity[None]
+    return gravity if np.allclose(turned, gravity) else turned
 
 
 def gravity_of(robot: Robot | None) -> Array:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
+from stitch.session.axes import Axis
 from stitch.session.robot import Robot
 from stitch.session.scan import Scan, bounding_box
 
@@ -97,12 +98,13 @@ class View:
 
     name: str
     cloud: Cloud | None
-    T_base_flange: Array  # (4, 4), reported, or from the joints where no pose is reported
+    T_base_flange: Array  # (4, 4), reported, or from the joints where no pose is reported; with the axes (`axes.py`)
     joints: Array | None  # (n,) rad
     approach: Array | None  # (n,) -1, 0, +1
     time_s: float | None
     covariates: dict[str, float]
     sighting: Sighting | None = None  # labelled points or a measured probe
+    axis_approach: Array | None = None  # (K,) -1, 0, +1 of the session's axes; their readings are covariates
 
 
 @dataclass(frozen=True)
@@ -162,6 +164,16 @@ class SessionData:
     warnings: tuple[str, ...] = field(default=())
     nominal: NominalTargets | None = None  # targets in the part frame
     repeatability: StatedRepeatability = field(default_factory=StatedRepeatability)
+    axes: tuple[Axis, ...] = ()  # in the order of the chain
+    has_poses: bool = True  # False: axes alone move what is scanned
+
+    @property
+    def reference_frame(self) -> str:
+        """Name of the frame in which the stitched cloud lies: the flange, the base, or an axis where there is no
+        robot."""
+        if not self.has_poses:
+            return next((axis for axis in self.axes if axis.is_rotary), self.axes[0]).name
+        return "flange" if self.mount == "eye_to_hand" else "base"
 
     @property
     def has_clouds(self) -> bool:

@@ -196,6 +196,7 @@ class HandEyeFit:
     degrees: int | None = None
     values: Array = field(default_factory=lambda: np.zeros(0))  # (P,) of the effects
     values_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (P, P)
+    visible_covariance: Array = field(default_factory=lambda: np.zeros((6, 0)))  # (6, 6 + P), without what is hidden
 
     @property
     def values_sigma(self) -> Array:
@@ -230,6 +231,7 @@ def fit_hand_eye(
     sources = _variance_sources(solution, repeating, scanner_errors or {})
     covariance = np.sum(list(sources.values()), axis=0)
     log_ratio = np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(solution.gls.covariance)[1]
+    visible = covariance[:6].copy()
     # Held where they are, the hidden directions are no better known than before.
     sources["unseen"][:6, :6] += solution.hidden @ solution.hidden.T
     covariance[:6, :6] += solution.hidden @ solution.hidden.T
@@ -244,6 +246,7 @@ def fit_hand_eye(
         position_shares=_source_shares(sources, slice(3, 6)),
         values=solution.values + solution.x[6:],
         values_covariance=covariance[6:, 6:],
+        visible_covariance=visible,
     )
 
 

@@ -16,12 +16,15 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES, METRES
+from stitch.session.axes import as_stated
 from stitch.session.moving_scanner import stand_still
 from stitch.session.reading.clouds import read_cloud
+from stitch.session.reading.csv_files import read_csv_lines
 from stitch.session.reading.scale_checks import check_scale, require_near
 from stitch.session.reading.session_toml import (
     cad_file,
     positive_number,
+    read_axes,
     read_crop_box,
     read_repeatability,
     read_robot,
@@ -35,7 +38,7 @@ from stitch.session.reading.text_files import (
     require_file,
     table_choice,
 )
-from stitch.session.reading.views_table import ViewRow, read_views, row_at
+from stitch.session.reading.views_table import ViewRow, has_pose_columns, read_views, row_at
 from stitch.session.session import (
     Cloud,
     Mount,
@@ -82,7 +85,10 @@ def load_session(
     unit = table_choice(file, document, "length_unit", tuple(METRES))
     mount = table_choice(file, document, "mount", get_args(Mount))
     robot = read_robot(file, document.get("robot"), unit)
-    rows = read_views(path / "views.csv", robot) if start is None else [row_at(file, robot, start)]
+    tables = document.get("axis", [])
+    has_poses = not tables or has_pose_columns(read_csv_lines(path / "views.csv")[0])
+    axes = read_axes(file, tables, mount, has_poses)
+    rows = read_views(path / "views.csv", robot, axes, unit) if start is None else [row_at(file, robot, start)]
     rows = [row for row in rows if only is None or row.view.name == only]
     cloud_unit = table_choice(file, {"cloud_unit": unit} | document, "cloud_unit", tuple(CLOUD_METRES))
     scanner = read_scanner(file, document.get("scanner", {}))
@@ -111,6 +117,8 @@ def load_session(
         nominal=_read_nominal(path, views) if scans else None,
         repeatability=read_repeatability(file, document.get("robot")),
     )
+    if axes:
+        session = as_stated(replace(session, has_poses=has_poses), axes)
     if scans:
         check_scale(session, cloud_unit)
     # One view alone says nothing of how the robot moved.

@@ -1,5 +1,6 @@
 """session.toml: every key checked, tables turned to what they describe."""
 
+import re
 import shlex
 from collections.abc import Collection
 from difflib import get_close_matches
@@ -12,6 +13,7 @@ from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
+from stitch.session.axes import KINDS, Axis
 from stitch.session.reading.robot_description import (
     LARGEST,
     require_known_keys,
@@ -36,12 +38,16 @@ from stitch.session.session import (
 
 SESSION_FORMAT = "stitch-session/1"
 _KEYS = {
-    "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part"},
+    "": {"format", "name", "length_unit", "cloud_unit", "mount", "scanner", "robot", "sphere", "part", "axis"},
     "scanner": {"pose", "noise", "standoff", "optical_axis", "kind", "within", "moving"},
     "robot": {"name", "dh", "joints", "urdf", "base_link", "flange_link", "payload", "gravity", "repeatability"},
     "sphere": {"radius"},
     "part": {"cad", "cad_unit"},
 }
+_AXIS_KEYS = ("name", "kind", "carries", "direction", "point", "stated")
+# What an axis may carry beside a robot that carries the scanner, or the part, and without a robot.
+_CARRIED = {"eye_in_hand": ("part", "robot"), "eye_to_hand": ("scanner", "robot"), "": ("part", "scanner")}
+_AXIS_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*")
 # Effects of the scanner count its field as x/z and y/z: they know no scanner that looks along x or y.
 _AXES = {"+z": np.array([0.0, 0.0, 1.0]), "-z": np.array([0.0, 0.0, -1.0])}
 
@@ -136,6 +142,66 @@ def _read_pose(file: Path, value: Any) -> Array:
             f"det {np.linalg.det(T[:3, :3]):+.3f}); write a rotation, and 0 0 0 1 in the last row"
         )
     return frames.make(frames.nearest_rotation(T[:3, :3]), T[:3, 3])
+
+
+def read_axes(file: Path, tables: Any, mount: str, has_poses: bool) -> tuple[Axis, ...]:
+    """Return the external axes of [[axis]], in the order of the chain; lengths in length_unit.
+
+    Args:
+        mount: eye_to_hand or eye_in_hand.
+        has_poses: a robot moves too.
+
+    Raises:
+        InputError: a value that cannot be, or an axis that carries what this mount leaves still.
+    """
+    if not isinstance(tables, list):
+        raise InputError(f"{file}: axes are tables [[axis]], one an axis; to fix: write the brackets twice")
+    if tables and not has_poses and mount != "eye_to_hand":
+        raise InputError(
+            f'{file}: axes without a robot carry the part or the scanner; to fix: write mount = "eye_to_hand", or '
+            "add the robot's poses to views.csv"
+        )
+    axes = [_read_axis(file, f"axis {k + 1}", table, mount if has_poses else "") for k, table in enumerate(tables)]
+    for axis in axes:
+        if [other.name for other in axes].count(axis.name) > 1:
+            raise InputError(f"{file}: two axes are called {axis.name}; to fix: give each a name of its own")
+    return tuple(axes)
+
+
+def _read_axis(file: Path, where: str, table: Any, mount: str) -> Axis:
+    """Return one axis; `mount` is empty without a robot."""
+    require_known_keys(f"{file}: {where}", table, _AXIS_KEYS)
+    name = table.get("name")
+    if not isinstance(name, str) or not _AXIS_NAME.fullmatch(name):
+        raise InputError(f'{file}: {where} needs a name of letters and digits; to fix: write name = "table"')
+    where = f"{file}: axis {name}"
+    kind = _one_of(where, table, "kind", KINDS)
+    carries = _one_of(where, table, "carries", _CARRIED[mount])
+    direction = None
+    if "direction" in table:
+        direction = table_numbers(where, table, "direction", (3,))
+        if not np.linalg.norm(direction) > 0:
+            raise InputError(f"{where}: direction is zero; to fix: write three numbers, [0, 0, 1] for upwards")
+        direction = direction / np.linalg.norm(direction)
+    if "point" in table and kind == "linear":
+        raise InputError(f"{where}: a linear axis has a direction alone; to fix: take the point out")
+    point = table_numbers(where, table, "point", (3,)) if "point" in table else None
+    stated = table.get("stated", False)
+    if not isinstance(stated, bool):
+        raise InputError(f"{where}: stated is {shortened(stated)}; use true or false")
+    axis = Axis(name, kind, carries, direction, point, stated)
+    if stated and not axis.is_placed:
+        needs = "direction and point" if axis.is_rotary else "a direction"
+        raise InputError(f"{where}: stated = true needs {needs}; to fix: write them, or leave stated out")
+    return axis
+
+
+def _one_of(where: str, table: dict[str, Any], key: str, choices: Collection[str]) -> str:
+    value = table.get(key)
+    if value not in tuple(choices):
+        words = " or ".join(f'"{choice}"' for choice in choices)
+        raise InputError(f"{where}: {key} is {shortened(value)}; here it is {words}")
+    return str(value)
 
 
 def read_crop_box(file: Path, table: dict[str, Any]) -> Array | None:

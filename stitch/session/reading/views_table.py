@@ -15,6 +15,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
+from stitch.session.axes import Axis
 from stitch.session.reading.csv_files import finite_number, is_number, read_csv_lines
 from stitch.session.reading.text_files import require_file, require_name
 from stitch.session.robot import Robot, forward
@@ -47,7 +48,7 @@ class ViewRow:
     view: View  # without what was seen; lengths in length_unit
 
 
-def read_views(file: Path, robot: Robot | None) -> list[ViewRow]:
+def read_views(file: Path, robot: Robot | None, axes: Sequence[Axis] = (), length_unit: str = "mm") -> list[ViewRow]:
     """Read and check views.csv.
 
     Columns that hold text in every row (notes) are left alone. Where joints and a reported pose both
@@ -58,12 +59,16 @@ def read_views(file: Path, robot: Robot | None) -> list[ViewRow]:
     """
     require_file(file, "a session needs a row per scan there")
     header, lines = read_csv_lines(file)
-    joint_count = _check_header(file, header, robot)
+    columns = [_axis_column(file, header, axis, length_unit) for axis in axes]
+    joint_count = _check_header(file, header, robot, has_axes=bool(axes))
     if not lines:
         raise InputError(f"{file}: no views; write one row per scan")
     cells = [(line, {name: cell.strip() for name, cell in zip(header, row, strict=True)}) for line, row in lines]
     covariates = covariate_names(header, cells)
     joints = [_row_joints(file, line, row, joint_count) for line, row in cells]
+    for line, row in cells:
+        for column in columns:
+            finite_number(file, line, column, row[column], "write the axis' reading in every row")
     require_loads(file, header, cells, joint_count)
     rows: list[ViewRow] = []
     names: dict[str, int] = {}
@@ -86,7 +91,11 @@ def read_views(file: Path, robot: Robot | None) -> list[ViewRow]:
             name=name,
             cloud=None,
             covariates={column: finite_number(file, line, column, row[column]) for column in covariates if row[column]},
-            T_base_flange=_flange_pose(file, line, name, row, joints[i], robot),
+            T_base_flange=(
+                _flange_pose(file, line, name, row, joints[i], robot)
+                if has_pose_columns(header) or not axes
+                else np.eye(4)
+            ),
             joints=joints[i],
             approach=_row_approach(file, line, row, joints[i], joints[i - 1] if i else None),
             time_s=time_s,
@@ -94,6 +103,27 @@ def read_views(file: Path, robot: Robot | None) -> list[ViewRow]:
         rows.append(ViewRow(line, row.get("cloud", ""), view))
     _require_no_hidden_joints(file, cells, [row.view.T_base_flange for row in rows], robot)
     return rows
+
+
+def has_pose_columns(header: Sequence[str]) -> bool:
+    """Return whether a header has columns of poses or of joint angles."""
+    return any(name in POSE_COLUMNS or _JOINT.match(name) for name in header)
+
+
+def _axis_column(file: Path, header: Sequence[str], axis: Axis, length_unit: str) -> str:
+    """Return the column of an axis' readings.
+
+    Raises:
+        InputError: none, or two of them.
+    """
+    possible = axis.columns(length_unit)
+    stated = [name for name in header if name in possible]
+    if len(stated) != 1:
+        words = " or ".join(possible)
+        raise InputError(
+            f"{file} line 1: axis {axis.name} has {len(stated)} columns of readings; to fix: give it one, {words}"
+        )
+    return stated[0]
 
 
 def row_at(file: Path, robot: Robot | None, joints: Array) -> ViewRow:
@@ -124,7 +154,7 @@ def has_reported_poses(file: Path) -> bool:
     return any(cells[k].strip() for _, cells in rows for k in columns)
 
 
-def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> int:
+def _check_header(file: Path, header: Sequence[str], robot: Robot | None, has_axes: bool = False) -> int:
     """Return how many joints have a column.
 
     Raises:
@@ -139,11 +169,11 @@ def _check_header(file: Path, header: Sequence[str], robot: Robot | None) -> int
     missing = [name for name in POSE_COLUMNS if name not in header]
     if 0 < len(missing) < len(POSE_COLUMNS):
         raise InputError(f"{file} line 1: a pose needs {', '.join(POSE_COLUMNS)}; missing {', '.join(missing)}")
-    if missing and not joint_count:
+    if missing and not joint_count and not has_axes:
         raise InputError(
             f"{file} line 1: neither joints (j1_deg …) nor poses ({','.join(POSE_COLUMNS)}); one of them is needed"
         )
-    if missing and not robot:
+    if missing and joint_count and not robot:
         raise InputError(f"{file} line 1: joints without poses need a [robot] in session.toml")
     return joint_count
 

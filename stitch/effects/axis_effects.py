@@ -1,0 +1,90 @@
+"""External axes: where they truly stand, which every model of a session with axes fits, and what goes wrong with them.
+
+Effects change an `AxisMotion`: readings, placement, how a carriage turns along its way, a twist beside the axis' own
+motion. Twists are those of the axis' frame, z along the axis, before it has moved. What turns with a table once is a
+place of the part on it and shows nothing; what turns against it shows, in the part's frame twice a turn.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from stitch.effects.contract import effect, per_axis
+from stitch.numerics.frames import Array, Mask
+from stitch.session.axes import AxisMotion
+from stitch.session.measurement import Views
+
+# Sides of an axis' frame across it.
+_ACROSS = ("u", "v")
+PLACEMENT = "axis_placement"
+
+
+@effect(
+    "axis",
+    needs=("axis",),
+    tier="geometry",
+    tilt=per_axis("rotary", "rad", 0.005, 0.5, _ACROSS),
+    shift=per_axis("rotary", "mm", 5.0, 500.0, _ACROSS),
+    turn=per_axis("linear", "rad", 0.005, 0.5, _ACROSS),
+)
+def axis_placement(motion: AxisMotion, views: Views, tilt: Array, shift: Array, turn: Array) -> AxisMotion:
+    """axis truly along exp(tilt) and through the point + shift, both across it"""
+    placement = motion.placement.copy()
+    rotary = views.axes.rotary
+    placement[rotary, :2] += tilt.reshape(-1, 2)
+    placement[rotary, 3:5] += shift.reshape(-1, 2)
+    placement[~rotary, :2] += turn.reshape(-1, 2)
+    return replace(motion, placement=placement)
+
+
+@effect("axis", needs=("rotary_axis",), A=per_axis("rotary", "mm", 0.05, 2.0), B=per_axis("rotary", "mm", 0.05, 2.0))
+def axis_eccentricity(motion: AxisMotion, views: Views, A: Array, B: Array) -> AxisMotion:
+    """centre off by A (sin θ, cos θ) + B (cos θ, −sin θ), θ the reading"""
+    return replace(motion, error=motion.error + _against(motion, views, A, B, (3, 4)))
+
+
+@effect(
+    "axis", needs=("rotary_axis",), A=per_axis("rotary", "rad", 2e-4, 0.01), B=per_axis("rotary", "rad", 2e-4, 0.01)
+)
+def axis_wobble(motion: AxisMotion, views: Views, A: Array, B: Array) -> AxisMotion:
+    """axis tilts by A (sin θ, cos θ) + B (cos θ, −sin θ), θ the reading"""
+    return replace(motion, error=motion.error + _against(motion, views, A, B, (0, 1)))
+
+
+def _against(motion: AxisMotion, views: Views, A: Array, B: Array, sides: Sequence[int]) -> Array:
+    """Return (V, K, 6) twists that turn against the rotary axes once a turn."""
+    rotary = views.axes.rotary
+    angle = motion.readings[:, rotary]
+    error = np.zeros_like(motion.error)
+    error[:, rotary, sides[0]] = A * np.sin(angle) + B * np.cos(angle)
+    error[:, rotary, sides[1]] = A * np.cos(angle) - B * np.sin(angle)
+    return error
+
+
+@effect("axis", needs=("linear_axis",), s=per_axis("linear", "1", 3e-4, 0.01))
+def axis_scale(motion: AxisMotion, views: Views, s: Array) -> AxisMotion:
+    """way = (1 + s) × reading"""
+    return replace(motion, readings=motion.readings * (1 + _spread(s, ~views.axes.rotary)))
+
+
+@effect("axis", needs=("linear_axis",), p=per_axis("linear", "rad/m", 2e-4, 0.02, ("x", "y", "z")))
+def axis_pitch(motion: AxisMotion, views: Views, p: Array) -> AxisMotion:
+    """the carriage turns by p × way: pitch and yaw, on an arc, and roll"""
+    along = motion.along.copy()
+    along[~views.axes.rotary] += p.reshape(-1, 3) / views.axes.per_metre
+    return replace(motion, along=along)
+
+
+@effect("axis", needs=("axis",), b=per_axis("rotary", "rad", 2e-4, 0.01), c=per_axis("linear", "mm", 0.05, 2.0))
+def axis_backlash(motion: AxisMotion, views: Views, b: Array, c: Array) -> AxisMotion:
+    """reading − b × approach, the direction of the last move; b of a rotary axis, c of a linear one"""
+    play = _spread(b, views.axes.rotary) + _spread(c, ~views.axes.rotary)
+    return replace(motion, readings=motion.readings - play * views.axes.approach)
+
+
+def _spread(values: Array, where: Mask) -> Array:
+    """Return (K,) with the values of some axes, zero for the others."""
+    out = np.zeros(len(where))
+    out[where] = values
+    return out

@@ -1,0 +1,147 @@
+"""Where the external axes of a session stand under a model, with sigma, as a person states them.
+
+Direction and point lie in the base frame with all axes at zero; without a robot in the scanner's frame, as the
+hand-eye has it. A point is that of the axis nearest to the one stated, or to what was scanned; along the axis it is
+free, and its sigma says nothing of that.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stitch.model.forward import chain_errors
+from stitch.model.model import Model, Term, values_of
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.numerics.units import METRES, value_uncertainty_text
+from stitch.session.axes import Axis
+from stitch.session.measurement import Measurement
+
+_STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class AxisPlace:
+    """One axis where a model puts it; sigmas are NaN where the views do not show it, or it was used as given."""
+
+    name: str
+    kind: str  # rotary | linear
+    direction: Array  # (3,) unit vector
+    direction_sigma: Array  # (3,) rad
+    point: Array | None  # (3,) length_unit, of a rotary axis
+    point_sigma: Array | None  # (3,)
+    unobservable: tuple[str, ...] = ()
+
+    def line(self, length_unit: str) -> str:
+        """Return it as people read it: direction in mrad across, point in mm, ± U (k = 2)."""
+        to_mm = METRES[length_unit] * 1e3
+        numbers = zip(self.direction, 2 * self.direction_sigma, strict=True)
+        shown = bool(np.isfinite(self.direction_sigma).all())
+        text = ", ".join(value_uncertainty_text(x, u) if shown else f"{x:.6f}" for x, u in numbers)
+        parts = [f"direction {text}"]
+        if self.point is not None and self.point_sigma is not None:
+            shown = bool(np.isfinite(self.point_sigma).all())
+            numbers = zip(self.point * to_mm, 2 * self.point_sigma * to_mm, strict=True)
+            text = ", ".join(value_uncertainty_text(x, u) if shown else f"{x:.3f}" for x, u in numbers)
+            parts.append(f"point {text} mm")
+        return f"{self.name}: {'; '.join([*parts, *self.unobservable])}"
+
+
+def axis_places(measurement: Measurement, model: Model) -> tuple[AxisPlace, ...]:
+    """Return where the axes of a session stand, in their order; none without axes."""
+    axes = measurement.views.axes
+    if not axes:
+        return ()
+    term = next((term for term in model.terms if term.is_geometry), None)
+    near = _middle(measurement, model)
+    names = [] if term is None else [f"{term.name}.{p.name}" for p in term.parameters]
+    steps, covariance = _joint_covariance(model, names)
+    places = []
+    for k, axis in enumerate(axes.axes):
+        here = _as_stated(measurement, model, term, k, near)
+        J = np.array(
+            [(_as_stated(measurement, *_moved(model, term, step), k, near) - here) / _STEP for step in steps]
+        ).reshape(len(steps), 6)
+        sigma = np.sqrt(np.maximum(np.einsum("ij,ik,kj->j", J, covariance, J), 0.0))
+        hidden, unknown = _unseen(axis, term, alone=not axes.has_robot, is_own=k == axes.own)
+        sigma[:3][hidden[0]] = np.nan
+        sigma[3:][hidden[1]] = np.nan
+        places.append(
+            AxisPlace(
+                axis.name,
+                axis.kind,
+                here[:3],
+                sigma[:3],
+                here[3:] if axis.is_rotary else None,
+                sigma[3:] if axis.is_rotary else None,
+                unknown,
+            )
+        )
+    return tuple(places)
+
+
+def _joint_covariance(model: Model, names: list[str]) -> tuple[Array, Array]:
+    """Return steps (6 + P, 6 + P) of hand-eye and placement, and their covariance."""
+    known = model.effects_covariance
+    size = 6 + len(names)
+    covariance = np.zeros((size, size))
+    beside = known.with_hand_eye
+    covariance[:6, :6] = beside[:, :6] if beside.size else model.covariance
+    at = [known.names.index(name) if name in known.names else -1 for name in names]
+    for i, a in enumerate(at):
+        if a < 0:
+            continue
+        for j, b in enumerate(at):
+            if b >= 0:
+                covariance[6 + i, 6 + j] = known.matrix[a, b]
+        if beside.size:
+            covariance[:6, 6 + i] = covariance[6 + i, :6] = beside[:, 6 + a]
+    return _STEP * np.eye(size), covariance
+
+
+def _moved(model: Model, term: Term | None, step: Array) -> tuple[Model, Term | None]:
+    T_mount = model.T_mount @ frames.exp(step[:6])
+    moved = None if term is None else term.at(values_of([term]) + step[6:])
+    return Model(T_mount), moved
+
+
+def _as_stated(measurement: Measurement, model: Model, term: Term | None, k: int, near: Array) -> Array:
+    """Return direction and point (6,) of axis k, in the frame in which session.toml states it."""
+    axes = measurement.views.axes
+    motion = axes.as_read() if term is None else chain_errors(measurement, [term]).axes
+    assert motion is not None
+    axis = axes.placed(motion)[k]
+    assert axis.direction is not None
+    direction = axis.direction
+    point = np.zeros(3) if axis.point is None else axis.point
+    if not axes.has_robot:
+        to_scanner = frames.inverse(model.T_mount)
+        direction = to_scanner[:3, :3] @ direction
+        point = frames.transform(to_scanner, point[None])[0]
+    return np.append(direction, point + direction * (direction @ (near - point)))
+
+
+def _middle(measurement: Measurement, model: Model) -> Array:
+    """Return the middle (3,) of what the views show, with all axes at zero, base frame or that of a still scanner."""
+    shown = [points.mean(axis=0) for points in measurement.capture.visible_points if len(points)]
+    if not measurement.views.axes.has_robot:
+        return np.asarray(np.mean(shown, axis=0))
+    views = zip(measurement.capture.poses(model.T_mount), measurement.capture.visible_points, strict=True)
+    placed = [frames.transform(T, points).mean(axis=0) for T, points in views if len(points)]
+    return np.asarray(np.mean(placed, axis=0))
+
+
+def _unseen(axis: Axis, term: Term | None, *, alone: bool, is_own: bool) -> tuple[tuple[bool, bool], tuple[str, ...]]:
+    """Return whether direction and point have no sigma, and what the views do not show."""
+    if is_own:
+        return (False, False), ()
+    if axis.is_fixed or term is None:
+        return (True, True), ()
+    mine = [p for p in term.parameters if p.name.partition("_")[2] == axis.name]
+    turned = [p.fitted for p in mine if p.unit == "rad"]
+    moved = [p.fitted for p in mine if p.unit != "rad"]
+    if alone and any(turned) and (any(moved) or not moved):
+        # Their common frame is free to turn about its own axis and to move along it.
+        return (False, False), ()
+    unknown = [f"{what} not known" for what, seen in (("direction", turned), ("place", moved)) if not all(seen)]
+    return (not all(turned), not all(moved)), tuple(unknown)

@@ -1,0 +1,231 @@
+"""External axes: turntable, tilt-and-turn positioner, rail, gantry; what they do to the chain of frames.
+
+An axis carries the robot, the part or the scanner. With A = A_1·A_2·… the product of exponentials of the axes of one
+kind, in the order in which session.toml states them (Brockett 1984), each in the base frame with all axes at zero:
+
+    x_ref = A_part⁻¹ · A_robot · T_base_flange · T_flange_scanner · x           eye_in_hand
+    x_ref = T_base_flange⁻¹ · A_robot⁻¹ · A_scanner · T_base_scanner · x        eye_to_hand
+
+Either is that of a robot with T_base_flange' = A_left⁻¹ · A_right · T_base_flange, the effective pose: a view holds
+this one, and all that follows sees no difference. Without a robot the axes are the robot: T_base_flange = 1, and those
+of the part stand right. Their frame then is that of the first rotary axis, along z at its zero, and the hand-eye says
+where it stands.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stitch.errors import InputError
+from stitch.numerics import frames
+from stitch.numerics.frames import Array, Mask
+from stitch.numerics.units import METRES
+
+if TYPE_CHECKING:
+    from stitch.session.session import SessionData
+
+KINDS = ("rotary", "linear")
+CARRIES = ("part", "robot", "scanner")
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis as the session states it; lengths in length_unit."""
+
+    name: str
+    kind: str  # rotary | linear
+    carries: str  # part | robot | scanner
+    direction: Array | None = None  # (3,) unit vector, base frame with all axes at zero; None: to be found
+    point: Array | None = None  # (3,) on a rotary axis; None: to be found
+    is_fixed: bool = False  # used as given
+
+    @property
+    def is_rotary(self) -> bool:
+        """True if its readings are angles."""
+        return self.kind == "rotary"
+
+    @property
+    def is_placed(self) -> bool:
+        """True if it is known from where to start."""
+        return self.direction is not None and (self.point is not None or not self.is_rotary)
+
+    def columns(self, length_unit: str) -> dict[str, float]:
+        """Return the columns of views.csv in which its readings may stand, and how much one of them is."""
+        if self.is_rotary:
+            return {f"{self.name}_deg": np.pi / 180}
+        return {f"{self.name}_{unit}": metres / METRES[length_unit] for unit, metres in METRES.items()}
+
+    @property
+    def frame(self) -> Array:
+        """(4, 4) with z along the axis, about which errors of the axis are counted."""
+        assert self.direction is not None
+        z = self.direction
+        # The world's axis that is farthest from it: a table's frame stands as the base's.
+        x = np.eye(3)[int(np.argmin(np.abs(z)))]
+        x = x - z * (x @ z)
+        x = x / np.linalg.norm(x)
+        return frames.make(np.column_stack([x, np.cross(z, x), z]), np.zeros(3) if self.point is None else self.point)
+
+
+@dataclass(frozen=True)
+class AxisMotion:
+    """How K axes move in V views: effects change it."""
+
+    readings: Array  # (V, K) rad or length_unit
+    placement: Array  # (K, 6) twist of the axis in its frame
+    along: Array  # (K, 3) rad by which a carriage turns per length_unit of its way, axis frame
+    error: Array  # (V, K, 6) twist beside the axis' own motion, axis frame
+
+
+@dataclass(frozen=True)
+class Axes:
+    """All axes of a session and their readings; empty without any."""
+
+    axes: tuple[Axis, ...] = ()
+    readings: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (V, K) rad or length_unit
+    approach: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (V, K) −1, 0, +1
+    has_robot: bool = True
+    length_unit: str = "mm"
+
+    def __bool__(self) -> bool:
+        return bool(self.axes)
+
+    @property
+    def rotary(self) -> Mask:
+        """(K,) bool."""
+        return np.array([axis.is_rotary for axis in self.axes], bool)
+
+    @property
+    def per_metre(self) -> float:
+        """Lengths in a metre."""
+        return 1 / METRES[self.length_unit]
+
+    @property
+    def own(self) -> int:
+        """Index of the axis whose frame is that of the others, where there is no robot; −1 with one."""
+        if self.has_robot or not self.axes:
+            return -1
+        return next((k for k, axis in enumerate(self.axes) if axis.is_rotary), 0)
+
+    @property
+    def are_placed(self) -> bool:
+        """True if it is known of all axes from where to start."""
+        return all(axis.is_placed for axis in self.axes)
+
+    def as_read(self) -> AxisMotion:
+        """Return the motion without errors."""
+        V, K = self.readings.shape
+        return AxisMotion(self.readings, np.zeros((K, 6)), np.zeros((K, 3)), np.zeros((V, K, 6)))
+
+    def sides(self, motion: AxisMotion | None = None) -> tuple[Array, Array]:
+        """Return A_left and A_right, (V, 4, 4) each; an axis that nobody has placed yet stands still in them."""
+        motion = motion or self.as_read()
+        count = len(motion.readings)
+        left = np.tile(np.eye(4), (count, 1, 1))
+        right = left
+        for k, axis in enumerate(self.axes):
+            if not axis.is_placed:
+                continue
+            F = axis.frame @ frames.exp(motion.placement[k])
+            moved = F @ frames.exp(motion.error[:, k]) @ frames.exp(self._screw(motion, k)) @ frames.inverse(F)
+            if axis.carries == ("robot" if self.has_robot else "part"):
+                right = right @ moved
+            else:
+                left = left @ moved
+        return left, right
+
+    def _screw(self, motion: AxisMotion, k: int) -> Array:
+        """Return the twists (V, 6) by which an axis moves, in its frame."""
+        twist = np.zeros((len(motion.readings), 6))
+        twist[:, 2 if self.axes[k].is_rotary else 5] = motion.readings[:, k]
+        twist[:, :3] += motion.readings[:, k, None] * motion.along[k]
+        return twist
+
+    def carried(self, motion: AxisMotion | None = None) -> Array:
+        """Return A_left⁻¹ · A_right (V, 4, 4), by which T_base_flange becomes the effective one."""
+        left, right = self.sides(motion)
+        return frames.inverse(left) @ right
+
+    def correction(self, motion: AxisMotion) -> Array:
+        """Return (V, 4, 4) from the left by which the effective poses change where the axes move otherwise."""
+        return self.carried(motion) @ frames.inverse(self.carried())
+
+    def only(self, keep: Sequence[int]) -> "Axes":
+        """Return the axes in some of the views."""
+        return replace(self, readings=self.readings[list(keep)], approach=self.approach[list(keep)])
+
+    def placed(self, motion: AxisMotion) -> tuple[Axis, ...]:
+        """Return the axes where a placement puts them."""
+        out = []
+        for k, axis in enumerate(self.axes):
+            F = axis.frame @ frames.exp(motion.placement[k])
+            out.append(replace(axis, direction=F[:3, 2], point=F[:3, 3] if axis.is_rotary else None))
+        return tuple(out)
+
+
+def axes_of(session: "SessionData") -> Axes:
+    """Return the axes of a session with their readings in its views."""
+    if not session.axes:
+        return Axes()
+    readings = np.array([axis_readings(session.axes, v.covariates, session.length_unit) for v in session.views])
+    moved = np.sign(np.diff(readings, axis=0, prepend=readings[:1]))
+    stated = zip(session.views, moved, strict=True)
+    approach = np.array([m if v.axis_approach is None else v.axis_approach for v, m in stated])
+    return Axes(session.axes, readings, approach, session.has_poses, session.length_unit)
+
+
+def axis_readings(axes: Sequence[Axis], covariates: Mapping[str, float], length_unit: str) -> Array:
+    """Return (K,) readings of one view, rad or length_unit, from its columns."""
+    columns = [axis.columns(length_unit) for axis in axes]
+    return np.array([next(covariates[c] * size for c, size in of.items() if c in covariates) for of in columns])
+
+
+def place_axes(session: "SessionData", axes: Sequence[Axis]) -> "SessionData":
+    """Return the session with axes of the same names at another place, and the effective poses that follow."""
+    reported = reported_poses(session)
+    session = replace(session, axes=tuple(axes))
+    poses = axes_of(session).carried() @ reported
+    views = [replace(view, T_base_flange=T) for view, T in zip(session.views, poses, strict=True)]
+    return replace(session, views=tuple(views))
+
+
+def reported_poses(session: "SessionData") -> Array:
+    """Return T_base_flange (V, 4, 4) as the robot reports it, without the axes."""
+    T = np.array([view.T_base_flange for view in session.views])
+    return frames.inverse(axes_of(session).carried()) @ T if session.axes else T
+
+
+def as_stated(session: "SessionData", axes: Sequence[Axis]) -> "SessionData":
+    """Return the session with its axes as session.toml states them, and the hand-eye that this states without a robot.
+
+    There they are given in the scanner's frame; they count in that of the first rotary axis at its zero.
+
+    Raises:
+        InputError: place of the axis and of the scanner are both stated.
+    """
+    if session.has_poses or not axes:
+        return place_axes(session, axes)
+    own = axes[Axes(tuple(axes), has_robot=False).own]
+    T_own_scanner = session.scanner.T_mount
+    if own.is_placed:
+        if T_own_scanner is not None:
+            raise InputError(
+                f"{session.path}: axis {own.name} and scanner.pose both state where the axis stands; to "
+                "fix: take one out"
+            )
+        T_own_scanner = frames.inverse(own.frame)
+        session = replace(session, scanner=replace(session.scanner, T_mount=T_own_scanner))
+    placed = []
+    for axis in axes:
+        if axis is own:
+            still = np.zeros(3) if axis.is_rotary else None
+            axis = replace(axis, direction=np.array([0.0, 0.0, 1.0]), point=still)
+        elif T_own_scanner is None:
+            axis = replace(axis, direction=None, point=None)
+        elif axis.direction is not None:
+            point = None if axis.point is None else frames.transform(T_own_scanner, axis.point[None])[0]
+            axis = replace(axis, direction=T_own_scanner[:3, :3] @ axis.direction, point=point)
+        placed.append(axis)
+    return place_axes(session, placed)
