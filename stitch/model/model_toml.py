@@ -18,7 +18,7 @@ from stitch.model.model import ARM_PLACES, EffectsCovariance, Model, Target, Ter
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, is_rigid
 from stitch.numerics.units import METRES
-from stitch.session.axes import place_axes
+from stitch.session.axis_poses import place_axes
 from stitch.session.measurement import Measurement
 from stitch.session.reading.text_files import optional_text, read_toml, table_choice
 from stitch.session.session import SessionData

@@ -15,7 +15,8 @@ import numpy as np
 
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
-from stitch.session.axes import Axes, axes_of
+from stitch.session.axes import Axes
+from stitch.session.axis_poses import axes_of
 from stitch.session.capture import Capture
 from stitch.session.robot import Robot
 from stitch.session.session import Mount, SensorKind, SessionData

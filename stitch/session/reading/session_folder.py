@@ -16,7 +16,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES, METRES
-from stitch.session.axes import as_stated
+from stitch.session.axis_poses import as_stated
 from stitch.session.moving_scanner import stand_still
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.csv_files import read_csv_lines
