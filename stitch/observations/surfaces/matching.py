@@ -61,28 +61,30 @@ def overlapping_pairs(
         at_most: points of a view that are probed; more than 250 tell nothing new.
     """
     queries = neighbour_queries(scans, poses, [sample_points(scan, min(at_most, _PROBES)) for scan in scans])
+    near = near_pairs(scans, poses, gate)
+    one = overlap_shares(queries, near, gate)
+    other = overlap_shares(queries, [(w, v) for v, w in near if one[v, w] < MINIMUM_OVERLAP], gate)
+    return [(v, w) for v, w in near if max(one[v, w], other.get((w, v), 0.0)) >= MINIMUM_OVERLAP]
 
-    def meeting(asked: tuple[int, list[int]]) -> list[int]:
-        """Return, of the views that ask one view, those of which enough points find a partner."""
+
+def overlap_shares(
+    queries: "NeighbourQueries", pairs: Sequence[tuple[int, int]], gate: float
+) -> dict[tuple[int, int], float]:
+    """Return by pair (asking, asked) the share of the first view's points that find a partner in the second."""
+    asking = defaultdict[int, list[int]](list)
+    for v, w in pairs:
+        asking[w].append(v)
+
+    def meeting(asked: tuple[int, list[int]]) -> list[float]:
+        """Return the shares of the views that ask one view."""
         w, views = asked
-        parts = [(v, slice(None)) for v in views if len(queries.index[v])]
-        if not parts:
-            return []
+        parts = [(v, slice(None)) for v in views]
         _, points, normals = queries.gather(parts)
         accepted = np.split(queries.search(w, points, normals, gate)[1], np.cumsum(queries.counts(parts))[:-1])
-        return [v for (v, _), of_view in zip(parts, accepted, strict=True) if np.mean(of_view) >= MINIMUM_OVERLAP]
+        return [float(np.mean(of_view)) if len(of_view) else 0.0 for of_view in accepted]
 
-    def met(pairs: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
-        """Return those of pairs (asking, asked) that meet."""
-        asking = defaultdict[int, list[int]](list)
-        for v, w in pairs:
-            asking[w].append(v)
-        return {(v, w) for w, views in zip(asking, parallel(meeting, asking.items()), strict=True) for v in views}
-
-    near = near_pairs(scans, poses, gate)
-    meet = met(near)
-    meet |= {(v, w) for w, v in met([(w, v) for v, w in near if (v, w) not in meet])}
-    return [pair for pair in near if pair in meet]
+    answers = zip(asking.items(), parallel(meeting, asking.items()), strict=True)
+    return {(v, w): share for (w, views), shares in answers for v, share in zip(views, shares, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -164,6 +166,7 @@ def match_pairs(
     gate: float,
     samples: Sequence[Indices],
     before: Searched | None = None,
+    turns: Indices | None = None,
 ) -> tuple[list[Match], Searched]:
     """Return the correspondences of `pairs`, each sampled point with its nearest point of the other, and the search.
 
@@ -175,8 +178,10 @@ def match_pairs(
         gate: largest distance between partners, length_unit.
         samples: per view the indices that search (see `sample_points`).
         before: a search under other poses; what cannot have changed since then is not looked for again.
+        turns: (V,) among how many points of a view they take turns, where that is known (`partners.py`).
     """
-    turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
+    if turns is None:
+        turns = -(-np.bincount(np.array(pairs, int).ravel(), minlength=len(scans)) // _MOST_PARTNERS)
     parts = [list[QueryPart]() for _ in scans]
     for v, w in pairs:
         for asking, asked in ((v, w), (w, v)):

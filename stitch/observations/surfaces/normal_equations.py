@@ -30,7 +30,8 @@ from stitch.errors import NoResultError
 from stitch.numerics import frames
 from stitch.numerics.distributions import mad_sigma, tukey
 from stitch.numerics.frames import Array, Indices, Mask
-from stitch.observations.surfaces.matching import Match, Searched, match_pairs, overlapping_pairs, sample_points
+from stitch.observations.surfaces.matching import Match, Searched, match_pairs, sample_points
+from stitch.observations.surfaces.partners import find_partners, more_points
 from stitch.session.capture import Capture, Sightings
 from stitch.session.scan import Scan, centroid
 
@@ -73,6 +74,7 @@ class Overlaps:
     targets: "TargetPairs | None" = None
     probed: tuple[Array, float] | None = None  # poses (V, 4, 4) and gate under which the pairs were found
     searched: Searched | None = None  # where an iteration may go on from it
+    turns: Indices | None = None  # (V,) of the pairs, among how many points of a view they take turns
 
 
 def collect_overlaps(
@@ -92,12 +94,14 @@ def collect_overlaps(
         NoResultError: no two views overlap.
     """
     if before is not None and before.probed is not None and _pairs_still_valid(before, poses, gate):
-        pairs = before.pairs
+        pairs, turns = before.pairs, before.turns
         probed, searched = before.probed, before.searched
     else:
-        pairs = overlapping_pairs(capture.scans, poses, gate, at_most=max(map(len, samples)))
+        pairs, turns = find_partners(capture.scans, poses, gate, at_most=max(map(len, samples)))
         probed, searched = (np.array(poses), gate), None
-    matches, searched = match_pairs(capture.scans, poses, pairs, gate, samples, searched)
+    if turns is not None:
+        samples = more_points(capture.scans, samples, turns)
+    matches, searched = match_pairs(capture.scans, poses, pairs, gate, samples, searched, turns)
     if not matches:
         raise NoResultError(
             f"{capture.name}: no two views overlap under this hand-eye; check mount, pose convention "
@@ -106,7 +110,7 @@ def collect_overlaps(
     surfaces = sum_matches(matches, len(capture.scans))
     targets = None if capture.sightings is None else target_pairs(capture.sightings, poses)
     g = append_targets(surfaces, targets, capture.noise_factor)
-    return Overlaps(pairs, matches, g, gate, targets, probed, searched)
+    return Overlaps(pairs, matches, g, gate, targets, probed, searched, turns)
 
 
 def _pairs_still_valid(before: Overlaps, poses: Array, gate: float) -> bool:
