@@ -44,6 +44,28 @@ def test_variances_are_found_again():
     assert (truth - mean < 3 * error).all()
 
 
+def test_steps_by_the_average_information_end_where_a_search_ends(monkeypatch):
+    """Of 300 numbers in one block: deviances within 0.01, variances within a twentieth of their standard errors."""
+    rng = np.random.default_rng(7)
+    n, truth = 300, np.array([2.0, 0.5, 1.0])
+    a, b = rng.standard_normal((2, n, n // 3)) / np.sqrt(n / 3)
+    C = np.array([a @ a.T, b @ b.T, np.diag(rng.uniform(0.2, 2.0, n))])[:, None]
+    A = rng.standard_normal((1, n, 6))
+    half = np.linalg.cholesky(np.einsum("c,cij->ij", truth, C[:, 0]))
+    mixed = MixedModel((half @ rng.standard_normal(n))[None], A, C)
+    steps = []
+    likelihood = reml.likelihood
+    monkeypatch.setattr(reml, "likelihood", lambda *given: steps.append(1) or likelihood(*given))
+    stepped, count = fit_variances(mixed, both_starts=True), len(steps)
+    monkeypatch.setattr(reml, "is_one_large", lambda _: False)
+    searched = fit_variances(mixed, both_starts=True)
+    assert count < (len(steps) - count) / 3
+    assert abs(stepped.deviance - searched.deviance) < 0.01
+    W = np.linalg.inv(mixed.covariance(searched.variances)[0])
+    information = np.einsum("iab,jba->ij", W @ C[:, 0], W @ C[:, 0]) / 2
+    assert (abs(stepped.variances - searched.variances) < np.sqrt(np.diag(np.linalg.inv(information))) / 20).all()
+
+
 def test_evidence_is_the_gaussian_integral():
     """Integrating θ out by hand gives the same likelihood as the covariance V + G S Gᵀ."""
     rng = np.random.default_rng(1)

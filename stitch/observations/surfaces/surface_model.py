@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from stitch.observations.surfaces.scanner_errors import field_scatter
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
+from stitch.system.threads import remembered
 
 # Columns of the model weaker than this many sigmas at their plausible size are not in the fit either.
 _UNSEEN = 0.25
@@ -49,11 +51,11 @@ class SurfaceTrial:
 
     def solve(self, left_out: Indices | None = None) -> Array:
         """Return coefficients (k,) by generalised least squares without some views."""
-        return self._solve(self._white(self.X), self.linear.white_z, left_out)
+        return self._solve(self._white_X, self.linear.white_z, left_out)
 
     def solve_each(self, priors: Sequence[CoefficientPrior], left_out: Indices | None = None) -> list[Array]:
         """Return the same under each prior; zero beyond the coefficients that it is of."""
-        white, solutions = self._white(self.X), []
+        white, solutions = self._white_X, []
         for prior in priors:
             half, k = np.sqrt(prior.precision), len(prior.precision)
             z = np.append(self.linear.white_z, half * prior.mean)
@@ -65,7 +67,7 @@ class SurfaceTrial:
         k = white.shape[1]
         if left_out is not None:
             # A view is left out by letting it move freely: six more columns each.
-            free = self._white(self._twists_of(left_out))
+            free = self._free(left_out)
             white = np.hstack([white, np.vstack([free, np.zeros((len(z) - len(free), free.shape[1]))])])
         return fit_columns(white, z)[:k]
 
@@ -87,7 +89,7 @@ class SurfaceTrial:
 
     def scatter(self, left_out: Indices, coefficients: Array) -> float:
         """Return the sum of squares in the whitened directions that the left-out views alone move."""
-        directions = column_space(self._white(self._twists_of(left_out)))
+        directions = column_space(self._free(left_out))
         rest = self.linear.white_z - self._white((self.X @ coefficients)[:, None])[:, 0]
         return float(np.sum((directions.T @ rest) ** 2))
 
@@ -95,12 +97,17 @@ class SurfaceTrial:
         """Return all views (V,)."""
         return np.arange(self.unconstrained.overlaps.gram.views, dtype=np.int64)
 
+    @cached_property
+    def _white_X(self) -> Array:
+        """(n, k)."""
+        return self._white(self.X)
+
     def _white(self, response: Array) -> Array:
         return self.linear.whiten(self.linear.reduce(response))
 
-    def _twists_of(self, views: Indices) -> Array:
-        """Return unit twists (6V, 6k) of some views."""
-        return np.eye(len(self.X))[:, (6 * np.asarray(views)[:, None] + np.arange(6)).ravel()]
+    def _free(self, views: Indices) -> Array:
+        """Return whitened unit twists (n, 6k) of some views."""
+        return white_twists(self.linear)[:, (6 * np.asarray(views)[:, None] + np.arange(6)).ravel()]
 
 
 @dataclass(frozen=True)
@@ -151,6 +158,14 @@ class SurfaceObservation(Observation):
         """(V, 3) translations of the twists that make reduced observations (n,), less the common motion."""
         out = self.expand(numbers).reshape(-1, 6)[:, 3:]
         return out - out.mean(axis=0)
+
+
+@remembered
+def white_twists(linear: LinearModel) -> Array:
+    """Return unit twists of all views (n, 6V) in units of the null's scatter."""
+    surfaces = surfaces_of(linear)
+    assert surfaces is not None
+    return linear.whiten(surfaces.reduced_poses.reduction)
 
 
 def surfaces_of(linear: LinearModel) -> SurfaceObservation | None:
