@@ -17,6 +17,7 @@ from typing import Any
 # Public names of the core and their modules; type checkers read __init__.pyi instead. A module is imported on first
 # use: reading a session does not wait for the statistics.
 _CORE = {
+    "CheckedSession": "stitch.api.check",
     "Diagnosis": "stitch.diagnosis.diagnosis",
     "InputError": "stitch.errors",
     "LiveSession": "stitch.api.live",
@@ -26,13 +27,16 @@ _CORE = {
     "Session": "stitch.api.session",
     "StitchError": "stitch.errors",
     "add": "stitch.api.verbs",
+    "check": "stitch.api.check",
     "compare": "stitch.api.verbs",
     "diagnose": "stitch.api.verbs",
     "drop": "stitch.api.verbs",
     "live": "stitch.api.live",
     "load_run": "stitch.api.verbs",
     "load_session": "stitch.api.session",
+    "next_view": "stitch.api.verbs",
     "read_model": "stitch.model.model_toml",
+    "report": "stitch.api.verbs",
     "run": "stitch.api.verbs",
     "run_rig": "stitch.api.verbs",
 }
@@ -53,7 +57,8 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_modules(), "MODULES", "__all__", "__version__"})
+    """Return what people call, without the inside."""
+    return [*_modules(), "MODULES", "__version__"]
 
 
 @cache

@@ -17,6 +17,7 @@ from stitch.observations.targets.outliers import Outlier
 from stitch.observations.targets.target_model import TargetModelFit
 from stitch.session.measurement import Measurement
 from stitch.session.session import SessionData
+from stitch.system.values import Table, Value
 
 # By which methods register moves single views, for people.
 METHOD_TITLES = {"dpwvm": "DPWVM-style weighted fit", "gicp": "plane to plane (GICP) inside Tukey's biweight"}
@@ -24,8 +25,8 @@ METHOD_TITLES = {"dpwvm": "DPWVM-style weighted fit", "gicp": "plane to plane (G
 _CLAUSE_END = re.compile(r"[:.] |; to fix: ")
 
 
-@dataclass(frozen=True)
-class StageResult:
+@dataclass(frozen=True, eq=False)
+class StageResult(Value):
     """One row of the stage table.
 
     Example:
@@ -37,7 +38,7 @@ class StageResult:
     rms: float  # length_unit
     correspondences: int
     iterations: int
-    seconds: float
+    seconds: float = field(compare=False)
     note: str = ""  # one plain sentence for people
     method: str = ""  # of register, between surfaces: dpwvm | gicp
 
@@ -47,8 +48,8 @@ class StageResult:
         return "; ".join(text for text in (METHOD_TITLES.get(self.method, self.method), self.note) if text)
 
 
-@dataclass(frozen=True)
-class FusedCloud:
+@dataclass(frozen=True, eq=False)
+class FusedCloud(Value):
     """The stitched cloud in the reference frame; lengths in length_unit.
 
     Example:
@@ -120,8 +121,8 @@ class LedgerStep:
     notes: tuple[Note, ...] = ()
 
 
-@dataclass(frozen=True)
-class Fit:
+@dataclass(frozen=True, eq=False)
+class Fit(Value):
     """What the stages found of one session under its model; lengths in length_unit, angles in rad.
 
     Example:
@@ -138,8 +139,9 @@ class Fit:
     verdict: str  # one plain sentence
     convergence: dict[str, list[float]]  # stage -> rms per iteration
     corrections: Array  # (V, 6) twists: poses = exp(corrections) @ poses_model, reference frame
-    overlaps: Overlaps | None = None  # correspondences of the model, before register moves single views
-    registered: Overlaps | None = None  # correspondences found anew after register: what scatters there is noise
+    # Correspondences of the model, before register moves single views; and found anew after it: what scatters is noise.
+    overlaps: Overlaps | None = field(default=None, compare=False)
+    registered: Overlaps | None = field(default=None, compare=False)
     targets: TargetModelFit | None = None  # what the labelled points say, where there are any
     outliers: tuple[Outlier, ...] = ()  # labelled points that do not count
     unobservable: tuple[str, ...] = ()  # plain words, one per unobservable direction
@@ -149,7 +151,7 @@ class Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class RunData:
+class RunData(Table, document="stitch.output.result_document:result_document", table="views"):
     """One session, its model and its results, as `result.json` and the report show them.
 
     Of a run that was read from a folder, `fit` is read and matched again when it is first asked for.
@@ -180,6 +182,9 @@ class RunData:
             InputError: a file of the run's folder is damaged, or belongs to another model or session.
         """
         return self.source if isinstance(self.source, Fit) else self.source(self)
+
+    def _stored(self) -> dict[str, Any]:
+        return super()._stored() | {"source": self.fit}
 
     def with_fit(self, **changes: Any) -> Self:
         """Return the run with other values of some fields of `fit`.

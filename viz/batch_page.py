@@ -19,11 +19,11 @@ def write_page(rows: Sequence[SessionRow], path: Path) -> None:
 
 def _row(row: SessionRow, folder: Path) -> dict[str, object]:
     of = f" of {(row.views or 0) + row.left_out}" if row.left_out else ""
-    lengths = (row.coarse_um, row.residual_um, row.registered_um, row.noise_floor_um, row.worst_view_um)
+    lengths = (*row.steps_um, row.noise_floor_um, row.worst_view_um)
     return {
         "name": row.name,
         "href": None if row.run is None else Path(relpath(Path(row.run) / "report.html", folder.resolve())).as_posix(),
-        "words": row.error or row.verdict,
+        "words": row.error or " ".join((*row.doubts, row.verdict or "")),
         "failed": row.error is not None,
         "lengths": ["–" if x is None else length_text(x / 1e3, "mm", zeros=True) for x in lengths],
         "worst_view": row.worst_view or "",

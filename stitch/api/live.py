@@ -7,13 +7,13 @@ from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 from threading import RLock
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch.api.run import FittedHandEye, Run, fitted_hand_eye
-from stitch.api.session import Session, check_convention, public_session
+from stitch.api.session import LengthUnit, Session, check_convention, public_session
 from stitch.api.verbs import run
 from stitch.errors import InputError, NoResultError
 from stitch.fit import surface_steps
@@ -35,8 +35,9 @@ from stitch.screening.view_screening import fit_screened_views
 from stitch.session.capture import Capture, build_capture, prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.robot import Robot
-from stitch.session.session import Scanner, SessionData, View
+from stitch.session.session import Mount, Scanner, SessionData, View
 from stitch.system.threads import library_threads_off
+from stitch.system.values import Value
 
 Verdict = Literal["waiting", "fits", "does_not_belong", "adds_nothing"]
 
@@ -56,8 +57,8 @@ _TURNS_DEG = (15.0, 30.0, 45.0)
 _UNSEEN = 1e-8
 
 
-@dataclass(frozen=True)
-class LiveView:
+@dataclass(frozen=True, eq=False)
+class LiveView(Value):
     """What is said of one view as it comes; `print` writes it as one line.
 
     Example:
@@ -81,8 +82,8 @@ class LiveView:
         return f"{self.name}: {self.verdict.replace('_', ' ')}. {self.why}{known}"
 
 
-@dataclass(frozen=True)
-class ProposedPose:
+@dataclass(frozen=True, eq=False)
+class ProposedPose(Value):
     """A pose of the flange that would show more of the hand-eye; whether the arm can take it is not asked.
 
     Example:
@@ -125,7 +126,9 @@ class LiveSession:
         ('flange', 5)
     """
 
-    def __init__(self, session: Session, recording: LiveRecording | None = None, cloud_unit: str | None = None) -> None:
+    def __init__(
+        self, session: Session, recording: LiveRecording | None = None, cloud_unit: LengthUnit | None = None
+    ) -> None:
         self.session = session  # with the views so far
         self.said: list[LiveView] = []  # of every view, in their order
         self._recording = recording
@@ -189,7 +192,7 @@ class LiveSession:
             times=None if time_s is None else [time_s],
             covariates={key: [value] for key, value in (covariates or {}).items()},
             scanner=cell.scanner,
-            unit=cell.length_unit,
+            unit=cast(LengthUnit, cell.length_unit),
             cloud_unit=self._cloud_unit,
             name=cell.name,
             check=False,
@@ -420,11 +423,11 @@ class LiveSession:
 
 def live(
     *,
-    mount: str,
+    mount: Mount,
     robot: Robot | Mapping[str, Any] | Path | str | None = None,
     scanner: Scanner | Mapping[str, Any] | None = None,
-    unit: str = "mm",
-    cloud_unit: str | None = None,
+    unit: LengthUnit = "mm",
+    cloud_unit: LengthUnit | None = None,
     name: str = "session",
     recording: Path | str | None = None,
 ) -> LiveSession:

@@ -1,8 +1,10 @@
 """A run as people hold it: hand-eye, stitched cloud, views, residuals, and what is drawn and written of them."""
 
 import html
+import json
+import logging
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -19,14 +21,19 @@ from stitch.numerics.units import METRES
 from stitch.output import run_folder
 from stitch.output.cloud_colours import Colours, residual_colours
 from stitch.output.fit_report import fit_report
-from stitch.output.result_document import points_of
+from stitch.output.json_file import to_json
+from stitch.output.result_document import ledger, points_of
 from stitch.output.run_folder import recordings, residual_table
+from stitch.output.stored_run import read_ledger
 from stitch.recorder import Recorder
 from stitch.run_data import FusedCloud, RunData, StageResult
 from stitch.session.capture import Capture
 from stitch.session.reading.session_folder import content_hash, measured_files
 from stitch.session.session import SessionData
 from stitch.system.open3d_library import import_open3d
+from stitch.system.values import Value
+
+_LOG = logging.getLogger("stitch")
 
 
 class AtPart(NamedTuple):
@@ -42,8 +49,8 @@ class AtPart(NamedTuple):
     mrad: float
 
 
-@dataclass(frozen=True)
-class FittedHandEye:
+@dataclass(frozen=True, eq=False)
+class FittedHandEye(Value):
     """The hand-eye of a run: where the scanner sits on what carries it.
 
     As an array it is its pose.
@@ -109,7 +116,7 @@ def fitted_hand_eye(
     return FittedHandEye(T_mount, covariance, frame, session.length_unit, middle, unknown)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stitched(FusedCloud):
     """The stitched cloud in the reference frame: the flange (eye_to_hand) or the base (eye_in_hand).
 
@@ -178,8 +185,8 @@ class Stitched(FusedCloud):
         return f"Stitched({len(self):,} points in the frame of the {self.frame}, {self.length_unit})"
 
 
-@dataclass(frozen=True)
-class RunView:
+@dataclass(frozen=True, eq=False)
+class RunView(Value):
     """One view as the run puts it.
 
     Example:
@@ -229,8 +236,9 @@ class Run(RunData):
         ...
     """
 
-    measured: Session | None = None  # with the views that were left out
-    recorded: tuple[tuple[str, tuple[Any, ...]], ...] = ()  # calls of a recorder, replayed by `save`
+    # With the views that were left out; and calls of a recorder, replayed by `save`.
+    measured: Session | None = field(default=None, compare=False)
+    recorded: tuple[tuple[str, tuple[Any, ...]], ...] = field(default=(), compare=False)
 
     @property
     def hand_eye(self) -> FittedHandEye:
@@ -284,7 +292,7 @@ class Run(RunData):
         run. What a run wrote there before is replaced; other files stay.
 
         Args:
-            force: replace the run of another session too.
+            force: replace the run of another session too, or one of this session with another history.
             recording: write recording.rrd.
             tolerance: within which the views have to agree on the part, length_unit: for the page's light.
 
@@ -297,6 +305,7 @@ class Run(RunData):
             ('ledger.json', 'model.toml', 'report.html')
         """
         folder = Path(folder)
+        _require_own_history(self, folder, force)
         whole = self.measured or public_session(self.session)
         path = _save_session_of_run(whole, folder) if whole.in_memory else whole.path
         saved = replace(self, session=replace(self.session, path=path))
@@ -335,10 +344,16 @@ class Run(RunData):
 
 
 class ReplayRecorder:
-    """Recorder that keeps its calls, so that a recording can be written once the run is saved."""
+    """Recorder that keeps its calls, so that a recording can be written once the run is saved; it logs every stage.
 
-    def __init__(self, other: Recorder | None = None) -> None:
-        self.other = other  # gets every call too
+    Args:
+        other: gets every call too.
+        progress: is called with the line of each stage.
+    """
+
+    def __init__(self, other: Recorder | None = None, progress: Callable[[str], object] | None = None) -> None:
+        self.other = other
+        self.progress = progress
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
 
     def start(self, session: SessionData) -> None:
@@ -347,10 +362,15 @@ class ReplayRecorder:
 
     def iteration(self, stage: str, index: int, poses: Array, rms: float, gate: float) -> None:
         """Keep one iteration."""
+        _LOG.debug("%s, iteration %d: rms %.4g within %.4g", stage, index, rms, gate)
         self._keep("iteration", stage, index, poses, rms, gate)
 
     def stage(self, result: StageResult, poses: Array) -> None:
-        """Keep the end of a stage."""
+        """Keep the end of a stage, and say it."""
+        line = f"{result.name}: rms {result.rms:.4g}, {result.seconds:.1f} s"
+        _LOG.info("%s", line)
+        if self.progress is not None:
+            self.progress(line)
         self._keep("stage", result, poses)
 
     def finish(self, run: RunData) -> None:
@@ -386,6 +406,24 @@ def rigid_transform(pose: Array) -> Any:
     if kind is None:
         raise InputError("transform: scipy has no RigidTransform before 1.16; to fix: use pose, the matrix (4, 4)")
     return kind.from_matrix(pose)
+
+
+def _require_own_history(run: RunData, folder: Path, force: bool) -> None:
+    """Refuse a folder in which the model went another way, or somebody remarked on it.
+
+    Raises:
+        InputError: it holds such a run.
+    """
+    if force or not (folder / "ledger.json").is_file():
+        return
+    steps = read_ledger(folder)
+    own = json.loads(to_json(ledger(run)))
+    if steps != own[: len(steps)]:
+        raise InputError(
+            f"{folder}: holds another run, whose model has a history of its own",
+            fix_cli="name another folder with -o, or replace it with --force",
+            fix_python="name another folder, or pass force=True",
+        )
 
 
 def _save_session_of_run(session: Session, folder: Path) -> Path:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from stitch.session.session import Cloud, Mount, Scanner, SessionData, StatedRep
 from stitch.session.thinning import MAX_POINTS
 from stitch.system.threads import parallel
 
+LengthUnit = Literal["mm", "m"]
 # Names of views that can be those of files.
 _PLAIN = re.compile(r"[\w+-][\w.+-]*")
 # No joint of an arm turns four times about itself, rad.
@@ -67,15 +68,15 @@ class Session(SessionData):
         clouds: Sequence[Any] | Mapping[str, Any] | None,
         poses: Any,
         *,
-        mount: str,
+        mount: Mount,
         joints: Any = None,
         robot: Robot | Mapping[str, Any] | Path | str | None = None,
         times: Any = None,
         covariates: Mapping[str, Any] | None = None,
         scanner: Scanner | Mapping[str, Any] | None = None,
         points: Sequence[Any] | None = None,
-        unit: str = "mm",
-        cloud_unit: str | None = None,
+        unit: LengthUnit = "mm",
+        cloud_unit: LengthUnit | None = None,
         name: str = "session",
         check: bool = True,
     ) -> "Session":
@@ -131,11 +132,11 @@ class Session(SessionData):
     def empty(
         cls,
         *,
-        mount: str,
+        mount: Mount,
         robot: Robot | Mapping[str, Any] | Path | str | None = None,
         scanner: Scanner | Mapping[str, Any] | None = None,
-        unit: str = "mm",
-        cloud_unit: str | None = None,
+        unit: LengthUnit = "mm",
+        cloud_unit: LengthUnit | None = None,
         name: str = "session",
     ) -> "Session":
         """Return a session without views, with what is stated of the cell; arguments as of `from_arrays`.
@@ -169,7 +170,7 @@ class Session(SessionData):
             path=path,
             name=name,
             length_unit=unit,
-            mount=cast(Mount, mount),
+            mount=mount,
             scanner=scanner,
             robot=robot,
             sphere_radius=None,

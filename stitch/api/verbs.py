@@ -1,30 +1,37 @@
-"""What the commands do, from Python: run, diagnose, add, drop, compare; plug-ins add verbs of their own.
+"""What the commands do, from Python: run, diagnose, add, drop, compare, next_view, report; plug-ins add theirs.
 
 An entry point of the group `stitch.verbs` makes the function NAME of a plug-in `stitch.NAME`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
 
 import numpy as np
 
 from stitch.api import pipeline, stepwise
 from stitch.api.run import ReplayRecorder, Run, public_run
 from stitch.api.session import Session, public_session
-from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.diagnosis import Diagnosis, Proposal
 from stitch.effects.contract import find_effect
+from stitch.errors import InputError
 from stitch.fit.correct import gate_of_model
-from stitch.fusion.register import DEFAULT
 from stitch.model.forward import corrected_capture
 from stitch.model.model_toml import ModelFile, keep_arm_effects
 from stitch.output import stored_run
 from stitch.output.comparison.residual_tables import ResidualTables, compare_surfaces, compare_targets
+from stitch.output.comparison.two_runs import compare_runs
 from stitch.output.result_document import model_of
+from stitch.output.run_folder import call_entry_points
 from stitch.recorder import Recorder
 from stitch.run_data import FusedCloud, RunData
 from stitch.session.session import SessionData
+from stitch.system.files import whole_file
 from stitch.system.threads import library_threads_off
+
+Register = Literal["dpwvm", "gicp"]
 
 
 def run(
@@ -34,7 +41,8 @@ def run(
     effects: Sequence[str] = (),
     keep: bool = False,
     arm: ModelFile | RunData | None = None,
-    register: str = DEFAULT,
+    register: Register = "dpwvm",
+    progress: Callable[[str], object] | None = None,
 ) -> Run:
     """Stitch one session: correct the hand-eye from the scans, register, fuse.
 
@@ -45,6 +53,7 @@ def run(
         keep: fuse also the views that do not belong.
         arm: a run, or a model, of whose joints and links the effects stay as they are, while all else is fitted.
         register: method by which single views are registered, "dpwvm" or "gicp"; labelled points need none.
+        progress: is called with a line a stage, as the logger `stitch` is.
 
     Returns:
         The run: hand-eye (4, 4) in the mount frame, poses (V, 4, 4) and cloud (N, 3) in the reference frame; lengths in
@@ -59,7 +68,8 @@ def run(
         >>> run.hand_eye.pose.shape
         (4, 4)
     """
-    return run_rig([session], model, None if recorder is None else [recorder], effects, keep, arm, register=register)[0]
+    others = None if recorder is None else [recorder]
+    return run_rig([session], model, others, effects, keep, arm, register, progress)[0]
 
 
 def run_rig(
@@ -69,13 +79,14 @@ def run_rig(
     effects: Sequence[str] = (),
     keep: bool = False,
     arm: ModelFile | RunData | None = None,
-    register: str = DEFAULT,
+    register: Register = "dpwvm",
+    progress: Callable[[str], object] | None = None,
 ) -> list[Run]:
     """Stitch several sessions of one rig with common effects and, of scans, one hand-eye; one run a session.
 
     Args:
         sessions: of one scanner on one mount, or labelled points of one arm, in one length_unit.
-        model, recorders, effects, keep, arm, register: as `stitch.run` takes them, a recorder a session.
+        model, recorders, effects, keep, arm, register, progress: as `stitch.run` takes them, a recorder a session.
 
     Returns:
         A run a session, shapes and frames as of `stitch.run`; of scans their hand-eyes (4, 4) are the same.
@@ -89,11 +100,12 @@ def run_rig(
         >>> bool((runs[0].T_mount == runs[1].T_mount).all())
         True
     """
+    _require_sessions(sessions)
     others: Sequence[Recorder | None] = recorders or [None] * len(sessions)
-    replays = [ReplayRecorder(other) for other in others]
+    replays = [ReplayRecorder(other, progress) for other in others]
     kept_arm = None if arm is None else keep_arm_effects(_model(arm)) if isinstance(arm, RunData) else arm
     known_model = None if model is None else _model(model)
-    known_effects = [find_effect(name).name for name in effects]
+    known_effects = [find_effect(name).name for name in _names(effects)]
     runs = pipeline.run_rig(sessions, known_model, replays, known_effects, keep, kept_arm, register=register)
     return [
         public_run(run, public_session(session), replay)
@@ -207,6 +219,70 @@ def compare(run: RunData) -> ResidualTables:
     return compare_surfaces(state) if state.measurement.capture.scans else compare_targets(state)
 
 
+def next_view(run: RunData | Diagnosis) -> tuple[Proposal, ...]:
+    """Return what to measure next, as `stitch next` does: poses or artefacts that separate what cannot be told apart.
+
+    Args:
+        run: a run, which is diagnosed, or its diagnosis.
+
+    Returns:
+        Proposals, the most telling first: `do` in words, `separates` effects, and of a pose `joints_deg` (in radians:
+        np.radians).
+
+    Raises:
+        NoResultError: no two views overlap.
+
+    Example:
+        >>> all(proposal.do and proposal.separates for proposal in stitch.next_view(run))
+        True
+    """
+    return (run if isinstance(run, Diagnosis) else diagnose(run)).next
+
+
+def report(
+    run: RunData,
+    file: Path | str,
+    *,
+    other: RunData | None = None,
+    diagnosis: Diagnosis | None = None,
+    tolerance: float | None = None,
+) -> Path:
+    """Write the page of a run, as `stitch report` does, and return its path.
+
+    Args:
+        file: of the page, NAME.html; it is written whole or not at all.
+        other: another run: the page says what changed from `run` to it.
+        diagnosis: of the run, which the page then shows.
+        tolerance: within which the views have to agree on the part, length_unit.
+
+    Raises:
+        InputError: no place for a page, two runs that cannot be compared, or nothing that draws is installed.
+
+    Example:
+        >>> stitch.report(run, folder / "page.html").name
+        'page.html'
+    """
+    page = Path(file)
+    if page.suffix != ".html" or not page.parent.is_dir():
+        raise InputError(
+            f"{page}: no place for a page; to fix: name a file that ends in .html, in a folder that exists"
+        )
+    with TemporaryDirectory() as scratch:
+        written = Path(scratch) / "report.html"
+        if other is not None:
+            both = compare_runs([run, other], [run.session.name, other.session.name])
+            call_entry_points("stitch.two_run_reports", both, written, tolerance)
+        else:
+            call_entry_points("stitch.reports", run, written, tolerance)
+        if not written.is_file():
+            raise InputError("report: nothing that draws is installed; to fix: install stitch with its package viz")
+        if diagnosis is not None:
+            call_entry_points("stitch.diagnosis_reports", diagnosis, run, written.parent)
+        with whole_file(page) as out:
+            out.write_bytes(written.read_bytes())
+    return page
+
+
 def stored_state(run: RunData) -> RunData:
     """Return what a command reads of the run's folder: partners are looked for within the gate of the model alone."""
     with library_threads_off():
@@ -217,6 +293,25 @@ def stored_cloud(run: RunData) -> FusedCloud:
     """Return the stitched cloud with the digits that the run's folder keeps: stitched.ply is of single precision."""
     names = ("points", "normals", "residual")
     return replace(run.fused, **{name: getattr(run.fused, name).astype(np.float32).astype(float) for name in names})
+
+
+def _require_sessions(sessions: Sequence[Any]) -> None:
+    """Refuse what is no session, and say what makes one."""
+    odd = next((session for session in sessions if not isinstance(session, SessionData)), None)
+    if isinstance(odd, str | Path):
+        raise InputError(f"stitch.run: {odd} is a path; to fix: pass stitch.load_session({str(odd)!r})")
+    if odd is not None:
+        raise InputError(
+            f"stitch.run: got a {type(odd).__name__}, no session; to fix: pass "
+            "stitch.Session.from_arrays(clouds, poses, mount=…)"
+        )
+
+
+def _names(effects: Sequence[str]) -> Sequence[str]:
+    """Refuse a text, whose letters would each be taken for a name."""
+    if isinstance(effects, str):
+        raise InputError(f"effects: {effects!r} is a text, and a list is asked for; to fix: pass [{effects!r}]")
+    return effects
 
 
 def _model(model: ModelFile | RunData) -> ModelFile:

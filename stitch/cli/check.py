@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -12,9 +12,6 @@ from stitch.cli.options import Json
 from stitch.cli.progress import show_activity
 from stitch.cli.terminal import emit, say, show_block
 from stitch.errors import InputError
-
-if TYPE_CHECKING:
-    from stitch.session.session import SessionData
 
 
 def check(
@@ -39,6 +36,7 @@ def check(
 
 def _check_readable(sessions: list[Path], as_json: bool) -> None:
     """Say what sessions hold; exit code 2 where one cannot be read."""
+    from stitch.api.check import session_summary
     from stitch.session.reading.session_folder import load_session
 
     summaries: list[dict[str, Any]] = []
@@ -81,32 +79,6 @@ def _check_deeply(sessions: list[Path], as_json: bool) -> None:
                 say(f"{path}: {line}", hang=2)
     if any(p.certain for _, _, problems in checked for p in problems):
         raise typer.Exit(2)
-
-
-def session_summary(session: SessionData) -> dict[str, Any]:
-    """Return what a session holds, in plain numbers."""
-    import numpy as np
-
-    from stitch.session.notes import session_notes
-
-    clouds = [view.cloud.points for view in session.views if view.cloud is not None]
-    sighted = [view.sighting.points for view in session.views if view.sighting is not None]
-    ranges = [float(np.median(np.linalg.norm(points, axis=1))) for points in clouds or sighted]
-    return {
-        "session": session.name,
-        "mount": session.mount,
-        "length_unit": session.length_unit,
-        "views": len(session.views),
-        "points": sum(view.cloud.count for view in session.views if view.cloud is not None),
-        "targets": len({name for view in session.views if view.sighting for name in view.sighting.targets}),
-        "sightings": sum(len(view.sighting.targets) for view in session.views if view.sighting),
-        "median_range": round(float(np.median(ranges)), 3) if ranges else None,
-        "joints": session.views[0].joints is not None,
-        "robot": session.robot.name if session.robot else None,
-        "hand_eye_given": session.scanner.T_mount is not None,
-        "covariates": sorted({name for view in session.views for name in view.covariates}),
-        "notes": session_notes(session),
-    }
 
 
 def _summary_rows(fact: dict[str, Any]) -> list[tuple[str, str]]:

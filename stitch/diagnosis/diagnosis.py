@@ -15,11 +15,17 @@ from stitch.diagnosis.verdict import Answer
 from stitch.numerics.frames import Array
 from stitch.observations.linear_model import LinearModel
 from stitch.observations.surfaces.field_error import FieldError
+from stitch.system.values import Table, Value
 
 
-@dataclass(frozen=True)
-class Proposal:
-    """One measurement."""
+@dataclass(frozen=True, eq=False)
+class Proposal(Value):
+    """One measurement.
+
+    Example:
+        >>> [proposal.separates for proposal in stitch.next_view(run)]
+        [...]
+    """
 
     do: str  # plain words
     separates: tuple[str, ...]
@@ -55,8 +61,8 @@ class Finding:
     validations: dict[str, CrossValidation]  # of candidates, by name
 
 
-@dataclass(frozen=True)
-class Diagnosis:
+@dataclass(frozen=True, eq=False)
+class Diagnosis(Table, document="stitch.output.diagnosis_document:diagnosis_document", table="candidates"):
     """Verdict, candidate effects, what the rest depends on, what to measure next.
 
     Example:

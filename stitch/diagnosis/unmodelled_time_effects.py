@@ -54,6 +54,7 @@ from stitch.observations.pose_errors import (
     usual_twist,
 )
 from stitch.system.threads import parallel
+from stitch.system.values import Value
 
 # Of a Gaussian its full width at half maximum.
 _FULL_WIDTH = 2.355
@@ -208,8 +209,8 @@ def _duration_in_words(linear: LinearModel, steps: float) -> str:
     return f"{steps:.2g} views" + (f" ({duration_text(steps * step)})" if step > 0 else "")
 
 
-@dataclass(frozen=True)
-class TimeCurve:
+@dataclass(frozen=True, eq=False)
+class TimeCurve(Value):
     """How far the flange turns and moves in time, in its own frame, beside where it stands otherwise.
 
     Example:

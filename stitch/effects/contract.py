@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from stitch.errors import InputError
+from stitch.errors import InputError, did_you_mean
 from stitch.numerics.units import Amount, format_amount
 from stitch.session.axes import KINDS, Axis
 from stitch.session.measurement import Measurement
@@ -280,7 +280,12 @@ def find_effect(name: str) -> Effect:
         InputError: no such effect.
     """
     if name not in EFFECTS:
-        raise InputError(f"no effect {name!r}; there are {', '.join(EFFECTS)} (your own: --effects-file)")
+        there = f"one of {', '.join(EFFECTS)}"
+        raise InputError(
+            f"no effect {name!r}{did_you_mean(name, EFFECTS)}",
+            fix_cli=f"{there}; your own: --effects-file",
+            fix_python=f"{there}; your own: import the file that defines it",
+        )
     return EFFECTS[name]
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stitch.errors import InputError
+from stitch.errors import InputError, did_you_mean
 from stitch.fusion.correspondence_weights import OffsetSums, dpwvm_weights, plane_weights, with_offsets
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
@@ -68,7 +68,9 @@ def method_named(name: str) -> Method:
         InputError: there is none of this name.
     """
     if name not in METHODS:
-        raise InputError(f"--register {name}: no method has this name; to fix: {' or '.join(METHODS)}")
+        raise InputError(
+            f"register {name}: no method has this name{did_you_mean(name, METHODS)}; to fix: {' or '.join(METHODS)}"
+        )
     return METHODS[name]
 
 

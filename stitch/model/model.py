@@ -19,6 +19,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array, Mask
 from stitch.numerics.units import METRES, value_uncertainty_text
 from stitch.session.measurement import Measurement
+from stitch.system.values import Value
 
 ARM_PLACES = ("robot", "links")  # where the effects of an arm stand in the chain of frames
 # Expanded uncertainty U = k·σ, coverage about 95 % (JCGM 100:2008, GUM).
@@ -29,8 +30,8 @@ _SAME_SIGMA = 1e-6
 _STEP = 1e-6
 
 
-@dataclass(frozen=True)
-class Term:
+@dataclass(frozen=True, eq=False)
+class Term(Value):
     """An effect in use; P parameters in the order of the effect's arguments.
 
     Example:
@@ -141,8 +142,8 @@ class Target:
     orientation: Array | None = None  # (3, 3) R_reference_probe
 
 
-@dataclass(frozen=True)
-class Model:
+@dataclass(frozen=True, eq=False)
+class Model(Value):
     """Fitted parameters of a cell: hand-eye, effects, targets. Lengths in the session's length_unit, angles in rad.
 
     Example:

@@ -22,6 +22,7 @@ from stitch.session.axis_poses import place_axes
 from stitch.session.measurement import Measurement
 from stitch.session.reading.text_files import optional_text, read_toml, table_choice
 from stitch.session.session import SessionData
+from stitch.system.values import Value
 
 FORMAT = "stitch-model/1"
 # What rounding, or a hand that writes six digits, does to a matrix of unit diagonal.
@@ -32,8 +33,8 @@ _HEADER = """# The model of this cell. hand_eye.corrected is {frame}: it maps sc
 """
 
 
-@dataclass(frozen=True)
-class ModelFile:
+@dataclass(frozen=True, eq=False)
+class ModelFile(Value):
     """What model.toml says: the model with its unit and mount, parameters by effect and name.
 
     Example:

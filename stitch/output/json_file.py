@@ -68,7 +68,11 @@ def require_free(path: Path, sessions: Sequence[Path], force: bool) -> None:
     """
     target, here = path.resolve(), Path.cwd()
     if target in (here, *here.parents):
-        raise InputError(f"{path}: one stands in this folder, and a run replaces it; name another with -o")
+        raise InputError(
+            f"{path}: one stands in this folder, and a run replaces it",
+            fix_cli="name another with -o",
+            fix_python="name another folder",
+        )
     read = [session.resolve() for session in sessions]
     for folder in (target, *target.parents):
         if folder in read or (folder / "session.toml").is_file():
@@ -79,10 +83,14 @@ def require_free(path: Path, sessions: Sequence[Path], force: bool) -> None:
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
     if (before := sessions_in(target)) is None:
-        raise InputError(f"{path}: exists and is not a run folder; name another with -o")
+        raise InputError(
+            f"{path}: exists and is not a run folder", fix_cli="name another with -o", fix_python="name another folder"
+        )
     if not force and {str(Path(s).resolve()) for s in before} != {str(s) for s in read}:
         raise InputError(
-            f"{path}: holds the run of {', '.join(before)}; name another with -o, or replace it with --force"
+            f"{path}: holds the run of {', '.join(before)}",
+            fix_cli="name another with -o, or replace it with --force",
+            fix_python="name another folder, or pass force=True",
         )
 
 

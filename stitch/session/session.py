@@ -13,6 +13,7 @@ from stitch.numerics.frames import Array
 from stitch.session.axes import Axis
 from stitch.session.robot import Robot
 from stitch.session.scan import Scan, bounding_box
+from stitch.system.values import Value
 
 Mount = Literal["eye_to_hand", "eye_in_hand"]
 SensorKind = Literal["area", "line", "tracker", "probe", "camera"]
@@ -47,7 +48,7 @@ class Cloud:
 class WholeCloud:
     """All points of a scan of which a cloud holds some; they stay where they are, mostly in a file."""
 
-    reload: Callable[[], Cloud]  # reads them
+    reload: Callable[[], Cloud] = field(compare=False)  # reads them
     count: int
     box: Array  # (2, 3) its lowest and highest corner, scanner frame
     scan: Scan  # the points that the cloud holds, with the surface of all of them
@@ -147,11 +148,11 @@ class StatedRepeatability:
         return None if self.rotation is None else self.rotation / 3.0
 
 
-@dataclass(frozen=True)
-class SessionData:
+@dataclass(frozen=True, eq=False)
+class SessionData(Value, document="stitch.api.check:session_summary"):
     """Measured data of one session. Lengths in length_unit, angles in rad."""
 
-    path: Path
+    path: Path = field(compare=False)
     name: str
     length_unit: str
     mount: Mount

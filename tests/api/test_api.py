@@ -21,6 +21,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import stitch
+from data_synth.fixtures.sphere_scans import sphere_cell, write_spheres
 from stitch.plugins.intake.layouts import possible_layouts
 from stitch.plugins.intake.raw_poses import read_raw_poses
 from stitch.plugins.intake.readings import readings
@@ -88,7 +89,7 @@ def moved(view):
 
 
 @pytest.fixture(scope="module")
-def names_of_examples(arrays, cell_folder, loaded, found, better):
+def names_of_examples(arrays, cell_folder, loaded, found, better, tmp_path_factory):
     """What the examples call as a person would, but for the folder to write into."""
     clouds, poses = arrays
     grown = stitch.live(mount="eye_in_hand")
@@ -96,6 +97,10 @@ def names_of_examples(arrays, cell_folder, loaded, found, better):
         grown.add_view(cloud, pose)
     # What takes seconds is done once, for all examples that ask for it.
     slow = {name: cache(getattr(stitch, name)) for name in ("compare", "diagnose", "plan")}
+    other = replace(loaded, name="other", views=tuple(moved(view) for view in loaded.views))
+    balls = write_spheres(sphere_cell(3, "area"), tmp_path_factory.mktemp("balls") / "ball")
+    place = len(found.stitched) // 2
+    at, axis = found.stitched.points[place], found.stitched.normals[place]
     return {
         "stitch": SimpleNamespace(**{name: getattr(stitch, name) for name in stitch.__all__} | slow),
         "np": np,
@@ -103,7 +108,10 @@ def names_of_examples(arrays, cell_folder, loaded, found, better):
         "clouds": clouds,
         "poses": poses,
         "session": loaded,
-        "other": replace(loaded, name="other", views=tuple(moved(view) for view in loaded.views)),
+        "other": other,
+        "artefact": other,
+        "plate": [stitch.Feature("patch", "plane", at=at, axis=axis, calibrated=0.0, calibrated_U=0.01)],
+        "ball_session": stitch.load_session(balls, at_most=None),
         "session_folder": cell_folder,
         "run": found,
         "better": better,
@@ -126,6 +134,8 @@ PLANS = [name for name in NAMES if any("stitch.plan(" in own.source for own in e
 def test_the_example_gives_what_it_says(name, names_of_examples, tmp_path):
     if "open3d" in name:
         needs_open3d()
+    if "to_pandas" in NAMES[name].__doc__:
+        pytest.importorskip("pandas")
     said = []
     example = example_of(name, names_of_examples | {"folder": tmp_path})
     doctest.DocTestRunner(optionflags=FLAGS).run(example, out=said.append)

@@ -31,7 +31,7 @@ def make_run(folder, session):
         ("link", "lies in the session"),
         (".", "the session .* lies in it|one stands in"),
         ("own", "not a run folder"),
-        ("other", "holds the run of .*--force"),
+        ("other", "holds the run of .*force=True"),
         ("model", "not a run folder"),
         ("damaged", "not a run folder"),
     ],

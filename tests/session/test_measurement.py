@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from data_synth.fixtures.labelled_arm import flange, labelled_cell
+from stitch.api.check import session_summary
 from stitch.api.pipeline import run
-from stitch.cli.check import session_summary
 from stitch.session.measurement import views_of
 from stitch.session.notes import gaps_note, payload_note
 from stitch.session.torques import torques_of

@@ -37,6 +37,7 @@ from stitch.observations.pose_errors import JOINT_SCATTER, PoseErrors, white_sca
 from stitch.observations.surfaces.normal_equations import Gram, pair_squares
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses
 from stitch.session.capture import Capture
+from stitch.system.values import Value
 
 # Errors of the scanner that all views repeat, by their name among the sources of the hand-eye's variance.
 SCANNER_FIELD, SCANNER_SCALE = "scanner field", "scanner scale"
@@ -48,8 +49,8 @@ _OBSERVABLE_SHARE = 1e-6
 _HELD = 1e12
 
 
-@dataclass(frozen=True)
-class Repeatability:
+@dataclass(frozen=True, eq=False)
+class Repeatability(Value):
     """Standard deviations of the flange poses and the factor on the noise within overlaps.
 
     Example:

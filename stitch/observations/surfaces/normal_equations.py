@@ -34,6 +34,7 @@ from stitch.observations.surfaces.matching import Match, Searched, match_pairs, 
 from stitch.observations.surfaces.partners import find_partners, more_points
 from stitch.session.capture import Capture, Sightings
 from stitch.session.scan import Scan, centroid
+from stitch.system.values import Value
 
 # Queries per view for the final normal equations and statistics.
 FINE_SAMPLES = 3000
@@ -58,8 +59,8 @@ _ROUNDING = 1e-12
 _PAIR_FIELDS = ("pairs", "matrix", "vector", "square", "weight", "count", "raw_square", "labelled")
 
 
-@dataclass(frozen=True)
-class Overlaps:
+@dataclass(frozen=True, eq=False)
+class Overlaps(Value):
     """Correspondences of all overlapping pairs, and common targets, with the normal equations of both.
 
     Example:

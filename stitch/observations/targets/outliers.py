@@ -25,6 +25,7 @@ from stitch.observations.targets.rows import (
     target_positions,
 )
 from stitch.session.capture import Sightings
+from stitch.system.values import Value
 
 # Six times the usual deviation: one in a thousand million of honest Gaussian errors. Pose errors of an arm whose
 # model lacks something have longer tails: six times the median happens.
@@ -37,8 +38,8 @@ _MIN_TARGETS, _MIN_VIEWS = 3, 3
 _CLEARER, _TRIALS = 0.2, 100_000
 
 
-@dataclass(frozen=True)
-class Outlier:
+@dataclass(frozen=True, eq=False)
+class Outlier(Value):
     """One target of one view, or a whole view, that does not count.
 
     Example:

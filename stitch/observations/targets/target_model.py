@@ -11,10 +11,11 @@ from stitch.observations.linear_model import LinearModel
 from stitch.observations.rows import row_model
 from stitch.observations.targets.rows import Drawing, Landmarks, TargetRows, initial_landmarks, target_rows
 from stitch.session.measurement import Measurement
+from stitch.system.values import Value
 
 
-@dataclass(frozen=True)
-class TargetModelFit:
+@dataclass(frozen=True, eq=False)
+class TargetModelFit(Value):
     """Model, places of the targets and scatter of the poses; lengths in length_unit, angles in rad.
 
     Example:

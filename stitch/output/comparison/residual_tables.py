@@ -11,6 +11,7 @@ Views are the samples: all points of a view share its pose error.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from stitch.output.comparison.displaced_views import FollowedCovariate, followed
 from stitch.run_data import RunData
 from stitch.session.measurement import Views
 from stitch.system.threads import library_threads_off
+from stitch.system.values import Table, Value
 
 PLACE = "place on the part"
 APPROACH = "approach of j"
@@ -44,8 +46,8 @@ _ROUNDING = 1e-6
 Properties = list[tuple[str, str, Array]]
 
 
-@dataclass(frozen=True)
-class BinStatistics:
+@dataclass(frozen=True, eq=False)
+class BinStatistics(Value):
     """Of B bins; lengths in length_unit, counts of rows and of views that make a sample."""
 
     mean: Array  # (B,) signed
@@ -57,7 +59,7 @@ class BinStatistics:
     p_value: Array  # (B,) that chance makes this one mean so large; NaN where that is unknown
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ResidualTable(BinStatistics):
     """One property in bins; lengths in length_unit, counts of correspondences and of views.
 
@@ -96,8 +98,8 @@ class ResidualTable(BinStatistics):
         return [int(i) for i in np.argsort(-np.nan_to_num(self.rms), kind="stable") if fair[i]][:at_most]
 
 
-@dataclass(frozen=True)
-class ResidualTables:
+@dataclass(frozen=True, eq=False)
+class ResidualTables(Table, document="stitch.output.comparison.residual_tables:comparison_document"):
     """All tables, and the rms they share, length_unit.
 
     Example:
@@ -120,6 +122,21 @@ class ResidualTables:
             'mm'
         """
         return next(t for t in self.tables if t.name == name)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row a bin of every table.
+
+        Example:
+            >>> stitch.compare(run).rows()[0]["table"]
+            'view'
+        """
+        columns = ("low", "high", "mean", "mean_sigma", "rms", "rms_sigma", "p_value", "count", "views")
+        return [
+            {"table": t.name, "unit": t.unit, "label": t.label[i] if t.label else None}
+            | {name: getattr(t, name)[i].item() for name in columns}
+            for t in self.tables
+            for i in range(len(t.rms))
+        ]
 
     @property
     def labelled(self) -> tuple[ResidualTable, ...]:

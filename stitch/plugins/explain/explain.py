@@ -18,6 +18,7 @@ from stitch.plugins.explain.formula_file import effect_source, formula_text
 from stitch.plugins.explain.quantities import view_quantities
 from stitch.plugins.explain.search import TestedSum, enough_views, fitted_sizes, search_sums
 from stitch.system.threads import library_threads_off
+from stitch.system.values import Value
 
 EFFECT_NAME = "explained"
 _TINY = 1e-12
@@ -26,8 +27,8 @@ _TOO_FEW = (
 )
 
 
-@dataclass(frozen=True)
-class Explanation:
+@dataclass(frozen=True, eq=False)
+class Explanation(Value):
     """A formula of which views that took no part in finding it want the like too; or none.
 
     Example:

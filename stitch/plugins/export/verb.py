@@ -5,7 +5,7 @@ from pathlib import Path
 from stitch.api.run import Run
 from stitch.api.verbs import stored_cloud
 from stitch.diagnosis.diagnosis import Diagnosis
-from stitch.errors import InputError
+from stitch.errors import InputError, did_you_mean
 from stitch.output.diagnosis_document import diagnosis_document
 from stitch.output.result_document import model_of, result_document
 from stitch.plugins.export.cloud_formats import CLOUD_FORMATS, coloured
@@ -62,9 +62,8 @@ def export_run(
         document = {} if diagnosis is None else diagnosis_document(diagnosis)
         text = HAND_EYE_FORMATS[to](hand_eye_from(result_document(run), model_of(run), document, parent, child))
     else:
-        raise InputError(
-            f"{to}: no such format; to fix: one of {', '.join((*HAND_EYE_FORMATS, *ARM_FORMATS, *CLOUD_FORMATS))}"
-        )
+        formats = (*HAND_EYE_FORMATS, *ARM_FORMATS, *CLOUD_FORMATS)
+        raise InputError(f"{to}: no such format{did_you_mean(to, formats)}; to fix: one of {', '.join(formats)}")
     if path is not None:
         with whole_file(path) as out:
             out.write_text(text, encoding="utf-8")

@@ -19,7 +19,7 @@ from stitch.screening.motions import RelativeScans
 from stitch.session.reading.range_image import read_range_image
 from stitch.session.reading.session_toml import read_session_document
 from stitch.session.reading.views_table import read_views
-from stitch.session.session import SessionData, Sighting
+from stitch.session.session import Cloud, SessionData, Sighting
 from stitch.system.packages import import_extra
 
 # Views that are compared: each with the next few that show the same targets.
@@ -83,17 +83,25 @@ class ViewScans:
 
 
 def scans_of_session(session: SessionData) -> ViewScans:
-    """The scans of a session, in its length_unit."""
-    rows = read_views(session.path / "views.csv", session.robot)
-    cloud_unit = read_session_document(session.path / "session.toml").get("cloud_unit", session.length_unit)
+    """The scans of a session, in its length_unit; of one in memory there are no files."""
+    files: tuple[Path | None, ...] = (None,) * len(session.views)
+    cloud_unit = session.length_unit
+    if (session.path / "session.toml").is_file():
+        rows = read_views(session.path / "views.csv", session.robot)
+        files = tuple(session.path / row.cloud if row.cloud else None for row in rows)
+        cloud_unit = read_session_document(session.path / "session.toml").get("cloud_unit", session.length_unit)
     return ViewScans(
         where=session.path,
-        files=tuple(session.path / row.cloud if row.cloud else None for row in rows),
+        files=files,
         file_unit=METRES[cloud_unit],
         unit=METRES[session.length_unit],
-        clouds=tuple(None if view.cloud is None else view.cloud.points for view in session.views),
+        clouds=tuple(None if view.cloud is None else _every_point(view.cloud) for view in session.views),
         rotations=tuple(view.T_base_flange[:3, :3] for view in session.views),
     )
+
+
+def _every_point(cloud: Cloud) -> Array:
+    return cloud.points if cloud.whole is None else cloud.whole.read().points
 
 
 def find_targets(scans: ViewScans, search: TargetSearch) -> tuple[list[Sighting], list[str]]:

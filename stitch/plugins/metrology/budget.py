@@ -16,6 +16,7 @@ from stitch.numerics.frames import Array
 from stitch.plugins.metrology.feature_file import Contribution, FeatureList
 from stitch.plugins.metrology.features import NUMBERS, Feature, FittedFeature, fit_feature, position_of, reach_of
 from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors, Responses, RunPoints
+from stitch.system.values import Table
 
 # The variances are posterior means, which hold already that they are not well known: twice their root covers 95 %
 # whatever the degrees of freedom. These are told for who compares with a factor of Student's t.
@@ -70,15 +71,24 @@ class Number:
         return False if self.value < low - self.U or self.value > high + self.U else None
 
 
-@dataclass(frozen=True)
-class MeasuredFeatures:
-    """Q numbers of the features of one run, with what is known of all of them together."""
+@dataclass(frozen=True, eq=False)
+class MeasuredFeatures(Table, document="stitch.plugins.metrology.documents:measure_document", table="numbers"):
+    """Numbers (Q) of the features of one run, with what is known of all of them together.
+
+    Example:
+        >>> at = run.stitched.points[len(run.stitched) // 2]
+        >>> patch = stitch.Feature("patch", "plane", at=at, axis=run.stitched.normals[len(run.stitched) // 2])
+        >>> measured = stitch.measure(run, [patch])
+        >>> [number.quantity for number in measured.numbers]
+        ['offset', 'slope_u', 'slope_v']
+    """
 
     numbers: tuple[Number, ...]
     covariance: Array  # (Q, Q)
     fits: tuple[FittedFeature, ...]  # of all features but distances
     length_unit: str
     not_measured: dict[str, str] = field(default_factory=dict)  # features without numbers, and why
+    checked: "MonteCarlo | None" = None  # trials that were drawn of all sources
 
     @property
     def correlation(self) -> Array:

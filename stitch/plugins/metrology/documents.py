@@ -13,8 +13,9 @@ from stitch.plugins.watch.dfq_file import Characteristic
 MEASURE_FORMAT = "stitch-measure/1"
 
 
-def measure_document(measured: MeasuredFeatures, run: str, trials: MonteCarlo | None = None) -> dict[str, Any]:
+def measure_document(measured: MeasuredFeatures, run: str = "", trials: MonteCarlo | None = None) -> dict[str, Any]:
     """Return features.json: all numbers with their budgets, and the covariance of all of them together."""
+    trials = trials or measured.checked
     ratios = [None] * len(measured.numbers) if trials is None else trials.ratio.tolist()
     return {
         "format": MEASURE_FORMAT,

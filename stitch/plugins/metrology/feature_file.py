@@ -1,5 +1,6 @@
 """FEATURES.toml: what is to be measured, in the frame of the part, with nominal values, tolerances and calibrations."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from stitch.errors import InputError
+from stitch.errors import InputError, did_you_mean
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
@@ -82,6 +83,41 @@ def read_features(file: Path, length_unit: str, spacing: float) -> FeatureList:
             )
     contributions = tuple(reader.contribution(i, row) for i, row in enumerate(document.get("contribution", [])))
     return FeatureList(features, contributions, reader.limits())
+
+
+def feature_list(
+    features: Sequence[Feature] | FeatureList | Path | str, length_unit: str, spacing: float
+) -> FeatureList:
+    """Return features of a program, or those of a file, as they are measured: with their reach, and unit directions.
+
+    Raises:
+        InputError: as of `read_features`; or none, a kind that is not known, or two of one name.
+    """
+    if isinstance(features, FeatureList):
+        return features
+    if isinstance(features, str | Path):
+        return read_features(Path(features), length_unit, spacing)
+    odd = next((f for f in features if f.kind not in NUMBERS), None)
+    if odd is not None:
+        close = did_you_mean(odd.kind, NUMBERS)
+        raise InputError(f"{odd.name}: kind is {odd.kind!r}{close}; to fix: one of {', '.join(NUMBERS)}")
+    names = [feature.name for feature in features]
+    if not names or len(set(names)) < len(names):
+        raise InputError("features: none, or two of one name; to fix: pass some, and name each once")
+    return FeatureList(tuple(_completed(feature, spacing) for feature in features))
+
+
+def _completed(feature: Feature, spacing: float) -> Feature:
+    """Return a feature of a program with the reach that a file gives it where nobody states one."""
+    axis = np.asarray(feature.axis, float)
+    is_patch = feature.kind in ("point", "plane", "deviation")
+    return replace(
+        feature,
+        at=np.asarray(feature.at, float),
+        axis=axis / np.linalg.norm(axis),
+        within=feature.within or _WITHIN * spacing,
+        radius=feature.radius or (_PATCH * spacing if is_patch else 0.0),
+    )
 
 
 @dataclass(frozen=True)

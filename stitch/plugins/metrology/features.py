@@ -16,6 +16,7 @@ from stitch.errors import NoResultError
 from stitch.numerics.distributions import mad_sigma
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.plugins.metrology.place_errors import RunPoints
+from stitch.system.values import Value
 
 # What a feature is, and the numbers that are told of it; the first is the one that a tolerance is of.
 NUMBERS = {
@@ -37,9 +38,15 @@ _STEPS = 3
 _Surface = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
-@dataclass(frozen=True)
-class Feature:
-    """What is asked for; lengths in length_unit of the run, reference frame."""
+@dataclass(frozen=True, eq=False)
+class Feature(Value):
+    """Feature that is asked for; lengths in length_unit of the run, reference frame.
+
+    Example:
+        >>> bore = stitch.Feature("bore", "cylinder", at=[10.0, 0.0, 5.0], axis=[0, 0, 1], size=8.0, radius=6.0)
+        >>> bore.kind, bore.tolerance is None
+        ('cylinder', True)
+    """
 
     name: str
     kind: str
@@ -53,7 +60,7 @@ class Feature:
     tolerance: tuple[float, float] | None = None  # limits of the deviation of its first number from nominal
     calibrated: float | None = None  # its first number as a laboratory measured it
     calibrated_U: float = 0.0  # expanded uncertainty (k = 2) of that
-    cad: Any = None  # trimesh.Trimesh in the reference frame, of a deviation
+    cad: Any = field(default=None, compare=False)  # trimesh.Trimesh in the reference frame, of a deviation
 
     @property
     def R(self) -> Array:

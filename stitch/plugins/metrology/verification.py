@@ -21,6 +21,7 @@ from stitch.plugins.metrology import error_sources
 from stitch.plugins.metrology.budget import COVERAGE_FACTOR, MeasuredFeatures, Number
 from stitch.run_data import RunData
 from stitch.screening.hand_eye_transfer import FOUND_FROM, HandEyeTransfer
+from stitch.system.values import Table
 
 VERIFY_FORMAT = "stitch-verify/1"
 # |E_n| up to 1 agrees (ISO 13528); of numbers of which 95 % should agree, so few by chance in one case of a hundred
@@ -111,9 +112,14 @@ class FormError:
         return self.limit is None or self.form <= self.limit
 
 
-@dataclass(frozen=True)
-class Verification:
-    """What an artefact says of a model."""
+@dataclass(frozen=True, eq=False)
+class Verification(Table, document="stitch.plugins.metrology.verification:verification_document", table="numbers"):
+    """Verdict of an artefact on a model.
+
+    Example:
+        >>> stitch.verify(run, artefact, plate).sentences[1]
+        '... of ... calibrated numbers agree within U.'
+    """
 
     numbers: tuple[VerifiedNumber, ...]
     forms: tuple[FormError, ...]
@@ -242,7 +248,12 @@ def largest_E_n(count: int) -> float:
 
 
 def verification_document(
-    result: Verification, state: RunData, run: str, session: str, valid_until: str | None, notes: Sequence[str] = ()
+    result: Verification,
+    state: RunData | None = None,
+    run: str = "",
+    session: str = "",
+    valid_until: str | None = None,
+    notes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return certificate.json.
 
@@ -291,9 +302,9 @@ def verification_document(
             {"feature": f.feature, "form_95": f.form, "limit": f.limit, "passes": f.passes} for f in result.forms
         ],
         "not_measured": result.not_measured,
-        "doubts": list(state.doubts),
-        "notes": [*state.notes, *notes],
-        "left_out": [{"view": item.view, "why": item.why} for item in state.left_out],
+        "doubts": [] if state is None else list(state.doubts),
+        "notes": [*(() if state is None else state.notes), *notes],
+        "left_out": [{"view": item.view, "why": item.why} for item in (() if state is None else state.left_out)],
         "valid_until": valid_until,
         "conditional_on": list(error_sources.NOT_INCLUDED),
         "in_the_manner_of": ["VDI/VDE 2634 part 3", "ISO 10360-13"],

@@ -46,30 +46,18 @@ def verify(
       stitch verify runs/blade-17 sessions/sphere-plate
       stitch verify runs/blade-17 sessions/sphere-plate --cell cells/robot-7
     """
-    from stitch.api.pipeline import run as stitch_session
     from stitch.output.json_file import to_json, write_json
     from stitch.output.run_folder import call_entry_points
     from stitch.output.stored_run import read_result, trusted_model
-    from stitch.plugins.metrology.budget import measure_features
-    from stitch.plugins.metrology.error_sources import error_chain, place_errors
-    from stitch.plugins.metrology.feature_file import read_features
+    from stitch.plugins.metrology.verb import judge_artefact
     from stitch.plugins.metrology.verification import verification_document
-    from stitch.plugins.metrology.verification import verify as judge
-    from stitch.screening.hand_eye_transfer import hand_eye_transfer
     from stitch.session.reading.session_folder import load_session
 
     listed = features or session / "artefact.toml"
     notes = _require_unseen(run, session, Path(read_result(run)["session"]))
     with show_activity("verifying: stitching the artefact under the model"):
         model, _ = trusted_model(run, effects_file, trust)
-        state = stitch_session(load_session(session), model)
-        wanted = read_features(listed, state.session.length_unit, state.measurement.capture.spacing)
-        if all(feature.calibrated is None for feature in wanted.features):
-            raise InputError(f"{listed}: no feature is calibrated; to fix: write calibrated = … and U = … of some")
-        chain = error_chain(state)
-        measured = measure_features(place_errors(state, chain), wanted)
-        hand_eye = hand_eye_transfer(state.measurement, chain.capture, chain.unconstrained, state.model)
-        result = judge(measured, wanted.limits, hand_eye)
+        result, state = judge_artefact(load_session(session), model, listed)
     document = verification_document(result, state, str(run), str(session), _valid_until(cell), notes)
     folder = output or Path("verify") / state.session.name
     folder.mkdir(parents=True, exist_ok=True)

@@ -23,6 +23,7 @@ from stitch.plugins.watch.update import (
     stored_alarms,
     stored_parameters,
 )
+from stitch.system.values import Table
 
 HORIZON = 180.0  # days that are looked ahead
 # A parameter has left its limits where that is more probable; it is asked for so often within the horizon.
@@ -46,7 +47,13 @@ _PLACES = {"hand_eye": "the mount"}
 
 @dataclass(frozen=True)
 class Change:
-    """One event of one parameter."""
+    """One event of one parameter.
+
+    Example:
+        >>> saved = run.save(folder / "monday", recording=False)
+        >>> [change.kind for _, change in stitch.watch(folder / "cell-7", [saved]).alarms]
+        []
+    """
 
     parameter: int
     since: int  # id of the first session that has moved
@@ -71,7 +78,13 @@ class FollowedChannel:
 
 @dataclass(frozen=True)
 class ParameterReport:
-    """One parameter, in its unit."""
+    """One parameter, in its unit.
+
+    Example:
+        >>> saved = run.save(folder / "monday", recording=False)
+        >>> stitch.watch(folder / "cell-7", [saved]).parameters[0].name.split(".")[0]
+        'hand_eye'
+    """
 
     name: str
     unit: str
@@ -96,9 +109,16 @@ class ParameterReport:
         return bool(2 * ndtr(-self.limit / max(self.own_sigma, 1e-300)) > _RISK)
 
 
-@dataclass(frozen=True)
-class CellReport:
-    """A cell after its last session."""
+@dataclass(frozen=True, eq=False)
+class CellReport(Table, document="stitch.plugins.watch.exported:report_document", table="parameters"):
+    """Parameters of a cell after its last session, and what moves.
+
+    Example:
+        >>> saved = run.save(folder / "monday", recording=False)
+        >>> report = stitch.watch(folder / "cell-7", [saved])
+        >>> report.name, report.alarms, report.rows()[0]["name"] == report.parameters[0].name
+        ('cell-7', [], True)
+    """
 
     name: str
     length_unit: str

@@ -503,8 +503,9 @@ def _radius_error(balls: Sequence[Sequence[Ball]], stated: Sequence[float], to_m
     found, views = float(np.median(group)) * to_mm, sum(any(b.radius in group for b in view) for view in balls)
     told = ", ".join(f"{radius * to_mm:g}" for radius in stated)
     return InputError(
-        f"--ball {told}: no ball of this radius; balls of {found:.2f} mm are seen in {views} view{'s' * (views > 1)}; "
-        f"to fix: state --ball {found:.2f} or --ball any, or correct cloud_unit in session.toml"
+        f"--ball {told}: no ball of this radius; balls of {found:.2f} mm are seen in {views} view{'s' * (views > 1)}",
+        fix_cli=f"state --ball {found:.2f} or --ball any, or correct cloud_unit in session.toml",
+        fix_python=f'pass balls=[{found:.2f}] or balls="any", or correct cloud_unit',
     )
 
 

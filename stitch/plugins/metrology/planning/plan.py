@@ -31,6 +31,7 @@ from stitch.plugins.metrology.planning.information import TwistChannel, noise_of
 from stitch.plugins.metrology.planning.planned_views import candidate_joints, with_views
 from stitch.session.session import SessionData
 from stitch.system.threads import library_threads_off
+from stitch.system.values import Table
 
 # Points on the part and correspondences of a view are few here: there are many pairs, and noise is not what limits.
 _SAMPLES = 250
@@ -288,8 +289,8 @@ class ProposedView:
     separated_share: float  # share of two rivals' forms that are told apart; NaN where no pair is asked for
 
 
-@dataclass(frozen=True)
-class Plan:
+@dataclass(frozen=True, eq=False)
+class Plan(Table, table="proposed"):
     """What the present views would tell, which to add, and what all of them would tell.
 
     Example:

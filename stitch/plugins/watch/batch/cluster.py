@@ -81,7 +81,13 @@ def joined_client(address: str) -> Iterator[Any]:
 
 
 def sessions_at_once(client: Any) -> int:
-    """Return how many sessions the workers of the busiest machine may have at a time: they share its cores."""
+    """Return how many sessions the workers of the busiest machine may have at a time: they share its cores.
+
+    Args:
+        client: of Dask, or a pool of this machine.
+    """
+    if not hasattr(client, "scheduler_info"):
+        return int(getattr(client, "_max_workers", 1))
     at_once: Counter[str] = Counter()
     for worker in client.scheduler_info(n_workers=-1)["workers"].values():
         at_once[worker["host"]] += worker["nthreads"]

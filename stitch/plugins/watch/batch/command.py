@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -17,6 +18,7 @@ from stitch.errors import InputError, NoResultError
 if TYPE_CHECKING:
     from stitch.plugins.watch.batch.run_batch import BatchJob, SessionRow
 
+_ALARMS = 3  # exit code where all have a run, and some a doubt about the session as a whole
 # Of more sessions than these the terminal shows only those that need somebody; the page has all.
 _MOST = 100
 
@@ -65,30 +67,43 @@ def batch(
     if not stood and output.is_dir() and not any(output.iterdir()):
         # Workers claim their places before they read: where nothing came of it, nothing is left.
         output.rmdir()
-    _finish_batch([rows[job.run.name] for job in jobs], output, as_json)
+    _finish_batch([rows[job.name] for job in jobs], output, as_json)
 
 
 def _batch_jobs(sessions: list[Path], output: Path, force: bool, recording: bool) -> list[BatchJob]:
-    """Return a job for each session.
+    """Return a job for each session; where two have one name, the runs lie as the sessions do.
 
     Raises:
         InputError: two sessions, or a session and a file of the batch, would have the same place.
     """
-    from stitch.plugins.watch.batch.run_batch import DOCUMENT, PAGE, BatchJob
+    from stitch.plugins.watch.batch.run_batch import DOCUMENT, PAGE, TABLE, BatchJob
 
     names = [_session_name(path) for path in sessions]
     if len(set(names)) < len(names):
-        twice = max(names, key=names.count)
-        raise InputError(f"two of the sessions are named {twice!r}; to fix: run them with -o of their own")
-    if taken := {DOCUMENT, PAGE} & set(names):
+        names = _mirrored_names(sessions)
+    if taken := {DOCUMENT, PAGE, TABLE} & set(names):
         raise InputError(
             f"a session is named {taken.pop()!r}, as a file of the batch is; to fix: name it otherwise in session.toml"
         )
     here, token = output.resolve(), uuid4().hex
     return [
-        BatchJob(path.resolve(), here / name, token, force, recording)
+        BatchJob(path.resolve(), here / name, token, force, recording, place=name)
         for path, name in zip(sessions, names, strict=True)
     ]
+
+
+def _mirrored_names(sessions: list[Path]) -> list[str]:
+    """Return the paths of the sessions below the folder that holds them all.
+
+    Raises:
+        InputError: one is named twice, or lies in another.
+    """
+    places = [path.resolve() for path in sessions]
+    for place in places:
+        if places.count(place) > 1 or any(place in other.parents for other in places):
+            raise InputError(f"{place}: is named twice, or holds another session; to fix: name each session once")
+    common = Path(os.path.commonpath(places))
+    return [place.relative_to(common).as_posix() for place in places]
 
 
 def _session_name(session: Path) -> str:
@@ -122,6 +137,8 @@ def _finish_batch(rows: list[SessionRow], output: Path, as_json: bool) -> None:
     if failed:
         kind = InputError if all(row.bad_input for row in failed) else NoResultError
         raise kind(f"no result of {len(failed)} of {len(rows)} sessions; to fix: see the line of each above")
+    if any(row.doubts for row in rows):
+        raise typer.Exit(_ALARMS)
 
 
 def _show_rows(rows: Sequence[SessionRow], sentence: str) -> None:
@@ -132,16 +149,18 @@ def _show_rows(rows: Sequence[SessionRow], sentence: str) -> None:
     shown = sorted(rows, key=SessionRow.urgency)[:_MOST] if len(rows) > _MOST else rows
     cells = []
     for row in shown:
-        lengths = [_um(x) for x in (row.coarse_um, row.residual_um, row.registered_um, row.noise_floor_um)]
+        lengths = [_um(x) for x in (*row.steps_um, row.noise_floor_um)]
         worst = "–" if row.worst_view is None else f"{row.worst_view} {_um(row.worst_view_um)}"
         cells.append((row.name, *lengths, worst, "–" if row.seconds is None else f"{row.seconds:.1f}"))
     headings = ("session", "before", "one hand-eye", "registered", "noise", "worst view", "s")
-    show_table("Distance between the views (rms)", headings, cells, words=("session", "worst view"))
+    show_table("Distance between the views, mean over the same pairs", headings, cells, words=("session", "worst view"))
     if len(shown) < len(rows):
         say(f"The {_MOST} of {len(rows)} that need somebody first; the page has all.")
     for row in rows:
         if row.error is not None:
             say(f"{row.session}: {row.error}")
+        for doubt in row.doubts:
+            say(f"{row.name}: {doubt}")
 
 
 def _row_text(row: SessionRow) -> str:

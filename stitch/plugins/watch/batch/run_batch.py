@@ -6,12 +6,13 @@ import json
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from stitch.api.pipeline import run
+from stitch.api.run import fitted_hand_eye
 from stitch.errors import BusyError, InputError, NoResultError, StitchError
 from stitch.numerics.units import MICROMETRES
 from stitch.output import run_folder
@@ -20,6 +21,7 @@ from stitch.output.run_folder import call_entry_points, recordings
 from stitch.output.stored_run import read_ledger, read_result
 from stitch.plugins.watch.batch.cluster import joined_client, local_client, sessions_at_once
 from stitch.recorder import RecorderGroup
+from stitch.run_data import RunData
 from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, measured_files
 from stitch.session.reading.text_files import read_toml
 from stitch.system.files import claim_folder, whole_file
@@ -33,6 +35,7 @@ _RETRY_SECONDS = 0.5
 # Beside the runs: for programs, and for people.
 DOCUMENT = "batch.json"
 PAGE = "batch.html"
+TABLE = "batch.parquet"
 BATCH_FORMAT = "stitch-batch/1"
 _WORKERS_DIED = NoResultError(
     "workers died over it, also when it ran alone; to fix: give it more memory, or thin its scans, and start the batch "
@@ -51,6 +54,12 @@ class BatchJob:
     force: bool = False  # run it although it is finished, and replace the run of another session
     recording: bool = True
     at_once: int = 1  # sessions that share the cores of the machine
+    place: str = ""  # of the run among those of the batch, where it is more than its folder's name
+
+    @property
+    def name(self) -> str:
+        """What the run is called in the batch."""
+        return self.place or self.run.name
 
 
 def session_content_hash(session: Path) -> str | None:
@@ -68,9 +77,9 @@ def session_content_hash(session: Path) -> str | None:
     return None if digest == UNKNOWN else digest
 
 
-def write_mark(job: BatchJob, content: str | None, folder: Path) -> None:
-    """Write into a folder that becomes the run's of which content it is; both are there at once."""
-    mark = {"format": _FORMAT, "batch": job.batch, "content": content, "began_with": _first_step_hash(folder)}
+def write_mark(job: BatchJob, content: str | None, folder: Path, U: Sequence[float] | None = None) -> None:
+    """Write into a folder that becomes the run's of which content it is, and U in mm and mrad; all at once."""
+    mark = {"format": _FORMAT, "batch": job.batch, "content": content, "began_with": _first_step_hash(folder), "U": U}
     with whole_file(folder / MARK) as file:
         file.write_text(json.dumps(mark) + "\n", encoding="utf-8")
 
@@ -115,7 +124,7 @@ class SessionRow:
     """What became of one session; lengths in µm, None where nothing was measured."""
 
     session: str
-    name: str  # of the run's folder
+    name: str  # of the run's folder, below that of the batch
     run: str | None = None  # folder; None without a result
     skipped: bool = False  # its run stood there
     error: str | None = None
@@ -130,6 +139,19 @@ class SessionRow:
     worst_view: str | None = None  # of the largest rms after register
     worst_view_um: float | None = None
     seconds: float | None = None  # of its stages
+    # Mean distance over the same correspondences: before, with one hand-eye, registered; None of labelled points alone.
+    same_pairs_um: tuple[float, float, float] | None = None
+    length_unit: str | None = None
+    hand_eye: list[float] | None = None  # T_mount_scanner, row by row, length_unit
+    U_mm: float | None = None  # expanded (k = 2), at the part
+    U_mrad: float | None = None
+    effects: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()  # of the session as a whole: alarms
+
+    @property
+    def steps_um(self) -> tuple[float | None, float | None, float | None]:
+        """How far the views are apart before, with one hand-eye, and registered."""
+        return self.same_pairs_um or (self.coarse_um, self.residual_um, self.registered_um)
 
     def urgency(self) -> tuple[bool, float]:
         """Return what sorts those first that have no result, then those with most above the noise."""
@@ -138,13 +160,26 @@ class SessionRow:
         return True, -self.residual_um / self.noise_floor_um
 
 
-def finished_row(session: Path, run: Path, skipped: bool = False) -> SessionRow:
+def finished_row(job: BatchJob, skipped: bool = False) -> SessionRow:
     """Return the row of a session with a run.
 
     Raises:
         InputError: no run folder of one session, or a damaged one.
     """
-    document = read_result(run)
+    try:
+        U = json.loads((job.run / MARK).read_text(encoding="utf-8")).get("U")
+    except (OSError, ValueError):
+        U = None
+    row = row_of_document(read_result(job.run), str(job.session), job.name, U=U)
+    return replace(row, run=str(job.run), skipped=skipped)
+
+
+def row_of_document(document: dict[str, Any], session: str, name: str, *, U: Sequence[float] | None) -> SessionRow:
+    """Return the row of a run by its result.json.
+
+    Args:
+        U: in mm and mrad at the part, which the document does not hold.
+    """
     to_um = MICROMETRES[document["length_unit"]]
     rms = {stage["name"]: stage["rms"] for stage in document["stages"]}
     views = [view for view in document["views"] if view["rms"] is not None]
@@ -154,11 +189,11 @@ def finished_row(session: Path, run: Path, skipped: bool = False) -> SessionRow:
     def um(value: Any) -> float | None:
         return None if value is None else float(value) * to_um
 
+    steps = [float(step["mean"]) * to_um for step in (document.get("disagreement") or {"steps": ()})["steps"]]
+    mm, mrad = U or (None, None)
     return SessionRow(
-        session=str(session),
-        name=run.name,
-        run=str(run),
-        skipped=skipped,
+        session=session,
+        name=name,
         verdict=document["verdict"],
         views=len(document["views"]) - left_out,
         left_out=left_out,
@@ -169,14 +204,21 @@ def finished_row(session: Path, run: Path, skipped: bool = False) -> SessionRow:
         worst_view=None if worst is None else worst["view"],
         worst_view_um=None if worst is None else um(worst["rms"]),
         seconds=sum(float(stage["seconds"]) for stage in document["stages"]),
+        same_pairs_um=(steps[0], steps[-2], steps[-1]) if len(steps) > 2 else None,
+        length_unit=document["length_unit"],
+        hand_eye=[float(x) for line in document["hand_eye"] for x in line],
+        U_mm=mm,
+        U_mrad=mrad,
+        effects=tuple(document["effects"]),
+        doubts=tuple(document.get("doubts", ())),
     )
 
 
-def failed_row(session: Path, run: Path, error: BaseException) -> SessionRow:
+def failed_row(session: str, name: str, error: BaseException) -> SessionRow:
     """Return the row of a session without a result: why, in one line."""
     kind = "" if isinstance(error, StitchError) else f"{type(error).__name__}: "
     text = f"{kind}{' '.join(str(error).split())}"
-    return SessionRow(str(session), run.name, error=text, bad_input=isinstance(error, InputError))
+    return SessionRow(session, name, error=text, bad_input=isinstance(error, InputError))
 
 
 def run_session(job: BatchJob) -> SessionRow:
@@ -192,11 +234,17 @@ def run_session(job: BatchJob) -> SessionRow:
                 with run_folder.new_folder(job.run, [job.session], job.force) as scratch:
                     result = run(session, recorder=RecorderGroup(recordings(scratch) if job.recording else []))
                     run_folder.write_with_page(result, scratch)
-                    write_mark(job, content, scratch)
+                    write_mark(job, content, scratch, uncertainty_at_part(result))
             # A worker may die between a run and its answer; the next finds a run of this batch.
-            return finished_row(job.session, job.run, skipped=batch not in (None, job.batch))
+            return finished_row(job, skipped=batch not in (None, job.batch))
     except Exception as error:  # whatever befalls one session, the others go on
-        return failed_row(job.session, job.run, error)
+        return failed_row(str(job.session), job.name, error)
+
+
+def uncertainty_at_part(run: RunData) -> tuple[float, float]:
+    """Return U (k = 2) of the hand-eye in mm and mrad, at the part."""
+    capture = run.measurement.capture
+    return fitted_hand_eye(run.session, capture, run.T_mount, run.mount_covariance, unknown=run.unknown).U
 
 
 @contextmanager
@@ -232,7 +280,20 @@ def write_summary(rows: Sequence[SessionRow], folder: Path) -> None:
     """Write both into the folder of the runs, each whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
     write_json(batch_document(rows), folder / DOCUMENT)
+    write_rows(rows, folder / TABLE)
     call_entry_points("stitch.batch_pages", rows, folder / PAGE)
+
+
+def write_rows(rows: Sequence[SessionRow], file: Path) -> None:
+    """Write the rows as a table of Parquet, for whoever asks many batches at once."""
+    arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
+    kinds = {"str": arrow.string(), "bool": arrow.bool_(), "int": arrow.int64(), "float": arrow.float64()}
+    kinds |= {"tuple[str, ...]": arrow.list_(arrow.string())}
+    hints = {f.name: f.type.__name__ if isinstance(f.type, type) else str(f.type) for f in fields(SessionRow)}
+    columns = {name: kinds.get(hint.split(" |")[0], arrow.list_(arrow.float64())) for name, hint in hints.items()}
+    table = arrow.Table.from_pylist([asdict(row) for row in rows], schema=arrow.schema(columns))
+    with whole_file(file) as scratch:
+        parquet.write_table(table, scratch)
 
 
 def batch_sentence(rows: Sequence[SessionRow]) -> str:
@@ -276,7 +337,7 @@ def rows_from(
     may have room alone.
     """
     # One group of tasks: the scheduler keeps them, and hands a worker no second one while it has one.
-    keys = [(f"stitch-{job.batch}", job.run.name) for job in jobs]
+    keys = [(f"stitch-{job.batch}", job.name) for job in jobs]
     futures = client.map(work, jobs, key=keys, pure=False)
     job_of = dict(zip(futures, jobs, strict=True))
     suspected = []
@@ -294,8 +355,8 @@ def rows_from(
             else:
                 yield row
     for job in suspected:
-        alone = client.submit(work, job, key=(f"stitch-{job.batch}-alone", job.run.name), pure=False)
-        yield _row_of_future(alone, job) or failed_row(job.session, job.run, _WORKERS_DIED)
+        alone = client.submit(work, job, key=(f"stitch-{job.batch}-alone", job.name), pure=False)
+        yield _row_of_future(alone, job) or failed_row(str(job.session), job.name, _WORKERS_DIED)
 
 
 def _row_of_future(future: Any, job: BatchJob) -> SessionRow | None:
@@ -308,5 +369,5 @@ def _row_of_future(future: Any, job: BatchJob) -> SessionRow | None:
             case "KilledWorker":
                 return None
             case "CancelledError" | "FutureCancelledError":
-                return failed_row(job.session, job.run, _SCHEDULER_GONE)
-        return failed_row(job.session, job.run, error)
+                return failed_row(str(job.session), job.name, _SCHEDULER_GONE)
+        return failed_row(str(job.session), job.name, error)

@@ -4,17 +4,23 @@ import fcntl
 import json
 import os
 import threading
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pyarrow import parquet
 
 from data_synth.fixtures.edits import edit
+from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
+from stitch.errors import InputError
 from stitch.output.run_folder import write_with_page
 from stitch.plugins.watch.batch import cluster, run_batch
 from stitch.plugins.watch.batch.run_batch import BatchJob, SessionRow, run_jobs, run_session
+from stitch.plugins.watch.verb import batch as stitch_batch
 from viz.batch_page import write_page
 from viz.page_parts import unbroken
 
@@ -192,3 +198,49 @@ def test_the_page_shows_those_first_that_need_somebody(tmp_path):
     assert "3 sessions: 2 run, 1 without a result." in page
     assert "&lt;b&gt;Odd" in page and "9 of 10" in page and unbroken("80.0 µm") in page
     assert str(tmp_path) not in page
+
+
+def test_two_sessions_of_one_name_lie_as_their_folders_do(cell, ran, tmp_path, monkeypatch, batch):
+    monkeypatch.chdir(tmp_path)
+    monday = [write_labelled(tmp_path / robot / "monday", cell, "points") for robot in ("robot-1", "robot-2")]
+    batch(*monday)
+    assert ran == ["monday", "monday"]
+    rows = parquet.read_table("runs/batch.parquet").to_pylist()
+    assert [row["name"] for row in rows] == ["robot-1/monday", "robot-2/monday"]
+    assert all(Path("runs", row["name"], "result.json").is_file() for row in rows)
+    assert all(len(row["hand_eye"]) == 16 and row["U_mm"] > 0 and row["length_unit"] == "mm" for row in rows)
+    batch(*monday)
+    assert len(ran) == 2
+    batch(monday[0], monday[0], code=2)
+
+
+def test_a_doubt_about_a_session_ends_with_three(sessions, result, monkeypatch, capsys, batch):
+    doubted = replace(result, doubts=("The base has moved.",))
+    monkeypatch.setattr(run_batch, "run", lambda loaded, recorder: replace(doubted, session=loaded))
+    batch(sessions[0], code=3)
+    assert "monday: The base has moved." in capsys.readouterr().err
+
+
+def test_before_and_after_are_of_the_same_pairs():
+    steps = [{"step": "coarse", "mean": 0.4}, {"step": "hand-eye", "mean": 0.02}, {"step": "register", "mean": 0.01}]
+    document = {
+        "length_unit": "mm",
+        "stages": [{"name": "coarse", "rms": 0.01, "seconds": 1}],
+        "views": [],
+        "effects": {},
+    }
+    document |= {"verdict": "", "residual_rms": 0.03, "noise_floor": 0.01, "hand_eye": np.eye(4).tolist()}
+    row = run_batch.row_of_document(document | {"disagreement": {"steps": steps}}, "s", "s", U=(0.1, 0.2))
+    assert row.steps_um == (400.0, 20.0, 10.0) and (row.U_mm, row.U_mrad) == (0.1, 0.2)
+    assert run_batch.row_of_document(document, "s", "s", U=None).steps_um == (10.0, 30.0, None)
+
+
+def test_a_pool_of_any_kind_hands_back_runs(sessions):
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        found = stitch_batch([*sessions, "nowhere"], pool)
+    assert [run.session.name for run in found.runs[:2]] == ["monday", "tuesday"]
+    assert found.runs[2] is None and "nowhere/session.toml" in found.errors["nowhere"]
+    assert [row["name"] for row in found.rows()] == ["monday", "tuesday", "nowhere"]
+    assert found.to_arrow().num_rows == 3
+    with pytest.raises(InputError, match="client is a str"):
+        stitch_batch(sessions, "tcp://10.0.0.5:8786")
