@@ -35,6 +35,9 @@ def init(
         guess: what neither of them tells is guessed.
         force: replace a session that lies there.
 
+    Returns:
+        The session, checked; lengths in its length_unit.
+
     Raises:
         InputError: what cannot be read or told; its `fixes` say as data what leads on, as words, as a command line and
             as a call of this function.
@@ -43,8 +46,8 @@ def init(
         >>> try:
         ...     stitch.init(folder / "nowhere")
         ... except stitch.InputError as error:
-        ...     print(error)
-        ...nowhere: no such folder; to fix: name the folder of the scans
+        ...     print(error.fix_python)
+        name the folder of the scans
     """
     given = {
         "poses": poses, "columns": columns, "rows": rows, "rotation": rotation, "angles": angles, "unit": unit,

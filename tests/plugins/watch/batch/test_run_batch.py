@@ -124,7 +124,12 @@ def test_it_goes_on_after_whatever_befalls_one_session(sessions, result, monkeyp
     batch(*sessions, "--json", code=1)
     bad, good = json.loads(capsys.readouterr().out)["sessions"]
     assert bad["error"] == "ZeroDivisionError: by zero" and good["error"] is None
-    assert sorted(path.name for path in Path("runs").iterdir()) == ["batch.html", "batch.json", "tuesday"]
+    assert sorted(path.name for path in Path("runs").iterdir()) == [
+        "batch.html",
+        "batch.json",
+        "batch.parquet",
+        "tuesday",
+    ]
     assert {"result.json", "report.html"} <= {path.name for path in Path("runs/tuesday").iterdir()}
 
 
@@ -202,6 +207,8 @@ def test_the_page_shows_those_first_that_need_somebody(tmp_path):
 
 def test_two_sessions_of_one_name_lie_as_their_folders_do(cell, ran, tmp_path, monkeypatch, batch):
     monkeypatch.chdir(tmp_path)
+    for robot in ("robot-1", "robot-2"):
+        (tmp_path / robot).mkdir()
     monday = [write_labelled(tmp_path / robot / "monday", cell, "points") for robot in ("robot-1", "robot-2")]
     batch(*monday)
     assert ran == ["monday", "monday"]
