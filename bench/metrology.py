@@ -2,8 +2,9 @@
 
 FEATURES: does U of features hold, on sphere plates in cells of known truth? A clean cell; a compliance of the joints
 that is in the model; an arm that is a little wrong in every joint and link; a scanner with smooth errors over field and
-incidence, each half as large as its noise. All have the small errors that every simulated cell has. MONTE_CARLO puts
-its spread over that of propagation. Used up: 20000 to 20223, 30000 to 30003, 40000 to 40203.
+incidence, each half as large as its noise; one whose smooth errors are new in each scan. All have the small errors that
+every simulated cell has. MONTE_CARLO puts its spread over that of propagation. Used up: 20000 to 20223, 30000 to 30003,
+40000 to 40203.
 
 CHANCES: do the chances that `stitch plan` states hold? A cell with one hidden effect of the size that nature draws,
 times 0.2 to 2. Before any scan the plan says how likely an effect of that size and shape is detected, named, misnamed;
@@ -51,12 +52,24 @@ from stitch.plugins.metrology.planning import expected_model as expected
 from stitch.plugins.metrology.planning.detection_chances import DRAWS, ExpectedDiagnosis
 from stitch.session.measurement import measurement_of, with_part_origin
 
-KINDS = ("clean", "effect in the model", "ordinary arm", "smooth scanner errors")
-GROUPS = {"point": "points", "plane": "planes", "sphere": "spheres", "distance": "distances"}
+NEW_IN_EACH = "smooth errors new in each scan"
+KINDS = ("clean", "effect in the model", "ordinary arm", "smooth scanner errors", NEW_IN_EACH)
+GROUPS = {
+    "point deviation": "points",
+    "plane offset": "planes",
+    "plane slope_u": "angles",
+    "plane slope_v": "angles",
+    "sphere diameter": "diameters",
+    "sphere x": "sphere centres",
+    "sphere y": "sphere centres",
+    "sphere z": "sphere centres",
+    "distance distance": "distances",
+}
 PLATE = SpherePlate(radius=28.0)
 VIEWS, PIXELS, INCIDENCE = 8, 130, 0.2
 ARM = 0.3  # of an ordinary arm, in plausible sizes
 FIELD = 0.01  # of a scanner with smooth errors, mm rms
+SCAN_LENGTHS = (0.05, 0.3)  # over which those of a single scan stay alike, as shares of the field
 REPEATABILITY = (15e-6, 0.01)  # of the flange, rad and mm
 LAWS = (
     *("joint_compliance", "range_scale", "gear_harmonic", "backlash", "part_slip", "joint_offset", "incidence_bias"),
@@ -79,7 +92,11 @@ def feature_trial(job: Row) -> Row:
     places, features, truth = _measured(job)
     numbers = measure_features(places, features).numbers
     errors = np.array([n.value for n in numbers]) - truth
-    return {"numbers": [(GROUPS[n.feature.kind], n.U, e) for n, e in zip(numbers, errors.tolist(), strict=True)]}
+    return {
+        "numbers": [
+            (GROUPS[f"{n.feature.kind} {n.quantity}"], n.U, e) for n, e in zip(numbers, errors.tolist(), strict=True)
+        ]
+    }
 
 
 def _measured(job: Row) -> tuple[PlaceErrors, FeatureList, Array]:
@@ -105,6 +122,9 @@ def cell(kind: str, seed: int, day: int = 0) -> Measured:
     if kind == "smooth scanner errors":
         scanner = replace(scanner, field_error=FIELD)
         hidden = {"incidence_bias": INCIDENCE}
+    if kind == NEW_IN_EACH:
+        length = np.exp(np.random.default_rng([seed, 78]).uniform(*np.log(SCAN_LENGTHS)))
+        scanner = replace(scanner, scan_error=FIELD, scan_error_length=float(length))
     part = replace(scene.part, labelled=False, parameters={"radius": PLATE.radius})
     scene = replace(scene, scanner=scanner, plan=replace(scene.plan, views=VIEWS), part=part)
     scene = replace(scene, repeatability=REPEATABILITY)
@@ -147,7 +167,7 @@ def feature_summary(rows: list[Row]) -> list[str]:
     numbers = [(row["kind"], group, row["seed"], abs(error) / U) for row in rows for group, U, error in row["numbers"]]
     lines = []
     for kind in (*KINDS, "all"):
-        for group in GROUPS.values():
+        for group in dict.fromkeys(GROUPS.values()):
             chosen = [(seed, ratio) for k, g, seed, ratio in numbers if g == group and kind in (k, "all")]
             if not chosen:
                 continue

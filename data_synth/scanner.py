@@ -22,6 +22,8 @@ class Scanner:
     noise: float = 0.02  # 1-sigma along the ray at the standoff, grows with range²
     tail: float = 0.0  # degrees of freedom of Student's t for that noise, above 2; 0 is Gaussian
     field_error: float = 0.0  # rms over the field of a smooth error along the ray, new for every cell
+    scan_error: float = 0.0  # rms of another smooth error along the ray, new in every scan
+    scan_error_length: float = 0.15  # sigma of its correlation over the field, as a share of that
     mixed_pixels: float = 0.0  # share of edge pixels that lie between front and back
     edge_bias: float = 0.0  # pixels within two of an edge lie this much too far
     grazing: float = 78.0  # incidence from which nothing returns; fewer and fewer do on the way there
@@ -63,6 +65,19 @@ def field_map(scanner: Scanner, rng: np.random.Generator) -> Array:
     weights[0, 0] = 0.0  # a constant is no error of the field
     scale = np.sqrt((weights**2 * np.outer([1, 0.5, 0.5], [1, 0.5, 0.5])).sum())
     return np.asarray(weights * scanner.field_error / max(scale, 1e-12))
+
+
+def scan_waves(scanner: Scanner, directions: Array, rng: np.random.Generator, waves: int = 120) -> Array:
+    """(N,) one draw of the smooth error of a single scan at directions (N, 3) with z = 1, rms `scan_error`.
+
+    A sum of plane waves over the field whose lengths are normal: its correlation falls like a normal density.
+    """
+    width = 2 * half_field(scanner)[0] * scanner.scan_error_length
+    numbers = rng.standard_normal((waves, 2)) / width
+    phase = rng.uniform(0, 2 * np.pi, waves)
+    return np.asarray(
+        scanner.scan_error * np.sqrt(2 / waves) * np.cos(directions[:, :2] @ numbers.T + phase).sum(axis=1)
+    )
 
 
 def profile_times(scanner: Scanner) -> Array:

@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from data_synth.scanner import Cloud, Scanner, half_field, profile_times, rays
+from data_synth.scanner import Cloud, Scanner, half_field, profile_times, rays, scan_waves
 
 Array = NDArray[np.float64]
 _BLOCK = 1 << 18  # rays cast at a time
@@ -62,6 +62,8 @@ def scan(
     r, cos, bright = distance[seen], cosine[seen], albedo[seen]
     sigma = scanner.noise * (r / scanner.standoff) ** 2
     r = r + sigma * _white(scanner, len(r), rng) + _field(d, scanner, field_weights)
+    if scanner.scan_error:
+        r = r + scan_waves(scanner, d, rng)
     if scanner.quantisation:
         r = np.round(r / scanner.quantisation) * scanner.quantisation
     intensity = bright * cos * (scanner.standoff / r) ** 2

@@ -40,7 +40,7 @@ FINE = len(_LEGENDRE_ORDERS)
 # view.
 SHARED, INCIDENCE, PER_VIEW = range(3)
 # What every scanner has, as a share of its noise along the ray, and the spread of its logarithm; what is asked at all.
-USUAL_SHARE, _SHARE_SPREAD, SHARE_BOUNDS = 0.3, 0.7, (0.01, 10.0)
+USUAL_SHARE, SHARE_SPREAD, SHARE_BOUNDS = 0.3, 0.7, (0.01, 10.0)
 # Rms over the field, as a share of the scanner's noise along the ray: what an effect must exceed to be named. An
 # effect of the scanner that is missing looks like a larger one, so this is not taken from the scans.
 ALARM_SHARE = 0.5
@@ -200,9 +200,9 @@ class SmoothErrorLikelihood:
         """(C,) likeliest rms of the errors over the noise, with a prior of usual sizes."""
 
         def deviance(log_shares: Array) -> tuple[float, Array]:
-            prior = (log_shares - np.log(USUAL_SHARE)) / _SHARE_SPREAD
+            prior = (log_shares - np.log(USUAL_SHARE)) / SHARE_SPREAD
             value, slope = self._deviance(log_shares)
-            return value + float(prior @ prior), slope + 2 * prior / _SHARE_SPREAD
+            return value + float(prior @ prior), slope + 2 * prior / SHARE_SPREAD
 
         start = np.full(len(self.design), np.log(USUAL_SHARE))
         bounds = [tuple(np.log(SHARE_BOUNDS))] * len(start)
@@ -212,10 +212,10 @@ class SmoothErrorLikelihood:
         """Return standard deviations (C,) of the logarithms of `map_shares`, from their posterior's curvature there."""
         logs, step = np.log(shares), 1e-3 * np.eye(len(shares))
         slopes = [self._deviance(logs + s)[1] - self._deviance(logs - s)[1] for s in step]
-        curvature = np.array(slopes) / 4e-3 + np.eye(len(shares)) / _SHARE_SPREAD**2
+        curvature = np.array(slopes) / 4e-3 + np.eye(len(shares)) / SHARE_SPREAD**2
         # Where the likelihood bends the other way the prior alone counts.
         values, vectors = np.linalg.eigh((curvature + curvature.T) / 2)
-        return np.sqrt((vectors**2) @ (1 / np.maximum(values, _SHARE_SPREAD**-2.0)))
+        return np.sqrt((vectors**2) @ (1 / np.maximum(values, SHARE_SPREAD**-2.0)))
 
     def ml_shares(self, most: Sequence[float]) -> tuple[Array, float]:
         """Return shares (C,) without a prior, at most so large, and −2 log likelihood."""

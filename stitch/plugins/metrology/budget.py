@@ -25,6 +25,8 @@ OWN_NOISE = "noise of the feature's own points"
 # Points of a feature that a trial fits; what views share does not average out among them.
 _TRIAL_POINTS = 300
 _TRIAL_BLOCK = 200
+# Features of which nothing is measured along the axis: a coordinate within 6° of it would have a tenth of the U across.
+AXIAL, _ALONG_AXIS = ("cylinder", "circle"), 0.995
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,11 @@ def measure_features(places: PlaceErrors, wanted: FeatureList) -> MeasuredFeatur
     for feature in wanted.features:
         if feature.kind == "distance" and (missing := not_measured.keys() & set(feature.between)):
             not_measured[feature.name] = f"{feature.name}: {', '.join(sorted(missing))} was not measured"
+        elif feature.kind == "distance" and (of := _runs_along_axis(feature, fits)):
+            not_measured[feature.name] = (
+                f"{feature.name}: runs along the axis of {of}, where its centre is not measured; "
+                "to fix: measure it between planes, spheres or points"
+            )
     measured = replace(wanted, features=tuple(f for f in wanted.features if f.name not in not_measured))
     return replace(evaluate(places, measured, fits), not_measured=not_measured)
 
@@ -141,7 +148,9 @@ def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeat
     by_fit = {fit.feature.name: fit for fit in fits}
     length_unit = places.measurement.length_unit
     numbers = []
-    for q, (feature, quantity) in enumerate(quantities):
+    kept = measured_rows(quantities)
+    for q in kept:
+        feature, quantity = quantities[q]
         squares = np.array([loadings[q] @ loadings[q] for _, loadings, _ in rows])
         total = max(squares.sum(), 1e-300)
         shares = dict.fromkeys((name for name, _, _ in rows), 0.0)
@@ -163,7 +172,29 @@ def evaluate(places: PlaceErrors, wanted: FeatureList, fits: Sequence[FittedFeat
                 form=float("nan") if fit is None else fit.form,
             )
         )
-    return MeasuredFeatures(tuple(numbers), covariance, tuple(fits), length_unit)
+    return MeasuredFeatures(tuple(numbers), covariance[np.ix_(kept, kept)], tuple(fits), length_unit)
+
+
+def measured_rows(quantities: Sequence[tuple[Feature, str]]) -> list[int]:
+    """Return which numbers are measured: all but the coordinate along which a cylinder's or circle's axis runs."""
+    return [
+        q
+        for q, (feature, quantity) in enumerate(quantities)
+        if feature.kind not in AXIAL or quantity == "diameter" or abs(feature.axis["xyz".index(quantity)]) < _ALONG_AXIS
+    ]
+
+
+def _runs_along_axis(feature: Feature, fits: Sequence[FittedFeature]) -> str | None:
+    """Return the cylinder or circle along whose axis a distance runs; None where both ends are measured across."""
+    ends = [fit for name in feature.between for fit in fits if fit.feature.name == name]
+    plane = next((fit for fit in ends if fit.feature.kind == "plane"), None)
+    if plane is not None:
+        along = plane.feature.axis
+    else:
+        along = position_of(ends[0].feature, ends[0].values) - position_of(ends[1].feature, ends[1].values)
+        along /= max(float(np.linalg.norm(along)), 1e-300)
+    axial = (fit.feature for fit in ends if fit.feature.kind in AXIAL)
+    return next((f.name for f in axial if abs(f.axis @ along) > _ALONG_AXIS), None)
 
 
 def stack_responses(parts: Sequence[Responses]) -> Responses:
@@ -172,6 +203,7 @@ def stack_responses(parts: Sequence[Responses]) -> Responses:
         np.vstack([part.views for part in parts]),
         np.vstack([part.parameters for part in parts]),
         np.vstack([part.field for part in parts]),
+        np.vstack([part.scans for part in parts]),
         block_diag(*(part.noise for part in parts)),
     )
 
@@ -285,6 +317,8 @@ def monte_carlo(
     for stated in wanted.contributions:
         loadings = _stated_loadings(stated, quantities, values)
         drawn = drawn + rng.standard_normal((trials, loadings.shape[1])) @ loadings.T
+    kept = measured_rows(quantities)
+    drawn, values = drawn[:, kept], values[kept]
     interval = np.quantile(drawn, [0.025, 0.975], axis=0).T - values[:, None]
     return MonteCarlo(trials, drawn.std(axis=0, ddof=1), np.array([n.u for n in linear.numbers]), interval)
 
@@ -302,10 +336,13 @@ def _refits(
     field = np.sum([s.field @ drawn for s, drawn in modes], axis=0).T
     of_points = np.hstack([parameters, field])
     shapes, noise = places.point_modes(fit.at)
+    own = [(drawn, places.scan_shapes(fit.at, s.scan)) for s, drawn in modes if s.scan is not None]
     numbers = np.empty((trials, len(fit.values)))
     for start in range(0, trials, _TRIAL_BLOCK):
         block = slice(start, min(start + _TRIAL_BLOCK, trials))
         moved = fit.at.points + np.tensordot(of_points[block], shapes, axes=1)
+        for drawn, shapes_of_scan in own:
+            moved += np.tensordot(drawn[:, block].T, shapes_of_scan, axes=1)
         moved += noise * rng.standard_normal((*moved.shape[:2], 1))
         numbers[block] = [fit.refit(points) for points in places.moved(fit.at, twists[block], moved)]
     return numbers

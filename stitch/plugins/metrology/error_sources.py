@@ -1,9 +1,9 @@
 """All that may be wrong about the places of a run, carried through the fit and through register.
 
 Register moves every view by δ̂ = K (d + n): d is how far robot and model misplace the view, n what noise and the
-scanner's smooth errors make of its overlaps, and K = (H + Λ)⁻¹ H with the information H of the overlaps and the
-precision Λ of the robot's pose. Hand-eye and effects are x̂ = X u, a linear answer to what the same overlaps show. So
-the registered views err by a known linear map of whatever errs,
+scanner's smooth errors, those of all scans and those of each, make of its overlaps, and K = (H + Λ)⁻¹ H with the
+information H of the overlaps and the precision Λ of the robot's pose. Hand-eye and effects are x̂ = X u, a linear answer
+to what the same overlaps show. So the registered views err by a known linear map of whatever errs,
 
     η = −(I − K) r + B x̂ + K (n + a·f),     x̂ = X (r + n + a·f),     B = (I − K) J_views − K J_points,
 
@@ -38,6 +38,7 @@ from stitch.observations.surfaces.hand_eye_fit import (
 from stitch.observations.surfaces.scanner_errors import half_field, shared_error_likelihood, sum_smooth_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
 from stitch.plugins.metrology.place_errors import ErrorSource, PlaceErrors
+from stitch.plugins.metrology.scan_errors import ScanErrors, fit_scan_errors, scan_error_twists
 from stitch.run_data import RunData
 from stitch.session.capture import Capture
 from stitch.system.threads import library_threads_off
@@ -49,6 +50,7 @@ WANDERING = "robot: wandering in time"
 STOP = "robot: shared by the scans of a stop"
 OVERLAPS = "noise of the overlaps"
 SCANNER = "scanner: smooth errors"
+SCAN = "scanner: smooth errors new in each scan"
 OTHER_RUN = "model of another run"
 OTHER_ARM = "arm of another run"
 UNSEEN = "hand-eye: not shown by the motions"
@@ -63,9 +65,8 @@ NOT_INCLUDED = (
 _MANY = 1e6
 # Directions with a smaller share of a component's largest variance are rounding.
 _ROUNDING = 1e-12
-# A source of one name: its modes as errors of views and of fitted parameters, how well its size is known, and of the
-# scanner's smooth errors which one it is.
-_Modes = tuple[str, tuple[Array, Array], float, int | None]
+# A source of one name: its modes as errors of views and of fitted parameters, and how well its size is known.
+_Modes = tuple[str, tuple[Array, Array], float]
 
 
 def place_errors(run: RunData, chain: "ErrorChain | None" = None) -> PlaceErrors:
@@ -81,14 +82,16 @@ def place_errors(run: RunData, chain: "ErrorChain | None" = None) -> PlaceErrors
     with library_threads_off():
         chain = chain or error_chain(run)
         terms = [term for term in run.terms if moves_points([term])]
+        sources, scan_errors = _sources(run, chain)
         return PlaceErrors(
             measurement=run.measurement,
             capture=chain.capture,
             poses=run.poses,
             centre=chain.unconstrained.overlaps.gram.centre,
-            sources=tuple(_sources(run, chain)),
+            sources=sources,
             slopes=PointSlopes(run.measurement, terms, run.model) if terms else None,
             half=half_field(run.measurement),
+            scan_errors=scan_errors,
         )
 
 
@@ -176,36 +179,59 @@ def _follow_overlaps(run: RunData, capture: Capture, solution: HandEyeSolution, 
     return np.linalg.solve(shift, K @ shift)
 
 
-def _sources(run: RunData, chain: ErrorChain) -> Iterator[ErrorSource]:
-    twists, sizes, degrees = _smooth_errors(run, chain)
-    smooth = [
-        (SCANNER, chain.of_overlaps(twists[:, [k]] * size), known, k)
-        for k, (size, known) in enumerate(zip(sizes, degrees, strict=True))
+def _sources(run: RunData, chain: ErrorChain) -> tuple[tuple[ErrorSource, ...], ScanErrors | None]:
+    """Return all sources, and the smooth errors that are new in each scan."""
+    twists, shapes, degrees, errors = _smooth_errors(run, chain)
+    of_scans = list[Array]()
+    if errors is not None:
+        views = range(len(run.poses))
+        of_scans = [scan_error_twists(run.measurement, chain.unconstrained, errors, v) for v in views]
+    smooth = twists @ shapes
+    sources = [
+        _source(chain, (SCANNER, chain.of_overlaps(smooth), degrees), shapes),
+        *(_source(chain, modes, shapes) for modes in _pose_modes(run, chain, np.hstack([smooth, *of_scans]))),
+        *(_source(chain, modes, shapes) for modes in _model_modes(run, chain)),
     ]
-    for name, (views, x), known, k in [*_pose_modes(run, chain, twists * sizes), *_model_modes(run, chain), *smooth]:
-        parameters = np.zeros((len(chain.fitted), x.shape[1]))
-        field = np.zeros((len(sizes), x.shape[1]))
-        parameters[chain.fitted] = x[6:]
-        if k is not None:
-            field[k] = sizes[k]
-        yield ErrorSource(name, views, parameters[chain.of_points], field, known)
+    for v, moved in enumerate(of_scans):
+        assert errors is not None
+        # Each scan is a row of its own, and one size is known for all.
+        modes = (SCAN, chain.of_overlaps(moved), errors.degrees / len(of_scans))
+        sources.append(replace(_source(chain, modes, shapes), scan=v))
+    return tuple(sources), errors
 
 
-def _smooth_errors(run: RunData, chain: ErrorChain) -> tuple[Array, Array, Array]:
-    """Twists (6V, K) that the overlaps show for unit smooth errors, their sizes (K,), and degrees of freedom (K,).
+def _source(chain: ErrorChain, modes: _Modes, shapes: Array) -> ErrorSource:
+    """Return a source by its modes; of the scanner's own, the first, they are shapes (K, K) of its smooth errors."""
+    name, (views, x), degrees = modes
+    parameters = np.zeros((len(chain.fitted), x.shape[1]))
+    parameters[chain.fitted] = x[6:]
+    field = shapes if name == SCANNER and x.shape[1] == shapes.shape[1] else np.zeros((len(shapes), x.shape[1]))
+    return ErrorSource(name, views, parameters[chain.of_points], field, degrees)
 
-    Sizes are those that the covariance of the hand-eye counts. One whose logarithm is known to s has ½/s² degrees of
-    freedom (JCGM 100, G.4.2).
+
+def _smooth_errors(run: RunData, chain: ErrorChain) -> tuple[Array, Array, float, ScanErrors | None]:
+    """Return twists (6V, K) that the overlaps show for unit smooth errors which all views share, these errors (K, K) as
+    K independent ones of unit variance, degrees of freedom, and those that are new in each scan.
+
+    The overlaps show a part of the errors themselves: what counts is their second moment given that, f̂f̂ᵀ + C, since no
+    point is corrected by it. A size whose logarithm is known to s has ½/s² degrees of freedom (JCGM 100, G.4.2).
     """
     sums, noise = sum_smooth_errors(run.measurement, chain.unconstrained)
     twists = apparent_twists(sums, chain.unconstrained)
     if not np.isfinite(noise):
-        return twists, np.zeros(twists.shape[1]), np.full(twists.shape[1], _MANY)
+        return twists, np.zeros((twists.shape[1], twists.shape[1])), _MANY, None
     likelihood = shared_error_likelihood(sums, twists, chain.unconstrained, noise)
     shares = likelihood.map_shares
-    spread = likelihood.share_spread(shares)
-    of_mode = np.append(np.zeros(twists.shape[1] - 1, int), 1)  # all over the field have one size, incidence its own
-    return twists, (noise * shares)[of_mode], (0.5 / spread**2)[of_mode]
+    causes = range(len(shares))
+    estimates = [noise * shares[cause] * likelihood.estimate(cause, shares) for cause in causes]
+    moments = [
+        np.outer(f, f) + (noise * shares[cause]) ** 2 * likelihood.posterior_covariance(cause, shares)
+        for cause, f in enumerate(estimates)
+    ]
+    degrees = float((0.5 / likelihood.share_spread(shares) ** 2).min())
+    half = half_field(run.measurement)
+    errors = fit_scan_errors(run.measurement, chain.unconstrained, noise, np.concatenate(estimates), half)
+    return twists, np.linalg.cholesky(block_diag(*moments)), degrees, errors
 
 
 def _pose_modes(run: RunData, chain: ErrorChain, smooth: Array) -> Iterator[_Modes]:
@@ -224,33 +250,33 @@ def _pose_modes(run: RunData, chain: ErrorChain, smooth: Array) -> Iterator[_Mod
     carried = frames.adjoint(frames.make(np.eye(3), -g.centre) @ chain.capture.T_reference_flange)
     for k, axes in enumerate((slice(0, 3), slice(3, 6))):
         root = block_diag(*carried[:, :, axes])
-        yield SCATTER, chain.of_poses(sigma[k] * root), float(known[k]), None
+        yield SCATTER, chain.of_poses(sigma[k] * root), float(known[k])
     visible = g.visible
     noise = sigma[NOISE] * visible.scale[:, None] * visible.vectors * np.sqrt(g.variance / visible.values)
     reduced_smooth = rig.reduce([smooth])
     beside = replace(mixed, fixed=(reduced_smooth @ reduced_smooth.T)[None])
     left = mean_variances(beside, fit_variances(beside, both_starts=True))[NOISE] / sigma[NOISE] ** 2
     for name, share in ((OVERLAPS, min(left, 1.0)), (SCANNER, 1.0 - min(left, 1.0))):
-        yield name, chain.of_overlaps(np.sqrt(share) * noise), float(known[NOISE]), None
+        yield name, chain.of_overlaps(np.sqrt(share) * noise), float(known[NOISE])
     names = dict.fromkeys(DRIFT_MEMORY, WANDERING) | dict.fromkeys(STOP_COMPONENTS, STOP)
     for k, (name, component) in enumerate(zip(errors.names, errors.components, strict=True), NOISE + 1):
-        yield names.get(name, ARM), chain.of_poses(sigma[k] * _root(component)), float(known[k]), None
+        yield names.get(name, ARM), chain.of_poses(sigma[k] * _root(component)), float(known[k])
 
 
 def _model_modes(run: RunData, chain: ErrorChain) -> Iterator[_Modes]:
     """Errors of a model that other views fitted, or of what these did not show."""
     kept = chain.columns @ kept_root(run.terms, run.model.effects_covariance)
     if kept.any():
-        yield OTHER_ARM, chain.of_poses(kept), _MANY, None
+        yield OTHER_ARM, chain.of_poses(kept), _MANY
     solution = chain.solution
     if not chain.answer.any():
         effects = run.model.effects_covariance.root(run.terms)[chain.fitted]
-        yield OTHER_RUN, chain.of_model(block_diag(_root(run.mount_covariance), effects)), _MANY, None
+        yield OTHER_RUN, chain.of_model(block_diag(_root(run.mount_covariance), effects)), _MANY
         return
-    yield UNSEEN, chain.of_model(solution.gls.covariance @ _root(solution.prior)), _MANY, None
+    yield UNSEEN, chain.of_model(solution.gls.covariance @ _root(solution.prior)), _MANY
     if solution.hidden.size:
         hand_eye = np.eye(6 + int(chain.fitted.sum()))[:, :6]
-        yield UNSEEN, chain.of_model(hand_eye @ solution.hidden), _MANY, None
+        yield UNSEEN, chain.of_model(hand_eye @ solution.hidden), _MANY
 
 
 def _root(covariance: Array) -> Array:

@@ -9,6 +9,7 @@ from stitch.model.forward import PointSlopes
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices, Mask
 from stitch.observations.surfaces.scanner_errors import smooth_corrections
+from stitch.plugins.metrology.scan_errors import ScanErrors
 from stitch.run_data import FusedCloud
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
@@ -19,7 +20,8 @@ from stitch.system.ply_file import vertex_columns, write_ply
 _LEAST_COSINE = 0.5
 # A view has a part in a fused point where it has one of its own within so many cells.
 _WITHIN = 1.5
-_BLOCK = 200_000
+# Numbers that are held at a time: points of a block by modes of all sources.
+_HELD = 20_000_000
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,7 @@ class ErrorSource:
     parameters: Array  # (P, m) errors of parameters of effects that change points
     field: Array  # (K, m) smooth errors of the scanner
     degrees: float  # of freedom with which its size is known
+    scan: int | None = None  # its modes are those of `ScanErrors`, of this scan alone
 
 
 @dataclass(frozen=True)
@@ -54,16 +57,22 @@ class Responses:
     views: Array  # (q, 6V) to left twists of the views
     parameters: Array  # (q, P)
     field: Array  # (q, K)
+    scans: Array  # (q, V, M) to the modes of each scan's own smooth errors
     noise: Array  # (q, q) covariance by the noise of their own points
 
     def loadings(self, source: ErrorSource) -> Array:
         """(q, m) what each mode of a source does to the numbers."""
-        return self.views @ source.views + self.parameters @ source.parameters + self.field @ source.field
+        of_all = self.views @ source.views + self.parameters @ source.parameters + self.field @ source.field
+        return of_all if source.scan is None else of_all + self.scans[:, source.scan]
 
     def combined(self, slopes: Array) -> "Responses":
         """The same of numbers with slopes (p, q) in these."""
         return Responses(
-            slopes @ self.views, slopes @ self.parameters, slopes @ self.field, slopes @ self.noise @ slopes.T
+            slopes @ self.views,
+            slopes @ self.parameters,
+            slopes @ self.field,
+            np.tensordot(slopes, self.scans, axes=1),
+            slopes @ self.noise @ slopes.T,
         )
 
 
@@ -78,6 +87,7 @@ class PlaceErrors:
     sources: tuple[ErrorSource, ...]
     slopes: PointSlopes | None  # of the P parameters that change points
     half: Array  # (2,) of the scanner's field
+    scan_errors: ScanErrors | None  # smooth errors that are new in each scan
 
     @property
     def points(self) -> RunPoints:
@@ -96,6 +106,8 @@ class PlaceErrors:
         views = np.zeros((len(gradient), len(self.poses), 6))
         field = np.zeros((len(gradient), self.modes_of_field))
         parameters = np.zeros((len(gradient), self.parameters))
+        own = 0 if self.scan_errors is None else self.scan_errors.count
+        scans = np.zeros((len(gradient), len(self.poses), own))
         noise = np.zeros((len(gradient), len(gradient)))
         for v in np.unique(at.view):
             of_view = np.flatnonzero(at.view == v)
@@ -105,12 +117,15 @@ class PlaceErrors:
             index = at.index[of_view]
             g_scanner = frames.rotate(frames.inverse(self.poses[v]), g)
             field += np.einsum("qni,kni->qk", g_scanner, self.field_modes(v, index))
+            if self.scan_errors is not None:
+                along_ray, modes = self.scan_modes(v, index)
+                scans[:, v] = np.einsum("qni,ni->qn", g_scanner, along_ray) @ modes
             if self.slopes is not None:
                 parameters += np.einsum("qni,kni->qk", g_scanner, self.slopes.at(v, self.poses[v], index))
             scan = self.capture.scans[v]
             along = scan.noise * np.einsum("qni,ni->qn", g_scanner, scan.normals[index])
             noise += along @ along.T
-        return Responses(views.reshape(len(gradient), -1), parameters, field, noise)
+        return Responses(views.reshape(len(gradient), -1), parameters, field, scans, noise)
 
     def point_modes(self, at: RunPoints) -> tuple[Array, Array]:
         """Return by how much points move per unit of the parameters and smooth errors (P + K, N, 3), and the noise of
@@ -126,6 +141,15 @@ class PlaceErrors:
             shapes[:, of_view] = frames.rotate(self.poses[v], modes)
             noise[of_view] = self.capture.scans[v].noise * at.normals[of_view]
         return shapes, noise
+
+    def scan_shapes(self, at: RunPoints, v: int) -> Array:
+        """Return by how much points move per mode of the smooth errors of scan v (M, N, 3), reference frame."""
+        assert self.scan_errors is not None
+        of_view = np.flatnonzero(at.view == v)
+        shapes = np.zeros((self.scan_errors.count, len(at.points), 3))
+        along_ray, modes = self.scan_modes(v, at.index[of_view])
+        shapes[:, of_view] = modes.T[:, :, None] * frames.rotate(self.poses[v], along_ray)
+        return shapes
 
     def moved(self, at: RunPoints, twists: Array, points: Array) -> Array:
         """Return points (M, N, 3) of some views, moved with their views by left twists (M, 6V) about the centre."""
@@ -153,14 +177,23 @@ class PlaceErrors:
         cosine = self.measurement.scan_views[v].cosine[index]
         return -smooth_corrections(scan.points[index] - scan.eye, cosine, self.half)
 
+    def scan_modes(self, v: int, index: Indices) -> tuple[Array, Array]:
+        """Return rays (N, 3) to points of view v, scanner frame, and by how much each mode of its own smooth errors
+        (N, M) moves them along."""
+        assert self.scan_errors is not None
+        scan = self.capture.scans[v]
+        away = scan.points[index] - scan.eye
+        return away / np.linalg.norm(away, axis=1)[:, None], self.scan_errors.along(away)
+
 
 def point_sigmas(places: PlaceErrors, cloud: FusedCloud) -> Array:
     """Return (N,) by which each fused point may lie off along its normal, one sigma, length_unit."""
     scans = places.capture.scans
     cell = _WITHIN * float(np.median([scan.scanned_spacing for scan in scans]))
     out = np.empty(len(cloud.points))
-    for start in range(0, len(out), _BLOCK):
-        block = slice(start, start + _BLOCK)
+    rows = max(_HELD // sum(source.views.shape[1] for source in places.sources), 1)
+    for start in range(0, len(out), rows):
+        block = slice(start, start + rows)
         out[block] = _sigmas(places, cloud.points[block], cloud.normals[block], cell)
     return out
 
@@ -197,9 +230,14 @@ def _of_points(places: PlaceErrors, views: Mask, shares: Array, nearest: Indices
     out = np.zeros((len(normals), sum(source.views.shape[1] for source in places.sources)))
     field = np.concatenate([source.field for source in places.sources], axis=1)
     parameters = np.concatenate([source.parameters for source in places.sources], axis=1)
+    ends = np.cumsum([source.views.shape[1] for source in places.sources])
+    of_scan = {s.scan: slice(end - s.views.shape[1], end) for s, end in zip(places.sources, ends, strict=True)}
     for v in np.flatnonzero(views):
         seen = frames.rotate(frames.inverse(places.poses[v]), normals)
         out += shares[v] * np.einsum("ni,kni->nk", seen, places.field_modes(int(v), nearest[:, v])) @ field
+        if places.scan_errors is not None:
+            along_ray, modes = places.scan_modes(int(v), nearest[:, v])
+            out[:, of_scan[int(v)]] += shares[v] * np.einsum("ni,ni->n", seen, along_ray)[:, None] * modes
         if places.slopes is not None:
             slopes = places.slopes.at(int(v), places.poses[v], nearest[:, v])
             out += shares[v] * np.einsum("ni,kni->nk", seen, slopes) @ parameters

@@ -93,7 +93,7 @@ def test_verify_passes_a_good_cell_and_fails_a_wrong_artefact(cell):
     write_certificate(good, cell / "certificate.html")
     assert good["sentence"] in (cell / "certificate.html").read_text(encoding="utf-8").replace("\u00a0", " ")
     assert good["passed"] and good["agreeing"] >= 13 and len(good["numbers"]) == 15
-    assert good["answers_to"] == ["hand_eye", "arm", "scanner"] and good["hand_eye"]["agrees"]
+    assert {"hand_eye", "scanner"} <= set(good["answers_to"]) and good["hand_eye"]["agrees"]
     assert all("scanner" in number["answers_to"] for number in good["numbers"])
     code, wrong = _verify(cell, _artefact(cell, "wrong.toml", 0.15, factor=1.002))  # 0.2 mm on 100 mm
     assert code == 3 and wrong["passed"] is False
