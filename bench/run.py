@@ -29,6 +29,7 @@ TABLES = {
     "faults": "faults:TABLE",
     "features": "metrology:FEATURES",
     "features-monte-carlo": "metrology:MONTE_CARLO",
+    "few-sessions": "few_sessions:TABLE",
     "few-views": "hand_eye_sigmas:FEW_VIEWS",
     "field-cases": "intake:CASES",
     "field-drawn": "intake:DRAWN",

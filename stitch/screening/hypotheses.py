@@ -120,6 +120,7 @@ MISTAKES: dict[str, dict[str, str]] = {
     # Two rows with the very same points, or the very same pose, of which one does not belong.
     "duplicate_scan": {
         "copied scan": "this scan is a copy of that of {of}; to fix: put the right file in its row",
+        "copies": "The scans of {views} are the same points; to fix: put the right file in each row, or leave one out.",
     },
     "duplicate_pose": {
         "copied pose": "{view} has the pose of {of}, and is {off}; to fix: put in its own",
@@ -128,6 +129,8 @@ MISTAKES: dict[str, dict[str, str]] = {
     # else explains it; distances from one target to the others step or creep, those among the others do not.
     "displaced": {
         "displaced": "its pose is {off}; to fix: correct the row, or scan again",
+        "not held": "it contradicts the others by an amount that its surface does not show; to fix: add views that "
+        "overlap with it, or leave it out",
         "wrong joint": "{joint} of {view} reads {stated:.4f}, {fits:.4f} would fit (it is {off}); to fix: correct it",
         "torn": "a part of this scan contradicts the other scans wherever it is put: something moved during the scan, "
         "or two scans are in one file; to fix: scan again",
@@ -174,8 +177,12 @@ MISTAKES: dict[str, dict[str, str]] = {
         "mrad; to fix: export more digits",
         "implausible scatter": "No arm scatters by {by}: several rows or scans are wrong, and hand-eye and pose "
         "errors are not reliable; to fix: check first {farthest}.",
-        "few views": "{count} poses contradict their scans by {by}, where arms repeat to about {usual}: a scan, a row "
-        "or the arm is off; to fix: add views, since {few} do not show which.",
+        "few views": "{count} poses contradict their scans by {by}: {odds} to 1 that a scan or a row is off, against "
+        "what ordinary arms leave; to fix: add views, since {few} do not show which.",
+        "one of few views": "{count} poses contradict their scans by {by}: {odds} to 1 that a view is off, most likely "
+        "{view}, against what ordinary arms leave; to fix: check its row and scan, and add views.",
+        "little overlap": "These {count} views overlap too little to say how well poses and scans agree; to fix: add "
+        "views that overlap with several others.",
         "no test": "No test says whether these {count} views belong together, since one hand-eye brings any together; "
         "to fix: add views.",
         "hand-eye of another set-up": "the model's hand-eye is {by} off what these scans show: it belongs to another "

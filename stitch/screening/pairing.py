@@ -119,6 +119,8 @@ def _single_view_problem(
     amount = displacement_text((m.rotation, m.distance), m.at_least, session.length_unit)
     off = f"off by {amount}" if amount else "off by an amount that its surface does not show"
     partner = next((v if w == m.view else w for v, w in same if m.view in (v, w)), None)
+    if not amount and partner is None:
+        return problem("not held", [name])
     if partner is not None:
         by_joints = session.views[m.view].joints is not None and abs(partner - m.view) == 1
         mistake = "copied joints" if by_joints else "copied pose"

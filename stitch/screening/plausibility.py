@@ -9,13 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stitch.numerics import frames
-from stitch.numerics.distributions import chi2_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES, angle_text, length_text
 from stitch.observations.pose_errors import usual_twist
 from stitch.screening.background import find_occluder, find_static_background
 from stitch.screening.hypotheses import BOTH_ORDERS, euler_angles, problem, sentence
-from stitch.screening.pose_tests import FEWEST_DEGREES
 from stitch.screening.problems import SessionProblem, displacement_text, list_views
 from stitch.screening.snooping import MisplacedView, Snooping
 from stitch.session.capture import Capture, part_size
@@ -25,11 +23,10 @@ from stitch.session.session import SessionData
 _ROTATION, _TRANSLATION_M = 0.010, 0.005
 # No effect of an arm is believed to displace a single view by more than half of that.
 _VIEW_ROTATION, _VIEW_M = 0.005, 0.0025
-# So many views leave too few degrees of freedom for their scatter to accuse one of them.
-_FEW_VIEWS = 5
-_NUMBERS = {2: "two", 3: "three", 4: "four", 5: "five"}
-# Chance that poses which repeat as those of arms do are said to disagree.
-_FEW_VIEWS_CHANCE = 1e-4
+_NUMBERS = {2: "two", 3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight"}
+# Odds from which a doubt is said: good sessions on ordinary arms seldom reach half of that. The largest odds that are
+# told, and the share of the probability from which one view is named.
+_DOUBTED_FROM, _MOST_ODDS, _LIKELY_VIEW = 0.6, 1000.0, 0.9
 # Views that are named as farthest off.
 _LISTED = 3
 # Rounding explains a scatter of no more than so many times what it makes, and no less than its part.
@@ -65,7 +62,20 @@ def apply_displacement_limits(session: SessionData, snooping: Snooping) -> Snoop
 def poses_contradict_scans(session: SessionData, snooping: Snooping) -> bool:
     """Return True if the poses contradict the scans beyond what any arm does."""
     lost = len(snooping.not_belonging) > len(session.views) / 2
-    return lost or beyond_any_arm(session, snooping.rotation, snooping.translation)
+    return lost or (beyond_any_arm(session, snooping.rotation, snooping.translation) and not is_ordinary(snooping))
+
+
+def scatters_beyond_effects(session: SessionData, snooping: Snooping) -> bool:
+    """Return True if the poses scatter as no effect of an arm is believed to make them."""
+    return beyond_effects(session, snooping.rotation, snooping.translation) and not is_ordinary(snooping)
+
+
+def is_ordinary(snooping: Snooping) -> bool:
+    """Return True if few views contradict their poses by no more than an ordinary arm leaves.
+
+    A scatter that few overlaps hardly hold may be estimated at anything; what they do show decides.
+    """
+    return snooping.few is not None and snooping.few.is_ordinary
 
 
 def scatter_in_words(session: SessionData, snooping: Snooping) -> str:
@@ -91,7 +101,7 @@ def snooping_warnings(session: SessionData, capture: Capture, snooping: Snooping
     rounding = rounding_that_explains(session, snooping)
     if rounding is not None:
         return (f"{rounding.describe()}.", *warnings)
-    if beyond_effects(session, snooping.rotation, snooping.translation):
+    if scatters_beyond_effects(session, snooping):
         return (_implausible_scatter(session, capture, snooping, T_mount), *warnings)
     few = check_few_views(session, snooping)
     return warnings if few is None else (few, *warnings)
@@ -140,35 +150,35 @@ def _implausible_scatter(session: SessionData, capture: Capture, snooping: Snoop
 
 
 def check_few_views(session: SessionData, snooping: Snooping) -> str | None:
-    """Return a warning of few views whose poses disagree by more than arms repeat, or that nothing can be tested by.
+    """Return a warning of few views of which one is likelier off than not, or that nothing can be tested by.
 
-    They show few motions: that something is wrong, but not which scan, row or effect. None where poses agree, or where
-    the views are enough for each to be tested by the others.
+    Weighed against what ordinary arms leave. None where they leave as much, or where the views are enough for each to
+    be tested by the others.
     """
     views = len(session.views)
     unit = session.length_unit
     count = _NUMBERS.get(views, str(views))
-    degrees = snooping.blunder_search.null_projector.degrees
-    if (views > _FEW_VIEWS and degrees >= FEWEST_DEGREES) or snooping.left_out or snooping.suspected:
+    if snooping.left_out or snooping.suspected:
         return None
-    if degrees < 1:
+    if snooping.blunder_search.null_projector.degrees < 1:
         return sentence("no test", count=count)
-    rotation, translation = usual_twist(unit)[[0, 3]]
-    if _global_model_test(snooping, np.array([rotation**2, translation**2, 1.0])):
+    few = snooping.few
+    if few is None:
+        return None
+    if few.is_ordinary and beyond_effects(session, snooping.rotation, snooping.translation):
+        return sentence("little overlap", count=count)
+    if few.odds < _DOUBTED_FROM:
         return None
     by = f"{length_text(snooping.translation, unit, 2)} and {angle_text(snooping.rotation, 2)}"
-    usual = f"{length_text(translation, unit, 2)} and {angle_text(rotation, 2)}"
-    return sentence("few views", count=count.capitalize(), by=by, usual=usual, few=count)
-
-
-def _global_model_test(snooping: Snooping, variances: Array) -> bool:
-    """Test the model as a whole (Baarda 1968): the scatter is known and not taken from the same data."""
-    mixed = snooping.model.mixed()
-    C, A, z = mixed.covariance(variances)[0], mixed.A[0], mixed.z[0]
-    CA = np.linalg.solve(C, A)
-    Cz = np.linalg.solve(C, z)
-    statistic = z @ Cz - Cz @ A @ np.linalg.solve(A.T @ CA, A.T @ Cz)
-    return chi2_tail(float(statistic), len(z) - A.shape[1]) > _FEW_VIEWS_CHANCE
+    words = {
+        "count": count.capitalize(),
+        "by": by,
+        "odds": f"{min(few.odds, _MOST_ODDS):.{0 if few.odds > 9 else 1}f}",
+        "few": count,
+    }
+    if few.share < _LIKELY_VIEW:
+        return sentence("few views", **words)
+    return sentence("one of few views", view=session.names[few.view], **words)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 from stitch.numerics import frames
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
+from stitch.screening.few_views import FEW_VIEWS, FewViews, weigh_few_views
 from stitch.screening.linkage import STILL_CONTRADICTS, Linkage, find_contradicting_views, linkage
 from stitch.screening.placement import (
     Placement,
@@ -38,6 +39,8 @@ from stitch.session.capture import Capture, part_size
 # Chance at which a step is tried: whether it stands out among the few views that are linked or not, that it links more
 # of them is the proof.
 _ANY_CHANCE = 1.0
+# Views of which one motion tells nothing against another are two.
+_FEWEST = 3
 # On the surface of the others: four robust sigmas of the overlaps.
 _TOLERANCE_SIGMAS = 4.0
 
@@ -71,6 +74,7 @@ class Snooping:
     expected: Array  # (V, 4, 4) T_reference_scanner by the robot, steps with it
     tolerance: float  # distance from the surface of the others that still lies on it, length_unit
     needed: float  # closure at which a scan counts as placed
+    few: FewViews | None = None  # of few views that nothing accuses: against what ordinary arms leave
 
     @property
     def left_out(self) -> tuple[int, ...]:
@@ -159,6 +163,10 @@ def snoop_views(
         if (v,) in groups
     ]
     misplaced = [replace(m, kind="torn") if m.view in torn else m for m in standing_out if m.view in sure]
+    few = None
+    accused = standing_out or foreign or tests.steps or tests.null_projector.degrees < 1
+    if usual is not None and _FEWEST <= model.count <= FEW_VIEWS and not accused:
+        few = weigh_few_views(usual.measurement, usual.model, located.unconstrained, model)
     return Snooping(
         linkage=located.linkage,
         misplaced=tuple(sorted([*misplaced, *foreign], key=lambda m: m.view)),
@@ -171,6 +179,7 @@ def snoop_views(
         expected=expected,
         tolerance=located.tolerance,
         needed=located.needed,
+        few=few,
     )
 
 

@@ -28,13 +28,14 @@ from stitch.screening.pairing import explain_misplaced
 from stitch.screening.plausibility import (
     apply_displacement_limits,
     beyond_any_arm,
-    beyond_effects,
     poses_contradict_scans,
+    scatters_beyond_effects,
     snooping_warnings,
     suspicion_in_words,
 )
 from stitch.screening.pose_tests import MAX_VIEWS_WITH_EFFECTS, length_problem
 from stitch.screening.problems import list_views
+from stitch.screening.scan_faults import find_identical
 from stitch.screening.snooping import Snooping, snoop_views
 from stitch.screening.target_checks import check_targets, target_warnings
 from stitch.screening.view_model import UsualEffects
@@ -168,7 +169,7 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
         # Other mistakes look like a factor on lengths too.
         refuse(session, [lengths if found.kind == lengths.kind else found for found in deep_check(session)])
         refuse(session, [lengths])
-    if beyond_effects(session, snooping.rotation, snooping.translation):
+    if scatters_beyond_effects(session, snooping):
         # Poses contradict the scans as no arm of use does: a mistake of all of them is refused.
         refuse_whole(session)
     warnings = snooping_warnings(session, capture, snooping, T_mount)
@@ -186,8 +187,15 @@ def screen_views(session: SessionData, measurement: Measurement, correction: Cor
             components=tuple(tuple(names[v] for v in part) for part in snooping.linkage.components),
             weak=tuple((names[v], names[w]) for v, w in snooping.linkage.single),
         ),
-        doubts=(*target_warnings(session, capture.sightings), *warnings),
+        doubts=(*target_warnings(session, capture.sightings), *_copies(session, capture, snooping), *warnings),
     )
+
+
+def _copies(session: SessionData, capture: Capture, snooping: Snooping) -> Iterator[str]:
+    """Yield a warning of every two scans with the same points, of which neither is left out."""
+    for v, w in find_identical(capture):
+        if not {v, w} & set(snooping.left_out):
+            yield sentence("copies", views=f"{session.names[v]} and {session.names[w]}")
 
 
 def _misplaced_views(

@@ -1,0 +1,116 @@
+"""Whether one of few views is off, weighed against what ordinary arms leave: the odds (a Bayes factor).
+
+Few views leave no scatter to test one of them by. What arms do is known in its sizes: joints and links a little
+wrong, wandering, and scatter of the poses, each as large as the priors of `pose_errors.py` say. Under these the
+marginal likelihood of what the overlaps show, the hand-eye free, is held against the same with one view displaced,
+every view and every size as likely as the others (Kass and Raftery 1995, J. Am. Stat. Assoc. 90:773). Sizes are summed
+over, so that an arm that is worse than most is no mistake of a row.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.special import logsumexp
+
+from stitch.model.model import Model
+from stitch.numerics.distributions import chi2_tail
+from stitch.numerics.frames import Array
+from stitch.observations.pose_errors import prior_pose_errors, usual_twist
+from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
+from stitch.observations.surfaces.view_poses import UnconstrainedPoses
+from stitch.screening.view_model import ViewModel
+from stitch.session.measurement import Measurement
+
+# So many views leave too few degrees of freedom for their scatter alone to accuse one of them.
+FEW_VIEWS = 8
+# Sizes of the arm's errors in those that are usual, of the scatter, and of a displaced view, in usual scatters.
+_ARM_SIZES, _SCATTERS, _DISPLACEMENTS = np.geomspace(0.5, 16, 6), np.geomspace(0.5, 4, 4), (10.0, 30.0, 100.0)
+# Neighbouring distances share points and normals: the variance of the overlaps' noise in that of independent ones.
+_NOISE_FACTOR = 3.0
+
+
+# Of an ordinary arm: sizes of all joints and links at once are three times the scale at which one of them is likely.
+_USUAL_ARM = 3.0
+# Chance that what an ordinary arm leaves is said not to be of one.
+_CHANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class FewViews:
+    """What few views say against what ordinary arms leave."""
+
+    odds: float  # to one, for a view that is off against an ordinary arm, if both were as likely before
+    view: int  # the likeliest
+    share: float  # of the probability that it is this one, if one is off
+    is_ordinary: bool  # an ordinary arm leaves as much, one time in ten thousand at the least
+
+
+def weigh_few_views(
+    measurement: Measurement, hand_eye: Model, unconstrained: UnconstrainedPoses, model: ViewModel
+) -> FewViews:
+    """Return the odds that a view is off, against what ordinary arms leave.
+
+    Args:
+        model: of what the unconstrained views say.
+    """
+    errors = prior_pose_errors([measurement], hand_eye, [model.centre]).project(model.reduced.reduction)
+    usual = errors.scales[:, None, None] ** 2 * errors.components
+    rotation, translation = usual_twist(measurement.length_unit)[[0, 3]]
+    white = rotation**2 * model.reduced.rotation + translation**2 * model.reduced.translation
+    scanner = np.hstack([columns[0] for columns in rig_scanner_errors([measurement], [unconstrained]).values()])
+    smooth = model.reduced.reduction @ scanner
+    ordinary = _Covariances(
+        A=model.mixed().A[0],
+        z=model.z,
+        fixed=_NOISE_FACTOR * model.reduced.noise + smooth @ smooth.T,
+        arm=usual[errors.arm_components].sum(axis=0),
+        scatter=white + usual[~errors.arm_components].sum(axis=0),
+    )
+    without, square = ordinary.evidence()
+    sizes = translation * np.array(_DISPLACEMENTS)
+    each = []
+    for columns in model.views:
+        # Shifted, or shifted and turned by as much at the part.
+        moved = [size * part for size in sizes for part in (columns, columns[:, 3:])]
+        each.append(logsumexp([ordinary.beside(part).evidence()[0] for part in moved]) - np.log(len(moved)))
+    best = int(np.argmax(each))
+    log_odds = float(logsumexp(each)) - np.log(len(each)) - without
+    degrees = len(model.z) - ordinary.A.shape[1]
+    return FewViews(
+        odds=float(np.exp(np.clip(log_odds, -300, 300))),
+        view=best,
+        share=float(np.exp(each[best] - logsumexp(each))),
+        is_ordinary=chi2_tail(square, degrees) > _CHANCE,
+    )
+
+
+@dataclass(frozen=True)
+class _Covariances:
+    """Of n numbers z: what is known, what the arm adds at a usual size, and what scatter does."""
+
+    A: Array  # (n, r) of a free hand-eye
+    z: Array  # (n,)
+    fixed: Array  # (n, n)
+    arm: Array  # (n, n)
+    scatter: Array  # (n, n)
+
+    def beside(self, columns: Array) -> "_Covariances":
+        """The same with a displacement of unit variance in columns (n, k)."""
+        return replace(self, fixed=self.fixed + columns @ columns.T)
+
+    def evidence(self) -> tuple[float, float]:
+        """Return the log restricted likelihood over all sizes, and the least χ² of z at sizes of ordinary arms."""
+        logs = list[float]()
+        squares = list[float]()
+        for arm_size, size in product(_ARM_SIZES, _SCATTERS):
+            C = self.fixed + arm_size**2 * self.arm + size**2 * self.scatter
+            CA = np.linalg.solve(C, self.A)
+            Cz = np.linalg.solve(C, self.z)
+            mean = self.A.T @ CA
+            square = float(self.z @ Cz - Cz @ self.A @ np.linalg.solve(mean, self.A.T @ Cz))
+            # Half-Cauchy sizes: over equal steps of the logarithm their density counts times themselves.
+            prior = np.log(arm_size / (_USUAL_ARM**2 + arm_size**2)) + np.log(size / (1 + size**2))
+            logs.append(prior - 0.5 * (np.linalg.slogdet(C)[1] + np.linalg.slogdet(mean)[1] + square))
+            squares.append(square)
+        return float(logsumexp(logs)), min(squares)
