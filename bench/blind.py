@@ -312,12 +312,11 @@ def _outside_table(rows: list[Row]) -> list[str]:
 
 
 def _follows(row: Row) -> bool:
-    """The right covariate: the angle of the joint, time (a knock), humidity."""
+    """The right covariate: the angle of the joint, humidity."""
     if row["effect"] == "third_harmonic":
         joint = next(iter(row["hidden"]["third_harmonic"])).removeprefix("A")
         return any(f.startswith((f"j{joint}", f"joint {joint}")) for f in row["follows"])
-    words = {"knock": ("time", "view"), "covariate_bias": ("humidity",)}[row["effect"]]
-    return any(word in f for f in row["follows"] for word in words)
+    return any("humidity" in f for f in row["follows"])
 
 
 def _pairs_table(rows: list[Row]) -> list[str]:

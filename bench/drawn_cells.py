@@ -161,7 +161,7 @@ def true_poses(cell: LinearCell, world: World, rng: np.random.Generator) -> Arra
         q = laws.act("joints", moment, moment.joints) + joint_errors[v]
         arm = laws.act("arm", moment, moment.arm)
         T = kinematics.flange(arm, q) if world.arm is None else world.arm.flange(arm, q[None])[0]
-        T = on_rail(T, cell.rail[v]) @ off[v]
+        T = on_rail(laws.act("base", moment, T), cell.rail[v]) @ off[v]
         mount = laws.act("mount", moment, cell.T_mount)
         moved = T_reference_part @ frames.inverse(laws.act("part", moment, T_reference_part))
         out.append(moved @ (frames.inverse(T) if cell.measurement.eye_to_hand else T) @ mount)

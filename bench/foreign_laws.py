@@ -218,7 +218,7 @@ def _with_the_law(state: RunData, trend: Array) -> Diagnosis:
         # Views that are yet to be taken go on as the last one.
         return views.at_scanner(np.outer(trend[np.minimum(views.number, len(trend) - 1)], xi))
 
-    effect("mount", tier="user", xi=twist("", 3e-4, 0.1))(true_law)
+    effect("mount", xi=twist("", 3e-4, 0.1))(true_law)
     try:
         return diagnose(state)
     finally:

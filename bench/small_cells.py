@@ -30,10 +30,10 @@ from stitch.run_data import RunData
 from stitch.session.measurement import Measurement
 
 SCENES = ("blade", "drill-plate", "blade-table")
-# The beams of brackets are written in other numbers than the library's droop (`foreign_laws.py` asks for them).
-LIBRARY = tuple(name for name in LAWS if name in EFFECTS and not name.endswith("_droop"))
+# The beams of brackets are written in other numbers than the library's (`foreign_laws.py` asks for them).
+LIBRARY = tuple(name for name in LAWS if name in EFFECTS and not name.endswith(("_droop", "_bend")))
 # Laws without a counterpart in the library, and what a user would write for them.
-OUTSIDE = {"third_harmonic": "third_harmonic", "knock": "knock", "covariate_bias": "humidity_bias"}
+OUTSIDE = {"third_harmonic": "third_harmonic", "covariate_bias": "humidity_bias"}
 # Noise that the model does not have, each about as large as the scanner's own.
 HARD = {
     "correlated field": {"field_error": 0.02},

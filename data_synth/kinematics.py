@@ -39,11 +39,22 @@ def flange(arm: Arm, q: Array) -> Array:
 
 def potential_energy(arm: Arm, q: Array) -> Array:
     """Joule (...): −Σ m g·c over links and payload."""
+    return np.asarray(-(mass_moment(arm, q) @ GRAVITY) / 1000.0)
+
+
+def mass_moment(arm: Arm, q: Array) -> Array:
+    """Sum of m·c over links and payload, kg mm (..., 3), base frame."""
     frames = links(arm, q)
     centres = np.einsum("...nij,nj->...ni", frames[..., 1:, :3, :3], arm.com) + frames[..., 1:, :3, 3]
     load = frames[..., -1, :3, :3] @ np.array(arm.payload_com) + frames[..., -1, :3, 3]
-    moment = np.einsum("n,...ni->...i", arm.mass, centres) + arm.payload_mass * load
-    return np.asarray(-(moment @ GRAVITY) / 1000.0)
+    return np.asarray(np.einsum("n,...ni->...i", arm.mass, centres) + arm.payload_mass * load)
+
+
+def base_moments(arm: Arm, q: Array) -> Array:
+    """N·m (..., 2) about the base's x and y: minus the slope of potential energy as the whole arm turns about them."""
+    turned = Rotation.from_rotvec(np.vstack([np.eye(3)[:2], -np.eye(3)[:2]]) * _ANGLE_STEP).as_matrix()
+    energy = -np.einsum("kij,...j,i->...k", turned, mass_moment(arm, q), GRAVITY) / 1000.0
+    return np.asarray((energy[..., 2:] - energy[..., :2]) / (2 * _ANGLE_STEP))
 
 
 def gravity_torques(arm: Arm, q: Array) -> Array:

@@ -4,7 +4,7 @@ A law turns what the controller believes into what is: true joint angles bend, t
 the part sags. Laws know nothing of how a model would correct them; `stitch.effects` knows nothing of them.
 
 Every law has a size at amplitude 1 that a cell could really have: around a tenth of a millimetre at the
-part. The last three have no counterpart in any library of effects.
+part. The last two have no counterpart in any library of effects.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ Parameters = dict[str, float]
 class Law:
     """One effect of nature. `place` says which function of the chain it changes."""
 
-    place: str  # joints | arm | mount | part | surface | points
+    place: str  # base | joints | arm | mount | part | surface | points
     draw: Callable[[float, Any, np.random.Generator], Parameters]  # (amplitude, plan, rng) → parameters
     act: Callable[..., Any]  # (parameters, moment, value) → value
 
@@ -55,8 +55,14 @@ LAWS: dict[str, Law] = {
     "part_slip": Law("part", bodies.draw_slip(4e-4, 0.1), bodies.part_slip),
     "mount_droop": Law("mount", brackets.draw, brackets.mount_droop),
     "fixture_droop": Law("part", brackets.draw, brackets.fixture_droop),
+    "base_compliance": Law("base", bodies.draw_base, bodies.base_compliance),
+    "joint_thermal": Law("joints", joints.draw_thermal, joints.joint_thermal),
+    "joint_step": Law("joints", joints.draw_step, joints.joint_step),
+    "mount_creep": Law("mount", bodies.draw_creep, bodies.mount_creep),
+    "mount_step": Law("mount", bodies.draw_slip(4e-4, 0.1), bodies.mount_step),
+    "mount_bend": Law("mount", brackets.draw_oblique, brackets.mount_droop),
+    "fixture_bend": Law("part", brackets.draw_oblique, brackets.fixture_droop),
     "third_harmonic": Law("joints", joints.draw_wave(2.5e-4), joints.wave(3)),
-    "knock": Law("mount", bodies.draw_slip(4e-4, 0.1), bodies.knock),
     "covariate_bias": Law("points", points.draw("k", 0.012), points.covariate_bias),
 }
 

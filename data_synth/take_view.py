@@ -51,7 +51,8 @@ def take_view(cell: Cell, moment: Moment, rail: float, rng: np.random.Generator)
         surface = trimesh.Trimesh(laws.act("surface", moment, surface.vertices), surface.faces, process=False)
 
     def scanner_at(q: Array) -> Array:
-        T = on_rail(kinematics.flange(arm, q), np.full(q.shape[:-1], rail)) @ scatter
+        on_base = laws.act("base", moment, kinematics.flange(arm, q))
+        T = on_rail(on_base, np.full(q.shape[:-1], rail)) @ scatter
         return np.asarray((frames.inverse(T) if scene.mount == "eye_to_hand" else T) @ mount)
 
     q_true = laws.act("joints", moment, moment.joints)

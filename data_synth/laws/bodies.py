@@ -1,10 +1,11 @@
-"""Laws that move scanner or part, or change the part's shape."""
+"""Laws that move base, scanner or part, or change the part's shape."""
 
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from data_synth import kinematics
 from data_synth.moment import Moment, Plan
 from stitch.numerics import frames
 
@@ -31,6 +32,18 @@ def draw_warmup(amplitude: float, plan: Plan, rng: np.random.Generator) -> Param
     return {**draw_twist(4e-4, 0.12)(amplitude, plan, rng), "T_c": float(rng.uniform(480, 900))}
 
 
+def draw_creep(amplitude: float, plan: Plan, rng: np.random.Generator) -> Parameters:
+    """Fast in the first half minute to two minutes, ever slower after."""
+    return {**draw_twist(1.2e-4, 0.04)(amplitude, plan, rng), "tau": float(rng.uniform(30, 120))}
+
+
+def draw_base(amplitude: float, plan: Plan, rng: np.random.Generator) -> Parameters:
+    """A foundation that tilts by 0.15 mrad under the largest moment of this plan."""
+    largest = float(np.abs(kinematics.base_moments(plan.arm, plan.joints)).max())
+    softness = 1.5e-4 * amplitude * rng.uniform(0.7, 1.3, 2) / max(largest, 1e-9)
+    return dict(zip(("c_x", "c_y"), map(float, softness), strict=True))
+
+
 def draw_slip(rotation: float, translation: float) -> Callable[[float, Plan, np.random.Generator], Parameters]:
     """A twist at a view in the middle third of the session."""
 
@@ -52,7 +65,18 @@ def mount_warmup(p: Parameters, moment: Moment, T: Array) -> Array:
     return T @ frames.exp(_twist(p) * (1 - np.exp(-moment.time / p["T_c"])))
 
 
-def knock(p: Parameters, moment: Moment, T: Array) -> Array:
+def mount_creep(p: Parameters, moment: Moment, T: Array) -> Array:
+    """M·exp(ξ log(1 + t/τ))."""
+    return T @ frames.exp(_twist(p) * np.log(1 + moment.time / p["tau"]))
+
+
+def base_compliance(p: Parameters, moment: Moment, T: Array) -> Array:
+    """The base gives way to the moment of arm and load: (..., 4, 4) of the flange turn about the base's origin."""
+    moments = kinematics.base_moments(moment.arm, moment.joints)
+    return np.asarray(frames.exp(np.array([p["c_x"] * moments[0], p["c_y"] * moments[1], 0, 0, 0, 0])) @ T)
+
+
+def mount_step(p: Parameters, moment: Moment, T: Array) -> Array:
     """From view v on the scanner sits displaced."""
     return T @ frames.exp(_twist(p)) if moment.index >= p["v"] else T
 

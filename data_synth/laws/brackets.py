@@ -22,7 +22,17 @@ GEOMETRY = tuple(f"{vector}{axis}" for vector in ("end_", "load_", "weak_") for 
 def draw(amplitude: float, plan: Plan, rng: np.random.Generator) -> Parameters:
     """A beam of 80 to 160 mm about along the flange's axis, up to four times as stiff about one axis as about another,
     the weight's centre off its end by a quarter to a half of its length."""
-    end = np.array([0.0, 0.0, 1.0]) + 0.4 * rng.standard_normal(3)
+    return _draw_along(np.array([0.0, 0.0, 1.0]) + 0.4 * rng.standard_normal(3), amplitude, plan, rng)
+
+
+def draw_oblique(amplitude: float, plan: Plan, rng: np.random.Generator) -> Parameters:
+    """The same at 30 to 80° from the flange's axis."""
+    off, around = np.radians(rng.uniform(30, 80)), rng.uniform(0, 2 * np.pi)
+    end = np.array([np.sin(off) * np.cos(around), np.sin(off) * np.sin(around), np.cos(off)])
+    return _draw_along(end, amplitude, plan, rng)
+
+
+def _draw_along(end: Array, amplitude: float, plan: Plan, rng: np.random.Generator) -> Parameters:
     end *= rng.uniform(80, 160) / np.linalg.norm(end)
     load = rng.standard_normal(3)
     load *= rng.uniform(0.25, 0.5) * np.linalg.norm(end) / np.linalg.norm(load)
@@ -54,10 +64,10 @@ def end_twist(p: Parameters, down: Array) -> Array:
 
 
 def mount_droop(p: Parameters, moment: Moment, T: Array) -> Array:
-    """The scanner sits at the end of the beam."""
+    """The scanner sits at the end of the beam; of an oblique one this is `mount_bend`."""
     return np.asarray(frames.exp(end_twist(p, moment.gravity_mount)) @ T)
 
 
 def fixture_droop(p: Parameters, moment: Moment, T: Array) -> Array:
-    """The part sits at the end of the beam, in the reference frame."""
+    """The part sits at the end of the beam, in the reference frame; of an oblique one this is `fixture_bend`."""
     return np.asarray(frames.exp(end_twist(p, moment.gravity_reference)) @ T)

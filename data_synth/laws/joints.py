@@ -49,6 +49,18 @@ def draw_compliance(amplitude: float, plan: Plan, rng: np.random.Generator) -> P
     return {"c2": c * rng.uniform(0.8, 1.2), "c3": c * rng.uniform(0.8, 1.2)}
 
 
+def draw_thermal(amplitude: float, plan: Plan, rng: np.random.Generator) -> Parameters:
+    """One joint that follows the arm's temperature, the first of those that a library knows."""
+    return {**draw_one("k", 6e-5, sign=True)(amplitude, plan, rng), "T": 0.0}
+
+
+def draw_step(amplitude: float, plan: Plan, rng: np.random.Generator) -> Parameters:
+    """One joint that loses counts in the middle third of the session."""
+    views = len(plan.joints)
+    lost = draw_one("d", 3e-4, sign=True)(amplitude, plan, rng)
+    return {**lost, "v": float(rng.integers(views // 3, 2 * views // 3 + 1))}
+
+
 def draw_link(amplitude: float, plan: Plan, rng: np.random.Generator) -> Parameters:
     """One length and one angle of a link between the base and the wrist are off."""
     joint = int(rng.choice([j for j in plan.useful if j + 1 < plan.arm.joints])) + 1
@@ -84,6 +96,17 @@ def backlash(p: Parameters, moment: Moment, q: Array) -> Array:
 def settling(p: Parameters, moment: Moment, q: Array) -> Array:
     """q* = q + s (q − q of the view before)."""
     return q + _of(p, "s", len(q)) * (moment.joints - moment.previous)
+
+
+def joint_thermal(p: Parameters, moment: Moment, q: Array) -> Array:
+    """q* = q + k (T − T₀)."""
+    warmer = moment.covariates["robot_temperature_c"] - moment.start["robot_temperature_c"]
+    return q + _of(p, "k", len(q)) * warmer
+
+
+def joint_step(p: Parameters, moment: Moment, q: Array) -> Array:
+    """From view v on one joint stands elsewhere than it reports."""
+    return q + _of(p, "d", len(q)) if moment.index >= p["v"] else q
 
 
 def latency(p: Parameters, moment: Moment, q: Array) -> Array:

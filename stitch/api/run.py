@@ -22,7 +22,7 @@ from stitch.output import run_folder
 from stitch.output.cloud_colours import Colours, residual_colours
 from stitch.output.fit_report import fit_report
 from stitch.output.json_file import to_json
-from stitch.output.result_document import ledger, points_of
+from stitch.output.result_document import effects_source, ledger, points_of
 from stitch.output.run_folder import recordings, residual_table
 from stitch.output.stored_run import read_ledger
 from stitch.recorder import Recorder
@@ -297,7 +297,8 @@ class Run(RunData):
             tolerance: within which the views have to agree on the part, length_unit: for the page's light.
 
         Raises:
-            InputError: the folder is no place for this run, or FOLDER-session holds another session.
+            InputError: the folder is no place for this run, FOLDER-session holds another session, or an effect in use
+                has no source that could be read again.
 
         Example:
             >>> saved = run.save(folder / "runs" / "bracket", recording=False)
@@ -306,6 +307,8 @@ class Run(RunData):
         """
         folder = Path(folder)
         _require_own_history(self, folder, force)
+        # What nobody could read again is refused before anything is written.
+        effects_source(self)
         whole = self.measured or public_session(self.session)
         path = _save_session_of_run(whole, folder) if whole.in_memory else whole.path
         saved = replace(self, session=replace(self.session, path=path))

@@ -85,6 +85,7 @@ def _show_effect(effect: Effect) -> None:
         "offset": ", {}, or zero",
         "joint": ", one a joint",
         "torque": ", one a gravity torque",
+        "moment": ", one a moment at the base",
         "twist": ", a twist: rx … tz",
         "rotary": ", one or more a rotary axis",
         "linear": ", one or more a linear axis",

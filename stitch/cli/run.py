@@ -294,9 +294,7 @@ def _write_runs(
     runs: list[RunData], folders: list[Path], scratch: Path, mesh: str | None, tolerance: float | None
 ) -> list[str]:
     """Write what was found, and return how each mesh lies to its cloud, in words."""
-    from stitch.model.model_toml import write_model
-    from stitch.output.result_document import model_of
-    from stitch.output.run_folder import write_with_page
+    from stitch.output.run_folder import write_model_with_effects, write_with_page
 
     fits = []
     for result, folder in zip(runs, folders, strict=True):
@@ -310,7 +308,7 @@ def _write_runs(
             write_mesh(surface, folder / "mesh.ply")
             fits.append(fit.sentence(result.session.length_unit))
     if len(runs) > 1:
-        write_model(model_of(runs[0]), scratch / "model.toml")
+        write_model_with_effects(runs[0], scratch)
     return fits
 
 

@@ -134,7 +134,7 @@ def free_masks(term: Term) -> list[Mask]:
             groups = groups + one_by_one(effect, parameters)
     free = ~term.gridded
     alone = [free & np.isin(np.arange(len(free)), group) for group in groups]
-    return [free, *(keep for keep in alone if (keep != free).any())]
+    return [keep for keep in (free, *(keep for keep in alone if (keep != free).any())) if keep.any()]
 
 
 def _grid_terms(linear: LinearModel, effect: Effect) -> list[Term]:

@@ -44,7 +44,8 @@ class Ranked:
 def rank_all(linear: LinearModel, candidates: Sequence[Candidate]) -> tuple[tuple[Ranked, ...], tuple[Ranked, ...]]:
     """Return all candidates scored and ranked among each other; those that these views cannot show are no tests."""
     scores = list(parallel(partial(score, linear), candidates, "candidate effects"))
-    return rank(scores, sum(s.observable for s in scores if not s.candidate.empirical))
+    beliefs = [s.candidate.effect.prior for s in scores if s.observable and not s.candidate.empirical]
+    return rank(scores, round(sum(beliefs)))
 
 
 def rank_one(linear: LinearModel, candidate: Candidate, tests: int, start: Array | None = None) -> Ranked:
@@ -66,7 +67,7 @@ def rank(scores: Sequence[Score], tests: int) -> tuple[tuple[Ranked, ...], tuple
     physical = [s for s in scores if not s.candidate.empirical]
     empirical = [s for s in scores if s.candidate.empirical and s.observable]
     tests = max(tests, 1)
-    weighted = [(s, limits.PRIOR_PHYSICAL / tests, tests) for s in physical]
+    weighted = [(s, limits.PRIOR_PHYSICAL * s.candidate.effect.prior / tests, tests) for s in physical]
     weighted += [(s, limits.PRIOR_UNKNOWN / len(empirical), len(empirical)) for s in empirical]
     logs = [s.log_bayes_factor + float(np.log(prior)) if s.observable else -np.inf for s, prior, _ in weighted]
     total = float(logsumexp([*logs, np.log(limits.PRIOR_NOTHING)]))

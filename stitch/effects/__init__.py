@@ -1,6 +1,7 @@
 """Physical effects along the chain of frames, each a short function: what nature does.
 
-Importing the package registers the library; `user_file.load` adds a user's own.
+Importing the package registers the library, and what installed packages offer (`stitch.effects`); `user_file.load` adds
+a user's own.
 """
 
 from stitch.effects import axis_effects, empirical, library
@@ -13,10 +14,15 @@ from stitch.effects.contract import (
     number,
     offset,
     per_joint,
+    per_moment,
     per_torque,
+    temperature,
     twist,
     vector,
 )
+from stitch.effects.user_file import load_packages
+
+load_packages()
 
 __all__ = [
     "EFFECTS",
@@ -30,7 +36,9 @@ __all__ = [
     "number",
     "offset",
     "per_joint",
+    "per_moment",
     "per_torque",
+    "temperature",
     "twist",
     "vector",
 ]

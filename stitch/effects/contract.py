@@ -18,13 +18,14 @@ import numpy as np
 from stitch.errors import InputError, did_you_mean
 from stitch.numerics.units import Amount, format_amount
 from stitch.session.axes import KINDS, Axis
-from stitch.session.measurement import Measurement
+from stitch.session.measurement import TEMPERATURES, Measurement
 
-# Stands for all views of the session in a grid.
-EVERY_VIEW = (-1.0,)
+# Stand in a grid for all views of the session, and for all of its temperatures.
+EVERY_VIEW, EVERY_TEMPERATURE = (-1.0,), (-2.0,)
 # Places that are tried for an event among hundreds of views.
 _EVENT_PLACES = 50
 PLACES = {
+    "base": "(views: Views, parameters) → twists (V, 6): the robot's base stands displaced by exp(twist), base frame",
     "sensor": "(points (N, 3) at x*, view: ScanView, parameters) → points (N, 3) that the scanner reports",
     "robot": "(joints (V, n) reported, views: Views, parameters) → true joints (V, n)",
     "links": "(links: Links, views: Views, parameters) → Links",
@@ -42,6 +43,8 @@ _LINK_MASS, _LINK_MASS_LIMIT = 10.0, 100.0
 _WHERE_FROM = {
     "joints": "joint angles in views.csv and the robot's DH rows or URDF",
     "torque": "joint angles and the robot's geometry",
+    "moment": "joint angles and the robot's geometry",
+    "temperature": "a column such as robot_temperature_c or ambient_c in views.csv",
     "velocity": "columns j1_velocity_deg_s … in views.csv",
     "time": "a column time_s in views.csv",
     "intensity": "an intensity for every point",
@@ -59,7 +62,7 @@ _WHERE_FROM = {
 class Spec:
     """How an argument of the function becomes parameters."""
 
-    kind: str  # number | vector | offset | joint | torque | twist | rotary | linear
+    kind: str  # number | vector | offset | joint | torque | moment | twist | rotary | linear
     unit: str
     typical: float
     limit: float
@@ -75,9 +78,9 @@ def number(unit: str, typical: float, limit: float, grid: Sequence[float] = ()) 
     return Spec("number", unit, typical, limit, tuple(grid))
 
 
-def vector(unit: str, typical: float, limit: float) -> Spec:
-    """Return a vector (3,): cx, cy, cz for c."""
-    return Spec("vector", unit, typical, limit)
+def vector(unit: str, typical: float, limit: float, axes: Sequence[str] = "xyz") -> Spec:
+    """Return an array, a vector (3,) cx, cy, cz for c unless `axes` says otherwise."""
+    return Spec("vector", unit, typical, limit, axes=tuple(axes))
 
 
 def offset(unit: str, typical: float, limit: float, axes: Sequence[str] = "xyz") -> Spec:
@@ -90,6 +93,11 @@ def event() -> Spec:
     """Return the view from which on something is different; every view that can show it is tried, of a hundred some
     fifty."""
     return Spec("number", "view", 1.0, float("inf"), EVERY_VIEW)
+
+
+def temperature() -> Spec:
+    """Return the number in `TEMPERATURES` of what an effect follows; each temperature that was measured is tried."""
+    return Spec("number", "column", 1.0, float("inf"), EVERY_TEMPERATURE)
 
 
 def per_joint(unit: str, typical: float, limit: float) -> Spec:
@@ -105,6 +113,11 @@ def per_torque(unit: str, typical: float, limit: float) -> Spec:
 def per_axis(kind: str, unit: str, typical: float, limit: float, axes: Sequence[str] = ("",)) -> Spec:
     """Return an array (K·a,) with a numbers for each of the K external axes of a kind, rotary or linear: Au_table."""
     return Spec(kind, unit, typical, limit, axes=tuple(axes))
+
+
+def per_moment(unit: str, typical: float, limit: float) -> Spec:
+    """Return one number for each moment at the base that `Views.tilt` knows: c_x, c_y with masses, c_x_2 … without."""
+    return Spec("moment", unit, typical, limit)
 
 
 def twist(
@@ -135,7 +148,7 @@ class Parameter:
     value: float = 0.0
     sigma: float = float("nan")  # NaN where the views do not show it: it is held at its value
     kept: bool = False  # of an arm that another run fitted: not fitted again
-    names: tuple[str, ...] = ()  # of the session's views, where it is the number of one
+    names: tuple[str, ...] = ()  # of the session's views or of temperatures, where it is the number of one
 
     @property
     def discrete(self) -> bool:
@@ -144,14 +157,14 @@ class Parameter:
 
     @property
     def formatted(self) -> Amount:
-        """As people read it; the view of an event by its name."""
+        """As people read it; the view of an event, and a temperature, by its name."""
         if self.view:
             return Amount(self.view, "–", "")
         return format_amount(self.value, self.sigma if self.fitted else None, self.unit)
 
     @property
     def view(self) -> str:
-        """Name of the first view after an event; empty where it is no event."""
+        """Name of the first view after an event, or of a temperature; empty where it is the number of neither."""
         number = int(np.ceil(self.value))
         return self.names[number] if 0 <= number < len(self.names) else ""
 
@@ -187,6 +200,8 @@ class Effect:
     prefers: tuple[str, ...]  # covariates used where present
     tier: str  # physical | empirical | user | geometry: in every model of a session that has it, and no candidate
     group: str = ""  # covariate that an empirical effect follows
+    prior: float = 1.0  # how often it is met, beside an effect that every arm, mount or part may have
+    origin: str = ""  # of a user's: the file that it was loaded from, or `package …`; empty for one of this program
 
     @property
     def formula(self) -> str:
@@ -194,16 +209,26 @@ class Effect:
         return (self.function.__doc__ or "").strip().splitlines()[0]
 
     def parameters(
-        self, joints: int, torques: Sequence[str], length_unit: str, axes: Sequence[Axis] = ()
+        self,
+        joints: int,
+        torques: Sequence[str],
+        length_unit: str,
+        axes: Sequence[Axis] = (),
+        moments: Sequence[str] = (),
     ) -> tuple[Parameter, ...]:
-        """Return all parameters for an arm of n joints at zero, in the session's unit."""
+        """Return all parameters for an arm of n joints at zero, in the session's unit.
+
+        Args:
+            torques: names of those that bend its joints.
+            moments: names of those that tilt its base.
+        """
         named = [
             (key, spec, name)
             for key, spec in self.specs.items()
             for name in (
                 [f"{key}{part}_{axis.name}" for axis in axes if axis.kind == spec.kind for part in spec.axes]
                 if spec.kind in KINDS
-                else _parameter_names(key, spec, joints, torques)
+                else _parameter_names(key, spec, joints, moments if spec.kind == "moment" else torques)
             )
         ]
         return tuple(_parameter(key, spec, name, length_unit) for key, spec, name in named)
@@ -226,7 +251,7 @@ def _parameter_names(key: str, spec: Spec, joints: int, torques: Sequence[str]) 
             return [key + axis for axis in spec.axes]
         case "joint":
             return [f"{key}{i + 1}" for i in range(joints)]
-        case "torque":
+        case "torque" | "moment":
             return [f"{key}{name}" for name in torques]
         case _:
             return TWIST
@@ -237,8 +262,8 @@ def _parameter(key: str, spec: Spec, name: str, length_unit: str) -> Parameter:
     unit, typical, limit = spec.unit, spec.typical, spec.limit
     if spec.kind == "twist" and name.startswith("t"):
         unit, typical, limit = spec.unit_shift, spec.typical_shift, spec.limit_shift
-    if spec.kind == "torque" and "_" in name[len(key) :]:
-        # A torque between two joints is that of 1 kg there: the coefficient holds the link's mass.
+    if spec.kind in ("torque", "moment") and "_" in name[len(key) :].lstrip("_"):
+        # A torque between two joints, or a moment of one link, is that of 1 kg there: the coefficient holds its mass.
         unit, typical, limit = f"kg {unit}", _LINK_MASS * typical, _LINK_MASS_LIMIT * limit
     above, _, below = unit.partition("/")
     factor = _PER_MM[length_unit] ** ((above == "mm") - (below == "mm"))
@@ -249,12 +274,18 @@ EFFECTS: dict[str, Effect] = {}
 
 
 def effect(
-    place: str, *, needs: Sequence[str] = (), prefers: Sequence[str] = (), tier: str = "physical", **specs: Spec
+    place: str,
+    *,
+    needs: Sequence[str] = (),
+    prefers: Sequence[str] = (),
+    tier: str = "",
+    prior: float = 1.0,
+    **specs: Spec,
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register the decorated function under its own name.
+    """Register the decorated function under its own name: of the library, or a user's where another module defines it.
 
     Raises:
-        InputError: unknown place, a name that is taken, or no docstring.
+        InputError: unknown place, a name that is taken, no docstring, or no parameter that can be fitted.
     """
     if place not in PLACES:
         raise InputError(f"effect at {place!r}: places are {', '.join(PLACES)}")
@@ -265,8 +296,21 @@ def effect(
             raise InputError(f"effect {name!r} is in the library already; give yours another name")
         if not (function.__doc__ or "").strip():
             raise InputError(f"effect {name!r} has no docstring; its first line says what nature does")
+        if all(isinstance(spec, Spec) and spec.grid for spec in specs.values()):
+            raise InputError(
+                f"effect {name!r} has nothing to fit; give it a parameter that is not tried value by value"
+            )
+        of_library = (function.__module__ or "").startswith("stitch.effects.")
+        known_tier = tier or ("physical" if of_library else "user")
         EFFECTS[name] = Effect(
-            name, place, specs, function=function, needs=tuple(needs), prefers=tuple(prefers), tier=tier
+            name,
+            place,
+            specs,
+            function=function,
+            needs=tuple(needs),
+            prefers=tuple(prefers),
+            tier=known_tier,
+            prior=prior,
         )
         return function
 
@@ -297,15 +341,25 @@ def parameters_in(measurement: Measurement, effect: Effect) -> tuple[Parameter, 
     # views its place matters less than the time to try them all.
     places = range(2, views.count - 1)
     events = tuple(float(v) for v in places[:: max(len(places) // _EVENT_PLACES, 1)])
+    grids: dict[tuple[float, ...], tuple[float, ...]] = {
+        EVERY_VIEW: events,
+        EVERY_TEMPERATURE: tuple(map(float, views.temperatures)),
+    }
     timed = bool(effect.prefers) and not any(views.has(name) for name in effect.prefers)
     return tuple(
         replace(
             p,
             unit=p.unit.replace("°C", "h") if timed else p.unit,
-            grid=events if p.grid == EVERY_VIEW else p.grid,
-            names=views.names if p.discrete else (),
+            grid=grids.get(p.grid, p.grid),
+            names=views.names if p.discrete else TEMPERATURES if p.unit == "column" else (),
         )
-        for p in effect.parameters(views.joints.shape[1], views.torques.names, measurement.length_unit, views.axes.axes)
+        for p in effect.parameters(
+            views.joints.shape[1],
+            views.torques.names,
+            measurement.length_unit,
+            views.axes.axes,
+            views.torques.base_names,
+        )
     )
 
 
@@ -364,23 +418,25 @@ def by_joint(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]
         return list(of_axes.values())
     if not any(spec.kind in ("joint", "torque") for spec in effect.specs.values()):
         return []
-    letters = sorted(effect.specs, key=len, reverse=True)
     joints: dict[str, list[int]] = {}
-    for i, parameter in enumerate(parameters):
-        letter = next(name for name in letters if parameter.name.startswith(name))
-        joints.setdefault(parameter.name[len(letter) :].split("_")[0], []).append(i)
+    for i, p in enumerate(parameters):
+        if not p.grid:
+            per_joint = effect.specs[p.argument].kind in ("joint", "torque")
+            whose = p.name[len(p.argument) :].split("_")[0] if per_joint else p.argument
+            joints.setdefault(whose, []).append(i)
     return list(joints.values())
 
 
 def without_offset(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
-    """Return indices of all parameters but an offset; empty for an effect without one."""
-    offsets = [f"{key}{axis}" for key, spec in effect.specs.items() if spec.kind == "offset" for axis in spec.axes]
-    return [[i for i, p in enumerate(parameters) if p.name not in offsets]] if offsets else []
+    """Return indices of all parameters but an offset; empty for an effect without one, or of nothing else."""
+    others = [i for i, p in enumerate(parameters) if effect.specs[p.argument].kind != "offset"]
+    fitted = any(not parameters[i].grid for i in others)
+    return [others] if fitted and len(others) < len(parameters) else []
 
 
 def one_by_one(effect: Effect, parameters: Sequence[Parameter]) -> list[list[int]]:
     """Return the smallest parts that can be true without the others."""
     if effect.place == "links" or effect.tier == "empirical":
         # One row of a table seldom is wrong altogether, nor a scanner in every term of a polynomial.
-        return [[i] for i in range(len(parameters))]
+        return [[i] for i, p in enumerate(parameters) if not p.grid]
     return by_joint(effect, parameters) or [*without_offset(effect, parameters), list(range(len(parameters)))]

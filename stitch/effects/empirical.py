@@ -1,6 +1,6 @@
 """The empirical tier: shapes without a cause. They only say on what the missing effect depends.
 
-Fourier terms of a joint, polynomials of time or a covariate, an event, a low-order field map. They compete
+Fourier terms of a joint, polynomials of time or a covariate, a low-order field map. They compete
 with the physical effects: where one of them explains the views far better than anything known, something
 unknown is at work.
 """
@@ -11,7 +11,7 @@ from math import prod
 
 import numpy as np
 
-from stitch.effects.contract import Effect, Spec, event, number, twist
+from stitch.effects.contract import Effect, Spec, number, twist
 from stitch.numerics.frames import Array
 from stitch.session.measurement import ScanView, Views
 
@@ -39,8 +39,7 @@ def empirical_effects(views: Views) -> list[Effect]:
             polynomials = {1: x, 2: 1.5 * x**2 - 0.5}
             effects += [_bias(name, order, shape) for order, shape in polynomials.items()]
             effects += [_mount(name, order, shape) for order, shape in polynomials.items()]
-    effects.append(_field())
-    return [*effects, _effect("an event", "knock_of_mount", "mount", _step, xi=twist("", 6e-4, 0.2), v=event())]
+    return [*effects, _field()]
 
 
 def _effect(
@@ -96,8 +95,3 @@ def _field() -> Effect:
     sizes = {name: 0.1 / prod(_REACH[factor] for factor in factors) for name, (_, factors) in terms.items()}
     specs = {name: number("mm", size, 50 * size) for name, size in sizes.items()}
     return _effect("the scanner's field", FIELD, "sensor", distort, ("optics",), **specs)
-
-
-def _step(views: Views, xi: Array, v: float) -> Array:
-    """M·exp(ξ) from view v on"""
-    return np.outer(views.number >= v, xi)

@@ -1,4 +1,4 @@
-"""A user's own effects from a Python file, written in the form of the library's.
+"""A user's own effects from a Python file or a package, written in the form of the library's.
 
 What the file says of an effect and what its function returns is checked; whatever goes wrong in it is one line that
 names the file and the place.
@@ -7,10 +7,12 @@ names the file and the place.
 import importlib.util
 import inspect
 import os
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +24,14 @@ from stitch.numerics.frames import Array
 from stitch.session.robot import Links
 from stitch.system.time_limit import time_limit
 
-_KINDS = ("number", "vector", "offset", "joint", "torque", "twist")
+_KINDS = ("number", "vector", "offset", "joint", "torque", "moment", "twist")
 # Seconds for the file and for every call of an effect; a call on a million points takes less than one.
 _SECONDS = 5.0
 _LIMIT = "STITCH_EFFECT_SECONDS"
 
 
 def load(path: Path) -> list[str]:
-    """Run the file; its effects join the registry.
+    """Run the file; its effects join the registry, in place of those of the file before.
 
     The file is Python and is executed: load only files that you would run.
 
@@ -46,7 +48,7 @@ def load(path: Path) -> list[str]:
     if spec is None or spec.loader is None:
         raise InputError(f"{path}: not called a Python file; rename it {path.with_suffix('.py').name}")
     before = dict(EFFECTS)
-    for name in [name for name, known in EFFECTS.items() if known.tier == "user"]:
+    for name in [name for name, known in EFFECTS.items() if known.origin.endswith(".py")]:
         del EFFECTS[name]
     try:
         with _name_errors(path, ""):
@@ -62,8 +64,32 @@ def load(path: Path) -> list[str]:
         EFFECTS.update(before)
         raise
     for name in names:
-        EFFECTS[name] = replace(EFFECTS[name], tier="user", function=_guard_function(EFFECTS[name], path))
+        own = EFFECTS[name]
+        EFFECTS[name] = replace(own, tier="user", function=_guard_function(own, path), origin=str(path.resolve()))
     return names
+
+
+def load_packages() -> None:
+    """Let the effects join the registry that installed packages offer by the entry-point group `stitch.effects`.
+
+    An entry names a module, or a function without arguments, that uses @effect. What fails is one warning.
+    """
+    for entry in entry_points(group="stitch.effects"):
+        before = dict(EFFECTS)
+        package = entry.dist.name if entry.dist else entry.module
+        try:
+            offered = entry.load()
+            if callable(offered):
+                offered()
+            names = [name for name in EFFECTS if EFFECTS[name] is not before.get(name)]
+            for name in names:
+                _require_effect(EFFECTS[name], f"package {package}: effect {name}")
+                EFFECTS[name] = replace(EFFECTS[name], tier="user", origin=f"package {package}")
+        except Exception as error:  # whatever another's package may raise
+            EFFECTS.clear()
+            EFFECTS.update(before)
+            reason = error if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+            warnings.warn(f"package {package}: its effects are left out: {reason}; to fix: correct it", stacklevel=2)
 
 
 def _require_effect(effect: Effect, where: str) -> None:
@@ -129,7 +155,7 @@ def _require_result(effect: Effect, arguments: tuple[Any, ...], result: Any, whe
         for name, given, value in zip(vars(result), vars(arguments[0]).values(), vars(result).values(), strict=True):
             _require_numbers(value, given, f"{where} returns {name} as")
         return result
-    if effect.place in ("mount", "part"):
+    if effect.place in ("base", "mount", "part"):
         return _require_numbers(result, np.zeros((arguments[0].count, 6)), f"{where} returns")
     return _require_numbers(result, arguments[0], f"{where} returns")
 

@@ -27,12 +27,13 @@ STEP, _STEP_GRIDDED = 0.1, 0.005
 
 @dataclass(frozen=True)
 class ChainErrors:
-    """What effects of robot, mount and part do to the chain of frames of V views."""
+    """What effects of base, robot, mount and part do to the chain of frames of V views."""
 
     joints: Array  # (V, n) rad, as they truly were
     links: Links  # as they truly are
     mount: Array  # (V, 6) twist right of the hand-eye
     part: Array  # (V, 6) twist of the part in the reference frame
+    base: Array  # (V, 6) twist of the robot's base in the base frame
     axes: AxisMotion | None = None  # of the external axes, as they truly move
 
 
@@ -42,8 +43,10 @@ def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErr
     if base is None:
         right = exact_links(*views.joints.shape)
         axes = views.axes.as_read() if views.axes else None
-        base = ChainErrors(views.joints, right, np.zeros((views.count, 6)), np.zeros((views.count, 6)), axes)
+        still = np.zeros((views.count, 6))
+        base = ChainErrors(views.joints, right, still, still, still, axes)
     joints, mount, part, axes = base.joints, base.mount, base.part, base.axes
+    tilt = base.base
     # A user's own effect may change the links that it is given in place.
     links = Links(*(value.copy() for value in vars(base.links).values()))
     for term in terms:
@@ -57,23 +60,34 @@ def chain_errors(measurement: Measurement, terms: Sequence[Term], base: ChainErr
             mount = mount + function(views, **arguments)
         elif term.effect.place == "part":
             part = part + function(views, **arguments)
+        elif term.effect.place == "base":
+            tilt = tilt + function(views, **arguments)
         elif term.effect.place == "axis":
             axes = function(axes, views, **arguments)
-    return ChainErrors(joints, links, mount, part, axes)
+    return ChainErrors(joints, links, mount, part, tilt, axes)
 
 
 def perturbed_frames(measurement: Measurement, terms: Sequence[Term]) -> tuple[Array, Array]:
-    """Return (V, 4, 4) what stands left of the hand-eye and right of it under effects of robot, mount and part."""
+    """Return (V, 4, 4) what stands left and right of the hand-eye under effects of base, robot, mount and part."""
     errors = chain_errors(measurement, terms)
     T_base_flange = measurement.T_base_flange
-    if measurement.robot is not None and any(term.effect.place in ARM_PLACES for term in terms):
-        true = forward_with_errors(measurement.robot, errors.joints, errors.links)
+    if any(term.effect.place in ARM_PLACES for term in terms):
         # A reported pose that differs from the nominal kinematics (a calibrated controller) keeps its difference.
-        T_base_flange = T_base_flange @ frames.inverse(forward(measurement.robot, measurement.views.joints)) @ true
+        under, true = _under_base(measurement), T_base_flange
+        if measurement.robot is not None and measurement.views.has("joints"):
+            true = forward_with_errors(measurement.robot, errors.joints, errors.links)
+        T_base_flange = under @ frames.exp(errors.base) @ true
     if errors.axes is not None and any(term.effect.place == "axis" for term in terms):
         T_base_flange = measurement.views.axes.correction(errors.axes) @ T_base_flange
     left = frames.inverse(T_base_flange) if measurement.eye_to_hand else T_base_flange
     return frames.exp(-errors.part) @ left, frames.exp(errors.mount)
+
+
+def _under_base(measurement: Measurement) -> Array:
+    """Return (V, 4, 4) what stands between the frame of the reported poses and the base that carries the arm."""
+    if measurement.robot is None or not measurement.views.has("joints"):
+        return np.broadcast_to(np.eye(4), measurement.T_base_flange.shape)
+    return measurement.T_base_flange @ frames.inverse(forward(measurement.robot, measurement.views.joints))
 
 
 def scan_correction(
@@ -253,7 +267,7 @@ class _ChainJacobian:
     def is_about(self, errors: ChainErrors) -> bool:
         """Return whether errors are those of this model: of the same effects, summed in another order, they are."""
         arrays, others = (
-            (e.joints, *vars(e.links).values(), e.mount, e.part, *(vars(e.axes).values() if e.axes else ()))
+            (e.joints, *vars(e.links).values(), e.mount, e.part, e.base, *(vars(e.axes).values() if e.axes else ()))
             for e in (self.errors, errors)
         )
         pairs = zip(arrays, others, strict=True)
@@ -268,7 +282,9 @@ class _ChainJacobian:
         if place == "axis":
             carried = self.measurement.views.axes.carried
             moved = [frames.log(carried(up.axes) @ frames.inverse(carried(down.axes))) for up, down in steps]
-            return _apply_matrices(self.of_base, np.array(moved))
+            return _apply_matrices(self.of_axes, np.array(moved))
+        if place == "base":
+            return _apply_matrices(self.of_base, np.array([up.base - down.base for up, down in steps]))
         if place in ARM_PLACES and self.measurement.robot is not None:
             moved = []
             for up, down in steps:
@@ -296,6 +312,12 @@ class _ChainJacobian:
 
     @cached_property
     def of_base(self) -> Array:
+        """(V, 6, 6) for changes of the twist of the base, which external axes may carry."""
+        under = frames.adjoint(_under_base(self.measurement))
+        return self.of_axes @ under @ frames.left_jacobian(self.errors.base)
+
+    @cached_property
+    def of_axes(self) -> Array:
         """(V, 6, 6) for twists left of the flange's effective pose."""
         if self.measurement.eye_to_hand:
             return -frames.adjoint(self._left)

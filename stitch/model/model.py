@@ -21,7 +21,7 @@ from stitch.numerics.units import METRES, value_uncertainty_text
 from stitch.session.measurement import Measurement
 from stitch.system.values import Value
 
-ARM_PLACES = ("robot", "links")  # where the effects of an arm stand in the chain of frames
+ARM_PLACES = ("base", "robot", "links")  # where the effects of an arm stand in the chain of frames
 # Expanded uncertainty U = k·σ, coverage about 95 % (JCGM 100:2008, GUM).
 COVERAGE_FACTOR = 2.0
 # A person may edit the sigmas of model.toml; then the matrix of the fit is no longer theirs.

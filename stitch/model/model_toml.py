@@ -226,19 +226,23 @@ def _matrix(path: Path, table: dict[str, Any], key: str, size: int) -> Array:
 
 def without_events(file: ModelFile) -> ModelFile:
     """Return the model for another session: without effects that begin at one view of its own, whose numbers say
-    nothing of other views; targets where they stand in the end.
+    nothing of other views; hand-eye and targets where they stand in the end.
 
     Raises:
         InputError: an effect that is not known.
     """
     events = [name for name, parameters in file.effects.items() if any(p.discrete for p in parameters.values())]
-    targets = file.targets
+    targets, T_mount = file.targets, file.T_mount
     for name in events:
         moved = [p.value for p in file.effects[name].values() if not p.discrete]
-        if find_effect(name).place == "part" and len(moved) == 6:
+        place = find_effect(name).place
+        if place == "part" and len(moved) == 6:
             T = frames.exp(np.array(moved))
             targets = {key: _moved_target(target, T) for key, target in targets.items()}
-    return replace(file, effects={k: v for k, v in file.effects.items() if k not in events}, targets=targets)
+        if place == "mount" and len(moved) == 6:
+            T_mount = T_mount @ frames.exp(np.array(moved))
+    rest = {k: v for k, v in file.effects.items() if k not in events}
+    return replace(file, effects=rest, targets=targets, T_mount=T_mount)
 
 
 def _moved_target(target: Target, T: Array) -> Target:

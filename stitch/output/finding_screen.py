@@ -27,7 +27,7 @@ from stitch.numerics.units import angle_text, length_text
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.output.comparison.disagreement_field import DisagreementField, Patches, patches_of
 from stitch.output.plain_finding import open_doubts
-from stitch.output.plain_words import DESCRIPTIONS, JOINT_DESCRIPTIONS, plain_covariate
+from stitch.output.plain_words import DESCRIPTIONS, EVENTS, JOINT_DESCRIPTIONS, plain_covariate
 from stitch.system.threads import remembered
 
 # Candidate effects that a screen compares: so many, and those that take 3 % of the rms on views left out (mean square).
@@ -254,11 +254,12 @@ def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:
     name = candidate.name
     term = candidate.ranked.score.form.at(candidate.ranked.score.values)
     view = next((p.view for p in term.parameters if p.discrete), "")
-    if view:
-        return f"The part slipped before view {view}" if name == "part_slip" else f"{name} at {view}"
+    when = f" before view {view}" if view else ""
     if trend is not None and name in JOINT_DESCRIPTIONS and trend.moves.startswith("joint"):
-        return f"{trend.moves.capitalize()} {JOINT_DESCRIPTIONS[name]}"
-    description = DESCRIPTIONS.get(name, name)
+        return f"{trend.moves.capitalize()} {JOINT_DESCRIPTIONS[name]}{when}"
+    if view and name not in EVENTS:
+        return f"{name} at {view}"
+    description = EVENTS[name] + when if view else DESCRIPTIONS.get(name, name)
     return description[:1].upper() + description[1:]
 
 

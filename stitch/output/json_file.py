@@ -21,6 +21,7 @@ FILES = {
     *("model.toml", "result.json", "ledger.json", "stitched.ply", "mesh.ply", "residuals.parquet", "recording.rrd"),
     *("report.html", "report.pdf", "two-runs.html", "two-runs.pdf", "features.json", "features.csv", "features.html"),
     *("compare.json", "witness.json", "witness.png", "diagnosis.json", "diagnosis.rrd", "robot.toml", "robot.urdf"),
+    "model_effects.py",
 }
 # Earlier fits of the run, by what they were made of.
 FITS = ".fits"

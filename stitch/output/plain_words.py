@@ -5,6 +5,7 @@ import re
 from stitch.numerics.units import covariate_text
 
 DESCRIPTIONS = {
+    "base_compliance": "the robot's base tilts under arm and load",
     "latency": "scan and pose are not taken at the same time",
     "joint_offset": "a joint counts its angle from a wrong zero",
     "link_geometry": "the arm's links are not as long or as square as stated",
@@ -14,11 +15,17 @@ DESCRIPTIONS = {
     "backlash": "a joint has play",
     "settling": "the arm is measured before it has come to rest",
     "robot_thermal_growth": "the arm grows with its warmth",
+    "joint_thermal": "joints turn with a temperature",
+    "joint_step": "a joint lost counts between two views",
     "mount_drift": "the scanner's mount creeps",
     "mount_warmup": "the scanner's mount moves while it warms up",
+    "mount_creep": "the scanner's mount settles, fast at first and ever slower",
+    "mount_step": "the scanner moved on its mount between two views",
     "mount_droop": "the scanner's mount gives way under its weight",
+    "mount_bend": "the scanner's oblique bracket gives way under its weight",
     "fixture_drift": "the part's fixture creeps",
     "fixture_droop": "the part's fixture gives way under its weight",
+    "fixture_bend": "the part's oblique fixture gives way under its weight",
     "part_slip": "the part slipped between two views",
     "part_growth": "the part grows with its warmth",
     "part_sag": "the part bends under its own weight",
@@ -37,6 +44,7 @@ DESCRIPTIONS = {
 }
 # What ends an effect at the machine; the scans at hand are saved by adding it to the model.
 REMEDIES = {
+    "base_compliance": "tighten the bolts of the robot's base and stiffen what it stands on",
     "latency": "stop the arm for every scan, or trigger both together",
     "joint_offset": "set the zero of the joint anew, or write the corrected arm back into the controller",
     "link_geometry": "write the corrected arm back into the controller",
@@ -46,11 +54,17 @@ REMEDIES = {
     "backlash": "approach every pose from the same side, or have the joint's gear adjusted",
     "settling": "wait longer at each pose before the scan",
     "robot_thermal_growth": "warm the arm up before scanning",
+    "joint_thermal": "warm the arm up before scanning, and keep that temperature",
+    "joint_step": "set the zero of the joint anew, and have its encoder and belt checked",
     "mount_drift": "fasten the scanner's mount",
     "mount_warmup": "let the scanner warm up before scanning",
+    "mount_creep": "mount the scanner some hours before scanning, and tighten its screws again",
+    "mount_step": "fasten the scanner's mount, and scan with one tool from the first view to the last",
     "mount_droop": "stiffen the scanner's mount",
+    "mount_bend": "stiffen the scanner's mount, or hold it along the flange's axis",
     "fixture_drift": "fasten the part's fixture",
     "fixture_droop": "stiffen the part's fixture",
+    "fixture_bend": "stiffen the part's fixture, or hold the part along the flange's axis",
     "part_slip": "clamp the part firmly",
     "part_growth": "let the part reach the temperature of the room",
     "part_sag": "support the part where it bends",
@@ -75,6 +89,14 @@ JOINT_DESCRIPTIONS = {
     "gear_harmonic": "has a gear that runs out of true twice a turn",
     "backlash": "has play",
     "settling": "is measured before it has come to rest",
+    "joint_thermal": "turns with a temperature",
+    "joint_step": "lost counts",
+}
+# What began at a view that is known.
+EVENTS = {
+    "part_slip": "the part slipped",
+    "mount_step": "the scanner moved on its mount",
+    "joint_step": "a joint lost counts",
 }
 
 

@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stitch.effects.contract import Parameter
+from stitch.effects.contract import Effect, Parameter
+from stitch.effects.user_source import FILE, source_of
 from stitch.errors import InputError
+from stitch.model.hand_eye_alone import HandEyeAlone, hand_eye_alone
 from stitch.model.model import EffectsCovariance, Target
 from stitch.model.model_toml import ModelFile
 from stitch.numerics.frames import Array
@@ -66,7 +68,6 @@ def ledger(run: RunData) -> list[dict[str, Any]]:
 
 def model_of(run: RunData) -> ModelFile:
     """Return the model that a run fitted, as model.toml states it; a file of effects while one of them is in use."""
-    uses_file = any(term.effect.tier == "user" for term in run.terms)
     return ModelFile(
         length_unit=run.session.length_unit,
         mount=run.session.mount,
@@ -74,11 +75,41 @@ def model_of(run: RunData) -> ModelFile:
         T_mount_coarse=run.T_mount_coarse,
         covariance=run.mount_covariance,
         effects={term.name: {p.name: p for p in term.parameters} for term in run.terms},
-        effects_file=run.effects_file if uses_file else None,
+        effects_file=_effects_file(run),
         targets=_targets(run.targets),
         effects_covariance=run.model.effects_covariance,
         axes={a.name: (a.direction, a.point) for a in run.session.axes if a.direction is not None},
     )
+
+
+def _effects_file(run: RunData) -> str | None:
+    """Return the file of effects that are no library's and no package's; of several origins the run's own."""
+    origins = {e.origin or run.effects_file or FILE for e in own_effects(run)}
+    file = origins.pop() if len(origins) == 1 else FILE
+    return None if not own_effects(run) else FILE if Path(file).name == FILE else file
+
+
+def own_effects(run: RunData) -> list[Effect]:
+    """Return effects in use that neither stitch nor an installed package has."""
+    own = [term.effect for term in run.terms if term.effect.tier == "user"]
+    return [effect for effect in own if not effect.origin.startswith("package")]
+
+
+def effects_source(run: RunData) -> str | None:
+    """Return the text of the file of effects that a run folder holds itself; None where it needs none.
+
+    Raises:
+        InputError: there is none that another program could read.
+    """
+    own = own_effects(run)
+    if _effects_file(run) != FILE:
+        return None
+    before = Path(own[0].origin or run.effects_file or "")
+    return before.read_text(encoding="utf-8") if before.name == FILE else source_of(own)
+
+
+def _hand_eye_alone(run: RunData) -> HandEyeAlone | None:
+    return hand_eye_alone(run.measurement, run.model)
 
 
 def residual_columns(fit: TargetModelFit, session: SessionData) -> dict[str, Array]:
@@ -315,6 +346,12 @@ _EFFECTS = Kind(
     table_of(table_of(_PARAMETER)).schema,
     lambda terms: {term.name: {p.name: parameter_row(p) for p in term.parameters} for term in terms},
 )
+_ALONE = Document(
+    Key("hand_eye", MATRIX, "T_mount"),
+    Key("covariance", Kind(list_of(list_of(NUMBER)).schema)),
+    Key("displacement", NUMBER),
+    Key("spread", NUMBER),
+)
 _SCATTER = Document(Key("rotation", NUMBER_OR_NULL), Key("translation", NUMBER_OR_NULL))
 _LEFT_OUT = Document(Key("view", TEXT), Key("why", TEXT))
 _WEAK = Document(
@@ -349,6 +386,7 @@ RESULT = Document(
     Key("hand_eye_coarse", attribute="T_mount_coarse"),
     Key("hand_eye_sigma", write=lambda run: np.sqrt(np.diag(run.mount_covariance))),
     Key("hand_eye_covariance", attribute="mount_covariance"),
+    Key("hand_eye_alone", _ALONE.kind(), write=_hand_eye_alone, when=_hand_eye_alone),
     Key("unobservable", TEXTS, of=Fit),
     Key("hand_eye_unknown", TEXTS, "unknown", of=Fit, optional=True),
     Key("hand_eye_stated", write=lambda run: run.session.scanner.T_mount is not None),

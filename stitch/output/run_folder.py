@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 
 from stitch.effects import EFFECTS
+from stitch.effects.user_source import FILE
 from stitch.errors import InputError
 from stitch.model.model_toml import read_model, write_model
 from stitch.numerics.frames import Array
 from stitch.observations.surfaces.matching import Match
 from stitch.output.json_file import FILES, FITS, is_run_file, require_free, write_json
-from stitch.output.result_document import ledger, model_of, residual_columns, result_document
+from stitch.output.result_document import effects_source, ledger, model_of, residual_columns, result_document
 from stitch.recorder import Recorder
 from stitch.run_data import FusedCloud, RunData
 from stitch.session.reading.session_folder import measured_files
@@ -276,11 +277,19 @@ def write_with_page(run: RunData, folder: Path, tolerance: float | None = None) 
     with ThreadPoolExecutor(2) as beside:
         page = beside.submit(call_entry_points, "stitch.reports", run, folder / "report.html", tolerance)
         points = beside.submit(_write_points, run, folder)
-        write_model(model_of(run), folder / "model.toml")
+        write_model_with_effects(run, folder)
         write_json(result_document(run), folder / "result.json")
         write_json(ledger(run), folder / "ledger.json")
         page.result()
         points.result()
+
+
+def write_model_with_effects(run: RunData, folder: Path) -> None:
+    """Write model.toml, and beside it the source of effects that no other file holds."""
+    source = effects_source(run)
+    if source is not None:
+        (folder / FILE).write_text(source, encoding="utf-8")
+    write_model(model_of(run), folder / "model.toml")
 
 
 def _write_points(run: RunData, folder: Path) -> None:

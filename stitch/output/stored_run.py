@@ -93,8 +93,10 @@ def trusted_model(
             "then allow it with --trust, or name a file of your own with --effects-file"
         )
     if model.effects_file:
-        load(Path(model.effects_file))
-    return model, model.effects_file
+        stated = (file.parent / model.effects_file).resolve()
+        load(stated)
+        return model, str(stated)
+    return model, None
 
 
 def _covariance_beside(path: Path, result: dict[str, Any] | None) -> EffectsCovariance:

@@ -356,7 +356,9 @@ class UsualEffects:
         responses = view_responses(self.measurement, self.model, terms, unconstrained)
         for term, response in zip(terms, responses, strict=True):
             usual = response.columns[:, ~term.gridded] * term.typical[~term.gridded]
-            columns.setdefault(term.effect.place, []).append(usual)
+            # A base that tilts follows the arm's pose as its joints do: one size for both.
+            place = "robot" if term.effect.place == "base" else term.effect.place
+            columns.setdefault(place, []).append(usual)
         return {place: np.hstack(blocks) for place, blocks in columns.items()}
 
 

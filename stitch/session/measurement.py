@@ -23,6 +23,14 @@ from stitch.session.session import Mount, SensorKind, SessionData
 from stitch.session.torques import Torques, no_torques, torque_columns, torques_of_views
 
 TURNED = 0.02  # rad by which gravity turns at the least: of what holds still it is a part of the hand-eye
+# Columns of temperatures of which each may bend an arm, by their number in a model.
+TEMPERATURES = (
+    "robot_temperature_c",
+    "ambient_c",
+    "ambient_temperature_c",
+    "scanner_temperature_c",
+    "part_temperature_c",
+)
 # Beyond 84° of incidence 1/cos α is noise of the normal; such points are not used anyway.
 MIN_COSINE = 0.1
 # Share of the points' own spread within which points on the flange stand still in it, if sensor and base are one frame.
@@ -86,6 +94,13 @@ class Views:
             sag[:, joint] += c[k] * self.torques.values[:, k]
         return sag
 
+    def tilt(self, c: Array) -> Array:
+        """Return (V, 6) twists of the base that yields by c (k,) under the moments of arm and load."""
+        twists = np.zeros((self.count, 6))
+        for k, axis in enumerate(self.torques.base_axis):
+            twists[:, axis] += c[k] * self.torques.base[:, k]
+        return twists
+
     def since_first(self, covariate: str) -> Array:
         """Return (V,) a covariate less its value at the first view."""
         return self.covariates[covariate] - self.first[covariate]
@@ -108,6 +123,12 @@ class Views:
         """Return (V,) since the first view."""
         return self.time / 3600.0
 
+    @property
+    def temperatures(self) -> tuple[int, ...]:
+        """Return the numbers of those of `TEMPERATURES` that were measured and change."""
+        measured = [i for i, name in enumerate(TEMPERATURES) if name in self.covariates]
+        return tuple(i for i in measured if np.ptp(self.covariates[TEMPERATURES[i]]) > 0)
+
     def only(self, keep: Sequence[int]) -> "Views":
         """Return some of the views; their numbers, rows before them and first values stay those of the session."""
         return replace(
@@ -118,7 +139,7 @@ class Views:
             previous=self.previous[keep],
             approach=self.approach[keep],
             velocity=None if self.velocity is None else self.velocity[keep],
-            torques=replace(self.torques, values=self.torques.values[keep]),
+            torques=self.torques.only(keep),
             covariates={name: values[keep] for name, values in self.covariates.items()},
             number=self.number[keep],
             axes=self.axes.only(keep) if self.axes else self.axes,
@@ -131,6 +152,8 @@ class Views:
         known = {
             "joints": self.joints.shape[1] > 0,
             "torque": len(self.torques.names) > 0,
+            "moment": len(self.torques.base_names) > 0,
+            "temperature": len(self.temperatures) > 0,
             "velocity": self.velocity is not None,
             "axis": bool(self.axes),
             "rotary_axis": bool(self.axes.rotary.any()),

@@ -123,11 +123,24 @@ def unit_torques(robot: Robot, joints: Array) -> Array:
     return torque * robot.metres_per_unit * (number[None, :] >= number[:, None])
 
 
+def base_moments(robot: Robot, joints: Array) -> Array:
+    """Return (..., n+1, 3) N·m about the base's axes of 1 kg at the centre of mass of each link, the payload's last."""
+    return np.cross(mass_centres(robot, joints), robot.gravity) * robot.metres_per_unit
+
+
+def mass_centres(robot: Robot, joints: Array) -> Array:
+    """Return (..., n+1, 3) centres of mass in the base frame: of each link, or its frame's origin where none is known,
+    and of the payload."""
+    link = link_frames(robot, joints)
+    centres = (link[..., 1:, :3, :3] @ robot.com[..., None])[..., 0] + link[..., 1:, :3, 3]
+    tool = (link[..., -1, :3, :3] @ robot.payload_com[:, None])[..., 0] + link[..., -1, :3, 3]
+    return np.concatenate([centres, tool[..., None, :]], axis=-2)
+
+
 def payload_torques(robot: Robot, joints: Array) -> Array:
     """Return (..., n) N·m about +z of every joint of 1 kg at the payload's centre of mass: z_i · (c − o_i) × g."""
-    flange = link_frames(robot, joints)[..., -1, :, :]
     point, axis = joint_axes(robot, joints)
-    centre = (flange[..., :3, :3] @ robot.payload_com[:, None])[..., 0] + flange[..., :3, 3]
+    centre = mass_centres(robot, joints)[..., -1, :]
     torque = np.einsum("...ij,...ij->...i", axis, np.cross(centre[..., None, :] - point, robot.gravity))
     return torque * robot.metres_per_unit
 
@@ -137,11 +150,8 @@ def gravity_torques(robot: Robot, joints: Array) -> Array:
 
     Minus the slope of potential energy V = −Σ m g·c; the drive holds the opposite. Zeros without masses.
     """
-    link = link_frames(robot, joints)
     point, axis = joint_axes(robot, joints)
-    centres = (link[..., 1:, :3, :3] @ robot.com[..., None])[..., 0] + link[..., 1:, :3, 3]
-    tool = (link[..., -1, :3, :3] @ robot.payload_com[:, None])[..., 0] + link[..., -1, :3, 3]
-    centres = np.concatenate([centres, tool[..., None, :]], axis=-2)
+    centres = mass_centres(robot, joints)
     mass = np.append(robot.mass, robot.payload_mass)
     # Link k is moved by joint i if k ≥ i; the payload by all.
     beyond = np.arange(robot.n_joints + 1)[None, :] >= np.arange(robot.n_joints)[:, None]

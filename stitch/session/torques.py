@@ -1,7 +1,9 @@
-"""Torques that bend the joints of an arm at its views: as drives report them, else those of gravity."""
+"""Torques that bend the joints of an arm at its views, as drives report them, else those of gravity; and the moments of
+arm and load that tilt its base."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +25,14 @@ class Torques:
     joint: tuple[int, ...]  # that the torque bends
     values: Array  # (V, m) N·m about +z of that joint; of 1 kg at the link's frame where masses are unknown
     measured: bool = False
+    # Moments about the base's axes x and y: of arm and load where masses are known, else of 1 kg at each link's frame.
+    base_names: tuple[str, ...] = ()  # _x, _y; without masses _x_3 of link 3, and _x, _y of a load that is known
+    base_axis: tuple[int, ...] = ()
+    base: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (V, k) N·m
+
+    def only(self, keep: Sequence[int]) -> "Torques":
+        """Return those of some of the views."""
+        return replace(self, values=self.values[keep], base=self.base[keep] if self.base_names else self.base)
 
 
 def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Torques:
@@ -33,20 +43,41 @@ def torques_of(robot: Robot, joints: Array, payload: Array | None = None) -> Tor
     Args:
         payload: (V,) kg, in place of the mass in [robot] payload.
     """
+    of_base = _base_moments(robot, joints, payload)
     if payload is None and robot.has_masses:
-        return _each_joint(kinematics.gravity_torques(robot, joints))
+        return replace(_each_joint(kinematics.gravity_torques(robot, joints)), **of_base)
     if payload is None and not robot.payload_mass:
-        return _unit_link_torques(robot, joints)
+        return replace(_unit_link_torques(robot, joints), **of_base)
     payload = np.full(len(joints), robot.payload_mass) if payload is None else payload
     carried = payload[:, None] * kinematics.payload_torques(robot, joints)
     if robot.has_masses:
-        return _each_joint(kinematics.gravity_torques(replace(robot, payload_mass=0.0), joints) + carried)
+        arm_alone = kinematics.gravity_torques(replace(robot, payload_mass=0.0), joints)
+        return replace(_each_joint(arm_alone + carried), **of_base)
     # What the links weigh nobody knows, what they carry is known: a coefficient of its own for every joint it bends.
     links = _unit_link_torques(robot, joints)
     shapes = kinematics.payload_torques(robot, _sample_joints(robot))
     bent = np.flatnonzero(np.ptp(shapes, axis=0) > STILL).tolist()
     names = (*links.names, *(str(i + 1) for i in bent))
-    return Torques(names, (*links.joint, *bent), np.hstack([links.values, carried[:, bent]]))
+    values = np.hstack([links.values, carried[:, bent]])
+    return Torques(names, (*links.joint, *bent), values, **of_base)
+
+
+def _base_moments(robot: Robot, joints: Array, payload: Array | None) -> dict[str, Any]:
+    """Return the fields of `Torques` that say what tilts the base."""
+    of_kg = kinematics.base_moments(robot, joints)[..., :2]
+    load = np.full(len(joints), robot.payload_mass) if payload is None else payload
+    moments = load[:, None] * of_kg[:, -1]
+    columns = list[tuple[str, int, Array]]()
+    if robot.has_masses:
+        moments = moments + np.einsum("k,vki->vi", robot.mass, of_kg[:, :-1])
+    else:
+        shapes = kinematics.base_moments(robot, _sample_joints(robot))[:, :-1]
+        links = [(i, k) for i in range(2) for k in _independent_links(shapes[..., i], range(robot.n_joints))]
+        columns = [(f"_{'xy'[i]}_{k + 1}", i, of_kg[:, k, i]) for i, k in links]
+    if robot.has_masses or load.any():
+        columns += [(f"_{'xy'[i]}", i, moments[:, i]) for i in range(2)]
+    values = np.array([value for *_, value in columns]).T.reshape(len(joints), len(columns))
+    return {"base_names": tuple(c[0] for c in columns), "base_axis": tuple(c[1] for c in columns), "base": values}
 
 
 def _each_joint(values: Array) -> Torques:
@@ -98,7 +129,8 @@ def torques_of_views(robot: Robot, joints: Array, covariates: Mapping[str, Array
     if not drives or len(drives) < joints.shape[1]:
         return torques_of(robot, joints, covariates.get(PAYLOAD))
     # A drive holds the opposite of what bends its joint.
-    return replace(_each_joint(-np.column_stack([covariates[name] for name in drives])), measured=True)
+    held = _each_joint(-np.column_stack([covariates[name] for name in drives]))
+    return replace(held, measured=True, **_base_moments(robot, joints, covariates.get(PAYLOAD)))
 
 
 def torque_columns(joints: int) -> list[str]:

@@ -319,7 +319,7 @@ OWN = "humidity_bias: an effect of your own, its name says nothing here; judge i
         ({}, "missing_effect", ["backlash"], {}, "wrong name"),
         ({}, "unknown_effect", [], {}, "wrong: nothing is left"),
         ({"third_harmonic": {"A2": 1e-4, "B2": 0.0}}, "unknown_effect", [], {}, "right: something is there"),
-        ({"knock": {"v": 5.0}}, "adequate", [], {}, "missed: knock"),
+        ({"third_harmonic": {"A2": 1e-4, "B2": 0.0}}, "adequate", [], {}, "missed: third_harmonic"),
     ],
 )  # fmt: skip
 def test_judgement(tmp_path, hidden, verdict, named, fitted, judgement):

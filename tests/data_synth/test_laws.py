@@ -35,7 +35,7 @@ def test_the_amplitude_scales_what_is_drawn(name):
     assert set(once) == set(twice) and once
     for parameter, value in once.items():
         # Times and views say when, places where, not how much.
-        factor = 1.0 if parameter in ("T_c", "v", *GEOMETRY) else 2.0
+        factor = 1.0 if parameter in ("T_c", "tau", "T", "v", *GEOMETRY) else 2.0
         assert twice[parameter] == pytest.approx(factor * value, rel=1e-12)
 
 
@@ -48,7 +48,7 @@ def test_joints_are_those_that_the_cell_can_show():
 
 
 def test_laws_have_the_names_and_places_of_the_contract():
-    places = {"points": 8, "joints": 8, "arm": 2, "mount": 4, "part": 3, "surface": 2}
+    places = {"points": 8, "base": 1, "joints": 10, "arm": 2, "mount": 6, "part": 4, "surface": 2}
     assert {place: sum(law.place == place for law in nature.LAWS.values()) for place in places} == places
     assert set(nature.SMALL) <= set(nature.LAWS)
 

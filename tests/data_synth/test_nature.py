@@ -95,6 +95,10 @@ def undone(name: str | None, measured: Measured, v: int) -> np.ndarray:
     elif name in ("gear_eccentricity", "gear_harmonic", "third_harmonic"):
         k = {"gear_eccentricity": 1, "gear_harmonic": 2, "third_harmonic": 3}[name]
         q = q + number(p, "A", n) * np.sin(k * q) + number(p, "B", n) * np.cos(k * q)
+    elif name == "joint_thermal":
+        q = q + number(p, "k", n) * warmer["robot_temperature_c"]
+    elif name == "joint_step" and v >= p["v"]:
+        q = q + number(p, "d", n)
     elif name == "backlash":
         q = q - number(p, "b", n) * np.sign(q - before)
     elif name == "settling":
@@ -112,19 +116,26 @@ def undone(name: str | None, measured: Measured, v: int) -> np.ndarray:
         mount = mount @ twist(p, t / HOUR)
     elif name == "mount_warmup":
         mount = mount @ twist(p, 1 - np.exp(-t / p["T_c"]))
-    elif name == "knock" and v >= p["v"]:
+    elif name == "mount_creep":
+        mount = mount @ twist(p, np.log(1 + t / p["tau"]))
+    elif name == "mount_step" and v >= p["v"]:
         mount = mount @ twist(p)
     T_flange = plain_product(arm, q)
+    if name == "base_compliance":
+        source = second_source(arm)
+        of_kg = robot.base_moments(source, measured.plan.joints[v])
+        moment = np.append(source.mass, source.payload_mass) @ of_kg
+        T_flange = frames.exp(np.array([p["c_x"] * moment[0], p["c_y"] * moment[1], 0, 0, 0, 0])) @ T_flange
     down = GRAVITY / np.linalg.norm(GRAVITY)
     in_flange = np.linalg.inv(plain_product(scene.arm, measured.plan.joints[v]))[:3, :3] @ down
-    if name == "mount_droop":
+    if name in ("mount_droop", "mount_bend"):
         mount = beam(p, down if scene.mount == "eye_to_hand" else in_flange) @ mount
     T = (np.linalg.inv(T_flange) if scene.mount == "eye_to_hand" else T_flange) @ mount
     # part
     T_part = scene.T_reference_part
     if name == "fixture_drift":
         T_part = twist(p, t / HOUR) @ T_part
-    elif name == "fixture_droop":
+    elif name in ("fixture_droop", "fixture_bend"):
         T_part = beam(p, in_flange if scene.mount == "eye_to_hand" else down) @ T_part
     elif name == "part_slip" and v >= p["v"]:
         T_part = twist(p) @ T_part
@@ -188,7 +199,10 @@ def test_undone_by_its_formula_the_cloud_lies_on_the_part(name):
     check_on_part(name, "blade", chord() if name == "part_sag" else EXACT)
 
 
-@pytest.mark.parametrize("name", ["joint_compliance", "mount_drift", "mount_droop", "fixture_drift", "part_sag"])
+@pytest.mark.parametrize(
+    "name",
+    ["base_compliance", "joint_compliance", "mount_drift", "mount_droop", "mount_bend", "fixture_drift", "part_sag"],
+)
 def test_the_same_with_the_scanner_on_the_arm(name):
     check_on_part(name, "blade-table", chord() if name == "part_sag" else EXACT)
 

@@ -1,6 +1,7 @@
 """Effects undo nature's laws, which share no code with them; what a session has to have for each, and in which units."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from stitch.diagnosis.ranking import is_certain, rank_all
 from stitch.diagnosis.thresholds import ODDS
 from stitch.effects import EFFECTS
 from stitch.effects.contract import find_effect, missing_need, parameters_in, require_available
-from stitch.effects.user_file import load
+from stitch.effects.user_file import load as load_effects
 from stitch.errors import InputError
 from stitch.model.forward import corrected_capture, perturbed_frames
 from stitch.model.model import Model, term_of
@@ -42,7 +43,8 @@ def hidden(name, mount):
 
 RIGID = [
     "mount_drift", "mount_warmup", "joint_offset", "link_geometry", "joint_compliance", "gear_eccentricity",
-    "gear_harmonic", "backlash", "settling", "robot_thermal_growth",
+    "gear_harmonic", "backlash", "settling", "robot_thermal_growth", "base_compliance", "joint_thermal", "joint_step",
+    "mount_creep", "mount_step",
 ]  # fmt: skip
 
 
@@ -91,7 +93,14 @@ def chain_with_origin(measured):
     return with_part_origin(measurement_of(session, prepare_capture(session)), measured.T_mount)
 
 
-@pytest.mark.parametrize(("effect", "carried"), [("mount_droop", "eye_in_hand"), ("fixture_droop", "eye_to_hand")])
+@pytest.mark.parametrize(
+    ("effect", "carried"),
+    [
+        (f"{body}_{law}", mount)
+        for law in ("droop", "bend")
+        for body, mount in (("mount", "eye_in_hand"), ("fixture", "eye_to_hand"))
+    ],
+)
 def test_only_what_the_arm_turns_against_gravity_can_droop(still_cells, effect, carried):
     for mount in ("eye_to_hand", "eye_in_hand"):
         missing = missing_need(chain_with_origin(still_cells[mount]), EFFECTS[effect])
@@ -175,6 +184,26 @@ def test_labelled_points_show_how_far_a_bracket_tilts(mount, effect):
     assert error @ np.linalg.solve(found.mount_covariance, error) < 22.5  # 99.9 % of χ²(6)
 
 
+def test_labelled_points_show_how_far_a_base_tilts_under_its_load(tmp_path):
+    """The second example of docs/extend.md, by its name: what the payload does is told from what the links may do."""
+    page = (Path(__file__).resolve().parents[2] / "docs" / "extend.md").read_text(encoding="utf-8")
+    (tmp_path / "own.py").write_text(next(block for block in page.split("```python\n")[1:]).split("```")[0])
+    c, rng = np.array([6e-6, 9e-6]), np.random.default_rng(7)
+    joints, load = joints_of(np.random.default_rng(7), 40), rng.uniform(0, 20, 40)
+    poses = np.array([flange(q) for q in joints])
+    moments = np.cross(poses[:, :3, 3] / 1000, load[:, None] * [0, 0, -9.81])
+    turned = np.hstack([moments[:, :2] * c, np.zeros((40, 4))])
+    moved = np.einsum("vij,vj->vi", frames.adjoint(frames.inverse(poses)), turned)
+    session, *_ = labelled_cell(7, 40, payload=load, errors=(np.zeros((40, 6)), moved))
+    (name,) = load_effects(tmp_path / "own.py")
+    try:
+        fitted = {p.name: p for p in run(session, effects=[name]).terms[0].parameters}
+    finally:
+        del EFFECTS[name]
+    for key, true in zip(("c_x", "c_y"), c, strict=True):
+        assert abs(fitted[key].value - true) < 4 * fitted[key].sigma < true
+
+
 def test_a_users_effect_of_the_mount_knows_gravity_and_the_flanges_pose(tmp_path, still_cells):
     (tmp_path / "own.py").write_text(
         "import numpy as np\n"
@@ -187,7 +216,7 @@ def test_a_users_effect_of_the_mount_knows_gravity_and_the_flanges_pose(tmp_path
         "    return views.at_scanner(np.outer(gravity[:, 1] ** 3, xi))\n"
     )
     xi, T = np.array([1e-4, 0, 2e-4, 0.1, 0, 0]), still_cells["eye_in_hand"].T_mount
-    (name,) = load(tmp_path / "own.py")
+    (name,) = load_effects(tmp_path / "own.py")
     try:
         measurement = chain_with_origin(still_cells["eye_in_hand"])
         left, right = perturbed_frames(measurement, [term_of(measurement, EFFECTS[name]).at(xi)])

@@ -38,6 +38,9 @@ _Parent = Annotated[
     str | None, typer.Option("--parent", help="Name of the frame that carries the scanner: flange, base_link …")
 ]
 _Child = Annotated[str, typer.Option("--child", help="Name of the scanner's frame.")]
+_WithEffects = Annotated[
+    bool, typer.Option("--with-effects", help="The hand-eye for a program that corrects the model's effects itself.")
+]
 _Frame = Annotated[
     str | None, typer.Option("--frame", help="Of a program's poses in the base, numbers as the controller shows.")
 ]
@@ -50,6 +53,10 @@ _J3 = Annotated[
     str | None, typer.Option("--j3", help="Of a FANUC program: own, or j2+j3 where the session's joint 3 is that.")
 ]
 
+_On = Annotated[
+    list[Path] | None,
+    typer.Option("--on", metavar="SESSION", help="Of an arm: another session of it, which it must not make worse."),
+]
 _Part = Annotated[int, typer.Option("--part", metavar="N", help="Of a fit with several parts: the one to follow.")]
 
 
@@ -61,12 +68,14 @@ def export_run(
     output: _Output = None,
     parent: _Parent = None,
     child: _Child = "scanner",
+    with_effects: _WithEffects = False,
     frame: _Frame = None,
     tool: _Tool = None,
     limit: _Limit = LIMIT_MM,
     near: _Near = None,
     j3: _J3 = None,
     part: _Part = 1,
+    on: _On = None,
     effects_file: EffectsFile = None,
     trust: Trust = False,
     as_json: Json = False,
@@ -96,17 +105,45 @@ def export_run(
     elif program is not None:
         with show_activity("export: reading the run"):
             arm = arm_of_run(run, effects_file, trust)
+        _prove(run, on, effects_file, trust)
         _export_program(program, arm, output, frame, tool, limit=limit, near=near, j3=j3, as_json=as_json)
     elif to in ARM_FORMATS:
-        _export_text(ARM_FORMATS[to](arm_of_run(run, effects_file, trust)), to, output)
+        text = ARM_FORMATS[to](arm_of_run(run, effects_file, trust))
+        _prove(run, on, effects_file, trust)
+        _export_text(text, to, output)
     elif to in HAND_EYE_FORMATS:
         with show_activity("export: reading the run"):
-            eye = hand_eye_of_run(run, parent, child)
+            eye = hand_eye_of_run(run, parent, child, with_effects)
         # ROS 1 knows launch files in XML only.
         old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
         _export_text(ros_launch(eye) if old else HAND_EYE_FORMATS[to](eye), to, output)
+        if eye.of_effects:
+            say(eye.of_effects)
     else:
         _export_cloud(run, str(to), output)
+
+
+def _prove(run: Path, on: list[Path] | None, effects_file: Path | None, trust: bool) -> None:
+    """Say what the arm of a run leaves on other sessions.
+
+    Raises:
+        InputError: more than the nominal arm, on one of them.
+    """
+    from stitch.model.model_toml import arm_model
+    from stitch.output.stored_run import trusted_model
+    from stitch.plugins.metrology.calibrate.other_sessions import UNASKED, require_held
+    from stitch.session.reading.session_folder import load_session
+
+    arm = arm_model(trusted_model(run, effects_file, trust)[0])
+    if arm is None:
+        return
+    if not on:
+        say(UNASKED)
+        return
+    with show_activity("export: running the other sessions"):
+        proofs = require_held(arm, [load_session(folder) for folder in on])
+    for proof in proofs:
+        say(proof.sentence)
 
 
 def _export_text(text: str, to: str, output: Path | None) -> None:

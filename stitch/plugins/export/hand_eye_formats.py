@@ -41,6 +41,7 @@ class ExportedHandEye:
     parent: str  # frame that carries the scanner, as other programs call it
     child: str  # the scanner's own frame
     notes: tuple[str, ...]  # plain sentences: what was not observable, what the numbers do not hold
+    of_effects: str = ""  # the one of them that says what of the effects the numbers hold
 
     @property
     def name(self) -> str:
@@ -72,11 +73,14 @@ class ExportedHandEye:
         return T
 
 
-def hand_eye_of_run(folder: Path, parent: str | None = None, child: str = "scanner") -> ExportedHandEye:
+def hand_eye_of_run(
+    folder: Path, parent: str | None = None, child: str = "scanner", with_effects: bool = False
+) -> ExportedHandEye:
     """Return the corrected hand-eye of a run folder.
 
     Args:
         parent: name of the frame that carries the scanner; default base_link (eye_to_hand) or flange (eye_in_hand).
+        with_effects: of `hand_eye_from`.
 
     Raises:
         InputError: no run, a damaged one, or a name that a frame cannot have.
@@ -85,7 +89,7 @@ def hand_eye_of_run(folder: Path, parent: str | None = None, child: str = "scann
     model = read_model(folder)
     if model.mount not in _PARENTS:
         raise InputError(f"{folder}/model.toml: mount is {model.mount!r}; to fix: eye_to_hand or eye_in_hand")
-    return hand_eye_from(result, model, read_diagnosis(folder), parent, child)
+    return hand_eye_from(result, model, read_diagnosis(folder), parent, child, with_effects)
 
 
 def hand_eye_from(
@@ -94,12 +98,15 @@ def hand_eye_from(
     diagnosis: dict[str, Any],
     parent: str | None = None,
     child: str = "scanner",
+    with_effects: bool = False,
 ) -> ExportedHandEye:
-    """Return the corrected hand-eye of a result and its model.
+    """Return the corrected hand-eye of a result and its model: at the mean of its effects over the views, unless asked
+    for the one that goes with them.
 
     Args:
         result: as result.json.
         diagnosis: as diagnosis.json; {} where there is none.
+        with_effects: for a program that corrects the effects itself.
         parent, child: names of frames, as `hand_eye_of_run` takes them.
 
     Raises:
@@ -114,7 +121,9 @@ def hand_eye_from(
         )
     metres = METRES[model.length_unit]
     scale = np.repeat([1.0, metres], 3)
-    T = model.T_mount.copy()
+    alone = None if with_effects else result.get("hand_eye_alone")
+    T = np.array(alone["hand_eye"]) if alone else model.T_mount.copy()
+    covariance = np.array(alone["covariance"]) if alone else model.covariance
     T[:3, 3] *= metres
     notes = [uncertainty_scope(diagnosis.get("verdict")).rstrip(".")]
     candidates = diagnosis.get("candidates", [])
@@ -128,17 +137,25 @@ def hand_eye_from(
         )
     notes += [f"Not observable from these motions, left at the coarse value: {axis}" for axis in result["unobservable"]]
     notes += [f"As stated in session.toml, not measured: {', '.join(unknown)}"] if unknown else []
-    if model.effects:
-        notes.append(f"Not in these numbers, as they are one rigid motion: {', '.join(model.effects)}")
+    of_effects = ""
+    if alone:
+        off, spread = (length_text(alone[key], model.length_unit, 2) for key in ("displacement", "spread"))
+        of_effects = (
+            f"At the mean of {', '.join(model.effects)} over these views: without these effects the model's hand-eye "
+            f"is off by {off} at the part. Single views differ by {spread} (rms), which U holds"
+        )
+    elif model.effects:
+        of_effects = f"Not in these numbers, as they are one rigid motion: {', '.join(model.effects)}"
     return ExportedHandEye(
         session=session,
         T_mount=T,
-        covariance=model.covariance * np.outer(scale, scale),
+        covariance=covariance * np.outer(scale, scale),
         length_unit=model.length_unit,
         mount=model.mount,
         parent=_require_plain_name("--parent", parent or _PARENTS[model.mount]),
         child=_require_plain_name("--child", child),
-        notes=tuple(notes),
+        notes=(*notes, of_effects) if of_effects else tuple(notes),
+        of_effects=of_effects,
     )
 
 

@@ -22,6 +22,7 @@ def export_run(
     *,
     parent: str | None = None,
     child: str = "scanner",
+    with_effects: bool = False,
     diagnosis: Diagnosis | None = None,
 ) -> str | None:
     """Write what a run found for other programs, as `stitch export RUN --to` does.
@@ -31,6 +32,7 @@ def export_run(
             e57 or glb for the stitched cloud.
         file: is written, whole or not at all; a cloud needs one.
         parent, child: names of the frames that carry the scanner and are the scanner's own.
+        with_effects: the hand-eye that goes with the model's effects, not that at their mean over the views.
         diagnosis: of the run; what is written says what it found.
 
     Returns:
@@ -60,7 +62,8 @@ def export_run(
         text = ARM_FORMATS[to](arm_from(session, model_of(run)))
     elif to in HAND_EYE_FORMATS:
         document = {} if diagnosis is None else diagnosis_document(diagnosis)
-        text = HAND_EYE_FORMATS[to](hand_eye_from(result_document(run), model_of(run), document, parent, child))
+        eye = hand_eye_from(result_document(run), model_of(run), document, parent, child, with_effects)
+        text = HAND_EYE_FORMATS[to](eye)
     else:
         formats = (*HAND_EYE_FORMATS, *ARM_FORMATS, *CLOUD_FORMATS)
         raise InputError(f"{to}: no such format{did_you_mean(to, formats)}; to fix: one of {', '.join(formats)}")

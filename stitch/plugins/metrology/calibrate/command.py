@@ -107,19 +107,27 @@ def robot(
     ] = None,
     force: Force = False,
     at_most: Annotated[int, typer.Option("--at-most", help="Largest number of effects.")] = 8,
+    on: Annotated[
+        list[Path] | None,
+        typer.Option("--on", metavar="SESSION", help="Another session of this arm, on which the model has to hold."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Kinematic calibration: what the arm's nominal model lacks, as model, corrected DH rows and URDF.
 
+    Of the effects that are found, those stay that make no session worse of those that are named with --on.
+
     \b
     Examples:
       stitch calibrate robot reflector-session -o runs/arm
+      stitch calibrate robot monday --on tuesday --on friday -o runs/arm
     """
     from stitch.api.pipeline import run
     from stitch.api.stepwise import suggest
     from stitch.cli.diagnose import write_diagnosis
     from stitch.output.json_file import to_json
     from stitch.output.run_folder import new_folder, write_with_page
+    from stitch.plugins.metrology.calibrate.other_sessions import keep_what_holds
     from stitch.plugins.metrology.calibrate.robot import (
         calibrated_robot_of_run,
         link_table,
@@ -130,17 +138,19 @@ def robot(
 
     with show_activity("calibrating the arm"):
         loaded = load_session(session)
+        others = [load_session(folder) for folder in on or ()]
         first = run(loaded)
         calibrated_robot_of_run(first)
         found, lines, diagnosis = suggest(first, at_most)
-    result = found or first
+        proved = keep_what_holds(found or first, others)
+    result = proved.run
     target = output or Path("runs") / f"{loaded.name}-robot"
     with new_folder(target, [session], force) as scratch:
         write_with_page(result, scratch)
-        table = link_table(loaded)
-        write_robot(table, result, scratch)
+        table = link_table(loaded, others)
+        write_robot(table, result, scratch, proved.sentences)
         write_diagnosis(diagnosis, result, scratch)
-    document = robot_document(result, table, lines, diagnosis.sentence)
+    document = robot_document(result, table, lines, diagnosis.sentence, proved.sentences)
     if as_json:
         emit(to_json(document))
     else:
@@ -163,7 +173,7 @@ def show_robot(result: RunData, document: dict[str, Any], lines: list[str], targ
                 for i, row in enumerate(document["robot"])
             ],
         )
-    for line in document["table"]["sentences"]:
+    for line in [*document["proved"], *document["table"]["sentences"]]:
         say(line)
     for pose in document["next"]:
         told = ", ".join(f"j{i + 1} {x:.0f}°" for i, x in enumerate(pose))

@@ -20,7 +20,7 @@ from stitch.api.pipeline import run
 from stitch.diagnosis.candidate_views import candidate_measurement, candidate_rows, nearby
 from stitch.effects.contract import EFFECTS
 from stitch.errors import InputError, NoResultError
-from stitch.model.model import Model, Term, sizes_of, stack_parameters, term_of, with_parameter_values
+from stitch.model.model import ARM_PLACES, Model, Term, sizes_of, stack_parameters, term_of, with_parameter_values
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Mask
 from stitch.numerics.least_squares import equilibrated, significantly_smaller
@@ -66,7 +66,7 @@ def calibrated_robot_of_run(run: RunData) -> Robot:
 
 def arm_effects(terms: Sequence[Term]) -> tuple[list[str], list[str]]:
     """The effects of the arm that a table of links can hold, and those that none can."""
-    of_arm = [term.name for term in terms if term.effect.place in ("robot", "links")]
+    of_arm = [term.name for term in terms if term.effect.place in ARM_PLACES]
     return [name for name in of_arm if name in GEOMETRY], [name for name in of_arm if name not in GEOMETRY]
 
 
@@ -139,25 +139,32 @@ class LinkTable:
     heldout_rms: float = np.nan
     nominal_rms: float = np.nan
     ranges: Array | None = None  # (n, 2) rad, of the joints that the proof covers
+    on_others: tuple[tuple[str, str, str], ...] = ()  # other sessions: what it leaves there, and the nominal arm
 
     def sentence(self, unit: str) -> str:
         """What the table is worth."""
         if np.isnan(self.nominal_rms):
             return "These views are too few to prove a table of links on a part of them: it is that of the nominal arm."
         here, nominal = length_text(self.heldout_rms, unit), length_text(self.nominal_rms, unit)
+        if not self.effects and self.on_others:
+            name, there, nominal = self.on_others[-1]
+            left = f"The best table leaves {there} on session {name}, the nominal {nominal}"
+            return f"{left}; it is that of the nominal arm."
         if not self.effects:
             return (
                 f"No table of links is better than the nominal one: read back, the best leaves {here} at ends of the "
                 f"joints' ranges that were left out, the nominal {nominal}; it is that of the nominal arm."
             )
+        elsewhere = "".join(f" On session {name} it leaves {a}, the nominal {b}." for name, a, b in self.on_others)
         return (
             f"Fitted for the table alone and read back, it leaves {here} at ends of the joints' ranges that were left "
-            f"out, the nominal {nominal}."
+            f"out, the nominal {nominal}.{elsewhere}"
         )
 
 
-def link_table(session: SessionData) -> LinkTable:
-    """The table that the ends of the joints' ranges trust; the nominal one where none leaves clearly less.
+def link_table(session: SessionData, others: Sequence[SessionData] = ()) -> LinkTable:
+    """The table that the ends of the joints' ranges trust; the nominal one where none leaves clearly less, or where it
+    leaves more on another session.
 
     Raises:
         InputError: the session has no robot with joints.
@@ -185,7 +192,16 @@ def link_table(session: SessionData) -> LinkTable:
         return LinkTable(nominal, (), heldout_rms, nominal_rms)
     ranges = np.stack([seen.joints.min(axis=0), seen.joints.max(axis=0)], axis=1)
     robot = seen.table(nominal, trust, np.ones(len(seen.joints), bool))
-    return LinkTable(robot, tuple(term.name for term in seen.terms), heldout_rms, nominal_rms, ranges)
+    on_others = list[tuple[str, str, str]]()
+    for other in others:
+        read = _read_back(robot, other.length_unit)
+        leaves, nominal_leaves = (run(of).residual_rms for of in (_with_reported_arm(other, read), other))
+        texts = length_text(leaves, other.length_unit), length_text(nominal_leaves, other.length_unit)
+        on_others.append((other.name, *texts))
+        if leaves > nominal_leaves:
+            return LinkTable(nominal, (), heldout_rms, nominal_rms, on_others=tuple(on_others))
+    names = tuple(term.name for term in seen.terms)
+    return LinkTable(robot, names, heldout_rms, nominal_rms, ranges, tuple(on_others))
 
 
 def _ends(joints: Array, of: Sequence[int] | None = None) -> list[Mask]:
@@ -304,10 +320,15 @@ def _with_reported_arm(session: SessionData, robot: Robot) -> SessionData:
     return replace(session, robot=robot, views=tuple(map(moved, session.views)))
 
 
-def write_robot(table: LinkTable, run: RunData, folder: Path) -> None:
-    """robot.toml (for an arm of DH rows) and robot.urdf."""
+def write_robot(table: LinkTable, run: RunData, folder: Path, proved: Sequence[str] = ()) -> None:
+    """robot.toml (for an arm of DH rows) and robot.urdf.
+
+    Args:
+        proved: what the model beside it was found to do on other sessions.
+    """
     (folder / "robot.urdf").write_text(to_urdf(table.robot), encoding="utf-8")
-    text = robot_toml(table.robot, [_HEADER, *robot_notes(table, run)], run.session.repeatability)
+    notes = [_HEADER, *robot_notes(table, run), *(f"The model: {line}" for line in proved)]
+    text = robot_toml(table.robot, notes, run.session.repeatability)
     if text is not None:
         (folder / "robot.toml").write_text(text, encoding="utf-8")
 
@@ -330,8 +351,10 @@ def robot_notes(table: LinkTable, run: RunData) -> list[str]:
     return notes
 
 
-def robot_document(run: RunData, table: LinkTable, notes: list[str], sentence: str) -> dict[str, Any]:
-    """The JSON document."""
+def robot_document(
+    run: RunData, table: LinkTable, notes: list[str], sentence: str, proved: Sequence[str] = ()
+) -> dict[str, Any]:
+    """The JSON document; `proved` is what the model was found to do on other sessions."""
     result = result_document(run)
     held, beyond = arm_effects(run.terms)
     steps = [
@@ -353,6 +376,7 @@ def robot_document(run: RunData, table: LinkTable, notes: list[str], sentence: s
             "sentence": table.sentence(run.session.length_unit),
             "sentences": robot_notes(table, run),
         },
+        "proved": list(proved),
         "beyond_dh": beyond,
         "unproved": [name for name in held if name not in table.effects],
         "way": notes,
