@@ -30,7 +30,7 @@ def error_falling(run: RunData) -> Figure:
     surface = part_surface(run.fused, history.patches)
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
     seen = visible(surface, camera)
-    limit = full_colour_distance(history.models[0].field) * um
+    limit = full_colour_distance(history.models[0].field, run.session) * um
     count = len(history.models)
     figure = Figure(figsize=(1.9 * count + 4.0, 3.6), layout="constrained")
     parts, right = figure.subfigures(1, 2, width_ratios=[1.9 * count, 3.6])

@@ -69,7 +69,7 @@ def model_scene(run: RunData, history: ModelHistory, surface: PartSurface, cell:
         surface=surface,
         names=tuple(run.session.names),
         um=MICROMETRES[run.session.length_unit],
-        limit=full_colour_distance(first),
+        limit=full_colour_distance(first, run.session),
         centre=centre,
         twists=twists,
         magnified=factors,

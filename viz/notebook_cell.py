@@ -47,7 +47,8 @@ def plot(run: RunData) -> Figure:
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
     # Coarse is so far off that all would be red.
     shown = [step_shown(step, um) for step in history.steps[1:]]
-    return part_picture(surface, camera, shown[-_STEPS:], full_colour_distance(history.models[0].field) * um, DISAGREE)
+    full = full_colour_distance(history.models[0].field, run.session) * um
+    return part_picture(surface, camera, shown[-_STEPS:], full, DISAGREE)
 
 
 # The longest stick covers this share of the targets' spread.

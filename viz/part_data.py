@@ -10,6 +10,7 @@ from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES
 from stitch.output.comparison.disagreement_field import full_colour_distance
 from stitch.output.comparison.model_history import ModelHistory
+from stitch.session.session import SessionData
 from viz.colours import signed_colours, unsigned_colours
 from viz.part_surface import Camera, PartSurface
 
@@ -62,17 +63,16 @@ def part_data(
     surface: PartSurface,
     camera: Camera,
     history: ModelHistory,
-    names: list[str],
-    length_unit: str,
+    session: SessionData,
     extent: Extent | None = None,
 ) -> dict[str, Any]:
     """Plain data for JSON; lengths of the field in µm.
 
     Args:
-        names: of the views (V,).
         extent: shown at first, the part's own if None.
     """
-    um = MICROMETRES[length_unit]
+    um, names = MICROMETRES[session.length_unit], session.names
+    full = full_colour_distance(history.models[0].field, session) * um
     own = [step.field.values * um for step in history.steps]
     first = history.models[0].field
     worst = np.argsort(-np.nan_to_num(np.array([_mean_abs(v) for v in own[-2]])), kind="stable")[:_VIEWS]
@@ -103,11 +103,11 @@ def part_data(
         "byView": [float(f"{x:.4g}") if np.isfinite(x) else None for x in history.models[-1].field.by_view * um],
         "sigma": [round(x, 2) if np.isfinite(x) else None for x in (_standard_error(first.sigma) * um).tolist()],
         "seen": np.isfinite(first.values).sum(axis=0).tolist(),
-        "full": full_colour_distance(first) * um,
-        "fullSigned": max(float(np.nanquantile(np.abs(first.values), 0.95)) * um, full_colour_distance(first) * um),
+        "full": full,
+        "fullSigned": max(float(np.nanquantile(np.abs(first.values), 0.95)) * um, full),
         "colours": colour_stops(),
         "unseen": bool(np.isnan(first.overall).any()),
-        "radius": f"{history.patches.radius:.3g} {length_unit}",
+        "radius": f"{history.patches.radius:.3g} {session.length_unit}",
         "begin": 1,
         "end": len(history.steps) - 2,
     }

@@ -14,6 +14,7 @@ from stitch.output.comparison.model_history import ModelHistory, effect_changes,
 from stitch.output.comparison.run_verdict import run_headline, run_light
 from stitch.run_data import RunData, doubt_headline
 from viz import captions
+from viz.machine_drawing import machine_svg
 from viz.page_parts import Head, Subject, Tile, identity, page_written, script_json, sections_of, write_page
 from viz.part_data import part_data
 from viz.part_surface import PartShape, camera_for, part_shape, part_surface
@@ -213,6 +214,7 @@ def _content(
         "steps": [] if history is None else history.steps,
         "ledger": ledger_rows(run),
         "notes": note_rows(run),
+        "machine": machine_svg(run),
         "targets": target_rows(run),
     }
 
@@ -244,7 +246,7 @@ def _part(run: RunData, history: ModelHistory, shape: PartShape | None) -> dict[
     """Data of the viewer, and its words."""
     surface = part_surface(run.fused, history.patches, shape)
     camera = camera_for(surface.vertices, surface.normals, upright=run.session.mount == "eye_in_hand")
-    data = part_data(surface, camera, history, run.session.names, run.session.length_unit)
+    data = part_data(surface, camera, history, run.session)
     return {
         "data": script_json(data),
         "title": "Where the views disagree",

@@ -20,11 +20,14 @@ from stitch.system.files import whole_file
 from viz import captions
 from viz.diagnosis_plots import Plots, alias_rows, budget_rows, comparison_plots, diagnosis_plots
 from viz.diagnosis_recording import add_diagnosis
+from viz.machine_drawing import machine_svg
 from viz.page_parts import Tile, render, script_json, unbroken, with_sections
 from viz.part_data import colour_stops
 
 # Candidate effects in the table of the page.
 _SHOWN = 8
+# What the scripts of the page draw from.
+_DRAWN = ("now", "why", "formula", "candidates", "places", "deciding_view")
 # Verdicts that name what is missing: the screen shows what adding it would change.
 _NAMING = ("missing_effect", "cannot_tell")
 
@@ -35,20 +38,22 @@ def write_diagnosis(found: Diagnosis, state: RunData, folder: Path) -> None:
     # Rerun's program writes the recording anew while the page is made.
     with ThreadPoolExecutor(1) as beside:
         recorded = beside.submit(add_diagnosis, found, screen, state.session, folder / "recording.rrd")
-        _insert(folder / "report.html", _sections(found, screen, state.session.length_unit, folder))
+        _insert(folder / "report.html", _sections(found, screen, state, folder))
         recorded.result()
 
 
-def _sections(found: Diagnosis, screen: dict[str, Any], unit: str, folder: Path) -> dict[str, str]:
+def _sections(found: Diagnosis, screen: dict[str, Any], state: RunData, folder: Path) -> dict[str, str]:
     """Return what a diagnosis says on the page of a run, by section."""
+    unit = state.session.length_unit
     shown = {"verdict": found.verdict, "named": list(found.effects), "um": MICROMETRES[unit], "colours": colour_stops()}
-    data = script_json({key: screen[key] for key in ("now", "why", "candidates", "places", "deciding_view")} | shown)
+    data = script_json({key: screen[key] for key in _DRAWN} | shown)
     parts = {
         "finding": f'<p class="verdict">{_words(screen["headline"])}</p>\n'
         f'<p class="evidence">{_words(screen["proof"])}</p>\n'
         f'<p class="evidence"><b>How sure:</b> {_words(screen["certainty"])}</p>',
         "doubts": render("doubts.html.j2", doubts=screen["doubts"]),
         "missing": render("missing.html.j2", **_bars(found, screen, unit)),
+        "machine": _machine(found, screen, state),
         "next": _next(found, folder.absolute().name),
         "screen": f'<script type="application/json" id="screen-data">{data}</script>',
         "diagnosis": _evidence(found, unit),
@@ -96,6 +101,7 @@ def _bars(found: Diagnosis, screen: dict[str, Any], unit: str) -> dict[str, Any]
     return {
         "title": titles.get(found.verdict, "What is missing?"),
         "bars": bars,
+        "untested": screen["untested"],
         "noise": length_text(screen["noise"], unit, 2),
         "others": tried - len(screen["candidates"]),
     }
@@ -112,8 +118,32 @@ def _next(found: Diagnosis, run: str) -> str:
     said = "Type, where the folder of this page stands" if why == "Next" else why.removeprefix("Next, ").capitalize()
     does = "It adds what is missing and fits the same views anew." if command.startswith("stitch add") else ""
     after = "".join(f"<p>{_words(text)}</p>" for text in (does, remedy_at_machine(found)) if text)
-    typed = f"<p>{_words(said)}:</p><p><code>{escape(command)}</code></p>"
+    typed = f"<p>{_words(said)}:</p>{_typed(command)}"
+    poses = [proposal for proposal in found.next if proposal.probability is not None]
+    if found.verdict == "cannot_tell" and poses:
+        decides = _words(f"The view that decides, with a probability of {poses[0].probability:.0%}: {poses[0].do}.")
+        instead = "" if command.startswith("stitch next") else f"<p>{_words('No time? ' + said)}:</p>{_typed(command)}"
+        scan = "<p>Scan there, add scan and row to the session, and run it again: the one law is then named.</p>"
+        typed = f"<p>{decides}</p>{_typed(f'stitch next {shlex.quote(run)} -o next.src')}{scan}{instead}"
     return f'<div class="card next"><h2>Next</h2>{typed}{after}</div>'
+
+
+def _typed(command: str) -> str:
+    """Return a command with a button that copies it."""
+    return f'<p><code>{escape(command)}</code> <button type="button" data-copy>Copy</button></p>'
+
+
+def _machine(found: Diagnosis, screen: dict[str, Any], state: RunData) -> str:
+    """Return the machine with what errs marked; after an effect was added what it cures."""
+    of = screen["why"]["of"] if screen["why"] is not None else ""
+    drawing = machine_svg(state, of)
+    if not drawing:
+        return ""
+    titles = {"adequate": f"The machine: {of}, in the model", "cannot_tell": f"The machine: {of}, or another part"}
+    title = titles.get(found.verdict, f"The machine: {of} errs") if of and of != "the views" else "The machine"
+    if found.verdict == "cannot_tell" and len({c["why"]["of"] for c in screen["candidates"][:2] if c["why"]}) == 1:
+        title = f"The machine: {of} errs"
+    return f'<div class="card machine"><h2>{_words(title)}</h2>{drawing}</div>'
 
 
 def _evidence(found: Diagnosis, unit: str) -> str:

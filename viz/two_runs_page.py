@@ -7,7 +7,6 @@ import numpy as np
 
 from stitch.numerics.frames import Array
 from stitch.numerics.units import MICROMETRES, length_text, value_uncertainty_text
-from stitch.output.comparison.disagreement_field import full_colour_distance
 from stitch.output.comparison.run_verdict import ToleranceVerdict, run_light, run_verdict
 from stitch.output.comparison.two_runs import ComparedRun, TwoRuns, comparison_sentence
 from stitch.run_data import RunData
@@ -235,7 +234,6 @@ def _parts(both: TwoRuns) -> list[dict[str, Any]]:
     """Data of both viewers, in one scale of colours and of lengths; empty without clouds."""
     if both.a.history is None or both.b.history is None:
         return []
-    um = MICROMETRES[both.a.run.session.length_unit]
     histories, sides = (both.a.history, both.b.history), (both.a, both.b)
     surfaces = [part_surface(side.run.fused, own.patches) for side, own in zip(sides, histories, strict=True)]
     upright = both.a.run.session.mount == "eye_in_hand"
@@ -244,10 +242,10 @@ def _parts(both: TwoRuns) -> list[dict[str, Any]]:
         cameras[1] = cameras[0]
     extents = _extents(surfaces, cameras, both.same_data)
     data = [
-        part_data(surface, camera, own, side.run.session.names, side.run.session.length_unit, extent)
+        part_data(surface, camera, own, side.run.session, extent)
         for surface, camera, own, side, extent in zip(surfaces, cameras, histories, sides, extents, strict=True)
     ]
-    limit = max(full_colour_distance(own.models[0].field) for own in histories) * um
+    limit = max(own["full"] for own in data)
     signed = max(own["fullSigned"] for own in data)
     return [
         {

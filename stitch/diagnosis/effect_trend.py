@@ -22,7 +22,7 @@ from stitch.diagnosis.deciding_view import model_beside, predict_views
 from stitch.diagnosis.residual_structure import Dependence, predicted_distances
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
-from stitch.effects.contract import EFFECTS, Effect, parameters_in, twist
+from stitch.effects.contract import EFFECTS, Effect, by_joint, parameters_in, twist
 from stitch.model.forward import moves_points, point_correction, pose_derivatives, scan_points
 from stitch.model.model import Model, Term
 from stitch.numerics import frames
@@ -81,11 +81,13 @@ class EffectTrend:
     predicted_sigma: Array  # (D,) standard deviation of that
     moves: str  # what the effect itself moves: `of` where the plot is its own
     effect: Array  # (D,) what it does there itself, whatever hand-eye and effects in use take of it
+    after: Array | None = None  # (D,) the dots with the effect in the model, where it is in it
 
     def only(self, dots: Indices) -> "EffectTrend":
         """Return the trend with some of its dots."""
-        names = ("at", "views", "measured", "sigma", "predicted", "predicted_sigma", "effect")
-        return replace(self, **{name: getattr(self, name)[dots] for name in names})
+        names = ("at", "views", "measured", "sigma", "predicted", "predicted_sigma", "effect", "after")
+        kept = {name: getattr(self, name) for name in names}
+        return replace(self, **{name: values[dots] for name, values in kept.items() if values is not None})
 
 
 def trends_of_candidates(linear: LinearModel, scores: Sequence[Score]) -> dict[str, EffectTrend]:
@@ -177,11 +179,39 @@ def trend_in_model(linear: LinearModel, term: Term) -> EffectTrend | None:
     fitted = linear.restricted(())
     form = candidate_as_fitted(fitted, term).forms[0]
     norms = np.linalg.norm(fitted.design, axis=0)
-    others = [j for j in range(len(norms)) if not _is_among(fitted.design[:, j], form.response, 1e-6 * norms[j])]
-    without = replace(fitted, design=fitted.design[:, others])
-    effect = _Effect(term, form, _change(without, form.columns, fitted))
-    plot = _plot(without, linear, *_direction(without, effect))
-    return None if plot is None else _trend_on(plot, effect)
+    # Its parameters that the fit holds at zero have columns too.
+    own = fitted.responses([term])[0].columns
+    others = [j for j in range(len(norms)) if not _is_among(fitted.design[:, j], own, 1e-6 * norms[j])]
+    # What was seen is counted from the model, which holds the effect.
+    seen = fitted.mixed.z + (form.columns @ term.values[form.keep]).reshape(fitted.mixed.z.shape)
+    without = replace(fitted, design=fitted.design[:, others], mixed=replace(fitted.mixed, z=seen))
+    effect = _Effect(term, form, _change(without, form.columns, without))
+    direction = _direction(without, _clearest_joint(effect))
+    plot = _plot(without, linear, *direction)
+    columns = np.hstack([without.design, form.response])
+    beside = _plot(replace(fitted, design=columns), linear, *direction)
+    if plot is None or beside is None:
+        return None
+    return _trend_on(replace(plot, after=beside.measured), effect)
+
+
+def _clearest_joint(effect: "_Effect") -> "_Effect":
+    """Return the effect of that joint alone which is the most of its own sigmas from zero; as it is without joints."""
+    term, change = effect.term, effect.change
+    place = np.cumsum(effect.form.keep) - 1
+    joints = [[i for i in joint if effect.form.keep[i]] for joint in by_joint(term.effect, term.parameters)]
+    joints = [joint for joint in joints if joint]
+    if not joints:
+        return effect
+
+    def squared_sigmas(joint: list[int]) -> float:
+        own = place[joint]
+        return float(change.values[own] @ np.linalg.pinv(change.covariance[np.ix_(own, own)]) @ change.values[own])
+
+    clearest = max(joints, key=squared_sigmas)
+    alone = np.where(np.isin(np.arange(len(term.values)), clearest) | term.gridded, term.values, 0.0)
+    values = np.where(np.isin(np.flatnonzero(effect.form.keep), clearest), change.values, 0.0)
+    return replace(effect, term=term.at(alone), change=replace(change, values=values))
 
 
 def _is_among(column: Array, columns: Array, tolerance: float) -> bool:
@@ -315,6 +345,7 @@ class _Plot:
     axis: _Axis
     measured: Array  # (V,)
     sigma: Array  # (V,)
+    after: Array | None = None  # (V,) with an effect in the model that the dots are without
 
     @cached_property
     def square(self) -> Array:
@@ -348,6 +379,7 @@ class _Plot:
             predicted_sigma=np.sqrt(np.einsum("vp,pq,vq->v", per_unit, change.covariance, per_unit).clip(0)),
             moves=moves,
             effect=effect,
+            after=self.after,
         )
         return trend.only(_shown(len(at)))
 

@@ -18,7 +18,7 @@ from stitch.diagnosis.effect_trend import (
     trends_of_candidates,
 )
 from stitch.diagnosis.residual_structure import predicted_distances
-from stitch.diagnosis.sentences import odds_text
+from stitch.diagnosis.sentences import fitted_amounts, odds_text
 from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
 from stitch.diagnosis.unmodelled_time_effects import reportable
 from stitch.effects.contract import describe_need
@@ -27,7 +27,13 @@ from stitch.numerics.units import angle_text, length_text
 from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.output.comparison.disagreement_field import DisagreementField, Patches, patches_of
 from stitch.output.plain_finding import open_doubts
-from stitch.output.plain_words import DESCRIPTIONS, EVENTS, JOINT_DESCRIPTIONS, plain_covariate
+from stitch.output.plain_words import (
+    DESCRIPTIONS,
+    EVENTS,
+    JOINT_DESCRIPTIONS,
+    effect_description,
+    plain_covariate,
+)
 from stitch.system.threads import remembered
 
 # Candidate effects that a screen compares: so many, and those that take 3 % of the rms on views left out (mean square).
@@ -57,6 +63,8 @@ def finding_screen(diagnosis: Diagnosis) -> dict[str, Any]:
         "certainty": certainty(diagnosis),
         "now": {"heldout": diagnosis.heldout_rms} | _on_part(present),
         "noise": diagnosis.noise_floor,
+        "untested": untested_text(diagnosis),
+        "formula": _formula(diagnosis),
         "why": _trend_row(why),
         "candidates": [_candidate_row(diagnosis, c, if_added.get(c.name), trends.get(c.name)) for c in candidates],
         "deciding_view": _deciding_view(diagnosis, trends),
@@ -185,13 +193,26 @@ def _on_part(field: DisagreementField | None) -> dict[str, Any]:
     return {"mean": field.mean_abs, "worst": worst, "field": values}
 
 
+def _formula(diagnosis: Diagnosis) -> str:
+    """Return the law that is drawn and its numbers; empty where it has no name."""
+    if diagnosis.verdict in _NAMING:
+        named = diagnosis.named[0]
+        return f"{named.score.candidate.effect.formula}; {fitted_amounts(named)}"
+    if diagnosis.verdict != "adequate" or not diagnosis.linear.model.terms:
+        return ""
+    term = diagnosis.linear.model.terms[-1]
+    amounts = [f"{p.name} = {p.formatted}" for p in term.parameters if p.fitted or p.grid]
+    return f"{term.effect.formula}; {', '.join(amounts)}"
+
+
 def _trend_row(trend: EffectTrend | None) -> dict[str, Any] | None:
     if trend is None:
         return None
     words = {key: getattr(trend, key) for key in ("follows", "unit", "of", "value_unit")}
     numbers = ("at", "measured", "sigma", "predicted", "predicted_sigma")
     dots = {key: _rounded(getattr(trend, key)) for key in numbers}
-    return words | {"views": trend.views.tolist()} | dots
+    after = None if trend.after is None else _rounded(trend.after)
+    return words | {"views": trend.views.tolist(), "after": after} | dots
 
 
 def _rounded(values: Array) -> list[float]:
@@ -202,9 +223,10 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
     """Return what is missing, in one sentence."""
     match diagnosis.verdict:
         case "adequate":
-            in_model = " and ".join(diagnosis.linear.model.effects)
-            tested = _tested(diagnosis)
-            return f"With {in_model} in the model, {tested}" if in_model else tested[0].upper() + tested[1:]
+            in_model = [effect_description(name) or name for name in diagnosis.linear.model.effects]
+            tested = _tested(diagnosis, "further " if in_model else "missing ")
+            added = f"In the model: {'; '.join(in_model)}. " if in_model else ""
+            return f"{added}{tested}"
         case "unknown_effect":
             follows = ""
             if diagnosis.follows_field:
@@ -217,20 +239,28 @@ def _headline(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> str:
             return f"Something is missing that no known effect explains{follows}."
     named = [c for c in compared(diagnosis) if c.name in diagnosis.effects]
     if len(named) > 1:
-        return _rivals(named, trends)
+        return _rivals(named, trends) + _decided_by(diagnosis)
     return f"{'' if diagnosis.certain else 'Perhaps: '}{_cause(named[0], trends.get(named[0].name))}."
 
 
-def _tested(diagnosis: Diagnosis) -> str:
-    """Return among how many effects none was found, and how many could not be tested, with what they need."""
+def _tested(diagnosis: Diagnosis, which: str) -> str:
+    """Return among how many effects none was found, and how many could not be tested."""
     seen = sum(c.ranked.score.observable for c in diagnosis.candidates)
     untested = len(diagnosis.candidates) - seen + len(diagnosis.missing)
-    if not untested:
-        return f"no missing effect was found among {seen}."
-    needs = dict.fromkeys(describe_need(need) for needs in diagnosis.missing.values() for need in needs)
-    if seen < len(diagnosis.candidates):
-        needs |= {"other views": None}
-    return f"no missing effect was found among {seen}; {untested} could not be tested (they need {'; '.join(needs)})."
+    others = f"; {untested} could not be tested" if untested else ""
+    return f"No {which}effect was found among {seen}{others}."
+
+
+def untested_text(diagnosis: Diagnosis) -> str:
+    """Return which effects could not be tested and what they need, a sentence for each need; empty where all were."""
+    unseen = [c.name for c in diagnosis.candidates if not c.ranked.score.observable]
+    lines = [f"These views cannot show {' and '.join(unseen)}: other poses are needed."] if unseen else []
+    for needs in dict.fromkeys(diagnosis.missing.values()):
+        names = [name for name, lacks in diagnosis.missing.items() if lacks == needs]
+        were, they = ("was", "it needs") if len(names) == 1 else ("were", "they need")
+        told = " and ".join(map(describe_need, needs))
+        lines.append(f"{' and '.join(names).capitalize()} {were} not tested: {they} {told}.")
+    return " ".join(lines)
 
 
 def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend]) -> str:
@@ -247,6 +277,12 @@ def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend]) ->
     causes = [_cause(c, trends.get(c.name)) for c in named]
     which = ", or ".join(cause[:1].lower() + cause[1:] for cause in causes)
     return f"These views cannot tell which of {len(causes)} it is: {which}."
+
+
+def _decided_by(diagnosis: Diagnosis) -> str:
+    """Return how likely the next view decides, as a sentence; empty where no pose does."""
+    first = next((proposal.probability for proposal in diagnosis.next if proposal.probability is not None), None)
+    return "" if first is None else f" One more view decides with a probability of {first:.0%}."
 
 
 def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:

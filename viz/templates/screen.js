@@ -47,12 +47,22 @@ function showScreen(root, part, found, um) {
     const values = pair()[0].values, all = views[0].front().filter(([k]) => Number.isFinite(values[k])), drawn = numbers.onVertices(values);
     // Where the colour, which is a mean of patches, is that of the number.
     const alike = all.filter(([k, , , i]) => Math.abs(drawn[i] - values[k]) < 0.15 * values[k]), front = (alike.length > 9 ? alike : all).sort((a, b) => values[a[0]] - values[b[0]]);
-    for (const wanted of [1, 0, 0.5]) {
+    const worst = worstPatch(values);
+    if (worst >= 0 && front.some(([k]) => k === worst)) tags.push({ patch: worst, worst: true, x: 9, y: 9 });
+    for (const wanted of tags.length ? [0, 0.5] : [1, 0, 0.5]) {
       const order = front.map((f, i) => [Math.abs(i / front.length - wanted), f]).sort((a, b) => a[0] - b[0]);
       const free = order.find(([, f]) => tags.every(t => Math.hypot(f[1] - t.x, f[2] - t.y) > 0.22));
       if (free) tags.push({ patch: free[1][0], x: free[1][1], y: free[1][2], vertex: free[1][3] });
     }
   }
+  const worstPatch = values => values.reduce((best, v, k) => Number.isFinite(v) && (best < 0 || v > values[best]) ? k : best, -1);
+  // A click on the tile of the worst place turns the part there.
+  const tile = root.ownerDocument.querySelector("[data-tile=worst]");
+  if (tile && views.length) tile.parentElement.addEventListener("click", () => {
+    const patch = worstPatch(pair()[0].values);
+    tags = [...tags.filter(t => !t.worst).slice(-2), { patch, worst: true }];
+    views.forEach(v => v.face(patch)); draw();
+  });
   views.forEach(v => v.picked = patch => {
     tags = tags.some(t => t.patch === patch) ? tags.filter(t => t.patch !== patch) : [...tags.slice(-3), { patch, picked: true }];
     draw();
@@ -102,9 +112,10 @@ function showScreen(root, part, found, um) {
       xyPlot(place, { x: { label: "views in their order", names: part.names }, y: { label: "µm" }, series: [{ kind: "dots", x: seen.map(s => s[0]), y: seen.map(s => s[1]), names: true, said: seen.map(s => said[s[0]]), tint: "dot" }] }, 230, i => chooseView(i < 0 ? -1 : seen[i][0]));
       return;
     }
-    const deciding = !asked && found.deciding_view, rivals = deciding && deciding.expected.map(e => found.candidates.find(c => c.effect === e.effect));
+    const deciding = !asked && found.deciding_view, rivals = deciding && deciding.expected.slice(0, 2).map(e => found.candidates.find(c => c.effect === e.effect));
     const plot = rivals ? duelPlot(rivals, deciding, part && part.names, um) : coursePlot(course, part && part.names, um, !asked && found.verdict === "unknown_effect" ? "their trend" : "what the effect predicts");
     title.textContent = plot.title;
+    if (!asked && found.formula) say(`The law: ${found.formula}.`);
     xyPlot(place, { ...plot.spec, pressed: course.views.indexOf(view) }, 230, i => chooseView(i < 0 ? -1 : course.views[i] ?? -1));
   }
   function chooseView(index) {
@@ -150,12 +161,12 @@ function coursePlot(course, names, um, line = "what the effect predicts") {
   const jumps = first > 0 && side.slice(first).every(s => s !== side[0]);
   const said = measured.map((m, i) => `${course.views.length ? `${named_[i]}, ` : ""}${shortNumber(x[i])}: measured ${shortNumber(m)} ± ${shortNumber(2 * sigma[i])} ${unit}, predicted ${shortNumber(predicted[i])} ± ${shortNumber(2 * about[i])} ${unit}`);
   return {
-    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are" : "is"} off without it in the model (${unit}), ± 2σ. Dots: measured. Line: ${course.of.endsWith("views") ? "means" : line}`,
+    title: `Why: how far ${course.of} ${course.of.endsWith("views") ? "are" : "is"} off without it in the model (${unit}), ± 2σ. Dots: measured${course.after ? ", open: with it in the model" : ""}. Line: ${course.of.endsWith("views") ? "means" : line}`,
     perUnit: seconds ? 1 / per : 1,
     spec: {
       x: { label, names: inOrder && course.views.length === (names || []).length ? named_ : undefined }, y: { label: unit },
       shaded: jumps ? { from: (x[first - 1] + x[first]) / 2, said: `from ${named_[first]} on` } : undefined,
-      series: [{ kind: "band", x, y: predicted, sigma: about, tint: "predicted" }, { kind: "line", x, y: predicted, step: jumps, tint: "predicted" }, { kind: "dots", x, y: measured, sigma, names: course.views.length > 0, said, tint: "dot" }],
+      series: [{ kind: "band", x, y: predicted, sigma: about, tint: "predicted" }, { kind: "line", x, y: predicted, step: jumps, tint: "predicted" }, { kind: "dots", x, y: measured, sigma, names: course.views.length > 0, said, tint: "dot" }, ...(course.after ? [{ kind: "dots", x, y: scaled(course.after), open: true, said: course.after.map((a, i) => `${named_[i]}, ${shortNumber(x[i])}: ${shortNumber(a * factor)} ${unit} with it in the model`), tint: "0" }] : [])],
     },
   };
 }
@@ -165,10 +176,10 @@ function duelPlot(rivals, view, names, um) {
   const [first, second] = rivals.map(c => coursePlot(c.why, names, um)), factor = rivals[0].why.value_unit === "rad" ? 1e3 : um, unit = first.spec.y.label;
   const x = view.at * first.perUnit, tints = ["predicted", "0"], [, , dots] = first.spec.series;
   const lines = [first, second].flatMap((plot, k) => plot.spec.series.slice(0, 2).map(s => ({ ...s, tint: tints[k], dashed: k === 1 })));
-  const expected = view.expected.map((e, k) => ({ kind: "dots", x: [x], y: [e.value * factor], sigma: [Math.hypot(e.sigma, view.sigma) * factor], tint: tints[k], open: true,
-    said: [`${e.effect} expects ${shortNumber(e.value * factor)} ± ${shortNumber(2 * e.sigma * factor)} ${unit} there; one view scatters by ± ${shortNumber(2 * view.sigma * factor)}`], label: `${e.effect}: ${shortNumber(Number((e.value * factor).toPrecision(2)))} ± ${shortNumber(Number((2 * Math.hypot(e.sigma, view.sigma) * factor).toPrecision(2)))}`, below: e.value < view.expected[1 - k].value }));
+  const expected = view.expected.slice(0, 2).map((e, k) => ({ kind: "dots", x: [x], y: [e.value * factor], sigma: [e.sigma * factor], tint: tints[k], open: true,
+    said: [`${e.effect} expects ${shortNumber(e.value * factor)} ± ${shortNumber(2 * e.sigma * factor)} ${unit} there; one view scatters by ± ${shortNumber(2 * view.sigma * factor)}`], label: `${e.effect}: ${shortNumber(Number((e.value * factor).toPrecision(2)))} ± ${shortNumber(Number((2 * e.sigma * factor).toPrecision(2)))}`, below: e.value < view.expected[1 - k].value }));
   return {
-    title: `Two laws, the same dots: how far ${rivals[0].why.of} is off without either (${unit}), ± 2σ. Solid: ${view.expected[0].effect}, dashed: ${view.expected[1].effect}; in the stripe what each expects in the view that stitch next proposes`,
+    title: `Two laws, the same dots: how far ${rivals[0].why.of} is off without either (${unit}), ± 2σ. Solid: ${view.expected[0].effect}, dashed: ${view.expected[1].effect}; in the stripe what each expects in the view that decides`,
     spec: { ...first.spec, shaded: undefined, stripe: { at: x, said: `measure here: ${shortNumber(x)}${rivals[0].why.unit === "°" ? "°" : ""}` }, series: [...lines, ...expected, dots] },
   };
 }
@@ -212,9 +223,9 @@ function partStage(card, data, index) {
       const away = ty > h / 2 ? -26 : 26;
       while (taken[side].some(t => Math.abs(t - ty) < 26)) ty += away;
       taken[side].push(ty);
-      const tx = side === "right" ? w - 40 : 40, text = Number.isFinite(value) ? roundLength(value) : "no value";
+      const tx = side === "right" ? w - (tag.worst ? 54 : 40) : tag.worst ? 54 : 40, text = Number.isFinite(value) ? `${tag.worst ? "worst " : ""}${roundLength(value)}` : "no value", half = tag.worst ? 52 : 36;
       nodes.push(svgNode("line", { class: "lead", x1: px, y1: py, x2: tx, y2: ty }), svgNode("circle", { class: "spot", cx: px, cy: py, r: 4 }),
-        svgNode("rect", { class: "tag", x: tx - 36, y: ty - 12, width: 72, height: 23, rx: 5 }), svgNode("text", { class: "tag-text", x: tx, y: ty + 4, "text-anchor": "middle" }, text));
+        svgNode("rect", { class: "tag", x: tx - half, y: ty - 12, width: 2 * half, height: 23, rx: 5 }), svgNode("text", { class: "tag-text", x: tx, y: ty + 4, "text-anchor": "middle" }, text));
     }
     above.replaceChildren(...nodes);
   }
@@ -225,6 +236,12 @@ function partStage(card, data, index) {
   return Object.assign(stage, {
     eye: look.now,
     look(eye) { look.set(eye); draw(); },
+    face(patch) {
+      const i = vertexOf(patch);
+      if (i < 0) return;
+      const [x, y, z] = [0, 1, 2].map(k => normals[3 * i + k]);
+      look.set({ ...look.now(), yaw: -Math.atan2(x, z), pitch: Math.atan2(y, Math.hypot(x, z)), panX: 0, panY: 0 }); draw();
+    },
     show(values, full, signed) {
       state = { values, full, signed };
       const on = numbers.onVertices(values);

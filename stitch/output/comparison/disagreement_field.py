@@ -16,11 +16,15 @@ from pykdtree.kdtree import KDTree
 from scipy.sparse import csr_matrix
 
 from stitch.numerics.frames import Array, Indices, Mask
+from stitch.numerics.units import METRES
 from stitch.observations.surfaces.matching import Match
 from stitch.observations.surfaces.normal_equations import RMS_GATE
+from stitch.session.session import SessionData
 
 # A colour bar shows so many steps that people tell apart.
 COLOUR_STEPS = 10
+# By how much poses of an arm of which nobody states it scatter, mm, and how much more is full of colour.
+_USUAL_ARM, _PALE = 0.02, 4.0
 # Mean of |x| of a normal x of unit sigma.
 _MEAN_OF_NORMAL = float(np.sqrt(2 / np.pi))
 # Radii of the patches that are tried, as shares of the part's longest side.
@@ -73,9 +77,12 @@ class DisagreementField:
         return float(np.quantile(seen, share)) if len(seen) else float("nan")
 
 
-def full_colour_distance(field: DisagreementField) -> float:
-    """Return the distance at which colours are full: their steps are no smaller than nearly all standard errors."""
-    return max(field.quantile(), COLOUR_STEPS * largest_standard_error(field.sigma))
+def full_colour_distance(field: DisagreementField, session: SessionData) -> float:
+    """Return the distance at which colours are full: what a usual arm leaves is pale, and steps of the colours are no
+    smaller than nearly all standard errors."""
+    stated = session.repeatability.sigma_translation
+    usual = _USUAL_ARM / (METRES[session.length_unit] * 1e3) if stated is None else stated
+    return max(field.quantile(), COLOUR_STEPS * largest_standard_error(field.sigma), _PALE * usual)
 
 
 def largest_standard_error(sigma: Array) -> float:
