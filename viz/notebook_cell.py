@@ -1,4 +1,4 @@
-"""A run in a cell of a notebook: the viewer of its page in a frame of its own, and the same as a picture."""
+"""A run in a cell of a notebook: its page in a frame, and the part as a picture."""
 
 import html
 
@@ -9,31 +9,26 @@ from matplotlib.figure import Figure
 from stitch.numerics.units import MICROMETRES
 from stitch.output.comparison.disagreement_field import full_colour_distance
 from stitch.output.comparison.model_history import model_history
-from stitch.output.comparison.run_verdict import run_headline
 from stitch.run_data import RunData
 from viz.colours import BLUE, ORANGE
 from viz.figures import plain
-from viz.page_parts import render
 from viz.part_picture import DISAGREE, part_picture, step_shown
 from viz.part_surface import camera_for, part_surface
 from viz.run_numbers import residual_vectors
-from viz.run_page import shown_part
+from viz.run_page import report_html
 
 # Steps of the model side by side, the last ones.
 _STEPS = 4
-_HEIGHT = 760
+_HEIGHT = 980
 
 
 def notebook_view(run: RunData) -> str:
-    """Return HTML for a cell: headline and viewer as report.html has them, in a frame, so that neither styles nor names
-    of a notebook's other cells come into it. It asks no server."""
-    history = model_history(run)
-    part = shown_part(run, history)
-    page = render("notebook.html.j2", title=run.session.name, verdict=run_headline(run, history), part=part)
-    height = 220 if part is None else _HEIGHT
+    """Return HTML for a cell: the screen of report.html in a frame, so that neither styles nor names of a notebook's
+    other cells come into it. It asks no server."""
+    name = html.escape(run.session.name)
     return (
-        f'<iframe srcdoc="{html.escape(page)}" sandbox="allow-scripts" title="{html.escape(run.session.name)}" '
-        f'style="width: 100%; height: {height}px; border: 0"></iframe>'
+        f'<iframe srcdoc="{html.escape(report_html(run))}" sandbox="allow-scripts" title="{name}" '
+        f'style="width: 100%; height: {_HEIGHT}px; border: 0"></iframe>'
     )
 
 

@@ -13,9 +13,20 @@ from stitch.observations.observability import NUMBERS
 from stitch.output.comparison.model_history import ModelHistory, effect_changes, model_history
 from stitch.output.comparison.run_verdict import run_headline, run_light
 from stitch.run_data import RunData, doubt_headline
+from stitch.system.files import whole_file
 from viz import captions
 from viz.machine_drawing import machine_svg
-from viz.page_parts import Head, Subject, Tile, identity, page_written, script_json, sections_of, write_page
+from viz.page_parts import (
+    Head,
+    Subject,
+    Tile,
+    identity,
+    page_written,
+    render,
+    script_json,
+    sections_of,
+    with_sections,
+)
 from viz.part_data import part_data
 from viz.part_surface import PartShape, camera_for, part_shape, part_surface
 from viz.run_numbers import shown_points, view_shifts
@@ -151,19 +162,26 @@ def write_report(run: RunData, path: Path, tolerance: float | None = None) -> No
     Args:
         tolerance: within which the views have to agree on the part, length_unit.
     """
+    diagnosed = _is_diagnosed(run, path.parent)
+    sections = sections_of(path.read_text(encoding="utf-8")) if diagnosed and path.is_file() else {}
+    page = with_sections(report_html(run, tolerance, diagnosed), sections)
+    with whole_file(path) as file:
+        file.write_text(page, encoding="utf-8")
+
+
+def report_html(run: RunData, tolerance: float | None = None, diagnosed: bool = False) -> str:
+    """Return the page of a run as text.
+
+    Args:
+        tolerance: as of `write_report`.
+        diagnosed: a diagnosis of this model lies in its folder.
+    """
     with ThreadPoolExecutor(1) as beside:
         begun = None if run.registered is None else beside.submit(part_shape, run.fused)
         history = model_history(run)
         shape = None if begun is None else begun.result()
-    diagnosed = _is_diagnosed(run, path.parent)
-    write_page(
-        path,
-        "report.html.j2",
-        _head(run, history, tolerance),
-        sections_of(path.read_text(encoding="utf-8")) if diagnosed and path.is_file() else None,
-        diagnosed=diagnosed,
-        **_content(run, history, tolerance, shape),
-    )
+    content = _content(run, history, tolerance, shape)
+    return render("report.html.j2", head=_head(run, history, tolerance), diagnosed=diagnosed, **content)
 
 
 def _is_diagnosed(run: RunData, folder: Path) -> bool:

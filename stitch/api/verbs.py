@@ -233,7 +233,7 @@ def next_view(run: RunData | Diagnosis) -> tuple[Proposal, ...]:
         NoResultError: no two views overlap.
 
     Example:
-        >>> all(proposal.do and proposal.separates for proposal in stitch.next_view(run))
+        >>> all(proposal.do for proposal in stitch.next_view(run))
         True
     """
     return (run if isinstance(run, Diagnosis) else diagnose(run)).next
