@@ -2,10 +2,9 @@
 
 FIELD: one simulated campaign in the ways of writing of data_synth/fixtures/field_folders.py. CASES: the folders of the
 shared cases, each simulated after a thread of somebody who does this job; with `--set run=true`, `stitch run` has to
-find the true hand-eye within twice its U, and to say of what it cannot know that it is not known. DRAWN: for each seed
-sixty ways of writing another campaign (data_synth/fixtures/field_drawn.py). Where init refuses, what it asks for is
-done to the letter, and it is asked again. Right: the views meet under the true hand-eye (cases), or poses, mount and
-pairing are those of the campaign.
+find the true hand-eye within twice its U, and to say of what it cannot know that it is not known. Where init refuses,
+what it asks for is done to the letter, and it is asked again. Right: the views meet under the true hand-eye (cases), or
+poses, mount and pairing are those of the campaign.
 
 CONVENTIONS: conventions scrambled on purpose, of the five objects of RegHEC, nine views each. Twelve orders of Euler
 angles × poses inverted or not, 24 tables an object; axes that turn along or stand still, degrees or radians, mm or m,
@@ -34,8 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.harness import SHARED_CASES, SHARED_DATA, Row, Table, grouped, markdown, with_all
 from data_synth.fixtures.blade_cells import measured_blade
-from data_synth.fixtures.field_drawn import draw_kinds
-from data_synth.fixtures.field_folders import KINDS, Campaign, Kind, rescale
+from data_synth.fixtures.field_folders import KINDS, Campaign, Kind
 from data_synth.fixtures.raw_folders import Convention, session_poses, table_of
 from data_synth.write import write_session
 from stitch.cli.main import main as stitch
@@ -110,7 +108,7 @@ def init(folder: Path, out: Path, *flags: str) -> Outcome:
     return command("init", str(folder), "--yes", "-o", str(out), *flags)
 
 
-def follow(refusal: str, folder: Path, campaign: Campaign | None = None) -> tuple[str, ...] | None:
+def follow(refusal: str, folder: Path) -> tuple[str, ...] | None:
     """Do what a refusal asks for, and return the flags that it asks for; None where it asks for something else."""
     if match := re.search(r'^stitch: (\S+): .*as "depth_scale": (\S+)$', refusal):
         file = Path(match[1])
@@ -118,13 +116,6 @@ def follow(refusal: str, folder: Path, campaign: Campaign | None = None) -> tupl
         return ()
     if "--ball RADIUS" in refusal:
         return ("--ball", "30")
-    if match := re.search(r"multiply x, y, z of the clouds by (\S+),", refusal):
-        return rescale(float(match[1]))(folder)
-    if "put the URDF" in refusal and (away := list(folder.glob("*.urdf.gone"))):
-        away[0].rename(away[0].with_suffix(""))
-        return ()
-    if "--orientation" in refusal and campaign is not None:
-        return ("--orientation", ",".join(f"{x:.8f}" for x in campaign.R.as_quat()[0]))
     match = re.search(r"state (--[a-z-]+) (\S+)$", refusal)
     return (match[1], match[2]) if match else None
 
@@ -228,31 +219,21 @@ def turns(session: SessionData, degrees: Sequence[float]) -> bool:
 
 def kind_jobs(seeds: range) -> Iterator[Row]:
     """Every kind of folder."""
-    yield from ({"name": name, "seed": None} for name in KINDS)
-
-
-def drawn_jobs(seeds: range) -> Iterator[Row]:
-    """Sixty drawn kinds for each seed."""
-    for seed in seeds:
-        yield from ({"name": name, "seed": seed} for name in draw_kinds(seed))
+    yield from ({"name": name} for name in KINDS)
 
 
 def kind_trial(job: Row) -> Row:
     """What becomes of a folder of a kind, and once more after what a refusal asks for."""
-    name, seed = job["name"], job["seed"]
-    kind = KINDS[name] if seed is None else draw_kinds(seed)[name]
-    still = name == "xyz-alone" or (seed is not None and name.startswith("still"))
-    known = campaigns(_SEED if seed is None else seed)
-    campaign = known["turntable" if kind.turntable else "still" if still else "arm"]
+    name = job["name"]
+    kind = KINDS[name]
+    campaign = campaigns(_SEED)["turntable" if kind.turntable else "still" if name == "xyz-alone" else "arm"]
     with TemporaryDirectory() as scratch:
         folder, out = Path(scratch) / name.replace(" ", "-"), Path(scratch) / f"{name}-session"
         folder.mkdir()
         kind.write(folder, campaign)
-        first = last = init(folder, out, *(kind.flags if seed is None else ()))
+        first = last = init(folder, out, *kind.flags)
         flags = None
-        if first.code and seed is not None:
-            flags = follow(first.refusal, folder, campaign)
-        elif first.code and kind.expected and kind.mend and re.search(kind.expected, first.refusal):
+        if first.code and kind.expected and kind.mend and re.search(kind.expected, first.refusal):
             flags = kind.mend(folder)
         if flags is not None:
             last = init(folder, out, *flags)
@@ -327,7 +308,6 @@ def folder_summary(rows: list[Row]) -> list[str]:
 
 CASES = Table(case_jobs, case_trial, folder_summary, range(1), page="own-data", block="field", settings={"run": False})
 FIELD = Table(kind_jobs, kind_trial, folder_summary, range(1))
-DRAWN = Table(drawn_jobs, kind_trial, folder_summary, range(1))
 
 
 def convention_jobs(seeds: range, views: int) -> Iterator[Row]:

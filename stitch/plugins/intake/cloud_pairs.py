@@ -53,9 +53,14 @@ def pairings(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers:
         InputError: so many more of one than of the other that they do not belong together.
     """
     named = named_pairing(clouds, labels, numbers)
-    if named is not None:
-        return [named]
     N, M = len(clouds), len(labels)
+    if named is not None:
+        # Numbers that only count the rows may begin elsewhere, or count a row too many: the scans decide.
+        counts = [list(range(first, first + M)) for first in (0, 1)]
+        counted = any([_last_number(text) for text in texts] in counts for texts in zip(*labels, strict=False))
+        open_ = counted and "numbers" in named.words and 3 <= N < M <= N + LACKING
+        rivals = _incomplete_pairings(N, M) if open_ else []
+        return [named, *(pair for pair in rivals if pair.rows != named.rows)]
     numbered = _by_row(clouds, M)
     if numbered:
         # A row too many is none of a cloud's number.

@@ -15,7 +15,7 @@ _LENGTHS |= {"inch": "inch", "in": "inch", "inches": "inch"}
 _ANGLES = {"deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radian": "rad", "radians": "rad"}
 # In German degrees, elsewhere a four-hundredth of a turn: the unit of an angle, whichever.
 _ANGULAR = {*_ANGLES, "grad"}
-_UNIT = re.compile(r"[\[(]\s*([^\])]*)\s*[\])]|[_\s](mm|cm|deg|rad|inch|°|grad|(?<=\s)m)$")
+_UNIT = re.compile(r"[\[(]\s*([^\])]*)\s*[\])]|[_\s](mm|cm|deg|rad|inch|°|grad|(?<=\s)m)$", re.IGNORECASE)
 # The one angle of a SCARA, or of a vehicle: a turn about z.
 _HEADING = re.compile(r"(?:u|a|c|w|r|rz|rot_?z|yaw|heading|theta|phi)(?:[ _]*[\[(]?(?:deg|rad|°)[\])]?)?")
 _COUNTED = re.compile(r".*tcp_?pose[_\[. ]*([0-6])\]?")
@@ -32,6 +32,7 @@ _NAMED = {
     ("w", "p", "r"): "xyz-extrinsic",
     ("roll", "pitch", "yaw"): "xyz-extrinsic",
     ("yaw", "pitch", "roll"): "zyx-intrinsic",
+    ("omega", "phi", "kappa"): "xyz-intrinsic",
     ("rx", "ry", "rz"): None,
     ("rz", "ry", "rx"): None,
     ("a", "b", "c"): None,

@@ -43,6 +43,7 @@ from stitch.plugins.intake.readings import (
     all_readings,
     candidate_units,
     doubted_readings,
+    left_handed_readings,
     mixed_readings,
     with_joints_of,
 )
@@ -117,13 +118,15 @@ def first_session(folder: Path, stated: StatedFolder) -> FirstSession:
     decided, scale = _decide(
         found, raw, ways_to_read, (capture, CLOUD_UNITS[own_units[0]] / MM), (pairs, units), stated, shown
     )
-    if alike := _units_of_scale(scale, decided, points, own_units[0], stated):
+    alike = _units_of_scale(scale, decided, points, own_units[0], stated)
+    if alike and alike[0] != (decided.best.interpretation.length_unit, own_units[0]):
         again = first_session(folder, replace(stated, length_unit=alike[0][0], cloud_unit=alike[0][1]))
         return replace(again, guesses=tuple(_unit_of_pairs(guess, alike, stated) for guess in again.guesses))
     require_scale(found, scale, stated)
     axis, axis_guess = guess_optical_axis(clouds)
     settled = choose_mounting(decided, stated.mount, stated.inverse)
     told = session_guesses(found, raw, decided, points, own_units, stated)
+    told = tuple(_unit_of_pairs(guess, alike, stated) for guess in told) if len(alike) > 1 else told
     beside = (*of_targets, *_codes_guess(clouds), *_left_out_guess(found, decided, lost))
     guesses = (*told, settled.guess, axis_guess, *beside)
     aside = _not_used(found, raw, decided, lost)
@@ -192,12 +195,12 @@ def _decide(
         ways = all_interpretations(ways_to_read, pairs[:1], units, (True, False))
         require_no_change(found.clouds, motions(), ways)
     scale = None if decided.determined else fitted_scale(motions(), decided)
-    if scale is not None and abs(np.log(scale)) >= _SCALE:
+    if scale is not None and abs(np.log(scale)) >= _SCALE and _is_between_units(scale):
         return decided, scale
     layout = decided.best.interpretation.reading.layout
     doubted = [] if layout.turntable else doubted_readings(raw, found.urdf, stated)
     if not decided.determined:
-        doubted += mixed_readings(raw, stated)
+        doubted += [*mixed_readings(raw, stated), *left_handed_readings(raw, stated)]
     if doubted and not decided.determined:
         decided = weigh_doubts(decided, choose(doubted))
     elif doubted and not (layout.sure or stated.rotation):
@@ -214,13 +217,13 @@ def _units_of_scale(
     """Units of poses and clouds under which the motions of both are alike; none where those tried are, or nothing is.
 
     Args:
-        scale: of the scans against the robot's motions, in the units tried.
+        scale: of the scans against the robot's motions, in the units tried; None: alike, or not known.
         cloud_unit: the one tried.
     """
-    if scale is None or abs(np.log(scale)) < _SCALE:
+    if scale is None and not decided.determined:
         return []
     way = decided.best.interpretation
-    factor = CLOUD_UNITS[cloud_unit] / POSE_UNITS[way.length_unit] / scale
+    factor = CLOUD_UNITS[cloud_unit] / POSE_UNITS[way.length_unit] / (scale or 1.0)
     known = stated.length_unit or way.reading.layout.length_unit
     pairs = unit_pairs(way.reading.T[:, :3, 3], clouds, factor)
     return [pair for pair in pairs if known in (None, pair[0]) and stated.cloud_unit in (None, pair[1])]
@@ -234,7 +237,11 @@ def _unit_of_pairs(guess: Guess, alike: Sequence[tuple[str, str]], stated: State
     others = ", ".join(f"{pose} with clouds in {cloud}" for pose, cloud in alike[1:])
     reason = f"motions of scans and robot are alike with poses in {alike[0][0]} and clouds in {alike[0][1]}"
     reason += "; only the usual size of a cell tells it from others" if others else ""
-    return replace(guess, reason=reason, determined=not others, runner_up=others or None)
+    name = ("unit", "cloud_unit")[side]
+    states, rival = ({name: pair[side]} for pair in (alike[0], alike[-1]))
+    return replace(
+        guess, reason=reason, determined=not others, runner_up=others or None, by="usual", states=states, other=rival
+    )
 
 
 # Of the width of a profile: how far its points lie from a plane through the scanner.
@@ -300,9 +307,29 @@ def _read_clouds(files: Sequence[Path], box: Array) -> tuple[list[Cloud], list[i
             continue
         clouds.append(cloud)
         kept.append(i)
-    if lost and (len(clouds) < _FEWEST or len(lost) > len(clouds)):
+    odd = _in_another_unit([files[i] for i in kept], clouds)
+    lost += odd.values()
+    if lost and (len(kept) - len(odd) < _FEWEST or len(lost) > len(kept)):
         raise lost[0]
-    return clouds, kept, [str(error).split("; ")[0] for error in lost]
+    same = [k for k in range(len(kept)) if k not in odd]
+    return [clouds[k] for k in same], [kept[k] for k in same], [error.what.split("; ")[0] for error in lost]
+
+
+# Between units that people write; scans of one campaign differ by less, in size and in distance alike.
+_UNIT_STEPS, _ALIKE = np.array([1e3, 25.4, 10.0, 0.1, 1 / 25.4, 1e-3]), 0.25
+
+
+def _in_another_unit(files: Sequence[Path], clouds: Sequence[Cloud]) -> dict[int, Refusal]:
+    """Return clouds that are so many times as large and as far as the others, each with what is wrong with it."""
+    spread = [(np.linalg.norm(np.std(c.points, axis=0)), np.linalg.norm(np.mean(c.points, axis=0))) for c in clouds]
+    ratio = np.log(spread) - np.log(np.median(spread, axis=0)) if clouds else np.empty((0, 2))
+    step = np.abs(ratio[:, None] - np.log(_UNIT_STEPS)[:, None]).max(axis=2)
+    out = {}
+    for k in np.flatnonzero(step.min(axis=1, initial=np.inf) < _ALIKE).tolist():
+        told = f"{files[k].name}: {np.exp(ratio[k].mean()):.4g} times as large and as far as the others"
+        advice = change(files[k], "export it again in the unit of the others")
+        out[k] = Refusal(f"{told}: that cloud alone is in another unit", advice)
+    return out
 
 
 def _codes_guess(clouds: Sequence[Cloud]) -> tuple[Guess, ...]:
@@ -331,6 +358,14 @@ _ROUND, _ROUND_NEAR = (1.0, 2.0, 2.5, 4.0, 5.0, 8.0), 0.02
 _INCHES = (25.4, 1 / 25.4, 2.54, 1 / 2.54, 0.0254, 1 / 0.0254)
 # Scanners and robots agree within this share; beyond, a unit is wrong.
 _SCALE = 0.05
+# Factors that are none between units are scales up to this.
+_LARGEST = 3.0
+
+
+def _is_between_units(scale: float) -> bool:
+    """True of a factor that a unit or a scale can explain; positions that count for nothing are none."""
+    near = np.abs(np.log(scale) - np.log([a / b for a in CLOUD_UNITS.values() for b in POSE_UNITS.values()])).min()
+    return bool(near < _SCALE or abs(np.log(scale)) < np.log(_LARGEST))
 
 
 def require_scale(files: FolderFiles, scale: float | None, stated: StatedFolder) -> None:

@@ -15,7 +15,7 @@ from natsort import natsorted, ns
 
 from stitch.errors import InputError
 from stitch.plugins.intake.inventory import FoundList, choose_list, take_inventory
-from stitch.plugins.intake.raw_poses import RawPoses, read_by_its_program, read_lists, read_raw_poses
+from stitch.plugins.intake.raw_poses import ARRAYS, RawPoses, read_by_its_program, read_lists, read_raw_poses
 from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.session.reading.clouds import CLOUD_SUFFIXES
 from stitch.session.reading.depth_image import DEPTH_SUFFIXES, is_depth_image
@@ -62,7 +62,7 @@ def _is_cloud_array(file: Path) -> bool:
     """An image of points, or more rows than a campaign has views; matrices (V, 4, 4) are poses."""
     try:
         shape = np.load(file, mmap_mode="r", allow_pickle=False).shape or (0,)
-    except (ValueError, OSError):
+    except (ValueError, OSError, EOFError):
         return False
     image = len(shape) == 3 and shape[1:] not in ((4, 4), (3, 4))
     return shape[-1] >= 3 and (image or (len(shape) == 2 and shape[0] >= _CLOUD_LINES))
@@ -229,7 +229,7 @@ def _may_hold_poses(file: Path) -> bool:
     suffix = file.suffix.lower()
     if file.stat().st_size > _LARGEST_TABLE_MB * 1e6 or suffix in _NO_POSES:
         return False
-    if suffix in (*WORKBOOKS, ".npy", ".npz"):
+    if suffix in (*WORKBOOKS, *ARRAYS):
         return True
     with file.open("rb") as stream:
         start = stream.read(_HEADER)

@@ -64,13 +64,16 @@ def possible_layouts(raw: RawPoses) -> list[ColumnLayout]:
     """
     if raw.header is not None:
         found = _layout_by_name(raw) or _turntable_layout(raw)
-        if found is not None:
-            return [_without_offset(found)]
+        chosen = [] if found is None else [found]
+        if found is None or not found.rotation.shape[1]:
+            chosen = _layouts_among(raw) or chosen
+        if chosen:
+            return [_without_offset(layout) for layout in chosen]
         _require_rotation(raw)
     x, rest = _without_time(_without_index(raw.numbers))
     count = x.shape[1]
     tried = {6: _six_column_layouts, 7: _seven_column_layouts, 12: _twelve_column_layouts, 16: _sixteen_column_layouts}
-    found_all = tried[count](x) if count in tried else []
+    found_all = (tried[count](x) if count in tried else []) or _layouts_among(raw)
     if not found_all:
         called = "" if raw.header is None else f", called {', '.join(raw.header)},"
         words = "name each with --columns, for example --columns x,y,z,rx,ry,rz (qx,qy,qz,qw for a quaternion, j1,j2 … "
@@ -215,6 +218,21 @@ def _sixteen_column_layouts(x: Array) -> list[ColumnLayout]:
     for words, M in (("4×4 matrices by rows", T), ("4×4 matrices by columns", T.transpose(0, 2, 1))):
         if np.allclose(M[:, 3], [0, 0, 0, 1], atol=1e-6) and _is_rotation(M[:, :3, :3].reshape(-1, 9)):
             return [ColumnLayout(M[:, :3, 3], M[:, :3, :3].reshape(-1, 9), None, words, "matrix")]
+    return []
+
+
+def _layouts_among(raw: RawPoses) -> list[ColumnLayout]:
+    """Poses among other columns, as beside a lens: a matrix, or a rotation with the position behind it or before it."""
+    x = raw.numbers
+    names = raw.header or tuple(map(str, range(x.shape[1])))
+    for width, read in ((16, _sixteen_column_layouts), (12, _twelve_column_layouts)):
+        for first in range(x.shape[1] - width + 1):
+            found = [lay for lay in read(x[:, first : first + width]) if np.ptp(lay.position, axis=0).any()]
+            if found and np.ptp(found[0].rotation, axis=0).any():
+                where = f"columns {first + 1} to {first + width} of {x.shape[1]}"
+                rest = {n: c for i, (n, c) in enumerate(zip(names, x.T, strict=True)) if not 0 <= i - first < width}
+                rest = rest if raw.header else {}
+                return [replace(layout, words=f"{where}: {layout.words}", rest=rest) for layout in found]
     return []
 
 

@@ -211,6 +211,16 @@ def longest_block(content: str) -> tuple[str, str] | None:
     return "\n".join(line if i in kept else "" for i, line in enumerate(lines)), words
 
 
+def repeated_records(content: str) -> list[list[str]]:
+    """Return the longest run of lines of as many numbers each, for records that go over several lines; few are none."""
+    cells = [_CELL_END.split(line.strip()) for line in content.splitlines() if line.strip()]
+    widths = [len(row) if all(parse_number(cell) is not None for cell in row) else 0 for row in cells]
+    edges = [0, *(i for i in range(1, len(cells)) if widths[i] != widths[i - 1]), len(cells)]
+    runs = pairwise(edges) if cells else ()
+    first, end = max(runs, key=lambda run: (run[1] - run[0]) * (widths[run[0]] > 1), default=(0, 0))
+    return cells[first:end] if first < end and widths[first] > 1 else []
+
+
 def _no_rows(file: Path) -> Refusal:
     named = Fix("name the table of poses with --poses FILE", {"poses": "FILE"})
     return Refusal(f"{file}: holds no rows of numbers", named)

@@ -22,6 +22,7 @@ from stitch.plugins.intake.pose_tables import (
     NumberTable,
     longest_block,
     parse_number_table,
+    repeated_records,
     with_one_header,
 )
 from stitch.plugins.intake.refusals import Fix, Refusal, change
@@ -35,7 +36,8 @@ from stitch.session.reading.text_files import (
 )
 from stitch.session.reading.yaml_file import parse_yaml
 
-STRUCTURED = (".json", ".yaml", ".yml", ".npy", ".npz")
+ARRAYS = (".npy", ".npz", ".mat")
+STRUCTURED = (".json", ".yaml", ".yml", *ARRAYS)
 TABLES = (".txt", ".csv", ".dat", ".tsv", ".tab", ".asc", ".pose", ".poses", ".log", ".va", ".pos")
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 _MAX_POSES_MB = 50
@@ -172,7 +174,7 @@ def read_lists(file: Path) -> list[RawPoses]:
     suffix = file.suffix.lower()
     if is_program(file):
         return [program_poses(file)]
-    if suffix in (".npy", ".npz"):
+    if suffix in ARRAYS:
         return _from_numpy(file)
     if suffix in WORKBOOKS:
         return _from_workbook(file)
@@ -196,6 +198,8 @@ def read_lists(file: Path) -> list[RawPoses]:
     except InputError:
         block = longest_block(text)
         if block is None:
+            if (records := _records_of_lines(file, text)) is not None:
+                return [records]
             raise
         table = parse_number_table(file, block[0])
         table = replace(table, words=f"{table.words}; {block[1]}")
@@ -259,6 +263,23 @@ def _matrix_blocks(table: NumberTable) -> RawPoses | None:
     return None
 
 
+# Lines of a record: a rotation and a position, and what stands before or behind them.
+_RECORD_LINES = range(4, 9)
+
+
+def _records_of_lines(file: Path, text: str) -> RawPoses | None:
+    """Return records of three numbers a line, each a row: rotation by rows, position, and others."""
+    lines = repeated_records(text)
+    x = np.array(lines, float) if lines and len(lines[0]) == 3 else np.empty((0, 3))
+    for height in _RECORD_LINES:
+        flat = x.reshape(-1, 3 * height) if len(x) % height == 0 and len(x) >= 3 * height else np.empty((0, 0))
+        for first in range(0, flat.shape[1] - 8, 3):
+            R = flat[:, first : first + 9].reshape(-1, 3, 3)
+            if np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-3) and np.ptp(R, axis=0).any():
+                return _raw_poses(str(file), None, flat, ((),) * len(flat), f"records of {height} lines")
+    return None
+
+
 def _from_json(file: Path, text: str) -> Any:
     try:
         return json.loads(text)
@@ -268,9 +289,8 @@ def _from_json(file: Path, text: str) -> Any:
 
 def _from_numpy(file: Path) -> list[RawPoses]:
     try:
-        loaded = np.load(file, allow_pickle=False)
-        arrays = {file.stem: loaded} if isinstance(loaded, np.ndarray) else {k: loaded[k] for k in loaded.files}
-    except (ValueError, OSError, EOFError) as error:
+        arrays = _named_arrays(file)
+    except (ValueError, OSError, EOFError, NotImplementedError) as error:
         raise Refusal(f"{file}: cannot be read ({reason_of(error)})", change(file, "save plain numbers")) from None
     fitting = [(name, a) for name, a in arrays.items() if a.dtype.kind in "fiu" and a.ndim in (2, 3) and a.size]
     fitting.sort(key=lambda item: -item[1].ndim)
@@ -284,6 +304,25 @@ def _from_numpy(file: Path) -> list[RawPoses]:
         raw = _raw_poses(str(file), None, flat, ((),) * len(flat), f"an array {'×'.join(map(str, x.shape))}")
         out.append(replace(raw, part=name))
     return out
+
+
+def _named_arrays(file: Path) -> dict[str, Array]:
+    """Return the arrays of a .npy, .npz or .mat by name; MATLAB counts matrices by the last axis."""
+    if file.suffix.lower() != ".mat":
+        loaded = np.load(file, allow_pickle=False)
+        return {file.stem: loaded} if isinstance(loaded, np.ndarray) else {k: loaded[k] for k in loaded.files}
+    from scipy.io import loadmat
+
+    waiting = list(loadmat(file, simplify_cells=True).items())
+    arrays: dict[str, Array] = {}
+    while waiting:
+        name, value = waiting.pop(0)
+        if isinstance(value, dict):
+            waiting += [(f"{name}.{key}", inner) for key, inner in value.items()]
+        elif isinstance(value, np.ndarray):
+            by_last = value.ndim == 3 and value.shape[:2] in ((4, 4), (3, 4)) and value.shape[1:] != (4, 4)
+            arrays[name] = value.transpose(2, 0, 1) if by_last else value
+    return arrays
 
 
 def _from_lists(file: Path, lists: dict[str, tuple[list[PoseRow], str]]) -> list[RawPoses]:

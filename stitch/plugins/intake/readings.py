@@ -216,6 +216,20 @@ def mixed_readings(raw: RawPoses, stated: StatedTable) -> Iterator[Reading]:
                 yield replace(reading, variant=f"but its {('first', 'second', 'third')[k]} angle in radians")
 
 
+def left_handed_readings(raw: RawPoses, stated: StatedTable) -> Iterator[Reading]:
+    """Yield angles that count the other way round, all of them or the one about the vertical, as headings do.
+
+    They count where the scans tell no other reading.
+    """
+    for layout in possible_layouts(raw):
+        for turned, words in ((-1.0, "but all its angles"), (np.array([1.0, 1.0, -1.0]), "but its third angle")):
+            if layout.rotation.shape[1] == 3:
+                for reading in readings(
+                    replace(layout, rotation=turned * layout.rotation), stated.rotation, stated.angle_unit
+                ):
+                    yield replace(reading, variant=f"{words} counted the other way round")
+
+
 # Readings of an unknown order that are tried with every linear axis; columns that can be one, and that are none.
 _USUAL_AXIS = 5
 _NO_AXIS = re.compile(
