@@ -126,8 +126,8 @@ def _small(off: Array) -> bool:
 
 # Ways that the dear judge sees: the best of each cheap one.
 _SHORT = 4
-# Motions that closed give a start for the surfaces.
-_CLOSED = 0.5
+# Motions that closed give a start for the surfaces; and so many of them leave no doubt of a pairing.
+_CLOSED, _MOST_CLOSED = 0.5, 0.85
 # Motions that close under one way, against those under the next: then the lead of surfaces that chance does not reach
 # (see CLEARLY_BETTER) tells it.
 _TWICE, BY_CHANCE = 1.9, 1.12
@@ -189,8 +189,10 @@ def choose_convention(
     if not first.determined:
         first = _choose_interpretation(capture, ways, motions())
     rows = {row for pairing in pairs for row in pairing.rows}
-    nothing_left = len({*pairs[0].rows}) == len(rows | {*pairs[0].rows})
-    if len(pairs) == 1 or (first.determined and nothing_left):
+    # Under a pairing that goes wrong in the middle the motions before it close all the same.
+    closes = first.best.closed is None or first.best.closed >= _MOST_CLOSED
+    nothing_left = None not in pairs[0].rows and len({*pairs[0].rows}) == len(rows | {*pairs[0].rows})
+    if len(pairs) == 1 or (first.determined and nothing_left and closes):
         return first
     every = _choose_interpretation(
         capture, _with_confirmed_unit(motions(), all_interpretations(readings, pairs, units, directions)), motions()
