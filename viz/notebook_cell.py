@@ -12,6 +12,7 @@ from stitch.output.comparison.model_history import model_history
 from stitch.run_data import RunData
 from viz.colours import BLUE, ORANGE
 from viz.figures import plain
+from viz.history_figures import error_falling
 from viz.part_picture import DISAGREE, part_picture, step_shown
 from viz.part_surface import camera_for, part_surface
 from viz.run_numbers import residual_vectors
@@ -32,9 +33,15 @@ def notebook_view(run: RunData) -> str:
     )
 
 
-def plot(run: RunData) -> Figure:
+def plot(run: RunData, of: str = "part") -> Figure:
     """Return the part at the last steps of the model, coloured by how far its views disagree (µm); of labelled points
-    alone, the targets as every view puts them."""
+    alone, the targets as every view puts them.
+
+    Args:
+        of: "error": how the error falls from step to step, in place of that.
+    """
+    if of == "error":
+        return error_falling(run)
     history, um = model_history(run), MICROMETRES[run.session.length_unit]
     if history is None:
         return _sticks(run)

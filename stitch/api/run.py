@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -320,10 +320,13 @@ class Run(RunData):
             run_folder.write_with_page(saved, scratch, tolerance)
         return folder
 
-    def plot(self) -> Any:
+    def plot(self, of: Literal["part", "error"] = "part") -> Any:
         """Return a matplotlib Figure: the part at every step of the model, coloured by how far its views disagree.
 
         Of labelled points alone, how far each target lies off.
+
+        Args:
+            of: "error" shows how the error falls from step to step of the model, in place of the part.
 
         Raises:
             InputError: no package that draws is installed.
@@ -331,11 +334,15 @@ class Run(RunData):
         Example:
             >>> type(run.plot()).__name__
             'Figure'
+            >>> len(better.plot("error").axes) > 0
+            True
         """
         draw = _entry_point("stitch.run_plots")
+        if of not in ("part", "error"):
+            raise InputError(f'run.plot: {of!r} is no picture; to fix: "part" or "error"')
         if draw is None:
             raise InputError("run.plot: nothing that draws is installed; to fix: install stitch with its package viz")
-        return draw(self)
+        return draw(self, of)
 
     def _repr_html_(self) -> str:
         """The viewer of report.html for a notebook; it asks no server. The report as text where nothing draws."""
@@ -448,6 +455,6 @@ def _save_session_of_run(session: Session, folder: Path) -> Path:
     return beside
 
 
-def _entry_point(group: str) -> Callable[[RunData], Any] | None:
+def _entry_point(group: str) -> Callable[..., Any] | None:
     """Return what another package offers under an entry-point group; None where there is none."""
     return next((entry.load() for entry in entry_points(group=group)), None)

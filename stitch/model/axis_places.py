@@ -16,13 +16,19 @@ from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES, value_uncertainty_text
 from stitch.session.axes import Axis
 from stitch.session.measurement import Measurement
+from stitch.system.values import Value
 
 _STEP = 1e-6
 
 
-@dataclass(frozen=True)
-class AxisPlace:
-    """One axis where a model puts it; sigmas are NaN where the views do not show it, or it was used as given."""
+@dataclass(frozen=True, eq=False)
+class AxisPlace(Value):
+    """One axis where a model puts it; sigmas are NaN where the views do not show it, or it was used as given.
+
+    Example:
+        >>> [axis.name for axis in run.axes]
+        []
+    """
 
     name: str
     kind: str  # rotary | linear
@@ -33,7 +39,12 @@ class AxisPlace:
     unobservable: tuple[str, ...] = ()
 
     def line(self, length_unit: str) -> str:
-        """Return it as people read it: direction in mrad across, point in mm, ± U (k = 2)."""
+        """Return it as people read it: direction in mrad across, point in mm, ± U (k = 2).
+
+        Example:
+            >>> [axis.line("mm") for axis in run.axes]
+            []
+        """
         to_mm = METRES[length_unit] * 1e3
         numbers = zip(self.direction, 2 * self.direction_sigma, strict=True)
         shown = bool(np.isfinite(self.direction_sigma).all())
