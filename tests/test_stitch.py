@@ -32,6 +32,7 @@ from data_synth.fixtures.labelled_files import write_labelled
 from data_synth.fixtures.sphere_scans import sphere_cell, write_spheres
 from stitch.diagnosis.diagnosis import Proposal
 from stitch.diagnosis.unmodelled_time_effects import TimeCurve
+from stitch.model.axis_places import AxisPlace
 from stitch.observations.targets.outliers import Outlier
 from stitch.output.json_file import to_json
 from stitch.plugins.metrology.planning.plan import Plan
@@ -379,6 +380,7 @@ def values(tmp_path_factory):
         *(stitch.calibrate(balls, "sphere"), arm, said, live.next_pose(), Proposal("do", ("a", "b"))),
         *(Outlier(0, "a", 1.0, 2.0), Change(0, 1, 2, "step", None, 1.0, 0.1, 0.01, "mean")),
         Plan(session, (), None, None, (), None),
+        AxisPlace("turn", "rotary", np.eye(3)[2], np.zeros(3), np.zeros(3), np.zeros(3)),
         stitch.add(run, "range_scale").model,
         TimeCurve(**{f.name: np.arange(3.0) if "Array" in str(f.type) else 1.0 for f in fields(TimeCurve)}),
     ]
