@@ -184,6 +184,24 @@ def test_labelled_points_show_how_far_a_bracket_tilts(mount, effect):
     assert error @ np.linalg.solve(found.mount_covariance, error) < 22.5  # 99.9 % of χ²(6)
 
 
+@pytest.mark.parametrize(("mount", "body"), [("eye_in_hand", "mount"), ("eye_to_hand", "fixture")])
+@pytest.mark.parametrize("oblique", [False, True])
+def test_a_bracket_along_the_flanges_axis_droops_and_an_oblique_one_bends(mount, body, oblique):
+    """Either does what a droop does: the special case is named where it is enough, and only there."""
+    joints = joints_of(np.random.default_rng(9), 40)
+    turned = np.array([flange(q)[:3, :3].T @ [0, 0, -1.0] for q in joints]) - [0, 0, 1.0]
+    # Softest across a line 60° off the axis, or about the axis itself.
+    line = np.array([0.0, np.sqrt(0.75), 0.5]) if oblique else np.array([0.0, 0.0, 1.0])
+    shift = 0.3 * turned @ (np.eye(3) - np.outer(line, line))
+    moved = np.hstack([np.cross([2e-4, -3e-4, 4e-4], turned), shift])
+    session, *_ = labelled_cell(9, 40, mount, errors=(np.zeros((40, 6)), moved))
+    linear = linear_model_of(run(session)).restricted(())
+    asked = [candidate_of(linear, EFFECTS[f"{body}_{name}"]) for name in ("droop", "bend")]
+    first, second = rank_all(linear, asked)[0]
+    assert first.name == f"{body}_{'bend' if oblique else 'droop'}" and is_certain(first)
+    assert first.log_posterior > second.log_posterior + ODDS
+
+
 def test_labelled_points_show_how_far_a_base_tilts_under_its_load(tmp_path):
     """The second example of docs/extend.md, by its name: what the payload does is told from what the links may do."""
     page = (Path(__file__).resolve().parents[2] / "docs" / "extend.md").read_text(encoding="utf-8")
