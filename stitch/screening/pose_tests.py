@@ -84,7 +84,7 @@ class PoseStep:
         """Return a warning with what to do."""
         off = displacement_text(self.size, self.at_least, length_unit)
         other = "scanner" if self.moved == "part" else "part"
-        slip = self.moved == "part" and self.distinguishable
+        cure = effect_cure("part_slip" if self.moved == "part" else "mount_step")
         return sentence(
             "step",
             before=names[self.start - 1],
@@ -92,7 +92,7 @@ class PoseStep:
             moved=self.moved,
             unsure="" if self.distinguishable else f" (or the {other}: these views do not show which)",
             by=f"{off} off at the part" if off else "by an amount that these surfaces do not show",
-            further=f", or {effect_cure('part_slip')}" if slip else "",
+            further=f", or {cure}" if self.distinguishable else "",
         )
 
     def columns(self, model: ViewModel) -> Array:

@@ -97,21 +97,22 @@ def test_no_model_is_built_on_a_doubtful_session(verdict):
 @pytest.mark.parametrize("moved", ["part", "scanner"])
 @pytest.mark.parametrize("distinguishable", [True, False])
 @pytest.mark.parametrize("further", [(), ("knocked",)])
-def test_a_slip_that_is_named_is_no_doubt_beside_it(moved, distinguishable, further):
-    """The step and the effect are one sentence; a scanner that was knocked is no slip of the part."""
+@pytest.mark.parametrize("named", ["part_slip", "mount_step"])
+def test_a_step_that_is_named_is_no_doubt_beside_it(moved, distinguishable, further, named):
+    """The step and the effect are one sentence; a scanner that was knocked is no slip of the part, and none is it."""
     step = PoseStep(2, moved, distinguishable, (7e-4, 0.12), (7e-4, 0.12), 1e-30)
     found = SimpleNamespace(
         verdict="missing_effect",
-        effects=("part_slip",),
-        candidates=(SimpleNamespace(name="part_slip", cross_validation=None),),
+        effects=(named,),
+        candidates=(SimpleNamespace(name=named, cross_validation=None),),
         doubts=(step.describe(["a", "b", "c", "d"], "mm"), *further),
         dropped_before=None,
         certain=True,
         likelier_than_not=True,
     )
-    same = moved == "part" and distinguishable
+    same = distinguishable and named == ("part_slip" if moved == "part" else "mount_step")
     told, command = plain_finding(found, "mm"), suggested_command(found, "RUN").rsplit(": ", 1)[1]
-    assert ("part_slip (from view c on the part sits elsewhere, " in told) == same
+    assert (f"{named} (from view c on the {moved} sits elsewhere, " in told) == same
     assert told.count("sits elsewhere") == 1
     assert ("may only be consequences" in told) == (not same or bool(further))
     assert command == ("stitch add RUN --suggested" if same and not further else "stitch review RUN")
