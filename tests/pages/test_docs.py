@@ -37,6 +37,7 @@ OTHERS = {
     "line/seam.toml",
     "session.toml",
     "model.toml",
+    "model_effects.py",
     "robot.toml",
     "my-cell.toml",
     "job.toml",
