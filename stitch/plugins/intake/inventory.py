@@ -33,6 +33,7 @@ class FoundList:
     raw: RawPoses | None
     taken_for: str = ""
     why_not: str = ""
+    refusal: Refusal | None = None  # in full, of files that hold a pose each but for one of them
 
     @property
     def name(self) -> str:
@@ -77,11 +78,10 @@ def take_inventory(files: Sequence[Path], accepts: Callable[[RawPoses], bool]) -
     out: list[FoundList] = []
     for group in alike.values():
         if len(group) >= _FEWEST_ALIKE:
-            with suppress(InputError):
-                found = _judged(FoundList(tuple(group), read_raw_poses(group)), accepts)
-                if not found.why_not:
-                    out.append(found)
-                    continue
+            found = _list_of_files(group, accepts)
+            if not found.why_not or found.refusal is not None:
+                out.append(found)
+                continue
         refused: list[FoundList] = []
         for file in group:
             try:
@@ -91,6 +91,20 @@ def take_inventory(files: Sequence[Path], accepts: Callable[[RawPoses], bool]) -
         # What is wrong with files that are named alike is said once.
         out += [replace(refused[0], files=tuple(group))] if len(refused) == len(group) else refused
     return out
+
+
+def _list_of_files(group: Sequence[Path], accepts: Callable[[RawPoses], bool]) -> FoundList:
+    """Return files that are named alike as one list, or why they are none."""
+    try:
+        return _judged(FoundList(tuple(group), read_raw_poses(group)), accepts)
+    except InputError as error:
+        single = 0
+        for file in group:
+            with suppress(InputError, NoResultError):
+                raw = read_raw_poses([file])
+                single += len(raw.numbers) == 1 and not _judged(FoundList((file,), raw), accepts).why_not
+        whole = error if isinstance(error, Refusal) and 2 * single > len(group) else None
+        return FoundList(tuple(group), None, why_not=_reason(error, group[0]), refusal=whole)
 
 
 def _judged(found: FoundList, accepts: Callable[[RawPoses], bool]) -> FoundList:
@@ -125,6 +139,8 @@ def choose_list(
         open_ = rows  # what is wrong with it is said by name when its columns are read
     if len(inventory) == 1 and len(inventory[0].files) == 1 and not open_:
         read_raw_poses(inventory[0].files)  # what is wrong with the one file is said in full
+    if not open_ and (refused := next((found.refusal for found in inventory if found.refusal), None)):
+        raise refused
     if not open_:
         words = "name the file of the poses with --poses FILE, or a list of it with --poses FILE#LIST, and its columns "
         named = Fix(f"{words}with --columns x,y,z,rx,ry,rz", {"poses": "FILE#LIST", "columns": "COLUMNS"})

@@ -7,12 +7,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from stitch.errors import InputError, NoResultError, StitchError
+from stitch.errors import NoResultError, StitchError
 from stitch.plugins.intake.first_session import FirstSession, first_session
 from stitch.plugins.intake.folder_files import one_scan_a_file
 from stitch.plugins.intake.guesses import Guess
 from stitch.plugins.intake.measured_points import measured_session, write_measured
-from stitch.plugins.intake.refusals import Fix, Refusal
+from stitch.plugins.intake.refusals import Fix, Refusal, change
 from stitch.plugins.intake.session_draft import draft_files, require_free, write_draft
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.screening.deep_check import deep_check
@@ -94,6 +94,8 @@ def _named_as(scratch: Path, folder: Path) -> Iterator[None]:
     try:
         yield
     except Refusal as refused:
+        if scratch == folder:
+            raise
         raise refused.named(scratch, folder) from None
     except StitchError as error:
         error.what = error.what.replace(str(scratch), str(folder))
@@ -122,7 +124,10 @@ def _require_fit(folder: Path, first: FirstSession, company: Company) -> None:
         except NoResultError as error:
             found = [str(error).replace(draft, str(folder))]
     if found:
-        raise InputError(f"{folder}: no session was written, as no reading of the poses fits the scans. {found[0]}")
+        what, _, advice = found[0].partition("; to fix: ")
+        known = Fix("state --rotation where it is known all the same", {"rotation": "ROTATION"})
+        told = f"{folder}: no session was written, as no reading of the poses fits the scans. {what}"
+        raise Refusal(told, *([change(folder, advice)] if advice else []), known)
 
 
 def _require_determined(out: Path, guesses: Sequence[Guess]) -> None:

@@ -228,6 +228,8 @@ def _no_rows(file: Path) -> Refusal:
 
 def _cell_number(file: Path, line: int, cell: str) -> float:
     found = parse_number(cell)
+    if _THOUSANDS.fullmatch(cell):
+        raise _has_marks(file, line, cell)
     if found is None or abs(found) >= 1e30:
         raise Refusal(f"{file} line {line}: {shortened(cell)} is no number", change(file, "write one there"))
     return found
@@ -250,9 +252,12 @@ def _require_no_thousands(file: Path, rows: Sequence[tuple[int, list[str]]], tex
     """Refuse marks for thousands, 1.358,401 or 1'358.401, that make a column of numbers one of words."""
     found = next(((i, row[c]) for c in text for i, row in rows if _THOUSANDS.fullmatch(row[c])), None)
     if found is not None:
-        line, cell = found
-        told = f"{file} line {line}: {shortened(cell)} has marks for thousands"
-        raise Refusal(told, change(file, "write the numbers without them"))
+        raise _has_marks(file, *found)
+
+
+def _has_marks(file: Path, line: int, cell: str) -> Refusal:
+    told = f"{file} line {line}: {shortened(cell)} has marks for thousands"
+    return Refusal(told, change(file, "write the numbers without them"))
 
 
 def _split_header(

@@ -138,10 +138,10 @@ def _read_each(files: Sequence[Path]) -> tuple[list[RawPoses], frozenset[int]]:
             refused = refused or error
             continue
         if len(rows[i].numbers) != 1:
-            raise Refusal(
-                f"{file}: holds {len(rows[i].numbers)} poses, one a file is expected",
-                Fix("name the one file of all poses with --poses FILE", {"poses": str(file)}),
-            )
+            held = len(rows[i].numbers)
+            named = Fix("name the one file of all poses with --poses FILE", {"poses": str(file)})
+            told = f"{file}: holds {held} poses, one a file is expected"
+            raise Refusal(told, named if held >= len(files) else change(file, "leave one in it"))
     if refused is not None and len(rows) < _FEWEST_WHOLE * len(files):
         raise refused
     broken = {i for i in range(len(files)) if i not in rows or rows[i].without_pose}
