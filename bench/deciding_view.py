@@ -22,7 +22,7 @@ from data_synth.moment import Plan
 from data_synth.scene import load_scene
 from data_synth.simulate import Measured, simulate
 from stitch.api.verbs import diagnose, run
-from stitch.diagnosis.deciding_view import MOST_VIEWS, deciding_views
+from stitch.diagnosis.deciding_view import MOST_VIEWS
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.numerics.frames import Array
 
@@ -66,19 +66,19 @@ def trial(job: Row) -> Row:
     row = {"verdict": found.verdict, "named": list(found.effects)}
     if found.verdict != "cannot_tell" or law not in found.effects:
         return row
-    proposed = deciding_views(found.linear, found.named)
+    proposed = [proposal for proposal in found.next if proposal.probability is not None]
     row["rivals"] = " / ".join(found.effects)
-    if proposed is None:
+    if not proposed:
         return row | {"probability": None}
-    row["probability"] = float(proposed.probability[0])
-    row["probability_of_all"] = float(proposed.probability[-1])
-    row["views"] = len(proposed.joints)
+    row["probability"] = proposed[0].probability
+    row["probability_of_all"] = proposed[-1].probability
+    row["views"] = len(proposed)
     waits = np.zeros(len(keep))
     for k in range(MOST_VIEWS):
         # Fewer are proposed where they are as good as certain: the last is then driven to again.
-        at = min(k, len(proposed.joints) - 1)
-        plan = _at(plan, count + k, proposed.joints[at])
-        waits[count + k] = max(proposed.wait[at] - waits[count : count + k].sum(), 0.0)
+        at = proposed[min(k, len(proposed) - 1)]
+        plan = _at(plan, count + k, np.radians(at.joints_deg))
+        waits[count + k] = max(at.wait_s - waits[count : count + k].sum(), 0.0)
     measured = _measured(hidden, seed, plan, rail[keep], waits)
     for views in (1, MOST_VIEWS):
         row[f"after_{views}"] = _told(_diagnosed(measured, count + views), law)

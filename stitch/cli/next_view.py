@@ -96,6 +96,8 @@ def write_program(diagnosis: Diagnosis, output: Path, j3: str | None) -> None:
     T_base_flange[:, :3, 3] *= METRES[diagnosis.linear.measurement.length_unit] * 1e3
     separates = poses[0].separates
     about = f"Drives to the view that decides between {' and '.join(separates)}." if separates else "Drives to a view."
+    waits = [f"{proposal.wait_s / 60:.0f} min" for proposal in poses if proposal.wait_s]
+    about += f" Scan no sooner after the last view than: {', '.join(waits)}." if waits else ""
     text = writer.load()(output, [proposal.joints_deg for proposal in poses], T_base_flange, about, j3)
     with whole_file(output) as file:
         file.write_bytes(text.encode("utf-8"))

@@ -133,7 +133,9 @@ def expected_in_view(
         return None
     measurement = candidate_measurement(linear.measurement, joints[None], wait)
     at = float(_axis(measurement.views, effect.term, motion)[2][0])
-    if follows == "view order":
+    if follows == "time":
+        at = float(measurement.views.time[0])
+    elif follows == "view order":
         at = float(linear.measurement.views.count)
     rim = np.repeat([surfaces.reach, 1.0], 3)
     unit = _unit_twist(fitted, motion, measurement, surfaces.centre) * rim

@@ -13,6 +13,7 @@ from stitch.diagnosis.diagnosis import Diagnosis, Proposal
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.sensitivity import alias_matrix
 from stitch.diagnosis.thresholds import ALIAS_CORRELATION, CLEAR_DEPENDENCE
+from stitch.model.forward import moves_points
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import equilibrated
 from stitch.numerics.units import covariate_text
@@ -22,6 +23,8 @@ from stitch.system.threads import library_threads_off
 
 # Poses that are tried for an error without a name; the likeliest candidates among which an alias of the best is sought.
 _TRIED, _LIKELIEST = 250, 6
+# Nats behind the best within which others count beside the rivals, and how many of them.
+_NEAR, _OTHERS = 10.0, 3
 # Precision of ten plausible sizes: a rival may take each of its parameters that large.
 RIDGE = 0.01
 
@@ -65,7 +68,7 @@ def propose_measurements(diagnosis: Diagnosis) -> tuple[Proposal, ...]:
         group = _effects_to_separate(diagnosis)
         names = tuple(ranked.name for ranked in group)
         artefacts = tuple(Proposal(ARTEFACTS[name], names) for name in names if name in ARTEFACTS)
-        views = deciding_views(diagnosis.linear, group)
+        views = deciding_views(diagnosis.linear, [*group, *_others_near(diagnosis, group)]) if group else None
         if views is not None:
             return (*_poses(diagnosis.linear, names, views), *artefacts)
         unknown = least_known_view(diagnosis) if diagnosis.verdict == "unknown_effect" else None
@@ -84,6 +87,17 @@ def _effects_to_separate(diagnosis: Diagnosis) -> list[Ranked]:
     others = [ranked for ranked in likeliest if ranked.name != first.name]
     row = alias_matrix(diagnosis.linear, [first.score, *(ranked.score for ranked in others)])[0, 1:]
     return [first, others[int(row.argmax())]] if row.max() > ALIAS_CORRELATION else []
+
+
+def _others_near(diagnosis: Diagnosis, group: list[Ranked]) -> list[Ranked]:
+    """Return the likeliest other effects of poses: one that is behind now may be ahead after a further view."""
+    least = max(ranked.log_posterior for ranked in group) - _NEAR
+    others = [
+        c.ranked
+        for c in diagnosis.candidates
+        if c.ranked.score.fitted and c.ranked.log_posterior > least and c.name not in {r.name for r in group}
+    ]
+    return [ranked for ranked in others if not moves_points([ranked.score.form.term])][:_OTHERS]
 
 
 def _poses(linear: LinearModel, names: tuple[str, ...], views: DecidingViews) -> tuple[Proposal, ...]:

@@ -282,7 +282,7 @@ def _rivals(named: Sequence[CandidateEffect], trends: dict[str, EffectTrend]) ->
 def _decided_by(diagnosis: Diagnosis) -> str:
     """Return how likely the next view decides, as a sentence; empty where no pose does."""
     first = next((proposal.probability for proposal in diagnosis.next if proposal.probability is not None), None)
-    return "" if first is None else f" One more view decides with a probability of {first:.0%}."
+    return "" if first is None else f" One more view decides ({first:.0%})."
 
 
 def _cause(candidate: CandidateEffect, trend: EffectTrend | None) -> str:

@@ -13,6 +13,7 @@ from data_synth.fixtures.quiet_scenes import clean, plan_for
 from data_synth.simulate import simulate
 from stitch.diagnosis import deciding_view
 from stitch.diagnosis.deciding_view import Prediction, deciding_views, possible_joints, predict_views
+from stitch.diagnosis.effect_trend import trend_in_model, trends_of_candidates
 from stitch.diagnosis.thresholds import ODDS
 from stitch.numerics import frames
 from stitch.session.capture import build_capture
@@ -99,3 +100,21 @@ def test_the_chosen_view_decides_at_least_as_often_as_those_that_were_tried(cell
     draws = np.random.default_rng(5).standard_normal((2000, 6))
     right = deciding_view._decisions(tried, weights, [], np.arange(len(joints)), draws)[0]
     assert views.probability[0] > right.max() - 0.05
+
+
+def test_the_law_of_an_effect_that_was_added_is_drawn_as_it_was_before(cell):
+    """Dots before: as without it, and small with it; the line is what it does, whatever its other parameters are."""
+    found, measured, _ = cell
+    session = session_of(measured)
+    added = stitch.add(stitch.run(replace(session, views=session.views[:VIEWS])), "gear_eccentricity")
+    linear = stitch.diagnose(added).linear
+    score = next(ranked.score for ranked in rivals_of(found) if ranked.name == "gear_eccentricity")
+    before = trends_of_candidates(found.linear, [score])["gear_eccentricity"]
+    now = trend_in_model(linear, linear.model.terms[-1])
+    assert now.of == before.of == "joint 5"
+    scatter = float(np.median(before.sigma))
+    # Matches are found anew and the hand-eye moves: the dots keep their course.
+    assert np.corrcoef(now.measured, before.measured)[0, 1] > 0.9
+    assert np.corrcoef(now.predicted, before.predicted)[0, 1] > 0.9
+    assert np.std(now.after) < 0.7 * np.std(now.measured)
+    assert np.isfinite(now.predicted_sigma).all() and now.predicted_sigma.max() < 3 * scatter

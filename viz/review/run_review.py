@@ -178,13 +178,17 @@ class RunReview:
         """
         run = str(self.run)
         match kind:
-            case "compare" | "diagnose":
+            case "compare" | "diagnose" | "next":
                 return [kind, run, *self._trusted()]
             case "report":
                 return [kind, run, "--no-diagnosis", *self._trusted()]
             case "add" | "drop":
                 quiet = [] if (self.run / "recording.rrd").is_file() else ["--no-recording"]
                 return [kind, run, *_names(asked.get("effects")), *quiet, *self._trusted()]
+            case "group":
+                return ["add", run, "--group", *self._trusted()]
+            case "explain":
+                return [kind, run, *self._trusted()]
             case "undo" | "redo":
                 change = self.snapshot().state["history"][kind]
                 if change is None:

@@ -96,6 +96,11 @@ _VIEWER = (
     "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
     "style-src 'self' 'unsafe-inline'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
 )
+# The page of a run in a frame without an origin of its own: it reaches nothing.
+_SCREEN = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'self'; sandbox allow-scripts"
+)
 
 
 class Guard:
@@ -116,6 +121,7 @@ class Guard:
             return
         inner = path[len(self.prefix) :] or "/"
         policy = _VIEWER if inner.startswith("/rerun/") else _PAGE.format(nonce=self.nonce)
+        policy = _SCREEN if inner == "/screen" else policy
         more = {
             "content-security-policy": policy,
             "referrer-policy": "no-referrer",
@@ -151,7 +157,7 @@ class Guard:
 
 # What a page may ask for: commands of stitch, consent to Python that somebody wrote, an end of what runs.
 
-_CHANGES = ("add", "drop", "undo", "redo")
+_CHANGES = ("add", "group", "drop", "undo", "redo")
 _FULL = "too many commands wait already"
 
 
@@ -253,6 +259,7 @@ class ReviewPages:
             Route("/", self.page),
             Route("/state", self.state),
             Route("/part", self.part),
+            Route("/screen", self.screen),
             Route("/chosen", self.chosen, methods=["POST"]),
             Route("/events", self.events),
             Route("/rerun/{name}", self.rerun),
@@ -267,6 +274,13 @@ class ReviewPages:
     def state(self, request: Request) -> Response:
         """The run as it stands, or why it cannot be read."""
         return json_response(self.review.state())
+
+    def screen(self, request: Request) -> Response:
+        """The page of the run as it stands."""
+        try:
+            return HTMLResponse((self.review.run / "report.html").read_text(encoding="utf-8"))
+        except OSError:
+            return PlainTextResponse("the page is on its way", 404)
 
     def part(self, request: Request) -> Response:
         """As report.html holds it: {"model", "part", "predicted"}."""

@@ -115,6 +115,13 @@ def test_python_of_a_run_that_somebody_sent_waits_for_consent(run, tmp_path):
     assert review.arguments("diagnose", {}) == ["diagnose", str(run), "--effects-file", str(file)]
 
 
+def test_what_a_page_asks_for_beside_single_effects_are_commands_too(run):
+    review = RunReview(run)
+    assert review.arguments("next", {}) == ["next", str(run)]
+    assert review.arguments("explain", {}) == ["explain", str(run)]
+    assert review.arguments("group", {}) == ["add", str(run), "--group"]
+
+
 def test_own_effects_stay_in_the_run_folder_and_go_with_every_command(run):
     review = RunReview(run)
     path = review.keep_own_effects("# mine\n")

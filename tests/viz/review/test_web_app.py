@@ -61,6 +61,15 @@ def test_nothing_beside_its_own_files_can_be_read(server, run):
         assert "private" not in told
 
 
+def test_the_page_of_the_run_stands_in_a_frame_that_reaches_nothing(server):
+    status, page = server.get("screen")
+    assert status == 200 and 'id="screen"' in page
+    connection = http.client.HTTPConnection(server.place, timeout=60)
+    connection.request("GET", f"/{server.token}/screen")
+    policy = connection.getresponse().headers["content-security-policy"]
+    assert "default-src 'none'" in policy and "sandbox allow-scripts" in policy and "connect-src" not in policy
+
+
 @pytest.mark.parametrize(
     "path, body, status",
     [

@@ -11,9 +11,8 @@ export function showCandidates(state, ask, busy) {
   const root = at("missing"), found = state.diagnosis;
   why(found && found.why, state);
   if (!found) {
-    const button = element("button", { type: "button", class: "main", id: "diagnose", disabled: busy, onclick: () => ask({ kind: "diagnose" }) }, "Find what is missing");
     root.replaceChildren(element("p", { class: "soft" }, "Every effect of the library is tried on what the poses leave, and validated on views left out."),
-      button, element("code", { class: "command" }, `stitch diagnose ${state.run}`));
+      element("code", { class: "command" }, `stitch diagnose ${state.run}`));
     return;
   }
   const rows = all ? found.candidates : found.candidates.slice(0, FIRST);
@@ -51,7 +50,8 @@ function row(name, fit, out, most, floor) {
 
 function candidate(c, found, state, most, ask, busy) {
   const named = found.named.includes(c.effect);
-  const add = element("button", { type: "button", class: named ? "main" : "", disabled: busy, "aria-label": `Add ${c.effect}`,
+  // What is named stands above the page.
+  const add = named ? "" : element("button", { type: "button", disabled: busy, "aria-label": `Add ${c.effect}`,
     title: `stitch add ${state.run} ${c.effect}`, onclick: () => { foresee("add", c.effect); ask({ kind: "add", effects: [c.effect] }); } }, "Add");
   const look = state.pictured.includes(c.effect) && element("button", { type: "button", "aria-label": `Show the part as ${c.effect} should leave it`,
     onclick: () => { predict(c.effect); why(found.courses[c.effect], state); } }, "Show");

@@ -7,6 +7,7 @@ import { chooseOnPart, showPlots } from "./plots.js";
 import { showRecording } from "./recording.js";
 import { markOf, onPick, show, showNumbers } from "./scene.js";
 import { listen, read, send } from "./server.js";
+import { showAnswer, showScreen, showSteps } from "./steps.js";
 import * as work from "./work.js";
 
 let state = null, version = null, reading = false, again = false;
@@ -32,6 +33,7 @@ async function draw() {
   const found = state.diagnosis && state.diagnosis.headline ? state.diagnosis : null;
   at("sentence").textContent = unbroken(found ? found.headline : state.sentence);
   at("evidence").textContent = unbroken(found ? `${found.proof} ${found.certainty}` : state.evidence === state.sentence ? "" : state.evidence);
+  showScreen(version);
   await show(state);
   showNumbers(state);
   showPlots(state);
@@ -43,6 +45,7 @@ async function draw() {
 function controls() {
   if (!state) return;
   const busy = work.busy() || Boolean(state.trust);
+  showSteps(state, ask, busy);
   showCandidates(state, ask, busy);
   showLedger(state, ask, busy);
 }
@@ -79,6 +82,7 @@ listen(event => {
   if (event.type === "job") {
     const before = work.heard(event.job);
     heardOwn(event.job);
+    showAnswer(event.job);
     if (before !== event.job.state) controls();
   }
 }, () => lost("The server does not answer; is `stitch review` still running? This page asks again by itself."));

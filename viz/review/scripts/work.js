@@ -8,7 +8,7 @@ let begun = 0;
 
 export const running = () => [...jobs.values()].find(j => j.state === "running") || [...jobs.values()].find(j => j.state === "waiting");
 // While one of these runs nothing else can be asked for that depends on the model.
-export const busy = () => [...jobs.values()].some(j => ["waiting", "running"].includes(j.state) && ["add", "drop", "undo", "redo", "diagnose"].includes(j.kind));
+export const busy = () => [...jobs.values()].some(j => ["waiting", "running"].includes(j.state) && ["add", "group", "drop", "undo", "redo", "diagnose", "next", "explain"].includes(j.kind));
 
 export function heard(job) {
   const before = jobs.get(job.number);
