@@ -148,6 +148,8 @@ class Fit(Value):
     unknown: tuple[str, ...] = ()  # of x, y, z, rx, ry, rz of the hand-eye: what those directions leave open
     notes: tuple[str, ...] = ()
     unsupported: Unsupported = field(default_factory=Unsupported)
+    # (6,) sigma of the hand-eye with usual sizes of what these views cannot show, as `hand_eye_sigma` counts
+    sigma_anywhere: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,10 +24,12 @@ from stitch.fit.pipelines import coarse_stage, pipeline_for
 from stitch.fit.sentences import view_notes
 from stitch.fusion.register import DEFAULT, method_named
 from stitch.model.model_toml import ModelFile, arm_model, convert_unit, with_model_axes, without_events
+from stitch.numerics.frames import Array
 from stitch.observations.observability import unknown_numbers, unobservable
 from stitch.recorder import Recorder, RecorderMemory, SilentRecorder
 from stitch.run_data import Fit, LedgerStep, RunData, StageResult
 from stitch.screening.deep_check import refuse_explained_mistake
+from stitch.screening.hand_eye_anywhere import hand_eye_sigma_anywhere
 from stitch.screening.hand_eye_transfer import hand_eye_transfer
 from stitch.screening.model_transfer import check_arm_transfer, check_model_transfer, find_disagreeing_sessions
 from stitch.screening.view_screening import ScreenedFit, ViewScreening, fit_screened_views, session_warnings
@@ -372,6 +374,16 @@ def _check_common_model(
     return notes, doubts
 
 
+def _sigma_anywhere(fitted: FittedRig, index: int) -> Array | None:
+    """Return sigma (6,) of the hand-eye with usual sizes of what the views cannot show; None without clouds."""
+    correction = fitted.correction
+    if correction is None:
+        return None
+    measurement = replace(fitted.sessions[index].measurement, capture=correction.captures[index])
+    unconstrained = correction.unconstrained[index]
+    return hand_eye_sigma_anywhere(measurement, fitted.model_of(index), unconstrained, correction.scatter[index])
+
+
 def _assemble_run(
     session: SessionData,
     index: int,
@@ -405,6 +417,7 @@ def _assemble_run(
         # A hand-eye of another run is as well known as it was there.
         unknown=() if start.source == REUSED else unknown_numbers(shared, model.T_mount),
         notes=(*of_views, *of_fit, *session_notes(session), *notes),
+        sigma_anywhere=None if start.source == REUSED else _sigma_anywhere(fitted, index),
     )
     rms = next(stage.rms for stage in fit.stages if stage.name == "correct")
     heldout_rms = fitted.heldout_rms(index)

@@ -157,4 +157,5 @@ def _show_missed(diagnosis: Diagnosis, length_unit: str) -> None:
 
     known = sorted(((c.hand_eye, c.name) for c in diagnosis.candidates if c.hand_eye is not None), reverse=True)
     if sizes := ", ".join(f"{name} {length_text(size, length_unit, 2)}" for size, name in known[:3]):
-        say(f"Effects too small to be seen could still displace the hand-eye, at the part by {sizes}. U omits them.")
+        still = "Effects too small to be seen could still displace the hand-eye, at the part by"
+        say(f"{still} {sizes}. U anywhere the arm reaches counts them.")

@@ -3,8 +3,10 @@
 from collections.abc import Iterable, Sequence
 from textwrap import wrap
 
+import numpy as np
+
 from stitch.effects.contract import Parameter
-from stitch.model.model import hand_eye_lines
+from stitch.model.model import COVERAGE_FACTOR, hand_eye_lines
 from stitch.numerics.units import angle_text, length_text, uncertainty_text
 from stitch.output.comparison.model_history import effect_changes, model_history
 from stitch.output.comparison.run_verdict import run_verdict
@@ -45,7 +47,7 @@ def fit_report(run: RunData, at_part: tuple[float, float]) -> str:
 
 def run_hand_eye_lines(run: RunData) -> list[str]:
     """Return the hand-eye of a run with U (k = 2); what its views do not show is not known, or as it was stated."""
-    return hand_eye_lines(
+    lines = hand_eye_lines(
         run.T_mount,
         run.mount_covariance,
         run.session.mount,
@@ -53,6 +55,13 @@ def run_hand_eye_lines(run: RunData) -> list[str]:
         unknown=run.unknown,
         stated=run.session.scanner.T_mount is not None,
     )
+    sigma = run.fit.sigma_anywhere
+    if sigma is not None and not run.unknown:
+        turn, shift = (COVERAGE_FACTOR * float(np.linalg.norm(part)) for part in (sigma[:3], sigma[3:]))
+        place = length_text(shift, run.session.length_unit, 2)
+        usual = "with usual sizes of effects that these views cannot show"
+        lines.append(f"  U anywhere the arm reaches {place} and {angle_text(turn, 2)}, {usual}")
+    return lines
 
 
 def axis_lines(run: RunData) -> list[str]:

@@ -288,6 +288,11 @@ def _axis_rows(run: RunData) -> list[dict[str, Any]]:
     return [{key: plain(value) for key, value in vars(place).items() if value is not None} for place in run.axes]
 
 
+def _known_anywhere(run: RunData) -> bool:
+    """Return whether the hand-eye's sigma anywhere the arm reaches is known."""
+    return run.fit.sigma_anywhere is not None
+
+
 def _disagreement(run: RunData) -> dict[str, Any] | None:
     """Return how far the views disagree on the part at every step of the model's history; None without clouds."""
     history = model_history(run)
@@ -385,6 +390,7 @@ RESULT = Document(
     Key("hand_eye", MATRIX, "T_mount"),
     Key("hand_eye_coarse", attribute="T_mount_coarse"),
     Key("hand_eye_sigma", write=lambda run: np.sqrt(np.diag(run.mount_covariance))),
+    Key("hand_eye_sigma_anywhere", array_of(6), "fit.sigma_anywhere", of=Fit, when=_known_anywhere),
     Key("hand_eye_covariance", attribute="mount_covariance"),
     Key("hand_eye_alone", _ALONE.kind(), write=_hand_eye_alone, when=_hand_eye_alone),
     Key("unobservable", TEXTS, of=Fit),

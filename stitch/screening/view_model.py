@@ -16,7 +16,7 @@ random effect (Searle, Casella and McCulloch 1992): every parameter of every eff
 the views scatter accordingly, together and not one by one (`UsualEffects`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -321,7 +321,7 @@ class UsualEffects:
         Returns:
             (6V, P) twists, reference frame, rad and length_unit.
         """
-        return _TIMES_USUAL * np.hstack(list(self._by_place(unconstrained).values()))
+        return _TIMES_USUAL * np.hstack(list(self.by_place(unconstrained).values()))
 
     def errors(self, unconstrained: UnconstrainedPoses) -> PoseErrors:
         """The same in sizes that the views show, one for every place of the chain, beside all that arms do.
@@ -337,17 +337,22 @@ class UsualEffects:
         of_part = np.tile(np.eye(6), (len(unconstrained.poses), 1, 1))
         for name, moved in (("wandering mount", of_mount), ("wandering part", of_part)):
             errors = errors.with_component(name, process_covariance((moved * unit).reshape(-1, 6), alike), 1.0)
-        for place, columns in self._by_place(_thin_correspondences(unconstrained)).items():
+        for place, columns in self.by_place(thin_correspondences(unconstrained)).items():
             errors = errors.with_component(place, columns @ columns.T, 1.0)
         return errors
 
-    def _by_place(self, unconstrained: UnconstrainedPoses) -> dict[str, Array]:
-        """(6V, P) twists by the effects of each place of the chain, one column a parameter, of usual size."""
+    def by_place(self, unconstrained: UnconstrainedPoses, without: Collection[str] = ()) -> dict[str, Array]:
+        """(6V, P) twists by the effects of each place of the chain, one column a parameter, of usual size.
+
+        Args:
+            without: names of effects that do not count.
+        """
         # Steps between two views are tested as blocks of views.
         possible = [
             effect
             for effect in EFFECTS.values()
             if effect.tier == "physical"
+            and effect.name not in without
             and all(spec.grid != EVERY_VIEW for spec in effect.specs.values())
             and not missing_need(self.measurement, effect)
         ]
@@ -362,7 +367,7 @@ class UsualEffects:
         return {place: np.hstack(blocks) for place, blocks in columns.items()}
 
 
-def _thin_correspondences(unconstrained: UnconstrainedPoses) -> UnconstrainedPoses:
+def thin_correspondences(unconstrained: UnconstrainedPoses) -> UnconstrainedPoses:
     """The same with fewer correspondences, each of more weight: what an effect roughly does to poses needs no more."""
     every = -(-sum(len(m.residual) for m in unconstrained.overlaps.matches) // _MAX_CORRESPONDENCES) or 1
     thinned = [
