@@ -92,7 +92,8 @@ class Session(SessionData):
                 legacy or of tensors, or (depth image or RGBD image, intrinsics). A mapping names the views. None for
                 labelled points alone.
             poses: T_base_flange of every view: (V, 4, 4), scipy's RigidTransform, (Rotation, (V, 3)), or a list of
-                one a view. None where joints and robot give them.
+                one a view; rows of numbers, (V, 7), a DataFrame, as `stitch init` reads a table. None where joints and
+                robot give them.
             mount: "eye_to_hand", scanner fixed and part on the flange, or "eye_in_hand", scanner on the flange.
             joints: (V, n) rad.
             robot: a `Robot`, the [robot] table of session.toml as a mapping, or the path of a URDF.
@@ -120,6 +121,7 @@ class Session(SessionData):
         cell = cls.empty(mount=mount, robot=robot, scanner=scanner, unit=unit, cloud_unit=cloud_unit, name=name)
         with _in_arguments(cell.path.name):
             names, scans = _views_of(clouds, poses, joints, points)
+            poses = _read_tables(cell, poses, scans, cloud_unit or unit)
             T, q = _arm(cell, names, poses, joints)
             views = _measured_views(cell, names, scans, points, cloud_unit or unit)
             session = replace(cell, views=_placed_views(views, T, q, times, covariates or {}))
@@ -246,6 +248,16 @@ def _views_of(clouds: Any, poses: Any, joints: Any, points: Any) -> tuple[list[s
         raise InputError("clouds: none, and no labelled points; to fix: pass one of the two, one a view")
     scans = list(clouds) if clouds is not None else [None] * len(points)
     return [f"v{i:03d}" for i in range(len(scans))], scans
+
+
+def _read_tables(cell: Session, poses: Any, scans: list[Any], cloud_unit: str) -> Any:
+    """Return poses that are rows of numbers as (V, 4, 4), where a package reads them as `stitch init` reads a table.
+
+    Others stay as they are (entry-point group `stitch.pose_tables`).
+    """
+    for reader in entry_points(group="stitch.pose_tables"):
+        poses = reader.load()(poses, scans, cell.length_unit, cloud_unit, cell.mount)
+    return poses
 
 
 def _arm(cell: Session, names: list[str], poses: Any, joints: Any) -> tuple[Array, Array | None]:

@@ -1,10 +1,12 @@
-"""Whether scans confirm the convention of poses that a person states with arrays, before `stitch check --deep` judges.
+"""Poses that a person passes as arrays: rows of numbers are read as a table is, and scans confirm what was stated.
 
-`Session.from_arrays` and `stitch.live` find it by the entry-point group `stitch.pose_checks`.
+`Session.from_arrays` and `stitch.live` find this by the entry-point groups `stitch.pose_tables`, `stitch.pose_checks`.
 """
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,13 +16,58 @@ from stitch.plugins.intake.convention_choice import choose_convention, require_o
 from stitch.plugins.intake.first_session import capture_of
 from stitch.plugins.intake.layouts import MM
 from stitch.plugins.intake.raw_poses import RawPoses
-from stitch.plugins.intake.readings import all_readings
+from stitch.plugins.intake.readings import Reading, all_readings
+from stitch.plugins.intake.refusals import Fix, Refusal
 from stitch.plugins.intake.stated_folder import StatedFolder
 from stitch.screening.motions import register_scan_pairs
+from stitch.session.reading.arrays import cloud_of
 from stitch.session.session import SessionData
 
 # Two motions, the fewest that tell a reading.
 _FEWEST_VIEWS = 3
+# Numbers of a pose in a row: six to sixteen.
+_WIDTHS = range(6, 17)
+
+
+def matrices_of_table(poses: Any, scans: Sequence[Any], length_unit: str, cloud_unit: str, mount: str) -> Any:
+    """Return rows of numbers as poses (V, 4, 4), as a table of them would be read; what is none of that as it is.
+
+    Args:
+        poses: (V, 6 … 16) or (V, 3, 4) numbers, or a DataFrame whose columns have names.
+        scans: as passed, that tell the reading where names and numbers do not; None: none.
+
+    Raises:
+        InputError: numbers that hold no pose, or that can be read in several ways.
+    """
+    names = tuple(map(str, poses.columns)) if hasattr(poses, "columns") else None
+    try:
+        table = np.asarray(poses, float)
+    except (TypeError, ValueError):
+        return poses
+    table = table.reshape(len(table), -1) if table.shape[1:] == (3, 4) else table
+    if table.ndim != 2 or table.shape == (4, 4) or (names is None and table.shape[1] not in _WIDTHS):
+        return poses
+    raw = RawPoses("poses", names, table, ((),) * len(table), "an array")
+    found = all_readings(raw, None, StatedFolder(length_unit=length_unit))
+    return (found[0] if len(found) == 1 else _told_by_scans(found, raw, scans, length_unit, cloud_unit, mount)).T
+
+
+def _told_by_scans(
+    found: Sequence[Reading], raw: RawPoses, scans: Sequence[Any], length_unit: str, cloud_unit: str, mount: str
+) -> Reading:
+    words = "pass matrices (V, 4, 4), such as scipy's Rotation and the positions make"
+    refusal = Refusal(f"poses: {raw.numbers.shape} numbers can be read in {len(found)} ways", Fix(words))
+    if len(scans) != len(raw.numbers) or len(scans) < _FEWEST_VIEWS or any(scan is None for scan in scans):
+        raise refusal
+    capture = capture_of([cloud_of(scan, f"view {i}") for i, scan in enumerate(scans)], METRES[cloud_unit] / MM)
+    pairs = pairings([Path("scan")] * len(scans), raw.labels)[:1]
+    carries = mount == "eye_in_hand"
+    choice = choose_convention(
+        capture, cache(lambda: register_scan_pairs(capture)), found, pairs, [length_unit], carries
+    )
+    if not choice.determined:
+        raise refusal
+    return choice.best.interpretation.reading
 
 
 def scans_confirm(session: SessionData) -> bool:
