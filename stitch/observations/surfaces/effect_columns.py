@@ -109,7 +109,9 @@ def stream_point_sums(
     def slopes(v: int, index: Indices, normal: Array) -> Array:
         """(N, K) how far points of view v move along normals (N, 3) of the reference frame, per unit."""
         in_scanner = frames.rotate(frames.inverse(unconstrained.poses[v]), normal)
-        return np.einsum("kni,ni->nk", of_points(v, index), in_scanner)
+        # A point is asked by several partners, and moves alike for all.
+        points, asked = np.unique(index, return_inverse=True)
+        return np.einsum("kni,ni->nk", of_points(v, points).take(asked, axis=1), in_scanner)
 
     sums = dict[int, tuple[Array, ...]]()
     for block in _match_blocks(unconstrained.overlaps.matches):

@@ -30,7 +30,7 @@ _BEST, _SPREAD = 12, 8
 # Kept besides: pairs with so large a share of all that holds their two views together, directly and by way of others.
 _IRREPLACEABLE = 0.25
 # Points of a view that are probed there: which partners are best needs no more.
-_PROBES = 80
+_PROBES = 50
 # How often a point is found in its view's partners, on average, where they take turns; and by how much more points
 # there are then. Noise of the points alone then moves the poses' variance to 0.82 (a blade, 60 views) and 1.04 (a
 # table, 100 views) of what it is with all partners, 20 at a time; without more points to 1.08 and 1.33.
