@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from stitch.numerics import frames
 from stitch.numerics.distributions import binomial_tail
 from stitch.numerics.frames import Array, Indices, Mask
-from stitch.observations.surfaces.matching import near_pairs, sample_points
+from stitch.observations.surfaces.matching import QueryPart, near_pairs, neighbour_queries, sample_points
 from stitch.observations.surfaces.normal_equations import Overlaps
 from stitch.session.scan import Scan
 from stitch.system.threads import parallel
@@ -167,23 +167,31 @@ def _point_visibility(
         near[v].append(w)
         near[w].append(v)
 
-    def of_view(v: int) -> dict[int, PointVisibility]:
-        scan = scans[v]
-        turns = -(-len(near[v]) // _VIEWS_COMPARED)
-        index = sample_points(scan, _CONTRADICTION_PROBES)
-        shown = {w: np.zeros(len(index), np.int8) for w in near[v]}
-        for k, w in enumerate(near[v]):
-            asked = slice(k % turns, None, turns)
-            T_w_v = frames.inverse(poses[w]) @ poses[v]
-            points = frames.transform(T_w_v, scan.points.take(index[asked], axis=0))
-            normals = frames.rotate(T_w_v, scan.normals.take(index[asked], axis=0))
-            _, along, beside = _nearest_partners(scans[w], points, normals, reach)
-            at_same_place = beside < _SPACINGS * scans[w].spacing
-            away = np.abs(along) / tolerance
-            shown[w][asked] = 2 * (at_same_place & (away < 1)) + (at_same_place & (away > _OFF_SURFACE_TOLERANCES))
-        return shown
+    queries = neighbour_queries(scans, poses, [sample_points(scan, _CONTRADICTION_PROBES) for scan in scans])
+    parts: list[list[QueryPart]] = [[] for _ in scans]
+    for v, others in enumerate(near):
+        turns = -(-len(others) // _VIEWS_COMPARED)
+        for k, w in enumerate(others):
+            parts[w].append((v, slice(k % turns, None, turns)))
 
-    return list(parallel(of_view, range(len(scans))))
+    def of_asked(w: int) -> dict[int, PointVisibility]:
+        """Return by view that asks what view w shows of its points: of all at once."""
+        if not parts[w]:
+            return {}
+        _, points, normals = queries.gather(parts[w])
+        T = frames.inverse(poses[w])
+        _, along, beside = _nearest_partners(scans[w], frames.transform(T, points), frames.rotate(T, normals), reach)
+        at_same_place = beside < _SPACINGS * scans[w].spacing
+        away = np.abs(along) / tolerance
+        says = 2 * (at_same_place & (away < 1)) + (at_same_place & (away > _OFF_SURFACE_TOLERANCES))
+        bounds = np.cumsum(queries.counts(parts[w]))[:-1]
+        return dict(zip((v for v, _ in parts[w]), np.split(says, bounds), strict=True))
+
+    shown = [{w: np.zeros(len(index), np.int8) for w in near[v]} for v, index in enumerate(queries.index)]
+    for w, answers in enumerate(parallel(of_asked, range(len(scans)))):
+        for v, asked in parts[w]:
+            shown[v][w][asked] = answers[v]
+    return shown
 
 
 def points_in_place(scan: Scan, points: Array, normals: Array, tolerance: float) -> Mask:
