@@ -36,6 +36,7 @@ from stitch.screening.view_model import (
     projector,
     rotation_shift_lower_bounds,
     test_alternative,
+    test_alternatives,
 )
 
 MovedBody = Literal["part", "scanner"]
@@ -180,7 +181,7 @@ def find_blunders(model: ViewModel, excluded: Sequence[int] = (), steps: Sequenc
         rest = [v for v in range(model.count) if v not in excluded and v not in freed]
         if len(freed) >= most or len(freed) >= significant + _MASKING_DEPTH or under.degrees < FEWEST_DEGREES:
             break
-        tests = {v: test_alternative(under, model.views[v]) for v in rest}
+        tests = dict(zip(rest, test_alternatives(under, [model.views[v] for v in rest]), strict=True))
         likely = sorted(rest, key=lambda v: tests[v].rank)[:_LEAVE_ONE_OUT_COUNT]
         # Either test alone holds its level; together they were seen to stay below it (docs/integrity.md).
         chance = {v: min(tests[v].p_value, leave_one_out_test(model, columns, v)[1]) for v in likely}
@@ -288,13 +289,15 @@ def _next_pick(model: ViewModel, columns: Array | None, taken: Sequence[dict[Mov
         rest = displaced - mean @ (mean.T @ displaced)
         return bool(np.linalg.norm(rest) >= _NEW_COLUMN_SHARE * np.linalg.norm(displaced))
 
-    alone = {v: test_alternative(under, own) for v, own in enumerate(model.views) if says_more(own)}
+    saying = [v for v, own in enumerate(model.views) if says_more(own)]
+    alone = dict(zip(saying, test_alternatives(under, [model.views[v] for v in saying]), strict=True))
     if not alone:
         return None
     every = range(_MIN_VIEWS_AT_END, model.count - _MIN_VIEWS_AT_END + 1)
     starts = [k for k in every if k not in [k for starts in taken for k in starts.values()]]
     steps = {(moved, k): step_columns(model, k, moved) for moved in MOVED_BODIES for k in starts}
-    tests = {at: test_alternative(under, displaced) for at, displaced in steps.items() if says_more(displaced)}
+    more = {at: displaced for at, displaced in steps.items() if says_more(displaced)}
+    tests = dict(zip(more, test_alternatives(under, list(more.values())), strict=True))
     view = min(alone, key=lambda v: alone[v].rank)
     likelier = min(tests, key=lambda at: tests[at].rank, default=None)
     # Of few views every start of a step may be taken.

@@ -216,9 +216,22 @@ def hstack_columns(*columns: Array | None) -> Array:
     return np.hstack([block for block in columns if block is not None])
 
 
+def test_alternatives(under: Projector, alternatives: Sequence[Array]) -> list[AlternativeTest]:
+    """Test each of the alternatives, columns (n, k) each, under a null hypothesis: P meets the columns of all at once."""
+    if not alternatives:
+        return []
+    bounds = np.cumsum([columns.shape[1] for columns in alternatives])[:-1]
+    weighted = np.split(under.P @ np.hstack(alternatives), bounds, axis=1)
+    return [_tested(under, columns, held) for columns, held in zip(alternatives, weighted, strict=True)]
+
+
 def test_alternative(under: Projector, columns: Array) -> AlternativeTest:
-    """Test the alternative with `columns` (n, 6) under a null hypothesis."""
-    N = columns.T @ under.P @ columns
+    """Test the alternative with `columns` (n, k) under a null hypothesis."""
+    return test_alternatives(under, [columns])[0]
+
+
+def _tested(under: Projector, columns: Array, weighted: Array) -> AlternativeTest:
+    N = columns.T @ weighted
     u = columns.T @ under.projected
     # Units of the columns may differ.
     same_units, unit = equilibrated(N)
