@@ -217,7 +217,7 @@ def hstack_columns(*columns: Array | None) -> Array:
 
 
 def test_alternatives(under: Projector, alternatives: Sequence[Array]) -> list[AlternativeTest]:
-    """Test each of the alternatives, columns (n, k) each, under a null hypothesis: P meets the columns of all at once."""
+    """Test each alternative, columns (n, k), under a null hypothesis: P meets the columns of all at once."""
     if not alternatives:
         return []
     bounds = np.cumsum([columns.shape[1] for columns in alternatives])[:-1]
