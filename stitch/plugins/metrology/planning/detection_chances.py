@@ -174,7 +174,9 @@ class ExpectedDiagnosis:
     def __init__(self, linear: LinearModel, candidates: Sequence[Candidate]) -> None:
         self.linear = linear
         self.candidates = [c for c in candidates if _is_visible(linear, c)]
-        self.tests = max(len(self.candidates), 1)
+        priors = np.array([c.effect.prior for c in self.candidates])
+        self.tests = max(round(priors.sum()), 1)
+        self._belief = np.log(priors)
         self._half = np.linalg.cholesky(linear.covariance[0])
         self._of_arm = set({} if linear.pose_errors is None else linear.pose_errors.effects)
         self._tests: dict[tuple[frozenset[str], str], CandidateTest] = {}
@@ -187,7 +189,8 @@ class ExpectedDiagnosis:
         answers = [self._test({c.name}, c).evaluate(numbers) for c in self.candidates]
         factor = np.array([f for f, _ in answers])
         significant = np.array([s for _, s in answers])
-        best = self._best(numbers, np.where(significant & (factor > 0), factor, -np.inf))
+        posterior = factor + self._belief[:, None]
+        best = self._best(numbers, np.where(significant & (factor > 0), posterior, -np.inf))
         alarm = (significant & (factor > limits.LOG_BAYES_FACTOR)).any(axis=0)
         counts = {c.name: float(np.mean(alarm & (best == k))) for k, c in enumerate(self.candidates)}
         named = counts.pop(effect, 0.0)
@@ -208,24 +211,25 @@ class ExpectedDiagnosis:
             self._tests[key] = CandidateTest(linear, tuple(forms))
         return self._tests[key]
 
-    def _best(self, numbers: Array, factor: Array) -> Array:
+    def _best(self, numbers: Array, posterior: Array) -> Array:
         """(D,) the candidate that is ahead of every contender by the odds that a name needs; −1 where none is.
 
         Args:
-            factor: (K, D) log Bayes factors, −∞ where a candidate does not contend.
+            posterior: (K, D) log Bayes factors with each one's belief, −∞ where a candidate does not contend.
         """
-        leader = factor.argmax(axis=0)
-        out = np.where(np.isfinite(factor.max(axis=0)), leader, -1)
+        leader = posterior.argmax(axis=0)
+        out = np.where(np.isfinite(posterior.max(axis=0)), leader, -1)
         for k in np.unique(leader[out >= 0]):
             led = np.flatnonzero((leader == k) & (out >= 0))
             out[led[~self._ahead_of_laws(int(k), numbers[:, led])]] = -1
-            for other in np.flatnonzero(np.isfinite(factor[:, led]).any(axis=1)):
-                contested = led[np.isfinite(factor[other, led])]
+            for other in np.flatnonzero(np.isfinite(posterior[:, led]).any(axis=1)):
+                contested = led[np.isfinite(posterior[other, led])]
                 if other != k:
                     pair = [self.candidates[k], self.candidates[other]]
                     names = {c.name for c in pair}
                     ahead, rival = (self._test(names, c).evaluate(numbers[:, contested])[0] for c in pair)
-                    out[contested[~(ahead > rival + limits.ODDS)]] = -1
+                    apart = self._belief[k] - self._belief[other]
+                    out[contested[~(ahead + apart > rival + limits.ODDS)]] = -1
         return out
 
     def _ahead_of_laws(self, k: int, numbers: Array) -> Mask:
@@ -241,7 +245,8 @@ class ExpectedDiagnosis:
         # Of each law the log Bayes factor at the likeliest of its sizes.
         factors = [[np.max([size.evaluate(numbers)[0] for size in law], axis=0) for law in kind] for kind in kinds]
         rival = log_posterior_of_any(np.array([log_mean_exp(np.array(kind)) for kind in factors]))
-        return test.evaluate(numbers)[0] + np.log(limits.PRIOR_PHYSICAL / self.tests) > rival + limits.ODDS
+        prior = np.log(limits.PRIOR_PHYSICAL / self.tests) + self._belief[k]
+        return test.evaluate(numbers)[0] + prior > rival + limits.ODDS
 
 
 def _is_visible(linear: LinearModel, candidate: Candidate) -> bool:
