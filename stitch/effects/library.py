@@ -33,9 +33,10 @@ _SHIFT = number("mm", typical=0.05, limit=2.0)
 _TILT = vector("rad", typical=2e-4, limit=0.01)
 _UNEVEN = offset("rad", typical=1e-4, limit=0.01, axes=("xx", "yy", "xy", "xz", "yz"))
 # Belief beside an effect that any arm, mount or part has: a judgement, which decides only where views hardly do. A base
-# that tilts and joints that follow a temperature are met less often than gears and springs; lost counts and oblique
-# brackets seldom. Over an hour creep looks like a scanner that warms up, which every scanner does: alike, it is that.
-_RARE, _FAULT, _CREEP = 0.3, 0.1, 0.04
+# that tilts and joints that follow a temperature are met less often than gears and springs; lost counts seldom. What is
+# like a usual effect in most sessions is that one, at less than 1 to 20: creep over an hour is like a scanner that
+# warms up, which every scanner does, and an oblique bracket like one that stands straight.
+_RARE, _SELDOM, _ALIKE = 0.3, 0.1, 0.04
 _BENT = vector("mm", typical=0.05, limit=2.0, axes=("_xx", "_yy", "_zz", "_xy", "_xz", "_yz"))
 
 
@@ -106,7 +107,7 @@ def joint_thermal(joints: Array, views: Views, k: Array, T: float) -> Array:
     return joints + np.outer(views.since_first(TEMPERATURES[round(T)]), k)
 
 
-@effect("robot", needs=("joints",), prior=_FAULT, d=per_joint("rad", 5e-4, 0.02), v=event())
+@effect("robot", needs=("joints",), prior=_SELDOM, d=per_joint("rad", 5e-4, 0.02), v=event())
 def joint_step(joints: Array, views: Views, d: Array, v: float) -> Array:
     """q*_i = q_i + d_i from view v on (counted from 0), one joint"""
     return joints + np.outer(views.number >= v, d)
@@ -143,7 +144,7 @@ def mount_warmup(views: Views, xi: Array, T_c: float) -> Array:
 @effect(
     "mount",
     needs=("time",),
-    prior=_CREEP,
+    prior=_ALIKE,
     xi=twist("", 2e-4, 0.07),
     tau=number("s", 60.0, 1e5, grid=(10.0, 60.0, 300.0)),
 )
@@ -252,13 +253,13 @@ def fixture_droop(views: Views, s: float, w: Array, a: Array) -> Array:
     return _droop(views.gravity_at_part, s, w, a)
 
 
-@effect("mount", needs=("gravity_at_mount",), prior=_FAULT, S=_BENT, w=_TILT, a=_UNEVEN)
+@effect("mount", needs=("gravity_at_mount",), prior=_ALIKE, S=_BENT, w=_TILT, a=_UNEVEN)
 def mount_bend(views: Views, S: Array, w: Array, a: Array) -> Array:
     """M tilts by w×g + A·g and moves by S·g, S symmetric, g the direction of gravity less z, flange frame"""
     return views.at_scanner(_bend(views.gravity_at_mount, S, w, a))
 
 
-@effect("part", needs=("gravity_at_part",), prior=_FAULT, S=_BENT, w=_TILT, a=_UNEVEN)
+@effect("part", needs=("gravity_at_part",), prior=_ALIKE, S=_BENT, w=_TILT, a=_UNEVEN)
 def fixture_bend(views: Views, S: Array, w: Array, a: Array) -> Array:
     """the part tilts by w×g + A·g and moves by S·g, S symmetric, g the direction of gravity less z, flange frame"""
     return _bend(views.gravity_at_part, S, w, a)
