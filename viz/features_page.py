@@ -1,6 +1,6 @@
 """The pages of measured features and of a verification, from the documents that stand beside them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,10 @@ from viz.page_parts import page_written, render, versions
 
 # Sources of a budget that a row shows by name.
 _SHOWN = 3
-_WORDS = ("error", "verdict", "what brings U", "answers to")
+_WORDS = ("error", "verdict", "what brings U", "answers to", "why")
 # Classes of a verdict: kept, not kept, and undecided.
 _MARKS = {True: "good", False: "bad", None: "check"}
+_LIMIT_HEADINGS = ("limit", "verdict")
 
 
 def write_features(document: Mapping[str, Any], path: Path) -> None:
@@ -36,11 +37,15 @@ def write_features(document: Mapping[str, Any], path: Path) -> None:
         for n in document["numbers"]
     ]
     headings = ("feature", "value", "off nominal", "U", "unit", "ν", "verdict", "what brings U")
+    tables = [
+        {"name": "Numbers and their budgets", "headings": headings, "rows": rows},
+        _unseen_table(document.get("not_measured", {})),
+    ]
     _write(
         path,
         title="Features",
         sentence=f"{len(rows)} numbers, each with U (k = 2)",
-        tables=[{"name": "Numbers and their budgets", "headings": headings, "rows": rows}],
+        tables=[table for table in tables if table["rows"]],
         facts=[("Run", document["run"]), ("ν", "degrees of freedom that U rests on")],
         outside_name="Not in U",
         outside=document["not_included"],
@@ -49,52 +54,12 @@ def write_features(document: Mapping[str, Any], path: Path) -> None:
 
 def write_certificate(document: Mapping[str, Any], path: Path) -> None:
     """Write what an artefact says of a model: passes or fails, on what conditions, until when."""
-    numbers = [
-        {
-            "cells": [
-                n["feature"],
-                n["error"],
-                *(_rounded(n[key], n["U"]) for key in ("calibrated", "measured")),
-                _rounded(n["deviation"], n["U"], "+"),
-                *(_rounded(n[key], n["U"]) for key in ("U", "U_calibrated")),
-                f"{n['E_n']:+.2f}",
-                *_kept(n),
-                ", ".join(n["answers_to"]).replace("_", "-") or "the artefact alone",
-            ],
-            "mark": _MARKS[n["passes"]],
-        }
-        for n in document["numbers"]
-    ]
-    forms = [
-        {"cells": [f["feature"], f"{f['form_95']:.2g}", *_kept(f)], "mark": "good" if f["passes"] else "bad"}
-        for f in document["forms"]
-    ]
     unit = document["length_unit"]
-    headings = ("feature", "error", "calibrated", "measured", "off", "U", "U cal.", "Eₙ")
-    limits = ("limit", "verdict")
-    hand_eye = document["hand_eye"]
-    apart = [_rounded(hand_eye[key], hand_eye["U"]) for key in ("distance", "U", "U_given")]
-    verdict = "agrees" if hand_eye["agrees"] else "does not agree"
-    agreement = {
-        "cells": ["hand-eye of the model", *apart, f"{hand_eye['ratio']:.2f}", verdict],
-        "mark": _MARKS[hand_eye["agrees"]],
-    }
-    asked = (
-        "against the views",
-        "apart at the part",
-        "U of both",
-        "U of the model",
-        "over what U allows",
-        "verdict",
-    )
     tables = [
-        {
-            "name": f"Sizes, distances and places, {unit} (k = 2)",
-            "headings": (*headings, *limits, "answers to"),
-            "rows": numbers,
-        },
-        {"name": f"Hand-eye, {unit} (k = 2)", "headings": asked, "rows": [agreement]},
-        {"name": f"Form, {unit}", "headings": ("feature", "band of 95 % of the points", *limits), "rows": forms},
+        _number_table(document["numbers"], unit),
+        _hand_eye_table(document["hand_eye"], unit),
+        _form_table(document["forms"], unit),
+        _unseen_table(document.get("not_measured", {})),
     ]
     standards = ", ".join(document["in_the_manner_of"])
     _write(
@@ -115,6 +80,51 @@ def write_certificate(document: Mapping[str, Any], path: Path) -> None:
         outside_name="Conditional on what U does not hold",
         outside=document["conditional_on"],
     )
+
+
+def _number_table(numbers: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
+    rows = [
+        {
+            "cells": [
+                n["feature"],
+                n["error"],
+                *(_rounded(n[key], n["U"]) for key in ("calibrated", "measured")),
+                _rounded(n["deviation"], n["U"], "+"),
+                *(_rounded(n[key], n["U"]) for key in ("U", "U_calibrated")),
+                f"{n['E_n']:+.2f}",
+                *_kept(n),
+                ", ".join(n["answers_to"]).replace("_", "-") or "the artefact alone",
+            ],
+            "mark": _MARKS[n["passes"]],
+        }
+        for n in numbers
+    ]
+    measured = ("feature", "error", "calibrated", "measured", "off", "U", "U cal.", "Eₙ")
+    headings = (*measured, *_LIMIT_HEADINGS, "answers to")
+    return {"name": f"Sizes, distances and places, {unit} (k = 2)", "headings": headings, "rows": rows}
+
+
+def _hand_eye_table(hand_eye: Mapping[str, Any], unit: str) -> dict[str, Any]:
+    apart = [_rounded(hand_eye[key], hand_eye["U"]) for key in ("distance", "U", "U_given")]
+    verdict = "agrees" if hand_eye["agrees"] else "does not agree"
+    cells = ["hand-eye of the model", *apart, f"{hand_eye['ratio']:.2f}", verdict]
+    asked = ("against the views", "apart at the part", "U of both", "U of the model", "over what U allows", "verdict")
+    rows = [{"cells": cells, "mark": _MARKS[hand_eye["agrees"]]}]
+    return {"name": f"Hand-eye, {unit} (k = 2)", "headings": asked, "rows": rows}
+
+
+def _form_table(forms: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
+    rows = [
+        {"cells": [f["feature"], f"{f['form_95']:.2g}", *_kept(f)], "mark": "good" if f["passes"] else "bad"}
+        for f in forms
+    ]
+    headings = ("feature", "band of 95 % of the points", *_LIMIT_HEADINGS)
+    return {"name": f"Form, {unit}", "headings": headings, "rows": rows}
+
+
+def _unseen_table(not_measured: Mapping[str, str]) -> dict[str, Any]:
+    rows = [{"cells": [name, why.removeprefix(f"{name}: ")]} for name, why in not_measured.items()]
+    return {"name": "Not measured", "headings": ("feature", "why"), "rows": rows}
 
 
 def _write(path: Path, facts: list[tuple[str, str]], **content: Any) -> None:

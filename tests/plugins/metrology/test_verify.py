@@ -192,4 +192,6 @@ def test_a_feature_that_nobody_saw_is_named_and_the_others_stand(cell):
     code, unseen = _verify(cell, cell / "unseen.toml")
     assert code == 3 and unseen["passed"] is None and len(unseen["numbers"]) == 10
     assert set(unseen["not_measured"]) == {"ball 1", *(f"distance {k}-1" for k in (2, 3, 4, 5))}
+    write_certificate(unseen, cell / "unseen.html")
+    assert "Not measured" in (cell / "unseen.html").read_text(encoding="utf-8")
     assert "Not measured: ball 1" in unseen["sentence"]
