@@ -22,6 +22,7 @@ TABLES = {
     "blind": "blind:TABLE",
     "certificate": "certificate:TABLE",
     "conventions": "intake:CONVENTIONS",
+    "deciding-view": "deciding_view:TABLE",
     "degenerate": "degenerate:TABLE",
     "diagnose-time": "speed:DIAGNOSE",
     "drilling": "drilling:TABLE",

@@ -9,12 +9,14 @@ import hashlib
 import io
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
+from stitch.plugins.watch.cell_identity import cell_identity, other_cell
 from stitch.plugins.watch.control_charts import Charts
 from stitch.plugins.watch.history import (
     TWIST_NAMES,
@@ -268,6 +270,11 @@ def _store_run(history: History, record: RunRecord) -> float | None:
                 f"{record.path}: has {key} {value}, the cell {history.folder} {stated}; to fix: name the cell of this "
                 "run"
             )
+    identity = cell_identity(Path(record.session))
+    known = history.stated("identity") or {}
+    if (other := other_cell(known, identity, record.length_unit)) is not None:
+        raise InputError(f"{record.path}: {other}; to fix: name the cell of this run, or begin a new one")
+    history.state({"identity": identity | known})
     begun = min(record.time, _replace_former_run(history, record))
     values = repr([(e.name, e.value) for e in record.estimates])
     numbers = matrix_json(record.T_mount) + matrix_json(record.covariance) + values
