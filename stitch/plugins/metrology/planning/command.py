@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -88,6 +89,7 @@ def plan_views(
 
     _require_plan_options(views, size, field, output)
     wanted = _plan_request(views, split, halve, place_of(folder, feature))
+    wanted = replace(wanted, poses=_deciding_poses(folder, split))
     stated = {"part": part, "size": size, "field": field, "start": start}
     with show_activity("planning: reading the cell"):
         session, planned = (
@@ -107,6 +109,19 @@ def plan_views(
         emit(to_json(document))
     else:
         _show_plan(plan, planned.cell, output)
+
+
+def _deciding_poses(folder: Path, split: tuple[str, str] | None) -> Array | None:
+    """Return (K, n) rad of the views by which a run's own diagnosis decides between two effects; None without any."""
+    import numpy as np
+
+    from stitch.session.reading.text_files import read_json_object
+
+    if split is None or not (folder / "diagnosis.json").is_file():
+        return None
+    proposed = read_json_object(folder / "diagnosis.json").get("next", [])
+    own = [row["joints_deg"] for row in proposed if row.get("joints_deg") and set(row["separates"]) == set(split)]
+    return np.radians(own) if own else None
 
 
 def _require_plan_options(views: int | None, size: float | None, field: float | None, output: Path | None) -> None:

@@ -259,6 +259,7 @@ class PlanRequest:
     split_any: bool = True
     views: int | None = None  # at the most
     feature: Array | None = None  # (3,) reference frame; or (6,) with the direction that counts
+    poses: Array | None = None  # (K, n) rad that a diagnosis proposes for this very pair: no others are sought
 
     @property
     def place(self) -> Array | None:
@@ -330,6 +331,9 @@ def plan_further_views(session: SessionData, planned: PlannedCell, request: Plan
             return empty
         further = with_views(session, list(joints))
         after = view_outlook(further, cell, errors, request.place, chances=now is None)
+        if now is not None and request.halve and request.split is None and after.hand_eye.U > now.hand_eye.U:
+            # Views that would make it no better than it is are none to take.
+            return empty
         split = next((goal.names for goal in goals if isinstance(goal, SplitPair)), None)
         place_now = next((goal.now for goal in goals if isinstance(goal, KnownPlace) and np.isfinite(goal.now)), None)
         return replace(
@@ -347,6 +351,11 @@ def _search_views(
     """Return goals over all views that were tried, the indices of the C chosen ones there, and their joints (C, n)."""
     assert session.joints is not None
     coarse = replace(cell, part=thinned_surface(cell.part.points, cell.part.normals, _POINTS))
+    if request.poses is not None:
+        every = with_views(session, list(request.poses))
+        simulated = simulate_views(every, coarse, _SAMPLES, _MIN_VIEW_SAMPLES)
+        goals = _plan_goals(PossibleViews(every, coarse, simulated, scatter), now, request)
+        return goals, list(range(len(session.views), len(every.views))), request.poses
     goals, chosen, joints = list[Goal](), list[int](), session.joints[:0]
     for _ in range(1 if request.feature is None else 1 + _CLOSER):
         tried = np.vstack([joints, candidate_joints(session, cell, _TRIED, joints if chosen else None)])
