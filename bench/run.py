@@ -16,6 +16,7 @@ from bench import harness  # noqa: E402
 
 # By name: the module of bench and the table in it.
 TABLES = {
+    "axes": "axes:TABLE",
     "base-to-base": "base_to_base:TABLE",
     "bad-arms": "real_arms:BAD_ARMS",
     "batch-speed": "watch:SPEED",

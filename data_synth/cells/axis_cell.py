@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +18,7 @@ from data_synth.scanning import scan
 from data_synth.shapes import build_shape
 
 Array = NDArray[np.float64]
-KINDS = ("turntable", "table-arm", "rail-arm", "tilt-turn")
+KINDS = ("turntable", "table-arm", "rail-arm", "tilt-turn", "arm")
 # What is hidden at amplitude 1: mm, rad, share, rad/m, and half a play in rad or mm.
 SIZES = {
     "axis_eccentricity": 0.1,
@@ -27,6 +28,7 @@ SIZES = {
     "axis_backlash": 3e-4,
 }
 _RAIL_BACKLASH = 0.08
+_BALL = 30.0  # radius of a ball that is scanned in place of the blade
 _ARM_SCATTER = np.repeat([20e-6, 0.02], 3)
 _AXIS_SCATTER = {"rotary": 10e-6, "linear": 0.005}
 _SCANNER = Scanner(columns=130, rows=130, noise=0.02, standoff=420.0, depth_of_field=500.0)
@@ -87,13 +89,23 @@ class AxisCell:
 
 
 def axis_cell(
-    kind: str, seed: int, hidden: dict[str, float] | None = None, views: int = 18, pixels: int = 130
+    kind: str,
+    seed: int,
+    hidden: dict[str, float] | None = None,
+    views: int = 18,
+    *,
+    pixels: int = 130,
+    ball: bool = False,
 ) -> AxisCell:
-    """Simulate a cell; `hidden` are faults by their names, times what a cell could really have."""
+    """Simulate a cell; `hidden` are faults by their names, times what a cell could really have.
+
+    Args:
+        ball: a ball, 60 mm beside, in place of the blade.
+    """
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     chance = np.random.default_rng([seed, KINDS.index(kind), 1])
     scanner = replace(_SCANNER, columns=pixels, rows=pixels)
-    mesh = build_shape("blade")
+    mesh = trimesh.creation.icosphere(5, _BALL) if ball else build_shape("blade")
     has_arm = kind.endswith("arm")
     axes = tuple(_with_faults(axis, hidden or {}, chance) for axis in _axes(kind, rng))
     readings = _readings(kind, axes, views, rng)
@@ -101,7 +113,7 @@ def axis_cell(
     middle = np.asarray(mesh.bounds.mean(axis=0))
     turned = Rotation.from_rotvec(rng.normal(0, 0.3, 3)).as_matrix()
     place = np.array([950.0, 40.0, 400.0]) + rng.normal(0, 8.0, 3)
-    T_world_part = _pose(turned, place - turned @ middle)
+    T_world_part = _pose(turned, place - turned @ middle + [0.0, 60.0 * ball, 0.0])
     weights = field_map(scanner, rng)
     T_mount = _pose(
         Rotation.from_rotvec(rng.normal(0, 0.6, 3)).as_matrix(), np.array([40.0, -30.0, 110.0]) + rng.normal(0, 10, 3)
@@ -152,6 +164,8 @@ def _axes(kind: str, rng: np.random.Generator) -> list[TrueAxis]:
         _near(lean, 2),
         np.array([950.0, 40.0, 300.0]) + rng.normal(0, 10, 3),
     )
+    if kind == "arm":
+        return []
     if kind == "rail-arm":
         return [TrueAxis("E1", "linear", "robot", _near(lean, 1), np.zeros(3))]
     if kind == "tilt-turn":
@@ -186,12 +200,12 @@ def _readings(kind: str, axes: tuple[TrueAxis, ...], views: int, rng: np.random.
             # Some steps go back, as operators do: play shows.
             order = np.argsort(np.arange(views) + 1.6 * (rng.random(views) < 0.4))
             columns.append(turn[order] if kind != "table-arm" else rng.permutation(turn))
-    return np.column_stack(columns)
+    return np.column_stack(columns) if columns else np.zeros((views, 0))
 
 
 def _view_of(place: Array, kind: str, v: int, rng: np.random.Generator) -> Array:
     """(4, 4) T_world_scanner that looks at a place."""
-    azimuth = np.pi + rng.uniform(-0.7, 0.7) + (v * 2.4 if kind == "rail-arm" else 0.0)
+    azimuth = np.pi + rng.uniform(-0.7, 0.7) + (v * 2.4 if kind in ("rail-arm", "arm") else 0.0)
     height = rng.uniform(0.1, 0.9)
     away = np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
     z = -away

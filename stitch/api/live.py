@@ -1,7 +1,7 @@
 """A session that is measured while you watch: every view is judged as it comes."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import entry_points
@@ -32,8 +32,10 @@ from stitch.recorder import Recorder, SilentRecorder
 from stitch.screening.pose_tests import BlunderSearch, find_blunders, least_displacement
 from stitch.screening.view_model import UsualEffects, ViewModel, view_model
 from stitch.screening.view_screening import fit_screened_views
+from stitch.session.axis_poses import as_stated, axes_of, place_axes, require_placed
 from stitch.session.capture import Capture, build_capture, prepare_capture
 from stitch.session.measurement import measurement_of
+from stitch.session.reading.session_toml import read_axes
 from stitch.session.robot import Robot
 from stitch.session.session import Mount, Scanner, SessionData, View
 from stitch.system.threads import library_threads_off
@@ -197,7 +199,14 @@ class LiveSession:
             name=cell.name,
             check=False,
         )
-        return replace(one.views[0], approach=None)
+        view = replace(one.views[0], approach=None)
+        if not cell.axes:
+            return view
+        for axis in cell.axes:
+            if not set(axis.columns(cell.length_unit)) & set(view.covariates):
+                column = " or ".join(axis.columns(cell.length_unit))
+                raise InputError(f"view {name}: no reading of axis {axis.name}; to fix: pass covariates with {column}")
+        return place_axes(replace(cell, axes=(), views=(view,)), cell.axes).views[0]
 
     def take(self, view: View) -> LiveView:
         """Take in a view that was read before, as of a session folder, and say whether it belongs.
@@ -252,7 +261,8 @@ class LiveSession:
             hand_eye = self.hand_eye
             if self._fit is None or hand_eye is None:
                 return None
-            return _next_pose(self._fit, [self.session.views[i] for i in self._members], hand_eye)
+            views = [self.session.views[i] for i in self._members]
+            return _as_reported(_next_pose(self._fit, views, hand_eye), self.session)
 
     def finish(self, recorder: Recorder | None = None, **options: Any) -> Run:
         """Run the session: the same result as `stitch.run` on all its views.
@@ -426,6 +436,7 @@ def live(
     mount: Mount,
     robot: Robot | Mapping[str, Any] | Path | str | None = None,
     scanner: Scanner | Mapping[str, Any] | None = None,
+    axes: Sequence[Mapping[str, Any]] = (),
     unit: LengthUnit = "mm",
     cloud_unit: LengthUnit | None = None,
     name: str = "session",
@@ -436,6 +447,8 @@ def live(
     Args:
         mount, robot, scanner, unit, cloud_unit, name: as of `Session.from_arrays`; scanner.pose (4, 4), where it is
             stated, saves the search and one view of waiting.
+        axes: [[axis]] tables of session.toml as mappings, each with its place; `covariates` of a view hold the
+            readings. They stay where they are stated until `finish` fits them.
         recording: shows the views as they come: "view" opens Rerun's viewer, "rerun+http://HOST:PORT/proxy" sends them
             to one, the path of an .rrd file keeps them.
 
@@ -451,11 +464,21 @@ def live(
         (True, True)
     """
     session = Session.empty(mount=mount, robot=robot, scanner=scanner, unit=unit, cloud_unit=cloud_unit, name=name)
+    placed = as_stated(
+        session, read_axes(session.path / "session.toml", [dict(t) for t in axes], mount, has_poses=True)
+    )
+    require_placed(placed)
+    session = public_session(placed) if axes else session
     return LiveSession(session, None if recording is None else _recording(session, str(recording)), cloud_unit)
 
 
 def follow(session: SessionData) -> LiveSession:
-    """Begin a live session with what a session folder states of its cell; its views come by `LiveSession.take`."""
+    """Begin a live session with what a session folder states of its cell; its views come by `LiveSession.take`.
+
+    Raises:
+        InputError: an external axis that nobody has placed.
+    """
+    require_placed(session)
     return LiveSession(public_session(replace(session, views=())))
 
 
@@ -465,6 +488,15 @@ def _recording(session: Session, target: str) -> LiveRecording:
         raise InputError("recording: nothing here shows it; to fix: install rerun-sdk, or leave recording out")
     recording: LiveRecording = entry.load()(session, target)
     return recording
+
+
+def _as_reported(proposed: ProposedPose, session: SessionData) -> ProposedPose:
+    """Return the pose as the arm is sent there, its external axes as at the view from which it is turned."""
+    if not session.axes:
+        return proposed
+    like = next(view for view in session.views if view.name == proposed.like)
+    T = frames.inverse(axes_of(replace(session, views=(like,))).carried())[0]
+    return replace(proposed, T_base_flange=T @ proposed.T_base_flange, turn_deg=T[:3, :3] @ proposed.turn_deg)
 
 
 def _next_pose(live_fit: LiveFit, views: list[View], hand_eye: FittedHandEye) -> ProposedPose:

@@ -19,6 +19,7 @@ import numpy as np
 from stitch.effects.contract import find_effect, parameters_in, require_available
 from stitch.errors import InputError
 from stitch.fit.coarse import COARSE_GATE, REUSED, CoarseHandEye
+from stitch.fit.coarse_axes import locate_axes
 from stitch.fit.fit import FitStart, FittedRig, InitialModel
 from stitch.fit.pipelines import coarse_stage, pipeline_for
 from stitch.fit.sentences import view_notes
@@ -33,6 +34,7 @@ from stitch.screening.hand_eye_anywhere import hand_eye_sigma_anywhere
 from stitch.screening.hand_eye_transfer import hand_eye_transfer
 from stitch.screening.model_transfer import check_arm_transfer, check_model_transfer, find_disagreeing_sessions
 from stitch.screening.view_screening import ScreenedFit, ViewScreening, fit_screened_views, session_warnings
+from stitch.session.axis_poses import axis_tables
 from stitch.session.capture import Capture, part_size, prepare_capture
 from stitch.session.measurement import Measurement, measurement_of, with_part_origin
 from stitch.session.notes import session_notes
@@ -103,6 +105,8 @@ def run_rig(
         arm = convert_unit(arm, sessions[0].length_unit) if arm else None
         require_effects(measurements, [*effects, *(model.effects if model else ()), *(arm.effects if arm else ())])
         require_measured_once(sessions)
+        if sessions[0].axes:
+            sessions, measurements = locate_axes(sessions, measurements)
         hand_eyes = pipeline_for(sessions[0]).start(sessions, measurements, model)
         measurements = [with_part_origin(m, start.T_mount) for m, start in zip(measurements, hand_eyes, strict=True)]
         seconds = clock.lap()
@@ -159,6 +163,11 @@ def require_same_rig(sessions: Sequence[SessionData], model: ModelFile | None) -
             )
         if not session.has_clouds:
             _require_same_arm(first, session)
+        if session is not first and (session.has_poses, axis_tables(session)) != (first.has_poses, axis_tables(first)):
+            raise InputError(
+                f"{session.path}: its [[axis]] tables are not those of {first.path}; to fix: state the same axes, at "
+                "the same place, in all sessions of a rig"
+            )
         if len(session.views) < 2:
             raise InputError(f"{session.path}/views.csv: one view only; stitching needs at least 2")
 

@@ -26,11 +26,12 @@ from stitch.output.session_files import (
 )
 from stitch.output.urdf_file import to_urdf
 from stitch.screening.deep_check import refuse_whole
+from stitch.session.axis_poses import as_stated, axis_tables, reported_poses
 from stitch.session.reading import session_folder
 from stitch.session.reading.arrays import cloud_of, per_view, poses_of, seconds_of, sighting_of
 from stitch.session.reading.scale_checks import check_scale
 from stitch.session.reading.session_folder import checked_scan
-from stitch.session.reading.session_toml import read_repeatability, read_robot, read_scanner, require_table
+from stitch.session.reading.session_toml import read_axes, read_repeatability, read_robot, read_scanner, require_table
 from stitch.session.reading.text_files import require_folder_name, require_name, table_choice
 from stitch.session.reading.views_table import require_agreement, require_covariate_name
 from stitch.session.robot import Robot, forward
@@ -75,6 +76,7 @@ class Session(SessionData):
         covariates: Mapping[str, Any] | None = None,
         scanner: Scanner | Mapping[str, Any] | None = None,
         points: Sequence[Any] | None = None,
+        axes: Sequence[Mapping[str, Any]] = (),
         unit: LengthUnit = "mm",
         cloud_unit: LengthUnit | None = None,
         name: str = "session",
@@ -101,6 +103,8 @@ class Session(SessionData):
             covariates: by name (V,) numbers that errors may follow, such as scanner_temperature_c; NaN: not known.
             scanner: a `Scanner`, or the [scanner] table of session.toml as a mapping: pose (4, 4), noise, standoff.
             points: one mapping a view from a target's name to its place (3,), sensor frame, or None.
+            axes: the [[axis]] tables of session.toml as mappings; `covariates` hold the readings (table_deg, E1_mm).
+                Without poses and joints the axes alone move what is scanned.
             unit: "mm" or "m", of all lengths.
             cloud_unit: of the scans, where it is another.
             name: of the session, for messages and folders.
@@ -121,12 +125,15 @@ class Session(SessionData):
         cell = cls.empty(mount=mount, robot=robot, scanner=scanner, unit=unit, cloud_unit=cloud_unit, name=name)
         with _in_arguments(cell.path.name):
             names, scans = _views_of(clouds, poses, joints, points)
-            poses = _read_tables(cell, poses, scans, cloud_unit or unit)
-            T, q = _arm(cell, names, poses, joints)
+            has_poses = poses is not None or joints is not None or not axes
+            poses = _read_tables(cell, poses, scans, cloud_unit or unit) if has_poses else poses
+            T, q = _arm(cell, names, poses, joints) if has_poses else (np.tile(np.eye(4), (len(names), 1, 1)), None)
             views = _measured_views(cell, names, scans, points, cloud_unit or unit)
             session = replace(cell, views=_placed_views(views, T, q, times, covariates or {}))
+            session = _with_axes(replace(session, has_poses=has_poses), axes)
             check_scale(session, cloud_unit or unit)
-            if check:
+            # Conventions are tried of poses that axes do not change.
+            if check and not axes:
                 check_convention(session)
         return session
 
@@ -283,6 +290,20 @@ def _arm(cell: Session, names: list[str], poses: Any, joints: Any) -> tuple[Arra
         for name, reported, computed in zip(names, T, from_joints, strict=True):
             require_agreement(f"view {name}", reported, computed, METRES[cell.length_unit])
     return T, q
+
+
+def _with_axes(session: Session, tables: Sequence[Mapping[str, Any]]) -> Session:
+    """Return the session with external axes by their [[axis]] tables; readings are covariates."""
+    axes = read_axes(session.path / "session.toml", [dict(t) for t in tables], session.mount, session.has_poses)
+    for axis in axes:
+        columns = axis.columns(session.length_unit)
+        for view in session.views:
+            if len(set(columns) & set(view.covariates)) != 1:
+                raise InputError(
+                    f"view {view.name}: no reading of axis {axis.name}; to fix: pass covariates with "
+                    f"{' or '.join(columns)}, one number a view"
+                )
+    return public_session(as_stated(session, axes)) if axes else session
 
 
 def _measured_views(cell: Session, names: list[str], scans: list[Any], points: Any, cloud_unit: str) -> list[View]:
@@ -442,7 +463,8 @@ def _view_columns(session: SessionData, files: list[str] | None) -> dict[str, li
     joints = range(next((len(view.joints) for view in views if view.joints is not None), 0))
     for i in joints:
         columns[f"j{i + 1}_deg"] = [_cell(None if v.joints is None else float(np.degrees(v.joints[i]))) for v in views]
-    columns |= {name: _digits(x) for name, x in pose_columns(np.array([v.T_base_flange for v in views])).items()}
+    if session.has_poses:
+        columns |= {name: _digits(x) for name, x in pose_columns(reported_poses(session)).items()}
     for i in joints:
         columns[f"j{i + 1}_approach"] = ["" if v.approach is None else f"{v.approach[i]:.0f}" for v in views]
     for name in dict.fromkeys(name for view in views for name in view.covariates):
@@ -476,15 +498,15 @@ def _columns(names: Sequence[str], rows: list[list[str]]) -> dict[str, list[str]
     return {name: column for name, column in columns.items() if any(column)}
 
 
-def _tables(session: SessionData) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+def _tables(session: SessionData) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the tables of session.toml beside its head, and texts that lie beside it."""
     stated = session.scanner
     scanner: dict[str, Any] = {"optical_axis": "-z" if stated.optical_axis[2] < 0 else "+z"}
-    if stated.T_mount is not None:
+    if stated.T_mount is not None and session.has_poses:
         scanner["pose"] = stated.T_mount.tolist()
     known = {"noise": stated.noise, "standoff": stated.standoff, "kind": stated.kind}
     scanner |= {key: value for key, value in known.items() if value is not None}
-    tables: dict[str, dict[str, Any]] = {"scanner": scanner}
+    tables: dict[str, Any] = {"scanner": scanner}
     texts: dict[str, str] = {}
     if session.robot is not None:
         table = robot_toml(session.robot)
@@ -496,6 +518,8 @@ def _tables(session: SessionData) -> tuple[dict[str, dict[str, Any]], dict[str, 
             tables |= tomllib.loads(table)
     if repeatability := repeatability_table(session.repeatability):
         tables.setdefault("robot", {})["repeatability"] = repeatability
+    if session.axes:
+        tables["axis"] = axis_tables(session)
     if session.sphere_radius is not None:
         tables["sphere"] = {"radius": session.sphere_radius}
     if session.cad is not None:

@@ -207,7 +207,7 @@ def remarks(result: RunData) -> list[str]:
             clear = max(term.sigmas_from_zero for term in result.terms if term.name in grown)
             rose = after.heldout_rms > HELDOUT_RISE * before.heldout_rms
             lines.append(_unseen_in_residuals(", ".join(grown), clear, "rose" if rose else "did not fall"))
-    for term in result.terms:
+    for term in (term for term in result.terms if not term.is_geometry):
         wild = [p.name for p in term.parameters if not p.grid and abs(p.value) > p.limit]
         if wild:
             lines.append(f"{term.name}: {', '.join(wild)} is larger than anybody would believe.")

@@ -74,7 +74,10 @@ def candidate_measurement(measurement: Measurement, joints: Array, wait: Array |
     pause = float(np.median(np.diff(views.time))) if views.has("time") and views.count > 1 else 0.0
     # They would be taken at rest.
     velocity = None if views.velocity is None else np.zeros_like(joints)
+    # External axes stay where they were last.
+    axes = views.axes.standing(count) if views.axes else views.axes
     T_base_flange = forward(measurement.robot, joints)
+    T_base_flange = axes.carried() @ T_base_flange if axes else T_base_flange
     candidate = replace(
         views,
         count=count,
@@ -87,6 +90,8 @@ def candidate_measurement(measurement: Measurement, joints: Array, wait: Array |
         covariates={name: np.full(count, values[-1]) for name, values in views.covariates.items()},
         number=np.full(count, views.number[-1] + 1),
         T_base_flange=T_base_flange,
+        axes=axes,
+        gravity=views.gravity if views.gravity.ndim == 1 else np.repeat(views.gravity[-1:], count, axis=0),
     )
     return replace(measurement, views=candidate, T_base_flange=T_base_flange, scan_views=())
 
@@ -110,6 +115,8 @@ def with_candidates(measurement: Measurement, further: Measurement) -> Measureme
         time=joined("time"),
         number=np.concatenate([views.number, more.number]),
         T_base_flange=joined("T_base_flange"),
+        axes=views.axes.with_more(more.axes) if views.axes else views.axes,
+        gravity=views.gravity if views.gravity.ndim == 1 else joined("gravity"),
     )
     T_base_flange = every.T_base_flange
     capture = build_capture("candidates", (), T_base_flange, measurement.mount)

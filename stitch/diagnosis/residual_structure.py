@@ -73,7 +73,7 @@ def variance_budget(
         field = linear.reduce(field_scatter(linear.measurement, surfaces.unconstrained, share=None))
         linear = replace(linear, mixed=replace(linear.mixed, fixed=(field @ field.T)[None]))
     hand_eye = linear.reduce(linear.design[:, :6])
-    terms = linear.model.terms
+    terms = [term for term in linear.model.terms if not term.is_geometry]
     explained = {
         term.name: linear.reduce(response.columns) @ term.values
         for term, response in zip(terms, linear.responses(terms), strict=True)

@@ -333,6 +333,12 @@ def feature_motions(capture: Capture) -> tuple[Array, Array]:
 
     A·X = X·B, with B the motion that maps view w's scanner frame into view v's, A that of the mount.
     """
+    pairs = neighbouring_views(len(capture.scans))
+    return motions_between(capture.T_reference_mount, pairs), register_pairs(capture, pairs)
+
+
+def register_pairs(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Array:
+    """Return (M, 4, 4) motions of the scanner by feature matching, from the second view's frame into the first's."""
     size = _FEATURE_SPACINGS * capture.spacing
 
     def described(scan: Scan) -> FeaturedSurface:
@@ -348,9 +354,7 @@ def feature_motions(capture: Capture) -> tuple[Array, Array]:
         T = feature_matching.register_ransac(source, target, reach=1.5 * size, draws=_DRAWS)
         return feature_matching.align_icp(source, target, T, reach=size)
 
-    pairs = neighbouring_views(len(capture.scans))
-    scanner = np.array(list(parallel(motion, pairs, "pairs of scans"))).reshape(-1, 4, 4)
-    return motions_between(capture.T_reference_mount, pairs), scanner
+    return np.array(list(parallel(motion, pairs, "pairs of scans"))).reshape(-1, 4, 4)
 
 
 def neighbouring_views(views: int) -> list[tuple[int, int]]:

@@ -119,7 +119,7 @@ def _why(diagnosis: Diagnosis, trends: dict[str, EffectTrend]) -> EffectTrend | 
     if diagnosis.verdict in _NAMING:
         return trends.get(diagnosis.effects[0])
     if diagnosis.verdict == "adequate":
-        return trend_in_model(linear, linear.model.terms[-1]) if linear.model.terms else None
+        return trend_in_model(linear, linear.model.terms[-1]) if linear.model.effects else None
     if diagnosis.curves:
         return trend_of_curve(linear, diagnosis.curves[0])
     return trend_of_dependence(linear, diagnosis.depends_on[0]) if diagnosis.depends_on else None
@@ -198,7 +198,7 @@ def _formula(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict in _NAMING:
         named = diagnosis.named[0]
         return f"{named.score.candidate.effect.formula}; {fitted_amounts(named)}"
-    if diagnosis.verdict != "adequate" or not diagnosis.linear.model.terms:
+    if diagnosis.verdict != "adequate" or not diagnosis.linear.model.effects:
         return ""
     term = diagnosis.linear.model.terms[-1]
     amounts = [f"{p.name} = {p.formatted}" for p in term.parameters if p.fitted or p.grid]

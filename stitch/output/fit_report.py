@@ -53,7 +53,7 @@ def run_hand_eye_lines(run: RunData) -> list[str]:
         run.session.mount,
         run.session.length_unit,
         unknown=run.unknown,
-        stated=run.session.scanner.T_mount is not None,
+        stated=run.session.scanner.T_mount is not None and run.session.has_poses,
     )
     sigma = run.fit.sigma_anywhere
     if sigma is not None and not run.unknown:
@@ -61,6 +61,9 @@ def run_hand_eye_lines(run: RunData) -> list[str]:
         place = length_text(shift, run.session.length_unit, 2)
         usual = "with usual sizes of effects that these views cannot show"
         lines.append(f"  U anywhere the arm reaches {place} and {angle_text(turn, 2)}, {usual}")
+    if not run.session.has_poses:
+        axis = run.session.reference_frame
+        lines[0] = lines[0].replace("T_base", f"T_{axis}").replace("frame of the base", f"frame of axis {axis}")
     return lines
 
 

@@ -395,7 +395,7 @@ RESULT = Document(
     Key("hand_eye_alone", _ALONE.kind(), write=_hand_eye_alone, when=_hand_eye_alone),
     Key("unobservable", TEXTS, of=Fit),
     Key("hand_eye_unknown", TEXTS, "unknown", of=Fit, optional=True),
-    Key("hand_eye_stated", write=lambda run: run.session.scanner.T_mount is not None),
+    Key("hand_eye_stated", write=lambda run: run.session.scanner.T_mount is not None and run.session.has_poses),
     Key("stages", _STAGE.rows(StageResult), of=Fit),
     Key("residual_rms", NUMBER, of=RunData),
     Key("heldout_rms", NUMBER_OR_NULL, of=RunData),

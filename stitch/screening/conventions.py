@@ -70,8 +70,9 @@ def rank_hypotheses(session: SessionData, motions: RelativeScans, rows: Indices 
     fits = [as_stated]
     if as_stated.closed < _ALL:
         tried = hypotheses(session, every, _accused_views(as_stated, motions, length))
-        tried += _with_stuck_columns_restored(as_stated, motions, length)
-        tried += _on_linear_axis(session, every, as_stated, motions)
+        if not session.axes:
+            tried += _with_stuck_columns_restored(as_stated, motions, length)
+            tried += _on_linear_axis(session, every, as_stated, motions)
         tried += _between_rows(stated, motions, length)
         tried += _by_table_part(tried, motions, [session.names[v] for v in every])
         fits += fit_hypotheses(tried, motions, session.length_unit)[1:]

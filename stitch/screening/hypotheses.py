@@ -284,6 +284,9 @@ def hypotheses(
     if exchangeable is None:
         exchangeable = range(len(every)) if len(every) <= MOST_EXCHANGED else ()
     of_rows = _row_mistakes(session, stated, every, exchangeable)
+    if session.axes:
+        # Axes move what poses and joints say: only whole rows are tried.
+        return [stated, *of_rows]
     return [stated, *_joint_mistakes(session, stated, every), *_pose_mistakes(stated), *of_rows]
 
 

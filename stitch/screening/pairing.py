@@ -175,7 +175,7 @@ def find_wrong_joint(
     """Find the joint that alone explains a displacement: name, degrees stated and that fit, whether a neighbour's."""
     robot = session.robot
     joints = session.views[m.view].joints
-    if robot is None or joints is None or m.T is None:
+    if robot is None or joints is None or m.T is None or session.axes:
         return None
     points = capture.scans[m.view].points[::_EVERY]
     there = frames.transform(m.T, points)

@@ -109,6 +109,10 @@ class Axes:
         """True if it is known of all axes from where to start."""
         return all(axis.is_placed for axis in self.axes)
 
+    def stands_right(self, axis: Axis) -> bool:
+        """Return whether an axis is a factor of A_right."""
+        return axis.carries == ("robot" if self.has_robot else "part")
+
     def as_read(self) -> AxisMotion:
         """Return the motion without errors."""
         V, K = self.readings.shape
@@ -125,7 +129,7 @@ class Axes:
                 continue
             F = axis.frame @ frames.exp(motion.placement[k])
             moved = F @ frames.exp(motion.error[:, k]) @ frames.exp(self._screw(motion, k)) @ frames.inverse(F)
-            if axis.carries == ("robot" if self.has_robot else "part"):
+            if self.stands_right(axis):
                 right = right @ moved
             else:
                 left = left @ moved
@@ -150,6 +154,16 @@ class Axes:
     def only(self, keep: Sequence[int]) -> "Axes":
         """Return the axes in some of the views."""
         return replace(self, readings=self.readings[list(keep)], approach=self.approach[list(keep)])
+
+    def standing(self, count: int) -> "Axes":
+        """Return the axes in so many views in which they stand as in the last one."""
+        approach = np.zeros((count, len(self.axes)))
+        return replace(self, readings=np.repeat(self.readings[-1:], count, axis=0), approach=approach)
+
+    def with_more(self, more: "Axes") -> "Axes":
+        """Return the axes in these views and then in others."""
+        readings = np.concatenate([self.readings, more.readings])
+        return replace(self, readings=readings, approach=np.concatenate([self.approach, more.approach]))
 
     def placed(self, motion: AxisMotion) -> tuple[Axis, ...]:
         """Return the axes where a placement puts them."""

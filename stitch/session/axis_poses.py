@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +18,11 @@ def axes_of(session: SessionData) -> Axes:
     if not session.axes:
         return Axes()
     readings = np.array([axis_readings(session.axes, v.covariates, session.length_unit) for v in session.views])
+    readings = readings.reshape(len(session.views), len(session.axes))
     moved = np.sign(np.diff(readings, axis=0, prepend=readings[:1]))
     stated = zip(session.views, moved, strict=True)
     approach = np.array([m if v.axis_approach is None else v.axis_approach for v, m in stated])
+    approach = np.reshape(approach, readings.shape)
     return Axes(session.axes, readings, approach, session.has_poses, session.length_unit)
 
 
@@ -31,6 +34,8 @@ def axis_readings(axes: Sequence[Axis], covariates: Mapping[str, float], length_
 
 def place_axes(session: SessionData, axes: Sequence[Axis]) -> SessionData:
     """Return the session with axes of the same names at another place, and the effective poses that follow."""
+    if not session.views:
+        return replace(session, axes=tuple(axes))
     reported = reported_poses(session)
     session = replace(session, axes=tuple(axes))
     poses = axes_of(session).carried() @ reported
@@ -76,3 +81,42 @@ def as_stated(session: SessionData, axes: Sequence[Axis]) -> SessionData:
             axis = replace(axis, direction=T_own_scanner[:3, :3] @ axis.direction, point=point)
         placed.append(axis)
     return place_axes(session, placed)
+
+
+def carried_last(session: SessionData) -> Array:
+    """Return (1, 4, 4) by which poses of the arm become effective ones where the axes stand as in the last view."""
+    return axes_of(session).standing(1).carried() if session.axes else np.eye(4)[None]
+
+
+def axis_tables(session: SessionData) -> list[dict[str, Any]]:
+    """Return the [[axis]] tables of a session, as `as_stated` reads them."""
+    tables = []
+    to_scanner = None
+    if not session.has_poses and session.scanner.T_mount is not None:
+        to_scanner = frames.inverse(session.scanner.T_mount)
+    for axis in session.axes:
+        table: dict[str, Any] = {"name": axis.name, "kind": axis.kind, "carries": axis.carries}
+        direction, point = axis.direction, axis.point
+        if to_scanner is not None and direction is not None:
+            direction = to_scanner[:3, :3] @ direction
+            point = None if point is None else frames.transform(to_scanner, point[None])[0]
+        if direction is not None and (session.has_poses or to_scanner is not None):
+            table["direction"] = direction.tolist()
+            table |= {} if point is None else {"point": point.tolist()}
+            table |= {"stated": True} if axis.is_fixed else {}
+        tables.append(table)
+    return tables
+
+
+def require_placed(session: SessionData) -> None:
+    """Refuse a session with an axis that nobody has placed, where it is not fitted.
+
+    Raises:
+        InputError: names the axis.
+    """
+    for axis in session.axes:
+        if not axis.is_placed:
+            raise InputError(
+                f"{session.path}: nobody says where axis {axis.name} stands; to fix: `stitch run` finds it; state what "
+                "result.json has under axes in [[axis]]"
+            )

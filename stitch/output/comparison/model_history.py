@@ -115,7 +115,9 @@ def _model_of(step: LedgerStep, measurement: Measurement) -> Model | None:
     if any(name not in EFFECTS or name not in step.values for name in step.effects):
         return None
     terms = []
-    for name in step.effects:
+    # Where axes stand is in every model.
+    placed = [name for name in step.values if name in EFFECTS and EFFECTS[name].tier == "geometry"]
+    for name in (*placed, *step.effects):
         parameters = parameters_in(measurement, EFFECTS[name])
         values = [step.values[name].get(p.name, 0.0) for p in parameters]
         terms.append(Term(EFFECTS[name], parameters).at(np.array(values)))

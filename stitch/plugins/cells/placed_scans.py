@@ -19,6 +19,7 @@ from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.units import METRES
 from stitch.plugins.cells.job_files import POSE_COLUMNS, JobTable, poses_from_columns, read_columns
+from stitch.session.axis_poses import require_placed
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.session_folder import load_session
 from stitch.session.scan import Scan, prepare_scan
@@ -129,6 +130,7 @@ def read_placed_session(folder: Path, hand_eye: Path) -> PlacedScans:
         InputError: session or hand-eye is missing or malformed, or they do not belong together.
     """
     session = load_session(folder, at_most=None)
+    require_placed(session)
     if session.mount != "eye_in_hand":
         raise InputError(
             f"{folder / 'session.toml'}: mount is {session.mount!r}; to fix: take scans with the scanner on the flange"

@@ -10,6 +10,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from stitch.effects.axis_effects import PLACEMENT
 from stitch.errors import InputError
 from stitch.model.model import COVERAGE_FACTOR, numbers_covariance, uncertainty_scope
 from stitch.model.model_toml import ModelFile, read_model
@@ -19,6 +20,7 @@ from stitch.numerics.units import METRES, length_text
 from stitch.output.stored_run import read_diagnosis, read_result
 from stitch.output.urdf_file import roll_pitch_yaw, xml_comment
 from stitch.plugins.intake.controllers.taught_points import NUMBERS, fixed_xyz_numbers, quaternion_w_first_numbers
+from stitch.session.axes import Axis
 from stitch.system.packages import stitch_version
 
 _PARENTS = {"eye_to_hand": "base_link", "eye_in_hand": "flange"}
@@ -42,6 +44,7 @@ class ExportedHandEye:
     child: str  # the scanner's own frame
     notes: tuple[str, ...]  # plain sentences: what was not observable, what the numbers do not hold
     of_effects: str = ""  # the one of them that says what of the effects the numbers hold
+    axes: tuple[tuple[str, Array], ...] = ()  # name and T_base_axis (4, 4), m, z along the axis
 
     @property
     def name(self) -> str:
@@ -114,6 +117,11 @@ def hand_eye_from(
     """
     unknown = result.get("hand_eye_unknown", [])
     session = str(result.get("name") or Path(result["session"]).name)
+    if result.get("reference_frame") not in (None, "base", "flange"):
+        raise InputError(
+            f"{session}: without a robot there is no hand-eye; to fix: take the axes from result.json, their place in "
+            "the scanner's frame"
+        )
     if unknown and not result.get("hand_eye_stated"):
         raise InputError(
             f"{session}: these views do not show {', '.join(unknown)} of the hand-eye; to fix: add views turned about "
@@ -138,14 +146,17 @@ def hand_eye_from(
     notes += [f"Not observable from these motions, left at the coarse value: {axis}" for axis in result["unobservable"]]
     notes += [f"As stated in session.toml, not measured: {', '.join(unknown)}"] if unknown else []
     of_effects = ""
+    effects = [name for name in model.effects if name != PLACEMENT]
     if alone:
         off, spread = (length_text(alone[key], model.length_unit, 2) for key in ("displacement", "spread"))
         of_effects = (
-            f"At the mean of {', '.join(model.effects)} over these views: without these effects the model's hand-eye "
+            f"At the mean of {', '.join(effects)} over these views: without these effects the model's hand-eye "
             f"is off by {off} at the part. Single views differ by {spread} (rms), which U holds"
         )
-    elif model.effects:
-        of_effects = f"Not in these numbers, as they are one rigid motion: {', '.join(model.effects)}"
+    elif effects:
+        of_effects = f"Not in these numbers, as they are one rigid motion: {', '.join(effects)}"
+    axes = result.get("axes", ())
+    notes += [_axis_note(axis, model.length_unit) for axis in axes]
     return ExportedHandEye(
         session=session,
         T_mount=T,
@@ -156,7 +167,21 @@ def hand_eye_from(
         child=_require_plain_name("--child", child),
         notes=(*notes, of_effects) if of_effects else tuple(notes),
         of_effects=of_effects,
+        axes=tuple((axis["name"], _axis_frame(axis, METRES[model.length_unit])) for axis in axes),
     )
+
+
+def _axis_note(axis: dict[str, Any], length_unit: str) -> str:
+    """Return where an external axis stands, in the base, as comments say it."""
+    direction = ", ".join(f"{x:.6f}" for x in axis["direction"])
+    to_mm = METRES[length_unit] * 1e3
+    point = "" if "point" not in axis else f" through ({', '.join(f'{to_mm * x:.3f}' for x in axis['point'])}) mm"
+    return f"Axis {axis['name']}, in the base: {axis['kind']}, along ({direction}){point}"
+
+
+def _axis_frame(axis: dict[str, Any], metres: float) -> Array:
+    point = None if "point" not in axis else metres * np.array(axis["point"])
+    return Axis(axis["name"], axis["kind"], "part", np.array(axis["direction"]), point).frame
 
 
 def _require_plain_name(flag: str, name: str) -> str:
@@ -174,6 +199,7 @@ class ControllerFrame:
     comment: str  # begins a line of comment
     template: str  # {name} and the numbers by position
     place: dict[str, str]  # mount → where it is entered
+    axis: str = "a feature of the installation"  # where the frame of an external axis is entered
 
 
 _CONTROLLERS = {
@@ -183,6 +209,7 @@ _CONTROLLERS = {
         "; ",
         "DECL FRAME {name}={{X {0},Y {1},Z {2},A {3},B {4},C {5}}}",
         {"eye_in_hand": "TOOL_DATA", "eye_to_hand": "BASE_DATA"},
+        "root point of the external kinematic, E1 …",
     ),
     "fanuc": ControllerFrame(
         tuple("XYZWPR"),
@@ -190,6 +217,7 @@ _CONTROLLERS = {
         "! ",
         "{name}:\nX = {0} mm, Y = {1} mm, Z = {2} mm,\nW = {3} deg, P = {4} deg, R = {5} deg",
         {"eye_in_hand": "UTOOL", "eye_to_hand": "UFRAME"},
+        "extended axis, or frame of the positioner's group",
     ),
     "abb": ControllerFrame(
         ("x", "y", "z", "q1", "q2", "q3", "q4"),
@@ -197,6 +225,7 @@ _CONTROLLERS = {
         "! ",
         "PERS pose {name}:=[[{0},{1},{2}],[{3},{4},{5},{6}]];",
         {"eye_in_hand": "tframe of a tooldata", "eye_to_hand": "uframe of a wobjdata"},
+        "base frame of the mechanical unit",
     ),
     "ur": ControllerFrame(
         ("x", "y", "z", "rx", "ry", "rz"),
@@ -214,6 +243,9 @@ def controller_frame(eye: ExportedHandEye, controller: str) -> str:
     head = eye.head(lambda T: _frame_numbers(T, controller, near), form.labels, form.units)
     lines = [*head, f"Entered as {form.place[eye.mount]}, in the controller's own base and flange"]
     text = form.template.format(*(f"{x + 0.0:.9f}" for x in near), name=eye.name)
+    for name, T in eye.axes:
+        text += f"\n{commented(form.comment, [f'Axis {name}, z along it: {form.axis}'])}"
+        text += form.template.format(*(f"{x + 0.0:.9f}" for x in _frame_numbers(T, controller)), name=f"T_base_{name}")
     return f"{commented(form.comment, lines)}{text}\n"
 
 

@@ -70,6 +70,7 @@ class Reading:
     layout: ColumnLayout
     rank: int  # of the usual, 0 first
     variant: str = ""  # what else was done to the numbers: an axis added, a joint uncoupled
+    axis: tuple[str, int, float] | None = None  # column added to x, y or z (0, 1, 2), and with which sign
 
     @property
     def stated(self) -> dict[str, str]:
@@ -246,7 +247,7 @@ def _on_a_linear_axis(found: Sequence[Reading]) -> Iterator[Reading]:
                 T = np.array(reading.T)
                 T[:, axis, 3] += sign * values
                 words = f"{name} added {'to' if sign > 0 else 'with the other sign to'} {'xyz'[axis]} as a linear axis"
-                yield replace(reading, T=T, variant=words)
+                yield replace(reading, T=T, variant=words, axis=(name, axis, sign))
 
 
 def _uncoupled(layout: ColumnLayout, urdf: Path, angle_unit: str | None) -> Iterator[Reading]:

@@ -105,6 +105,7 @@ def toml_text(folder: Path, first: FirstSession) -> str:
         lines += ["", "# stated with --within: what lies beyond stands still before the scanner", f"within = {corners}"]
     if first.sphere_mm is not None:
         lines += ["", "[sphere]", f"radius = {first.sphere_mm * MM / METRES[unit]:.9g}"]
+    lines += axis_lines(first)
     if robot := robot_lines(folder, first.files.urdf, first.choice.best.interpretation.reading):
         lines += ["", *robot]
     return "\n".join(lines) + "\n"
@@ -147,12 +148,50 @@ def views_text(folder: Path, first: FirstSession) -> str:
     }
     reading = first.choice.best.interpretation.reading
     columns |= joint_columns(reading, rows)
-    if reading.rotation != JOINT_ANGLES:
+    if reading.rotation != JOINT_ANGLES and not reading.layout.turntable:
         columns |= {
             name: [f"{x:.9g}" for x in values] for name, values in pose_columns(_flange_poses(first, rows)).items()
         }
-    columns |= covariate_columns(reading.layout, rows, first.raw.time_s)
-    return table_text(columns)
+    axis = _axis_column(first, rows)
+    beside = covariate_columns(reading.layout, rows, first.raw.time_s)
+    return table_text(columns | axis | {k: v for k, v in beside.items() if v not in axis.values()})
+
+
+def axis_lines(first: FirstSession) -> list[str]:
+    """Return the table [[axis]] of session.toml, in lines: a turntable whose place the scans show, or a rail."""
+    reading = first.choice.best.interpretation.reading
+    if reading.layout.turntable:
+        return ["", "[[axis]]", 'name = "turntable"', 'kind = "rotary"', 'carries = "part"']
+    if reading.axis is None:
+        return []
+    column, along, sign = reading.axis
+    direction = [0.0, 0.0, 0.0]
+    direction[along] = sign
+    lines = ["", "[[axis]]", f'name = "{_axis_name(column)}"', 'kind = "linear"', 'carries = "robot"']
+    return [*lines, f"direction = {direction}"]
+
+
+def _axis_name(column: str) -> str:
+    """A name for session.toml from that of a column: E1, rail of rail_mm."""
+    letters = re.sub(r"[^A-Za-z0-9]+", "_", re.sub(r"[_ (\[]*(mm|m)[)\]]*$", "", column)).strip("_")
+    return letters if letters[:1].isalpha() else "axis"
+
+
+def _axis_column(first: FirstSession, rows: list[int]) -> dict[str, list[str]]:
+    """The readings of an external axis as session.toml asks for them; none without one."""
+    way = first.choice.best.interpretation
+    reading = way.reading
+    if reading.layout.turntable:
+        T = reading.T[rows]
+        return {"turntable_deg": [f"{x % 360:.9g}" for x in np.degrees(np.arctan2(T[:, 1, 0], T[:, 0, 0]))]}
+    if reading.axis is None:
+        return {}
+    values = np.asarray(reading.layout.rest[reading.axis[0]])[rows] * _scale_of_poses(first)
+    return {f"{_axis_name(reading.axis[0])}_{length_unit(first)}": [f"{x:.9g}" for x in values]}
+
+
+def _scale_of_poses(first: FirstSession) -> float:
+    return POSE_UNITS[first.choice.best.interpretation.length_unit] / METRES[length_unit(first)]
 
 
 def _clouds_in_order(first: FirstSession) -> tuple[int, ...]:
@@ -165,7 +204,12 @@ def _flange_poses(first: FirstSession, rows: list[int]) -> Array:
     """T_base_flange (V, 4, 4) in the session's length_unit."""
     way = first.choice.best.interpretation
     T = way.reading.T[rows]
-    scale = POSE_UNITS[way.length_unit] / METRES[length_unit(first)]
+    if way.reading.axis is not None:
+        # The axis stands beside the poses, as the controller reports them.
+        column, along, sign = way.reading.axis
+        T = T.copy()
+        T[:, along, 3] -= sign * np.asarray(way.reading.layout.rest[column])[rows]
+    scale = _scale_of_poses(first)
     return first.mounting.flange(frames.make(T[:, :3, :3], T[:, :3, 3] * scale))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from stitch.errors import InputError
 from stitch.numerics.frames import Array
 from stitch.numerics.units import CLOUD_METRES, METRES
-from stitch.session.axis_poses import as_stated
+from stitch.session.axis_poses import as_stated, require_placed
 from stitch.session.moving_scanner import stand_still
 from stitch.session.reading.clouds import read_cloud
 from stitch.session.reading.csv_files import read_csv_lines
@@ -119,6 +119,8 @@ def load_session(
     )
     if axes:
         session = as_stated(replace(session, has_poses=has_poses), axes)
+        if scanner.moving:
+            require_placed(session)
     if scans:
         check_scale(session, cloud_unit)
     # One view alone says nothing of how the robot moved.

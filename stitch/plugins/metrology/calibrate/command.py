@@ -42,12 +42,14 @@ def sphere(
     """
     from stitch.output.json_file import write_json
     from stitch.plugins.metrology.calibrate.sphere import calibrate_sphere, sphere_document
+    from stitch.session.axis_poses import require_placed
     from stitch.session.reading.session_folder import load_session
 
     if output is not None and output.exists() and output.suffix != ".json":
         raise InputError(f"{output}: exists and is no JSON file; to fix: name another, or remove it")
     with show_activity("calibrating by a sphere"):
         loaded = load_session(session, at_most=None)
+        require_placed(loaded)
         document = sphere_document(calibrate_sphere(loaded, radius_free), loaded)
     if output is not None:
         write_json(document, output)
@@ -79,9 +81,11 @@ def tracker(session: _SESSION, as_json: Json = False) -> None:
     import numpy as np
 
     from stitch.plugins.metrology.calibrate.tracker import calibrate_tracker, tracker_document
+    from stitch.session.axis_poses import require_placed
     from stitch.session.reading.session_folder import load_session
 
     loaded = load_session(session)
+    require_placed(loaded)
     document = tracker_document(calibrate_tracker(loaded), loaded)
     if as_json:
         emit(json.dumps(document, indent=1))

@@ -30,6 +30,7 @@ from stitch.output.result_document import result_document
 from stitch.output.session_files import dh_rows, robot_toml
 from stitch.output.urdf_file import to_urdf
 from stitch.run_data import RunData
+from stitch.session.axis_poses import reported_poses
 from stitch.session.reading.robot_description import robot_from_dh, robot_from_urdf
 from stitch.session.reading.views_table import has_reported_poses
 from stitch.session.robot import Robot, elementary, forward
@@ -342,7 +343,8 @@ def robot_notes(table: LinkTable, run: RunData) -> list[str]:
         notes.append(f"Proved for {', '.join(each)}; beyond, nothing was measured.")
     notes.append(beyond_sentence(run.terms, table.effects))
     if table.effects and session.robot is not None and has_reported_poses(session.path / "views.csv"):
-        poses = [(view.T_base_flange, view.joints) for view in session.views if view.joints is not None]
+        views = zip(reported_poses(session), session.views, strict=True)
+        poses = [(T, view.joints) for T, view in views if view.joints is not None]
         off = max(float(np.linalg.norm((T - forward(session.robot, q))[:3, 3])) for T, q in poses)
         notes.append(
             "Take x … qw out of views.csv too: they are the nominal arm's (within "

@@ -175,6 +175,7 @@ def _cell_of_session(
     import numpy as np
 
     from stitch.plugins.metrology.planning.expected_model import cell_of_session
+    from stitch.session.axis_poses import require_placed
     from stitch.session.reading.session_folder import load_session
 
     joints = None
@@ -186,6 +187,7 @@ def _cell_of_session(
             "where the scanner sees the part"
         )
     session = load_session(folder, scans=False, start=joints)
+    require_placed(session)
     return session, cell_of_session(session, part, size, field)
 
 

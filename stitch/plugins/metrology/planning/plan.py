@@ -29,6 +29,7 @@ from stitch.plugins.metrology.planning.expected_model import (
 )
 from stitch.plugins.metrology.planning.information import TwistChannel, noise_of
 from stitch.plugins.metrology.planning.planned_views import candidate_joints, with_views
+from stitch.session.axis_poses import reported_poses
 from stitch.session.session import SessionData
 from stitch.system.threads import library_threads_off
 from stitch.system.values import Table
@@ -426,6 +427,7 @@ def _proposed_views(
         U_after: of the hand-eye with all of them, of their whole scans; the search has thinner ones. None: of a place.
     """
     present, out = len(further.views) - len(chosen), list[ProposedView]()
+    reported = reported_poses(further)
     for k, view in enumerate(further.views[present:]):
         before = further.views[present + k - 1].joints
         assert view.joints is not None and before is not None
@@ -438,6 +440,7 @@ def _proposed_views(
             else:
                 apart = float(goal.progress(normal))
         travel = float(np.abs(view.joints - before).max())
-        out.append(ProposedView(view.name, view.joints, view.T_base_flange, travel=travel, U=U, separated_share=apart))
+        T = reported[present + k]
+        out.append(ProposedView(view.name, view.joints, T, travel=travel, U=U, separated_share=apart))
     scale = 1.0 if U_after is None else U_after / out[-1].U
     return tuple(replace(view, U=scale * view.U) for view in out)

@@ -8,6 +8,7 @@ import numpy as np
 from stitch.diagnosis.candidate_views import reachable
 from stitch.numerics.frames import Array
 from stitch.plugins.metrology.planning.expected_model import FEWEST, CellModel, expected_scans
+from stitch.session.axis_poses import carried_last
 from stitch.session.capture import build_capture
 from stitch.session.robot import forward
 from stitch.session.session import SessionData, View
@@ -26,6 +27,8 @@ def with_views(session: SessionData, joints: Sequence[Array], in_turn: bool = Tr
     """
     assert session.robot is not None
     last, views = session.views[-1], list(session.views)
+    # External axes stay where they were last.
+    carried = carried_last(session)
     times = [view.time_s for view in views if view.time_s is not None]
     pause = float(np.median(np.diff(times))) if len(times) > 1 else 60.0
     for k, q in enumerate(joints):
@@ -37,7 +40,7 @@ def with_views(session: SessionData, joints: Sequence[Array], in_turn: bool = Tr
             View(
                 name=f"p{k + 1:02d}",
                 cloud=None,
-                T_base_flange=forward(session.robot, q),
+                T_base_flange=carried[0] @ forward(session.robot, q),
                 joints=q,
                 approach=np.sign(q - before.joints),
                 time_s=None if last.time_s is None else last.time_s + later,
@@ -56,7 +59,8 @@ def candidate_joints(session: SessionData, cell: CellModel, count: int, chosen: 
 
     def poses_of(joints: Array) -> Array:
         assert session.robot is not None
-        return build_capture(session.name, (), forward(session.robot, joints), session.mount).poses(T_mount)
+        T = carried_last(session) @ forward(session.robot, joints)
+        return build_capture(session.name, (), T, session.mount).poses(T_mount)
 
     seen_from = build_capture(session.name, (), T_base_flange, session.mount).poses(T_mount)
     joints = reachable(driven, poses_of, seen_from, cell.part.centre, chosen)

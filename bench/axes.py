@@ -1,0 +1,186 @@
+"""External axes: places found with their sigma, the cloud beside an arm's alone, faults named, and a ball as a rival.
+
+A table, a rail, a positioner stated wrongly by 1 mm and 1 mrad, or not at all; hand-eyes likewise searched. The rival
+places a turntable as is usual: a ball on it, its centre fitted in every view, a circle through the centres.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+import stitch
+from bench.harness import Parts, Row, Table, grouped, markdown, share
+from data_synth.cells.axis_cell import AxisCell, axis_cell, write_cell
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+
+KINDS = ("turntable", "table-arm", "rail-arm", "tilt-turn")
+# Twice what views of development seeds could detect, as a multiple of what the cell hides at amplitude 1.
+FAULTS = (
+    ("turntable", "axis_eccentricity", 0.11),
+    ("turntable", "axis_wobble", 0.18),
+    ("table-arm", "axis_eccentricity", 1.05),
+    ("table-arm", "axis_wobble", 0.4),
+    ("rail-arm", "axis_pitch", 0.7),
+    ("rail-arm", "axis_scale", 0.45),
+)
+# A component of an axis counts where its sigma is no accident of the axis' own direction.
+_COUNTS = 0.2
+
+
+def jobs(seeds: range, faulty: int = 8) -> Iterator[Row]:
+    """Yield every trial; those that a page needs first."""
+    for seed in seeds:
+        for kind in KINDS:
+            for how in ("off by 1", "unknown"):
+                yield {"part": "found", "kind": kind, "how": how, "seed": seed}
+        yield {"part": "found", "kind": "arm", "how": "no axis", "seed": seed}
+        yield {"part": "ball", "seed": seed}
+        for kind, fault, amplitude in FAULTS if seed < seeds.start + faulty else ():
+            yield {"part": "named", "kind": kind, "fault": fault, "amplitude": amplitude, "seed": seed}
+
+
+def _stated(cell: AxisCell, seed: int, known: bool) -> list[dict[str, Any]]:
+    rng = np.random.default_rng([seed, 77])
+    tables = []
+    for axis in cell.axes:
+        direction, point = cell.stated(axis)
+        across = np.linalg.svd(direction[None])[2][1:]
+        turn, shift = (_unit(rng.standard_normal(2)) @ across for _ in range(2))
+        table = {"direction": (direction + 1e-3 * turn).tolist()}
+        tables.append(table | ({"point": (point + shift).tolist()} if axis.kind == "rotary" else {}) if known else {})
+    return tables
+
+
+def _unit(v: Array) -> Array:
+    return v / np.linalg.norm(v)
+
+
+def _run(cell: AxisCell, tables: list[dict[str, Any]]) -> stitch.Run:
+    with tempfile.TemporaryDirectory() as folder:
+        write_cell(Path(folder) / "s", cell, tables)
+        return stitch.run(stitch.load_session(Path(folder) / "s"))
+
+
+def found(job: Row) -> Row:
+    """Return errors of axes and hand-eye over their sigma, of the cloud, and what is named where nothing is hidden."""
+    cell = axis_cell(job["kind"], job["seed"])
+    try:
+        run = _run(cell, _stated(cell, job["seed"], job["how"] == "off by 1"))
+    except stitch.NoResultError as error:
+        return {"failed": str(error)}
+    ratios = []
+    for axis, place in zip(cell.axes, run.axes, strict=True):
+        direction, point = cell.stated(axis)
+        pairs = [(place.direction - direction, place.direction_sigma)]
+        if place.point is not None:
+            pairs.append((place.point - point - direction * (direction @ (place.point - point)), place.point_sigma))
+        for off, sigma in pairs:
+            counts = ~(sigma < _COUNTS * np.nanmax(sigma))
+            ratios += (off[counts] / sigma[counts]).tolist()
+    hand_eye: list[float] = []
+    if cell.T_base_flange is not None:
+        off = frames.log(frames.inverse(cell.T_mount) @ run.T_mount)
+        hand_eye = (off / np.sqrt(np.diag(run.mount_covariance))).tolist()
+    row: Row = {"axes": ratios, "hand_eye": hand_eye}
+    row |= {"cloud": cloud_error(cell, run.poses), "model": cloud_error(cell, run.poses_model)}
+    if job["how"] != "unknown":
+        diagnosis = stitch.diagnose(run)
+        row |= {"verdict": diagnosis.verdict, "effects": list(diagnosis.effects)}
+    return row
+
+
+def cloud_error(cell: AxisCell, poses: Array) -> float:
+    """Return the rms distance (µm) of the points of all views from where they are, the cloud put onto the truth."""
+    clouds = [cloud.points[:: max(len(cloud.points) // 300, 1)] for cloud in cell.clouds]
+    put = np.concatenate([frames.transform(T, c) for T, c in zip(poses, clouds, strict=True)])
+    true = np.concatenate([frames.transform(T, c) for T, c in zip(cell.poses, clouds, strict=True)])
+    a, b = put - put.mean(axis=0), true - true.mean(axis=0)
+    R = frames.nearest_rotation(b.T @ a)
+    return float(1e3 * np.sqrt(np.mean(np.sum((a @ R.T - b) ** 2, axis=1))))
+
+
+def named(job: Row) -> Row:
+    """Return what a diagnosis names where a fault is hidden."""
+    cell = axis_cell(job["kind"], job["seed"], {job["fault"]: job["amplitude"]})
+    diagnosis = stitch.diagnose(_run(cell, _stated(cell, job["seed"], known=True)))
+    return {"verdict": diagnosis.verdict, "effects": list(diagnosis.effects)}
+
+
+def ball(job: Row) -> Row:
+    """Return how far a turntable's axis and the blade's cloud are off, by ball and circle, and by the blade itself."""
+    cell, blade = axis_cell("turntable", job["seed"], ball=True), axis_cell("turntable", job["seed"])
+    centres = np.array([_ball_centre(cloud.points) for cloud in cell.clouds])
+    middle = centres.mean(axis=0)
+    normal = np.linalg.svd(centres - middle)[2][2]
+    plane = np.linalg.svd(normal[None])[2][1:]
+    flat = (centres - middle) @ plane.T
+    x = np.linalg.lstsq(np.column_stack([2 * flat, np.ones(len(flat))]), (flat**2).sum(axis=1), rcond=None)[0]
+    point = middle + x[:2] @ plane
+    true, at = blade.in_scanner(blade.axes[0])
+    normal = normal * np.sign(normal @ true)
+    A = [frames.exp(np.append(normal * -q, np.cross(point, normal * -q))) for q in blade.readings[:, 0]]
+    run = _run(blade, _stated(blade, job["seed"], known=True))
+    place = run.axes[0]
+    return {
+        "ball": [*_off(normal, point, true, at), cloud_error(blade, np.array(A))],
+        "ours": [*_off(place.direction, place.point, true, at), cloud_error(blade, run.poses_model)],
+    }
+
+
+def _off(direction: Array, point: Array, true: Array, at: Array) -> list[float]:
+    """Angle in mrad, and distance in µm from the true axis."""
+    offs = np.cross(direction, true), np.cross(true, point - at)
+    return [1e3 * float(np.linalg.norm(off)) for off in offs]
+
+
+def _ball_centre(points: Array) -> Array:
+    start = np.linalg.lstsq(np.column_stack([2 * points, np.ones(len(points))]), (points**2).sum(axis=1), rcond=None)[0]
+    radius = np.sqrt(start[3] + start[:3] @ start[:3])
+
+    def off(x: Array) -> Array:
+        return np.linalg.norm(points - x[:3], axis=1) - x[3]
+
+    fit = least_squares(off, np.append(start[:3], radius), loss="soft_l1", f_scale=0.05)
+    return np.asarray(fit.x[:3])
+
+
+def _found_lines(rows: list[Row]) -> list[str]:
+    table = []
+    for (kind, how), of in grouped(rows, "kind", "how").items():
+        done = [row for row in of if "failed" not in row]
+        axes = share(abs(x) <= 3 for row in done for x in row["axes"])
+        hand_eye = share(abs(x) <= 3 for row in done for x in row["hand_eye"])
+        adequate = share(row["verdict"] == "adequate" for row in done if "verdict" in row)
+        clouds = [[row["cloud"] for row in done], [row["model"] for row in done]]
+        registered, model = (f"{np.median(x):.1f} ({max(x):.1f})" if x else "–" for x in clouds)
+        table.append((kind, how, f"{len(done)} of {len(of)}", axes, hand_eye, registered, model, adequate))
+    head = (
+        "cell | axis stated | placed | axis within 3 σ | hand-eye within 3 σ | cloud, µm | by the model, µm | adequate"
+    )
+    return markdown(head, table)
+
+
+def _named_lines(rows: list[Row]) -> list[str]:
+    table = []
+    for (kind, fault), of in grouped(rows, "kind", "fault").items():
+        groups = share(fault in row["effects"] and len(row["effects"]) > 1 for row in of)
+        wrong = share(bool(row["effects"]) and fault not in row["effects"] for row in of)
+        table.append((kind, f"`{fault}`", share(row["effects"] == [fault] for row in of), groups, wrong))
+    return markdown("cell | hidden | named | in a group | wrong", table)
+
+
+def _ball_lines(rows: list[Row]) -> list[str]:
+    table = []
+    for name, key in (("a ball, a circle through its centres", "ball"), ("the blade's own scans", "ours")):
+        angle, place, cloud = np.median([row[key] for row in rows], axis=0)
+        table.append((name, f"{angle:.3f}", f"{place:.1f}", f"{cloud:.1f}"))
+    return markdown("turntable placed by | direction, mrad | place, µm | cloud by the model, µm", table)
+
+
+_PARTS = Parts({"found": (found, _found_lines), "named": (named, _named_lines), "ball": (ball, _ball_lines)})
+TABLE = Table(jobs, _PARTS.trial, _PARTS.summary, range(200, 220), page="axes", block="axes", settings={"faulty": 8})

@@ -1,0 +1,283 @@
+"""Where external axes stand, from nothing: relative motions of the scans against readings and poses.
+
+Neighbouring views are registered by features; a third of these motions may be wrong. Turns first: directions of rotary
+axes and the turn of the hand-eye that explain most motions, from many random ones, each then improved. Given these, the
+rest is linear: places of rotary axes, directions of linear ones, the shift of the hand-eye. Last all together.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from stitch.errors import InputError, NoResultError
+from stitch.fit.coarse import neighbouring_views, register_pairs
+from stitch.numerics import frames
+from stitch.numerics.frames import Array
+from stitch.session.axes import Axes, Axis, AxisMotion
+from stitch.session.axis_poses import axes_of, place_axes, reported_poses
+from stitch.session.capture import Capture, build_capture, part_size
+from stitch.session.measurement import Measurement, measurement_of
+from stitch.session.session import SessionData
+
+# Random turns that are tried, those that are improved, and how far a right one may be off, rad.
+_DRAWS, _IMPROVED, _OFF = 20_000, 24, 0.3
+# A motion is explained within so many rad and so much of the part's size.
+_ANGLE, _SHARE = 0.03, 0.03
+# Fewer explained motions place no axis; of so many unknowns a third of what they say.
+_FEWEST = 5
+_BLOCK = 500
+
+
+def locate_axes(
+    sessions: Sequence[SessionData], measurements: Sequence[Measurement]
+) -> tuple[list[SessionData], list[Measurement]]:
+    """Return sessions and measurements with axes placed that nobody has stated; all as they are where none is missing.
+
+    Raises:
+        InputError: there are no clouds, or sessions differ in what they state.
+        NoResultError: the scans do not say where.
+    """
+    axes = axes_of(sessions[0])
+    if axes.are_placed:
+        return list(sessions), list(measurements)
+    unknown = " and ".join(axis.name for axis in axes.axes if not axis.is_placed)
+    fix = f"to fix: state direction (and point) of {unknown} in [[axis]], to some millimetres and milliradians"
+    if not sessions[0].has_clouds:
+        raise InputError(f"{sessions[0].path}: labelled points do not say where axis {unknown} stands; {fix}")
+    found = _find(sessions[0], measurements[0].capture)
+    if found is None:
+        raise NoResultError(f"the scans do not say where axis {unknown} stands; {fix}")
+    placed = [place_axes(session, found) for session in sessions]
+    return placed, [_placed(session, m) for session, m in zip(placed, measurements, strict=True)]
+
+
+def _placed(session: SessionData, measurement: Measurement) -> Measurement:
+    capture = measurement.capture
+    T = np.array([view.T_base_flange for view in session.views])
+    return measurement_of(session, build_capture(capture.name, capture.scans, T, session.mount, capture.sightings))
+
+
+@dataclass(frozen=True)
+class _Motions:
+    """What is known before: readings, reported poses, and motions of the scans between pairs of views."""
+
+    axes: Axes
+    reported: Array  # (V, 4, 4) T_base_flange
+    to_hand: bool
+    pairs: Array  # (P, 2)
+    scanner: Array  # (P, 4, 4) from the second view's scanner frame into the first's
+    size: float  # of the part
+
+    def turned(self, directions: Array) -> Array:
+        """(N, V, 3, 3) what stands left of the hand-eye, for directions (N, K, 3) of the axes."""
+        out = np.broadcast_to(self.reported[:, :3, :3], (len(directions), *self.reported[:, :3, :3].shape))
+        left = right = np.broadcast_to(np.eye(3), out.shape)
+        for k, axis in enumerate(self.axes.axes):
+            if not axis.is_rotary:
+                continue
+            vectors = directions[:, k, None, :] * self.axes.readings[None, :, k, None]
+            R = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(out.shape)
+            if self.axes.stands_right(axis):
+                right = right @ R
+            else:
+                left = left @ R
+        out = np.swapaxes(left, -1, -2) @ right @ out
+        return np.swapaxes(out, -1, -2) if self.to_hand else out
+
+    def angles(self, directions: Array, R_mount: Array) -> Array:
+        """(N, P) rad between the motions of the scans and those foretold, R_mount (N, 3, 3)."""
+        pose = self.turned(directions) @ R_mount[:, None]
+        first, second = pose[:, self.pairs[:, 0]], pose[:, self.pairs[:, 1]]
+        trace = np.einsum("npji,npjk,pik->np", first, second, self.scanner[:, :3, :3])
+        return np.asarray(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+    def places(self, directions: Array, R_mount: Array, use: Array) -> tuple[tuple[Axis, ...], Array] | None:
+        """Axes and hand-eye (4, 4) that turns (K, 3), (3, 3) and the motions in use (P,) lead to; None: too few."""
+        K = len(self.axes.axes)
+        size = 3 + 6 * K
+
+        def shifts(x: Array) -> Array:
+            placed = self._shifted(directions, x)
+            pose = placed @ frames.make(R_mount, x[:3])
+            first, second = pose[self.pairs[use, 0]], pose[self.pairs[use, 1]]
+            off = second[:, :3, 3] - first[:, :3, 3]
+            inside = np.einsum("pji,pj->pi", first[:, :3, :3], off)
+            return np.asarray((inside - self.scanner[use, :3, 3]).ravel())
+
+        at = np.zeros(size)
+        for k, axis in enumerate(self.axes.axes):
+            if axis.is_placed and axis.point is not None:
+                at[3 + 6 * k : 6 + 6 * k] = axis.point
+            if axis.is_placed and not axis.is_rotary:
+                at[6 + 6 * k : 9 + 6 * k] = axis.direction
+        free = [0, 1, 2]
+        for k, axis in enumerate(self.axes.axes):
+            if not axis.is_placed:
+                start = 3 + 6 * k if axis.is_rotary else 6 + 6 * k
+                free += [start, start + 1, start + 2]
+        base = shifts(at)
+        columns = np.column_stack([shifts(at + np.eye(size)[i]) - base for i in free])
+        x = at.copy()
+        weight = np.ones(len(base))
+        for _ in range(20):
+            step = np.linalg.lstsq(columns * weight[:, None], -base * weight, rcond=1e-4)[0]
+            left = np.linalg.norm((base + columns @ step).reshape(-1, 3), axis=1)
+            weight = np.repeat(1 / np.sqrt(1 + (left / (_SHARE * self.size)) ** 2) ** 2, 3)
+        x[free] += step
+        axes = []
+        for k, axis in enumerate(self.axes.axes):
+            way = x[6 + 6 * k : 9 + 6 * k]
+            if axis.is_placed:
+                axes.append(axis)
+            elif axis.is_rotary:
+                axes.append(replace(axis, direction=directions[k], point=x[3 + 6 * k : 6 + 6 * k]))
+            elif np.linalg.norm(way) > 0:
+                axes.append(replace(axis, direction=way / np.linalg.norm(way)))
+            else:
+                return None
+        return tuple(axes), frames.make(R_mount, x[:3])
+
+    def _shifted(self, directions: Array, x: Array) -> Array:
+        """(V, 4, 4) what stands left of the hand-eye; x holds its shift, and per axis a point and a way (3,) each."""
+        count = len(self.reported)
+        left = right = np.broadcast_to(np.eye(4), (count, 4, 4))
+        for k, axis in enumerate(self.axes.axes):
+            reading = self.axes.readings[:, k, None]
+            point, way = x[3 + 6 * k : 6 + 6 * k], x[6 + 6 * k : 9 + 6 * k]
+            if axis.is_rotary:
+                R = Rotation.from_rotvec(directions[k] * reading).as_matrix()
+                A = frames.make(R, point - R @ point)
+            else:
+                A = frames.make(np.broadcast_to(np.eye(3), (count, 3, 3)), way * reading)
+            if self.axes.stands_right(axis):
+                right = right @ A
+            else:
+                left = left @ A
+        T = frames.inverse(left) @ right @ self.reported
+        return frames.inverse(T) if self.to_hand else T
+
+    def residual(self, axes: Axes, placement: Array, T_mount: Array) -> Array:
+        """(P, 6) of the motions, as displacements of the part."""
+        motion = AxisMotion(axes.readings, placement, np.zeros((len(axes.axes), 3)), axes.as_read().error)
+        T = axes.carried(motion) @ self.reported
+        pose = (frames.inverse(T) if self.to_hand else T) @ T_mount
+        told = frames.inverse(pose[self.pairs[:, 0]]) @ pose[self.pairs[:, 1]]
+        return frames.log(frames.inverse(self.scanner) @ told) * np.repeat([self.size, 1.0], 3)
+
+
+def _find(session: SessionData, capture: Capture) -> tuple[Axis, ...] | None:
+    """Return the axes, placed; None where too few motions agree."""
+    axes = axes_of(session)
+    pairs = _pairs(axes)
+    motions = _Motions(
+        axes,
+        reported_poses(session),
+        session.mount == "eye_to_hand",
+        np.array(pairs),
+        register_pairs(capture, pairs),
+        part_size([capture]),
+    )
+    best: tuple[int, float, Axes, Array] | None = None
+    for directions, R_mount in _turns(motions, session.scanner.T_mount):
+        use = motions.angles(directions[None], R_mount[None])[0] < 3 * _ANGLE
+        placed = motions.places(directions, R_mount, use) if use.sum() >= _FEWEST else None
+        if placed is None:
+            continue
+        refined, T_mount = _refined(motions, replace(axes, axes=placed[0]), placed[1])
+        off = np.linalg.norm(motions.residual(refined, np.zeros((len(axes.axes), 6)), T_mount), axis=1)
+        near = off < _SHARE * motions.size
+        trial = (int(near.sum()), -float(off[near].sum()), refined, T_mount)
+        if best is None or trial[:2] > best[:2]:
+            best = trial
+    return None if best is None or best[0] < _FEWEST else best[2].axes
+
+
+def _pairs(axes: Axes) -> list[tuple[int, int]]:
+    """Views that may overlap: neighbours in time, and by the reading of each axis."""
+    count = len(axes.readings)
+    pairs = set(neighbouring_views(count))
+    for column in axes.readings.T:
+        order = np.argsort(column)
+        pairs |= {(min(a, b), max(a, b)) for a, b in zip(order[:-1].tolist(), order[1:].tolist(), strict=True)}
+    return sorted(pairs)
+
+
+def _turns(motions: _Motions, T_mount: Array | None) -> list[tuple[Array, Array]]:
+    """Return directions (K, 3) and turns of the hand-eye (3, 3) that explain motions, the likeliest few."""
+    rng = np.random.default_rng(0)
+    known = [axis.direction for axis in motions.axes.axes]
+    wanted = [k for k, axis in enumerate(motions.axes.axes) if axis.is_rotary and known[k] is None]
+    draws = _DRAWS if T_mount is None or len(wanted) > 1 else _DRAWS // 10
+    directions = rng.standard_normal((draws, len(known), 3))
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    for k, direction in enumerate(known):
+        if direction is not None:
+            directions[:, k] = direction
+    R_mount = np.asarray(Rotation.random(draws, rng=rng).as_matrix())
+    if T_mount is not None:
+        R_mount = np.broadcast_to(T_mount[:3, :3], (draws, 3, 3))
+    blocks = range(0, draws, _BLOCK)
+    capped = [np.minimum(motions.angles(directions[i : i + _BLOCK], R_mount[i : i + _BLOCK]), _OFF) for i in blocks]
+    order = np.argsort((np.concatenate(capped) ** 2).sum(axis=1))[:_IMPROVED]
+    trials = [_improved_turn(motions, directions[i], R_mount[i], wanted) for i in order]
+    scored = [(float((np.minimum(motions.angles(d[None], R[None]), _ANGLE) ** 2).sum()), d, R) for d, R in trials]
+    distinct: list[tuple[Array, Array]] = []
+    for _, d, R in sorted(scored, key=lambda item: item[0]):
+        if all(
+            frames.angle_between(_turn(R), _turn(R2)) > _ANGLE or np.abs(d - d2).max() > _ANGLE for d2, R2 in distinct
+        ):
+            distinct.append((d, R))
+    return distinct[:4]
+
+
+def _turn(R: Array) -> Array:
+    return frames.make(R, np.zeros(3))
+
+
+def _improved_turn(motions: _Motions, directions: Array, R_mount: Array, wanted: list[int]) -> tuple[Array, Array]:
+    """Return them after least squares of all angles between motions, wrong ones counting little."""
+
+    def moved(x: Array) -> tuple[Array, Array]:
+        turned = directions.copy()
+        for i, k in enumerate(wanted):
+            turned[k] = Rotation.from_rotvec(x[3 + 3 * i : 6 + 3 * i]).as_matrix() @ directions[k]
+        return turned, R_mount @ Rotation.from_rotvec(x[:3]).as_matrix()
+
+    def residual(x: Array) -> Array:
+        d, R = moved(x)
+        return motions.angles(d[None], R[None])[0]
+
+    fit = least_squares(residual, np.zeros(3 + 3 * len(wanted)), loss="cauchy", f_scale=_ANGLE, max_nfev=40)
+    return moved(fit.x)
+
+
+def _refined(motions: _Motions, axes: Axes, T_mount: Array) -> tuple[Axes, Array]:
+    """Return axes and hand-eye after robust least squares of all that is unknown."""
+    free = [
+        (k, i)
+        for k, axis in enumerate(axes.axes)
+        if not motions.axes.axes[k].is_placed
+        for i in ((0, 1, 3, 4) if axis.is_rotary else (0, 1))
+    ]
+    unit = np.array([1.0] * 3 + [motions.size] * 3 + [1.0 if i < 3 else motions.size for _, i in free])
+
+    def moved(x: Array) -> tuple[Array, Array]:
+        x = x * unit
+        placement = np.zeros((len(axes.axes), 6))
+        for value, at in zip(x[6:], free, strict=True):
+            placement[at] = value
+        return placement, T_mount @ frames.exp(x[:6])
+
+    fit = least_squares(
+        lambda x: motions.residual(axes, *moved(x)).ravel(),
+        np.zeros(len(unit)),
+        loss="cauchy",
+        f_scale=_SHARE / 3 * motions.size,
+        max_nfev=60,
+    )
+    placement, T = moved(fit.x)
+    motion = replace(axes.as_read(), placement=placement)
+    return replace(axes, axes=axes.placed(motion)), T
