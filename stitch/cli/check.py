@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -53,7 +54,7 @@ def _check_readable(sessions: list[Path], as_json: bool) -> None:
             say(f"{summary['session']}: readable", bold=True)
             show_block(_summary_rows(summary))
     for line in errors:
-        say(f"stitch: {line}")
+        say(f"stitch: {line}", stream=sys.stderr)
     if errors:
         raise typer.Exit(2)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust
 from stitch.cli.progress import opened_run, show_activity
-from stitch.cli.terminal import answers, emit, in_full, say, show_columns, show_next
+from stitch.cli.terminal import emit, in_full, say, show_columns, show_next
 from stitch.system.process import end_at_once
 
 if TYPE_CHECKING:
@@ -45,9 +45,8 @@ def diagnose_run(
     if as_json:
         emit(to_json(document))
     else:
-        with answers():
-            show_diagnosis(diagnosis)
-            show_next(suggested_command(diagnosis, shlex.quote(str(run))))
+        show_diagnosis(diagnosis)
+        show_next(suggested_command(diagnosis, shlex.quote(str(run))))
     end_at_once()
 
 
@@ -135,7 +134,8 @@ def _show_particulars(diagnosis: Diagnosis, listed: Sequence[CandidateEffect], l
     for line in curve_sentences(diagnosis, length_unit):
         say(line)
     for proposal in diagnosis.next[:3]:
-        say(f"To measure next: {proposal.do} (separates {', '.join(proposal.separates)}).")
+        separates = f" (separates {', '.join(proposal.separates)})" if proposal.separates else ""
+        say(f"To measure next: {proposal.do}{separates}.")
 
 
 def show_budget(budget: Sequence[BudgetLine], length_unit: str) -> None:

@@ -5,6 +5,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +13,7 @@ import typer
 
 from stitch.cli.commands import CommandGroup
 from stitch.cli.progress import TimeLeft, live_line
-from stitch.cli.terminal import say, speak_any_terminal
+from stitch.cli.terminal import answers, say, speak_any_terminal
 from stitch.errors import StitchError
 from stitch.session.reading.text_files import shortened
 from stitch.system import process, time_limit
@@ -70,8 +71,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     time_limit.may_end_process()
     try:
         with watched(TimeLeft()):
+            words = sys.argv[1:] if arguments is None else arguments
             try:
-                build()(list(arguments) if arguments is not None else None)
+                # JSON is then the only result; what else is said goes beside it.
+                with nullcontext() if "--json" in words else answers():
+                    build()(list(arguments) if arguments is not None else None)
             except SystemExit as end:
                 if arguments is None and not end.code and process.ends_at_once():
                     # Taking arrays, modules and threads down one by one takes a quarter of a second.

@@ -9,7 +9,7 @@ import typer
 
 from stitch.cli.diagnose import diagnose_folder
 from stitch.cli.options import EffectsFile, Json, RunFolder, Trust, require_new
-from stitch.cli.terminal import answers, emit, say, show_columns
+from stitch.cli.terminal import emit, say, show_columns
 from stitch.errors import InputError
 from stitch.system.process import end_at_once
 
@@ -52,11 +52,10 @@ def next_measurement(
     if as_json:
         emit(to_json({key: document[key] for key in ("verdict", "effects", "next")} | next_view_row(document)))
     else:
-        with answers():
-            show_next_views(diagnosis, document)
-            if output is not None:
-                say(f"  {output}")
-                say("Drive there at reduced speed, scan, add the scan and its row to the session, and run it again.")
+        show_next_views(diagnosis, document)
+        if output is not None:
+            say(f"  {output}")
+            say("Drive there at reduced speed, scan, add the scan and its row to the session, and run it again.")
     end_at_once()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -190,7 +191,8 @@ def _follow_session(folder: Path, views: int | None) -> None:
     table = folder / "views.csv"
     read_session_document(folder / "session.toml")
     end = "Ctrl-C ends it and runs the session" if views is None else f"the session is run once {views} views are there"
-    say(f"Following {folder}: each view is judged as its scan and its row in views.csv arrive; {end}.")
+    begun = f"Following {folder}: each view is judged as its scan and its row in views.csv arrive; {end}."
+    say(begun, stream=sys.stderr)
     live: LiveSession | None = None
     failed = _Failures()
     try:
@@ -233,7 +235,7 @@ class _Failures:
         now = time.monotonic()
         self._since = self._since or now
         if now - self._since > _PATIENCE and message != self._said:
-            say(f"waiting: {message}")
+            say(f"waiting: {message}", stream=sys.stderr)
             self._said = message
 
 

@@ -42,7 +42,7 @@ def _answer_stream() -> IO[str] | None:
 
 @contextmanager
 def answers() -> Iterator[None]:
-    """While the block lasts, lines and tables for people are the command's result: they go to standard output."""
+    """While the block lasts, lines and tables for people are the result of a command: they go to standard output."""
     _answers.append(results_stream())
     try:
         yield

@@ -101,7 +101,7 @@ def test_run_takes_the_session_one_stands_in(session, monkeypatch, capsys):
     monkeypatch.chdir(session)
     with pytest.raises(SystemExit) as ended:
         main(["run", "--no-recording"])
-    told = capsys.readouterr().err
+    told = capsys.readouterr().out
     assert not ended.value.code and (session.parent / "runs" / session.name / "result.json").is_file()
     assert sorted(path.name for path in session.iterdir()) == ["clouds", "session.toml", "views.csv"]
     # What a person needs at the end: the hand-eye with U and its frame, errors, files, what to do next.

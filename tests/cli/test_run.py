@@ -156,13 +156,13 @@ def test_a_member_of_a_rig_that_is_changed_says_that_the_others_are_not(tmp_path
     ]
     stitch_command("run", *folders, "-o", tmp_path / "rig", "--no-recording")
     stitch_command("add", tmp_path / "rig" / "b", "joint_offset", "--no-recording")
-    said = " ".join(capsys.readouterr().err.split())
+    said = " ".join(capsys.readouterr().out.split())
     assert "this run alone has changed: a, c and their common model.toml are as they were" in said
     assert "with all sessions --effects joint_offset and -o" in said
     stitch_command("run", folders[0], "-o", tmp_path / "alone", "--no-recording")
     capsys.readouterr()
     stitch_command("add", tmp_path / "alone", "joint_offset", "--no-recording")
-    assert "alone has changed" not in " ".join(capsys.readouterr().err.split())
+    assert "alone has changed" not in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.slow

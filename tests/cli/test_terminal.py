@@ -89,11 +89,11 @@ def printed(tmp_path_factory, stitch_command):
     out = io.StringIO()
     with redirect_stderr(out), redirect_stdout(out), pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", _without_pictures)
-        stitch_command("check", measured)
-        stitch_command("run", measured, "-o", run, "--no-recording")
+        out.write(stitch_command("check", measured))
+        out.write(stitch_command("run", measured, "-o", run, "--no-recording"))
         for command in ("compare", "diagnose"):
-            stitch_command(command, run)
-        stitch_command("add", run, "joint_offset", "--no-recording")
+            out.write(stitch_command(command, run))
+        out.write(stitch_command("add", run, "joint_offset", "--no-recording"))
         for wrong in (["run", str(measured), "--effects", "elbow"], ["drop", str(run), "backlash"]):
             with pytest.raises(SystemExit):
                 main(wrong)

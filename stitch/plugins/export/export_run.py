@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -118,7 +119,7 @@ def export_run(
         old = to == "ros" and output is not None and output.suffix in (".launch", ".xml")
         _export_text(ros_launch(eye) if old else HAND_EYE_FORMATS[to](eye), to, output)
         if eye.of_effects:
-            say(eye.of_effects)
+            say(eye.of_effects, stream=sys.stderr)
     else:
         _export_cloud(run, str(to), output)
 
@@ -138,12 +139,12 @@ def _prove(run: Path, on: list[Path] | None, effects_file: Path | None, trust: b
     if arm is None:
         return
     if not on:
-        say(UNASKED)
+        say(UNASKED, stream=sys.stderr)
         return
     with show_activity("export: running the other sessions"):
         proofs = require_held(arm, [load_session(folder) for folder in on])
     for proof in proofs:
-        say(proof.sentence)
+        say(proof.sentence, stream=sys.stderr)
 
 
 def _export_text(text: str, to: str, output: Path | None) -> None:

@@ -77,7 +77,7 @@ def test_compare_with_open3d_writes_the_witness_and_says_what_differs(run, witne
     with pytest.raises(SystemExit) as ended:
         main(["compare", str(folder), "--with", "open3d"])
     assert not ended.value.code
-    told = " ".join(capsys.readouterr().err.split())
+    told = " ".join(capsys.readouterr().out.split())
     assert "registered the same scans by" in told and "From its cloud to this one: half within" in told
     document = json.loads((folder / "witness.json").read_text())
     assert [row["view"] for row in document["views"]] == list(witness.views)

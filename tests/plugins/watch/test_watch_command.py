@@ -53,7 +53,7 @@ def test_a_knock_ends_with_3_and_its_session(tmp_path, capsys):
     for name in ("watch.html", "watch.prom", "history.sqlite"):
         assert (cell / name).stat().st_size > 500
     assert ends("watch", cell, "--no-page") == 3
-    assert "the mount jumped before session s20" in " ".join(capsys.readouterr().err.split())
+    assert "the mount jumped before session s20" in " ".join(capsys.readouterr().out.split())
     # A new calibration, of after the knock: what was is settled.
     assert ends("watch", cell, "--in-use", runs[23], "--json") == 0
     assert json.loads(capsys.readouterr().out)["in_use"] == "s23"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 from uuid import uuid4
@@ -53,12 +55,13 @@ def batch(
         raise InputError(f"{output}: is a file; to fix: name a folder for the runs with -o")
     jobs, stood = _batch_jobs(sessions, output, force, recording), output.exists()
     rows: dict[str, SessionRow] = {}
+    tell = partial(say, stream=sys.stderr)
     try:
         # Whatever ends the loop ends the workers.
-        with closing(run_jobs(jobs, workers, scheduler, say)) as coming:
+        with closing(run_jobs(jobs, workers, scheduler, tell)) as coming:
             for row in steps("sessions", coming, len(jobs)):
                 rows[row.name] = row
-                say(f"{len(rows)} of {len(jobs)}  {row.name}: {_row_text(row)}")
+                tell(f"{len(rows)} of {len(jobs)}  {row.name}: {_row_text(row)}")
     except KeyboardInterrupt:
         raise NoResultError(
             f"stopped after {len(rows)} of {len(jobs)} sessions; to fix: start the same command again, it goes on from "
@@ -158,7 +161,7 @@ def _show_rows(rows: Sequence[SessionRow], sentence: str) -> None:
         say(f"The {_MOST} of {len(rows)} that need somebody first; the page has all.")
     for row in rows:
         if row.error is not None:
-            say(f"{row.session}: {row.error}")
+            say(f"{row.session}: {row.error}", stream=sys.stderr)
         for doubt in row.doubts:
             say(f"{row.name}: {doubt}")
 

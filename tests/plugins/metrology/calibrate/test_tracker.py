@@ -76,7 +76,7 @@ def test_command(as_json, tmp_path, capsys):
     if as_json:
         assert np.abs(np.array(json.loads(out.out)["hand_eye"]) - truth).max() < 0.5
     else:
-        assert out.out == "" and "T_base_scanner" in out.err
+        assert out.err == "" and "T_base_scanner" in out.out
 
 
 def test_poses_turned_about_one_axis_are_refused(tmp_path):

@@ -154,7 +154,7 @@ def test_no_answer_is_one_line(sessions, monkeypatch, capsys, batch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(cluster, "_ANSWER_SECONDS", 0.3)
     batch(*sessions, "--scheduler", "tcp://127.0.0.1:9", code=2)
-    told = capsys.readouterr().err
+    told = capsys.readouterr().out
     assert told.startswith("stitch: --scheduler tcp://127.0.0.1:9: no answer") and told.count("\n") == 1
     batch(*sessions, "--scheduler", "what://ever", code=2)
     batch(*sessions, "--scheduler", "tcp://127.0.0.1:9", "--workers", "2", code=2)
@@ -225,7 +225,7 @@ def test_a_doubt_about_a_session_ends_with_three(sessions, result, monkeypatch, 
     doubted = replace(result, doubts=("The base has moved.",))
     monkeypatch.setattr(run_batch, "run", lambda loaded, recorder: replace(doubted, session=loaded))
     batch(sessions[0], code=3)
-    assert "monday: The base has moved." in capsys.readouterr().err
+    assert "monday: The base has moved." in capsys.readouterr().out
 
 
 def test_before_and_after_are_of_the_same_pairs():
