@@ -126,8 +126,7 @@ def test_a_diagnosis_of_this_very_model_is_not_made_anew(folder, tmp_path, monke
     monkeypatch.setattr(pipeline, "diagnose", again)
     stitch_command("report", run)
     assert said.items() <= sections_of(page.read_text()).items()
-    stitch_command("add", run, "--suggested")
-    told = capsys.readouterr().out
+    told = stitch_command("add", run, "--suggested")
     assert "Nothing at all.\nNothing was added" in told and f"Next: stitch export {run} --to ros" in told
     (run / "diagnosis.json").write_text(json.dumps(document | {"of": "another"}))
     stitch_command("report", run, "--no-diagnosis")

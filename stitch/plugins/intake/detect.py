@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -71,7 +72,7 @@ def detect(
         with whole_file(output) as scratch:
             write_table(scratch, columns)
     for note in notes:
-        say(f"{note}.")
+        say(f"{note}.", stream=sys.stderr)
     if as_json:
         emit(json.dumps(_document(session, views, found, notes), indent=1))
     elif output is None:
@@ -79,9 +80,9 @@ def detect(
     showing = sum(bool(s.targets) for s in found)
     count = len(views_of_targets(found))
     where = output or "standard output"
-    say(f"{where}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views")
+    say(f"{where}: {count} target{'s' * (count > 1)} in {showing} of {len(views)} views", stream=sys.stderr)
     if output == session / "points.csv":
-        say(f"Next: stitch run {shlex.quote(str(session))}")
+        say(f"Next: stitch run {shlex.quote(str(session))}", stream=sys.stderr)
 
 
 def parse_target_options(board: list[str] | None, ball: list[str] | None) -> TargetSearch:

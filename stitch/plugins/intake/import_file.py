@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -76,6 +77,6 @@ def import_command(
         with whole_file(output) as scratch:
             scratch.write_text(imported.text, encoding="utf-8")
     for warning in imported.warnings:
-        say(f"stitch: {file}: {warning}")
+        say(f"stitch: {file}: {warning}", stream=sys.stderr)
     where = output or "standard output"
-    say(f"{imported.rows} rows of {imported.table} to {where}; orientations: {imported.convention}")
+    say(f"{imported.rows} rows of {imported.table} to {where}; orientations: {imported.convention}", stream=sys.stderr)

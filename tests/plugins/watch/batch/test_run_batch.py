@@ -154,7 +154,7 @@ def test_no_answer_is_one_line(sessions, monkeypatch, capsys, batch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(cluster, "_ANSWER_SECONDS", 0.3)
     batch(*sessions, "--scheduler", "tcp://127.0.0.1:9", code=2)
-    told = capsys.readouterr().out
+    told = capsys.readouterr().err
     assert told.startswith("stitch: --scheduler tcp://127.0.0.1:9: no answer") and told.count("\n") == 1
     batch(*sessions, "--scheduler", "what://ever", code=2)
     batch(*sessions, "--scheduler", "tcp://127.0.0.1:9", "--workers", "2", code=2)
