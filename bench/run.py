@@ -38,6 +38,7 @@ TABLES = {
     "drawn-folders": "drawn_folders:DRAWN",
     "field-kinds": "intake:FIELD",
     "large": "speed:LARGE",
+    "laws-everywhere": "laws_everywhere:TABLE",
     "mistakes": "integrity:MISTAKES",
     "mistakes-in-many-views": "integrity:MANY",
     "mistakes-in-measured-scans": "integrity:MEASURED",

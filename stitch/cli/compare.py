@@ -16,7 +16,7 @@ from stitch.cli.terminal import emit, say, show_block, show_columns, show_files,
 from stitch.errors import InputError
 
 if TYPE_CHECKING:
-    from stitch.output.comparison.displaced_views import FollowedCovariate
+    from stitch.diagnosis.dependence import Dependence
     from stitch.output.comparison.residual_tables import ResidualTable, ResidualTables
     from stitch.run_data import RunData
 
@@ -124,9 +124,9 @@ def show_comparison(comparison: ResidualTables, state: RunData, run: Path) -> No
     show_next(f"Next: stitch {command} {shlex.quote(str(run))}")
 
 
-def _show_followed(followed: Sequence[FollowedCovariate], to_um: float) -> None:
+def _show_followed(followed: Sequence[Dependence], to_um: float) -> None:
     """Print what whole views follow, and their trend along the clearest covariate."""
-    from stitch.output.comparison.displaced_views import also_clear, equally_clear
+    from stitch.diagnosis.dependence import also_clear, equally_clear
 
     if not followed:
         return
@@ -147,17 +147,17 @@ def _show_followed(followed: Sequence[FollowedCovariate], to_um: float) -> None:
     axis = ", ".join(f"{x:+.2f}" for x in first.direction)
     unit = f" ({first.unit})" if first.unit else ""
     columns = (
-        (first.covariate, lambda i: f"{first.at[i]:.4g}"),
+        (first.covariate, lambda i: f"{first.bins[i]:.4g}"),
         ("mean (µm)", lambda i: f"{first.mean[i] * to_um:+.1f}"),
         ("± 1 σ", lambda i: f"{first.sigma[i] * to_um:.1f}"),
     )
     title = f"Displacement at the part along ({axis}), by {first.covariate}{unit}"
-    show_columns(title, columns, range(len(first.at)), words=())
+    show_columns(title, columns, range(len(first.bins)), words=())
 
 
-def _followed_text(x: FollowedCovariate) -> str:
-    """Return a covariate with the shape of its trend and the chance of it: time (a line, p = 3e-07)."""
-    return f"{x.covariate} ({x.shape}, p = {x.p_value:.1g})"
+def _followed_text(x: Dependence) -> str:
+    """Return a covariate with place and shape of its trend, and the chance: time_s (joint 2, a line, p = 3e-07)."""
+    return f"{x.covariate} ({x.place}, {x.shape}, p = {x.p_value:.1g})"
 
 
 def _significance_sentence(comparison: ResidualTables) -> str:

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from stitch.diagnosis.candidates import candidates_of
-from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis
+from stitch.diagnosis.dependence import dependences
+from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis, too_large
 from stitch.diagnosis.evidence import find_scanner_error, gather_evidence, overlap_misfit_beyond_noise
 from stitch.diagnosis.ranking import Ranked, conditioned_on_effects, rank_one
 from stitch.diagnosis.regime import regime_of
-from stitch.diagnosis.residual_structure import dependences, follows_field, variance_budget
+from stitch.diagnosis.residual_structure import follows_field, variance_budget
 from stitch.diagnosis.score import scatter_limit
 from stitch.diagnosis.sensitivity import (
     alias_matrix,
@@ -63,8 +64,8 @@ def _diagnose(state: RunData) -> Diagnosis:
     announce("diagnosing: errors without a name, and where the error comes from")
     is_unknown = evidence.verdict == "unknown_effect"
     repeating = evidence.repeating_errors or ()
-    if is_unknown and evidence.repeating_errors is None:
-        repeating = find_repeating_errors(linear)
+    if is_unknown and (evidence.repeating_errors is None or evidence.told_laws):
+        repeating = find_repeating_errors(conditioned_on_effects(linear, evidence.told_laws[:1]))
     reported = reportable(repeating, evidence.implausible_scatter)
     process = reported[0].process if reported else None
     with_reported = _with_joint_effect(linear, reported)
@@ -83,7 +84,7 @@ def _diagnose(state: RunData) -> Diagnosis:
         translation=translation,
         candidates=tuple(examined),
         matrix=matrix,
-        depends_on=tuple(dependences(linear, evidence.empirical)),
+        depends_on=dependences(linear),
         missing=missing,
         linear=linear,
         notes=evidence.notes,
@@ -98,6 +99,8 @@ def _diagnose(state: RunData) -> Diagnosis:
         and (evidence.scanner_error is not None or follows_field(evidence.empirical, repeating)),
         scanner_error=evidence.scanner_error or (find_scanner_error(linear) if is_unknown else None),
         doubts=state.doubts,
+        laws=evidence.told_laws,
+        beyond_belief=too_large(evidence.named),
         together=_named_together(evidence),
         tried=state.tried,
         budget=variance_budget(with_reported, [r.score for r in evidence.named[:1]], process),

@@ -19,7 +19,8 @@ import numpy as np
 from stitch.diagnosis.candidate_views import candidate_measurement
 from stitch.diagnosis.candidates import Form, candidate_as_fitted
 from stitch.diagnosis.deciding_view import model_beside, predict_views
-from stitch.diagnosis.residual_structure import Dependence, predicted_distances
+from stitch.diagnosis.dependence import Dependence
+from stitch.diagnosis.residual_structure import predicted_distances
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.effects.contract import EFFECTS, Effect, by_joint, parameters_in, twist

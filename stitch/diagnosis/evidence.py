@@ -26,10 +26,12 @@ from stitch.diagnosis.ranking import (
     rank_all,
     rank_one,
     rescored_against,
+    stands_out,
 )
 from stitch.diagnosis.regime import regime_of
 from stitch.diagnosis.score import ScatterLimit, implausible, score
 from stitch.diagnosis.stepwise_selection import forward_selection, keep_worth_adding
+from stitch.diagnosis.systematic_laws import Dictionary, dictionary_of, rank_laws
 from stitch.diagnosis.unmodelled_time_effects import (
     find_repeating_errors,
     least_log_bayes_factor,
@@ -45,8 +47,6 @@ from stitch.observations.surfaces.surface_model import surfaces_of
 from stitch.observations.surfaces.view_poses import noise_floor
 from stitch.session.measurement import Views
 
-# Errors of one and two periods a turn have a name; those of three and four have not.
-_GEARS, _NAMELESS_ORDERS = ("gear_eccentricity", "gear_harmonic"), ("fourier_3", "fourier_4")
 # The effect of the direction from which a joint comes.
 _BY_DIRECTION = "backlash"
 # Share of a joint's moves on either side of a jump that go one way, and the moves there must be to tell.
@@ -66,6 +66,7 @@ class Case(NamedTuple):
 
     linear: LinearModel
     candidates: Sequence[Candidate]
+    dictionary: Dictionary
 
     @property
     def many_views(self) -> bool:
@@ -85,8 +86,9 @@ def gather_evidence(
     Args:
         overlap_misfit: rms that no motion of the views removes (`overlap_misfit_beyond_noise`), length_unit.
     """
-    proposed = propose_names(linear, candidates, limit)
-    evidence = ask(TESTS, Case(linear, candidates), replace(proposed, proposed=proposed))
+    case = Case(linear, candidates, dictionary_of(linear, candidates))
+    proposed = _propose_names(case, limit)
+    evidence = ask(TESTS, case, replace(proposed, proposed=proposed))
     if overlap_misfit:
         misfit = Reply("yes, beyond the noise", {"overlap_misfit": overlap_misfit})
         evidence = _answered(evidence, overlap_misfit_beyond_noise, misfit)
@@ -95,9 +97,14 @@ def gather_evidence(
 
 def propose_names(linear: LinearModel, candidates: Sequence[Candidate], limit: ScatterLimit) -> Evidence:
     """Return the effects that would explain the views, and what explains them as well; nothing is left out yet."""
-    ranked, empirical = rank_all(linear, candidates)
-    evidence = Evidence(ranked, empirical, implausible_scatter=implausible(linear, limit))
-    return ask(NAMING, Case(linear, candidates), evidence)
+    return _propose_names(Case(linear, candidates, dictionary_of(linear, candidates)), limit)
+
+
+def _propose_names(case: Case, limit: ScatterLimit) -> Evidence:
+    ranked, empirical = rank_all(case.linear, case.candidates)
+    laws = rank_laws(case.linear, case.dictionary)
+    evidence = Evidence(ranked, empirical, laws=laws, implausible_scatter=implausible(case.linear, limit))
+    return ask(NAMING, case, evidence)
 
 
 def ask(questions: Sequence[Question], case: Case, evidence: Evidence) -> Evidence:
@@ -124,11 +131,8 @@ def _answered(evidence: Evidence, question: Callable[..., object], reply: Reply)
 def is_anything_certain(case: Case, evidence: Evidence) -> Reply | None:
     """Is an effect certain by itself, or a shape without a cause?"""
     certain = [r for r in evidence.ranked if is_certain(r)]
-    shape = next(iter(evidence.empirical), None)
-    if shape is not None and not (
-        shape.adjusted < limits.ALPHA_UNKNOWN and shape.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
-    ):
-        shape = None
+    shapes = [r for r in (*evidence.empirical, *evidence.laws) if stands_out(r)]
+    shape = max(shapes, key=lambda r: r.log_posterior, default=None)
     if shape is None and not certain:
         return Reply("no")
     return Reply(_names(certain) or "a shape without a cause", {"alarm": True, "shape": shape})
@@ -153,12 +157,18 @@ def which_explains_most(case: Case, evidence: Evidence) -> Reply | None:
     if len(contenders) > 1 and base is not case.linear:
         # There their Bayes factors are over one and the same.
         contenders = sorted((rescored_in(base, r) for r in contenders), key=lambda r: -r.log_posterior)
+    laws = evidence.laws if base is case.linear else rank_laws(base, case.dictionary)
+    contenders = sorted((case.dictionary.credited(r, laws) for r in contenders), key=lambda r: -r.log_posterior)
     best = contenders[0]
-    unmodelled = unmodelled_log_posterior(base)
+    rivals = case.dictionary.without(base, laws, best)
+    unmodelled = max([unmodelled_log_posterior(base), *(r.log_posterior for r in rivals)])
+    shapes = [r for r in (*evidence.empirical, *rivals) if stands_out(r)]
+    shape = max(shapes, key=lambda r: r.log_posterior, default=None)
     changes = {
+        "laws": laws,
         "explanation": (best,),
         "together": (best,),
-        "shape": evidence.shape and rescored_in(base, evidence.shape),
+        "shape": shape and (shape if shape in rivals else rescored_in(base, shape)),
         "contenders": tuple(contenders),
         "base": base,
         "unmodelled_log_posterior": unmodelled,
@@ -230,20 +240,6 @@ def is_it_wanted_beside_smooth_errors(case: Case, evidence: Evidence) -> Reply |
     return Reply("no", {"unmodelled_explains_it": True, "notes": (*evidence.notes, note)}, ends=True)
 
 
-def may_a_gear_be_of_another_order(case: Case, evidence: Evidence) -> Reply | None:
-    """May an error of a gear, over so short a range, be one of an order without a name?"""
-    best = evidence.explanation[0]
-    base = evidence.base
-    if best.name not in _GEARS or base is None:
-        return None
-    nameless = [r for r in evidence.empirical if r.name.startswith(_NAMELESS_ORDERS)]
-    if regime_of(base).prior:
-        nameless = [rescored_in(base, r) for r in nameless]
-    if any(r.log_posterior > best.log_posterior - limits.ODDS for r in nameless):
-        return Reply("yes", {"unmodelled_explains_it": True, "notes": ()}, ends=True)
-    return Reply("no")
-
-
 def which_come_near(case: Case, evidence: Evidence) -> Reply | None:
     """Which other effects come within 20 to 1?"""
     if evidence.further is not None:
@@ -252,6 +248,16 @@ def which_come_near(case: Case, evidence: Evidence) -> Reply | None:
     likely = [r for r in evidence.contenders if r.log_posterior > best.log_posterior - limits.ODDS]
     near = [r for r in likely if r.name != best.name and r.name not in evidence.refused]
     return Reply(_names(near) or "none", {"explanation": (best, *near)})
+
+
+def which_laws_come_near(case: Case, evidence: Evidence) -> Reply | None:
+    """Which laws that are no effect's come within 20 to 1, wherever they act and whatever they follow?"""
+    best, *others = evidence.together or evidence.explanation
+    base = conditioned_on_effects(evidence.base or case.linear, others)
+    laws = rank_laws(base, case.dictionary) if others else evidence.laws
+    rivals = case.dictionary.without(base, laws, best)
+    near = tuple(r for r in rivals if r.log_posterior > best.log_posterior - limits.ODDS and stands_out(r))
+    return Reply(_names(near) or "none", {"rival_laws": near})
 
 
 def are_two_missing(case: Case, evidence: Evidence) -> Reply | None:
@@ -270,9 +276,9 @@ NAMING: tuple[Question, ...] = (
     do_poses_err_without_a_name,
     does_an_unmodelled_effect_explain_it,
     is_it_wanted_beside_smooth_errors,
-    may_a_gear_be_of_another_order,
     which_come_near,
     are_two_missing,
+    which_laws_come_near,
 )
 
 

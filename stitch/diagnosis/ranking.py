@@ -105,6 +105,12 @@ def is_certain(ranked: Ranked) -> bool:
     return is_contender(ranked) and ranked.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
 
 
+def stands_out(ranked: Ranked) -> bool:
+    """Return whether a shape without a cause is enough for an alarm."""
+    # Laws of the dictionary and other shapes, two families.
+    return ranked.adjusted < 0.5 * limits.ALPHA_UNKNOWN and ranked.score.log_bayes_factor > limits.LOG_BAYES_FACTOR
+
+
 def conditioned_without(
     linear: LinearModel, chosen: Sequence[Ranked], one: Ranked, start: Array | None = None
 ) -> LinearModel:

@@ -1,21 +1,19 @@
 """What a model leaves: on what it depends, from which sources it comes, what a candidate would leave of it.
 
-`dependences` says of every covariate how much of the views' unexplained scatter follows it, with the shape as binned
-means. `variance_budget` shares out what the poses leave by source: effects in use, what is named, an unmodelled trend,
+`variance_budget` shares out what the poses leave by source: effects in use, what is named, an unmodelled trend,
 smooth errors, wandering, white scatter, noise. `predicted_distances` says correspondence by correspondence what a
 candidate effect would leave between the surfaces.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stitch.diagnosis.ranking import Ranked, rank_all
+from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.score import Score, score
 from stitch.diagnosis.smooth_processes import FittedProcess
-from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, DEPENDENCE_BINS, ODDS
+from stitch.diagnosis.thresholds import ALPHA_UNKNOWN, ODDS
 from stitch.diagnosis.unmodelled_time_effects import RepeatingError
 from stitch.effects.empirical import FIELD
 from stitch.model.forward import moves_points, scan_correction
@@ -29,7 +27,6 @@ from stitch.observations.pose_errors import DRIFT_MEMORY, JOINT_SCATTER
 from stitch.observations.surfaces.matching import signed_distances
 from stitch.observations.surfaces.scanner_errors import field_scatter
 from stitch.observations.surfaces.surface_model import surfaces_of
-from stitch.session.measurement import Views
 
 # Sources that are new in every view, or no error of the poses.
 NOT_REPEATING = ("sensor noise", "white repeatability", "scanner field")
@@ -132,96 +129,6 @@ def follows_field(empirical: Sequence[Ranked], repeating: Sequence[RepeatingErro
         return False
     others = [r.score.log_bayes_factor for r in empirical[1:2]] + [error.log_bayes_factor for error in repeating]
     return bool(best.score.log_bayes_factor > max([0.0, *others]) + ODDS)
-
-
-@dataclass(frozen=True)
-class Dependence:
-    """One covariate; bins, mean and sigma show the shape along the direction that follows it most."""
-
-    covariate: str
-    score: float  # share of the views' unexplained scatter that follows it, 0 … 1
-    p_value: float  # family-wise over all covariates and shapes
-    bins: Array  # (B,) middle of each bin
-    mean: Array  # (B,) displacement at the part, length_unit
-    sigma: Array  # (B,)
-    shape: str  # the empirical form that fits best, in words
-    at: Array  # (V,) the covariate of every view
-    moved: Array  # (V,) displacement of every view along that direction, length_unit
-
-
-def dependences(linear: LinearModel, empirical: Sequence[Ranked]) -> list[Dependence]:
-    """Return the best empirical form of every covariate, clearest first.
-
-    Over scatter alone: what follows a covariate may also be an error of the poses that repeats; this says where it is.
-    """
-    if linear.pose_errors is not None:
-        linear = linear.restricted(())
-        empirical = rank_all(linear, [r.score.candidate for r in empirical])[1]
-    views = linear.measurement.views
-    best: dict[str, Ranked] = {}
-    for r in empirical:
-        group = r.score.candidate.effect.group
-        if group not in best or r.score.log_bayes_factor > best[group].score.log_bayes_factor:
-            best[group] = r
-    shown = [
-        _dependence(linear, r, values)
-        for name, r in best.items()
-        if (values := covariate_values(views, name)) is not None
-    ]
-    return sorted(shown, key=lambda d: (d.p_value, -d.score))
-
-
-def covariate_values(views: Views, name: str) -> Array | None:
-    """Return (V,) values of a covariate, a joint angle in degrees, the time, or the order of the views for an event."""
-    if name == "time_s":
-        return views.time
-    if name == "an event":
-        return np.arange(views.count, dtype=float)
-    if joint := re.fullmatch(r"j(\d+)_deg", name):
-        return np.degrees(views.joints[:, int(joint[1]) - 1])
-    return views.covariates.get(name)
-
-
-def _dependence(linear: LinearModel, ranked: Ranked, values: Array) -> Dependence:
-    """Return how the views' displacements follow values (V,) of a covariate."""
-    scored = ranked.score
-    basis, s, _ = np.linalg.svd(linear.residual(scored.form.columns), full_matrices=False)
-    basis = basis[:, s > 1e-9 * max(float(s[0]), 1e-300)]
-    white = linear.white_residual
-    share = float(np.sum((basis.T @ white) ** 2) / max(float(np.sum(white**2)), 1e-300))
-    displacement = linear.view_displacements()
-    # The direction in which the displacements follow the fitted shape most.
-    fitted = linear.observation.part_displacements(scored.form.columns @ scored.values)
-    direction = np.linalg.svd(fitted, full_matrices=False)[2][0]
-    # Towards where the views lie off most: one step points the same way along everything that it follows.
-    main = np.linalg.svd(displacement, full_matrices=False)[2][0]
-    main *= 1.0 if (displacement @ main)[len(displacement) // 2 :].sum() >= 0 else -1.0
-    direction *= 1.0 if direction @ main >= 0 else -1.0
-    moved = displacement @ direction
-    centres, mean, sigma = bin_means(values, moved)
-    effect = scored.candidate.effect
-    return Dependence(
-        covariate=effect.group if effect.group != "an event" else "view order",
-        score=share,
-        p_value=ranked.adjusted,
-        bins=centres,
-        mean=mean,
-        sigma=sigma,
-        shape=effect.formula,
-        at=values,
-        moved=moved,
-    )
-
-
-def bin_means(x: Array, y: Array, bins: int = DEPENDENCE_BINS) -> tuple[Array, Array, Array]:
-    """Return middle, mean and standard error of y in bins of x with equal counts; views are the samples."""
-    order = np.argsort(x, kind="stable")
-    parts = [p for p in np.array_split(order, min(bins, max(len(x) // 2, 1))) if len(p)]
-    spread = float(np.std(y, ddof=1)) if len(y) > 1 else 0.0
-    middle = np.array([x[p].mean() for p in parts])
-    mean = np.array([y[p].mean() for p in parts])
-    sigma = np.array([(np.std(y[p], ddof=1) if len(p) > 2 else spread) / np.sqrt(len(p)) for p in parts])
-    return middle, mean, sigma
 
 
 def predicted_distances(linear: LinearModel, scored: Score | None = None) -> Array | None:

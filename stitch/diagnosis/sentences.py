@@ -7,9 +7,11 @@ import numpy as np
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.ranking import Ranked
 from stitch.diagnosis.residual_structure import NOT_REPEATING
-from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE
+from stitch.diagnosis.systematic_laws import law_of, law_size
+from stitch.diagnosis.thresholds import BELIEVABLE_SIZES, CLEAR_DEPENDENCE, ODDS
 from stitch.diagnosis.unmodelled_joint_effects import JointCurve
 from stitch.diagnosis.unmodelled_time_effects import ROTATION_PART, TRANSLATION_PART, TimeCurve, reportable
+from stitch.effects.contract import EFFECTS
 from stitch.numerics.units import angle_text, duration_text, format_amount, length_text, rounded
 from stitch.observations.surfaces.field_error import FieldError
 
@@ -61,6 +63,7 @@ def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] 
     ranked = pair[0] if pair else candidate.ranked
     is_missing = "is missing" if d.certain else "may be missing"
     yield f"{candidate.name} {is_missing} ({fitted_amounts(ranked)}; p = {ranked.adjusted:.1g})."
+    yield _what_looks_the_same(d, candidate.name)
     yield from _why_not_the_likeliest(d)
     yield _odds_over_chance(d)
     yield _residual_sentence(d, length_unit)
@@ -73,11 +76,18 @@ def _missing_effect(d: Diagnosis, length_unit: str, pair: tuple[Ranked, Ranked] 
     if _SCALE in (candidate.name, pair[1].name if pair else ""):
         # Scans, hand-eye and ways of the arm, all longer by the same share, fit each other as before.
         yield "These views cannot tell it from arm lengths that are all off by the same share; a known length can."
-    scored = ranked.score
-    if scored.fitted:
-        large = [p.name for p, value in zip(scored.form.free, scored.values, strict=True) if abs(value) > p.limit]
+    if large := d.beyond_belief:
         verb = "is" if len(large) == 1 else "are"
-        yield f"{_listed(large, 'and')} {verb} larger than plausible: check session.toml." if large else ""
+        yield f"{_listed(large, 'and')} {verb} more than {BELIEVABLE_SIZES:g} times the usual size: check session.toml."
+
+
+def _what_looks_the_same(d: Diagnosis, name: str) -> str:
+    """Say which other place would move whole views as an effect does; nothing where there is none."""
+    place = EFFECTS[name].place if name in EFFECTS else ""
+    if place not in ("mount", "part") or d.linear.measurement.eye_to_hand != (place == "mount"):
+        return ""
+    stands = "the scanner's stand" if place == "mount" else "what holds the part"
+    return f"A base of the robot that moves so looks the same to these views as {stands}."
 
 
 def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
@@ -98,7 +108,7 @@ def _why_not_the_likeliest(d: Diagnosis) -> Iterator[str]:
 
 def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:
     is_missing = "is missing" if d.certain else "may be missing"
-    yield f"Something {is_missing}: {' or '.join(d.effects)}. These views cannot tell which."
+    yield f"Something {is_missing}: {' or '.join([*d.effects, *_laws_in_words(d)])}. These views cannot tell which."
     if d.coincidence:
         yield f"{d.coincidence}. To tell, drive a few of these poses again from the first side."
     yield _odds_over_chance(d)
@@ -107,6 +117,7 @@ def _ambiguous_group(d: Diagnosis, length_unit: str) -> Iterator[str]:
 
 def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
     yield f"No effect of the library explains what is left. {_residual_sentence(d, length_unit)}"
+    yield from _laws_found(d)
     if d.overlap_misfit:
         size = length_text(d.overlap_misfit, length_unit, 2)
         yield f"However each view is moved, the overlaps keep a misfit of {size}."
@@ -120,7 +131,7 @@ def _unknown_effect(d: Diagnosis, length_unit: str) -> Iterator[str]:
         if d.scanner_error.by_view:
             yield f"Poses found from such scans scatter too. {_CAUSES}"
     clear = [x.covariate for x in d.depends_on if x.p_value < CLEAR_DEPENDENCE][:3]
-    if clear:
+    if clear and not d.laws:
         yield f"What is left follows {_listed(clear, 'and')}."
     yield from _poses_of_unknown(d, length_unit)
     yield from _not_named(d)
@@ -135,7 +146,8 @@ def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
     if errors := reportable(d.repeating_errors, d.implausible):
         size = np.sqrt(sum(line.sigma**2 for line in d.budget if line.source not in NOT_REPEATING))
         amount = f" ({length_text(float(size), length_unit, 2)})" if size > 0 else ""
-        yield f"The pose errors repeat{amount}: they {' and '.join(error.words for error in errors)}."
+        beside = "Beside that the" if d.laws else "The"
+        yield f"{beside} pose errors repeat{amount}: they {' and '.join(error.words for error in errors)}."
         yield f"Apart from that the poses scatter by {scatter}."
     elif not d.implausible:
         shown = d.rotation > 0 or d.translation > 0
@@ -149,6 +161,21 @@ def _poses_of_unknown(d: Diagnosis, length_unit: str) -> Iterator[str]:
         yield "Such errors repeat at the same poses, so a correction found on one object holds for another."
 
 
+def _laws_in_words(d: Diagnosis) -> list[str]:
+    return [law_of(r).words for r in d.laws]
+
+
+def _laws_found(d: Diagnosis) -> Iterator[str]:
+    """Say which laws of the dictionary do, with their sizes, and what to do."""
+    if not d.laws:
+        return
+    sizes = [format_amount(*law_size(d.linear, r)) for r in d.laws]
+    told = [f"{words} by {size}" for words, size in zip(_laws_in_words(d), sizes, strict=True)]
+    among = "A law does" if len(told) == 1 else "One of these laws does, and these views cannot tell which"
+    yield f"{among}: {_listed(told, 'or')} (p = {d.laws[0].adjusted:.1g})."
+    yield "Keep what it follows steady, or describe it by an effect of your own (stitch explain writes one)."
+
+
 def _residual_sentence(d: Diagnosis, length_unit: str) -> str:
     now, floor = (length_text(x, length_unit) for x in (d.residual_rms, d.noise_floor))
     return f"The residual is {now}; the sensor's noise alone would leave {floor}."
@@ -156,7 +183,11 @@ def _residual_sentence(d: Diagnosis, length_unit: str) -> str:
 
 def _odds_over_chance(d: Diagnosis) -> str:
     """Say how much likelier than chance it is, where that is little."""
-    return "" if d.certain else f"The odds that it is more than chance are {odds_text(d.log_odds_over_nothing)}."
+    return (
+        ""
+        if d.log_odds_over_nothing > ODDS
+        else f"The odds that it is more than chance are {odds_text(d.log_odds_over_nothing)}."
+    )
 
 
 def _scatter(translation: float, rotation: float, length_unit: str) -> str:

@@ -14,8 +14,15 @@ ALPHA_NAME, ALPHA_UNKNOWN = 0.8 * ALPHA, 0.2 * ALPHA
 LOG_BAYES_FACTOR = 2.5
 # A name needs 20 to 1 over every other, and the unknown 20 to 1 over every name ("strong", Kass & Raftery 1995).
 ODDS = float(np.log(20.0))
+# Laws of the dictionary that are told together where views do not tell them apart: more help nobody (custom).
+MOST_LAWS = 3
 # Prior shares: nothing is missing, one effect of the library, something without a name (of every kind by itself).
 PRIOR_NOTHING, PRIOR_PHYSICAL, PRIOR_UNKNOWN = 0.5, 0.45, 0.05
+# Usual sizes up to which a name may be certain: beyond, something that is stated is likelier to be wrong (custom).
+BELIEVABLE_SIZES = 10.0
+# The share of the laws of the dictionary, alike for each of some two hundred: an effect that was thought of before is
+# some twenty times as likely as one of them (judgement).
+PRIOR_LAWS = 0.3
 # Probability with which the smallest detectable size is detected (custom in power analysis).
 POWER = 0.8
 # Squares in units of the scatter; an effect that needs more is of no plausible size: its prior holds back all of it.

@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 from scipy.special import logsumexp
 
-from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis import thresholds as limits
+from stitch.diagnosis.ranking import Ranked, stands_out
 from stitch.diagnosis.unmodelled_time_effects import RepeatingError
 from stitch.diagnosis.validation import CrossValidation
 from stitch.observations.linear_model import LinearModel
@@ -33,6 +34,8 @@ class Evidence:
 
     ranked: tuple[Ranked, ...]  # physical effects, best first, unobservable last
     empirical: tuple[Ranked, ...]  # shapes without a cause, best first
+    laws: tuple[Ranked, ...] = ()  # of the dictionary that no effect says, likeliest first
+    rival_laws: tuple[Ranked, ...] = ()  # those of them that explain the views as well as what is named
     # An effect or a shape is 12 to 1 over nothing at a family-wise p < 0.04, and views left out do not refute it.
     alarm: bool = False
     # Effects of which each would explain the alarm, likeliest first; alone where none comes within 20 to 1.
@@ -69,10 +72,22 @@ class Evidence:
         """The first row of the table in docs/diagnosis.md ("The verdict") whose condition holds."""
         without_rival = not (self.unmodelled_explains_it or self.refuted or scanner_explains_it(self))
         if self.explanation and without_rival:
-            return "missing_effect" if len(self.explanation) == 1 else "cannot_tell"
+            return "missing_effect" if len(self.explanation) == 1 and not self.rival_laws else "cannot_tell"
         scanner_errs = self.scanner_error is not None and self.scanner_error.over_noise
         unexplained = self.alarm or self.repeating_errors or self.implausible_scatter
         return "unknown_effect" if unexplained or scanner_errs or self.overlap_misfit > 0 else "adequate"
+
+    @property
+    def told_laws(self) -> tuple[Ranked, ...]:
+        """Laws that are told: beside what is named those that explain as much; else what stands out, with all within
+        20 to 1, unless these are too many to help."""
+        if self.named:
+            return self.rival_laws
+        if self.verdict != "unknown_effect" or not self.laws or not stands_out(self.laws[0]):
+            return ()
+        least = self.laws[0].log_posterior - limits.ODDS
+        near = tuple(r for r in self.laws if r.log_posterior > least)
+        return near if len(near) <= limits.MOST_LAWS else ()
 
     @property
     def named(self) -> tuple[Ranked, ...]:

@@ -1,8 +1,7 @@
-"""The empirical tier: shapes without a cause. They only say on what the missing effect depends.
+"""The empirical tier: shapes without a cause that no motion of whole views makes.
 
-Fourier terms of a joint, polynomials of time or a covariate, a low-order field map. They compete
-with the physical effects: where one of them explains the views far better than anything known, something
-unknown is at work.
+Errors along the rays that follow a covariate, a low-order field map. They compete with the physical effects, as do the
+laws of motions of whole views (`diagnosis/systematic_laws.py`).
 """
 
 from collections.abc import Callable
@@ -11,13 +10,12 @@ from math import prod
 
 import numpy as np
 
-from stitch.effects.contract import Effect, Spec, number, twist
+from stitch.effects.contract import Effect, Spec, number
 from stitch.numerics.frames import Array
 from stitch.session.measurement import ScanView, Views
 
 # A distortion of the scanner's field by no law.
 FIELD = "distortion_over_field"
-_HARMONICS = (1, 2, 3, 4)
 # Where a scanner sees, a = x/z and b = y/z reach so far, and the range r from its standoff r₀, d = r/r₀ − 1.
 _REACH = {"a": 0.3, "b": 0.3, "d": 0.1}
 # Monomials of these three, of the first and the second degree.
@@ -27,10 +25,6 @@ _MONOMIALS = [factors for degree in (1, 2) for factors in combinations_with_repl
 def empirical_effects(views: Views) -> list[Effect]:
     """Return every empirical effect that these views can carry."""
     effects = []
-    for joint in range(views.joints.shape[1]):
-        # A joint that hardly turns shows no period.
-        if np.ptp(views.joints[:, joint]) > np.radians(15.0):
-            effects += [_harmonic(joint, order) for order in _HARMONICS]
     covariates = ({"time_s": views.time} if views.has("time") else {}) | views.covariates
     for name, values in covariates.items():
         if np.ptp(values) > 0 and len(np.unique(values)) > 2:
@@ -38,7 +32,6 @@ def empirical_effects(views: Views) -> list[Effect]:
             # Polynomials (V,) of the covariate over ±1.
             polynomials = {1: x, 2: 1.5 * x**2 - 0.5}
             effects += [_bias(name, order, shape) for order, shape in polynomials.items()]
-            effects += [_mount(name, order, shape) for order, shape in polynomials.items()]
     return [*effects, _field()]
 
 
@@ -48,32 +41,12 @@ def _effect(
     return Effect(name, place, specs, function=function, needs=needs, prefers=(), tier="empirical", group=group)
 
 
-def _harmonic(joint: int, order: int) -> Effect:
-    def fourier(joints: Array, views: Views, A: float, B: float) -> Array:
-        true = joints.copy()
-        true[:, joint] += A * np.sin(order * views.joints[:, joint]) + B * np.cos(order * views.joints[:, joint])
-        return true
-
-    fourier.__doc__ = f"joint {joint + 1}: A sin {order}q + B cos {order}q"
-    name = f"fourier_{order}_of_j{joint + 1}"
-    size = number("rad", 4e-4, 0.01)
-    return _effect(f"j{joint + 1}_deg", name, "robot", fourier, A=size, B=size)
-
-
 def _bias(name: str, order: int, shape: Array) -> Effect:
     def bias(points: Array, view: ScanView, k: float) -> Array:
         return points + view.along(points) * (k * shape[view.index])
 
     bias.__doc__ = f"along the ray by k·P{order}({name})"
     return _effect(name, f"bias_{order}_of_{name}", "sensor", bias, k=number("mm", 0.1, 5.0))
-
-
-def _mount(name: str, order: int, shape: Array) -> Effect:
-    def follow(views: Views, xi: Array) -> Array:
-        return np.outer(shape, xi)
-
-    follow.__doc__ = f"M·exp(ξ·P{order}({name}))"
-    return _effect(name, f"mount_{order}_of_{name}", "mount", follow, xi=twist("", 4e-4, 0.15))
 
 
 def _field() -> Effect:

@@ -7,6 +7,7 @@ import numpy as np
 
 from stitch.diagnosis.diagnosis import CandidateEffect, Diagnosis, Finding
 from stitch.diagnosis.score import Score
+from stitch.diagnosis.systematic_laws import law_of, law_size
 from stitch.diagnosis.unmodelled_time_effects import TimeCurve
 from stitch.diagnosis.validation import CrossValidation
 from stitch.numerics.frames import Array
@@ -140,6 +141,17 @@ def _time_law(curve: TimeCurve | None) -> dict[str, Any] | None:
     }
 
 
+def _law_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Return the laws of the dictionary that are told: rivals of a name, or what is found where none is given."""
+    rows = []
+    for ranked in diagnosis.laws:
+        law = law_of(ranked)
+        size, sigma, unit = law_size(diagnosis.linear, ranked)
+        row = {"place": law.place.name, "follows": law.driver.name, "shape": law.shape, "words": law.words}
+        rows.append(row | {"size": size, "sigma": sigma, "unit": unit, "p_value": ranked.adjusted})
+    return rows
+
+
 # What is read again of a candidate.
 _CANDIDATE = Document(
     Key("effect", TEXT),
@@ -161,8 +173,9 @@ DIAGNOSIS = Document(
     Key("candidates", Kind(list_of(_CANDIDATE.kind()).schema), write=_candidate_rows, optional=True),
     Key(
         "depends_on",
-        write=lambda d: rows_of_fields(d.depends_on, "covariate score p_value bins mean sigma shape"),
+        write=lambda d: rows_of_fields(d.depends_on, "covariate place score p_value bins mean sigma shape"),
     ),
+    Key("laws", write=_law_rows),
     # Along what a joint errs by no known law, in the unit of its covariate; errors in rad.
     Key("joint_laws", write=lambda d: rows_of_fields(d.curves, "joint covariate share at error sigma may_follow")),
     Key("time_law", write=lambda d: _time_law(d.time_curve)),

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from stitch.diagnosis.diagnosis import Diagnosis
 from stitch.diagnosis.residual_structure import BudgetLine
 from stitch.diagnosis.sentences import odds_text
-from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, HELDOUT_FALL, MAX_REMAINING_SHARE
+from stitch.diagnosis.systematic_laws import law_of
+from stitch.diagnosis.thresholds import CLEAR_DEPENDENCE, HELDOUT_FALL, MAX_REMAINING_SHARE, ODDS
 from stitch.diagnosis.validation import CrossValidation, group_helps, group_share
 from stitch.numerics.units import length_text
 from stitch.observations.surfaces.field_error import FieldError
@@ -47,8 +48,10 @@ def _same_as_finding(diagnosis: Diagnosis) -> str | None:
 
 def _finding(diagnosis: Diagnosis, length_unit: str) -> str:
     """Return what is missing, and how far the error should fall with it."""
-    named = " or ".join(effect_in_words(name) for name in diagnosis.effects)
-    odds = "" if diagnosis.certain else f" The odds against chance are {odds_text(diagnosis.log_odds_over_nothing)}."
+    rivals = [law_of(r).words for r in diagnosis.laws]
+    named = " or ".join([*map(effect_in_words, diagnosis.effects), *rivals])
+    sure = diagnosis.certain or diagnosis.log_odds_over_nothing > ODDS
+    odds = "" if sure else f" The odds against chance are {odds_text(diagnosis.log_odds_over_nothing)}."
     match diagnosis.verdict:
         case "adequate":
             return (
@@ -107,6 +110,8 @@ def _error_location(diagnosis: Diagnosis) -> str:
         return ": each scan has its own error, as if the part bent or the scanner changed"
     if diagnosis.follows_field:
         return ": the scanner's error depends on the position in its field of view"
+    if diagnosis.laws:
+        return f": {' or '.join(law_of(r).words for r in diagnosis.laws)}"
     if diagnosis.curves:
         joints = " or ".join(f"joint {k}" for k in sorted({curve.joint for curve in diagnosis.curves}))
         return f": the error follows {joints}, but no known formula"
@@ -130,6 +135,9 @@ def remedy_at_machine(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "unknown_effect" and diagnosis.follows_field:
         by_view = diagnosis.scanner_error is not None and diagnosis.scanner_error.by_view
         remedy = "" if by_view else "have the scanner calibrated"
+    elif diagnosis.verdict == "unknown_effect" and diagnosis.laws:
+        law = law_of(diagnosis.laws[0])
+        remedy = f"look for what changes with {plain_covariate(law.driver.name)} at {law.place.name}"
     elif diagnosis.verdict == "unknown_effect" and diagnosis.curves:
         remedy = f"have joint {diagnosis.curves[0].joint} checked: gear, bearing, and what hangs on it"
     elif diagnosis.verdict == "unknown_effect":
@@ -151,11 +159,13 @@ def suggested_command(diagnosis: Diagnosis, run: str) -> str:
             return f"Next, to see where the model fails: stitch review {run}"
         case "missing_effect":
             return f"Next: stitch add {run} --suggested"
-        case "cannot_tell" if not _group_helps(diagnosis):
+        case "cannot_tell" if diagnosis.laws or not _group_helps(diagnosis):
             return f"Next, for views that would separate them: stitch next {run}"
         case "cannot_tell":
             return f"Next, to fit them as one group: stitch add {run} --group"
-        case "unknown_effect" if not diagnosis.follows_field and (diagnosis.curves or diagnosis.time_curve):
+        case "unknown_effect" if not diagnosis.follows_field and (
+            diagnosis.laws or diagnosis.curves or diagnosis.time_curve
+        ):
             return f"Next, to look for a formula: stitch explain {run} -o mine.py"
         case "unknown_effect":
             return f"Next, to see where the model fails: stitch review {run}"

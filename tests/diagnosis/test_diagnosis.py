@@ -12,9 +12,9 @@ from data_synth.fixtures.labelled_arm import TABLE, TARGETS, Growth, labelled_ce
 from stitch.api.pipeline import change, diagnose, run
 from stitch.api.stepwise import suggest
 from stitch.diagnosis.diagnose import diagnose_state, linear_model_of
-from stitch.diagnosis.residual_structure import covariate_values
 from stitch.diagnosis.score import scatter_limit
 from stitch.diagnosis.stepwise_selection import find_effect_to_drop
+from stitch.diagnosis.systematic_laws import drivers_of
 from stitch.effects.empirical import FIELD, empirical_effects
 from stitch.numerics import frames
 from stitch.output.diagnosis_document import diagnosis_document
@@ -289,7 +289,6 @@ def test_a_covariate_is_no_joint_by_its_name(blade_capture):
     views = replace(
         measurement_of(session_of(measured), capture).views, covariates={"jig_deg": tilt, "j_deg": 2 * tilt}
     )
-    assert np.array_equal(covariate_values(views, "jig_deg"), tilt) and np.array_equal(
-        covariate_values(views, "j_deg"), 2 * tilt
-    )
-    assert np.allclose(covariate_values(views, "j2_deg"), np.degrees(measured.plan.joints[:, 1]))
+    values = {driver.name: driver.values for driver in drivers_of(views)}
+    assert np.array_equal(values["jig_deg"], tilt) and np.array_equal(values["j_deg"], 2 * tilt)
+    assert np.allclose(values["j2_deg"], np.degrees(measured.plan.joints[:, 1]))

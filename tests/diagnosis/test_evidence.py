@@ -24,7 +24,7 @@ from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 from tests.diagnosis.freed_blade import freed_blade
 
-NO_CASE = gathering.Case(None, ())
+NO_CASE = gathering.Case(None, (), None)
 ONE, OTHER = (SimpleNamespace(name=n, score=SimpleNamespace(log_bayes_factor=8.0)) for n in ("backlash", "settling"))
 LARGE, SMALL = (FieldError(0.02, 0.0, gain, over_noise) for gain, over_noise in ((20.0, True), (5.0, False)))
 REPEATS = (SimpleNamespace(words="wander"),)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stitch.diagnosis.diagnosis import Diagnosis
+from stitch.diagnosis.diagnosis import Diagnosis, too_large
 from stitch.diagnosis.score import ScatterLimit
 from stitch.diagnosis.sentences import diagnosis_sentence, odds_text, scanner_advice, scanner_error_sentence
 from stitch.diagnosis.verdict import Evidence
@@ -26,6 +26,7 @@ def test_the_scatter_of_the_poses_is_told_where_there_is_one(verdict):
         "overlap_misfit": 0.0,
         "follows_field": False,
         "scanner_error": None,
+        "laws": (),
         "scatter_limit": ScatterLimit(2.5e-4, 0.12),
     }
     told = diagnosis_sentence(SimpleNamespace(**common, rotation=2e-5, translation=0.02), "mm", None)
@@ -52,6 +53,8 @@ def said_at(odds: float, verdict: str, *effects: str, score=NOT_FITTED) -> str:
         translation=0.0,
         log_odds_over_nothing=np.log(odds),
         coincidence="",
+        laws=(),
+        beyond_belief=too_large([SimpleNamespace(score=score)]) if score.fitted else (),
     )
     found.certain = Diagnosis.certain.fget(found)
     return diagnosis_sentence(found, "mm", None)
@@ -74,6 +77,8 @@ def test_the_sentence_says_why_the_likeliest_in_the_table_is_not_named(together,
         residual_rms=0.0132,
         noise_floor=0.0110,
         certain=True,
+        beyond_belief=(),
+        log_odds_over_nothing=np.inf,
         together=together,
         notes=notes,
     )
@@ -92,14 +97,15 @@ def test_a_scale_of_the_scanner_may_be_one_of_the_arm(effect, said):
     assert ("arm lengths that are all off by the same share" in said_at(25.0, "missing_effect", effect)) == said
 
 
-def test_a_size_larger_than_plausible_is_asked_about():
+def test_a_size_beyond_belief_is_asked_about_and_not_certain():
     """No size forbids a name: a number in a table may be wrong."""
     free = [SimpleNamespace(name=name, limit=5.0, unit="mm") for name in ("da1", "da2")]
-    form = SimpleNamespace(free=free, term=SimpleNamespace(parameters=[]))
+    form = SimpleNamespace(free=free, term=SimpleNamespace(parameters=[]), sizes=np.array([0.3, 0.3]))
     score = SimpleNamespace(fitted=True, form=form, values=np.array([0.1, -8.0]), sigmas=np.array([0.02, 0.02]))
     told = said_at(1e9, "missing_effect", "link_geometry", score=score)
     assert "da2 = -8 ± 0.02 mm" in told
-    assert told.endswith(" da2 is larger than plausible: check session.toml.")
+    assert told.endswith(" da2 is more than 10 times the usual size: check session.toml.")
+    assert told.startswith("link_geometry may be missing") and "odds" not in told
 
 
 @pytest.mark.parametrize(("odds", "said"), [(25.0, "Something is missing: "), (4.0, "Something may be missing: ")])

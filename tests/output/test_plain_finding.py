@@ -38,6 +38,7 @@ def test_the_next_command_can_be_typed(monkeypatch, verdict, curves, time_curve,
     monkeypatch.setattr("stitch.output.plain_finding.group_share", lambda linear, group: (0.7, 0.1))
     found = SimpleNamespace(
         verdict=verdict,
+        laws=(),
         curves=curves,
         time_curve=time_curve,
         doubts=(),
@@ -61,6 +62,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
     cause = SimpleNamespace(name="play", ranked=SimpleNamespace(score=None))
     found = SimpleNamespace(
         verdict="cannot_tell",
+        laws=(),
         effects=("play",),
         candidates=(cause,),
         doubts=(),
@@ -83,6 +85,7 @@ def test_a_group_that_is_refused_is_not_proposed(monkeypatch, share):
 def test_no_model_is_built_on_a_doubtful_session(verdict):
     found = SimpleNamespace(
         verdict=verdict,
+        laws=(),
         effects=("backlash",),
         curves=("of joint 3",),
         time_curve=None,
@@ -103,6 +106,7 @@ def test_a_step_that_is_named_is_no_doubt_beside_it(moved, distinguishable, furt
     step = PoseStep(2, moved, distinguishable, (7e-4, 0.12), (7e-4, 0.12), 1e-30)
     found = SimpleNamespace(
         verdict="missing_effect",
+        laws=(),
         effects=(named,),
         candidates=(SimpleNamespace(name=named, cross_validation=None),),
         doubts=(step.describe(["a", "b", "c", "d"], "mm"), *further),
@@ -125,6 +129,7 @@ def test_what_the_scans_err_by_is_part_of_what_explains_the_rest():
     for smooth, said in ((None, "arm's scatter explain"), (same, "own error (17 µm over"), (own, "own error (12 µm, ")):
         found = SimpleNamespace(
             verdict="adequate",
+            laws=(),
             effects=(),
             scanner_error=smooth,
             doubts=(),
@@ -148,11 +153,13 @@ def test_a_name_that_may_be_chance_is_no_statement(odds, said):
     candidate = SimpleNamespace(name="settling", cross_validation=None)
     found = SimpleNamespace(
         verdict="missing_effect",
+        laws=(),
         effects=("settling",),
         candidates=(candidate,),
         doubts=(),
         dropped_before=None,
         log_odds_over_nothing=np.log(odds),
+        beyond_belief=(),
     )
     found.certain = Diagnosis.certain.fget(found)
     found.likelier_than_not = Diagnosis.likelier_than_not.fget(found)
@@ -174,6 +181,7 @@ def test_an_error_that_should_rise_is_no_gain(inside, poses, said):
     left = CrossValidation(inside=inside, heldout=1.0, poses=poses, poses_sigma=0.1, steadiness=0.9)
     found = SimpleNamespace(
         verdict="missing_effect",
+        laws=(),
         effects=("settling",),
         candidates=(SimpleNamespace(name="settling", cross_validation=left),),
         doubts=(),
@@ -203,6 +211,7 @@ def _found(
     candidate = SimpleNamespace(name="play", ranked=ranked, cross_validation=SimpleNamespace(heldout=heldout))
     return SimpleNamespace(
         verdict=verdict,
+        laws=(),
         effects=("play",) if verdict == "missing_effect" else (),
         candidates=(candidate, SimpleNamespace(name="sag", ranked=other, cross_validation=None)),
         certain=certain,
@@ -244,7 +253,7 @@ def test_the_screen_says_how_sure_it_is(found, said):
 )
 def test_where_no_effect_is_named_the_machine_is_still_told_of(curves, said):
     follows = (SimpleNamespace(covariate="j2_deg", p_value=1e-9),)
-    found = SimpleNamespace(verdict="unknown_effect", curves=curves, depends_on=follows, follows_field=False)
+    found = SimpleNamespace(verdict="unknown_effect", laws=(), curves=curves, depends_on=follows, follows_field=False)
     assert remedy_at_machine(found) == f"At the machine: {said}"
     for by_view, told in ((False, "At the machine: have the scanner calibrated."), (True, "")):
         found.follows_field, found.scanner_error = True, SimpleNamespace(by_view=by_view)

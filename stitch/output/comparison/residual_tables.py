@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from stitch.diagnosis.dependence import Dependence, dependences
 from stitch.fit.pipelines import linearise
 from stitch.model.forward import corrected_capture
 from stitch.numerics.distributions import f_tail
@@ -24,7 +25,6 @@ from stitch.numerics.units import covariate_unit
 from stitch.observations.surfaces.matching import Match, sample_points
 from stitch.observations.surfaces.normal_equations import FINE_SAMPLES, RMS_GATE, collect_overlaps
 from stitch.observations.targets.rows import drawing_of, initial_landmarks, target_rows
-from stitch.output.comparison.displaced_views import FollowedCovariate, followed_covariates
 from stitch.run_data import RunData
 from stitch.session.measurement import Views
 from stitch.system.threads import library_threads_off
@@ -112,7 +112,7 @@ class ResidualTables(Table, document="stitch.output.comparison.residual_tables:c
     rms: float
     views: tuple[str, ...] = ()  # names, V
     of_views: dict[str, Array] = field(default_factory=dict)  # property -> (V,) value of each view
-    followed: tuple[FollowedCovariate, ...] = ()  # what the displacements of whole views follow, clearest first
+    followed: tuple[Dependence, ...] = ()  # what the displacements of whole views follow, clearest first
 
     def table(self, name: str) -> ResidualTable:
         """Return one table by its name.
@@ -233,7 +233,7 @@ def compare_targets(state: RunData) -> ResidualTables:
 def _comparison(state: RunData, tables: Sequence[ResidualTable], rms: float, known: Properties) -> ResidualTables:
     """Return tables with what is known of the views, and what the displacements of whole views follow of it."""
     with library_threads_off():
-        followed = followed_covariates(linearise(state.session, state.measurement, state.model, state.gate))
+        followed = dependences(linearise(state.session, state.measurement, state.model, state.gate))
     return ResidualTables(
         tables=tuple(table for table in tables if len(table.count)),
         rms=rms,
@@ -506,11 +506,17 @@ def _same_rows(a: ResidualTable, b: ResidualTable) -> bool:
     return all(np.allclose(x[first], y[second], rtol=0, atol=small, equal_nan=True) for x, y in pairs)
 
 
+def _followed_row(followed: Dependence) -> dict[str, object]:
+    names = ["covariate", "unit", "place", "shape", "p_value", "p_beside", "direction", "mean", "sigma"]
+    row = {name: getattr(followed, name) for name in names} | {"at": followed.bins}
+    return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in row.items()}
+
+
 def comparison_document(comparison: ResidualTables) -> dict[str, object]:
     """Return compare.json: the tables as plain lists."""
     return {
         "rms": comparison.rms,
-        "follows": [followed.document() for followed in comparison.followed],
+        "follows": [_followed_row(followed) for followed in comparison.followed],
         "means": comparison.means,
         "tables": [_table_row(comparison, table) for table in comparison.tables],
         "views": [

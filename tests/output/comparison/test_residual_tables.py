@@ -8,7 +8,8 @@ from data_synth.fixtures.blade_cells import measured_blade
 from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.labelled_arm import labelled_cell
 from stitch.api.pipeline import run
-from stitch.output.comparison.displaced_views import FOLLOWS, VIEW_ORDER, also_clear, equally_clear, followed_covariates
+from stitch.diagnosis.dependence import FOLLOWS, also_clear, dependences, equally_clear
+from stitch.diagnosis.systematic_laws import STEP
 from stitch.output.comparison.residual_tables import (
     compare_surfaces,
     compare_targets,
@@ -182,7 +183,7 @@ def blade():
 
 
 def test_scans_that_only_scatter_follow_nothing(blade):
-    found = followed_covariates(blade.seen(blade.measurement.T_base_flange))
+    found = dependences(blade.seen(blade.measurement.T_base_flange))
     assert found[0].p_value > FOLLOWS and not equally_clear(found) and not also_clear(found)
 
 
@@ -196,10 +197,10 @@ def test_a_step_is_told_with_its_view_its_size_and_its_sign():
     flange = np.zeros((VIEWS, 6))
     flange[START:, 4] = -0.3
     first = followed(flange=flange)[0]
-    assert first.covariate == VIEW_ORDER and first.shape == f"a step at view v{START}" and first.p_value < 1e-12
+    assert first.covariate == STEP and first.shape == f"a step at view v{START}" and first.p_value < 1e-12
     assert first.direction[1] > 0.98
     assert first.mean[1] - first.mean[0] == pytest.approx(0.3, abs=0.03)
-    assert first.at == pytest.approx([(START - 1) / 2, (START + VIEWS - 1) / 2])
+    assert first.bins == pytest.approx([(START - 1) / 2, (START + VIEWS - 1) / 2])
 
 
 def test_a_joint_is_told_from_time_and_from_the_others():
@@ -207,7 +208,7 @@ def test_a_joint_is_told_from_time_and_from_the_others():
     joints = np.zeros((VIEWS, 6))
     joints[:, 4] = 5e-4 * np.sin(session.joints[:, 4])
     found = followed(joints=joints)
-    assert found[0].covariate == "j5" and found[0].shape == "a wave, once a turn"
+    assert found[0].covariate == "j5_deg" and found[0].shape == "a wave, once a turn"
     assert not also_clear(found)
 
 
@@ -219,7 +220,7 @@ def test_two_things_are_both_told():
     flange[START:, 4] = 0.3
     found = followed(joints=joints, flange=flange)
     assert found[0].p_beside == 1
-    assert {VIEW_ORDER, "j3"} <= {found[0].covariate} | {own.covariate for own in also_clear(found)}
+    assert {STEP, "j3_deg"} <= {found[0].covariate} | {own.covariate for own in also_clear(found)}
 
 
 def test_the_document_holds_it_as_lists():

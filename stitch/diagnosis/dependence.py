@@ -1,0 +1,168 @@
+"""What the displacements of whole views follow, by the dictionary of systematic laws: one table for all who ask.
+
+A view that is off is off in all its points, and a mean over points whose sign changes with the pose hides that. So the
+views themselves are asked, beside hand-eye and effects in use and over scatter alone: for every covariate, whether the
+part, the far end of the arm or any one joint moves with it (F test; Bonferroni over all laws). What follows a covariate
+may also be an error of the poses that repeats; this says where it is, and names no cause.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stitch.diagnosis.systematic_laws import STEP, Law, dictionary_of
+from stitch.diagnosis.thresholds import DEPENDENCE_BINS
+from stitch.numerics.distributions import f_tail
+from stitch.numerics.frames import Array
+from stitch.numerics.least_squares import column_space, fit_columns
+from stitch.numerics.reml import at_variances
+from stitch.observations.linear_model import LinearModel
+
+# Family-wise p of the clearest covariate at which the views are said to follow it (custom).
+FOLLOWS = 0.01
+# Odds below which another covariate explains the displacements as well ("strong", Kass & Raftery 1995).
+_AS_WELL = 20.0
+# Columns of which less than this share is new beside the model say nothing; nor does what is smaller than the second.
+_NEW_SHARE, _NOTHING = 1e-4, 1e-9
+# Laws whose scatter is fitted anew, the clearest, and of more numbers than these (time).
+_REFITTED, _FEW_NUMBERS, _REFITTED_OF_MANY = 12, 400, 3
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """One covariate, by the law that explains most of the displacements; bins along the direction that follows it."""
+
+    covariate: str
+    unit: str
+    place: str  # that moves with it
+    shape: str  # in words: a step at view v012
+    score: float  # share of the views' unexplained scatter that follows it, 0 … 1
+    p_value: float  # over all laws
+    p_beside: float  # the same beside the clearest covariate; 1 of that itself
+    direction: Array  # (3,) unit, reference frame; its largest component is positive
+    bins: Array  # (B,) middle of each bin, in the unit of the covariate
+    mean: Array  # (B,) displacement along the direction, length_unit
+    sigma: Array  # (B,) standard error, views as samples
+    at: Array  # (V,) the covariate of every view
+    moved: Array  # (V,) displacement of every view along the direction, length_unit
+
+    @property
+    def clear(self) -> bool:
+        """True where chance does not explain it."""
+        return self.p_value < FOLLOWS
+
+
+def equally_clear(followed: Sequence[Dependence]) -> tuple[Dependence, ...]:
+    """Return the clearest covariate and those that explain the displacements as well; () where nothing is clear."""
+    return tuple(x for x in followed if x.clear and x.p_value <= _AS_WELL * followed[0].p_value)
+
+
+def also_clear(followed: Sequence[Dependence]) -> tuple[Dependence, ...]:
+    """Return those that are clear beside the clearest too."""
+    return tuple(x for x in followed if x.clear and x.p_beside < FOLLOWS)
+
+
+def dependences(linear: LinearModel) -> tuple[Dependence, ...]:
+    """Find what the displacements of whole views follow, clearest first; () where too few numbers are free."""
+    linear = linear.restricted(())
+    laws = [law for law in dictionary_of(linear).laws if law.is_whole]
+    if not laws:
+        return ()
+    columns = [law.reduced(linear.observation) for law in laws]
+    p_values = _p_values(linear, columns)
+    best: dict[str, int] = {}
+    for k in np.argsort(p_values, kind="stable"):
+        best.setdefault(laws[k].driver.name, int(k))
+    first, *others = best.values()
+    beside = dict(
+        zip(others, _p_values(_conditioned(linear, columns[first]), [columns[k] for k in others]), strict=True)
+    )
+    displacement = linear.view_displacements()
+    tried = len(laws)  # each is the likeliest of all of them
+    return tuple(
+        _dependence(linear, laws[k], columns[k], displacement, tried * p_values[k], tried * beside.get(k, 1.0))
+        for k in best.values()
+    )
+
+
+def _p_values(linear: LinearModel, columns: Sequence[Array]) -> list[float]:
+    """Return the chance of what each of some columns (n, k) explains.
+
+    That of the clearest is under the scatter that is left beside them: what views follow counts as scatter as long as
+    it is not taken out, and hides itself.
+    """
+    p_values = [_p_value(linear, x) for x in columns]
+    refitted = _REFITTED if linear.mixed.size <= _FEW_NUMBERS else _REFITTED_OF_MANY
+    for k in np.argsort(p_values, kind="stable")[:refitted]:
+        scatter = at_variances(linear.mixed, _conditioned(linear, columns[k]).null.variances)
+        p_values[k] = _p_value(replace(linear, null=scatter), columns[k])
+    return p_values
+
+
+def _p_value(linear: LinearModel, columns: Array) -> float:
+    """Return the chance of what columns (n, k) explain, of a scatter that is known to so many degrees of freedom."""
+    white = linear.residual(columns)
+    U = column_space(white) if np.abs(white).max(initial=0.0) > _NOTHING else white[:, :0]
+    if not U.shape[1]:
+        return 1.0
+    known = linear.satterthwaite.degrees_of_freedom(linear.in_blocks(white))
+    return f_tail(float(np.sum((U.T @ linear.white_residual) ** 2)) / U.shape[1], U.shape[1], max(known, 1.0))
+
+
+def _conditioned(linear: LinearModel, columns: Array) -> LinearModel:
+    """Return the model with the combinations of columns (n, k) that it does not explain itself."""
+    white = linear.residual(columns)
+    length = np.maximum(np.linalg.norm(white, axis=0), 1e-300)
+    _, s, turned = np.linalg.svd(white / length, full_matrices=False)
+    keep = s > _NEW_SHARE * s[0]
+    combined = (columns / length) @ (turned[keep].T / s[keep])
+    return linear.conditioned_on(combined, np.full(int(keep.sum()), np.inf))
+
+
+def _dependence(
+    linear: LinearModel, law: Law, columns: Array, displacement: Array, p_value: float, p_beside: float
+) -> Dependence:
+    """Return the bins of one law along the direction in which what it explains is largest."""
+    white = linear.residual(columns)
+    moved = columns @ fit_columns(white, linear.white_residual)
+    held = linear.reduce(linear.design) @ fit_columns(linear.white_design, linear.whiten(moved[:, None])[:, 0])
+    direction = np.linalg.svd(linear.observation.part_displacements(moved - held), full_matrices=False)[2][0]
+    direction = direction * np.sign(direction[np.abs(direction).argmax()])
+    along = displacement @ direction
+    x = law.driver.values
+    split = law.driver.name == STEP and int(np.argmax(law.shapes[:, 0] > 0))
+    middle, mean, sigma = bin_means(x, along, split=float(split) - 0.5 if split else None)
+    explained = np.sum((column_space(white).T @ linear.white_residual) ** 2)
+    return Dependence(
+        covariate=law.driver.name,
+        unit=law.driver.unit,
+        place=law.place.name,
+        shape=law.shape,
+        score=float(explained / max(float(np.sum(linear.white_residual**2)), 1e-300)),
+        p_value=min(p_value, 1.0),
+        p_beside=min(p_beside, 1.0),
+        direction=direction,
+        bins=middle,
+        mean=mean,
+        sigma=sigma,
+        at=x,
+        moved=along,
+    )
+
+
+def bin_means(
+    x: Array, y: Array, bins: int = DEPENDENCE_BINS, split: float | None = None
+) -> tuple[Array, Array, Array]:
+    """Return middle, mean and standard error of y in bins of x with equal counts, or on both sides of a split; views
+    are the samples."""
+    order = np.argsort(x, kind="stable")
+    if split is None:
+        parts = [part for part in np.array_split(order, min(bins, max(len(x) // 2, 1))) if len(part)]
+    else:
+        parts = [order[x[order] < split], order[x[order] > split]]
+    spread = float(np.std(y, ddof=1)) if len(y) > 1 else 0.0
+    middle = np.array([x[part].mean() for part in parts])
+    mean = np.array([y[part].mean() for part in parts])
+    sigma = np.array([(np.std(y[part], ddof=1) if len(part) > 2 else spread) / np.sqrt(len(part)) for part in parts])
+    return middle, mean, sigma

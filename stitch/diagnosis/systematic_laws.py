@@ -1,0 +1,481 @@
+"""The dictionary of systematic laws: whatever is known of the views, at every place where it could act.
+
+A name is worth no more than what it is compared with, and a library is a poor rival of itself. So an effect is held
+against all that views may follow: every column of views.csv, time or view order, angle, last move and torque of every
+joint, its approach, a step from some view on. Each may move what the reference carries (the part, and the base of an
+arm whose base is the reference), what stands at the far end of the arm, or any one joint; as a line or smoothly; in all
+six numbers, or along or about one axis.
+
+A place and what it follows are one law, each as likely before as any other; its forms share that. All forms are sized
+at the variances of the model, the likeliest few with all variances anew (`score.try_form`), as effects are.
+
+A law that an effect of the library or of a user says too is no rival of it: it is that effect, by its name. What turns
+the first joint turns the base about its axis, and the last one what the flange carries; they are one place.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.special import logsumexp
+from scipy.stats import f as f_distribution
+
+from stitch.diagnosis import thresholds as limits
+from stitch.diagnosis.candidates import Candidate, Form
+from stitch.diagnosis.ranking import Ranked
+from stitch.diagnosis.regime import regime_of
+from stitch.diagnosis.score import Score, try_form
+from stitch.effects.contract import EFFECTS, Effect, Parameter
+from stitch.model.forward import pose_derivatives
+from stitch.model.model import Term, term_of
+from stitch.numerics import frames
+from stitch.numerics.common_covariance import SelectedColumns
+from stitch.numerics.frames import Array, Indices
+from stitch.numerics.least_squares import column_space, project_out
+from stitch.observations.linear_model import LinearModel, Observation
+from stitch.observations.pose_errors import usual_twist
+from stitch.session.measurement import Views
+
+TIME = "time_s"
+# What views follow in their order: a step from some view on, or where no time is stated a trend.
+STEP = "view order"
+NUMBER = "view number"
+# Degree of a smooth function of a covariate; each power usually half as large as the one before.
+_DEGREE = 3
+# Views at an end that make a step; steps that are tried at the most, and laws and forms whose variances are fitted anew
+# (time).
+_VIEWS_AT_END, _MOST_STEPS = 2, 50
+_LAWS_FITTED, _FORMS_FITTED = 6, 12
+# Two columns of which this share is common are one.
+_SAME = 0.999
+_SAME_VALUE = 1e-9
+# Bytes of columns that are held from one question to the next.
+_HELD = 60e6
+# A joint that turns less (rad) follows nothing of its own angle.
+_STILL = np.radians(2.0)
+# What is usual of a joint (rad); of a flange `usual_twist` says it.
+_JOINT = 4e-4
+# Draws of what chance makes of the clearest law, their seed; by-count chances beyond which none is clear, and numbers
+# among which there is no time to draw.
+_DRAWS, _SEED = 499, 20
+_DRAWN_UP_TO, _MOST_DRAWN = 1.0, 400
+
+
+@dataclass(frozen=True, eq=False)
+class Driver:
+    """What views may follow."""
+
+    name: str  # a column of views.csv, time, view order, angle of joint 3, view (a step)
+    unit: str
+    values: Array  # (V,)
+    shapes: dict[str, Array]  # in words: (V, R), nought where the law is none yet, 1 at the most
+    joint: int | None = None  # the one that alone may follow it, counted from 1
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where a law acts."""
+
+    name: str  # joint 3, or all that moves alike: the part or the base
+    twists: Array  # (V, 6, k) of the views about the observation's centre, per rad and length_unit
+    sizes: Array  # (k,) that are usual
+    whole: Indices  # all that is independent of these; the others are further axes
+    units: tuple[str, ...]  # rad, or length_unit
+    joint: int | None = None  # counted from 1
+    kind: str = "robot"  # place of effects that act there: robot, part, mount
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """A place that follows something, in one form."""
+
+    place: Place
+    driver: Driver
+    shape: str  # of those of the driver
+    columns: Indices  # of the place's that it has
+    centred: bool = False  # nought on average over the views, and not where the driver stands at first
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """What tells laws from each other, whatever their form."""
+        return self.place.name, self.driver.name
+
+    @property
+    def is_whole(self) -> bool:
+        """True for all six numbers, or a joint that counts from where its driver stands at first."""
+        return self.columns is self.place.whole and not self.centred
+
+    @cached_property
+    def shapes(self) -> Array:
+        """(V, R) of the views."""
+        shapes = self.driver.shapes[self.shape]
+        return shapes - shapes.mean(axis=0) if self.centred else shapes
+
+    @cached_property
+    def sizes(self) -> Array:
+        """(k·R,) usual sizes."""
+        return np.outer(self.place.sizes[self.columns], 0.5 ** np.arange(self.shapes.shape[1])).ravel()
+
+    def reduced(self, observation: Observation) -> Array:
+        """(n, k·R) columns of the reduced observations."""
+        moved = self.place.twists[:, :, self.columns, None] * self.shapes[:, None, None, :]
+        return observation.from_twists(moved.reshape(6 * len(moved), -1))
+
+    @property
+    def words(self) -> str:
+        """Joint 3 follows ambient_c (a line); the part sits displaced from view v010 on."""
+        if self.driver.name == STEP:
+            verb = "is off" if self.place.joint else "sits displaced"
+            return f"{self.place.name} {verb} from {self.shape.removeprefix('a step at ')} on"
+        return f"{self.place.name} follows {self.driver.name} ({self.shape})"
+
+
+@dataclass(frozen=True)
+class Dictionary:
+    """All laws that views can show, and the prior share of each form of its law."""
+
+    laws: tuple[Law, ...]
+    shares: Array  # (L,)
+    said_by: dict[tuple[str, str], frozenset[str]]  # of each law, the effects that say it
+    observation: Observation
+
+    def credited(self, effect: Ranked, laws: Sequence[Ranked]) -> Ranked:
+        """Return an effect with the evidence of the law that it says, which may be of one axis where it has six."""
+        said = [r.score.log_bayes_factor for r in laws if effect.name in self.said_by[law_of(r).key]]
+        more = max([0.0, *(factor - effect.score.log_bayes_factor for factor in said)])
+        return replace(effect, log_posterior=effect.log_posterior + more)
+
+    @cached_property
+    def stems(self) -> dict[Law, Indices]:
+        """Laws that are alike but for the place's axes: by the one of all axes, the numbers of those it holds."""
+        stems: dict[tuple[str, str, str, bool], list[int]] = {}
+        for i, law in enumerate(self.laws):
+            stems.setdefault((*law.key, law.shape, law.centred), []).append(i)
+        return {
+            replace(self.laws[index[0]], columns=np.arange(self.laws[index[0]].place.twists.shape[2])): np.array(index)
+            for index in stems.values()
+        }
+
+    def columns(self) -> Iterator[tuple[Law, Indices, Array]]:
+        """Give each stem, the numbers of its laws and its columns (n, k·R) per usual size: held, unless too large."""
+        for stem, index in self.stems.items():
+            held = self._held.get(stem)
+            columns = stem.reduced(self.observation) * stem.sizes if held is None else held
+            if held is None and columns.nbytes < _HELD / len(self.stems):
+                self._held[stem] = columns
+            yield stem, index, columns
+
+    @cached_property
+    def _held(self) -> dict[Law, Array]:
+        return {}
+
+    @property
+    def keys(self) -> list[tuple[str, str]]:
+        """All that are told from each other."""
+        return list(self.said_by)
+
+    def without(self, linear: LinearModel, laws: Sequence[Ranked], effect: Ranked) -> tuple[Ranked, ...]:
+        """Return those of some laws that an effect does not say, nor does at its own place in these views."""
+        rivals = [r for r in laws if effect.name not in self.said_by[law_of(r).key]]
+        place = effect.score.candidate.effect.place
+        explained = linear.residual(effect.score.form.columns)
+        return tuple(
+            r
+            for r in rivals
+            if law_of(r).place.joint is not None
+            or law_of(r).place.kind != place
+            or not _contains(explained, linear.residual(r.score.form.columns))
+        )
+
+
+def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> Dictionary:
+    """Return the laws of a session, and which of the candidates says each."""
+    laws, shares, said_by = list[Law](), list[float](), dict[tuple[str, str], frozenset[str]]()
+    drivers = list(drivers_of(linear.measurement.views))
+    effects = [c for c in candidates if not c.empirical]
+    for place in _places(linear):
+        for driver in drivers:
+            if driver.joint not in (None, place.joint):
+                continue
+            forms = list(_forms(place, driver))
+            laws += [law for law, _ in forms]
+            shares += [share for _, share in forms]
+            said_by[place.name, driver.name] = frozenset(c.name for c in effects if _says(linear, c, place, driver))
+    return Dictionary(tuple(laws), np.array(shares), said_by, linear.observation)
+
+
+def rank_laws(linear: LinearModel, dictionary: Dictionary) -> tuple[Ranked, ...]:
+    """Return the likeliest laws beside a model, best first, with their log posterior as that of effects (`Ranked`)."""
+    laws = dictionary.laws
+    if not laws:
+        return ()
+    starts = (linear, *linear.alternative_starts)
+    gains, scales, p_value = np.full(len(laws), -np.inf), np.ones(len(laws)), 1.0
+    best_start = np.zeros(len(laws), np.int64)
+    for k, at in enumerate(starts):
+        tried, scale = _gains(at, dictionary)
+        tried = tried + 0.5 * (linear.null.deviance - at.null.deviance)
+        better = tried > gains
+        gains, scales = np.where(better, tried, gains), np.where(better, scale, scales)
+        best_start[better] = k
+    weighted = gains + np.log(dictionary.shares)
+    by_key: dict[tuple[str, str], list[int]] = {key: [] for key in dictionary.keys}
+    for i, law in enumerate(laws):
+        by_key[law.key].append(i)
+    likeliest = sorted(by_key, key=lambda key: -logsumexp(weighted[by_key[key]]))[:_LAWS_FITTED]
+    prior = float(np.log(limits.PRIOR_LAWS / len(by_key)))
+    ranked = list[Ranked]()
+    for key in likeliest:
+        among = sorted(by_key[key], key=lambda i: -weighted[i])
+        fits = dict[int, tuple[Candidate, Score]]()
+        for i in among[: _FORMS_FITTED // _LAWS_FITTED]:
+            fits[i] = _fitted(linear, laws[i], starts[best_start[i]].null.variances, float(scales[i]))
+            weighted[i] = fits[i][1].log_bayes_factor + np.log(dictionary.shares[i])
+        best = max(fits, key=lambda i: weighted[i])
+        total = float(logsumexp(weighted[among]))
+        scored = fits[best][1]
+        p_value = scored.p_value / float(dictionary.shares[best]) * len(by_key)
+        ranked.append(Ranked(replace(scored, log_bayes_factor=total), p_value, total + prior, 0.0, len(by_key)))
+    ranked.sort(key=lambda r: -r.log_posterior)
+    first, *others = ranked
+    others = [replace(r, adjusted=min(r.adjusted, 1.0)) for r in others]
+    return replace(first, adjusted=_family_wise(linear, dictionary, first)), *others
+
+
+def _family_wise(linear: LinearModel, dictionary: Dictionary, ranked: Ranked) -> float:
+    """Return the chance that the clearest of all laws is as clear as this one.
+
+    Laws resemble each other. So where their number alone does not decide, the clearest is drawn from scatter and noise
+    of as many degrees of freedom as the law's own are known to.
+    """
+    by_count = ranked.adjusted
+    if by_count < limits.ALPHA_UNKNOWN or by_count > _DRAWN_UP_TO or linear.mixed.z.size > _MOST_DRAWN:
+        return min(by_count, 1.0)
+    rng = np.random.default_rng(_SEED)
+    known = linear.mixed.size - linear.design.shape[1]
+    drawn = rng.standard_normal((linear.mixed.z.size, _DRAWS)) / np.sqrt(rng.chisquare(known, _DRAWS) / known)
+    by_rank: dict[int, list[tuple[Array, float]]] = {}
+    for law, share in zip(dictionary.laws, dictionary.shares, strict=True):
+        U = column_space(linear.residual(law.reduced(linear.observation)))
+        by_rank.setdefault(U.shape[1], []).append((U, share))
+    as_clear = np.zeros(_DRAWS, bool)
+    for rank, laws in by_rank.items():
+        if not rank:
+            continue
+        least = np.array([by_count * share for _, share in laws]) / len(dictionary.keys)
+        limit = rank * f_distribution.isf(np.minimum(least, 1.0), rank, known)
+        squares = (np.hstack([U for U, _ in laws]).T @ drawn) ** 2
+        as_clear |= (squares.reshape(len(laws), rank, -1).sum(axis=1) >= limit[:, None]).any(axis=0)
+    return float((1 + as_clear.sum()) / (1 + _DRAWS))
+
+
+def law_of(ranked: Ranked) -> Law:
+    """Return the law of a ranked candidate."""
+    effect = ranked.score.candidate.effect
+    assert isinstance(effect, LawEffect)
+    return effect.law
+
+
+def law_size(linear: LinearModel, ranked: Ranked) -> tuple[float, float, str]:
+    """Return how far a law turns its joint, or else moves the views at the part, between its extremes; sigma; unit."""
+    scored = ranked.score
+    law = law_of(ranked)
+    if law.place.joint is not None:
+        change = law.shapes - law.shapes[np.argmin(law.shapes @ scored.values)]
+        farthest = change[np.argmax(np.abs(change @ scored.values))]
+        unit = "rad"
+    else:
+        moved = np.stack([linear.observation.part_displacements(column) for column in scored.form.columns.T], axis=2)
+        moved = moved - moved[0]
+        k = int(np.argmax(np.linalg.norm(moved @ scored.values, axis=1)))
+        along = moved[k] @ scored.values
+        farthest = along / max(float(np.linalg.norm(along)), 1e-300) @ moved[k]
+        unit = linear.measurement.length_unit
+    sigma = float(np.sqrt(max(farthest @ scored.covariance @ farthest, 0.0)))
+    return abs(float(farthest @ scored.values)), sigma, unit
+
+
+@dataclass(frozen=True)
+class LawEffect(Effect):
+    """A law as a candidate among effects: no function of a library undoes it."""
+
+    law: Law = None  # type: ignore[assignment]
+
+
+def _fitted(linear: LinearModel, law: Law, start: Array, scale: float) -> tuple[Candidate, Score]:
+    reduced = law.reduced(linear.observation)
+    k = reduced.shape[1] // len(law.columns)
+    units = [unit for unit in np.array(law.place.units)[law.columns] for _ in range(k)]
+    parameters = tuple(
+        Parameter(f"c{i}", unit, typical=float(size))
+        for i, (unit, size) in enumerate(zip(units, law.sizes, strict=True))
+    )
+    kind = law.place.kind
+    effect = LawEffect(
+        law.words, kind, {}, _no_function, needs=(), prefers=(), tier="empirical", group=law.driver.name, law=law
+    )
+    whole = linear.observation.expand(reduced)
+    form = Form(Term(effect, parameters), np.ones(len(parameters), bool), whole, reduced, law.sizes)
+    candidate = Candidate(effect, (form,), whole, None)
+    trial = try_form(linear, form, start, scale)
+    assert trial.values is not None and trial.covariance is not None
+    return candidate, Score(
+        candidate,
+        True,
+        form,
+        trial.p_value,
+        trial.log_bayes_factor,
+        values=trial.values,
+        covariance=trial.covariance,
+        scale=trial.scale,
+        variances=trial.variances,
+    )
+
+
+def _no_function(*_: object) -> None:
+    """A law of the dictionary"""
+
+
+def _gains(linear: LinearModel, dictionary: Dictionary) -> tuple[Array, Array]:
+    """Return (L,) log Bayes factors at the null's variances over all scales, and the likeliest scale of each."""
+    scales = regime_of(linear).scales
+    at = np.array(list(scales))[:, None, None]
+    share = np.log(list(scales.values()))
+    gains, likeliest = np.zeros((2, len(dictionary.laws)))
+    held = list(dictionary.columns())
+    sums = linear.information([SelectedColumns(columns) for _, _, columns in held])
+    by_size: dict[int, list[tuple[int, Array, Array]]] = {}
+    for (stem, index, _), (information, vector) in zip(held, sums, strict=True):
+        shapes = stem.shapes.shape[1]
+        for i in index:
+            some = (shapes * dictionary.laws[i].columns[:, None] + np.arange(shapes)).ravel()
+            by_size.setdefault(len(some), []).append((i, information[np.ix_(some, some)], vector[some]))
+    for sets in by_size.values():
+        k, turned = np.linalg.eigh(np.array([information for _, information, _ in sets]))
+        g = np.einsum("fij,fi->fj", turned, np.array([vector for _, _, vector in sets]))
+        square = at**2 * np.maximum(k, 0.0)
+        evidence = 0.5 * (at**2 * g**2 / (1 + square) - np.log1p(square)).sum(axis=2) + share[:, None]
+        index = np.array([i for i, _, _ in sets])
+        gains[index] = logsumexp(evidence, axis=0)
+        likeliest[index] = at[evidence.argmax(axis=0), 0, 0]
+    return gains, likeliest
+
+
+def _places(linear: LinearModel) -> Iterator[Place]:
+    """Give what the reference carries, what stands at the far end of the arm, and the joints."""
+    measurement = linear.measurement
+    capture = measurement.capture
+    centre = linear.observation.centre
+    count = measurement.views.count
+    to_centre = frames.make(np.eye(3), -centre)
+    still = np.broadcast_to(np.eye(4), (count, 4, 4))
+    usual = usual_twist(measurement.length_unit)
+    sizes = np.append(4 * usual, 4 * usual[:3])
+    units = ("rad",) * 3 + (measurement.length_unit,) * 3 + ("rad",) * 3
+    if measurement.eye_to_hand:
+        names = ("the part on the flange", "the scanner's stand or the base")
+    else:
+        names = ("the part or the base", "the scanner or its mount")
+    about_centre = np.broadcast_to(np.eye(6)[:, :3], (count, 6, 3))
+    for name, kind, carried in zip(names, ("part", "mount"), (still, capture.T_reference_mount), strict=True):
+        moved = frames.adjoint(to_centre @ carried)
+        axes = moved[:, :3, :3]
+        about = np.concatenate([axes, np.zeros_like(axes)], axis=1) if kind == "mount" else about_centre
+        yield Place(name, np.concatenate([moved, about], axis=2), sizes, np.arange(6), units, kind=kind)
+    if measurement.views.joints.shape[1] and measurement.robot is not None:
+        offset = term_of(measurement, EFFECTS["joint_offset"])
+        motions = next(pose_derivatives(measurement, linear.model, [offset], centre))
+        for k, moved in enumerate(motions):
+            end = {0: " or the base", len(motions) - 1: " or what the flange carries"}.get(k, "")
+            size = np.array([_JOINT])
+            yield Place(f"joint {k + 1}{end}", moved[..., None], size, np.arange(1), ("rad",), k + 1)
+
+
+def drivers_of(views: Views) -> Iterator[Driver]:
+    """Give all that views may follow."""
+    order = np.arange(views.count, dtype=float)
+    known = [(TIME, "s", views.time)] if views.has("time") else [(NUMBER, "view", order)]
+    known += [(name, "", values) for name, values in views.covariates.items()]
+    for name, unit, values in known:
+        if np.ptp(values) > _SAME_VALUE:
+            yield Driver(name, unit, values, _smooth(values))
+    starts = np.arange(_VIEWS_AT_END, views.count - _VIEWS_AT_END + 1)
+    picked = starts[np.unique(np.linspace(0, len(starts) - 1, min(len(starts), _MOST_STEPS)).astype(int))]
+    steps = {f"a step at view {views.names[views.number[k]]}": (order >= k)[:, None].astype(float) for k in picked}
+    if steps:
+        yield Driver(STEP, "view", order, steps)
+    for k, angle in enumerate(views.joints.T):
+        if np.ptp(angle) < _STILL:
+            continue
+        waves = [np.column_stack([np.sin(n * angle), np.cos(n * angle)]) for n in (1, 2, 3, 4)]
+        turns = {"a wave, once a turn": waves[0], "a wave, twice a turn": waves[1]}
+        yield Driver(f"j{k + 1}_deg", "deg", np.degrees(angle), _smooth(angle) | turns)
+        # Errors of a gear of one and two periods a turn have a name; those of three and four have not.
+        teeth = {"a wave, three times a turn": waves[2], "a wave, four times a turn": waves[3]}
+        yield Driver(f"j{k + 1}_deg, in short waves", "deg", np.degrees(angle), teeth, k + 1)
+        moves = np.degrees(angle - views.previous[:, k])
+        yield from _lines(f"j{k + 1}_move_deg", "deg", moves)
+        yield from _lines(f"j{k + 1}_approach", "", views.approach[:, k].astype(float))
+    for name, torque in zip(views.torques.names, views.torques.values.T, strict=True):
+        yield from _lines(f"j{name}_torque_nm", "N m", torque)
+
+
+def _lines(name: str, unit: str, values: Array) -> Iterator[Driver]:
+    """Give what is followed in proportion, if it changes."""
+    if np.ptp(values) > _SAME_VALUE * max(np.abs(values).max(), 1.0):
+        yield Driver(name, unit, values, {"in proportion": (values / np.abs(values).max())[:, None]})
+
+
+def _smooth(values: Array) -> dict[str, Array]:
+    """Return a line from the first value on, and a polynomial where there are enough values."""
+    x = 2 * (values - values.min()) / np.ptp(values) - 1
+    powers = np.polynomial.legendre.legvander(x, _DEGREE)[:, 1:]
+    powers = powers - powers[0]
+    line = powers[:, :1] / np.abs(powers[:, 0]).max()
+    if len(np.unique(values)) <= _DEGREE + 1:
+        return {"a line": line}
+    return {"a line": line, "smoothly": powers / np.abs(powers).max(axis=0)}
+
+
+def _forms(place: Place, driver: Driver) -> Iterator[tuple[Law, float]]:
+    """Give the forms of one law with their shares."""
+    shares = 1 / len(driver.shapes)
+    for shape in driver.shapes:
+        if place.joint is not None:
+            yield Law(place, driver, shape, place.whole), shares / 2
+            yield Law(place, driver, shape, place.whole, centred=True), shares / 2
+            continue
+        yield Law(place, driver, shape, place.whole), shares / 2
+        axes = place.twists.shape[2]
+        for k in range(axes):
+            yield Law(place, driver, shape, np.array([k])), shares / 2 / axes
+
+
+def _says(linear: LinearModel, candidate: Candidate, place: Place, driver: Driver) -> bool:
+    """Return whether an effect is this law: it acts there and follows that, as it declares or as its columns show."""
+    effect = candidate.effect
+    if effect.place != place.kind:
+        return False
+    follows = {*effect.needs, *effect.prefers}
+    views = linear.measurement.views
+    if effect.prefers and not any(views.has(name) for name in effect.prefers):
+        follows.add(TIME)
+    event = any(p.discrete for p in candidate.parameters)
+    declared = driver.name in follows or (driver.name == STEP and event)
+    if place.joint is None and declared:
+        return True
+    if (driver.name == STEP) != event:
+        return False
+    whole = [form.columns for form in candidate.forms if form.keep.sum() == candidate.forms[0].keep.sum()]
+    for shape in driver.shapes:
+        law = Law(place, driver, shape, place.whole).reduced(linear.observation)
+        if any(_contains(X, law) if place.joint is not None else _contains(law, X) for X in whole):
+            return True
+    return False
+
+
+def _contains(columns: Array, others: Array) -> bool:
+    """Return whether other columns (n, q) are combinations of columns (n, p)."""
+    left = project_out(columns, others)
+    return bool(others.any() and np.sum(left**2) < (1 - _SAME) * np.sum(others**2))

@@ -1,0 +1,111 @@
+"""Laws at every place: each is found by its place and what it follows, and no effect is beaten by its own law."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.fixtures.labelled_arm import labelled_cell
+from stitch.api.pipeline import run
+from stitch.diagnosis.candidates import candidate_of, candidates_of
+from stitch.diagnosis.diagnose import linear_model_of
+from stitch.diagnosis.evidence import propose_names
+from stitch.diagnosis.ranking import stands_out
+from stitch.diagnosis.score import scatter_limit, score
+from stitch.diagnosis.systematic_laws import STEP, dictionary_of, law_of, law_size, rank_laws
+from stitch.effects.contract import EFFECTS, effect, twist
+from stitch.numerics.reml import fit_variances
+
+VIEWS = 30
+PAYLOAD = 3 + np.cos(np.arange(VIEWS) ** 1.5)
+
+
+@pytest.fixture(scope="module")
+def cell():
+    """A session of labelled points that only scatter, with a column, as a linear model."""
+    found = run(labelled_cell(5, views=VIEWS, payload=PAYLOAD)[0])
+    return linear_model_of(found), scatter_limit(found.session)
+
+
+@pytest.fixture
+def own_effect():
+    """A mount that follows the payload, as somebody writes it into a file of effects."""
+
+    @effect("mount", needs=("payload_kg",), tier="user", xi=twist("/kg", 1e-4, 0.02))
+    def mount_by_payload(views, xi):
+        """M·exp(ξ (m − m₀))"""
+        return np.outer(views.since_first("payload_kg"), xi)
+
+    yield EFFECTS["mount_by_payload"]
+    del EFFECTS["mount_by_payload"]
+
+
+def shown(linear, column):
+    """The same session where a column (n,) of the reduced observations is added to what was seen."""
+    mixed = replace(linear.mixed, z=linear.mixed.z + column.reshape(linear.mixed.z.shape))
+    return replace(linear, mixed=mixed, null=fit_variances(mixed, both_starts=True))
+
+
+@pytest.mark.parametrize(
+    ("place", "follows", "words"),
+    [
+        ("joint 3", "payload_kg", "joint 3 follows payload_kg (a line)"),
+        ("joint 4", "j2_move_deg", "joint 4 follows j2_move_deg (in proportion)"),
+        ("the scanner's stand or the base", STEP, "the scanner's stand or the base sits displaced from view v12 on"),
+        ("the part on the flange", "payload_kg", "the part on the flange follows payload_kg (a line)"),
+    ],
+)
+def test_a_law_is_found_by_its_place_and_what_it_follows(cell, place, follows, words):
+    linear, _ = cell
+    laws = [law for law in dictionary_of(linear).laws if law.key == (place, follows) and law.is_whole]
+    law = next(law for law in laws if law.words == words)
+    size = np.zeros(len(law.sizes))
+    size[-1] = 1e-3 if law.place.joint else 0.3
+    found = rank_laws(shown(linear, law.reduced(linear.observation) @ size), dictionary_of(linear))
+    assert law_of(found[0]).key == law.key and stands_out(found[0])
+    value, sigma, _ = law_size(linear, found[0])
+    moved = np.ptp(law.shapes, axis=0).max() * size[-1]
+    assert abs(value - moved) < 4 * sigma + (0.3 if law.place.joint is None else 0.0) * moved
+
+
+@pytest.mark.slow
+def test_scatter_alone_stands_out_in_one_session_of_a_hundred(cell):
+    """Of 40 draws, family-wise over all laws: three or more have a chance of 0.007."""
+    linear, _ = cell
+    rng = np.random.default_rng(3)
+    half = np.linalg.cholesky(linear.covariance)
+    dictionary = dictionary_of(linear)
+    alarms = 0
+    for _ in range(40):
+        z = (half @ rng.standard_normal((*linear.mixed.z.shape, 1)))[..., 0]
+        drawn = shown(linear, (z - linear.mixed.z).ravel())
+        alarms += stands_out(rank_laws(drawn, dictionary)[0])
+    assert alarms <= 2
+
+
+def test_effects_say_the_laws_that_they_are(cell, own_effect):
+    linear, _ = cell
+    said = dictionary_of(linear, candidates_of(linear)[0]).said_by
+    assert "mount_by_payload" in said["the scanner's stand or the base", "payload_kg"]
+    assert "settling" in said["joint 2", "j2_move_deg"] and "settling" not in said["joint 2", "j3_move_deg"]
+    assert "part_slip" in said["the part on the flange", STEP]
+    assert not said["joint 3", "payload_kg"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["part_slip", "joint_offset", "gear_eccentricity", "settling", "mount_by_payload"])
+def test_no_effect_loses_as_it_grows(cell, own_effect, name):
+    """From its usual size to a hundred times: more evidence each time, and named each time."""
+    linear, limit = cell
+    candidate = candidate_of(linear, EFFECTS[name])
+    form = candidate.forms[len(candidate.forms) // 2 if name == "part_slip" else 0]
+    rng = np.random.default_rng(8)
+    column = form.columns @ (rng.choice([-1, 1], len(form.sizes)) * form.sizes)
+    candidates = candidates_of(linear)[0]
+    evidence = []
+    for amplitude in (1, 3, 10, 30, 100):
+        seen = shown(linear, amplitude * column)
+        evidence.append(score(seen, candidate).log_bayes_factor)
+        found = propose_names(seen, candidates, limit)
+        assert evidence[-1] < 3 or name in [r.name for r in found.named], (amplitude, found.verdict, found.laws[:2])
+    assert (np.diff(evidence) > 0).all(), evidence
