@@ -1,7 +1,7 @@
-"""The wheel in fresh environments outside the checkout: python bench/install_matrix.py PYTHON … [-o ROWS.md].
+"""The wheel in fresh environments outside the checkout: python bench/install_matrix.py PYTHON …
 
-Every PYTHON is a path. A row each: what is installed beside it, whether a cell is made and run, MB, seconds. Then, in the
-environment of the first, each heavy package is taken away in turn, and the line that is printed without it.
+Every PYTHON is a path. A row each: whether a cell is made, run and diagnosed, MB, seconds. Then, in the environment of
+the first, each heavy package is taken away in turn, and the line that is printed without it.
 """
 
 import argparse

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 from uuid import uuid4
 
@@ -27,8 +28,8 @@ _MOST = 100
 
 @stdout_for_results
 def batch(
-    sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Session folders.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Where the runs go.")] = Path("runs"),
+    sessions: Annotated[list[str], typer.Argument(metavar="SESSION...", help="Session folders, also s3://…")],
+    output: Annotated[str, typer.Option("-o", "--output", metavar="DIR", help="Where the runs go.")] = "runs",
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes on this machine.")] = 1,
     scheduler: Annotated[
         str, typer.Option("--scheduler", metavar="tcp://…", help="Workers of a Dask scheduler that runs already.")
@@ -46,14 +47,37 @@ def batch(
       stitch batch blade-17 blade-18 blade-19 -o runs --workers 2
       stitch batch blade-* --scheduler tcp://10.0.0.5:8786
     """
-    from stitch.plugins.watch.batch.run_batch import run_jobs
-    from stitch.system.process import steps
+    from stitch.plugins.watch.batch.storage import is_remote, put_summary
 
     if scheduler and workers > 1:
         raise InputError("--workers and --scheduler: the scheduler has workers of its own; to fix: name one of the two")
-    if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; to fix: name a folder for the runs with -o")
-    jobs, stood = _batch_jobs(sessions, output, force, recording), output.exists()
+    if any(is_remote(place) != is_remote(output) for place in sessions):
+        raise InputError(
+            f"{output}: sessions of a store beside some of this disk; to fix: name sessions and -o of stores"
+        )
+    if is_remote(output):
+        with TemporaryDirectory() as scratch:
+            folder = Path(scratch)
+            try:
+                _run_all(_stored_jobs(sessions, output, force, recording), folder, workers, scheduler, as_json)
+            finally:
+                put_summary(folder, output)
+        return
+    _run_all(
+        _batch_jobs([Path(s) for s in sessions], Path(output), force, recording),
+        Path(output),
+        workers,
+        scheduler,
+        as_json,
+    )
+
+
+def _run_all(jobs: list[BatchJob], output: Path, workers: int, scheduler: str, as_json: bool) -> None:
+    """Run the jobs, and write how it ended."""
+    from stitch.plugins.watch.batch.run_batch import run_jobs
+    from stitch.system.process import steps
+
+    stood = output.exists()
     rows: dict[str, SessionRow] = {}
     tell = partial(say, stream=sys.stderr)
     try:
@@ -77,9 +101,12 @@ def _batch_jobs(sessions: list[Path], output: Path, force: bool, recording: bool
     """Return a job for each session; where two have one name, the runs lie as the sessions do.
 
     Raises:
-        InputError: two sessions, or a session and a file of the batch, would have the same place.
+        InputError: two sessions, or a session and a file of the batch, would have the same place; no folder for runs.
     """
     from stitch.plugins.watch.batch.run_batch import DOCUMENT, PAGE, TABLE, BatchJob
+
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: is a file; to fix: name a folder for the runs with -o")
 
     names = [_session_name(path) for path in sessions]
     if len(set(names)) < len(names):
@@ -92,6 +119,21 @@ def _batch_jobs(sessions: list[Path], output: Path, force: bool, recording: bool
     return [
         BatchJob(path.resolve(), here / name, token, force, recording, place=name)
         for path, name in zip(sessions, names, strict=True)
+    ]
+
+
+def _stored_jobs(sessions: list[str], output: str, force: bool, recording: bool) -> list[BatchJob]:
+    """Return a job for each session of a store; the runs lie as the sessions do."""
+    from stitch.plugins.watch.batch.run_batch import BatchJob
+
+    places = [Path(session.partition("://")[2]) for session in sessions]
+    names = [place.name for place in places]
+    if len(set(names)) < len(names):
+        names = _mirrored_names(places)
+    token = uuid4().hex
+    return [
+        BatchJob(Path(name), Path(name), token, force, recording, 1, name, source.rstrip("/"), f"{output}/{name}")
+        for name, source in zip(names, sessions, strict=True)
     ]
 
 

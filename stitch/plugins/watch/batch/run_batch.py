@@ -36,6 +36,7 @@ _RETRY_SECONDS = 0.5
 DOCUMENT = "batch.json"
 PAGE = "batch.html"
 TABLE = "batch.parquet"
+_STORAGE = "stitch.plugins.watch.batch.storage"  # which runs what it fetched here
 BATCH_FORMAT = "stitch-batch/1"
 _WORKERS_DIED = NoResultError(
     "workers died over it, also when it ran alone; to fix: give it more memory, or thin its scans, and start the batch "
@@ -55,6 +56,8 @@ class BatchJob:
     recording: bool = True
     at_once: int = 1  # sessions that share the cores of the machine
     place: str = ""  # of the run among those of the batch, where it is more than its folder's name
+    source: str = ""  # of the session, and
+    target: str = ""  # of the run, in a store
 
     @property
     def name(self) -> str:
@@ -224,6 +227,9 @@ def failed_row(session: str, name: str, error: BaseException) -> SessionRow:
 def run_session(job: BatchJob) -> SessionRow:
     """Run a session into its folder unless its run stands there; what goes wrong becomes part of the answer."""
     share_cores(job.at_once)
+    if job.source:
+        run_stored: Callable[[BatchJob], SessionRow] = import_module(_STORAGE).run_stored
+        return run_stored(job)
     try:
         require_free(job.run, [job.session], job.force)
         with _locked_folder(job.run):

@@ -251,3 +251,26 @@ def test_a_pool_of_any_kind_hands_back_runs(sessions):
     assert found.to_arrow().num_rows == 3
     with pytest.raises(InputError, match="client is a str"):
         stitch_batch(sessions, "tcp://10.0.0.5:8786")
+
+
+@pytest.mark.parametrize("store", ["memory://fleet", "file://FOLDER/fleet"])
+def test_sessions_of_a_store_become_runs_of_a_store(sessions, tmp_path, capsys, batch, store):
+    fsspec = pytest.importorskip("fsspec")
+    store = store.replace("FOLDER", str(tmp_path))
+    files, root = fsspec.core.url_to_fs(store)
+    for session in sessions:
+        files.put(str(session), f"{root}/in/{session.name}", recursive=True)
+    places = [f"{store}/in/monday", f"{store}/in/tuesday"]
+    batch(*places, f"{store}/in/nowhere", "-o", f"{store}/out", code=1)
+    assert "nothing there; to fix: correct the address" in capsys.readouterr().err
+    assert {"result.json", "batch-mark.json"} <= {Path(name).name for name in files.find(f"{root}/out/monday")}
+    assert json.loads(files.cat(f"{root}/out/monday/result.json"))["session"] == places[0]
+    batch(*places, "-o", f"{store}/out", "--json")
+    rows = json.loads(capsys.readouterr().out)["sessions"]
+    assert [row["skipped"] for row in rows] == [True, True] and rows[0]["run"] == f"{store}/out/monday"
+    assert rows[0]["U_mm"] > 0 and files.exists(f"{root}/out/batch.parquet")
+    text = files.cat(f"{root}/in/monday/points.csv").rstrip() + b"1\n"
+    files.pipe(f"{root}/in/monday/points.csv", text)
+    batch(*places, "-o", f"{store}/out", "--json")
+    assert [row["skipped"] for row in json.loads(capsys.readouterr().out)["sessions"]] == [False, True]
+    batch(sessions[0], "-o", f"{store}/out", code=2)
