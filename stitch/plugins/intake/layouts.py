@@ -79,7 +79,7 @@ def possible_layouts(raw: RawPoses) -> list[ColumnLayout]:
         words = "name each with --columns, for example --columns x,y,z,rx,ry,rz (qx,qy,qz,qw for a quaternion, j1,j2 … "
         raise Refusal(
             f"{raw.source}: {raw.numbers.shape[1]} columns of numbers{called} hold no pose that is known",
-            Fix(f"{words}for joint angles, - for one to leave out)", {"columns": "COLUMNS"}),
+            Fix(f"{words}for joint angles, - for one to leave out)", {"columns": "COLUMNS"}, shows=raw.shown),
         )
     return [_without_offset(replace(layout, rest=rest)) for layout in found_all]
 
@@ -161,7 +161,7 @@ def _require_rotation(raw: RawPoses) -> None:
         raise Refusal(
             f"{raw.source}: x, y, z stand there without a rotation",
             Fix(words, {"orientation": "ORIENTATION", "rotation": "ROTATION"}),
-            Fix("name the columns of the rotation with --columns", {"columns": "COLUMNS"}),
+            Fix("name the columns of the rotation with --columns", {"columns": "COLUMNS"}, shows=raw.shown),
         )
     joints = [name for name in header if _JOINT_WORDS.search(name)]
     if len(joints) >= _FEWEST_JOINTS:

@@ -41,6 +41,7 @@ STRUCTURED = (".json", ".yaml", ".yml", *ARRAYS)
 TABLES = (".txt", ".csv", ".dat", ".tsv", ".tab", ".asc", ".pose", ".poses", ".log", ".va", ".pos")
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 _MAX_POSES_MB = 50
+_ROWS_SHOWN = 3
 # Of files, or of rows, that have to hold a pose: where fewer do, the export is at fault and not a view.
 _FEWEST_WHOLE = 0.6
 
@@ -56,6 +57,17 @@ class RawPoses:
     words: str  # how it was read
     without_pose: frozenset[int] = frozenset()  # rows without a number where one belongs; they repeat another row
     part: str = ""  # its name among the lists of its file: a path in a document, an element, a sheet
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """The first rows with their columns numbered, for a person who is asked for their names."""
+        names = self.header or ("",) * self.numbers.shape[1]
+        columns = [
+            [f"{i}{':' * bool(name)}{name}", *(f"{x:.6g}" for x in column)]
+            for i, (name, column) in enumerate(zip(names, self.numbers[:_ROWS_SHOWN].T, strict=True), 1)
+        ]
+        padded = [[cell.rjust(max(map(len, column))) for cell in column] for column in columns]
+        return tuple("  ".join(row) for row in zip(*padded, strict=True))
 
     @property
     def clock(self) -> ClockTimes | None:

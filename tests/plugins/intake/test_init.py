@@ -109,6 +109,20 @@ def test_a_terminal_is_asked_what_cannot_be_told(raw, capsys, monkeypatch):
     assert "zyx-intrinsic" in text and 'mount = "eye_in_hand"' in text
 
 
+def test_a_terminal_is_asked_one_question_in_place_of_a_refusal(raw, capsys, monkeypatch):
+    """Eight columns of which two are something else: they are shown, numbered, and named by an answer."""
+    table = raw / "RobotPoses.dat"
+    table.write_text("".join(f"{i}.5,7.25,{row}\n" for i, row in enumerate(table.read_text().splitlines())))
+    asked = []
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("typer.prompt", lambda text, err: asked.append(text) or "-,-,rx,ry,rz,x,y,z")
+    monkeypatch.setattr("typer.confirm", lambda text, default, err: True)
+    code, _, err = ended(capsys, "init", raw, *STATED, "--no-inverse")
+    assert code == 0 and asked == ["--columns"], err
+    assert "hold no pose that is known" in err and any(line.split()[:3] == ["1", "2", "3"] for line in err.splitlines())
+    assert load_session(raw).views
+
+
 @pytest.mark.parametrize(
     ("spoil", "arguments", "told"),
     [

@@ -164,6 +164,7 @@ ELSEWHERE = {
     "require_no_background", "require_own_frames", "require_scale", "require_no_change", "_require_fit",
     "_require_determined", "rows_with_scans", "_without_folder", "_from_workbook", "header_poses", "_no_rows",
     "_require_one_decimal_mark", "_split_header", "_read_file", "_in_another_unit", "_read_clouds", "_require_folder",
+    "_told_by_scans",
     "_no_clouds", "_has_marks", "named",  # these make one for others
 }  # fmt: skip
 REFUSING: set[str] = set()
