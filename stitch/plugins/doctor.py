@@ -8,17 +8,25 @@ from typing import Annotated, Any
 
 import typer
 
-from stitch.cli.options import Json
+from stitch.cli.options import Json, require_new
 from stitch.cli.terminal import emit, results_stream, say, show_columns, stdout_for_results
 from stitch.errors import InputError
 from stitch.system.open3d_library import import_open3d
 from stitch.system.packages import DISTRIBUTION, PACKAGES, command_of, stitch_version
+
+# What a bundle holds of a run and of its session: neither clouds nor pictures.
+_NUMBERS = ("model.toml", "result.json", "ledger.json", "diagnosis.json", "compare.json")
+_TABLES = ("session.toml", "views.csv")
 
 
 @stdout_for_results
 def doctor(
     run: Annotated[
         Path | None, typer.Argument(metavar="RUN", help="A run: with which versions was it computed?")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="ZIP", help="Pack what who helps needs of RUN: numbers, no clouds."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -28,6 +36,7 @@ def doctor(
     Examples:
       stitch doctor
       stitch doctor runs/blade-17 --json
+      stitch doctor runs/blade-17 -o bundle.zip
     """
     from stitch.output.json_file import to_json
 
@@ -38,6 +47,8 @@ def doctor(
         document["open3d"] = open3d
     if run is not None:
         document["run"] = other_versions(run)
+    if output is not None:
+        _write_bundle(run, output, to_json(document))
     if as_json:
         emit(to_json(document))
         return
@@ -56,6 +67,30 @@ def doctor(
         say(open3d, stream=out)
     for row in document.get("run", ()):
         say(f"{run}: computed with {row['name']} {row['run']}; here is {row['here'] or 'none'}", stream=out)
+
+
+def _write_bundle(run: Path | None, output: Path, report: str) -> None:
+    """Pack the numbers of a run and its session's tables, with what is installed here.
+
+    Raises:
+        InputError: no run is named, or the file is there.
+    """
+    from zipfile import ZIP_DEFLATED, ZipFile
+
+    from stitch.output.stored_run import read_result
+    from stitch.system.files import whole_file
+
+    if run is None:
+        raise InputError(f"{output}: of which run? to fix: stitch doctor RUN -o {output}")
+    require_new(output)
+    session = Path(read_result(run)["session"])
+    with whole_file(output) as scratch, ZipFile(scratch, "w", ZIP_DEFLATED) as bundle:
+        bundle.writestr("doctor.json", report)
+        for place, names in ((run, _NUMBERS), (session, _TABLES)):
+            for file in (place / name for name in names):
+                if file.is_file():
+                    bundle.write(file, f"{'run' if place == run else 'session'}/{file.name}")
+    say(f"{output}: numbers, paths and names of views; read it before you pass it on", stream=results_stream())
 
 
 def package_rows() -> list[dict[str, str | None]]:

@@ -1,9 +1,13 @@
 """`stitch doctor` names each package that is there or missing, what is not without it, and the command that brings it."""
 
 import json
+from zipfile import ZipFile
 
 import pytest
 
+import stitch
+from data_synth.fixtures.labelled_arm import labelled_cell
+from data_synth.fixtures.labelled_files import write_labelled
 from stitch.cli.main import main
 from stitch.plugins import doctor
 from stitch.system.packages import PACKAGES, command_for
@@ -65,3 +69,15 @@ def test_a_folder_without_a_run_is_refused(tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["doctor", str(tmp_path)])
     assert ended.value.code == 2 and "name a run folder that `stitch run` wrote" in capsys.readouterr().err
+
+
+def test_a_bundle_holds_the_numbers_of_a_run_and_no_clouds(tmp_path, capsys):
+    session = write_labelled(tmp_path / "s", labelled_cell(2, views=8)[0], "points")
+    run = stitch.run(stitch.load_session(session)).save(tmp_path / "run", recording=False)
+    said(capsys, run, "-o", tmp_path / "bundle.zip")
+    names = set(ZipFile(tmp_path / "bundle.zip").namelist())
+    assert {"doctor.json", "run/model.toml", "run/result.json", "run/ledger.json", "session/session.toml"} <= names
+    assert not any(name.endswith((".ply", ".parquet", ".html", ".rrd", "points.csv")) for name in names)
+    with pytest.raises(SystemExit) as ended:
+        main(["doctor", str(run), "-o", str(tmp_path / "bundle.zip")])
+    assert ended.value.code == 2
