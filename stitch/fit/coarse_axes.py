@@ -29,6 +29,8 @@ _ANGLE, _SHARE = 0.03, 0.03
 # Fewer explained motions place no axis; of so many unknowns a third of what they say.
 _FEWEST = 5
 _BLOCK = 500
+# Views that are turned most alike, of each.
+_ALIKE = 3
 
 
 def locate_axes(
@@ -171,10 +173,11 @@ class _Motions:
 def _find(session: SessionData, capture: Capture) -> tuple[Axis, ...] | None:
     """Return the axes, placed; None where too few motions agree."""
     axes = axes_of(session)
-    pairs = _pairs(axes)
+    reported = reported_poses(session)
+    pairs = _pairs(axes, reported)
     motions = _Motions(
         axes,
-        reported_poses(session),
+        reported,
         session.mount == "eye_to_hand",
         np.array(pairs),
         register_pairs(capture, pairs),
@@ -195,13 +198,21 @@ def _find(session: SessionData, capture: Capture) -> tuple[Axis, ...] | None:
     return None if best is None or best[0] < _FEWEST else best[2].axes
 
 
-def _pairs(axes: Axes) -> list[tuple[int, int]]:
-    """Views that may overlap: neighbours in time, and by the reading of each axis."""
+def _pairs(axes: Axes, reported: Array) -> list[tuple[int, int]]:
+    """Views that may overlap: neighbours in time, by the reading of each axis, and by how the arm is turned.
+
+    The angle of a motion is that of the scanner, whatever the hand-eye; where a rotary axis is missing it says little.
+    """
     count = len(axes.readings)
     pairs = set(neighbouring_views(count))
     for column in axes.readings.T:
         order = np.argsort(column)
         pairs |= {(min(a, b), max(a, b)) for a, b in zip(order[:-1].tolist(), order[1:].tolist(), strict=True)}
+    if not axes.has_robot:
+        return sorted(pairs)
+    trace = np.einsum("vij,wij->vw", reported[:, :3, :3], reported[:, :3, :3])
+    near = np.argsort(-trace, axis=1, kind="stable")[:, 1 : 1 + _ALIKE]
+    pairs |= {(min(a, int(b)), max(a, int(b))) for a, row in enumerate(near) for b in row if a != b}
     return sorted(pairs)
 
 
