@@ -70,6 +70,9 @@ def suggest(
         assert finding is not None
         lines += finding.lines
         if diagnosis is not None and (why := _reason_to_stop(diagnosis, left, at_most)) is not None:
+            fewer, happened = (None, []) if result is None else _drop_idle(result, given, recorder)
+            if fewer is not None and happened:
+                return fewer, [*lines, *why, *happened], diagnose(fewer)
             return result, [*lines, *why], diagnosis
         known = None
         before = result
@@ -188,6 +191,22 @@ def _finding_and_evidence(diagnosis: Diagnosis) -> list[str]:
     from stitch.output.plain_finding import plain_finding
 
     return [plain_finding(diagnosis, diagnosis.linear.measurement.length_unit), diagnosis.sentence]
+
+
+def _drop_idle(result: RunData, given: set[str], recorder: Recorder | None) -> tuple[RunData, list[str]]:
+    """Return the run without added effects of which in the end no parameter differs from zero, and what was dropped."""
+    from stitch.diagnosis.thresholds import FAINT_SIGMAS
+
+    lines: list[str] = []
+    while True:
+        added = [term for term in result.terms if term.name in result.model.effects and term.name not in given]
+        faint = next((term for term in added if term.sigmas_from_zero < FAINT_SIGMAS), None)
+        if faint is None:
+            return result, lines
+        reason = f"{faint.name} ends with no parameter that differs from zero"
+        lines.append(f"{reason}; it was dropped.")
+        fewer = change(result, [name for name in result.effects if name != faint.name], recorder)
+        result = replace(fewer, tried=result.tried | {faint.name: reason})
 
 
 def _drop_unneeded(result: RunData, given: set[str], recorder: Recorder | None) -> tuple[RunData, list[str]]:

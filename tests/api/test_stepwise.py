@@ -9,7 +9,7 @@ import pytest
 from data_synth.fixtures.labelled_arm import labelled_cell
 from data_synth.fixtures.labelled_files import write_labelled
 from stitch.api import stepwise
-from stitch.api.pipeline import diagnose, run
+from stitch.api.pipeline import change, diagnose, run
 from stitch.diagnosis.validation import CrossValidation, _squares_by_fold
 from stitch.effects.contract import find_effect, parameters_in
 from stitch.model.model import Term
@@ -165,3 +165,15 @@ def with_effect(state):
     effect = find_effect("joint_offset")
     parameters = tuple(replace(p, value=1e-3, sigma=1e-5) for p in parameters_in(state.measurement, effect))
     return replace(state, model=state.model.with_terms([Term(effect, parameters)]))
+
+
+def test_an_effect_that_ends_with_nothing_is_taken_out():
+    """Of labelled points whose gears are right, waves of the gears are zero: what was given stays, what was added goes."""
+    session, *_ = labelled_cell(3, views=24)
+    added = change(run(session), ["gear_harmonic"])
+    assert added.terms[0].sigmas_from_zero < 3
+    faint = tuple(replace(p, value=0.5 * p.sigma if p.fitted else p.value) for p in added.terms[0].parameters)
+    added = replace(added, model=added.model.with_terms([replace(added.terms[0], parameters=faint)]))
+    fewer, lines = stepwise._drop_idle(added, set(), None)
+    assert not fewer.effects and "gear_harmonic" in fewer.tried and "differs from zero; it was dropped" in lines[0]
+    assert stepwise._drop_idle(added, {"gear_harmonic"}, None) == (added, [])
