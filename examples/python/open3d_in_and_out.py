@@ -1,5 +1,7 @@
 """Open3D clouds and poses in; hand-eye and an Open3D cloud out."""
 
+from pathlib import Path
+
 import open3d as o3d
 
 import stitch
@@ -10,4 +12,4 @@ clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points)) for 
 session = stitch.Session.from_arrays(clouds, cell.T_base_flange, mount="eye_in_hand", unit="mm")
 run = stitch.run(session)
 print(run.hand_eye)
-o3d.io.write_point_cloud("stitched.ply", run.stitched.to_open3d())
+o3d.io.write_point_cloud(Path("stitched.ply"), run.stitched.to_open3d())

@@ -1,5 +1,7 @@
 """An effect of one's own: diagnosed, added, and a picture of how the error falls."""
 
+from typing import Any
+
 import numpy as np
 
 import stitch
@@ -8,7 +10,7 @@ from stitch.effects import effect, number
 
 
 @effect("sensor", needs=("humidity_percent",), k=number("mm", 0.01, 0.5))
-def humidity_bias(points, view, k):
+def humidity_bias(points: Any, view: Any, k: float) -> Any:
     """x = x* + u·k·(H−H₀), u along the ray, H in percent"""
     return points + view.along(points) * (k * view.since_first("humidity_percent"))
 
@@ -18,5 +20,4 @@ steps = zip((cloud.points for cloud in cell.clouds), 0.03 * (humidity - 40), str
 clouds = [p * (1 + k / np.linalg.norm(p, axis=1, keepdims=True)) for p, k in steps]
 known = {"humidity_percent": humidity}
 run = stitch.run(stitch.Session.from_arrays(clouds, cell.T_base_flange, mount="eye_in_hand", covariates=known))
-found = stitch.diagnose(run)
-stitch.add(run, *found.effects).plot("error").savefig("error.png")
+stitch.add(run, *stitch.diagnose(run).effects).plot("error").savefig("error.png")
