@@ -11,7 +11,7 @@ from stitch.numerics.frames import Array
 from stitch.run_data import RunData
 from stitch.session.robot import link_frames
 
-_WIDTH, _HEIGHT, _EDGE = 230.0, 250.0, 46.0
+_WIDTH, _HEIGHT, _EDGE = 230.0, 250.0, 58.0
 # The magnified motion carries what errs by this share of the arm's reach.
 _SHOWN = 0.12
 _MARK = "var(--best)"

@@ -48,19 +48,21 @@ function showScreen(root, part, found, um) {
     // Where the colour, which is a mean of patches, is that of the number.
     const alike = all.filter(([k, , , i]) => Math.abs(drawn[i] - values[k]) < 0.15 * values[k]), front = (alike.length > 9 ? alike : all).sort((a, b) => values[a[0]] - values[b[0]]);
     const worst = worstPatch(values);
-    if (worst >= 0 && front.some(([k]) => k === worst)) tags.push({ patch: worst, worst: true, x: 9, y: 9 });
+    if (worst >= 0 && isWorst(values[worst]) && front.some(([k]) => k === worst)) tags.push({ patch: worst, worst: true, x: 9, y: 9 });
     for (const wanted of tags.length ? [0, 0.5] : [1, 0, 0.5]) {
       const order = front.map((f, i) => [Math.abs(i / front.length - wanted), f]).sort((a, b) => a[0] - b[0]);
       const free = order.find(([, f]) => tags.every(t => Math.hypot(f[1] - t.x, f[2] - t.y) > 0.22));
       if (free) tags.push({ patch: free[1][0], x: free[1][1], y: free[1][2], vertex: free[1][3] });
     }
   }
+  // Called the worst is what the tile says; the part's own patches may lie beside it.
+  const isWorst = value => !shown || value > 0.95 * found.now.worst * um;
   const worstPatch = values => values.reduce((best, v, k) => Number.isFinite(v) && (best < 0 || v > values[best]) ? k : best, -1);
   // A click on the tile of the worst place turns the part there.
   const tile = root.ownerDocument.querySelector("[data-tile=worst]");
   if (tile && views.length) tile.parentElement.addEventListener("click", () => {
     const patch = worstPatch(pair()[0].values);
-    tags = [...tags.filter(t => !t.worst).slice(-2), { patch, worst: true }];
+    tags = [...tags.filter(t => !t.worst).slice(-2), { patch, worst: isWorst(pair()[0].values[patch]) }];
     views.forEach(v => v.face(patch)); draw();
   });
   views.forEach(v => v.picked = patch => {
