@@ -50,7 +50,8 @@ def batch(
 
     Args:
         sessions: in memory, or folders that the workers can read.
-        client: what has `submit`: a `concurrent.futures` pool or a Dask client; None: this process.
+        client: what has `submit`: a `concurrent.futures` pool or a Dask client; None: this process. Processes that are
+            forked wait for ever for threads of this one: make a pool by multiprocessing.get_context("spawn").
         effects, keep: as of `stitch.run`.
 
     Returns:
