@@ -23,7 +23,7 @@ from stitch.cli.main import build
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md")))
-LANGUAGES = ("console", "sh", "python", "toml", "csv", "text", "diff", "yaml")
+LANGUAGES = ("console", "sh", "python", "toml", "csv", "text", "diff", "yaml", "sql")
 _BLOCK = re.compile(r"(?:^<!-- not run: ([^\n]+) -->\n)?^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 

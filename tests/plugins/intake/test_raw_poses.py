@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 from data_synth.fixtures.robot_programs import program
@@ -171,7 +172,7 @@ def test_mech_mind_quaternion_may_be_of_either_order_until_somebody_says(tmp_pat
 
 
 @pytest.mark.parametrize("order", ["rows", "columns"])
-def test_matrices_in_text_json_yaml_and_numpy(tmp_path, order):
+def test_matrices_in_text_json_yaml_numpy_and_matlab(tmp_path, order):
     T = np.tile(np.eye(4), (3, 1, 1))
     T[:, :3, :3] = Rotation.from_rotvec(np.eye(3)).as_matrix()
     T[:, :3, 3] = [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
@@ -186,7 +187,20 @@ def test_matrices_in_text_json_yaml_and_numpy(tmp_path, order):
     (tmp_path / "dashes.yml").write_text(dashes, encoding="utf-8")
     np.save(tmp_path / "all.npy", written)
     np.savetxt(tmp_path / "flat.csv", written.reshape(3, 16), delimiter=";")
-    for name in ("blocks.txt", "lists.json", "named.json", "dashes.yml", "all.npy", "flat.csv"):
+    # MATLAB counts views last, and people keep their arrays in structures.
+    savemat(tmp_path / "matlab.mat", {"poses": written.transpose(1, 2, 0)})
+    savemat(tmp_path / "structure.mat", {"robot": {"name": "cell 3", "T": written.transpose(1, 2, 0)}})
+    files = (
+        "blocks.txt",
+        "lists.json",
+        "named.json",
+        "dashes.yml",
+        "all.npy",
+        "flat.csv",
+        "matlab.mat",
+        "structure.mat",
+    )
+    for name in files:
         assert np.allclose(only(read_raw_poses([tmp_path / name])).T, T), name
 
 
