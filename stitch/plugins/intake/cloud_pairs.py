@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from itertools import combinations, count
 from pathlib import Path
 
+import numpy as np
+
 from stitch.numerics.frames import Array
 from stitch.plugins.intake.clock_times import rows_by_time
 from stitch.plugins.intake.refusals import Fix, Refusal
@@ -100,7 +102,7 @@ def named_pairing(
 ) -> Pairing | None:
     """Return the pairing that names, times or numbers tell; None where they do not."""
     ways = (
-        _by_text(clouds, labels),
+        _by_text(clouds, labels, numbers),
         _by_time(clouds, labels, numbers),
         _by_number(clouds, labels),
         _by_column(clouds, numbers),
@@ -154,8 +156,11 @@ def _incomplete_pairings(N: int, M: int) -> list[Pairing]:
     return out
 
 
-def _by_text(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairing | None:
-    """A text beside the pose is the cloud's path, file name, or name without its ending."""
+def _by_text(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]], numbers: Array | None) -> Pairing | None:
+    """A text beside the pose is the cloud's path, file name, or name without its ending.
+
+    A row that is written twice, with the same numbers, counts once.
+    """
     where: dict[str, set[int]] = {}
     for row, texts in enumerate(labels):
         for text in texts:
@@ -164,8 +169,11 @@ def _by_text(clouds: Sequence[Path], labels: Sequence[tuple[str, ...]]) -> Pairi
                 where.setdefault(name, set()).add(row)
     rows = []
     for cloud in clouds:
-        found = where.get(cloud.name.lower()) or where.get(cloud.stem.lower())
-        rows.append(next(iter(found)) if found is not None and len(found) == 1 else None)
+        called = sorted(where.get(cloud.name.lower()) or where.get(cloud.stem.lower()) or ())
+        alike = len(called) == 1 or (
+            numbers is not None and len(called) > 1 and not np.ptp(numbers[called], axis=0).any()
+        )
+        rows.append(called[0] if alike else None)
     known = [row for row in rows if row is not None]
     if len(known) < 2 or len(set(known)) < len(known):
         return None

@@ -25,6 +25,15 @@ def test_names_tell(labels, rows):
     assert pairing.rows == rows and pairing.by_name
 
 
+def test_a_row_that_is_written_twice_counts_once_and_two_poses_of_one_name_are_none():
+    labels = [(cloud.stem,) for cloud in (*CLOUDS, CLOUDS[1])]
+    numbers = np.arange(6.0 * len(labels)).reshape(-1, 6)
+    assert pairings(CLOUDS, labels, numbers)[0].rows == (0, None, *range(2, len(CLOUDS)))
+    numbers[-1] = numbers[1]
+    (pairing,) = pairings(CLOUDS, labels, numbers)
+    assert pairing.rows == tuple(range(len(CLOUDS)))
+
+
 def test_without_names_the_order_comes_first_then_what_people_do_wrong():
     found = pairings(CLOUDS, [()] * 4)
     assert found[0].rows == (0, 1, 2, 3) and found[1].rows == (3, 2, 1, 0)
