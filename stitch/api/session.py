@@ -262,6 +262,9 @@ def _read_tables(cell: Session, poses: Any, scans: list[Any], cloud_unit: str) -
 
     Others stay as they are (entry-point group `stitch.pose_tables`).
     """
+    with suppress(ValueError):
+        if poses is None or np.shape(poses)[1:] == (4, 4):
+            return poses
     for reader in entry_points(group="stitch.pose_tables"):
         poses = reader.load()(poses, scans, cell.length_unit, cloud_unit, cell.mount)
     return poses

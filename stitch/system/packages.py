@@ -47,6 +47,8 @@ PACKAGES = {
     "rosbags": ("rosbags", "bags of ROS, and MCAP"),
     "distributed": ("distributed", "batch on more than one process"),
     "cryptography": ("cryptography", "batch on more than one process"),
+    "fsspec": ("fsspec", "sessions and runs in object storage"),
+    "pandas": ("pandas", "tables of results for pandas"),
 }
 
 

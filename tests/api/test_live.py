@@ -198,7 +198,7 @@ def test_a_folder_is_followed_as_it_fills(cell_folder, tmp_path, capfd):
         main(["run", str(folder), "--follow", "--views", str(len(rows)), "-o", str(tmp_path / "run"), "--no-recording"])
     writer.join()
     assert not end.value.code
-    shown = capfd.readouterr().err
+    shown = capfd.readouterr().out
     assert shown.count("waiting. The hand-eye is fitted") >= 2 and "The first hand-eye." in shown
     assert (tmp_path / "run" / "result.json").is_file()
 

@@ -12,7 +12,8 @@ def with_effect(sigmas: float, heldout: float) -> SimpleNamespace:
     parameter = SimpleNamespace(name="a", value=sigmas, sigma=1.0, fitted=True, grid=(), limit=1e3)
     steps = (SimpleNamespace(effects=(), heldout_rms=1.0), SimpleNamespace(effects=("settling",), heldout_rms=heldout))
     return SimpleNamespace(
-        ledger=steps, terms=(SimpleNamespace(name="settling", parameters=(parameter,), sigmas_from_zero=sigmas),)
+        ledger=steps,
+        terms=(SimpleNamespace(name="settling", parameters=(parameter,), sigmas_from_zero=sigmas, is_geometry=False),),
     )
 
 

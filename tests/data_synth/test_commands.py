@@ -250,7 +250,7 @@ def test_people_read_what_was_hidden_once_and_with_units(tmp_path, capsys):
     judged(tmp_path, fitted=FITTED, diagnosis={**NAMED, "verdict": "adequate", "effects": []})
     with pytest.raises(SystemExit):
         main(["reveal", str(tmp_path / "run"), str(tmp_path / "truth.json")])
-    told = capsys.readouterr().err.split("\n")
+    told = capsys.readouterr().out.split("\n")
     assert [line.split() for line in told[:3]] == [
         ["hidden", "joint_compliance"],
         ["in", "the", "model", "joint_compliance"],

@@ -163,14 +163,14 @@ def _init_from_files(folder: Path, out: Path, options: dict[str, str], yes: bool
 
 def _ask_way_on(refused: Refusal) -> dict[str, str]:
     """Return the options that lead on, as a person chooses and completes them, with the rows shown."""
-    say(refused.command_line, bold=True)
+    say(refused.command_line, bold=True, stream=sys.stderr)
     ways = [fix for fix in refused.fixes if fix.options]
     for number, fix in enumerate(ways, 1) if len(ways) > 1 else ():
-        say(f"  {number}: {fix.words}", hang=5)
+        say(f"  {number}: {fix.words}", hang=5, stream=sys.stderr)
     chosen = typer.prompt("Which", default="1", err=True) if len(ways) > 1 else "1"
     fix = ways[int(chosen) - 1] if chosen.isdigit() and 0 < int(chosen) <= len(ways) else ways[0]
     for line in fix.shows:
-        say(f"  {line}")
+        say(f"  {line}", stream=sys.stderr)
     return {
         name: str(typer.prompt(f"--{name.replace('_', '-')}", err=True)).strip() if value.isupper() else value
         for name, value in fix.options.items()

@@ -242,7 +242,7 @@ def test_a_camera_that_stands_in_the_cell(tmp_path, capsys):
     bag = write(tmp_path / "b", "ros2", urdf=False, camera_fixed=True)
     with pytest.raises(SystemExit) as end:
         main(["init", str(bag)])
-    assert not end.value.code and "mount: eye_to_hand" in capsys.readouterr().err
+    assert not end.value.code and "mount: eye_to_hand" in capsys.readouterr().out
     session = load_session(tmp_path / "b-session")
     assert session.mount == "eye_to_hand" and session.joints is None
     assert session.views[1].T_base_flange[:3, 3] == pytest.approx(1000 * flange(STOPS[1])[:3, 3], abs=1e-4)
