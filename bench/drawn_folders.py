@@ -119,7 +119,7 @@ def summary(rows: list[Row]) -> list[str]:
             "right, or refused with the true cause, after one answer at most",
             lambda r: _is_fine(r) and len(r["asked"]) < 2,
         ),
-        ("of these without a question", lambda r: _is_fine(r) and not r["asked"]),
+        ("right without a question", lambda r: _is_fine(r) and not r["asked"]),
         ("silently wrong", lambda r: r["outcome"].startswith("silently")),
         ("wrong, and marked as a guess", lambda r: r["outcome"].startswith("wrong as")),
         ("refused for another cause than the true one, or without a way on", lambda r: r["outcome"] == "refused"),

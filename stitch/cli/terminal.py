@@ -17,8 +17,8 @@ _SPELT = {"µ": "u", "μ": "u", "–": "-", "—": "-", "±": "+-", "×": "x", "
 # Where results go, and whether headlines alone are printed: of the innermost command that runs.
 _results: list[IO[str]] = []
 _briefly: list[bool] = []
-# Where lines and tables for people go, while these are a command's result.
-_answers: list[IO[str]] = []
+# While it holds anything, lines and tables for people are a command's result.
+_answers: list[bool] = []
 
 
 def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = None) -> None:
@@ -37,13 +37,14 @@ def say(text: str, bold: bool = False, hang: int = 0, stream: IO[str] | None = N
 
 
 def _answer_stream() -> IO[str] | None:
-    return _answers[-1] if _answers else None
+    # Asked anew for each line: a command may keep descriptor 1 for its results and let it lead to 2 meanwhile.
+    return results_stream() if _answers else None
 
 
 @contextmanager
 def answers() -> Iterator[None]:
     """While the block lasts, lines and tables for people are the result of a command: they go to standard output."""
-    _answers.append(results_stream())
+    _answers.append(True)
     try:
         yield
     finally:

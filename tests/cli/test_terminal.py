@@ -60,6 +60,17 @@ def test_the_result_of_a_command_is_json_whatever_an_effect_prints(tmp_path):
     assert all(f"from {what}" in ended.stderr for what in ("python", "a stream", "below"))
 
 
+def test_what_a_command_finds_goes_to_standard_output_as_a_process_too(tmp_path):
+    """There descriptor 1 leads to 2 while a command runs, so that no library's line comes between."""
+    session, *_ = labelled_cell(2, views=12, offset=np.zeros(6))
+    measured, run = write_labelled(tmp_path / "s", session, "points"), tmp_path / "r"
+    ended = subprocess.run([*MAIN, "run", measured, "-o", run, "--no-recording"], capture_output=True, text=True)
+    assert "Hand-eye T_base_scanner" in ended.stdout and f"Next: stitch diagnose {run}" in ended.stdout, ended.stderr
+    assert "Hand-eye" not in ended.stderr and "Next:" not in ended.stderr
+    ended = subprocess.run([*MAIN, "add", run, "elbow"], capture_output=True, text=True)
+    assert ended.returncode == 2 and not ended.stdout and ended.stderr.startswith("stitch: no effect 'elbow'")
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
 def test_letters_that_a_terminal_does_not_have_are_spelt(encoding):
     environment = os.environ | {"PYTHONIOENCODING": encoding, "COLUMNS": "200"}
@@ -162,7 +173,7 @@ def drawn(_blade_on_disk, tmp_path_factory):
         csv.writer(file).writerows([rows[0], *([name, *row[1:]] for name, row in zip(NAMES, rows[1:], strict=True))])
     ended = subprocess.run([sys.executable, "-c", CODE], cwd=folder, capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
-    return folder / "r", ended.stderr
+    return folder / "r", ended.stdout + ended.stderr
 
 
 def test_a_terminal_shows_names_as_they_are_and_nothing_warns(drawn):
