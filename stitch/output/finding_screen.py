@@ -361,9 +361,8 @@ def certainty(diagnosis: Diagnosis) -> str:
     if likeliest is None:
         return "No known effect can be tested with these views."
     if likeliest.adjusted > _PLAIN_CHANCE:
-        return f"None of {likeliest.tests} further effects shows."
-    nearest = f"Of {likeliest.tests} further effects, {likeliest.name} comes nearest."
-    return f"{nearest} {chance_text(likeliest.adjusted)}"
+        return "None of the effects tried shows."
+    return f"Of the effects tried, {likeliest.name} comes nearest. {chance_text(likeliest.adjusted)}"
 
 
 def chance_text(p: float) -> str:

@@ -44,7 +44,7 @@ function showScreen(root, part, found, um) {
   // Places with their numbers on both parts: at first the worst, the best and one between that are in sight.
   let tags = [];
   function firstTags() {
-    const values = pair()[0].values, all = views[0].front().filter(([k]) => Number.isFinite(values[k])), drawn = numbers.onVertices(values);
+    const values = present().values, all = views[0].front().filter(([k]) => Number.isFinite(values[k])), drawn = numbers.onVertices(values);
     // Where the colour, which is a mean of patches, is that of the number.
     const alike = all.filter(([k, , , i]) => Math.abs(drawn[i] - values[k]) < 0.15 * values[k]), front = (alike.length > 9 ? alike : all).sort((a, b) => values[a[0]] - values[b[0]]);
     const worst = worstPatch(values);
@@ -55,14 +55,16 @@ function showScreen(root, part, found, um) {
       if (free) tags.push({ patch: free[1][0], x: free[1][1], y: free[1][2], vertex: free[1][3] });
     }
   }
+  // What the tiles speak of: the first picture beside a candidate, else the last.
+  const present = () => pair()[shown ? 0 : pair().length - 1];
   // Called the worst is what the tile says; the part's own patches may lie beside it.
   const isWorst = value => !shown || value > 0.95 * found.now.worst * um;
   const worstPatch = values => values.reduce((best, v, k) => Number.isFinite(v) && (best < 0 || v > values[best]) ? k : best, -1);
   // A click on the tile of the worst place turns the part there.
   const tile = root.ownerDocument.querySelector("[data-tile=worst]");
   if (tile && views.length) tile.parentElement.addEventListener("click", () => {
-    const patch = worstPatch(pair()[0].values);
-    tags = [...tags.filter(t => !t.worst).slice(-2), { patch, worst: isWorst(pair()[0].values[patch]) }];
+    const { values } = present(), patch = worstPatch(values);
+    tags = [...tags.filter(t => !t.worst).slice(-2), { patch, worst: isWorst(values[patch]) }];
     views.forEach(v => v.face(patch)); draw();
   });
   views.forEach(v => v.picked = patch => {
@@ -215,7 +217,7 @@ function partStage(card, data, index) {
     drawing.paint({ turn: look.turn(), scale: look.scales(), shift: look.shift(), zoom: look.now().zoom, blend: 0, full: state.full, signed: state.signed });
     const w = canvas.clientWidth, h = canvas.clientHeight;
     above.setAttribute("viewBox", `0 0 ${w} ${h}`);
-    const nodes = [], taken = { left: [], right: [] };
+    const nodes = [], taken = { left: [], right: [] }, largest = state.values ? Math.max(...state.values.filter(Number.isFinite)) : NaN;
     for (const tag of tags) {
       const i = tag.vertex ?? (tag.vertex = vertexOf(tag.patch));
       if (i < 0 || depthOf(i) < 0.05 || !state.values) continue;
@@ -225,7 +227,7 @@ function partStage(card, data, index) {
       const away = ty > h / 2 ? -26 : 26;
       while (taken[side].some(t => Math.abs(t - ty) < 26)) ty += away;
       taken[side].push(ty);
-      const tx = side === "right" ? w - (tag.worst ? 54 : 40) : tag.worst ? 54 : 40, text = Number.isFinite(value) ? `${tag.worst ? "worst " : ""}${roundLength(value)}` : "no value", half = tag.worst ? 52 : 36;
+      const tx = side === "right" ? w - (tag.worst ? 54 : 40) : tag.worst ? 54 : 40, text = Number.isFinite(value) ? `${tag.worst && value === largest ? "worst " : ""}${roundLength(value)}` : "no value", half = tag.worst ? 52 : 36;
       nodes.push(svgNode("line", { class: "lead", x1: px, y1: py, x2: tx, y2: ty }), svgNode("circle", { class: "spot", cx: px, cy: py, r: 4 }),
         svgNode("rect", { class: "tag", x: tx - half, y: ty - 12, width: 2 * half, height: 23, rx: 5 }), svgNode("text", { class: "tag-text", x: tx, y: ty + 4, "text-anchor": "middle" }, text));
     }
