@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stitch.cli.options import EffectsFile, Json
-from stitch.cli.terminal import emit, results_stream, say, show_columns
+from stitch.cli.terminal import emit, say, show_columns
 
 if TYPE_CHECKING:
     from stitch.effects.contract import Effect
@@ -46,7 +46,7 @@ def effects(
         _show_effect(listed[0])
     else:
         words = [heading for heading, _ in columns]
-        show_columns("Physical effects", columns, listed, words, stream=results_stream())
+        show_columns("Physical effects", columns, listed, words)
 
 
 def parameter_signature(effect: Effect) -> str:
@@ -100,4 +100,4 @@ def _show_effect(effect: Effect) -> None:
     if effect.prefers:
         lines.append(f"  uses {', '.join(effect.prefers)} where the session has it")
     for line in lines:
-        say(line, stream=results_stream())
+        say(line)

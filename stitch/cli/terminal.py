@@ -68,7 +68,6 @@ def show_table(
     headings: Sequence[str],
     rows: Sequence[Sequence[str]],
     words: Sequence[str] | None = None,
-    stream: IO[str] | None = None,
 ) -> None:
     """Print a table: columns of `words`, if not stated the first, to the left, numbers to the right.
 
@@ -78,13 +77,13 @@ def show_table(
 
     from stitch.system.process import console
 
-    say(title, bold=True, stream=stream)
+    say(title, bold=True)
     widths = [max(map(cell_len, column)) for column in zip(headings, *rows, strict=True)]
-    terminal = console(stream or _answer_stream())
+    terminal = console(_answer_stream())
     if terminal.is_terminal and sum(widths) + 2 * len(widths) > terminal.width:
         for first, *cells in rows:
             named = ", ".join(f"{heading} {cell}" for heading, cell in zip(headings[1:], cells, strict=True))
-            say(f"  {first}: {named}", hang=4, stream=stream)
+            say(f"  {first}: {named}", hang=4)
         return
     left = [heading in (headings[:1] if words is None else words) for heading in headings]
     for row in (headings, *rows):
@@ -92,7 +91,7 @@ def show_table(
         cells = [
             f"{cell}{pad}" if to_left else f"{pad}{cell}" for cell, pad, to_left in zip(row, pads, left, strict=True)
         ]
-        say(f"  {'  '.join(cells)}".rstrip(), stream=stream)
+        say(f"  {'  '.join(cells)}".rstrip())
 
 
 def show_columns(
@@ -100,11 +99,10 @@ def show_columns(
     columns: Sequence[tuple[str, Callable[[Any], str]]],
     items: Iterable[Any],
     words: Sequence[str] | None = None,
-    stream: IO[str] | None = None,
 ) -> None:
     """Print a table with a row an item: each column is its heading and what it says of an item."""
     headings = [heading for heading, _ in columns]
-    show_table(title, headings, [[cell(item) for _, cell in columns] for item in items], words, stream)
+    show_table(title, headings, [[cell(item) for _, cell in columns] for item in items], words)
 
 
 def show_files(folder: Path, names: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from stitch.cli.options import Json, require_new
-from stitch.cli.terminal import emit, results_stream, say, show_columns, stdout_for_results
+from stitch.cli.terminal import emit, say, show_columns, stdout_for_results
 from stitch.errors import InputError
 from stitch.system.open3d_library import import_open3d
 from stitch.system.packages import DISTRIBUTION, PACKAGES, command_of, stitch_version
@@ -53,20 +53,19 @@ def doctor(
         emit(to_json(document))
         return
     missing = [row for row in packages if row["version"] is None]
-    out = results_stream()
     there = f"{len(packages) - len(missing)} of {len(packages)} packages are there"
-    say(f"stitch {stitch_version()} ({DISTRIBUTION}): {there}", stream=out)
+    say(f"stitch {stitch_version()} ({DISTRIBUTION}): {there}")
     if missing:
         columns = (
             ("missing", lambda row: row["name"]),
             ("not without it", lambda row: row["for"]),
             ("to type", lambda row: row["command"]),
         )
-        show_columns("Missing packages", columns, missing, [heading for heading, _ in columns], stream=out)
+        show_columns("Missing packages", columns, missing, [heading for heading, _ in columns])
     if open3d:
-        say(open3d, stream=out)
+        say(open3d)
     for row in document.get("run", ()):
-        say(f"{run}: computed with {row['name']} {row['run']}; here is {row['here'] or 'none'}", stream=out)
+        say(f"{run}: computed with {row['name']} {row['run']}; here is {row['here'] or 'none'}")
 
 
 def _write_bundle(run: Path | None, output: Path, report: str) -> None:
@@ -90,7 +89,7 @@ def _write_bundle(run: Path | None, output: Path, report: str) -> None:
             for file in (place / name for name in names):
                 if file.is_file():
                     bundle.write(file, f"{'run' if place == run else 'session'}/{file.name}")
-    say(f"{output}: numbers, paths and names of views; read it before you pass it on", stream=results_stream())
+    say(f"{output}: numbers, paths and names of views; read it before you pass it on")
 
 
 def package_rows() -> list[dict[str, str | None]]:
