@@ -13,6 +13,7 @@ from scipy.stats import binomtest
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
+from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array
 from stitch.numerics.units import angle_text, length_text
 from stitch.run_data import RunData
@@ -232,8 +233,7 @@ def _common_motion(clouds: list[Array], poses: Array, wanted: Array) -> Array:
     """Return the rigid motion (4, 4) that brings all views nearest to where others put them."""
     a = np.concatenate([frames.transform(T, points) for T, points in zip(poses, clouds, strict=True)])
     b = np.concatenate([frames.transform(T, points) for T, points in zip(wanted, clouds, strict=True)])
-    R = frames.nearest_rotation((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
-    return frames.make(R, b.mean(axis=0) - R @ a.mean(axis=0))
+    return align_points(a, b)
 
 
 def _overlaps(clouds: list[Array], normals: list[Array], rivals: tuple[Array, Array], reach: float) -> Array:
