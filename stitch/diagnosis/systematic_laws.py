@@ -19,7 +19,6 @@ from functools import cached_property
 
 import numpy as np
 from scipy.special import logsumexp
-from scipy.stats import f as f_distribution
 
 from stitch.diagnosis import thresholds as limits
 from stitch.diagnosis.candidates import Candidate, Form
@@ -31,6 +30,7 @@ from stitch.model.forward import pose_derivatives
 from stitch.model.model import Term, term_of
 from stitch.numerics import frames
 from stitch.numerics.common_covariance import SelectedColumns
+from stitch.numerics.distributions import f_limits
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.least_squares import column_space, project_out
 from stitch.observations.linear_model import LinearModel, Observation
@@ -264,7 +264,7 @@ def _family_wise(linear: LinearModel, dictionary: Dictionary, ranked: Ranked) ->
         if not rank:
             continue
         least = np.array([by_count * share for _, share in laws]) / len(dictionary.keys)
-        limit = rank * f_distribution.isf(np.minimum(least, 1.0), rank, known)
+        limit = rank * f_limits(np.minimum(least, 1.0), rank, known)
         squares = (np.hstack([U for U, _ in laws]).T @ drawn) ** 2
         as_clear |= (squares.reshape(len(laws), rank, -1).sum(axis=1) >= limit[:, None]).any(axis=0)
     return float((1 + as_clear.sum()) / (1 + _DRAWS))

@@ -58,9 +58,14 @@ def f_tail(x: float, numerator: float, denominator: float) -> float:
 
 
 def f_limit(p: float, numerator: float, denominator: float) -> float:
-    """The F that a share p exceeds, exact for tiny p too: by the beta distribution of d₂/(d₂ + d₁ F)."""
+    """The F that a share p exceeds."""
+    return float(f_limits(np.array(p), numerator, denominator))
+
+
+def f_limits(p: Array, numerator: float, denominator: float) -> Array:
+    """The F that shares p exceed, exact for tiny ones too: by the beta distribution of d₂/(d₂ + d₁ F)."""
     share = special.betaincinv(denominator / 2, numerator / 2, p)
-    return float(denominator * (1 - share) / (numerator * share))
+    return denominator * (1 - share) / (numerator * share)
 
 
 def noncentral_f_tail(x: float, numerator: float, denominator: float, shift: float) -> float:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 from pykdtree.kdtree import KDTree
-from scipy.stats import binomtest
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
+from stitch.numerics.distributions import binomial_tail
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array
 from stitch.numerics.units import angle_text, length_text
@@ -101,7 +101,7 @@ class Witness:
             f"Where two views overlap, their surfaces lie {ours} apart by this run's poses and {theirs} by Open3D's "
             "(medians)."
         )
-        chance = binomtest(nearer, count).pvalue
+        chance = min(1.0, 2 * binomial_tail(max(nearer, count - nearer) - 1, count, 0.5))
         if chance > _CLEAR:
             yield f"This run is nearer in {nearer} of {count} overlaps: no difference beyond chance (p = {chance:.2g})."
         else:

@@ -9,10 +9,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm
 
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
+from stitch.numerics.distributions import normal_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.units import METRES
 from stitch.output.session_files import SessionFiles, pose_columns
@@ -82,7 +82,7 @@ def solve_stand(stand: Stand) -> BaseResult:
             f"rod and joints contradict each other: {texts}. No transform is given; to fix: read these points again"
         )
     solution = fit_stand(stand)
-    if solution.p_value < 2 * norm.sf(CONTRADICTION_SIGMAS):
+    if solution.p_value < 2 * normal_tail(CONTRADICTION_SIGMAS):
         sizes = np.linalg.norm(np.vstack([solution.rail_residuals, solution.rod_residuals]), axis=1)
         worst = int(np.argmax(sizes))
         raise NoResultError(

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from scipy.stats import f
 
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
+from stitch.numerics.distributions import f_tail
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array
 from stitch.plugins.cells.job_files import on_a_line
@@ -307,7 +307,7 @@ def _test_effect(smaller: CameraFit, bigger: CameraFit) -> CameraEffectTest:
     free = count - 11 - len(bigger.effects)
     F = (smaller.sum_of_squares - bigger.sum_of_squares) / (bigger.sum_of_squares / free)
     bic = count * np.log(bigger.sum_of_squares / smaller.sum_of_squares) + np.log(count)
-    p = float(f.sf(max(F, 0.0), 1, free))
+    p = f_tail(max(F, 0.0), 1, free)
     effect = bigger.effects[-1]
     value = bigger.k1 if effect == "k1" else bigger.plate_height
     accepted = bool(p < _EFFECT_P_LIMIT and bic < 0)
@@ -527,7 +527,7 @@ def find_tool_axis(reported: Array, directions: Array) -> ToolAxis | None:
     scatter = np.cov(small, rowvar=False)
     mean = small.mean(axis=0)
     F = count * mean @ np.linalg.pinv(scatter) @ mean * (count - 2) / (2 * (count - 1))
-    p = float(f.sf(F, 2, count - 2))
+    p = f_tail(F, 2, count - 2)
     axis = local.mean(axis=0)
     axis /= np.linalg.norm(axis)
     tilt = float(np.arctan2(np.hypot(axis[0], axis[1]), axis[2]))

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import chi2
 
 from stitch.errors import InputError, NoResultError
 from stitch.numerics import frames
+from stitch.numerics.distributions import chi2_tail
 from stitch.numerics.feature_matching import align_points
 from stitch.numerics.frames import Array, Indices
 from stitch.numerics.hand_eye import park_martin
@@ -123,7 +123,7 @@ class RobotModel:
     @property
     def p_value(self) -> float:
         """Chance of so large a misfit if robot and tracker are as good as stated."""
-        return float(chi2.sf(self.chi_square, self.redundancy))
+        return chi2_tail(self.chi_square, self.redundancy)
 
 
 def _initial_base(readings: ReflectorReadings) -> Array:
@@ -387,7 +387,7 @@ def find_leg_offset(readings: ReflectorReadings, model: RobotModel, legs: Legs, 
         chi_square_drop=float(drops[best]),
         runner_up=int(second) + 1,
         runner_up_drop=float(drops[second]),
-        detected=bool(chi2.sf(drops[best], 1) * tests < _FALSE_ALARM),
+        detected=chi2_tail(drops[best], 1) * tests < _FALSE_ALARM,
     )
 
 

@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from stitch.errors import NoResultError
 from stitch.numerics import frames
+from stitch.numerics.distributions import chi2_tail
 from stitch.numerics.frames import Array
 from stitch.session.robot import elementary
 
@@ -224,7 +224,7 @@ class BaseFit:
     @property
     def p_value(self) -> float:
         """Chance of so large a misfit if the stated sigmas hold; 1 without redundancy."""
-        return float(chi2.sf(self.chi_square, self.redundancy)) if self.redundancy else 1.0
+        return chi2_tail(self.chi_square, self.redundancy) if self.redundancy else 1.0
 
     @property
     def sigma(self) -> Array:
