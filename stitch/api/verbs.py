@@ -271,9 +271,9 @@ def report(
         written = Path(scratch) / "report.html"
         if other is not None:
             both = compare_runs([run, other], [run.session.name, other.session.name])
-            call_entry_points("stitch.two_run_reports", both, written, tolerance)
+            call_entry_points("stitch.two_run_reports", both, written, tolerance, required=True)
         else:
-            call_entry_points("stitch.reports", run, written, tolerance)
+            call_entry_points("stitch.reports", run, written, tolerance, required=True)
         if not written.is_file():
             raise InputError("report: nothing that draws is installed; to fix: install stitch with its package viz")
         if diagnosis is not None:

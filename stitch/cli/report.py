@@ -121,7 +121,7 @@ def _write_run_page(
     activity = "report: reading the scans, writing the page"
     with opened_run(run, effects_file, trust, activity) as state:
         with show_activity(activity):
-            run_folder.call_entry_points("stitch.reports", state, page, tolerance)
+            run_folder.call_entry_points("stitch.reports", state, page, tolerance, required=True)
         show_light(state, tolerance)
         # A diagnosis of this very model stays on the page.
         shows = page.is_file() and 'id="screen-data"' in page.read_text(encoding="utf-8")
@@ -156,6 +156,6 @@ def _write_two_run_page(
         both = compare_runs(runs, [str(folder) for folder in folders] if names[0] == names[1] else names)
     page = output or other / "two-runs.html"
     with nullcontext() if output else run_folder.lock_run_folder(other):
-        run_folder.call_entry_points("stitch.two_run_reports", both, page, tolerance)
+        run_folder.call_entry_points("stitch.two_run_reports", both, page, tolerance, required=True)
     say(comparison_sentence(both), bold=True)
     return page

@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from importlib.metadata import entry_points
 from itertools import chain
@@ -30,7 +30,7 @@ from stitch.run_data import FusedCloud, RunData
 from stitch.session.reading.session_folder import measured_files
 from stitch.session.session import SessionData
 from stitch.system.files import claim_folder, rewrite_folder
-from stitch.system.packages import stitch_version
+from stitch.system.packages import stitch_version, unless_missing
 from stitch.system.ply_file import ply_header
 from stitch.system.threads import release_mapped
 
@@ -45,7 +45,11 @@ _KEPT_BYTES = 1e9
 
 def recordings(folder: Path) -> list[Recorder]:
     """Return what other packages record of a run into its folder, by the entry-point group `stitch.recorders`."""
-    return [entry.load()(folder / "recording.rrd") for entry in entry_points(group="stitch.recorders")]
+    found: list[Recorder] = []
+    for entry in entry_points(group="stitch.recorders"):
+        with unless_missing():
+            found.append(entry.load()(folder / "recording.rrd"))
+    return found
 
 
 def write_cloud(cloud: FusedCloud, path: Path) -> None:
@@ -249,10 +253,11 @@ def lock_run_folder(path: Path) -> Iterator[None]:
         yield
 
 
-def call_entry_points(group: str, *arguments: Any) -> None:
-    """Call what other packages offer under an entry-point group."""
+def call_entry_points(group: str, *arguments: Any, required: bool = False) -> None:
+    """Call what other packages offer under an entry-point group; unless required, what lacks a package is left out."""
     for entry in entry_points(group=group):
-        entry.load()(*arguments)
+        with nullcontext() if required else unless_missing():
+            entry.load()(*arguments)
 
 
 def preload_entry_points(*groups: str) -> None:
@@ -294,4 +299,5 @@ def write_model_with_effects(run: RunData, folder: Path) -> None:
 
 def _write_points(run: RunData, folder: Path) -> None:
     write_cloud(run.fused, folder / "stitched.ply")
-    write_residuals(run, folder / "residuals.parquet")
+    with unless_missing():
+        write_residuals(run, folder / "residuals.parquet")

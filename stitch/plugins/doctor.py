@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -12,7 +12,7 @@ from stitch.cli.options import Json, require_new
 from stitch.cli.terminal import emit, say, show_columns, stdout_for_results
 from stitch.errors import InputError
 from stitch.system.open3d_library import import_open3d
-from stitch.system.packages import DISTRIBUTION, PACKAGES, command_of, stitch_version
+from stitch.system.packages import DISTRIBUTION, PACKAGES, command_of, small_requirements, stitch_version
 
 # What a bundle holds of a run and of its session: neither clouds nor pictures.
 _NUMBERS = ("model.toml", "result.json", "ledger.json", "diagnosis.json", "compare.json")
@@ -28,6 +28,10 @@ def doctor(
         Path | None,
         typer.Option("-o", "--output", metavar="ZIP", help="Pack what who helps needs of RUN: numbers, no clouds."),
     ] = None,
+    requirements: Annotated[
+        Literal["small"] | None,
+        typer.Option(help="Print, for pip, what a small install needs: no page, recording, table or simulator."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Say which packages are there, what is missing without the others, and what brings them.
@@ -37,7 +41,11 @@ def doctor(
       stitch doctor
       stitch doctor runs/blade-17 --json
       stitch doctor runs/blade-17 -o bundle.zip
+      stitch doctor --requirements small > small.txt
     """
+    if requirements is not None:
+        emit("\n".join(small_requirements()))
+        return
     from stitch.output.json_file import to_json
 
     packages = package_rows()

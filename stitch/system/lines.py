@@ -1,5 +1,6 @@
 """Lines for people: none is broken inside a word, a number, or between a number and its unit."""
 
+import os
 import re
 from typing import Any
 
@@ -43,6 +44,10 @@ class PeopleConsole(Console):
         if soft_wrap:
             objects = tuple(self._whole_words(own) if isinstance(own, str) else own for own in objects)
         super().print(*objects, soft_wrap=soft_wrap, **options)
+
+    def on_broken_pipe(self) -> None:
+        """Whoever reads has seen enough: the rest goes nowhere, and the command still writes its files."""
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
 
     def _whole_words(self, text: str) -> str:
         text = printable(text)

@@ -3,7 +3,10 @@
 `import stitch` and the command `stitch` belong to the distribution DISTRIBUTION: on PyPI, `stitch` is somebody else's.
 """
 
+import logging
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,6 +14,11 @@ from typing import Any
 from stitch.errors import InputError
 
 DISTRIBUTION = "stitch-scans"
+# What matches points and fits a hand-eye without page, recording, table or simulator: a third of a gigabyte.
+SMALL = (
+    *("numpy", "scipy", "pykdtree", "threadpoolctl", "tomli-w", "typer", "rich", "pyyaml"),
+    *("jsonschema", "natsort", "python-neo-lzf"),
+)
 # Packages by the name under which they are installed: that of their import, and what is not there without them.
 PACKAGES = {
     "numpy": ("numpy", "everything"),
@@ -64,6 +72,14 @@ def command_for(extra: str) -> str:
     return f"pip install '{DISTRIBUTION}[{extra}]'"
 
 
+def small_requirements() -> list[str]:
+    """Return SMALL as lines for pip; NumPy from 1.26 on, since a newer one is asked for by the recording alone."""
+    from importlib.metadata import requires
+
+    asked = {re.match(r"[\w.-]+", line)[0].lower(): line for line in requires(DISTRIBUTION) or ()}  # type: ignore[index]
+    return ["numpy>=1.26" if name == "numpy" else asked[name] for name in SMALL]
+
+
 def command_of(name: str) -> str:
     """Return the command that installs one of PACKAGES: its extra where it has one, else itself."""
     from importlib.metadata import requires
@@ -78,11 +94,26 @@ def command_of(name: str) -> str:
 
 def missing_package(error: ModuleNotFoundError) -> str | None:
     """Return the line for one of PACKAGES that an import did not find; None for anything else."""
-    top = (error.name or "").partition(".")[0]
+    top = (error.name or "").partition(".")[0].replace("markupsafe", "jinja2")  # which brings it
     for name, (module, purpose) in PACKAGES.items():
         if module == top:
             return f"needs {name}, which is not installed ({purpose}); to fix: {command_of(name)}"
     return None
+
+
+@contextmanager
+def unless_missing() -> Iterator[None]:
+    """What needs one of PACKAGES that is not installed is left out, with its line as a warning of the logger `stitch`.
+
+    For pictures, pages and recordings: numbers come without them.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        line = missing_package(error)
+        if line is None:
+            raise
+        logging.getLogger("stitch").warning("Left out: it %s", line)
 
 
 def import_extra(name: str, where: Path | str, extra: str) -> Any:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -220,3 +221,13 @@ def test_a_scratch_folder_that_cannot_be_made_names_the_folder(tmp_path, monkeyp
     with pytest.raises(PermissionError) as error, rewrite_folder(Path("run"), lambda inside: True):
         pass
     assert error.value.filename == "run"
+
+
+def test_a_reader_that_has_seen_enough_loses_no_run(session, tmp_path):
+    command = [sys.executable, "-P", "-m", "stitch", "run", str(session), "-o", "run", "--no-recording"]
+    run = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert run.stdout is not None and run.stderr is not None
+    run.stdout.close()  # as `| head -0` does
+    said = run.stderr.read()
+    assert run.wait() == 0, said
+    assert (tmp_path / "run" / "model.toml").is_file()

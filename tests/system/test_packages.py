@@ -1,6 +1,8 @@
 """The distribution has a name of its own; no message, page or error names another that is not among its packages."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -14,11 +16,14 @@ from stitch.errors import InputError
 from stitch.system.packages import (
     DISTRIBUTION,
     PACKAGES,
+    SMALL,
     command_for,
     command_of,
     import_extra,
     missing_package,
+    small_requirements,
     stitch_version,
+    unless_missing,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -149,3 +154,45 @@ def test_a_package_that_an_import_misses_is_one_line_of_the_command(module, line
         main(["run"])
     assert ended.value.code == 2 and capsys.readouterr().err.startswith(f"stitch: {line}")
     assert missing_package(ModuleNotFoundError("no", name="stitch.nothing")) is None
+
+
+def without_packages(names, words, folder):
+    """The end of a command in a process in which packages cannot be imported."""
+    lacked = [PACKAGES[name][0] for name in names]
+    code = f"import sys; sys.modules.update(dict.fromkeys({lacked})); from stitch.__main__ import main; main()"
+    return subprocess.run(
+        [sys.executable, "-P", "-c", code, *words], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+def test_the_small_requirements_are_those_of_the_project_with_an_older_numpy():
+    asked = {name_of(requirement): requirement for requirement in PROJECT["dependencies"]}
+    assert small_requirements() == [{"numpy": "numpy>=1.26"}.get(name, asked[name]) for name in SMALL]
+    lines = without_packages(["typer", "numpy"], ["doctor", "--requirements", "small"], ROOT).stdout
+    assert lines.splitlines() == small_requirements()
+
+
+def test_a_small_install_runs_diagnoses_and_exports_and_says_what_it_leaves_out(session, tmp_path):
+    large = [name for name in PACKAGES if name not in SMALL]
+    ran = without_packages(large, ["run", str(session), "-o", "run"], tmp_path)
+    assert ran.returncode == 0 and "Hand-eye" in ran.stdout
+    for name in ("rerun-sdk", "pyarrow", "jinja2"):
+        assert f"Left out: it needs {name}, which is not installed" in ran.stderr
+    assert {path.name for path in (tmp_path / "run").iterdir()} >= {"model.toml", "result.json", "stitched.ply"}
+    for words in (["diagnose", "run"], ["export", "run", "--to", "ros"]):
+        assert without_packages(large, words, tmp_path).returncode == 0
+    page = without_packages(large, ["report", "run"], tmp_path)
+    assert page.returncode == 2 and "pip install 'jinja2" in page.stderr
+
+
+def test_without_the_packages_of_the_commands_one_line_says_what_to_install(tmp_path):
+    ended = without_packages(["typer"], ["run"], tmp_path)
+    assert ended.returncode == 2 and ended.stderr.count("\n") == 1
+    assert "needs typer" in ended.stderr and all(f"'{line}'" in ended.stderr for line in small_requirements())
+
+
+def test_what_is_left_out_is_a_package_that_is_known():
+    with unless_missing():
+        raise ModuleNotFoundError("no", name="rerun")
+    with pytest.raises(ModuleNotFoundError), unless_missing():
+        raise ModuleNotFoundError("no", name="stitch.nothing")

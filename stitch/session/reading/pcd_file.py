@@ -7,7 +7,6 @@ import io
 import struct
 from pathlib import Path
 
-import lzf
 import numpy as np
 
 from stitch.errors import InputError
@@ -97,6 +96,8 @@ def _compressed_columns(
     packed, size = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, 0)
     if size != layout.itemsize * count or len(body) < 8 + packed or size > _MOST_PACKED * packed:
         raise InputError(f"{path}: compressed data are cut short; export it again")
+    import lzf  # few PCD files are packed
+
     data = lzf.decompress(body[8 : 8 + packed], size) if size else b""
     if data is None or len(data) != size:
         raise InputError(f"{path}: compressed data do not give its {count} points; export it again")
