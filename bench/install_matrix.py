@@ -1,7 +1,7 @@
 """The wheel in fresh environments outside the checkout: python bench/install_matrix.py PYTHON …
 
-Every PYTHON is a path. A row each: whether a cell is run and diagnosed, MB, seconds; of the first also the small install
-it with NumPy 1.26, and one where an open3d is. Then each heavy package is taken out of the bare one in turn.
+Every PYTHON is a path. A row each: whether a cell is run and diagnosed, MB, seconds; of the first also the small
+install, it with NumPy 1.26, and one where an open3d is. Then each heavy package is taken out of the bare one in turn.
 """
 
 import argparse
