@@ -85,6 +85,8 @@ def arguments(job: Row) -> Arguments:
     given["check"] = job["checked"]
     if job["stated"]:
         given["scanner"] = {"pose": (_HAND_EYE @ frames.exp(np.repeat([0.03, 5.0], 3))).tolist()}
+        if job["seed"] % 2:
+            given["scanner"] |= {"standoff": _FROM_PART, "kind": "area"}
     if job["robot"]:
         given |= {"joints": q, "robot": robot_table(ARMS["UR10"])}
     if job["times"] != "none":
@@ -197,7 +199,7 @@ def trial(job: Row) -> Row:
         _stage(outcome, "compare", lambda: str(stitch.compare(run)))
         _stage(outcome, "diagnose", lambda: str(stitch.diagnose(run)))
         _stage(outcome, "add", lambda: str(stitch.add(run, "joint_offset" if job["robot"] else "range_scale")))
-        _stage(outcome, "plan", lambda: str(stitch.plan(session)))
+        _stage(outcome, "plan", lambda: str(stitch.plan(session, views=1, size=120.0)))
         _stage(outcome, "save run", lambda: run.save(folder / "run"))
         _stage(outcome, "load run", lambda: str(stitch.load_run(folder / "run")))
     return outcome

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from stitch.errors import NoResultError
 from stitch.model.model import Model
 from stitch.numerics import frames
 from stitch.numerics.frames import Array, Indices
@@ -53,6 +54,8 @@ _CONVERGED, _AT_REST = 1e-2, 0.1
 # A corrected hand-eye leaves the robot's pose errors: some percent of the part at most.
 REUSE_GATE = 0.05
 _TIGHTENINGS = 4
+# No scanner stands farther from its mount than so many times the size of what it sees.
+_FARTHEST = 1e3
 _GATE_CONVERGED = 0.99
 
 # From free-network poses per capture to the twists (6V, K) of each by the scanner's errors that all views repeat, by
@@ -106,7 +109,7 @@ def correct(
         met: overlaps per capture under the coarse hand-eye, if they are at hand.
 
     Raises:
-        NoResultError: no two views of a capture overlap.
+        NoResultError: no two views of a capture overlap, or they hold the hand-eye nowhere.
     """
     T_mount, overlaps, history = icp_hand_eye(captures, T_mount, [gate] * len(captures), first=met, recorder=recorder)
     gates = [next_gate(o, c) for o, c in zip(overlaps, captures, strict=True)]
@@ -115,6 +118,7 @@ def correct(
         unconstrained_poses(c, c.poses(T_mount), gate, o) for c, gate, o in zip(captures, gates, overlaps, strict=True)
     )
     T_first, scatters = step_hand_eye(captures, unconstrained, T_mount)
+    _check_distance(captures, T_first)
     # Large pose errors bend the linear step, and the bend would count as noise: once more from where it led.
     captures = [with_noise_factor(c, scatter) for c, scatter in zip(captures, scatters, strict=True)]
     # Where clouds now weigh otherwise beside labelled points, the views are moved anew.
@@ -123,6 +127,7 @@ def correct(
         for c, f, gate in zip(captures, unconstrained, gates, strict=True)
     )
     solved = solve_hand_eye(captures, unconstrained, T_first)
+    _check_distance(captures, solved.T_mount)
 
     def statistics() -> HandEyeFit:
         common = None if scanner_errors is None else scanner_errors(unconstrained)
@@ -143,6 +148,14 @@ def correct(
         history=(*history, pooled_rms(final)),
         captures=tuple(captures),
     )
+
+
+def _check_distance(captures: Sequence[Capture], T_mount: Array) -> None:
+    if not np.linalg.norm(T_mount[:3, 3]) < _FARTHEST * part_size(captures):
+        raise NoResultError(
+            "these views hold the hand-eye nowhere: what the scans show hardly follows the poses; to fix: check that "
+            "poses and scans belong together, and turn the flange more between views"
+        )
 
 
 def icp_hand_eye(
