@@ -1,6 +1,8 @@
 """Fuse registered views into one cloud: overlap averaged by weight on a grid of the scans' spacing.
 
-What a view shows in a cell is a voxel of it. A point counts where it is supported (`support.py`).
+The grid lies along the principal axes of what was scanned, about its middle: how the base's axes run, and where they
+begin, changes no point. What a view shows in a cell is a voxel of it. A point counts where it is supported
+(`support.py`).
 
 Scans of which memory holds only some points are read once more, slab by slab of the part. The slabs end where cells of
 the grid end, so that what comes out does not depend on how many there are. A voxel takes normal, edge and support from
@@ -76,7 +78,10 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     Raises:
         InputError: a scan is not what it was when it was read, or there is no room for the fused cloud.
     """
-    scans, poses = registered.own.scans, registered.poses
+    scans = registered.own.scans
+    T_part = part_axes(scans, registered.poses)
+    poses = frames.inverse(T_part) @ registered.poses
+    registered = replace(registered, poses=poses)
     cell = float(np.median([scan.scanned_spacing for scan in scans]))
     whole = has_whole_clouds(registered.session)
     # Points in memory may stand in rows: not their spacing says what place one has, but its surface.
@@ -85,7 +90,7 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
     support = find_support(scans, poses, placed, place)
     if not whole:
         dropped = Unsupported(len(support.kept), int(support.alone.sum()), int(support.looked_through.sum()))
-        return fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell), dropped
+        return _moved(_fuse_points(placed.take(support.kept) if support.kept.any() else placed, cell), T_part), dropped
     del placed  # of every view: memory is for the slabs
     # One point in memory is looked up for a block of voxels, which is no larger than the place of such a point.
     slabs = _cut_into_slabs(registered, cell, max(1, int(place / cell)), slab)
@@ -98,7 +103,8 @@ def fuse_every_point(registered: RegisteredSession, slab: int = _SLAB) -> tuple[
         voxels, unsupported = zip(*(view.voxels(number) for view in views), strict=True)
         together = _Voxels(*(np.concatenate(columns) for columns in zip(*map(_columns, voxels), strict=True)))
         del voxels
-        return _fuse_voxels(together) if len(together.cell) else None, sum(unsupported, Unsupported())
+        cloud = _moved(_fuse_voxels(together), T_part) if len(together.cell) else None
+        return cloud, sum(unsupported, Unsupported())
 
     def clouds() -> Iterator[FusedCloud]:
         nonlocal dropped
@@ -116,14 +122,17 @@ def has_whole_clouds(session: SessionData) -> bool:
     return any(view.cloud is not None and view.cloud.whole is not None for view in session.views)
 
 
-def fuse(capture: Capture, poses: Array, cell: float | None = None) -> FusedCloud:
-    """Average all points of all views in cells of `cell` (default: the scans' spacing), in the reference frame.
+def fuse(capture: Capture, poses: Array, cell: float | None = None, T_part: Array | None = None) -> FusedCloud:
+    """Average all points of all views in cells of `cell` (default: the scans' spacing) along the axes of T_part (4, 4),
+    T_reference_part (default: the part's own), in the reference frame.
 
     Returns:
         Points, normals, `residual` = rms distance of the views' surfaces from the fused one along
         its normal (NaN where one view only), and the number of views per point.
     """
-    return fuse_points(place_scans(capture.scans, poses), cell or capture.spacing)
+    T_part = part_axes(capture.scans, poses) if T_part is None else T_part
+    placed = place_scans(capture.scans, frames.inverse(T_part) @ poses)
+    return _moved(_fuse_points(placed, cell or capture.spacing), T_part)
 
 
 def place_scans(scans: Sequence[Scan], poses: Array) -> PlacedPoints:
@@ -139,8 +148,33 @@ def _place_scan(scan: Scan, T: Array, v: int) -> PlacedPoints:
     return PlacedPoints(points, normals, weight, np.full(len(points), v), np.asarray(scan.usable, bool))
 
 
-def fuse_points(placed: PlacedPoints, size: float) -> FusedCloud:
-    """Return the mean surface of placed points in cells of `size`; the grid is the reference frame's own."""
+def part_axes(scans: Sequence[Scan], poses: Array) -> Array:
+    """Return (4, 4) T_reference_part: middle and principal axes of all points, the shortest first.
+
+    Which way an axis points makes no other cells; that it is told by the third moment keeps their order.
+    """
+    counts = np.array([len(scan.points) for scan in scans])
+    means = np.array([frames.transform(T, scan.points).mean(axis=0) for scan, T in zip(scans, poses, strict=True)])
+    middle = counts @ means / counts.sum()
+    square = np.zeros((3, 3))
+    for scan, T in zip(scans, poses, strict=True):
+        away = frames.transform(T, scan.points) - middle
+        square += away.T @ away
+    _, axes = np.linalg.eigh(square)
+    skew = np.zeros(3)
+    for scan, T in zip(scans, poses, strict=True):
+        skew += (((frames.transform(T, scan.points) - middle) @ axes) ** 3).sum(axis=0)
+    axes = axes * np.where(skew < 0, -1.0, 1.0)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return frames.make(axes, middle)
+
+
+def _moved(cloud: FusedCloud, T: Array) -> FusedCloud:
+    return replace(cloud, points=frames.transform(T, cloud.points), normals=frames.rotate(T, cloud.normals))
+
+
+def _fuse_points(placed: PlacedPoints, size: float) -> FusedCloud:
+    """Return the mean surface of placed points in cells of `size`."""
     return _fuse_voxels(_voxels(placed, cell_numbers(placed.points, size)))
 
 

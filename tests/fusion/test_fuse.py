@@ -1,5 +1,7 @@
 """What is fused lies on the part, and is every point, as if all had been in memory."""
 
+from dataclasses import replace
+
 import igl
 import numpy as np
 import pytest
@@ -10,9 +12,10 @@ from data_synth.fixtures.in_memory import session_of
 from data_synth.fixtures.quiet_scenes import mesh_of
 from stitch.effects import EFFECTS
 from stitch.errors import InputError
-from stitch.fusion.fuse import RegisteredSession, fuse, fuse_every_point
+from stitch.fusion.fuse import RegisteredSession, fuse, fuse_every_point, part_axes
 from stitch.model.forward import corrected_capture
 from stitch.model.model import Model, term_of
+from stitch.numerics import frames
 from stitch.session.capture import prepare_capture
 from stitch.session.measurement import measurement_of
 from stitch.session.reading.session_folder import load_session
@@ -55,7 +58,7 @@ def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect):
     light = registered(thin_session(session, 1500)[0], measured, effect)
     assert all(len(scan.points) == 1500 for scan in light.own.scans)
     cell = float(np.median([scan.scanned_spacing for scan in light.own.scans]))
-    expected = fuse(whole.own, whole.poses, cell)
+    expected = fuse(whole.own, whole.poses, cell, part_axes(light.own.scans, light.poses))
     found, _ = fuse_every_point(light, slab=4000)
     if effect == "intensity_bias":  # mean and spread of the points in memory are not quite those of all
         assert len(found.points) == pytest.approx(len(expected.points), rel=2e-3)
@@ -64,6 +67,17 @@ def test_every_point_is_fused_as_if_all_were_in_memory(blade_capture, effect):
     apart, _ = KDTree(expected.points).query(found.points)
     # Weights go by normals, and these are the neighbour's: a mean moves by a part of the cell where they differ.
     assert np.median(apart) < 1e-3 * cell and np.quantile(apart, 0.95) < 0.1 * cell
+
+
+def test_the_axes_of_the_base_and_the_order_of_views_change_no_point(blade_capture):
+    measured, capture = blade_capture
+    poses = measured.T_reference_scanner
+    turned = frames.exp(np.array([0.4, -1.1, 0.7, 310.0, -120.0, 55.0]))
+    backwards = replace(capture, scans=capture.scans[::-1])
+    plain, other, reverse = fuse(capture, poses), fuse(capture, turned @ poses), fuse(backwards, poses[::-1])
+    assert np.abs(frames.transform(turned, plain.points) - other.points).max() < 1e-9
+    assert np.array_equal(plain.count, other.count)
+    assert np.abs(plain.points - reverse.points).max() < 1e-9
 
 
 def test_the_number_of_slabs_does_not_matter(blade_capture, monkeypatch):
