@@ -34,6 +34,8 @@ _LENGTHS = (0.12, 0.2, 0.33, 0.55)
 _SIZES, _NOISES = np.geomspace(0.02, 10.0, 32), np.geomspace(0.2, 1.6, 24)
 # Distances of a pair that are compared, the fewest that tell anything, and pairs of a session.
 _MOST_SAMPLES, _FEWEST, _MOST_PAIRS = 200, 40, 24
+# A point's place times this, less whole numbers, is as good as drawn.
+_SHUFFLE = 1e3 * (np.sqrt(5) - 1)
 # Places along one side of the field where errors are free, up to beyond its corners.
 _NODES = np.linspace(-1.3, 1.3, 41)
 # Of the errors' variance this share counts in modes; the others carry the rest. So many modes of all views at most.
@@ -153,23 +155,29 @@ def _modes_of(variances: Array, degrees: float, half: float, unconstrained: Unco
 def _pair_samples(
     measurement: Measurement, unconstrained: UnconstrainedPoses, shared: Array, half: Array
 ) -> list[tuple[Array, Array, list[tuple[Array, Array]]]]:
-    """Per pair: distances (N,), rows (N, 6) of a motion, and of either view rays (N, 3) and cosines (N,)."""
-    rng = np.random.default_rng(0)
+    """Per pair: distances (N,), rows (N, 6) of a motion, and of either view rays (N, 3) and cosines (N,).
+
+    Which pairs and distances stand for all goes by names and points, not by the order of the views.
+    """
     overlaps = unconstrained.overlaps
     g = overlaps.gram
+    scans = measurement.capture.scans
     enough = [m for m in overlaps.matches if len(m.residual) >= _FEWEST]
+    enough.sort(key=lambda m: sorted([scans[m.v].name, scans[m.w].name]))
     chosen = [enough[k] for k in np.unique(np.linspace(0, len(enough) - 1, _MOST_PAIRS).astype(int))] if enough else []
     samples = []
     for match in chosen:
         sound = np.flatnonzero(np.abs(match.residual) < RMS_GATE * g.scale)
         if len(sound) < _FEWEST:
             continue
-        keep = rng.choice(sound, min(len(sound), _MOST_SAMPLES), replace=False)
+        drawn = scans[match.v].points[match.index_v[sound]].sum(axis=1)
+        drawn += scans[match.w].points[match.index_w[sound]].sum(axis=1)
+        keep = sound[np.argsort(drawn / g.scale * _SHUFFLE % 1.0)[:_MOST_SAMPLES]]
         m = Match(match.v, match.w, *(column[keep] for column in match.columns))
         distances = np.array(m.residual)
         sides = []
         for view, index, sign in ((m.v, m.index_v, 1.0), (m.w, m.index_w, -1.0)):
-            scan = measurement.capture.scans[view]
+            scan = scans[view]
             away = scan.points[index] - scan.eye
             cosine = measurement.scan_views[view].cosine[index]
             pose = unconstrained.poses[view]

@@ -37,3 +37,13 @@ def test_the_modes_hold_the_variance_and_the_correlation_of_what_the_simulator_d
     # The field is cut into modes, and the length is one of few: variances within a third, far places independent.
     assert np.abs(np.diag(modelled) / np.diag(simulated_covariance) - 1).max() < 0.35
     assert np.abs(modelled[0, 4:]).max() < 0.15 * errors.size**2
+
+
+def test_the_order_of_the_views_changes_nothing(monkeypatch):
+    scene = clean("spheres", rays=60, noise=0.02, scan_error=0.02, scan_error_length=0.2)
+    session = session_of(simulated(replace(scene, repeatability=(15e-6, 0.01)), {}, 6, views=5))
+    views = [replace(view, time_s=None) for view in session.views]
+    # Half of the pairs, so that it counts which they are.
+    monkeypatch.setattr("stitch.plugins.metrology.scan_errors._MOST_PAIRS", 5)
+    sizes = [place_errors(run(replace(session, views=tuple(order)))).scan_errors.size for order in (views, views[::-1])]
+    assert sizes[0] == pytest.approx(sizes[1], rel=1e-3)
