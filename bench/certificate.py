@@ -22,11 +22,10 @@ from stitch.api.pipeline import run
 from stitch.numerics import frames
 from stitch.output.result_document import model_of
 from stitch.plugins.metrology.budget import MeasuredFeatures, measure_features
-from stitch.plugins.metrology.error_sources import error_chain, place_errors
+from stitch.plugins.metrology.error_sources import place_errors
 from stitch.plugins.metrology.feature_file import FeatureList
 from stitch.plugins.metrology.verification import Verification, verify
-from stitch.run_data import RunData
-from stitch.screening.hand_eye_transfer import HandEyeTransfer, hand_eye_transfer
+from stitch.run_data import HandEyeTransfer, RunData
 
 KINDS = ("clean", "ordinary arm", "smooth scanner errors")
 U_CALIBRATED = 0.002  # mm, of a laboratory
@@ -77,9 +76,8 @@ def _calibrated(features: FeatureList, truth: np.ndarray, rng: np.random.Generat
 
 
 def _measured(state: RunData, wanted: FeatureList) -> tuple[MeasuredFeatures, HandEyeTransfer]:
-    chain = error_chain(state)
-    hand_eye = hand_eye_transfer(state.measurement, chain.capture, chain.unconstrained, state.model)
-    return measure_features(place_errors(state, chain), wanted), hand_eye
+    assert state.hand_eye_transfer is not None
+    return measure_features(place_errors(state), wanted), state.hand_eye_transfer
 
 
 def _with_wrong_numbers(

@@ -11,6 +11,7 @@ import numpy as np
 from stitch.model.axis_places import AxisPlace, axis_places
 from stitch.model.model import Model, Term
 from stitch.numerics.frames import Array
+from stitch.numerics.units import length_text
 from stitch.observations.surfaces.hand_eye_fit import Repeatability
 from stitch.observations.surfaces.normal_equations import Overlaps
 from stitch.observations.targets.outliers import Outlier
@@ -21,6 +22,10 @@ from stitch.system.values import Table, Value
 
 # By which methods register moves single views, for people.
 METHOD_TITLES = {"dpwvm": "DPWVM-style weighted fit", "gicp": "plane to plane (GICP) inside Tukey's biweight"}
+# Chance that a given hand-eye which is right is doubted.
+_DOUBTED = 0.01
+# A hand-eye that is off by so many of its U would be found: else these views do not say whether it is right.
+FOUND_FROM = 5.0
 # Where the first clause of a doubt ends: what it means and what to do comes after.
 _CLAUSE_END = re.compile(r"[:.] |; to fix: ")
 
@@ -152,6 +157,38 @@ class Fit(Value):
     sigma_anywhere: Array | None = None
 
 
+@dataclass(frozen=True)
+class HandEyeTransfer:
+    """How far a given hand-eye and the one of the views themselves put the middle of the part apart."""
+
+    turn: float  # rad, between the two
+    distance: float  # length_unit
+    ratio: float  # of the difference to the largest that 95 % of pairs which are the same show, all six numbers
+    U: float  # expanded uncertainty of the distance, both hand-eyes together
+    U_given: float  # of the given one alone
+    p_value: float  # that two hand-eyes which are the same differ by as much
+
+    @property
+    def holds(self) -> bool:
+        """True unless the views contradict the given hand-eye beyond chance."""
+        return self.p_value >= _DOUBTED
+
+    @property
+    def decides(self) -> bool:
+        """True if these views would show a hand-eye that is off by five times its U."""
+        return FOUND_FROM * self.U_given >= self.U
+
+    def sentence(self, unit: str) -> str:
+        """Return how the two compare, for people."""
+        away = f"{length_text(self.distance, unit)} and {1e3 * self.turn:.2g} mrad away at the part"
+        if self.holds:
+            return f"The given hand-eye agrees with these views: the one that they show lies {away}, within U of both."
+        return (
+            f"The given hand-eye does not fit these views: the one that they show lies {away}, "
+            f"{self.ratio:.1f} times what U of both allows; to fix: find it anew, by a run without --hand-eye."
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class RunData(Table, document="stitch.output.result_document:result_document", table="views"):
     """One session, its model and its results, as `result.json` and the report show them.
@@ -175,6 +212,7 @@ class RunData(Table, document="stitch.output.result_document:result_document", t
     left_out: tuple[ExcludedView, ...] = ()  # views of the session that are not fused
     links: ViewLinks = field(default_factory=ViewLinks)
     tried: dict[str, str] = field(default_factory=dict)  # effects that were fitted and dropped again, and why
+    hand_eye_transfer: HandEyeTransfer | None = field(default=None, compare=False)  # of a given one; not stored
 
     @cached_property
     def fit(self) -> Fit:

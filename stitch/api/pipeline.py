@@ -337,7 +337,7 @@ def _check_given_hand_eye(screened: ScreenedFit, effects: Sequence[str], model: 
         capture, unconstrained = correction.captures[i], correction.unconstrained[i]
         transfer = hand_eye_transfer(measurement, capture, unconstrained, correction.model)
         doubts = () if transfer.holds else (transfer.sentence(session.length_unit),)
-        screenings.append(replace(screening, doubts=(*screening.doubts, *doubts)))
+        screenings.append(replace(screening, doubts=(*screening.doubts, *doubts), hand_eye=transfer))
     return replace(screened, screenings=screenings)
 
 
@@ -447,6 +447,7 @@ def _assemble_run(
         doubts=screening.doubts,
         left_out=left_out,
         links=screening.links,
+        hand_eye_transfer=screening.hand_eye,
     )
 
 

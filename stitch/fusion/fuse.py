@@ -153,17 +153,11 @@ def part_axes(scans: Sequence[Scan], poses: Array) -> Array:
 
     Which way an axis points makes no other cells; that it is told by the third moment keeps their order.
     """
-    counts = np.array([len(scan.points) for scan in scans])
-    means = np.array([frames.transform(T, scan.points).mean(axis=0) for scan, T in zip(scans, poses, strict=True)])
-    middle = counts @ means / counts.sum()
-    square = np.zeros((3, 3))
-    for scan, T in zip(scans, poses, strict=True):
-        away = frames.transform(T, scan.points) - middle
-        square += away.T @ away
-    _, axes = np.linalg.eigh(square)
-    skew = np.zeros(3)
-    for scan, T in zip(scans, poses, strict=True):
-        skew += (((frames.transform(T, scan.points) - middle) @ axes) ** 3).sum(axis=0)
+    points = np.concatenate([frames.transform(T, scan.points) for scan, T in zip(scans, poses, strict=True)])
+    middle = points.mean(axis=0)
+    points -= middle
+    _, axes = np.linalg.eigh(points.T @ points)
+    skew = ((points @ axes) ** 3).sum(axis=0)
     axes = axes * np.where(skew < 0, -1.0, 1.0)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     return frames.make(axes, middle)

@@ -5,8 +5,6 @@ views' free-network poses do: one generalised least-squares step from the given 
 views ask for, with all that arms and scanners repeat in its covariance.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from stitch.model.model import Model, displacement
@@ -14,53 +12,17 @@ from stitch.numerics import frames
 from stitch.numerics.distributions import chi2_limit, chi2_tail
 from stitch.numerics.frames import Array
 from stitch.numerics.least_squares import equilibrated
-from stitch.numerics.units import length_text
 from stitch.observations.pose_errors import prior_pose_errors
 from stitch.observations.surfaces.effect_columns import view_columns
 from stitch.observations.surfaces.hand_eye_fit import fit_hand_eye
 from stitch.observations.surfaces.scanner_errors import rig_scanner_errors
 from stitch.observations.surfaces.view_poses import UnconstrainedPoses, unconstrained_poses
+from stitch.run_data import HandEyeTransfer
 from stitch.session.capture import Capture
 from stitch.session.measurement import Measurement
 
-# That a hand-eye which is right is doubted.
-_CHANCE = 0.01
-# A hand-eye that is off by so many of its U would be found: else these views do not say whether it is right.
-FOUND_FROM = 5.0
 # What another run's effects may still err by.
 _EFFECTS = "effects of the model"
-
-
-@dataclass(frozen=True)
-class HandEyeTransfer:
-    """How far a given hand-eye and the one of the views themselves put the middle of the part apart."""
-
-    turn: float  # rad, between the two
-    distance: float  # length_unit
-    ratio: float  # of the difference to the largest that 95 % of pairs which are the same show, all six numbers
-    U: float  # expanded uncertainty of the distance, both hand-eyes together
-    U_given: float  # of the given one alone
-    p_value: float  # that two hand-eyes which are the same differ by as much
-
-    @property
-    def holds(self) -> bool:
-        """True unless the views contradict the given hand-eye beyond chance."""
-        return self.p_value >= _CHANCE
-
-    @property
-    def decides(self) -> bool:
-        """True if these views would show a hand-eye that is off by five times its U."""
-        return FOUND_FROM * self.U_given >= self.U
-
-    def sentence(self, unit: str) -> str:
-        """Return how the two compare, for people."""
-        away = f"{length_text(self.distance, unit)} and {1e3 * self.turn:.2g} mrad away at the part"
-        if self.holds:
-            return f"The given hand-eye agrees with these views: the one that they show lies {away}, within U of both."
-        return (
-            f"The given hand-eye does not fit these views: the one that they show lies {away}, "
-            f"{self.ratio:.1f} times what U of both allows; to fix: find it anew, by a run without --hand-eye."
-        )
 
 
 def hand_eye_transfer(

@@ -14,7 +14,7 @@ from stitch.fit.correct import Correction
 from stitch.fit.fit import FittedRig
 from stitch.numerics.frames import Array
 from stitch.observations.targets.target_model import TargetModelFit
-from stitch.run_data import ExcludedView, ViewLinks
+from stitch.run_data import ExcludedView, HandEyeTransfer, ViewLinks
 from stitch.screening.deep_check import (
     deep_check,
     refuse,
@@ -56,6 +56,7 @@ class ViewScreening:
     suspected: tuple[ExcludedView, ...] = ()  # off by no more than an effect of an arm may cause: fused, and noted
     links: ViewLinks = field(default_factory=ViewLinks)
     doubts: tuple[str, ...] = ()  # of the session as a whole, as sentences
+    hand_eye: HandEyeTransfer | None = None  # of a given one, against that of the views
 
     @property
     def names(self) -> set[str]:

@@ -69,18 +69,15 @@ _ROUNDING = 1e-12
 _Modes = tuple[str, tuple[Array, Array], float]
 
 
-def place_errors(run: RunData, chain: "ErrorChain | None" = None) -> PlaceErrors:
+def place_errors(run: RunData) -> PlaceErrors:
     """Return the places of a run's points with all that its own views say may be wrong about them.
-
-    Args:
-        chain: what `error_chain` returns of the run, if it is at hand.
 
     Raises:
         InputError: a run without clouds.
         NoResultError: no two views overlap.
     """
     with library_threads_off():
-        chain = chain or error_chain(run)
+        chain = error_chain(run)
         terms = [term for term in run.terms if moves_points([term])]
         sources, scan_errors = _sources(run, chain)
         return PlaceErrors(

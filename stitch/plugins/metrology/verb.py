@@ -19,13 +19,12 @@ from stitch.plugins.metrology.budget import MeasuredFeatures, measure_features, 
 from stitch.plugins.metrology.calibrate.robot import calibrated_robot_of_run, link_table, robot_document
 from stitch.plugins.metrology.calibrate.sphere import calibrate_sphere, sphere_document
 from stitch.plugins.metrology.calibrate.tracker import calibrate_tracker, tracker_document
-from stitch.plugins.metrology.error_sources import error_chain, place_errors
+from stitch.plugins.metrology.error_sources import place_errors
 from stitch.plugins.metrology.feature_file import FeatureList, feature_list
 from stitch.plugins.metrology.features import Feature
 from stitch.plugins.metrology.verification import Verification
 from stitch.plugins.metrology.verification import verify as judge
 from stitch.run_data import RunData
-from stitch.screening.hand_eye_transfer import hand_eye_transfer
 from stitch.session.session import SessionData
 from stitch.system.values import Value, same
 
@@ -135,10 +134,9 @@ def judge_artefact(
             fix_cli="write calibrated = … and U = … of some",
             fix_python="state calibrated and calibrated_U of some",
         )
-    chain = error_chain(state)
-    measured = measure_features(place_errors(state, chain), wanted)
-    hand_eye = hand_eye_transfer(state.measurement, chain.capture, chain.unconstrained, state.model)
-    return judge(measured, wanted.limits, hand_eye), state
+    measured = measure_features(place_errors(state), wanted)
+    assert state.hand_eye_transfer is not None
+    return judge(measured, wanted.limits, state.hand_eye_transfer), state
 
 
 def calibrate(

@@ -19,8 +19,7 @@ from scipy.special import ndtr, ndtri
 from stitch.numerics.distributions import binomial_tail
 from stitch.plugins.metrology import error_sources
 from stitch.plugins.metrology.budget import COVERAGE_FACTOR, MeasuredFeatures, Number
-from stitch.run_data import RunData
-from stitch.screening.hand_eye_transfer import FOUND_FROM, HandEyeTransfer
+from stitch.run_data import FOUND_FROM, HandEyeTransfer, RunData
 from stitch.system.values import Table
 
 VERIFY_FORMAT = "stitch-verify/1"
