@@ -51,7 +51,7 @@ def require_tolerance(tolerance: float | None) -> None:
         raise InputError(f"--tolerance {tolerance:g}: to fix: give a length above zero, in the session's length_unit")
 
 
-def bytes_of(size: str | None) -> float | None:
+def bytes_of(size: str | None, option: str = "--memory") -> float | None:
     """Return the bytes of a size as people write it, None for none.
 
     Raises:
@@ -65,5 +65,5 @@ def bytes_of(size: str | None) -> float | None:
     except ValueError:
         count = float("nan")
     if not 0 < count < float("inf"):
-        raise InputError(f"--memory {size}: to fix: give a size such as 2GB or 800MB")
+        raise InputError(f"{option} {size}: to fix: give a size such as 2GB or 800MB")
     return count

@@ -282,11 +282,16 @@ def write_with_page(run: RunData, folder: Path, tolerance: float | None = None) 
     with ThreadPoolExecutor(2) as beside:
         page = beside.submit(call_entry_points, "stitch.reports", run, folder / "report.html", tolerance)
         points = beside.submit(_write_points, run, folder)
-        write_model_with_effects(run, folder)
-        write_json(result_document(run), folder / "result.json")
-        write_json(ledger(run), folder / "ledger.json")
+        write_numbers(run, folder)
         page.result()
         points.result()
+
+
+def write_numbers(run: RunData, folder: Path) -> None:
+    """Write model.toml, result.json and ledger.json into `folder`."""
+    write_model_with_effects(run, folder)
+    write_json(result_document(run), folder / "result.json")
+    write_json(ledger(run), folder / "ledger.json")
 
 
 def write_model_with_effects(run: RunData, folder: Path) -> None:

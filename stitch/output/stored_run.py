@@ -186,7 +186,13 @@ def diagnosed_state(run: RunData, folder: Path) -> str:
 
 
 def fused_cloud(path: Path) -> FusedCloud:
-    """Return what stitched.ply holds; reference frame, length_unit."""
+    """Return what stitched.ply holds; reference frame, length_unit.
+
+    Raises:
+        InputError: not there, as in a run of which the numbers alone are kept; not readable, or too large.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: not kept; to fix: stitch run SESSION -o {path.parent} --force makes it again")
     require_room(path)
     vertex = vertex_columns(path)
     columns = np.column_stack([vertex[name] for name in ("x", "y", "z", "nx", "ny", "nz", "residual")])

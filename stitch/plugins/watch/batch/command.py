@@ -6,15 +6,16 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 from uuid import uuid4
 
 import typer
 
-from stitch.cli.options import Json
+from stitch.cli.options import Json, bytes_of
 from stitch.cli.terminal import emit, say, show_files, show_table, stdout_for_results
 from stitch.errors import InputError, NoResultError
 
@@ -38,6 +39,15 @@ def batch(
         bool, typer.Option("--force", help="Run finished sessions too, and replace runs of other sessions.")
     ] = False,
     recording: Annotated[bool, typer.Option("--recording/--no-recording", help="Write recording.rrd.")] = True,
+    store: Annotated[
+        Literal["all", "small"], typer.Option(help="Keep all of a run, or its numbers alone (20 kB).")
+    ] = "all",
+    seconds: Annotated[
+        float, typer.Option("--session-seconds", min=0.0, metavar="S", help="End a session after so long; 0: never.")
+    ] = 0.0,
+    memory: Annotated[
+        str | None, typer.Option("--session-memory", metavar="SIZE", help="End a session beyond so much, such as 4GB.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Run many sessions; one that fails does not stop the others. Started again, it runs what is not finished.
@@ -46,6 +56,7 @@ def batch(
     Examples:
       stitch batch blade-17 blade-18 blade-19 -o runs --workers 2
       stitch batch blade-* --scheduler tcp://10.0.0.5:8786
+      stitch batch blade-* --store small --session-seconds 600 --session-memory 4GB
     """
     from stitch.plugins.watch.batch.storage import is_remote, put_summary
 
@@ -55,21 +66,23 @@ def batch(
         raise InputError(
             f"{output}: sessions of a store beside some of this disk; to fix: name sessions and -o of stores"
         )
+    bounds: dict[str, Any] = {
+        "small": store == "small",
+        "seconds": seconds,
+        "memory": int(bytes_of(memory, "--session-memory") or 0),
+    }
     if is_remote(output):
+        jobs = [replace(job, **bounds) for job in _stored_jobs(sessions, output, force, recording)]
         with TemporaryDirectory() as scratch:
             folder = Path(scratch)
             try:
-                _run_all(_stored_jobs(sessions, output, force, recording), folder, workers, scheduler, as_json)
+                _run_all(jobs, folder, workers, scheduler, as_json)
             finally:
                 put_summary(folder, output)
         return
-    _run_all(
-        _batch_jobs([Path(s) for s in sessions], Path(output), force, recording),
-        Path(output),
-        workers,
-        scheduler,
-        as_json,
-    )
+    folder = Path(output)
+    jobs = [replace(job, **bounds) for job in _batch_jobs([Path(s) for s in sessions], folder, force, recording)]
+    _run_all(jobs, folder, workers, scheduler, as_json)
 
 
 def _run_all(jobs: list[BatchJob], output: Path, workers: int, scheduler: str, as_json: bool) -> None:

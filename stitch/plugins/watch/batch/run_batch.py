@@ -36,7 +36,9 @@ _RETRY_SECONDS = 0.5
 DOCUMENT = "batch.json"
 PAGE = "batch.html"
 TABLE = "batch.parquet"
-_STORAGE = "stitch.plugins.watch.batch.storage"  # which runs what it fetched here
+# They run what they fetched, or what they bound, here.
+_STORAGE = "stitch.plugins.watch.batch.storage"
+_BOUNDS = "stitch.plugins.watch.batch.bounds"
 BATCH_FORMAT = "stitch-batch/1"
 _WORKERS_DIED = NoResultError(
     "workers died over it, also when it ran alone; to fix: give it more memory, or thin its scans, and start the batch "
@@ -58,6 +60,9 @@ class BatchJob:
     place: str = ""  # of the run among those of the batch, where it is more than its folder's name
     source: str = ""  # of the session, and
     target: str = ""  # of the run, in a store
+    small: bool = False  # keep the numbers of a run: no cloud, residuals, page or recording
+    seconds: float = 0.0  # after which a session is ended, 0: never; and
+    memory: int = 0  # bytes beyond which it is
 
     @property
     def name(self) -> str:
@@ -230,6 +235,9 @@ def run_session(job: BatchJob) -> SessionRow:
     if job.source:
         run_stored: Callable[[BatchJob], SessionRow] = import_module(_STORAGE).run_stored
         return run_stored(job)
+    if job.seconds or job.memory:
+        run_bounded: Callable[[BatchJob], SessionRow] = import_module(_BOUNDS).run_bounded
+        return run_bounded(job)
     try:
         require_free(job.run, [job.session], job.force)
         with _locked_folder(job.run):
@@ -238,8 +246,9 @@ def run_session(job: BatchJob) -> SessionRow:
             if batch is None:
                 session = load_session(job.session)
                 with run_folder.new_folder(job.run, [job.session], job.force) as scratch:
-                    result = run(session, recorder=RecorderGroup(recordings(scratch) if job.recording else []))
-                    run_folder.write_with_page(result, scratch)
+                    recorded = job.recording and not job.small
+                    result = run(session, recorder=RecorderGroup(recordings(scratch) if recorded else []))
+                    (run_folder.write_numbers if job.small else run_folder.write_with_page)(result, scratch)
                     write_mark(job, content, scratch, uncertainty_at_part(result))
             # A worker may die between a run and its answer; the next finds a run of this batch.
             return finished_row(job, skipped=batch not in (None, job.batch))

@@ -253,6 +253,32 @@ def test_a_pool_of_any_kind_hands_back_runs(sessions):
         stitch_batch(sessions, "tcp://10.0.0.5:8786")
 
 
+@pytest.mark.slow  # half a minute of starting workers
+def test_workers_of_dask_hand_back_twenty_runs(sessions):
+    pytest.importorskip("distributed")
+    with cluster.local_client(2) as client:
+        found = stitch_batch([sessions[n % 2] for n in range(20)], client)
+    assert [run.session.name for run in found.runs] == ["monday", "tuesday"] * 10 and not found.errors
+    assert found.runs[0] == found.runs[18] != found.runs[1]
+
+
+def test_a_session_beyond_its_seconds_or_memory_is_ended_and_the_others_run(sessions, capsys, batch):
+    batch(sessions[0], "--session-seconds", "0.01", code=1)
+    assert "took more than 0.01 s; to fix: give it longer" in capsys.readouterr().err
+    batch(sessions[0], "--session-memory", "30MB", code=1)
+    assert "needs more than 0.03 GB; to fix: give it more" in capsys.readouterr().err
+    batch(sessions[0], "--session-memory", "much", code=2)
+    assert "--session-memory much: to fix: give a size such as 2GB" in capsys.readouterr().err
+    batch(*sessions, "--session-seconds", "100", "--session-memory", "4GB", "--store", "small", "--json")
+    assert json.loads(capsys.readouterr().out)["done"] == 2
+    kept = {"model.toml", "result.json", "ledger.json", "batch-mark.json"}
+    assert {path.name for path in Path("runs/monday").iterdir()} == kept
+    main_ends("export", "runs/monday", "--to", "ros")
+    capsys.readouterr()
+    batch(*sessions, "--json")
+    assert json.loads(capsys.readouterr().out)["skipped"] == 2
+
+
 @pytest.mark.parametrize("store", ["memory://fleet", "file://FOLDER/fleet"])
 def test_sessions_of_a_store_become_runs_of_a_store(sessions, tmp_path, capsys, batch, store):
     fsspec = pytest.importorskip("fsspec")

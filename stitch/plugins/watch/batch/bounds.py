@@ -1,0 +1,66 @@
+"""A session of a batch in a process of its own, which ends after so many seconds or beyond so much memory.
+
+A worker's thread cannot be interrupted, and one session that takes all memory takes the worker with it.
+"""
+
+import os
+import pickle
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from threading import Thread
+
+from stitch.errors import NoResultError
+from stitch.plugins.watch.batch.run_batch import BatchJob, SessionRow, failed_row, run_session
+
+_PROGRAM = "from stitch.plugins.watch.batch.bounds import main; main()"
+_NO_MEMORY = ("MemoryError", "cannot allocate", "not enough memory")
+
+
+def run_bounded(job: BatchJob) -> SessionRow:
+    """Return the row of a session that is run in its own process within the bounds of the job.
+
+    Memory is what the process itself may hold (RLIMIT_DATA), files that it maps not counted.
+    """
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-P", "-c", _PROGRAM],
+            input=pickle.dumps(job),
+            capture_output=True,
+            timeout=job.seconds or None,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        late = NoResultError(f"took more than {job.seconds:g} s; to fix: give it longer, or thin its scans")
+        return failed_row(str(job.session), job.name, late)
+    if ended.returncode == 0:
+        row: SessionRow = pickle.loads(ended.stdout)
+        if row.error is None or not row.error.startswith(_NO_MEMORY):
+            return row
+    elif job.memory == 0:
+        words = ended.stderr.decode("utf-8", "replace").split()[-20:]
+        died = NoResultError(f"its process died with {ended.returncode}: {' '.join(words)}")
+        return failed_row(str(job.session), job.name, died)
+    full = NoResultError(f"needs more than {job.memory / 1e9:g} GB; to fix: give it more, or thin its scans")
+    return failed_row(str(job.session), job.name, full)
+
+
+def main() -> None:
+    """Run the job that stands on standard input, and write its row to standard output, which nothing else reaches."""
+    with os.fdopen(os.dup(1), "wb") as answer:
+        os.dup2(2, 1)
+        Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+        job: BatchJob = pickle.loads(sys.stdin.buffer.read())
+        if job.memory:
+            import resource  # not on Windows
+
+            resource.setrlimit(resource.RLIMIT_DATA, (job.memory, job.memory))
+        answer.write(pickle.dumps(run_session(replace(job, seconds=0.0, memory=0))))
+
+
+def _end_with(parent: int) -> None:
+    """End this process once its worker has gone."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
