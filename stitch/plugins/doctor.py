@@ -41,7 +41,7 @@ def doctor(
       stitch doctor
       stitch doctor runs/blade-17 --json
       stitch doctor runs/blade-17 -o bundle.zip
-      stitch doctor --requirements small > small.txt
+      stitch doctor --requirements small
     """
     if requirements is not None:
         emit("\n".join(small_requirements()))
