@@ -10,11 +10,11 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
+from stitch.system.packages import arrow_alone
 from viz.page_parts import unbroken
 
-# Text beside the pictures of a recording.
-
 os.environ.setdefault("RERUN_ANALYTICS", "off")
+arrow_alone()
 
 
 def words(markdown: str) -> rr.TextDocument:

@@ -157,19 +157,18 @@ def try_form(linear: LinearModel, form: Form, start: Array, scale: float) -> For
     deviances = {scale: integrated.deviance}
     if len(scales) > 1:
         # What the form explains is no scatter: beside less of it another scale may be the likeliest.
-        deviances = {s: at_variances(mixed, integrated.variances, G, s * form.sizes).deviance for s in scales}
+        deviances = {s: integrated.under_prior(s * form.sizes).deviance for s in scales}
         best = min(deviances, key=lambda s: deviances[s])
         if best != scale:
             scale, integrated = best, fit_variances(mixed, G, best * form.sizes, start=integrated.variances)
             deviances[best] = integrated.deviance
     wide = limits.FREE_SIZES * form.sizes
     if regime.free_fit_keeps_variances:
-        mean, covariance = integrated.under_prior(wide)
+        free = integrated.under_prior(wide)
     else:
         free = fit_variances(mixed, G, wide, integrated.variances)
-        mean, covariance = free.mean, free.covariance
     a = mixed.A.shape[2]
-    theta, of_theta = mean[a:], covariance[a:, a:]
+    theta, of_theta = free.mean[a:], free.covariance[a:, a:]
     # θᵀC⁻¹θ over the combinations of which the views say more than the wide prior does.
     values, vectors = np.linalg.eigh(of_theta / np.outer(form.sizes, form.sizes))
     seen = values < 0.5 * limits.FREE_SIZES**2

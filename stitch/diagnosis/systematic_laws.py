@@ -32,7 +32,7 @@ from stitch.numerics import frames
 from stitch.numerics.common_covariance import SelectedColumns
 from stitch.numerics.distributions import f_limits
 from stitch.numerics.frames import Array, Indices
-from stitch.numerics.least_squares import column_space, project_out
+from stitch.numerics.least_squares import column_space
 from stitch.observations.linear_model import LinearModel, Observation
 from stitch.observations.pose_errors import usual_twist
 from stitch.session.measurement import Views
@@ -179,21 +179,22 @@ class Dictionary:
         """Return those of some laws that an effect does not say, nor does at its own place in these views."""
         rivals = [r for r in laws if effect.name not in self.said_by[law_of(r).key]]
         place = effect.score.candidate.effect.place
-        explained = linear.residual(effect.score.form.columns)
+        explained = _Span(linear.residual(effect.score.form.columns))
         return tuple(
             r
             for r in rivals
             if law_of(r).place.joint is not None
             or law_of(r).place.kind != place
-            or not _contains(explained, linear.residual(r.score.form.columns))
+            or not explained.contains(_Span(linear.residual(r.score.form.columns)))
         )
 
 
 def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> Dictionary:
     """Return the laws of a session, and which of the candidates says each."""
     laws, shares, said_by = list[Law](), list[float](), dict[tuple[str, str], frozenset[str]]()
-    drivers = list(drivers_of(linear.measurement.views))
-    effects = [c for c in candidates if not c.empirical]
+    views = linear.measurement.views
+    drivers = list(drivers_of(views))
+    effects = [(c, _whole_forms(c)) for c in candidates if not c.empirical]
     for place in _places(linear):
         for driver in drivers:
             if driver.joint not in (None, place.joint):
@@ -201,7 +202,10 @@ def dictionary_of(linear: LinearModel, candidates: Sequence[Candidate] = ()) -> 
             forms = list(_forms(place, driver))
             laws += [law for law, _ in forms]
             shares += [share for _, share in forms]
-            said_by[place.name, driver.name] = frozenset(c.name for c in effects if _says(linear, c, place, driver))
+            whole = [Law(place, driver, shape, place.whole) for shape in driver.shapes]
+            spans = [_Span(law.reduced(linear.observation)) for law in whole]
+            said = (c.name for c, forms in effects if _says(views, c, forms, place, driver, spans))
+            said_by[place.name, driver.name] = frozenset(said)
     return Dictionary(tuple(laws), np.array(shares), said_by, linear.observation)
 
 
@@ -350,7 +354,7 @@ def _gains(linear: LinearModel, dictionary: Dictionary) -> tuple[Array, Array]:
         shapes = stem.shapes.shape[1]
         for i in index:
             some = (shapes * dictionary.laws[i].columns[:, None] + np.arange(shapes)).ravel()
-            by_size.setdefault(len(some), []).append((i, information[np.ix_(some, some)], vector[some]))
+            by_size.setdefault(len(some), []).append((i, information[some[:, None], some], vector[some]))
     for sets in by_size.values():
         k, turned = np.linalg.eigh(np.array([information for _, information, _ in sets]))
         g = np.einsum("fij,fi->fj", turned, np.array([vector for _, _, vector in sets]))
@@ -452,13 +456,37 @@ def _forms(place: Place, driver: Driver) -> Iterator[tuple[Law, float]]:
             yield Law(place, driver, shape, np.array([k])), shares / 2 / axes
 
 
-def _says(linear: LinearModel, candidate: Candidate, place: Place, driver: Driver) -> bool:
-    """Return whether an effect is this law: it acts there and follows that, as it declares or as its columns show."""
+@dataclass(frozen=True, eq=False)
+class _Span:
+    """What columns (n, p) can say."""
+
+    columns: Array
+
+    @cached_property
+    def basis(self) -> Array:
+        """(n, r) orthonormal."""
+        return column_space(self.columns)
+
+    def contains(self, other: "_Span") -> bool:
+        """Return whether the other's columns are combinations of these."""
+        left = other.columns - self.basis @ (self.basis.T @ other.columns)
+        return bool(other.columns.any() and np.sum(left**2) < (1 - _SAME) * np.sum(other.columns**2))
+
+
+def _whole_forms(candidate: Candidate) -> list[_Span]:
+    """Return the forms of an effect with all its parameters."""
+    forms = candidate.forms
+    return [_Span(form.columns) for form in forms if form.keep.sum() == forms[0].keep.sum()]
+
+
+def _says(
+    views: Views, candidate: Candidate, whole: Sequence[_Span], place: Place, driver: Driver, laws: Sequence[_Span]
+) -> bool:
+    """Return whether an effect is a law: it acts there and follows that, as it declares or as its columns show."""
     effect = candidate.effect
     if effect.place != place.kind:
         return False
     follows = {*effect.needs, *effect.prefers}
-    views = linear.measurement.views
     if effect.prefers and not any(views.has(name) for name in effect.prefers):
         follows.add(TIME)
     event = any(p.discrete for p in candidate.parameters)
@@ -467,15 +495,6 @@ def _says(linear: LinearModel, candidate: Candidate, place: Place, driver: Drive
         return True
     if (driver.name == STEP) != event:
         return False
-    whole = [form.columns for form in candidate.forms if form.keep.sum() == candidate.forms[0].keep.sum()]
-    for shape in driver.shapes:
-        law = Law(place, driver, shape, place.whole).reduced(linear.observation)
-        if any(_contains(X, law) if place.joint is not None else _contains(law, X) for X in whole):
-            return True
-    return False
-
-
-def _contains(columns: Array, others: Array) -> bool:
-    """Return whether other columns (n, q) are combinations of columns (n, p)."""
-    left = project_out(columns, others)
-    return bool(others.any() and np.sum(left**2) < (1 - _SAME) * np.sum(others**2))
+    if place.joint is None:
+        return any(law.contains(form) for law in laws for form in whole)
+    return any(form.contains(law) for law in laws for form in whole)

@@ -8,6 +8,7 @@ errors of one go with errors of another.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -78,7 +79,7 @@ class Term(Value):
         """(P,) bool: tried value by value instead of fitted."""
         return np.array([bool(p.grid) for p in self.parameters], bool)
 
-    @property
+    @cached_property
     def arguments(self) -> dict[str, Any]:
         """Keyword arguments of the effect's function."""
         return self.effect.arguments(self.parameters)

@@ -277,6 +277,7 @@ class Likelihood:
     half: Array  # (a + g, r) square root of their covariance
     errors: InverseCovariance | PairWeights  # of the numbers
     sums: Array  # (a + g + 1, a + g + 1) XzᵀV⁻¹Xz of the mean's columns and what was seen
+    of_variances: float  # of the deviance, what no mean changes
 
     @property
     def covariance(self) -> Array:
@@ -357,7 +358,7 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
     k = len(problem.precision)
     if not np.isfinite(errors.logdet):
         nothing = np.zeros((k + 1, k + 1))
-        return Likelihood(problem, log_variances, 1e300, nothing[0, :k], nothing[:k, :k], errors, nothing)
+        return Likelihood(problem, log_variances, 1e300, nothing[0, :k], nothing[:k, :k], errors, nothing, 1e300)
     if isinstance(errors, PairWeights):
         sums = np.tensordot(errors.pairs, columns.products, axes=1)
     else:
@@ -376,8 +377,9 @@ def likelihood(log_variances: Array, problem: RemlProblem) -> Likelihood:
         rest = (flatten_blocks(columns.Xz) @ of_rest).reshape(*mixed.z.shape, 1)
         square = float(np.sum((errors.half @ rest) ** 2))
     square += float(mean @ (problem.precision * mean))
-    value = errors.logdet + of_information + problem.offset + square + log_prior(log_variances, mixed.further)[0]
-    return Likelihood(problem, log_variances, value, mean, half, errors, sums)
+    prior = log_prior(log_variances, mixed.further)[0]
+    value = errors.logdet + of_information + problem.offset + square + prior
+    return Likelihood(problem, log_variances, value, mean, half, errors, sums, errors.logdet + prior)
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:
@@ -415,12 +417,17 @@ class VarianceFit:
     mean: Array  # (a + g,)
     covariance: Array  # (a + g, a + g)
     sums: Array  # (a + g + 1, a + g + 1) XᵀV⁻¹X of the mean's columns, and of what was seen as the last one
+    of_variances: float = 0.0  # of the deviance, what no mean changes
 
-    def under_prior(self, prior: Array) -> tuple[Array, Array]:
-        """Mean (a + g,) and covariance at the same variances, with standard deviations (g,) of further coefficients."""
+    def under_prior(self, prior: Array) -> Self:
+        """Return the fit at the same variances, with standard deviations (g,) of the further coefficients."""
         precision = np.append(np.zeros(len(self.mean) - len(prior)), prior**-2.0)
-        half, _ = _root_of_inverse(self.sums[:-1, :-1] + np.diag(precision))
-        return half @ (half.T @ self.sums[:-1, -1]), half @ half.T
+        half, of_information = _root_of_inverse(self.sums[:-1, :-1] + np.diag(precision))
+        mean = half @ (half.T @ self.sums[:-1, -1])
+        of_rest = np.append(-mean, 1.0)
+        square = float(of_rest @ self.sums @ of_rest + mean @ (precision * mean))
+        value = self.of_variances + of_information + 2 * float(np.log(prior).sum()) + square
+        return replace(self, deviance=value, mean=mean, covariance=half @ half.T)
 
 
 def fit_variances(
@@ -478,7 +485,8 @@ def _fit_at(problem: RemlProblem, variances: Array) -> VarianceFit:
 
 
 def _as_variance_fit(variances: Array, solution: Likelihood) -> VarianceFit:
-    return VarianceFit(variances, solution.deviance, solution.mean, solution.covariance, solution.sums)
+    mean, covariance = solution.mean, solution.covariance
+    return VarianceFit(variances, solution.deviance, mean, covariance, solution.sums, solution.of_variances)
 
 
 def fisher_scoring(problem: RemlProblem, start: Array, flat: float) -> Likelihood | None:

@@ -30,7 +30,7 @@ from stitch.run_data import FusedCloud, RunData
 from stitch.session.reading.session_folder import measured_files
 from stitch.session.session import SessionData
 from stitch.system.files import claim_folder, rewrite_folder
-from stitch.system.packages import stitch_version, unless_missing
+from stitch.system.packages import arrow_alone, stitch_version, unless_missing
 from stitch.system.ply_file import ply_header
 from stitch.system.threads import release_mapped
 
@@ -89,8 +89,7 @@ def residual_table(run: RunData) -> Any:
     `time_s` is NaN where nobody states it; a covariate that is called like another column becomes `covariate_NAME`.
     What the clouds state of every point stands there as well, of the partner's point as `partner_NAME`.
     """
-    import pyarrow as pa
-
+    pa = arrow_alone()
     session = _without_reserved_covariates(run.session)
     of_views = {key for view in session.views for key in view.covariates}
     of_points = {key for view in session.views if view.cloud is not None for key in view.cloud.scalars}

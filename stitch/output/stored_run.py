@@ -26,7 +26,7 @@ from stitch.session.measurement import measurement_of, with_part_origin
 from stitch.session.reading.scan_files import require_room
 from stitch.session.reading.session_folder import UNKNOWN, content_hash, load_session, session_hash
 from stitch.session.reading.text_files import shortened
-from stitch.system.packages import stitch_version
+from stitch.system.packages import arrow_alone, stitch_version
 from stitch.system.ply_file import vertex_columns
 from stitch.system.threads import library_threads_off
 
@@ -268,5 +268,6 @@ def _target_fit(folder: Path, run: RunData) -> TargetModelFit:
     heldout: Array = np.full(used.shape, np.nan)
     # Beside clouds views are left out with their surfaces, not by their labelled points.
     if not run.measurement.capture.scans:
+        arrow_alone()
         heldout[used] = read_table(folder / "residuals.parquet")["heldout"].to_numpy()
     return replace(fit, heldout=heldout)

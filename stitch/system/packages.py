@@ -5,8 +5,10 @@
 
 import logging
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -65,6 +67,26 @@ def stitch_version() -> str:
     from importlib.metadata import version  # a third of `import stitch`, which needs none
 
     return version(DISTRIBUTION)
+
+
+@cache
+def arrow_alone() -> Any:
+    """Return pyarrow, which at its first list loads pandas where that is installed, a third of a second, to know one of
+    its columns by sight: here no such column comes, and pyarrow asks once."""
+    import pyarrow
+
+    class NoPandas:
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "pandas":
+                raise ModuleNotFoundError(name=name)
+
+    finder: Any = NoPandas()
+    sys.meta_path.insert(0, finder)
+    try:
+        pyarrow.array([0])
+    finally:
+        sys.meta_path.remove(finder)
+    return pyarrow
 
 
 def command_for(extra: str) -> str:
